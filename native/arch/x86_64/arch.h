@@ -1,0 +1,125 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Everything the engine knows about the CPU (x86-64).  A second CPU is a second
+ * folder with the same names.  ptrace(2) errors are returned as -1 with errno.
+ */
+#ifndef AVCKPT_ARCH_H
+#define AVCKPT_ARCH_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <sys/types.h>
+#include <sys/user.h>
+
+#include "home.h"
+
+#define ARCH_NAME "x86-64"
+#define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
+
+struct arch_regs {
+	struct user_regs_struct r;
+};
+
+/* An address in a target, never to be dereferenced here. */
+typedef uint64_t avc_remote;
+
+int arch_regs_get(pid_t tid, struct arch_regs *regs);
+int arch_regs_set(pid_t tid, const struct arch_regs *regs);
+/* Sets the result of the system call the stopped thread is in, nothing else. */
+int arch_result_set(pid_t tid, long result);
+
+/* The system call a stopped thread is in, -1 if it is in none. */
+static inline long arch_syscall_nr(const struct arch_regs *regs)
+{
+	return (long)regs->r.orig_rax;
+}
+static inline void arch_syscall_nr_set(struct arch_regs *regs, long nr)
+{
+	regs->r.orig_rax = (unsigned long long)nr;
+}
+static inline long arch_syscall_result(const struct arch_regs *regs)
+{
+	return (long)regs->r.rax;
+}
+static inline void arch_result_note(struct arch_regs *regs, long result)
+{
+	regs->r.rax = (unsigned long long)result;
+}
+uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned int n);
+void arch_syscall_arg_set(struct arch_regs *regs, unsigned int n, uint64_t value);
+
+static inline avc_remote arch_pc(const struct arch_regs *regs)
+{
+	return regs->r.rip;
+}
+static inline avc_remote arch_sp(const struct arch_regs *regs)
+{
+	return regs->r.rsp;
+}
+static inline avc_remote arch_tls(const struct arch_regs *regs)
+{
+	return regs->r.fs_base;
+}
+static inline uint64_t arch_other_base(const struct arch_regs *regs)
+{
+	return regs->r.gs_base;
+}
+static inline void arch_pc_set(struct arch_regs *regs, avc_remote pc)
+{
+	regs->r.rip = pc;
+}
+
+/* False for a task in 32-bit mode. */
+bool arch_is_native(const struct arch_regs *regs);
+
+/* `regs` as of a stop inside a system call that is to be made again: as the
+ * kernel would leave them, but in one piece.  Not in a call: unchanged. */
+void arch_rewind(struct arch_regs *regs);
+
+/* The call number a compiler would have loaded with the instruction before the
+ * system call at `pc` (the address after it), or -1: `code` are the ARCH_CODE_BYTES
+ * before `pc`. */
+#define ARCH_CODE_BYTES 7
+long arch_syscall_nr_before(const uint8_t code[ARCH_CODE_BYTES]);
+
+/* Whether `code` is the instruction for a system call. */
+#define ARCH_SYSCALL_BYTES 2
+bool arch_is_syscall(const uint8_t code[ARCH_SYSCALL_BYTES]);
+
+/* Like arch_rewind(), for the *same* task going on without the kernel's help:
+ * a restart block is still there and is continued, not begun again. */
+void arch_resume(struct arch_regs *regs);
+
+/* `base` (a live user context of the task) sent to `pc` with one argument. */
+void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
+	       uint64_t arg);
+
+/* Fills in the context that inj_go_home() goes back to. */
+void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
+
+/* The extended (FPU, vector) state of a stopped thread.  `arch_xstate_bytes` is
+ * its size on this machine, 0 if it can not be found out. */
+size_t arch_xstate_bytes(void);
+
+/* Room one thread's signal frame takes, and how it is built: first, while the
+ * thread is stopped, the extended state is read straight into the frame; later
+ * the rest is filled in.  `frame` is where the engine sees it (aligned to 64),
+ * `remote` where the target will.  Returns the stack pointer for
+ * inj_sigreturn(). */
+size_t arch_frame_bytes(void);
+int arch_frame_read_xstate(pid_t tid, void *frame);
+avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
+			    uint64_t sigmask, const uint64_t altstack[3]);
+
+/* A stub that makes one system call (registers preset by arch_stub_call) and
+ * then goes back to `regs` by itself, signal mask included.  Writes at most
+ * ARCH_STUB_BYTES to `code`, position dependent on `address`. */
+#define ARCH_STUB_BYTES 224
+size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
+/* Whether `code` is what arch_stub_build() has written once. */
+bool arch_is_stub(const uint8_t *code);
+void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub, long nr,
+		    const uint64_t arg[6]);
+
+#endif

@@ -1,0 +1,113 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What injected code can not say in C (x86-64).
+ */
+#include "home.h"
+
+#define NR_RT_SIGPROCMASK 14
+#define NR_RT_SIGRETURN 15
+#define NR_CLONE 56
+#define NR_EXIT 60
+#define NR_GETTID 186
+
+	.text
+
+/* Go back to the context in `home`, signal mask included.
+ *
+ * The stack pointer is the app's own before any signal can come in again: a
+ * handler that runs between here and home then finds the stack (and the red
+ * zone, which the kernel leaves alone) as if it had come a moment earlier.
+ * From there on nothing is written to the stack, so flags are put back without
+ * popf. */
+	.globl	inj_go_home
+	.type	inj_go_home, @function
+inj_go_home:
+	movq	home+120(%rip), %rsp
+	movl	$NR_RT_SIGPROCMASK, %eax
+	movl	$2, %edi			/* SIG_SETMASK */
+	leaq	home+HOME_SIGMASK(%rip), %rsi
+	xorl	%edx, %edx
+	movl	$8, %r10d
+	syscall
+	movl	home+HOME_FLAGS(%rip), %eax
+	cld
+	cmpl	$0, home+HOME_DIRECTION(%rip)
+	je	1f
+	std
+1:	addb	$1, %al				/* OF */
+	sahf					/* the others */
+	movq	home+0(%rip), %r15
+	movq	home+8(%rip), %r14
+	movq	home+16(%rip), %r13
+	movq	home+24(%rip), %r12
+	movq	home+32(%rip), %rbp
+	movq	home+40(%rip), %rbx
+	movq	home+48(%rip), %r11
+	movq	home+56(%rip), %r10
+	movq	home+64(%rip), %r9
+	movq	home+72(%rip), %r8
+	movq	home+80(%rip), %rax
+	movq	home+88(%rip), %rcx
+	movq	home+96(%rip), %rdx
+	movq	home+104(%rip), %rsi
+	movq	home+112(%rip), %rdi
+	jmp	*home+HOME_RIP(%rip)
+
+/* clone(2) without a new stack.  The child is meant to be stopped and sent
+ * elsewhere by the tracer; if there is none any more it leaves at once, and
+ * without touching memory: a CLONE_VM child shares this very stack. */
+	.globl	inj_clone
+	.type	inj_clone, @function
+inj_clone:
+	movq	%rcx, %r10
+	movl	$NR_CLONE, %eax
+	syscall
+	testq	%rax, %rax
+	jz	2f
+	ret
+2:	movl	$NR_EXIT, %eax
+	xorl	%edi, %edi
+	syscall
+	jmp	2b
+
+/* A thread: long inj_spawn(flags, stack, tls, thread, slot, tid).  A child with
+ * another number than `tid` leaves at once and without touching its stack, on
+ * which the next attempt may run already. */
+	.globl	inj_spawn
+	.type	inj_spawn, @function
+inj_spawn:
+	pushq	%r12
+	pushq	%r13
+	pushq	%r14
+	movq	%r8, %r12
+	movq	%rcx, %r13
+	movl	%r9d, %r14d
+	movq	%rdx, %r8
+	xorl	%edx, %edx
+	xorl	%r10d, %r10d
+	movl	$NR_CLONE, %eax
+	syscall
+	testq	%rax, %rax
+	jz	3f
+	popq	%r14
+	popq	%r13
+	popq	%r12
+	ret
+3:	movl	$NR_GETTID, %eax
+	syscall
+	cmpl	%eax, %r14d
+	jne	2b
+	movq	%r12, %rdi
+	movq	%r13, %rsi
+	call	inj_thread
+	ud2
+
+	.globl	inj_sigreturn
+	.type	inj_sigreturn, @function
+inj_sigreturn:
+	movq	%rdi, %rsp
+	movl	$NR_RT_SIGRETURN, %eax
+	syscall
+	ud2
+
+	.section .note.GNU-stack,"",@progbits

@@ -1,0 +1,254 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What a thread is to the kernel: scheduling, I/O priority, credentials, prctl(2)
+ * settings.
+ *
+ * A restored process has what its template has, which is a fork of the main thread:
+ * most of it is right by itself.  What is left is
+ *   - what fork(2) resets: parent-death signal, child subreaper;
+ *   - threads that differ from the main thread: they set themselves up again, but for
+ *     scheduling, which a process may be allowed to have and not to set: that is done
+ *     from outside.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/securebits.h>
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define IOPRIO_WHO_PROCESS 1
+#define CAPABILITY_VERSION_3 0x20080522
+
+struct attributes {
+	char oom_score_adj[16];
+	uint32_t count;
+	struct {
+		pid_t inside;
+		struct scheduling scheduling;
+	} thread[]; /* those to be set from outside                            */
+};
+
+/* What the kernel writes where; the rest are results. */
+struct answers {
+	uint32_t uid[3], gid[3];
+	uint32_t caps[6];
+	uint32_t death_signal, subreaper;
+	uint32_t header[2];
+};
+
+enum { FSUID, FSGID, SECUREBITS, NO_NEW_PRIVS, SLACK, SECCOMP, RESULTS };
+
+void scheduling_read(pid_t tid, struct scheduling *s)
+{
+	memset(s, 0, sizeof *s);
+	if (syscall(SYS_sched_getattr, tid, s->attr, sizeof s->attr, 0))
+		memset(s->attr, 0, sizeof s->attr);
+	s->io_priority = (int32_t)syscall(SYS_ioprio_get, IOPRIO_WHO_PROCESS, tid);
+}
+
+/* `out`, `remote`: room for ATTRIBUTES_ASK_BYTES. */
+struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote)
+{
+	struct answers *a = out;
+	struct inj_syscall *first;
+
+	a->header[0] = CAPABILITY_VERSION_3;
+	a->header[1] = 0;
+#define AT(field) (remote + offsetof(struct answers, field))
+	first = call_add(call, SYS_setfsuid, (uint64_t)-1, 0, 0, 0, 0); /* changes nothing */
+	call_add(call, SYS_setfsgid, (uint64_t)-1, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_SECUREBITS, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_NO_NEW_PRIVS, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_TIMERSLACK, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_SECCOMP, 0, 0, 0, 0);
+	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8, 0, 0);
+	call_add(call, SYS_getresgid, AT(gid), AT(gid) + 4, AT(gid) + 8, 0, 0);
+	call_add(call, SYS_capget, AT(header), AT(caps), 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_PDEATHSIG, AT(death_signal), 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_CHILD_SUBREAPER, AT(subreaper), 0, 0, 0);
+#undef AT
+	return first;
+}
+
+void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *c)
+{
+	const struct answers *a = out;
+
+	_Static_assert(sizeof *a <= ATTRIBUTES_ASK_BYTES, "room for the answers");
+	memset(c, 0, sizeof *c); /* compared with memcmp() */
+	memcpy(c->uid, a->uid, sizeof a->uid);
+	memcpy(c->gid, a->gid, sizeof a->gid);
+	memcpy(c->caps, a->caps, sizeof c->caps);
+	c->fsuid = (uint32_t)first[FSUID].result;
+	c->fsgid = (uint32_t)first[FSGID].result;
+	c->securebits = (uint32_t)first[SECUREBITS].result;
+	c->no_new_privs = first[NO_NEW_PRIVS].result == 1;
+	c->seccomp = (int32_t)first[SECCOMP].result;
+	c->slack_ns = (uint64_t)first[SLACK].result;
+	c->death_signal = a->death_signal;
+	c->subreaper = a->subreaper;
+}
+
+/* ---- when the app runs again ------------------------------------------------------------ */
+
+/* A thread that has fewer rights than the main thread, or other ones.  To go on with
+ * more than it had would be wrong: these must succeed. */
+static void lower(const struct creds *from, const struct creds *to, struct setup *setup)
+{
+	const struct {
+		uint32_t header[2], caps[6];
+	} data = {
+		.header = { CAPABILITY_VERSION_3, 0 },
+		.caps = { to->caps[0], to->caps[1], to->caps[2], to->caps[3], to->caps[4],
+			  to->caps[5] },
+	};
+	const avc_remote at = setup_data(setup, &data, sizeof data);
+	const bool uids = memcmp(from->uid, to->uid, sizeof to->uid) != 0;
+	const bool caps = uids || memcmp(from->caps, to->caps, sizeof to->caps) != 0;
+	/* Or the capabilities would go with the user. */
+	const uint32_t keep = from->securebits | SECBIT_KEEP_CAPS;
+
+	if (memcmp(from->gid, to->gid, sizeof to->gid))
+		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
+				 to->gid[2], 0, 0);
+	if (uids) {
+		if (from->securebits != keep)
+			setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1, 0,
+					 0, 0);
+		setup_add_thread(setup, "setresuid", SYS_setresuid, to->uid[0], to->uid[1],
+				 to->uid[2], 0, 0);
+		if (!(to->securebits & SECBIT_KEEP_CAPS))
+			setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 0, 0,
+					 0, 0);
+	}
+	if (from->fsgid != to->fsgid || to->fsgid != to->gid[1])
+		setup_add_thread(setup, "setfsgid", SYS_setfsgid, to->fsgid, 0, 0, 0, 0);
+	if (from->fsuid != to->fsuid || to->fsuid != to->uid[1])
+		setup_add_thread(setup, "setfsuid", SYS_setfsuid, to->fsuid, 0, 0, 0, 0);
+	if ((from->securebits ^ to->securebits) & ~(uint32_t)SECBIT_KEEP_CAPS)
+		setup_add_thread(setup, "prctl(SECUREBITS)", SYS_prctl, PR_SET_SECUREBITS,
+				 to->securebits, 0, 0, 0);
+	/* Also the file system's user takes capabilities along. */
+	if (caps || from->fsuid != to->fsuid)
+		setup_add_thread(setup, "capset", SYS_capset, at, at + sizeof data.header, 0, 0, 0);
+	if (to->no_new_privs && !from->no_new_privs)
+		setup_add_thread(setup, "prctl(NO_NEW_PRIVS)", SYS_prctl, PR_SET_NO_NEW_PRIVS, 1, 0,
+				 0, 0);
+}
+
+/* Each capability set of `to` within the permitted ones of `from`? */
+static bool has_less(const struct creds *from, const struct creds *to)
+{
+	return !(to->caps[1] & ~from->caps[1]) && !(to->caps[4] & ~from->caps[4]);
+}
+
+int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
+			    const struct thread *t, struct setup *setup, struct avc_error *err)
+{
+	const struct creds *from = &main_thread->creds, *to = &t->creds;
+
+	if (to->death_signal)
+		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
+				 to->death_signal, 0, 0, 0);
+	if (t == main_thread) {
+		if (to->subreaper)
+			setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl,
+					 PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+		return 0;
+	}
+	if (to->slack_ns && to->slack_ns != from->slack_ns)
+		setup_add_thread(setup, "prctl(TIMERSLACK)", SYS_prctl, PR_SET_TIMERSLACK,
+				 to->slack_ns, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
+	if (to->seccomp != from->seccomp)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "its threads differ in their seccomp filters (thread %d)", t->inside);
+	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "thread %d has privileges that the main thread has given up",
+			    t->inside);
+	lower(from, to, setup);
+	return 0;
+}
+
+static bool same_scheduling(const struct scheduling *a, const struct scheduling *b)
+{
+	return !memcmp(a, b, sizeof *a);
+}
+
+int attributes_keep(const struct target *target, struct generation *generation,
+		    struct avc_error *err)
+{
+	struct attributes *kept =
+		calloc(1, sizeof *kept + generation->threads * sizeof kept->thread[0]);
+	struct scheduling inherited;
+
+	generation->attributes = kept;
+	if (!kept)
+		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
+	if (proc_read(target->pid, "oom_score_adj", kept->oom_score_adj,
+		      sizeof kept->oom_score_adj) <= 0)
+		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
+	scheduling_read(generation->template, &inherited);
+	for (uint32_t i = 0; i < target->thread_count; i++) {
+		const struct thread *t = &target->threads[i];
+
+		if (t->block < 0 || same_scheduling(&t->scheduling, &inherited))
+			continue;
+		kept->thread[kept->count].inside = t->inside;
+		kept->thread[kept->count++].scheduling = t->scheduling;
+	}
+	return 0;
+}
+
+/* ---- at a restore, from outside ------------------------------------------------------------ */
+
+struct search {
+	const struct attributes *attributes;
+	struct avc_error *notice;
+};
+
+static int put_back(pid_t tid, void *arg)
+{
+	const struct search *search = arg;
+	const pid_t inside = proc_inside(tid);
+
+	for (uint32_t i = 0; i < search->attributes->count; i++) {
+		const struct scheduling *s = &search->attributes->thread[i].scheduling;
+
+		if (search->attributes->thread[i].inside != inside)
+			continue;
+		if (syscall(SYS_sched_setattr, tid, s->attr, 0))
+			fail_errno(search->notice, tid, "restore", "sched_setattr",
+				   "its scheduling can not be put back");
+		if (s->io_priority >= 0 &&
+		    syscall(SYS_ioprio_set, IOPRIO_WHO_PROCESS, tid, s->io_priority))
+			fail_errno(search->notice, tid, "restore", "ioprio_set",
+				   "its I/O priority can not be put back");
+	}
+	return 0;
+}
+
+void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice)
+{
+	struct search search = { .attributes = attributes, .notice = notice };
+	int dirfd;
+
+	if (attributes->oom_score_adj[0])
+		oom_score_adj_set(pid, attributes->oom_score_adj);
+	if (!attributes->count)
+		return;
+	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	if (dirfd < 0)
+		return; /* it has been killed again already */
+	(void)proc_tasks(dirfd, put_back, &search);
+	close(dirfd);
+}

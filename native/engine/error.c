@@ -1,0 +1,73 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+#include <errno.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+static void copy(char *to, size_t size, const char *from)
+{
+	snprintf(to, size, "%s", from ? from : "");
+}
+
+static int vfail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid,
+		 const char *operation, const char *syscall, const char *detail, va_list args)
+{
+	if (err->code) {
+		err->undo_failures++;
+		return -1;
+	}
+	err->code = code;
+	err->errnum = errnum;
+	err->pid = pid;
+	copy(err->operation, sizeof err->operation, operation);
+	copy(err->syscall, sizeof err->syscall, syscall);
+	vsnprintf(err->detail, sizeof err->detail, detail, args);
+	return -1;
+}
+
+int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const char *operation,
+	 const char *syscall, const char *detail, ...)
+{
+	va_list args;
+
+	va_start(args, detail);
+	vfail(err, code, errnum, pid, operation, syscall, detail, args);
+	va_end(args);
+	return -1;
+}
+
+int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
+	       const char *detail, ...)
+{
+	const int errnum = errno;
+	enum avc_code code = AVC_KERNEL;
+	va_list args;
+
+	if (errnum == ESRCH || errnum == ENOENT)
+		code = AVC_GONE;
+	else if (errnum == EPERM || errnum == EACCES)
+		code = AVC_DENIED;
+	va_start(args, detail);
+	vfail(err, code, errnum, pid, operation, syscall, detail, args);
+	va_end(args);
+	return -1;
+}
+
+uint64_t now_ns(void)
+{
+	struct timespec t;
+
+	clock_gettime(CLOCK_MONOTONIC, &t);
+	return (uint64_t)t.tv_sec * NS_PER_S + (uint64_t)t.tv_nsec;
+}
+
+void close_fd(int *fd)
+{
+	if (*fd >= 0)
+		close(*fd);
+	*fd = -1;
+}

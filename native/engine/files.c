@@ -1,0 +1,607 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Looks at a table of descriptors (files.h).
+ *
+ * A checkpoint looks twice: before the freeze at everything, names and all, while
+ * the app runs; and during the freeze at what is of that instant, while the kernel
+ * clones.  What was another one a moment before is looked at in full again.
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/kcmp.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/sysmacros.h>
+#include <unistd.h>
+
+#include "files.h"
+
+#define ROOM_SPARE 64
+
+struct look {
+	struct files *files, *known;
+	pid_t pid, init;
+	int pidfd, fd_dir;
+	enum files_depth depth;
+	struct stat init_stdio[3];
+	bool init_known[3];
+};
+
+struct files *files_new(uint32_t room)
+{
+	struct files *files = calloc(1, sizeof *files);
+
+	if (!files)
+		return NULL;
+	files->room = room;
+	files->file = calloc(room, sizeof *files->file);
+	if (!files->file) {
+		free(files);
+		return NULL;
+	}
+	return files;
+}
+
+void files_free(struct files *files)
+{
+	if (!files)
+		return;
+	for (uint32_t i = 0; i < files->count; i++) {
+		struct file *f = &files->file[i];
+
+		free(f->name);
+		free(f->watch);
+		free(f->lock);
+		free(f->socket);
+		free(f->content);
+	}
+	free(files->file);
+	free(files);
+}
+
+struct file *files_find(const struct files *files, int fd)
+{
+	uint32_t low = 0, high = files ? files->count : 0;
+
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+
+		if (files->file[middle].fd == fd)
+			return &files->file[middle];
+		if (files->file[middle].fd < fd)
+			low = middle + 1;
+		else
+			high = middle;
+	}
+	return NULL;
+}
+
+int files_borrow(int pidfd, int fd)
+{
+	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
+}
+
+/* The same file, socket, pipe...; of anonymous inodes only eventfds say who they are. */
+bool files_same_object(const struct file *a, const struct file *b)
+{
+	return a->kind == b->kind && a->dev == b->dev && a->ino == b->ino && a->rdev == b->rdev &&
+	       a->id == b->id && !((a->flags ^ b->flags) & (O_ACCMODE | O_PATH));
+}
+
+static bool is_anonymous(const struct file *f)
+{
+	return !(f->mode & S_IFMT);
+}
+
+static enum file_kind kind_of(const struct file *f)
+{
+	static const struct {
+		const char *name;
+		enum file_kind kind;
+	} kinds[] = {
+		{ "anon_inode:[eventfd]", FILE_EVENTFD },
+		{ "anon_inode:[timerfd]", FILE_TIMERFD },
+		{ "anon_inode:[signalfd]", FILE_SIGNALFD },
+		{ "anon_inode:[eventpoll]", FILE_EPOLL },
+		{ "anon_inode:inotify", FILE_INOTIFY },
+		{ "anon_inode:[inotify]", FILE_INOTIFY },
+	};
+
+	switch (f->mode & S_IFMT) {
+	case S_IFREG:
+		return strncmp(f->name, "anon_inode:", 11) ? FILE_REGULAR : FILE_OTHER;
+	case S_IFDIR:
+		return FILE_DIRECTORY;
+	case S_IFCHR:
+	case S_IFBLK:
+		return FILE_DEVICE;
+	case S_IFIFO:
+		return strncmp(f->name, "pipe:", 5) ? FILE_FIFO : FILE_PIPE;
+	case S_IFSOCK:
+		return FILE_SOCKET;
+	}
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++)
+		if (!strcmp(f->name, kinds[i].name))
+			return kinds[i].kind;
+	return FILE_OTHER;
+}
+
+static char *read_name(const struct look *look, int fd)
+{
+	char number[16], name[4096];
+	ssize_t n;
+
+	snprintf(number, sizeof number, "%d", fd);
+	n = readlinkat(look->fd_dir, number, name, sizeof name - 1);
+	if (n < 0)
+		return NULL;
+	name[n] = 0;
+	return strdup(name);
+}
+
+/* stdio that init has, too: then others read and write with the same offset. */
+static bool is_inits(const struct look *look, const struct file *f)
+{
+	for (int i = 0; i < 3; i++)
+		if (look->init_known[i] && look->init_stdio[i].st_dev == f->dev &&
+		    look->init_stdio[i].st_ino == f->ino &&
+		    syscall(SYS_kcmp, look->pid, look->init, KCMP_FILE, f->fd, i) == 0)
+			return true;
+	return false;
+}
+
+static void look_at_owner(int fd, struct file *f)
+{
+	struct f_owner_ex owner = { 0 };
+
+	if (f->flags & O_PATH || fcntl(fd, F_GETOWN_EX, &owner))
+		return;
+	f->owner_type = owner.type;
+	f->owner = owner.pid;
+	f->owner_signal = fcntl(fd, F_GETSIG);
+}
+
+/* Takes over what the look before the freeze has found out, if this is still the same. */
+static struct file *take_known(const struct look *look, struct file *f)
+{
+	struct file *k = files_find(look->known, f->fd);
+
+	if (!k || !k->name || k->dev != f->dev || k->ino != f->ino || k->rdev != f->rdev ||
+	    k->mode != f->mode || (k->flags ^ f->flags) & (O_ACCMODE | O_PATH))
+		return NULL;
+	f->kind = k->kind;
+	if (is_anonymous(f) && !file_read_info(look->pid, f)) {
+		char *name = read_name(look, f->fd);
+		const bool same = name && !strcmp(name, k->name);
+
+		free(name);
+		if (!same) {
+			const int fd = f->fd, flags = f->flags;
+
+			free(f->watch);
+			*f = (struct file){ .fd = fd,
+					    .shared = fd,
+					    .offset = -1,
+					    .dev = f->dev,
+					    .ino = f->ino,
+					    .rdev = f->rdev,
+					    .mode = f->mode,
+					    .flags = flags };
+			return NULL;
+		}
+	}
+	f->known = true;
+	f->remote = k->remote;
+	if (look->depth == FILES_NOW) {
+		if (!is_anonymous(f))
+			f->id = k->id;
+		return k;
+	}
+	if (!is_anonymous(f))
+		f->cloexec = k->cloexec;
+	f->outside = k->outside;
+	f->id = k->id;
+	f->shared = k->shared;
+	f->owner_type = k->owner_type;
+	f->owner = k->owner;
+	f->owner_inside = k->owner_inside;
+	f->owner_signal = k->owner_signal;
+	f->name = k->name;
+	f->socket = k->socket;
+	f->lock = k->lock;
+	f->lock_count = k->lock_count;
+	k->name = NULL;
+	k->socket = NULL;
+	k->lock = NULL;
+	k->lock_count = 0;
+	return k;
+}
+
+/* A file server is asked nothing while the app stands still, or is dead: it may be the
+ * app itself (FUSE), or not answer; and to close a duplicate is to ask (flush).  What
+ * fdinfo says has to do. */
+static bool look_at_remote(const struct look *look, int number, struct file *f)
+{
+	const struct file *k = look->known ? files_find(look->known, number) : NULL;
+
+	if (!k || !k->remote || !k->name)
+		return false;
+	*f = (struct file){ .fd = number, .shared = number, .kind = FILE_REGULAR };
+	file_read_info(look->pid, f);
+	free(f->lock);
+	if (f->told_ino != k->told_ino || (f->told_flags ^ k->told_flags) & (O_ACCMODE | O_PATH))
+		return false;
+	*f = (struct file){
+		.fd = number,
+		.shared = number,
+		.dev = k->dev,
+		.ino = k->ino,
+		.rdev = k->rdev,
+		.mode = k->mode,
+		.flags = f->told_flags & ~O_CLOEXEC,
+		.offset = f->told_offset,
+		.bytes = k->bytes,
+		.modified = k->modified,
+		.changed = k->changed,
+	};
+	if (!take_known(look, f))
+		return false;
+	file_read_info(look->pid, f);
+	return true;
+}
+
+static int look_at(struct look *look, int number, struct avc_error *err)
+{
+	struct files *files = look->files;
+	const int sync = look->depth == FILES_FROZEN ? AT_STATX_DONT_SYNC : AT_STATX_SYNC_AS_STAT;
+	struct statx st;
+	struct file *f;
+	const struct file *known;
+	const struct file_socket *socket;
+	uint32_t locks;
+	int fd;
+
+	if (files->count == files->room) {
+		if (look->depth != FILES_FROZEN) {
+			struct file *more = realloc(files->file, 2 * files->room * sizeof *more);
+
+			if (!more)
+				return fail_errno(err, look->pid, "look at descriptors", "realloc",
+						  "out of memory");
+			memset(more + files->room, 0, files->room * sizeof *more);
+			files->file = more;
+			files->room *= 2;
+		} else {
+			return fail(err, AVC_DEADLINE, 0, look->pid, "freeze", "",
+				    "more descriptors than prepared for");
+		}
+	}
+	f = &files->file[files->count];
+	if (look->depth != FILES_BEFORE && look_at_remote(look, number, f)) {
+		files->count++;
+		return 0;
+	}
+	fd = files_borrow(look->pidfd, number);
+	if (fd < 0) {
+		if (errno == EBADF)
+			return 0; /* closed meanwhile */
+		return fail_errno(err, look->pid, "look at descriptors", "pidfd_getfd",
+				  "descriptor %d", number);
+	}
+	*f = (struct file){ .fd = number, .shared = number, .offset = -1 };
+	if (statx(fd, "", AT_EMPTY_PATH | sync, STATX_BASIC_STATS, &st)) {
+		close(fd);
+		return 0;
+	}
+	f->dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+	f->ino = st.stx_ino;
+	f->rdev = makedev(st.stx_rdev_major, st.stx_rdev_minor);
+	f->mode = st.stx_mode;
+	f->bytes = (int64_t)st.stx_size;
+	f->modified = (struct timespec){ st.stx_mtime.tv_sec, st.stx_mtime.tv_nsec };
+	f->changed = (struct timespec){ st.stx_ctime.tv_sec, st.stx_ctime.tv_nsec };
+	f->flags = fcntl(fd, F_GETFL);
+	known = look->depth == FILES_BEFORE ? NULL : take_known(look, f);
+	if (!known) {
+		f->name = read_name(look, number);
+		if (!f->name) {
+			close(fd);
+			return 0;
+		}
+		f->kind = kind_of(f);
+		f->outside = is_inits(look, f);
+		look_at_owner(fd, f);
+		if (f->kind == FILE_SOCKET)
+			file_look_at_socket(fd, f);
+	}
+	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
+	    !(f->flags & O_PATH))
+		f->remote = file_is_remote(fd);
+	locks = known ? known->lock_count + f->lock_count : 0;
+	if (!known || (f->kind == FILE_REGULAR && !(f->flags & O_PATH) &&
+		       (locks || f->remote || file_is_locked(fd))))
+		file_read_info(look->pid, f);
+	if ((f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) && !(f->flags & O_PATH))
+		f->offset = lseek(fd, 0, SEEK_CUR);
+	socket = known && look->depth == FILES_NOW ? known->socket : f->socket;
+	if (f->kind == FILE_SOCKET && (look->depth == FILES_NOW || look->files->with_tcp))
+		file_look_at_tcp(fd, f, socket);
+	close(fd);
+	files->count++;
+	return 0;
+}
+
+static int by_fd(const void *a, const void *b)
+{
+	return ((const struct file *)a)->fd - ((const struct file *)b)->fd;
+}
+
+static int compare_keys(const struct file *a, const struct file *b)
+{
+	if (a->dev != b->dev)
+		return a->dev < b->dev ? -1 : 1;
+	if (a->ino != b->ino)
+		return a->ino < b->ino ? -1 : 1;
+	if (a->kind != b->kind)
+		return a->kind < b->kind ? -1 : 1;
+	if (a->id != b->id)
+		return a->id < b->id ? -1 : 1;
+	return 0;
+}
+
+static int by_key(const void *a, const void *b)
+{
+	const struct file *x = *(struct file *const *)a, *y = *(struct file *const *)b;
+	const int order = compare_keys(x, y);
+
+	return order ? order : x->fd - y->fd;
+}
+
+/* Which descriptors are of the same open file description.  Only those of the same
+ * file can be, and kcmp(2) gives an order, so that it takes few calls. */
+static void find_shared(struct files *files, pid_t pid)
+{
+	struct file **sorted = calloc(files->count + 1, sizeof *sorted);
+	struct file **kinds = calloc(files->count + 1, sizeof *kinds);
+
+	for (uint32_t i = 0; sorted && kinds && i < files->count; i++)
+		sorted[i] = &files->file[i];
+	if (sorted && kinds)
+		qsort(sorted, files->count, sizeof *sorted, by_key);
+	for (uint32_t i = 0, kind_count = 0; sorted && kinds && i < files->count; i++) {
+		uint32_t low = 0, high;
+		bool found = false;
+
+		if (i && compare_keys(sorted[i], sorted[i - 1]))
+			kind_count = 0;
+		high = kind_count;
+		while (low < high && !found) {
+			const uint32_t middle = (low + high) / 2;
+			const long order = syscall(SYS_kcmp, pid, pid, KCMP_FILE, sorted[i]->fd,
+						   kinds[middle]->fd);
+
+			if (order == 0) {
+				sorted[i]->shared = kinds[middle]->fd;
+				found = true;
+			} else if (order == 1) {
+				high = middle;
+			} else {
+				low = middle + 1;
+			}
+		}
+		if (!found) {
+			memmove(&kinds[low + 1], &kinds[low], (kind_count - low) * sizeof *kinds);
+			kinds[low] = sorted[i];
+			kind_count++;
+		}
+	}
+	free(sorted);
+	free(kinds);
+}
+
+/* The same during a freeze: what was found before it is only checked. */
+static void check_shared(struct files *files, pid_t pid)
+{
+	for (uint32_t i = 0; i < files->count; i++) {
+		struct file *f = &files->file[i];
+
+		if (f->known && (f->shared == f->fd ||
+				 syscall(SYS_kcmp, pid, pid, KCMP_FILE, f->fd, f->shared) == 0))
+			continue;
+		f->shared = f->fd;
+		for (uint32_t j = 0; j < files->count; j++) {
+			const struct file *g = &files->file[j];
+
+			if (g->fd != f->fd && g->shared == g->fd && !compare_keys(f, g) &&
+			    syscall(SYS_kcmp, pid, pid, KCMP_FILE, f->fd, g->fd) == 0) {
+				f->shared = g->fd;
+				break;
+			}
+		}
+	}
+}
+
+static void keep_contents(struct look *look)
+{
+	for (uint32_t i = 0; i < look->files->count; i++) {
+		struct file *f = &look->files->file[i];
+		int fd;
+
+		/* Once for each object, from an end that can be read. */
+		if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) ||
+		    f->shared != f->fd || (f->kind != FILE_PIPE && f->kind != FILE_SOCKET) ||
+		    !files_other_end(look->files, f))
+			continue;
+		fd = files_borrow(look->pidfd, f->fd);
+		if (fd < 0)
+			continue;
+		file_keep_content(fd, f);
+		close(fd);
+	}
+}
+
+struct linux_dirent64 {
+	uint64_t d_ino;
+	int64_t d_off;
+	unsigned short d_reclen;
+	unsigned char d_type;
+	char d_name[];
+};
+
+static int walk(struct look *look, struct avc_error *err)
+{
+	char buf[16384] __attribute__((aligned(8)));
+
+	for (;;) {
+		const long n = syscall(SYS_getdents64, look->fd_dir, buf, sizeof buf);
+
+		if (n < 0)
+			return fail_errno(err, look->pid, "look at descriptors", "getdents64",
+					  "it has ended");
+		if (n == 0)
+			return 0;
+		for (long at = 0; at < n;) {
+			const struct linux_dirent64 *entry = (struct linux_dirent64 *)(buf + at);
+
+			at += entry->d_reclen;
+			if (entry->d_name[0] != '.' && look_at(look, atoi(entry->d_name), err))
+				return -1;
+		}
+	}
+}
+
+int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
+	       struct files *known, pid_t init, struct avc_error *err)
+{
+	struct look look = { .files = files,
+			     .known = known,
+			     .pid = pid,
+			     .init = init,
+			     .pidfd = pidfd,
+			     .depth = depth };
+	struct timespec now;
+	int result;
+
+	look.fd_dir = proc_open(pid, "fd", O_RDONLY | O_DIRECTORY);
+	if (look.fd_dir < 0)
+		return fail_errno(err, pid, "look at descriptors", "open(fd)", "it has ended");
+	for (int i = 0; i < 3 && depth != FILES_FROZEN && init; i++) {
+		char path[48];
+
+		snprintf(path, sizeof path, "/proc/%d/fd/%d", init, i);
+		look.init_known[i] = stat(path, &look.init_stdio[i]) == 0;
+	}
+	files->count = 0;
+	clock_gettime(CLOCK_REALTIME, &now);
+	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
+	result = walk(&look, err);
+	close(look.fd_dir);
+	if (result)
+		return -1;
+	qsort(files->file, files->count, sizeof *files->file, by_fd);
+	if (depth == FILES_FROZEN) {
+		check_shared(files, pid);
+		files_find_peers(files, pid); /* of pairs that are quite new */
+		keep_contents(&look);
+	} else {
+		find_shared(files, pid);
+		if (depth == FILES_BEFORE)
+			files_find_peers(files, pid);
+	}
+	return 0;
+}
+
+/* Only the app itself, its threads and its group can be named again. */
+static void find_owners(const struct target *target, struct files *files)
+{
+	for (uint32_t i = 0; i < files->count; i++) {
+		struct file *f = &files->file[i];
+
+		if (!f->owner || f->owner_inside)
+			continue;
+		if (f->owner_type == F_OWNER_PGRP)
+			f->owner_inside = proc_inside(f->owner);
+		else if (f->owner == target->pid)
+			f->owner_inside = target->inside;
+		for (uint32_t k = 0; f->owner_type == F_OWNER_TID && k < target->thread_count; k++)
+			if (target->threads[k].tid == f->owner)
+				f->owner_inside = target->threads[k].inside;
+		if (f->owner_inside < 0)
+			f->owner_inside = 0;
+	}
+}
+
+int files_prepare(struct target *target, struct avc_error *err)
+{
+	struct files *before = files_new(target->files_seen + ROOM_SPARE);
+	struct files *image;
+
+	files_free(target->files_image);
+	target->files_image = NULL;
+	if (!before)
+		return fail_errno(err, target->pid, "look at descriptors", "calloc",
+				  "out of memory");
+	if (files_look(before, target->pid, target->pidfd, FILES_BEFORE, target->files_before,
+		       target->init, err)) {
+		files_free(before);
+		return -1;
+	}
+	files_free(target->files_before);
+	target->files_before = before;
+	target->files_seen = before->count;
+	find_owners(target, before);
+	image = files_new(before->count + before->count / 4 + ROOM_SPARE);
+	if (!image)
+		return fail_errno(err, target->pid, "look at descriptors", "calloc",
+				  "out of memory");
+	/* Touched now: a first touch costs a fault, then while the app is stopped. */
+	memset(image->file, 0, image->room * sizeof *image->file);
+	image->with_tcp = target->tcp_moved;
+	target->files_image = image;
+	return 0;
+}
+
+int files_capture(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct files *image = target->files_image;
+
+	target->files_image = NULL;
+	generation->files = image;
+	if (files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
+		       target->init, err))
+		return -1;
+	find_owners(target, image);
+	return 0;
+}
+
+/* Nothing tells cheaply of flock(2): one that is there now, after the freeze, and was not
+ * there before it may be of either side, and is left alone at a restore. */
+void files_settle(struct target *target, struct generation *generation)
+{
+	for (uint32_t i = 0; i < generation->files->count; i++) {
+		struct file *f = &generation->files->file[i];
+		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };
+
+		if (f->kind != FILE_REGULAR || f->flags & O_PATH)
+			continue;
+		file_read_info(target->pid, &now);
+		for (uint32_t k = 0; k < now.lock_count; k++)
+			f->lock_unsure |= now.lock[k].kind == LOCK_FLOCK_;
+		for (uint32_t k = 0; k < f->lock_count; k++)
+			f->lock_unsure &= f->lock[k].kind != LOCK_FLOCK_;
+		free(now.lock);
+	}
+}
+
+void files_forget(struct target *target)
+{
+	files_free(target->files_before);
+	files_free(target->files_image);
+	target->files_before = NULL;
+	target->files_image = NULL;
+}

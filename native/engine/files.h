@@ -1,0 +1,186 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Descriptors: what the app had open at one instant, and how it becomes that again.
+ *
+ *   files.c         looks at a table
+ *   files_info.c    what /proc/PID/fdinfo says
+ *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
+ *   files_make.c    opens and makes again what is lost
+ *   files_restore.c compares two tables and makes the one the other
+ *   files_calls.c   what the restored process has to do for that itself
+ *   files_strict.c  whether a file was written (avckpt.files=strict)
+ *
+ * Looking is done on a duplicate (pidfd_getfd(2)) that lives for microseconds: while
+ * it is there the app's close(2) closes nothing.
+ */
+#ifndef AVCKPT_FILES_H
+#define AVCKPT_FILES_H
+
+#include <signal.h>
+#include <sys/socket.h>
+#include <time.h>
+
+#include "internal.h"
+
+enum file_kind {
+	FILE_OTHER,
+	FILE_REGULAR,
+	FILE_DIRECTORY,
+	FILE_DEVICE,
+	FILE_FIFO, /* with a name                                                */
+	FILE_PIPE,
+	FILE_SOCKET,
+	FILE_EVENTFD,
+	FILE_TIMERFD,
+	FILE_SIGNALFD,
+	FILE_EPOLL,
+	FILE_INOTIFY
+};
+
+struct file_lock {
+	enum { LOCK_FLOCK_, LOCK_POSIX_, LOCK_OFD_ } kind;
+	bool exclusive;
+	int64_t start, end; /* last byte; -1: to the end of the file             */
+};
+
+struct file_watch { /* of an epoll set                                         */
+	int fd;
+	uint32_t events;
+	uint64_t data;
+};
+
+struct file_socket {
+	int domain, type, protocol;
+	bool listening, connected;
+	int backlog;
+	uint64_t peer; /* inode of the other end of a Unix socket, 0: not known    */
+	socklen_t local_bytes, remote_bytes;
+	struct sockaddr_storage local, remote;
+};
+
+struct file {
+	int fd;
+	enum file_kind kind;
+	uint64_t dev, ino, rdev;
+	uint64_t id; /* of an eventfd, 0: the kernel does not say                   */
+	uint32_t mode;
+	int flags; /* F_GETFL                                                       */
+	bool cloexec;
+	bool outside; /* its open file description is also init's                  */
+	int shared;   /* lowest fd with the same open file description             */
+	bool known;   /* the same object as in `known` of files_look(); at a restore
+		       * the name and what does not change is left to that   */
+	char *name;   /* as readlink(2) says, allocated                            */
+	/* F_GETOWN_EX: in our namespace, and in its own (0: not the app's); F_GETSIG */
+	int owner_type, owner, owner_inside, owner_signal;
+	int64_t offset; /* -1: it has none                                          */
+	int64_t bytes;  /* size of the file                                         */
+	struct timespec modified, changed;
+	/* eventfd */
+	uint64_t count;
+	bool semaphore;
+	/* timerfd: when it is to go off next, by its own clock; 0: never          */
+	int clock, settime_flags;
+	uint64_t ticks, deadline_ns, interval_ns;
+	uint64_t mask; /* signalfd                                                  */
+	/* inotify: how many watches, and a sum over what fdinfo says of them      */
+	uint32_t watch_count;
+	uint64_t watch_sum;
+	struct file_watch *watch; /* epoll, allocated                              */
+	/* As fdinfo says it                                                      */
+	int told_flags;
+	uint64_t told_ino;
+	int64_t told_offset;
+	struct file_lock *lock; /* allocated                                     */
+	uint32_t lock_count;
+	bool remote;                /* a network file system: no questions while frozen       */
+	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
+	struct file_socket *socket; /* allocated                                   */
+	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
+	int tcp_state; /* 0: no TCP                                                 */
+	/* What can be read from it, when its other end is the app's own as well   */
+	uint8_t *content;
+	uint32_t content_bytes;
+	bool content_lost; /* there was something that can not be put back          */
+};
+
+struct files {
+	uint32_t count, room;
+	bool with_tcp;     /* count the bytes of connections, during a freeze, too      */
+	uint64_t taken_ns; /* CLOCK_REALTIME                                       */
+	struct file *file; /* by fd, ascending                                     */
+};
+
+enum files_depth {
+	FILES_BEFORE, /* everything about what stays the same; the app runs         */
+	FILES_FROZEN, /* what is of this instant; the rest from `known`             */
+	FILES_NOW     /* at a restore: what may have changed since `known`          */
+};
+
+/* files.c */
+struct files *files_new(uint32_t room);
+int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
+	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
+struct file *files_find(const struct files *files, int fd);
+/* A duplicate of the descriptor of a process, or -1. */
+int files_borrow(int pidfd, int fd);
+bool files_same_object(const struct file *a, const struct file *b);
+
+/* files_info.c */
+/* fdinfo of a descriptor: O_CLOEXEC, locks, and what is in anonymous inodes.  True if
+ * it says that it is of that kind. */
+bool file_read_info(pid_t pid, struct file *file);
+
+/* files_state.c */
+void file_look_at_socket(int fd, struct file *file);
+void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
+void files_find_peers(struct files *files, pid_t pid);
+/* Whether both ends of this pipe or socket pair are in the table. */
+const struct file *files_other_end(const struct files *files, const struct file *file);
+void file_keep_content(int fd, struct file *file);
+/* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
+bool file_is_locked(int fd);
+bool file_is_remote(int fd);
+/* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
+ * open file description; `now` is what it is (NULL: fresh). Returns NULL or why not. */
+const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind);
+const char *file_put_content(int fd, int other_fd, const struct file *want);
+bool file_tcp_moved(const struct file *want, const struct file *now);
+const char *file_reset_tcp(int fd);
+
+/* files_make.c */
+/* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
+ * may be set on success as well: what is not as it was. */
+/* The file that it was, by its path: an O_PATH descriptor, or -1. */
+int file_open_path(const struct file *want, pid_t init);
+int file_make(const struct file *want, pid_t template, pid_t init, const char **why);
+/* Both ends of a pipe or socket pair. */
+int file_make_pair(const struct file *want, int ends[2]);
+/* A socket or pipe that reads as closed by the other side. */
+int file_make_dead(const struct file *want, pid_t template);
+
+/* files_restore.c and files_calls.c */
+/* One restore of a table: from `now` to `want`. */
+struct files_work {
+	struct target *target;
+	struct generation *generation;
+	const struct avc_config *config;
+	pid_t init;
+	struct files *want, *now;
+	int *local;      /* of want, by group leader: a descriptor of ours, or -1  */
+	int *claimed_by; /* of now: leader (index in want) of the group that has it */
+	int *source;     /* of want, by group leader: index in now, or -1          */
+	bool *lost;      /* of want: has to be put in place                        */
+	uint32_t listed; /* calls for the template that were not made yet          */
+	uint32_t problems;
+	struct avc_error *notes;
+};
+
+uint32_t files_index(const struct files *files, const struct file *file);
+/* Index of the first descriptor of the same open file description. */
+uint32_t files_leader(const struct files *files, const struct file *file);
+/* What is `want`'s i-th already, or NULL if it is made anew. */
+const struct file *files_now_of(const struct files_work *work, uint32_t i);
+void files_list_calls(struct files_work *work);
+
+#endif

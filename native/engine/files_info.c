@@ -1,0 +1,207 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What /proc/PID/fdinfo says of a descriptor (proc(5)).
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "files.h"
+
+/* All of a file of /proc, NUL at the end; NULL if it can not be had.  `first` is used
+ * when it is large enough. */
+static char *read_all(int fd, char *first, size_t first_bytes)
+{
+	char *text = first;
+	size_t room = first_bytes, used = 0;
+
+	for (;;) {
+		const ssize_t n = read(fd, text + used, room - used - 1);
+
+		if (n < 0)
+			goto failed;
+		if (n == 0)
+			break;
+		used += (size_t)n;
+		if (room - used < 512) {
+			char *more = realloc(text == first ? NULL : text, 4 * room);
+
+			if (!more)
+				goto failed;
+			if (text == first)
+				memcpy(more, first, used);
+			text = more;
+			room *= 4;
+		}
+	}
+	text[used] = 0;
+	return text;
+failed:
+	if (text != first)
+		free(text);
+	return NULL;
+}
+
+static uint64_t sum_up(uint64_t sum, const char *text, size_t bytes)
+{
+	for (size_t i = 0; i < bytes; i++)
+		sum = (sum ^ (uint8_t)text[i]) * UINT64_C(0x100000001b3);
+	return sum;
+}
+
+/* "1: POSIX  ADVISORY  WRITE 14092 fe:00:2147490 5 14" */
+static void add_lock(struct file *file, const char *line)
+{
+	char kind[16], mode[16], way[16], end[24];
+	long long start;
+	struct file_lock *more;
+
+	if (sscanf(line, "%*d: %15s %15s %15s %*d %*s %lld %23s", kind, mode, way, &start, end) !=
+	    5)
+		return;
+	more = realloc(file->lock, (file->lock_count + 1) * sizeof *more);
+	if (!more)
+		return;
+	file->lock = more;
+	more += file->lock_count;
+	if (!strcmp(kind, "FLOCK"))
+		more->kind = LOCK_FLOCK_;
+	else if (!strcmp(kind, "POSIX"))
+		more->kind = LOCK_POSIX_;
+	else if (!strcmp(kind, "OFDLCK"))
+		more->kind = LOCK_OFD_;
+	else
+		return; /* a lease */
+	more->exclusive = !strcmp(way, "WRITE");
+	more->start = start;
+	more->end = strcmp(end, "EOF") ? atoll(end) : -1;
+	file->lock_count++;
+}
+
+static void add_watch(struct file *file, const char *line, uint32_t *room)
+{
+	struct file_watch watch;
+	unsigned long long data;
+
+	if (sscanf(line, " %d events: %x data: %llx", &watch.fd, &watch.events, &data) != 3)
+		return;
+	watch.data = data;
+	if (file->watch_count == *room) {
+		const uint32_t wanted = *room ? 2 * *room : 32;
+		struct file_watch *more = realloc(file->watch, wanted * sizeof *more);
+
+		if (!more)
+			return;
+		file->watch = more;
+		*room = wanted;
+	}
+	file->watch[file->watch_count++] = watch;
+}
+
+static uint64_t nanoseconds(const char *value)
+{
+	unsigned long long s, ns;
+
+	return sscanf(value, " (%llu, %llu)", &s, &ns) == 2 ? s * NS_PER_S + ns : 0;
+}
+
+static void timer_deadline(struct file *file, uint64_t left_ns)
+{
+	struct timespec now;
+
+	file->deadline_ns = 0;
+	if (left_ns && clock_gettime(file->clock, &now) == 0)
+		file->deadline_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec +
+				    left_ns;
+}
+
+static void take_line(struct file *file, const char *key, const char *value, uint32_t *room,
+		      uint64_t *left_ns)
+{
+	if (!strcmp(key, "flags")) {
+		file->told_flags = (int)strtoul(value, NULL, 8);
+		file->cloexec = file->told_flags & O_CLOEXEC;
+	} else if (!strcmp(key, "pos"))
+		file->told_offset = atoll(value);
+	else if (!strcmp(key, "ino"))
+		file->told_ino = strtoull(value, NULL, 10);
+	else if (!strcmp(key, "lock"))
+		add_lock(file, value);
+	else if (!strcmp(key, "eventfd-count"))
+		file->count = strtoull(value, NULL, 16);
+	else if (!strcmp(key, "eventfd-id"))
+		file->id = strtoull(value, NULL, 10) + 1;
+	else if (!strcmp(key, "eventfd-semaphore"))
+		file->semaphore = atoi(value);
+	else if (!strcmp(key, "clockid"))
+		file->clock = atoi(value);
+	else if (!strcmp(key, "ticks"))
+		file->ticks = strtoull(value, NULL, 10);
+	else if (!strcmp(key, "settime flags"))
+		file->settime_flags = (int)strtol(value, NULL, 8);
+	else if (!strcmp(key, "it_value"))
+		*left_ns = nanoseconds(value);
+	else if (!strcmp(key, "it_interval"))
+		file->interval_ns = nanoseconds(value);
+	else if (!strcmp(key, "sigmask"))
+		file->mask = strtoull(value, NULL, 16);
+	else if (!strcmp(key, "tfd"))
+		add_watch(file, value, room);
+	else if (!strncmp(key, "inotify wd", 10)) {
+		file->watch_count++;
+		file->watch_sum += sum_up(1, value, strcspn(value, "\n"));
+	}
+}
+
+static const struct {
+	enum file_kind kind;
+	const char *key;
+} telling[] = {
+	{ FILE_EVENTFD, "eventfd-count" },
+	{ FILE_TIMERFD, "clockid" },
+	{ FILE_SIGNALFD, "sigmask" },
+	{ FILE_EPOLL, "tfd" },
+};
+
+bool file_read_info(pid_t pid, struct file *file)
+{
+	char name[32], first[4096], *text, *line, *next;
+	uint64_t left_ns = 0;
+	uint32_t room = 0;
+	bool told = false;
+	int fd;
+
+	snprintf(name, sizeof name, "fdinfo/%d", file->fd);
+	fd = proc_open(pid, name, O_RDONLY);
+	if (fd < 0)
+		return false;
+	text = read_all(fd, first, sizeof first);
+	close(fd);
+	if (!text)
+		return false;
+	file->lock_count = 0;
+	file->watch_count = 0;
+	file->watch_sum = 0;
+	for (line = text; *line; line = next) {
+		char *colon;
+
+		next = line + strcspn(line, "\n");
+		if (*next)
+			*next++ = 0;
+		colon = strchr(line, ':');
+		if (!colon)
+			continue;
+		*colon = 0;
+		take_line(file, line, colon + 1, &room, &left_ns);
+		for (size_t i = 0; i < sizeof telling / sizeof *telling; i++)
+			told |= file->kind == telling[i].kind && !strcmp(line, telling[i].key);
+	}
+	if (file->kind == FILE_TIMERFD)
+		timer_deadline(file, left_ns);
+	if (text != first)
+		free(text);
+	return told;
+}

@@ -1,0 +1,259 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Opens and makes again what is not in the table any more (files.h).  A file is only
+ * opened if it is the very one: the app is given nothing that it did not have.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/openat2.h>
+#include <netinet/in.h>
+#include <sched.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
+#include <sys/inotify.h>
+#include <sys/signalfd.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/timerfd.h>
+#include <unistd.h>
+
+#include "files.h"
+
+static bool is_the_one(int fd, const struct file *want)
+{
+	struct stat st;
+
+	return fstat(fd, &st) == 0 && st.st_dev == want->dev && st.st_ino == want->ino &&
+	       (st.st_mode & S_IFMT) == (want->mode & S_IFMT) && st.st_rdev == want->rdev;
+}
+
+/* From any descriptor of a file to one with the flags that the app had. */
+static int open_as(int fd, const struct file *want)
+{
+	int flags = want->flags & ~(O_CREAT | O_EXCL | O_TRUNC | O_NOFOLLOW | O_DIRECTORY | FASYNC);
+	char path[40];
+	int opened;
+
+	if (want->flags & O_PATH)
+		return fcntl(fd, F_DUPFD_CLOEXEC, 3);
+	/* Nobody may be there to open a fifo's other side. */
+	if (want->kind == FILE_FIFO || want->kind == FILE_DEVICE)
+		flags |= O_NONBLOCK;
+	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
+	opened = open(path, flags | O_NOCTTY | O_CLOEXEC);
+	if (opened < 0 && errno == ENXIO && want->kind == FILE_FIFO) {
+		/* To write, with no reader: there must be one for this moment. */
+		const int reader = open(path, O_RDONLY | O_NONBLOCK | O_CLOEXEC);
+
+		opened = open(path, flags | O_CLOEXEC);
+		if (reader >= 0)
+			close(reader);
+	}
+	return opened;
+}
+
+/* init's root is the container's; the app may have changed its own. */
+int file_open_path(const struct file *want, pid_t init)
+{
+	struct open_how how = { .flags = O_PATH | O_CLOEXEC,
+				.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS };
+	int root = proc_open(init, "root", O_PATH | O_DIRECTORY), fd = -1;
+
+	if (root < 0)
+		return -1;
+	if (want->name[0] == '/')
+		fd = (int)syscall(SYS_openat2, root, want->name, &how, sizeof how);
+	close(root);
+	if (fd >= 0 && !is_the_one(fd, want)) {
+		close(fd);
+		fd = -1;
+		errno = ESTALE;
+	}
+	return fd;
+}
+
+/* A file without a name may still be mapped into the template. */
+static int open_mapped(const struct file *want, pid_t template)
+{
+	char path[64], line[512];
+	FILE *maps;
+	int fd = -1;
+
+	snprintf(path, sizeof path, "/proc/%d/maps", template);
+	maps = fopen(path, "re");
+	if (!maps)
+		return -1;
+	while (fd < 0 && fgets(line, sizeof line, maps)) {
+		unsigned long start, end, ino;
+
+		if (sscanf(line, "%lx-%lx %*s %*x %*s %lu", &start, &end, &ino) != 3 ||
+		    ino != want->ino)
+			continue;
+		snprintf(path, sizeof path, "map_files/%lx-%lx", start, end);
+		fd = proc_open(template, path, O_PATH);
+		if (fd >= 0 && !is_the_one(fd, want))
+			close_fd(&fd);
+	}
+	fclose(maps);
+	return fd;
+}
+
+static int open_empty(const struct file *want)
+{
+	return open("/dev/null", (want->flags & (O_ACCMODE | O_PATH)) | O_CLOEXEC);
+}
+
+static int make_named(const struct file *want, pid_t template, pid_t init, const char **why)
+{
+	int found = file_open_path(want, init), fd = -1;
+
+	if (found < 0)
+		found = open_mapped(want, template);
+	if (found >= 0) {
+		fd = open_as(found, want);
+		close(found);
+		if (fd < 0)
+			*why = "it was closed since the checkpoint and can not be opened again";
+	} else {
+		*why = "it was closed since the checkpoint and is not there any more";
+	}
+	return fd >= 0 ? fd : open_empty(want);
+}
+
+/* In the app's network namespace, or it would get a way into ours. */
+static int socket_of(pid_t template, int domain, int type, int protocol)
+{
+	int own = open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC);
+	int theirs = proc_open(template, "ns/net", O_RDONLY), fd = -1;
+
+	if (own >= 0 && theirs >= 0 && setns(theirs, CLONE_NEWNET) == 0) {
+		fd = socket(domain, type | SOCK_CLOEXEC, protocol);
+		if (setns(own, CLONE_NEWNET))
+			close_fd(&fd);
+	}
+	close_fd(&own);
+	close_fd(&theirs);
+	return fd;
+}
+
+int file_make_dead(const struct file *want, pid_t template)
+{
+	const struct file_socket *s = want->socket;
+	int ends[2], fd;
+
+	if (want->kind == FILE_PIPE) {
+		const int mine = (want->flags & O_ACCMODE) == O_RDONLY ? 0 : 1;
+
+		if (pipe2(ends, O_CLOEXEC))
+			return -1;
+		close(ends[!mine]);
+		return ends[mine];
+	}
+	if (s && s->protocol == IPPROTO_TCP) {
+		fd = socket_of(template, s->domain, SOCK_STREAM, IPPROTO_TCP);
+		if (fd >= 0) {
+			shutdown(fd, SHUT_RDWR); /* ENOTCONN, and done (net/ipv4/af_inet.c) */
+			return fd;
+		}
+	}
+	if (socketpair(AF_UNIX,
+		       (s && s->type == SOCK_SEQPACKET ? SOCK_SEQPACKET : SOCK_STREAM) |
+			       SOCK_CLOEXEC,
+		       0, ends))
+		return -1;
+	close(ends[1]);
+	return ends[0];
+}
+
+/* Those that need nobody at the other end. */
+static int make_socket(const struct file *want, pid_t template, const char **why)
+{
+	const struct file_socket *s = want->socket;
+	const struct sockaddr *local, *remote;
+	const int yes = 1;
+	int fd;
+
+	if (!s || (s->domain != AF_INET && s->domain != AF_INET6 && s->domain != AF_NETLINK) ||
+	    (s->type == SOCK_STREAM && !s->listening))
+		return file_make_dead(want, template);
+	local = (const struct sockaddr *)&s->local;
+	remote = (const struct sockaddr *)&s->remote;
+	fd = socket_of(template, s->domain, s->type, s->protocol);
+	if (fd < 0)
+		return file_make_dead(want, template);
+	if (s->type == SOCK_STREAM)
+		setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
+	if (bind(fd, local, s->local_bytes) || (s->listening && listen(fd, s->backlog)) ||
+	    (s->connected && connect(fd, remote, s->remote_bytes))) {
+		*why = s->listening
+			       ? "it was closed since the checkpoint and its port is taken now"
+			       : "it was closed since the checkpoint and its address is taken now";
+		close(fd);
+		return file_make_dead(want, template);
+	}
+	return fd;
+}
+
+/* init has the same stdio as the app was started with. */
+static int take_from_init(const struct file *want, pid_t init)
+{
+	int pidfd = proc_pidfd_open(init), fd = -1;
+
+	for (int i = 0; pidfd >= 0 && fd < 0 && i < 3; i++) {
+		fd = files_borrow(pidfd, i);
+		if (fd >= 0 && (!is_the_one(fd, want) ||
+				(fcntl(fd, F_GETFL) & O_ACCMODE) != (want->flags & O_ACCMODE)))
+			close_fd(&fd);
+	}
+	close_fd(&pidfd);
+	return fd;
+}
+
+int file_make(const struct file *want, pid_t template, pid_t init, const char **why)
+{
+	const int nonblock = want->flags & O_NONBLOCK;
+	int fd;
+
+	*why = NULL;
+	switch (want->kind) {
+	case FILE_REGULAR:
+	case FILE_DIRECTORY:
+	case FILE_DEVICE:
+	case FILE_FIFO:
+		fd = want->outside ? take_from_init(want, init) : -1;
+		return fd >= 0 ? fd : make_named(want, template, init, why);
+	case FILE_PIPE:
+		fd = take_from_init(want, init);
+		return fd >= 0 ? fd : file_make_dead(want, template);
+	case FILE_SOCKET:
+		fd = take_from_init(want, init);
+		return fd >= 0 ? fd : make_socket(want, template, why);
+	case FILE_EVENTFD:
+		return eventfd(0, EFD_CLOEXEC | (nonblock ? EFD_NONBLOCK : 0) |
+					  (want->semaphore ? EFD_SEMAPHORE : 0));
+	case FILE_TIMERFD:
+		return timerfd_create(want->clock, TFD_CLOEXEC | (nonblock ? TFD_NONBLOCK : 0));
+	case FILE_SIGNALFD:
+		return (int)syscall(SYS_signalfd4, -1, &want->mask, 8,
+				    SFD_CLOEXEC | (nonblock ? SFD_NONBLOCK : 0));
+	case FILE_EPOLL:
+		return epoll_create1(EPOLL_CLOEXEC);
+	case FILE_INOTIFY:
+		if (want->watch_count)
+			*why = "it was closed since the checkpoint; its watches are lost";
+		return inotify_init1(IN_CLOEXEC | (nonblock ? IN_NONBLOCK : 0));
+	case FILE_OTHER:
+		break;
+	}
+	*why = "it was closed since the checkpoint and can not be made again";
+	return open_empty(want);
+}
+
+int file_make_pair(const struct file *want, int ends[2])
+{
+	if (want->kind == FILE_PIPE)
+		return pipe2(ends, O_CLOEXEC);
+	return socketpair(AF_UNIX, want->socket->type | SOCK_CLOEXEC, 0, ends);
+}

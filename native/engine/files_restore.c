@@ -1,0 +1,585 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Makes the table of descriptors the checkpoint's again (files.h).
+ *
+ * The dead app's table lives on in its templates.  The engine gets or makes what is
+ * missing, and the template, by injected calls, takes it over a socket and puts it in
+ * its place: nobody else runs with this table meanwhile.  What depends on the process
+ * (epoll and signalfd, owners, POSIX locks) is left to the restored process itself, as a
+ * list of calls in its slot.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <netinet/in.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "files.h"
+
+#define NAME_SHOWN 48
+
+struct mail { /* in the pad: one recvmsg(2) that brings one descriptor          */
+	struct msghdr head;
+	struct iovec io;
+	uint8_t byte;
+	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
+};
+
+static void note(struct files_work *work, const struct file *f, const char *problem)
+{
+	if (!problem)
+		return;
+	if (!work->problems++) {
+		const size_t bytes = strlen(f->name);
+		const bool cut = bytes > NAME_SHOWN;
+
+		fail(work->notes, AVC_UNSUPPORTED, 0, work->target->inside, "restore descriptors",
+		     "", "descriptor %d (%s%s): %s", f->fd, cut ? "..." : "",
+		     f->name + (cut ? bytes - NAME_SHOWN : 0), problem);
+	}
+}
+
+uint32_t files_index(const struct files *files, const struct file *f)
+{
+	return (uint32_t)(f - files->file);
+}
+
+/* Index of the first descriptor of the same open file description. */
+uint32_t files_leader(const struct files *files, const struct file *f)
+{
+	const struct file *l = files_find(files, f->shared);
+
+	return files_index(files, l ? l : f);
+}
+
+/* ---- what stays, and where the rest comes from ---------------------------------- */
+
+/* By number: whoever comes first claims the open file description. */
+static void find_staying(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i], *n = files_find(work->now, w->fd);
+		const uint32_t group = files_leader(work->want, w);
+		uint32_t description;
+
+		work->lost[i] = true;
+		if (!n || !files_same_object(w, n))
+			continue;
+		description = files_leader(work->now, n);
+		if (work->claimed_by[description] < 0 && work->source[group] < 0) {
+			work->claimed_by[description] = (int)group;
+			work->source[group] = (int)description;
+		}
+		work->lost[i] = work->source[group] != (int)description;
+	}
+}
+
+/* A pair of which an end was closed is no pair any more: both are made again. */
+static void break_pairs(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const struct file *other;
+
+		if (w->kind != FILE_SOCKET || work->source[files_leader(work->want, w)] >= 0)
+			continue;
+		other = files_other_end(work->want, w);
+		if (other)
+			work->source[files_leader(work->want, other)] = -1;
+	}
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->source[files_leader(work->want, &work->want->file[i])] < 0)
+			work->lost[i] = true;
+}
+
+/* Somewhere else in the table, perhaps: the app may have moved it. */
+static void find_moved(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (files_leader(work->want, w) != i || work->source[i] >= 0 ||
+		    (!(w->mode & S_IFMT) && !w->id))
+			continue;
+		for (uint32_t k = 0; k < work->now->count && work->source[i] < 0; k++)
+			if (work->claimed_by[k] < 0 &&
+			    files_leader(work->now, &work->now->file[k]) == k &&
+			    files_same_object(w, &work->now->file[k])) {
+				work->claimed_by[k] = (int)i;
+				work->source[i] = (int)k;
+			}
+	}
+}
+
+static void make_pair(struct files_work *work, const struct file *w)
+{
+	const struct file *other = files_other_end(work->want, w);
+	int ends[2];
+	uint32_t a, b;
+
+	if (!other)
+		return;
+	a = files_leader(work->want, w);
+	b = files_leader(work->want, other);
+	if (a == b || work->local[a] >= 0 || work->local[b] >= 0 || work->source[a] >= 0 ||
+	    work->source[b] >= 0 || file_make_pair(w, ends))
+		return;
+	work->local[a] = ends[0];
+	work->local[b] = ends[1];
+}
+
+static const struct file *pipe_in_table(const struct files_work *work, const struct file *w)
+{
+	for (uint32_t k = 0; w->kind == FILE_PIPE && k < work->now->count; k++)
+		if (work->now->file[k].kind == FILE_PIPE && work->now->file[k].ino == w->ino)
+			return &work->now->file[k];
+	return NULL;
+}
+
+/* An end of a pipe of which another end is still open, anywhere in the table. */
+static int reopen_pipe(const struct files_work *work, const struct file *w)
+{
+	const struct file *n = pipe_in_table(work, w);
+	char path[48];
+
+	if (!n)
+		return -1;
+	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->generation->template, n->fd);
+	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
+	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
+}
+
+/* Connections that a lost listening socket had accepted keep its port, and without
+ * SO_REUSEADDR (socket(7)) to themselves. */
+static void share_port(const struct files_work *work, const struct file *w)
+{
+	const struct sockaddr_in *wanted = (const struct sockaddr_in *)&w->socket->local;
+	const int yes = 1;
+
+	for (uint32_t k = 0; k < work->now->count; k++) {
+		struct sockaddr_storage address = { 0 };
+		const struct sockaddr_in *is = (const struct sockaddr_in *)&address;
+		socklen_t bytes = sizeof address;
+		int fd;
+
+		if (work->now->file[k].kind != FILE_SOCKET)
+			continue;
+		/* The port is at the same place in an IPv6 address. */
+		fd = files_borrow(work->generation->pidfd, work->now->file[k].fd);
+		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
+		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
+			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
+		close_fd(&fd);
+	}
+}
+
+/* What is in the table somewhere, as long as it is: one descriptor of ours for every open
+ * file description that has to be put in place. */
+static void gather(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const uint32_t group = files_leader(work->want, w);
+
+		if (!work->lost[i] || work->local[group] >= 0)
+			continue;
+		if (work->source[group] >= 0)
+			work->local[group] = files_borrow(work->generation->pidfd,
+							  work->now->file[work->source[group]].fd);
+		if (work->local[group] < 0)
+			work->local[group] = reopen_pipe(work, w);
+	}
+}
+
+/* The rest, when what the app has opened since is closed, and its ports are free. */
+static void make_lost(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->lost[i] && !pipe_in_table(work, &work->want->file[i]))
+			make_pair(work, &work->want->file[i]);
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const uint32_t group = files_leader(work->want, w);
+		const char *why = NULL;
+
+		if (!work->lost[i] || work->local[group] >= 0)
+			continue;
+		if (w->socket && w->socket->listening)
+			share_port(work, w);
+		work->local[group] = file_make(w, work->generation->template, work->init, &why);
+		note(work, w, why);
+		if (work->local[group] < 0)
+			note(work, w, "it can not be made again");
+	}
+}
+
+/* Whether the calls that were listed have to be made at once: locks of what is to be closed
+ * would be in the way of others. */
+static bool is_urgent(const struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->lost[i] || work->want->file[i].lock_count)
+			return true;
+	return false;
+}
+
+/* ---- in the template ------------------------------------------------------------- */
+
+/* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
+static struct mail *mail_of(const struct files_work *work)
+{
+	return (struct mail *)(pad_files(&work->target->pad, work->generation->slot) +
+			       INJ_FILES_BYTES / 2);
+}
+
+static struct inj_syscall *list_of(const struct files_work *work)
+{
+	return (struct inj_syscall *)(mail_of(work) + 1);
+}
+
+#define LISTED_MAX ((INJ_FILES_BYTES / 2 - sizeof(struct mail)) / sizeof(struct inj_syscall))
+
+/* What was listed becomes the template's next call. */
+static void close_list(struct files_work *work)
+{
+	struct inj_call *call =
+		&pad_slot(&work->target->pad, work->generation->slot)->template_call;
+
+	if (work->listed)
+		call_add(call, INJ_LIST, pad_remote(&work->target->pad, list_of(work)),
+			 work->listed, 0, 0, 0);
+	work->listed = 0;
+}
+
+static int flush(struct files_work *work, struct avc_error *err)
+{
+	struct generation *generation = work->generation;
+	struct inj_call *call = &pad_slot(&work->target->pad, generation->slot)->template_call;
+	int result = 0;
+
+	close_list(work);
+	if (call->count)
+		result = pad_send(&work->target->pad, generation->template, &generation->base, call,
+				  err) ||
+			 pad_run(generation->template, call, err);
+	call_begin(call, INJ_AFTER_PARK);
+	return result ? -1 : 0;
+}
+
+static int inject(struct files_work *work, struct avc_error *err, long nr, uint64_t a, uint64_t b,
+		  uint64_t c)
+{
+	if (work->listed == LISTED_MAX && flush(work, err))
+		return -1;
+	list_of(work)[work->listed++] = (struct inj_syscall){ .nr = nr, .arg = { a, b, c } };
+	return 0;
+}
+
+/* In ranges: a program may have opened thousands since. */
+static int close_new(struct files_work *work, struct avc_error *err)
+{
+	const struct files *now = work->now;
+
+	for (uint32_t i = 0; i < now->count; i++) {
+		const uint32_t first = i;
+
+		if (files_find(work->want, now->file[i].fd))
+			continue;
+		while (i + 1 < now->count && now->file[i + 1].fd == now->file[i].fd + 1 &&
+		       !files_find(work->want, now->file[i + 1].fd))
+			i++;
+		if (inject(work, err, SYS_close_range, (uint64_t)now->file[first].fd,
+			   (uint64_t)now->file[i].fd, 0))
+			return -1;
+	}
+	return 0;
+}
+
+/* Cheaper set than looked at; and by the template, for which a filter of system calls
+ * that the app has made for itself is suspended. */
+static int set_cloexec(struct files_work *work, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (!work->lost[i] && inject(work, err, SYS_fcntl, (uint64_t)w->fd, F_SETFD,
+					     w->cloexec ? FD_CLOEXEC : 0))
+			return -1;
+	}
+	return 0;
+}
+
+/* Which numbers are taken, so that it is known which one the kernel gives next. */
+struct numbers {
+	uint8_t *taken;
+	int room;
+};
+
+static int lowest_free(const struct numbers *numbers, const struct files *avoid)
+{
+	for (int fd = 0; fd < numbers->room; fd++)
+		if (!numbers->taken[fd] && !(avoid && files_find(avoid, fd)))
+			return fd;
+	return -1;
+}
+
+static int send_one(int socket, int fd)
+{
+	uint8_t byte = 0, control[CMSG_SPACE(sizeof fd)] __attribute__((aligned(8))) = { 0 };
+	struct iovec io = { &byte, 1 };
+	struct msghdr head = { .msg_iov = &io,
+			       .msg_iovlen = 1,
+			       .msg_control = control,
+			       .msg_controllen = sizeof control };
+	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
+
+	c->cmsg_level = SOL_SOCKET;
+	c->cmsg_type = SCM_RIGHTS;
+	c->cmsg_len = CMSG_LEN(sizeof fd);
+	memcpy(CMSG_DATA(c), &fd, sizeof fd);
+	return sendmsg(socket, &head, MSG_DONTWAIT | MSG_NOSIGNAL) == 1 ? 0 : -1;
+}
+
+static avc_remote lay_out_mail(const struct files_work *work)
+{
+	const struct pad *pad = &work->target->pad;
+	struct mail *mail = mail_of(work);
+
+	*mail = (struct mail){ 0 };
+	mail->io = (struct iovec){ (void *)pad_remote(pad, &mail->byte), 1 };
+	mail->head = (struct msghdr){
+		.msg_iov = (void *)pad_remote(pad, &mail->io),
+		.msg_iovlen = 1,
+		.msg_control = (void *)pad_remote(pad, mail->control),
+		.msg_controllen = sizeof mail->control,
+	};
+	return pad_remote(pad, &mail->head);
+}
+
+/* One letter for all: recvmsg(2) leaves the header as it was, for it is just as long. */
+static int receive(struct files_work *work, struct numbers *numbers, int ours, int theirs,
+		   struct avc_error *err)
+{
+	const avc_remote mail = lay_out_mail(work);
+
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const int from = work->local[files_leader(work->want, w)];
+		int to;
+
+		if (!work->lost[i] || from < 0)
+			continue;
+		to = lowest_free(numbers, NULL);
+		if (send_one(ours, from)) {
+			note(work, w, "it could not be handed over");
+			continue;
+		}
+		if (inject(work, err, SYS_recvmsg, (uint64_t)theirs, mail,
+			   MSG_CMSG_CLOEXEC | MSG_DONTWAIT))
+			return -1;
+		if (to != w->fd) {
+			if (inject(work, err, SYS_dup3, (uint64_t)to, (uint64_t)w->fd,
+				   w->cloexec ? O_CLOEXEC : 0) ||
+			    inject(work, err, SYS_close, (uint64_t)to, 0, 0))
+				return -1;
+		} else if (!w->cloexec && inject(work, err, SYS_fcntl, (uint64_t)to, F_SETFD, 0)) {
+			return -1;
+		}
+		numbers->taken[w->fd] = 1;
+	}
+	return 0;
+}
+
+static int put_lost(struct files_work *work, struct avc_error *err)
+{
+	const struct pad *pad = &work->target->pad;
+	struct inj_call *call = &pad_slot(pad, work->generation->slot)->template_call;
+	struct numbers numbers = { .room = 16 };
+	int32_t ends[2];
+	int ours, theirs, result = -1;
+	bool any = false;
+
+	for (uint32_t i = 0; i < work->want->count; i++)
+		any |= work->lost[i] &&
+		       work->local[files_leader(work->want, &work->want->file[i])] >= 0;
+	if (!any)
+		return 0;
+	numbers.room += work->want->count ? work->want->file[work->want->count - 1].fd : 0;
+	numbers.taken = calloc((size_t)numbers.room, 1);
+	if (!numbers.taken)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->now->count; i++)
+		if (files_find(work->want, work->now->file[i].fd))
+			numbers.taken[work->now->file[i].fd] = 1;
+	if (flush(work, err))
+		goto out;
+	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
+		 pad_remote(pad, call->out), 0);
+	if (flush(work, err))
+		goto out;
+	memcpy(ends, call->out, sizeof ends);
+	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers.room || ends[1] < 0 ||
+	    ends[1] >= numbers.room) {
+		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->target->inside,
+		     "restore descriptors", "socketpair", "descriptors could not be handed over");
+		goto out;
+	}
+	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
+	theirs = lowest_free(&numbers, work->want);
+	ours = files_borrow(work->generation->pidfd, ends[1]);
+	if (ours < 0) {
+		fail_errno(err, work->generation->template, "restore descriptors", "pidfd_getfd",
+			   "descriptors could not be handed over");
+		goto out;
+	}
+	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 0;
+	numbers.taken[theirs] = 1;
+	if (inject(work, err, SYS_fcntl, (uint64_t)ends[0], F_DUPFD_CLOEXEC, (uint64_t)theirs) ||
+	    inject(work, err, SYS_close, (uint64_t)ends[0], 0, 0) ||
+	    inject(work, err, SYS_close, (uint64_t)ends[1], 0, 0) ||
+	    receive(work, &numbers, ours, theirs, err) ||
+	    inject(work, err, SYS_close, (uint64_t)theirs, 0, 0) || flush(work, err))
+		result = -1;
+	else
+		result = 0;
+	close(ours);
+out:
+	free(numbers.taken);
+	return result;
+}
+
+/* ---- what is behind them ------------------------------------------------------------ */
+
+const struct file *files_now_of(const struct files_work *work, uint32_t i)
+{
+	const int source = work->source[files_leader(work->want, &work->want->file[i])];
+
+	return source < 0 ? NULL : &work->now->file[source];
+}
+
+static void put_states(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
+		int fd;
+
+		if (files_leader(work->want, w) != i)
+			continue;
+		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
+		    !n->lock_count && !w->lock_count)
+			continue;
+		fd = files_borrow(work->generation->pidfd, w->fd);
+		if (fd < 0) {
+			note(work, w, "it could not be put in its place");
+			continue;
+		}
+		note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
+		    (work->config->tcp == AVC_TCP_RESET ||
+		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
+			note(work, w, file_reset_tcp(fd));
+		close(fd);
+	}
+}
+
+static void put_contents(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i],
+				  *other = files_other_end(work->want, w);
+		int fd, other_fd, bytes = 0;
+
+		if (!other || files_leader(work->want, w) != i)
+			continue;
+		fd = files_borrow(work->generation->pidfd, w->fd);
+		other_fd = files_borrow(work->generation->pidfd, other->fd);
+		if (fd >= 0 && other_fd >= 0 &&
+		    (w->content_bytes || w->content_lost ||
+		     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
+			note(work, w, file_put_content(fd, other_fd, w));
+		close_fd(&fd);
+		close_fd(&other_fd);
+	}
+}
+
+/* ---- all of it ------------------------------------------------------------------------------ */
+
+static void *filled(uint32_t count, int value)
+{
+	int *array = malloc((count + 1) * sizeof *array);
+
+	for (uint32_t i = 0; array && i < count; i++)
+		array[i] = value;
+	return array;
+}
+
+int files_restore(struct target *target, struct generation *generation,
+		  const struct avc_config *config, pid_t init, struct avc_error *notes,
+		  struct avc_error *err)
+{
+	struct files_work work = { .target = target,
+				   .generation = generation,
+				   .config = config,
+				   .init = init,
+				   .want = generation->files,
+				   .notes = notes };
+	int result = -1;
+
+	if (config->files == AVC_FILES_STRICT &&
+	    files_check_strict(generation, generation->template, generation->pidfd, init, err))
+		return -1;
+	work.now = files_new(work.want->count + 64);
+	work.local = filled(work.want->count, -1);
+	work.source = filled(work.want->count, -1);
+	work.lost = calloc(work.want->count + 1, sizeof *work.lost);
+	if (!work.now || !work.local || !work.source || !work.lost) {
+		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		goto out;
+	}
+	if (files_look(work.now, generation->template, generation->pidfd, FILES_NOW, work.want,
+		       init, err))
+		goto out;
+	work.claimed_by = filled(work.now->count, -1);
+	if (!work.claimed_by) {
+		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		goto out;
+	}
+	call_begin(&pad_slot(&target->pad, generation->slot)->template_call, INJ_AFTER_PARK);
+	find_staying(&work);
+	find_moved(&work);
+	break_pairs(&work);
+	gather(&work);
+	/* What is left on the list is made just before the fork (restore.c). */
+	if (close_new(&work, err) || set_cloexec(&work, err) ||
+	    (is_urgent(&work) && flush(&work, err)))
+		goto out;
+	make_lost(&work);
+	if (put_lost(&work, err))
+		goto out;
+	put_states(&work);
+	put_contents(&work);
+	files_list_calls(&work);
+	close_list(&work);
+	if (work.problems > 1) {
+		char rest[32];
+
+		snprintf(rest, sizeof rest, " (and %u more)", work.problems - 1);
+		strncat(notes->detail, rest, sizeof notes->detail - strlen(notes->detail) - 1);
+	}
+	result = 0;
+out:
+	for (uint32_t i = 0; work.local && i < work.want->count; i++)
+		close_fd(&work.local[i]);
+	free(work.local);
+	free(work.source);
+	free(work.lost);
+	free(work.claimed_by);
+	files_free(work.now);
+	return result;
+}

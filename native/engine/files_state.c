@@ -1,0 +1,505 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What is behind a descriptor, besides the file: offsets, flags, counts, timers,
+ * unread bytes, locks (files.h).
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/netlink.h>
+#include <linux/sock_diag.h>
+#include <linux/sockios.h>
+#include <linux/unix_diag.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <sys/file.h>
+#include <sys/ioctl.h>
+#include <sys/signalfd.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/timerfd.h>
+#include <sys/uio.h>
+#include <sys/un.h>
+#include <sys/vfs.h>
+#include <unistd.h>
+
+#include "files.h"
+
+#define CONTENT_MAX (1 << 20)
+/* fcntl(F_SETFL) changes these. */
+#define STATUS_FLAGS (O_APPEND | O_NONBLOCK | O_DIRECT | O_NOATIME)
+
+/* ---- sockets ---------------------------------------------------------------- */
+
+static int option(int fd, int level, int name)
+{
+	int value = 0;
+	socklen_t bytes = sizeof value;
+
+	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
+}
+
+void file_look_at_socket(int fd, struct file *file)
+{
+	struct file_socket *s = calloc(1, sizeof *s);
+
+	if (!s)
+		return;
+	s->domain = option(fd, SOL_SOCKET, SO_DOMAIN);
+	s->type = option(fd, SOL_SOCKET, SO_TYPE);
+	s->protocol = option(fd, SOL_SOCKET, SO_PROTOCOL);
+	s->listening = option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0;
+	s->local_bytes = sizeof s->local;
+	if (getsockname(fd, (struct sockaddr *)&s->local, &s->local_bytes))
+		s->local_bytes = 0;
+	s->remote_bytes = sizeof s->remote;
+	s->connected = getpeername(fd, (struct sockaddr *)&s->remote, &s->remote_bytes) == 0;
+	if (s->listening && s->protocol == IPPROTO_TCP) {
+		struct tcp_info info = { 0 };
+		socklen_t bytes = sizeof info;
+
+		/* Of a listening socket, tcp_get_info() says it there (net/ipv4/tcp.c). */
+		if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) == 0)
+			s->backlog = (int)info.tcpi_sacked;
+	}
+	free(file->socket);
+	file->socket = s;
+}
+
+/* As linux/tcp.h has it; glibc's struct ends before. */
+struct tcp_info_tail {
+	struct tcp_info head;
+	uint64_t pacing_rate, max_pacing_rate, bytes_acked, bytes_received;
+};
+
+void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
+{
+	struct tcp_info_tail info = { 0 };
+	int unread = 0, unacknowledged = 0;
+	socklen_t bytes = sizeof info;
+
+	if (!s || s->protocol != IPPROTO_TCP || s->listening ||
+	    getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+		return;
+	file->tcp_state = info.head.tcpi_state;
+	if (ioctl(fd, SIOCINQ, &unread))
+		unread = 0;
+	if (ioctl(fd, SIOCOUTQ, &unacknowledged))
+		unacknowledged = 0;
+	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
+	file->tcp_taken = info.bytes_received - (uint64_t)unread;
+}
+
+/* Asks sock_diag(7) for the other end of a Unix socket. */
+static uint64_t ask_peer(int diag, uint64_t ino)
+{
+	struct {
+		struct nlmsghdr head;
+		struct unix_diag_req ask;
+	} request = {
+		.head = { .nlmsg_len = sizeof request,
+			  .nlmsg_type = SOCK_DIAG_BY_FAMILY,
+			  .nlmsg_flags = NLM_F_REQUEST },
+		.ask = { .sdiag_family = AF_UNIX,
+			 .udiag_states = ~0u,
+			 .udiag_ino = (uint32_t)ino,
+			 .udiag_show = UDIAG_SHOW_PEER,
+			 .udiag_cookie = { ~0u, ~0u } },
+	};
+	char answer[512] __attribute__((aligned(8)));
+	const struct nlmsghdr *head = (const struct nlmsghdr *)answer;
+	const struct unix_diag_msg *message = (const struct unix_diag_msg *)(head + 1);
+	ssize_t n, at = (ssize_t)(sizeof *head + sizeof *message);
+
+	if (send(diag, &request, sizeof request, 0) < 0)
+		return 0;
+	n = recv(diag, answer, sizeof answer, MSG_DONTWAIT);
+	if (n < at || head->nlmsg_type != SOCK_DIAG_BY_FAMILY)
+		return 0;
+	while (at + 4 <= n) {
+		const struct nlattr *attribute = (const struct nlattr *)(answer + at);
+		uint32_t peer;
+
+		if (attribute->nla_len < sizeof *attribute)
+			break;
+		if (attribute->nla_type == UNIX_DIAG_PEER) {
+			memcpy(&peer, attribute + 1, sizeof peer);
+			return peer;
+		}
+		at += (ssize_t)((attribute->nla_len + 3u) & ~3u);
+	}
+	return 0;
+}
+
+/* A socket of the network namespace of the process. */
+static int diag_open(pid_t pid)
+{
+	int own = open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC);
+	int theirs = proc_open(pid, "ns/net", O_RDONLY), fd = -1;
+
+	if (own >= 0 && theirs >= 0 && setns(theirs, CLONE_NEWNET) == 0) {
+		fd = socket(AF_NETLINK, SOCK_RAW | SOCK_CLOEXEC, NETLINK_SOCK_DIAG);
+		if (setns(own, CLONE_NEWNET))
+			close_fd(&fd);
+	}
+	close_fd(&own);
+	close_fd(&theirs);
+	return fd;
+}
+
+/* Only unnamed ones at both ends come from socketpair(2). */
+static bool maybe_pair(const struct file *f)
+{
+	return f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
+	       f->socket->connected && f->socket->local_bytes <= sizeof(sa_family_t) &&
+	       f->socket->remote_bytes <= sizeof(sa_family_t);
+}
+
+void files_find_peers(struct files *files, pid_t pid)
+{
+	int diag = -1;
+
+	for (uint32_t i = 0; i < files->count; i++) {
+		struct file *f = &files->file[i];
+
+		if (!maybe_pair(f) || f->socket->peer)
+			continue;
+		if (diag < 0)
+			diag = diag_open(pid);
+		if (diag < 0)
+			return;
+		f->socket->peer = ask_peer(diag, f->ino);
+	}
+	close_fd(&diag);
+}
+
+/* ---- bytes in pipes and socket pairs ------------------------------------------ */
+
+const struct file *files_other_end(const struct files *files, const struct file *file)
+{
+	if (file->kind == FILE_SOCKET && (!file->socket || !file->socket->peer))
+		return NULL;
+	for (uint32_t i = 0; i < files->count; i++) {
+		const struct file *f = &files->file[i];
+
+		if (file->kind == FILE_PIPE && f->kind == FILE_PIPE && f->ino == file->ino &&
+		    (f->flags & O_ACCMODE) != O_RDONLY && (file->flags & O_ACCMODE) == O_RDONLY)
+			return f;
+		if (file->kind == FILE_SOCKET && f->kind == FILE_SOCKET &&
+		    f->ino == file->socket->peer)
+			return f;
+	}
+	return NULL;
+}
+
+/* Reads without taking anything out: tee(2) shares the pages with a pipe of ours. */
+static void keep_pipe(int fd, struct file *file, uint32_t bytes)
+{
+	int copy[2];
+	uint32_t got = 0;
+
+	if (pipe2(copy, O_CLOEXEC | O_NONBLOCK)) {
+		file->content_lost = true;
+		return;
+	}
+	fcntl(copy[1], F_SETPIPE_SZ, fcntl(fd, F_GETPIPE_SZ));
+	while (got < bytes) {
+		ssize_t n = tee(fd, copy[1], bytes - got, SPLICE_F_NONBLOCK);
+
+		/* It always begins at the front: once is all. */
+		if (n < (ssize_t)bytes)
+			break;
+		while (got < bytes && (n = read(copy[0], file->content + got, bytes - got)) > 0)
+			got += (uint32_t)n;
+		break;
+	}
+	file->content_bytes = got;
+	file->content_lost = got != bytes;
+	close(copy[0]);
+	close(copy[1]);
+}
+
+void file_keep_content(int fd, struct file *file)
+{
+	int bytes = 0;
+	ssize_t n;
+
+	if (ioctl(fd, FIONREAD, &bytes) || bytes <= 0)
+		return;
+	if (bytes > CONTENT_MAX ||
+	    (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM)) {
+		file->content_lost = true;
+		return;
+	}
+	file->content = malloc((size_t)bytes);
+	if (!file->content) {
+		file->content_lost = true;
+		return;
+	}
+	if (file->kind == FILE_PIPE) {
+		keep_pipe(fd, file, (uint32_t)bytes);
+		return;
+	}
+	n = recv(fd, file->content, (size_t)bytes, MSG_PEEK | MSG_DONTWAIT);
+	file->content_bytes = n > 0 ? (uint32_t)n : 0;
+	file->content_lost = n != bytes; /* a descriptor in flight ends what is seen */
+}
+
+/* A description of our own of the same pipe, so that its O_NONBLOCK is ours. */
+static int reopen(int fd, int flags)
+{
+	char path[32];
+
+	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
+	return open(path, flags | O_NONBLOCK | O_CLOEXEC);
+}
+
+static void drain(int fd, const struct file *want)
+{
+	char buf[65536];
+	ssize_t n;
+
+	do {
+		n = want->kind == FILE_PIPE ? read(fd, buf, sizeof buf)
+					    : recv(fd, buf, sizeof buf, MSG_DONTWAIT);
+	} while (n > 0);
+}
+
+const char *file_put_content(int fd, int other_fd, const struct file *want)
+{
+	const bool pipe = want->kind == FILE_PIPE;
+	int in = pipe ? reopen(fd, O_RDONLY) : fd,
+	    out = pipe ? reopen(other_fd, O_WRONLY) : other_fd;
+	const char *problem = NULL;
+	uint32_t put = 0;
+
+	if (in >= 0 && out >= 0) {
+		drain(in, want);
+		while (put < want->content_bytes) {
+			const uint8_t *from = want->content + put;
+			const size_t bytes = want->content_bytes - put;
+			const ssize_t n = pipe ? write(out, from, bytes)
+					       : send(out, from, bytes,
+						      MSG_DONTWAIT | MSG_NOSIGNAL);
+
+			if (n <= 0)
+				break;
+			put += (uint32_t)n;
+		}
+	}
+	if (put < want->content_bytes || in < 0 || out < 0)
+		problem = "what was in it could not be put back";
+	else if (want->content_lost)
+		problem = "what was in it is lost";
+	if (pipe) {
+		close_fd(&in);
+		close_fd(&out);
+	}
+	return problem;
+}
+
+/* ---- counts, timers, masks, offsets --------------------------------------------- */
+
+static const char *put_count(int fd, const struct file *want, const struct file *now)
+{
+	uint64_t value;
+	struct iovec io = { &value, sizeof value };
+
+	if (now && now->count == want->count)
+		return NULL;
+	/* Down to 0 without ever waiting, whatever its flags are. */
+	for (int i = 0; i < 1000000; i++)
+		if (preadv2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value)
+			break;
+	value = want->count;
+	if (value && pwritev2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value &&
+	    write(fd, &value, sizeof value) < 0)
+		return "its count could not be put back";
+	return NULL;
+}
+
+static struct timespec timespec_of(uint64_t ns)
+{
+	return (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
+				  .tv_nsec = (long)(ns % NS_PER_S) };
+}
+
+/* At the instant it would have gone off; an expiry that was not read yet at once. */
+static const char *put_timer(int fd, const struct file *want)
+{
+	struct itimerspec t = { .it_interval = timespec_of(want->interval_ns),
+				.it_value = timespec_of(want->deadline_ns) };
+	int flags = TFD_TIMER_ABSTIME | (want->settime_flags & TFD_TIMER_CANCEL_ON_SET);
+
+	if (want->ticks)
+		t.it_value = (struct timespec){ .tv_nsec = 1 };
+	if (want->ticks && want->deadline_ns && want->interval_ns) {
+		/* The one before the next, so that the phase stays. */
+		const uint64_t last = want->deadline_ns > want->interval_ns
+					      ? want->deadline_ns - want->interval_ns
+					      : 1;
+
+		t.it_value = timespec_of(last);
+	}
+	return timerfd_settime(fd, flags, &t, NULL) ? "its timer could not be set" : NULL;
+}
+
+bool file_is_locked(int fd)
+{
+	struct flock lock = { .l_type = F_WRLCK, .l_whence = SEEK_SET };
+
+	return fcntl(fd, F_OFD_GETLK, &lock) || lock.l_type != F_UNLCK;
+}
+
+bool file_is_remote(int fd)
+{
+	/* linux/magic.h; the server would be asked for locks, or for a program's answer */
+	static const uint32_t remote[] = { 0x6969,     0x65735546, 0xfe534d42, 0xff534d42,
+					   0x517b,     0x01021997, 0x00c36400, 0x5346414f,
+					   0x01161970, 0x7461636f, 0x73757245 };
+	struct statfs fs;
+
+	if (fstatfs(fd, &fs))
+		return true;
+	for (size_t i = 0; i < sizeof remote / sizeof *remote; i++)
+		if ((uint32_t)fs.f_type == remote[i])
+			return true;
+	return false;
+}
+
+static const char *put_flocks(int fd, const struct file *want, const struct file *now)
+{
+	int was = 0, is = 0;
+
+	for (uint32_t i = 0; i < want->lock_count; i++)
+		if (want->lock[i].kind == LOCK_FLOCK_)
+			was = want->lock[i].exclusive ? LOCK_EX : LOCK_SH;
+	for (uint32_t i = 0; now && i < now->lock_count; i++)
+		if (now->lock[i].kind == LOCK_FLOCK_)
+			is = now->lock[i].exclusive ? LOCK_EX : LOCK_SH;
+	/* To do what is so already is nothing; but a server might be asked. */
+	if (want->lock_unsure || (want->remote && was == is))
+		return NULL;
+	return flock(fd, (was ? was : LOCK_UN) | LOCK_NB) && was ? "its lock is somebody else's now"
+								 : NULL;
+}
+
+static const char *put_ofd_locks(int fd, const struct file *want, const struct file *now)
+{
+	const char *problem = NULL;
+	struct flock lock = { .l_whence = SEEK_SET };
+
+	for (uint32_t i = 0; now && i < now->lock_count; i++)
+		if (now->lock[i].kind == LOCK_OFD_) {
+			lock.l_type = F_UNLCK;
+			lock.l_start = now->lock[i].start;
+			lock.l_len = now->lock[i].end < 0
+					     ? 0
+					     : now->lock[i].end - now->lock[i].start + 1;
+			fcntl(fd, F_OFD_SETLK, &lock);
+		}
+	for (uint32_t i = 0; i < want->lock_count; i++)
+		if (want->lock[i].kind == LOCK_OFD_) {
+			lock.l_type = want->lock[i].exclusive ? F_WRLCK : F_RDLCK;
+			lock.l_start = want->lock[i].start;
+			lock.l_len = want->lock[i].end < 0
+					     ? 0
+					     : want->lock[i].end - want->lock[i].start + 1;
+			if (fcntl(fd, F_OFD_SETLK, &lock))
+				problem = "its lock is somebody else's now";
+		}
+	return problem;
+}
+
+static bool same_ofd_locks(const struct file *a, const struct file *b)
+{
+	uint32_t n = 0;
+
+	for (uint32_t i = 0; i < a->lock_count; i++) {
+		bool found = a->lock[i].kind != LOCK_OFD_;
+
+		for (uint32_t k = 0; !found && k < b->lock_count; k++)
+			found = !memcmp(&a->lock[i], &b->lock[k], sizeof *a->lock);
+		if (!found)
+			return false;
+		n += a->lock[i].kind == LOCK_OFD_;
+	}
+	for (uint32_t i = 0; i < b->lock_count; i++)
+		n -= b->lock[i].kind == LOCK_OFD_;
+	return n == 0;
+}
+
+const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind)
+{
+	const char *problem = NULL, *other;
+
+	if (want->flags & O_PATH)
+		return NULL;
+	/* FASYNC is only taken away here: whoever sets it is whom it is for. */
+	if ((!now || (now->flags ^ want->flags) & (STATUS_FLAGS | FASYNC)) && !want->outside) {
+		const int keep = ~(STATUS_FLAGS | (want->flags & FASYNC ? 0 : FASYNC));
+
+		if (fcntl(fd, F_SETFL, (fcntl(fd, F_GETFL) & keep) | (want->flags & STATUS_FLAGS)))
+			problem = "its flags could not be put back";
+	}
+	switch (want->kind) {
+	case FILE_REGULAR:
+	case FILE_DIRECTORY:
+		/* Appended to: where the next byte goes is not ours to say. */
+		if (want->offset >= 0 && !want->outside && !(want->flags & O_APPEND && now) &&
+		    (rewind || !now) && (!now || now->offset != want->offset) &&
+		    lseek(fd, want->offset, SEEK_SET) < 0)
+			problem = "its offset could not be put back";
+		other = put_flocks(fd, want, now);
+		problem = problem ? problem : other;
+		if (now ? !same_ofd_locks(want, now) : want->lock_count) {
+			other = put_ofd_locks(fd, want, now);
+			problem = problem ? problem : other;
+		}
+		break;
+	case FILE_EVENTFD:
+		other = put_count(fd, want, now);
+		problem = problem ? problem : other;
+		break;
+	case FILE_TIMERFD:
+		other = put_timer(fd, want);
+		problem = problem ? problem : other;
+		break;
+	case FILE_SIGNALFD:
+		if ((!now || now->mask != want->mask) &&
+		    syscall(SYS_signalfd4, fd, &want->mask, 8, 0) < 0)
+			problem = "its mask could not be put back";
+		break;
+	case FILE_INOTIFY:
+		if (now &&
+		    (now->watch_count != want->watch_count || now->watch_sum != want->watch_sum))
+			problem = "its watches are not those it had";
+		break;
+	default:
+		break;
+	}
+	return problem;
+}
+
+bool file_tcp_moved(const struct file *want, const struct file *now)
+{
+	return want->tcp_written != now->tcp_written || want->tcp_taken != now->tcp_taken;
+}
+
+/* connect(2) to nothing resets it, shutdown(2) makes it read as closed. */
+const char *file_reset_tcp(int fd)
+{
+	struct sockaddr nobody = { .sa_family = AF_UNSPEC };
+	int error;
+	socklen_t bytes = sizeof error;
+
+	if (connect(fd, &nobody, sizeof nobody))
+		return "its connection could not be reset";
+	shutdown(fd, SHUT_RDWR); /* says ENOTCONN, and does it (net/ipv4/af_inet.c) */
+	getsockopt(fd, SOL_SOCKET, SO_ERROR, &error, &bytes);
+	return NULL;
+}

@@ -1,0 +1,108 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.files=strict: memory does not go back behind files that were written (files.h).
+ */
+#include <fcntl.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "files.h"
+
+static bool is_data(const struct file *f)
+{
+	return f->kind == FILE_REGULAR && (f->flags & O_ACCMODE) != O_RDONLY &&
+	       !(f->flags & O_PATH) && !f->outside && f->name && strncmp(f->name, "/memfd:", 7);
+}
+
+static uint64_t real_ns(const struct timespec *t)
+{
+	return (uint64_t)t->tv_sec * NS_PER_S + (uint64_t)t->tv_nsec;
+}
+
+/* Timestamps of most kernels advance by a tick: a write in the same tick as the
+ * checkpoint may not show. */
+#define TICK_NS (10 * NS_PER_MS)
+
+static bool was_written(const struct files *want, const struct file *w, const struct stat *st)
+{
+	return st->st_size != w->bytes || real_ns(&st->st_mtim) != real_ns(&w->modified) ||
+	       real_ns(&st->st_ctim) != real_ns(&w->changed) ||
+	       real_ns(&w->modified) + TICK_NS > want->taken_ns;
+}
+
+static int check_mapped(pid_t template, struct avc_error *err)
+{
+	char path[64], line[512];
+	FILE *maps;
+	int result = 0;
+
+	snprintf(path, sizeof path, "/proc/%d/maps", template);
+	maps = fopen(path, "re");
+	if (!maps)
+		return fail_errno(err, template, "restore", "open(maps)", "the template has ended");
+	while (!result && fgets(line, sizeof line, maps)) {
+		char mode[5], name[256];
+		unsigned long ino;
+
+		if (sscanf(line, "%*s %4s %*s %*s %lu %255s", mode, &ino, name) == 3 &&
+		    !strcmp(mode, "rw-s") && ino && strncmp(name, "/dev/", 5) &&
+		    strncmp(name, "/memfd:", 7) && strncmp(name, "/SYSV", 5) &&
+		    strncmp(name, "/run/", 5))
+			result = fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+				      "avckpt.files=strict: %.80s is mapped for writing", name);
+	}
+	fclose(maps);
+	return result;
+}
+
+int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
+		       struct avc_error *err)
+{
+	const struct files *want = generation->files;
+	struct files *now = files_new(want->count + 64);
+	int result = -1;
+
+	if (!now || files_look(now, pid, pidfd, FILES_NOW, generation->files, init, err))
+		goto out;
+	for (uint32_t i = 0; i < want->count; i++) {
+		const struct file *w = &want->file[i];
+		const struct file *n = files_find(now, w->fd);
+		struct stat st = { 0 };
+		int fd;
+
+		if (!is_data(w))
+			continue;
+		n = n && files_same_object(w, n) ? n : NULL;
+		fd = n ? files_borrow(pidfd, n->fd) : file_open_path(w, init);
+		if (fd < 0 || fstat(fd, &st)) {
+			close_fd(&fd);
+			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+			     "avckpt.files=strict: %.80s is not there any more", w->name);
+			goto out;
+		}
+		close(fd);
+		if (was_written(want, w, &st) || (n && n->offset != w->offset)) {
+			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+			     "avckpt.files=strict: %.80s was written since the checkpoint",
+			     w->name);
+			goto out;
+		}
+	}
+	for (uint32_t i = 0; i < now->count; i++) {
+		const struct file *n = &now->file[i], *w = files_find(want, n->fd);
+
+		if (is_data(n) && !(w && files_same_object(w, n)) &&
+		    real_ns(&n->modified) + TICK_NS > want->taken_ns) {
+			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+			     "avckpt.files=strict: %.80s was written since the checkpoint",
+			     n->name);
+			goto out;
+		}
+	}
+	result = check_mapped(generation->template, err);
+out:
+	files_free(now);
+	return result;
+}

@@ -1,0 +1,187 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A template once the app runs again: made to lie still, and prepared so that a
+ * restore finds everything ready in its slot of the pad.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/sysmacros.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+/* The OOM killer is to take templates first; undone in what is restored. */
+void oom_score_adj_set(pid_t pid, const char *value)
+{
+	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);
+
+	if (fd < 0)
+		return;
+	if (write(fd, value, strlen(value)) < 0)
+		errno = 0; /* best effort */
+	close(fd);
+}
+
+/* A descriptor of the app's that is its controlling terminal, or -1. */
+static int tty_fd(pid_t pid, uint32_t tty)
+{
+	for (int fd = 0; fd < 3; fd++) {
+		char path[64];
+		struct stat st;
+
+		snprintf(path, sizeof path, "/proc/%d/fd/%d", pid, fd);
+		if (stat(path, &st) == 0 && S_ISCHR(st.st_mode) && st.st_rdev == tty)
+			return fd;
+	}
+	return -1;
+}
+
+static int quieten(struct target *target, struct generation *generation, bool session_leader,
+		   struct avc_error *err)
+{
+	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
+	struct inj_call *call = &slot->template_call;
+	const pid_t pid = generation->template;
+
+	if (tracee_await(pid, NULL, err) != STOP_TRAP)
+		return -1;
+	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
+		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
+			  PTRACE_O_SUSPEND_SECCOMP)) ||
+	    arch_regs_get(pid, &generation->base))
+		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
+	memcpy(call->out, "avckpt-tmpl", 12);
+	call_begin(call, INJ_AFTER_PARK);
+	/* Out of the app's session or process group, or the number stays taken. */
+	if (session_leader)
+		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
+	else
+		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_SET_NAME, pad_remote(&target->pad, call->out), 0, 0, 0);
+	if (pad_send(&target->pad, pid, &generation->base, call, err) || pad_run(pid, call, err))
+		return -1;
+	oom_score_adj_set(pid, "1000");
+	return 0;
+}
+
+/* Fills the slot in from what freeze() has read: one block per thread. */
+static int fill_slot(struct target *target, struct generation *generation,
+		     const struct proc_stat *stat, pid_t group_inside, struct avc_error *err)
+{
+	const struct pad *pad = &target->pad;
+	struct inj_slot *slot = pad_slot(pad, generation->slot);
+	const struct thread *main_thread = thread_find(target, target->pid);
+	struct proc_status status;
+	struct setup setup;
+	int mem_fd = proc_open(generation->template, "mem", O_RDONLY);
+
+	if (mem_fd < 0)
+		return fail_errno(err, generation->template, "keep template", "open(mem)",
+				  "it was killed");
+	setup_begin(&setup, pad, generation->slot);
+	for (uint32_t i = 0; i < target->thread_count; i++) {
+		struct thread t = target->threads[i];
+		const uint32_t b = (uint32_t)t.block;
+		struct inj_thread *block;
+		uint8_t *frame;
+
+		if (t.block < 0)
+			continue;
+		block = pad_thread(pad, generation->slot, b);
+		frame = pad_frame(pad, generation->slot, b);
+
+		/* The main thread's was seen to when it was borrowed; its own
+		 * memory has been run on since. */
+		if (b)
+			rseq_fixup(mem_fd, &t);
+		rewind_original(&t, &t.regs);
+		arch_rewind(&t.regs);
+		*block = (struct inj_thread){
+			.frame = arch_frame_build(frame, pad_remote(pad, frame), &t.regs, t.sigmask,
+						  t.altstack),
+			.stack = pad_remote(pad, pad_stack(pad, generation->slot, b)) - 16,
+			.tls = arch_tls(&t.regs),
+			.clear_tid = t.clear_tid,
+			.robust_list = t.robust_list,
+			.robust_bytes = t.robust_bytes,
+			.rseq = t.rseq,
+			.rseq_bytes = t.rseq_bytes,
+			.rseq_signature = t.rseq_signature,
+			.other_base = arch_other_base(&t.regs),
+			.tid = t.inside,
+			.affinity_bytes = t.affinity_bytes,
+		};
+		memcpy(block->affinity, t.affinity, sizeof block->affinity);
+		memcpy(block->name, t.name, sizeof block->name);
+		setup_thread(&setup, block);
+		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
+					    err)) {
+			close(mem_fd);
+			return -1;
+		}
+		pending_setup_thread(target, &t, &setup);
+	}
+	close(mem_fd);
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
+	generation->sandboxed = status.seccomp == 1 ||
+				status.seccomp_filters > target->plain_filters;
+	if (memory_finish(target, generation, status.locked_kb, &setup, err))
+		return -1;
+	pending_setup(target, &setup);
+	if (attributes_keep(target, generation, err))
+		return -1;
+	if (timers_setup(target, generation, &setup, err))
+		return -1;
+	generation->notice = setup.notice;
+	slot->threads = generation->threads;
+	slot->pid = target->inside;
+	slot->group = group_inside;
+	slot->session_leader = stat->session == target->pid;
+	slot->tty_fd = stat->tty && stat->tty_group == stat->group ? tty_fd(target->pid, stat->tty)
+								   : -1;
+	return setup_end(&setup, target->pid, err);
+}
+
+int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct proc_stat stat = { 0 };
+	long pages;
+	pid_t group;
+
+	generation->pidfd = proc_pidfd_open(generation->template);
+	if (generation->pidfd < 0 || proc_stat(target->pid, &stat))
+		return fail_errno(err, target->pid, "keep template", "pidfd_open", "it has ended");
+	/* Nothing but the app's own group, or one whose leader is visible, can be
+	 * put back. */
+	group = stat.group == target->pid ? target->inside : proc_inside(stat.group);
+	if (group <= 0)
+		group = target->inside;
+	pages = proc_vm_pages(generation->template);
+	if (quieten(target, generation, stat.session == target->pid, err))
+		return -1;
+	if (pages >= 0 && pages != generation->vm_pages)
+		return memory_learn(target, generation->vm_pages - pages, err);
+	return fill_slot(target, generation, &stat, group, err);
+}
+
+void generation_drop(struct generation *generation)
+{
+	if (generation->template)
+		tracee_kill(generation->template);
+	close_fd(&generation->pidfd);
+	mem_image_free(generation->image);
+	free(generation->timers);
+	free(generation->attributes);
+	files_free(generation->files);
+	*generation = (struct generation){ .pidfd = -1 };
+}

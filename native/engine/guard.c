@@ -1,0 +1,417 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The guard: one thread per container that waits, decides and reports.  It makes
+ * every ptrace call for its container, so that it may.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <sys/prctl.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+#define FREEZE_DEADLINE_NS (50 * NS_PER_MS)
+#define LOOK_AGAIN_NS (20 * NS_PER_MS)   /* for init to set itself up        */
+#define LOOK_SELDOM_NS (250 * NS_PER_MS) /* after LOOK_OFTEN_NS of that      */
+#define LOOK_OFTEN_NS (5 * NS_PER_S)
+#define STRAGGLER_NS (NS_PER_MS / 5)
+#define STRAGGLER_LONG_NS (20 * NS_PER_MS)
+
+/* ---- telling ---------------------------------------------------------------- */
+
+struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind kind)
+{
+	return (struct avc_event){
+		.kind = kind,
+		.cookie = guard->cookie,
+		.at_ns = now_ns(),
+		.app_pid = guard->target.pid,
+		.app_pid_inside = guard->target.inside,
+		.generations = guard->count,
+		.restores = guard->restores,
+	};
+}
+
+void emit(struct avc_guard *guard, const struct avc_event *event)
+{
+	engine_emit(guard->engine, event);
+}
+
+void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
+		const struct avc_error *error)
+{
+	struct avc_event event = event_new(guard, kind);
+
+	event.ticket = ticket;
+	event.error = *error;
+	emit(guard, &event);
+}
+
+void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
+{
+	struct avc_error error = { 0 };
+
+	fail(&error, code, 0, guard->target.pid, "command", "", "%s", why);
+	emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+}
+
+/* ---- commands -------------------------------------------------------------------- */
+
+static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
+{
+	if (!guard->count) {
+		guard->room = 0;
+		refuse(guard, ticket, AVC_EMPTY, "no generation is held");
+		return;
+	}
+	guard->room = guard->count - 1;
+	lose_generation(guard, dispensable(guard, false), AVC_REASON_MEMORY, ticket);
+}
+
+static void refill(struct avc_guard *guard)
+{
+	if (guard->room == guard->config.keep)
+		return;
+	guard->room = guard->config.keep;
+	if (!guard->count && guard->config.interval_ns)
+		guard->next_ns = now_ns();
+}
+
+static void vouch(struct avc_guard *guard)
+{
+	guard->vouching = true;
+	guard->proved = true;
+	/* A check that has just passed may have looked at something that a hung app
+	 * left a moment ago: what was taken since the last one waits for the next. */
+	for (uint32_t i = 0; i < guard->count; i++) {
+		guard->generations[i].vouched |= guard->generations[i].seen;
+		guard->generations[i].seen = true;
+	}
+}
+
+static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason reason)
+{
+	struct avc_error error = { 0 };
+
+	if (!guard->count || !guard->target.pid) {
+		refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
+		return;
+	}
+	if (link_stop_asked(&guard->link)) {
+		refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+		return;
+	}
+	/* An app that hangs is better started anew than left as it is. */
+	if (guard->config.files == AVC_FILES_STRICT && reason == AVC_REASON_COMMAND &&
+	    files_check_strict(&guard->generations[guard->count - 1], guard->target.pid,
+			       guard->target.pidfd, guard->link.init, &error)) {
+		emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+		return;
+	}
+	guard->restore_asked = reason;
+	guard->restore_ticket = ticket;
+	/* init reports the death; the rest is as after any other. */
+	kill(guard->target.pid, SIGKILL);
+}
+
+static bool take_command(struct avc_guard *guard, struct command *command)
+{
+	bool found = false;
+
+	pthread_mutex_lock(&guard->lock);
+	if (guard->command_count) {
+		*command = guard->commands[0];
+		memmove(guard->commands, guard->commands + 1,
+			--guard->command_count * sizeof *guard->commands);
+		found = true;
+	}
+	pthread_mutex_unlock(&guard->lock);
+	return found;
+}
+
+static void obey(struct avc_guard *guard, const struct command *command)
+{
+	switch (command->command) {
+	case AVC_COMMAND_CHECKPOINT:
+		checkpoint(guard, command->ticket);
+		break;
+	case AVC_COMMAND_RESTORE:
+		roll_back(guard, command->ticket, AVC_REASON_COMMAND);
+		break;
+	case AVC_COMMAND_UNHEALTHY:
+		roll_back(guard, command->ticket, AVC_REASON_UNHEALTHY);
+		break;
+	case AVC_COMMAND_DROP_OLDEST:
+		drop_oldest(guard, command->ticket);
+		break;
+	case AVC_COMMAND_REFILL:
+		refill(guard);
+		break;
+	case AVC_COMMAND_VOUCH:
+		vouch(guard);
+		break;
+	}
+}
+
+static void carry_out(struct avc_guard *guard)
+{
+	struct command command;
+	eventfd_t ignored;
+
+	(void)eventfd_read(guard->wake_fd, &ignored);
+	while (take_command(guard, &command)) {
+		if (!guard->attached)
+			refuse(guard, command.ticket, AVC_EMPTY, "avckpt-init has not started yet");
+		else
+			obey(guard, &command);
+	}
+}
+
+/* ---- the thread --------------------------------------------------------------------- */
+
+static bool must_stop(struct avc_guard *guard)
+{
+	bool stop;
+
+	pthread_mutex_lock(&guard->lock);
+	stop = guard->stop;
+	pthread_mutex_unlock(&guard->lock);
+	return stop;
+}
+
+/* Until init has set itself up: the hook runs before the container does. */
+static void attach(struct avc_guard *guard)
+{
+	struct avc_error error = { 0 };
+	const uint64_t now = now_ns();
+
+	switch (link_open(&guard->link, &error)) {
+	case 1:
+		if (find_app(guard, &error)) {
+			link_close(&guard->link);
+			break;
+		}
+		guard->attached = true;
+		guard->unprotected = false;
+		guard->next_ns = guard->config.interval_ns ? now + guard->config.interval_ns
+							   : UINT64_MAX;
+		{
+			const struct avc_event event = event_new(guard, AVC_EVENT_ATTACHED);
+
+			emit(guard, &event);
+		}
+		return;
+	case -1:
+		unprotect(guard, 0, &error);
+	}
+	guard->next_ns = now +
+			 (now - guard->started_ns < LOOK_OFTEN_NS ? LOOK_AGAIN_NS : LOOK_SELDOM_NS);
+}
+
+static void wait_for_news(struct avc_guard *guard, bool straggling)
+{
+	struct pollfd fds[AVC_KEEP_MAX + 4];
+	const uint64_t now = now_ns();
+	uint64_t ns = guard->next_ns > now ? guard->next_ns - now : 0;
+	struct timespec timeout;
+	nfds_t n = 0;
+
+	fds[n++] = (struct pollfd){ .fd = guard->wake_fd, .events = POLLIN };
+	fds[n++] = (struct pollfd){ .fd = guard->link.init_pidfd, .events = POLLIN };
+	fds[n++] = (struct pollfd){ .fd = guard->link.report_fd, .events = POLLIN };
+	fds[n++] = (struct pollfd){ .fd = guard->target.holder_pidfd, .events = POLLIN };
+	for (uint32_t i = 0; i < guard->count; i++)
+		fds[n++] = (struct pollfd){ .fd = guard->generations[i].pidfd, .events = POLLIN };
+	if (straggling) {
+		const bool fresh = now - guard->stragglers_since_ns < NS_PER_S;
+		const uint64_t slice = fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS;
+
+		ns = ns < slice ? ns : slice;
+	}
+	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
+				     .tv_nsec = (long)(ns % NS_PER_S) };
+	(void)ppoll(fds, n, guard->next_ns == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
+}
+
+static void let_go(struct avc_guard *guard)
+{
+	const uint64_t end = now_ns() + NS_PER_S;
+
+	if (guard->link.ctl)
+		link_arm(&guard->link, false);
+	drop_all(guard);
+	unhold(&guard->target);
+	/* The end of this thread detaches what is left. */
+	while (guard->target.threads && stragglers(&guard->target) && now_ns() < end)
+		usleep(200);
+	target_close(&guard->target);
+	pad_close(&guard->target.pad);
+	link_close(&guard->link);
+	close_fd(&guard->link.init_pidfd);
+}
+
+static void *guard_main(void *arg)
+{
+	struct avc_guard *guard = arg;
+	struct avc_error error = { 0 };
+	bool ended = false;
+
+	prctl(PR_SET_NAME, "avckpt-guard");
+	if (tracee_timer_new(&guard->timer, &error)) {
+		emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
+		ended = true;
+	}
+	while (!ended && !must_stop(guard)) {
+		const uint32_t straggling = stragglers(&guard->target);
+		const bool dying = now_ns() < guard->dying_until_ns;
+		struct avc_report report;
+
+		if (!straggling && !dying)
+			guard->stragglers_since_ns = now_ns();
+		if (guard->target.lost)
+			kill_lost(guard);
+		if (dying)
+			reap_unknown(guard);
+		wait_for_news(guard, straggling || dying);
+		if (guard->attached && link_report(&guard->link, &report)) {
+			died(guard, &report);
+			continue;
+		}
+		reap_dead(guard);
+		if (pidfd_ended(guard->link.init_pidfd)) {
+			ended = true;
+			break;
+		}
+		carry_out(guard);
+		if (now_ns() < guard->next_ns)
+			continue;
+		if (!guard->attached)
+			attach(guard);
+		else if (stragglers(&guard->target))
+			guard->next_ns = now_ns() + STRAGGLER_LONG_NS;
+		else
+			checkpoint(guard, 0);
+	}
+	let_go(guard);
+	timer_delete(guard->timer);
+	pthread_mutex_lock(&guard->lock);
+	guard->ended = true;
+	pthread_mutex_unlock(&guard->lock);
+	if (ended) {
+		const struct avc_event event = event_new(guard, AVC_EVENT_ENDED);
+
+		emit(guard, &event);
+	}
+	return NULL;
+}
+
+/* ---- the interface ---------------------------------------------------------------------- */
+
+static int check_config(const struct avc_config *config, struct avc_error *err)
+{
+	if (config->keep < 1 || config->keep > AVC_KEEP_MAX)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "start guard", "", "keep must be 1 to %d",
+			    AVC_KEEP_MAX);
+	if (config->restore_max > RESTORES_MAX)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "start guard", "",
+			    "restore_max must be at most %d", RESTORES_MAX);
+	return 0;
+}
+
+struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
+				  uint64_t cookie, struct avc_error *err)
+{
+	struct avc_guard *guard = NULL;
+	int result;
+
+	*err = (struct avc_error){ 0 };
+	if (check_config(config, err))
+		return NULL;
+	guard = calloc(1, sizeof *guard);
+	if (!guard) {
+		fail_errno(err, 0, "start guard", "calloc", "out of memory");
+		return NULL;
+	}
+	guard->engine = engine;
+	guard->config = *config;
+	if (!guard->config.freeze_deadline_ns)
+		guard->config.freeze_deadline_ns = FREEZE_DEADLINE_NS;
+	guard->cookie = cookie;
+	guard->room = config->keep;
+	guard->started_ns = now_ns();
+	pthread_mutex_init(&guard->lock, NULL);
+	link_init(&guard->link);
+	target_init(&guard->target);
+	guard->target.threads = calloc(THREADS_MAX, sizeof *guard->target.threads);
+	guard->target.thread_room = THREADS_MAX;
+	guard->target.memory = memory_new();
+	guard->target.pending = pending_new();
+	guard->target.timers = timers_new();
+	guard->target.shm_bytes = config->shm_bytes;
+	guard->link.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 3);
+	guard->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+	if (!guard->target.threads || !guard->target.memory || !guard->target.pending ||
+	    !guard->target.timers || guard->link.init_pidfd < 0 || guard->wake_fd < 0) {
+		fail_errno(err, 0, "start guard", "eventfd", "out of memory or descriptors");
+		goto failed;
+	}
+	result = pthread_create(&guard->thread, NULL, guard_main, guard);
+	if (result) {
+		errno = result;
+		fail_errno(err, 0, "start guard", "pthread_create", "no thread");
+		goto failed;
+	}
+	return guard;
+failed:
+	close_fd(&guard->link.init_pidfd);
+	close_fd(&guard->wake_fd);
+	free(guard->target.threads);
+	memory_free(guard->target.memory);
+	free(guard->target.pending);
+	free(guard->target.timers);
+	free(guard);
+	return NULL;
+}
+
+int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
+		      struct avc_error *err)
+{
+	int result = 0;
+
+	*err = (struct avc_error){ 0 };
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNHEALTHY)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
+	pthread_mutex_lock(&guard->lock);
+	if (guard->ended)
+		result = fail(err, AVC_GONE, ESRCH, 0, "command", "", "the container has ended");
+	else if (guard->command_count == COMMANDS_MAX)
+		result = fail(err, AVC_BUSY, EAGAIN, 0, "command", "",
+			      "too many commands are waiting");
+	else
+		guard->commands[guard->command_count++] = (struct command){ command, ticket };
+	pthread_mutex_unlock(&guard->lock);
+	if (!result)
+		eventfd_write(guard->wake_fd, 1);
+	return result;
+}
+
+void avc_guard_stop(struct avc_guard *guard)
+{
+	pthread_mutex_lock(&guard->lock);
+	guard->stop = true;
+	pthread_mutex_unlock(&guard->lock);
+	eventfd_write(guard->wake_fd, 1);
+	pthread_join(guard->thread, NULL);
+	close_fd(&guard->wake_fd);
+	pthread_mutex_destroy(&guard->lock);
+	free(guard->target.threads);
+	memory_free(guard->target.memory);
+	free(guard->target.pending);
+	free(guard->target.timers);
+	free(guard);
+}

@@ -1,0 +1,95 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The guard's own state, and what its files give each other.  Only the guard's
+ * thread runs any of it.
+ *
+ *   guard.c             waits, obeys, tells; the public interface
+ *   guard_generations.c which generations are held
+ *   guard_checkpoint.c  when and how a checkpoint is taken
+ *   guard_death.c       what follows a death
+ */
+#ifndef AVCKPT_GUARD_H
+#define AVCKPT_GUARD_H
+
+#include "internal.h"
+
+#define COMMANDS_MAX 64
+#define RESTORES_MAX 64
+#define DYING_NS NS_PER_S
+
+struct command {
+	enum avc_command command;
+	uint64_t ticket;
+};
+
+struct avc_guard {
+	struct avc_engine *engine;
+	struct avc_config config;
+	uint64_t cookie;
+	pthread_t thread;
+	int wake_fd;
+	/* Shared with callers, under the lock. */
+	pthread_mutex_t lock;
+	struct command commands[COMMANDS_MAX];
+	uint32_t command_count;
+	bool stop, ended;
+	/* The thread's own. */
+	timer_t timer;
+	struct link link;
+	bool attached, unprotected;
+	struct target target;
+	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
+	uint32_t count;
+	uint64_t number; /* of the last generation taken             */
+	uint64_t started_ns, next_ns, stragglers_since_ns;
+	uint64_t dying_until_ns; /* when it was found dying, some time more: see reap_unknown() */
+	uint32_t misses;         /* in a row, of one that is unsupported     */
+	uint32_t room;           /* generations that may be held now         */
+	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
+	uint32_t restores, crash_restores;
+	/* Of the process that runs now. */
+	uint32_t lineage, lineages;    /* its own; how many there have been        */
+	uint64_t restored_from;        /* generation, 0: never restored            */
+	uint64_t restored_ns;          /* after a crash; 0: not, or long ago       */
+	bool proved;                   /* got somewhere since it was restored      */
+	bool vouching;                 /* somebody says when the app is healthy    */
+	uint64_t restore_ticket;       /* of a command that has killed the app     */
+	enum avc_reason restore_asked; /* NONE: nobody has                      */
+	uint32_t verdict_seq;
+};
+
+/* ---- guard.c: what is told ------------------------------------------------- */
+
+struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind kind);
+void emit(struct avc_guard *guard, const struct avc_event *event);
+void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
+		const struct avc_error *error);
+void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
+
+/* ---- guard_generations.c --------------------------------------------------- */
+
+void drop_generation(struct avc_guard *guard, uint32_t i);
+void drop_all(struct avc_guard *guard);
+uint32_t free_slot(const struct avc_guard *guard);
+void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason, uint64_t ticket);
+int known_tracees(const struct avc_guard *guard, pid_t keep[AVC_KEEP_MAX + 2]);
+void kill_lost(struct avc_guard *guard);
+void reap_dead(struct avc_guard *guard);
+void reap_unknown(const struct avc_guard *guard);
+uint32_t dispensable(const struct avc_guard *guard, bool probation);
+void keep_generation(struct avc_guard *guard, struct generation *fresh);
+void count_crash(struct avc_guard *guard, bool hung);
+void drop_unhealthy(struct avc_guard *guard);
+void choose(struct avc_guard *guard, bool used_up);
+
+/* ---- guard_checkpoint.c ---------------------------------------------------- */
+
+void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
+int find_app(struct avc_guard *guard, struct avc_error *err);
+void checkpoint(struct avc_guard *guard, uint64_t ticket);
+
+/* ---- guard_death.c --------------------------------------------------------- */
+
+void died(struct avc_guard *guard, const struct avc_report *report);
+
+#endif

@@ -1,0 +1,203 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * When a checkpoint is taken, and what is said when none can be.
+ */
+#include <errno.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+#define QUIESCE_STEP_NS (1 * NS_PER_MS)
+#define TAKE_TRIES 4
+#define MISSES_UNTIL_UNPROTECTED 3
+
+/* ---- checkpoint --------------------------------------------------------------- */
+
+/* The app as it can not be protected: says so once, and gives everything up. */
+void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
+{
+	drop_all(guard);
+	unhold(&guard->target);
+	if (!guard->unprotected || ticket)
+		emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
+	guard->unprotected = true;
+}
+
+int find_app(struct avc_guard *guard, struct avc_error *err)
+{
+	struct proc_status init;
+	pid_t app;
+
+	if (guard->target.pid)
+		return 0;
+	app = link_app(&guard->link);
+	if (!app || !link_app_started(&guard->link, app))
+		return fail(err, AVC_DEADLINE, 0, 0, "attach", "",
+			    "the application has not been started yet");
+	guard->target.init = guard->link.init;
+	guard->target.tcp_moved = guard->config.tcp == AVC_TCP_RESET_MOVED;
+	if (proc_status(guard->link.init, &init) == 0)
+		guard->target.plain_filters = init.seccomp_filters;
+	return target_open(&guard->target, app, proc_inside(app), err);
+}
+
+static void wait_quiescent(struct avc_guard *guard, bool *found)
+{
+	const uint64_t end = now_ns() + guard->config.quiesce_ns;
+
+	*found = false;
+	if (!guard->config.quiesce_ns)
+		return;
+	while (!(*found = quiescent(&guard->target)) && now_ns() < end)
+		usleep(QUIESCE_STEP_NS / 1000);
+}
+
+/* The first touch of a page costs a fault: not while the app is stopped. */
+static void touch_slot(const struct pad *pad, uint32_t slot, uint32_t threads)
+{
+	for (uint32_t i = 0; i < threads && i < pad->threads_max; i++) {
+		volatile uint8_t *frame = pad_frame(pad, slot, i);
+
+		for (size_t at = 0; at < arch_frame_bytes(); at += 4096)
+			frame[at] = 0;
+		frame[arch_frame_bytes() - 1] = 0;
+		*(volatile uint64_t *)pad_thread(pad, slot, i) = 0;
+	}
+}
+
+static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err)
+{
+	struct target *target = &guard->target;
+	const uint64_t deadline = guard->config.freeze_deadline_ns;
+
+	if (find_app(guard, err) || support_check(target, passing, err) || take_stock(target, err))
+		return -1;
+	if (target->infected && target->thread_count > target->pad.threads_max)
+		target->infected = false;
+	if (!target->infected) {
+		/* Templates of another pad are of another program or too small. */
+		drop_all(guard);
+		unhold(target);
+		for (uint32_t i = 0; i < target->thread_count; i++)
+			target->threads[i].known = false;
+		if (infect(target, guard->config.keep + 1, guard->timer, deadline, err))
+			return -1;
+	}
+	if (acquaint(target, guard->timer, deadline, err))
+		return -1;
+	if (!target->holder && hold(target, guard->timer, deadline, err))
+		return -1;
+	return 0;
+}
+
+static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	struct target *target = &guard->target;
+	struct generation fresh = { .pidfd = -1, .slot = free_slot(guard) };
+	struct freeze_times times;
+	int result;
+
+	if (files_prepare(target, err) || memory_prepare(target->memory, &fresh.image, err)) {
+		generation_drop(&fresh);
+		return -1;
+	}
+	touch_slot(&target->pad, fresh.slot, target->thread_count);
+	wait_quiescent(guard, &fresh.quiescent);
+	result = freeze(target, guard->timer, guard->config.freeze_deadline_ns, &fresh, &times,
+			err);
+	event->freeze_ns = times.freeze_ns;
+	event->stop_ns = times.stop_ns;
+	event->clone_ns = times.clone_ns;
+	event->threads = fresh.threads;
+	if (!result && fresh.files_error.code) {
+		*err = fresh.files_error;
+		result = -1;
+	}
+	if (result) {
+		generation_drop(&fresh);
+		return -1;
+	}
+	tracee_deadline_set(guard->timer, NS_PER_S);
+	result = generation_finish(target, &fresh, err);
+	tracee_deadline_clear(guard->timer);
+	if (result) {
+		generation_drop(&fresh);
+		return -1;
+	}
+	event->error = fresh.notice;
+	files_settle(target, &fresh);
+	fresh.number = ++guard->number;
+	keep_generation(guard, &fresh);
+	link_arm(&guard->link, true);
+	event->generation = fresh.number;
+	event->generations = guard->count;
+	event->quiescent = fresh.quiescent;
+	return 0;
+}
+
+/* What is copied aside is known from the checkpoint before: EAGAIN means that there
+ * was something new, and that it is known now. */
+static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	for (int tries = 1;; tries++) {
+		*err = (struct avc_error){ 0 };
+		if (take_once(guard, event, err) == 0)
+			return 0;
+		if (err->code != AVC_DEADLINE || err->errnum != EAGAIN || tries == TAKE_TRIES)
+			return -1;
+	}
+}
+
+void checkpoint(struct avc_guard *guard, uint64_t ticket)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_CHECKPOINT);
+	struct avc_error error = { 0 };
+	bool passing = false;
+
+	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
+						   : UINT64_MAX;
+	if (link_stop_asked(&guard->link)) {
+		if (ticket)
+			refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+		return;
+	}
+	if (!guard->room) {
+		if (ticket)
+			refuse(guard, ticket, AVC_BUSY,
+			       "memory is short, so no generation is held");
+		return;
+	}
+	if (prepare(guard, &passing, &error) == 0 && take(guard, &event, &error) == 0) {
+		guard->misses = 0;
+		guard->unprotected = false;
+		event.ticket = ticket;
+		event.app_pid = guard->target.pid;
+		event.app_pid_inside = guard->target.inside;
+		emit(guard, &event);
+		return;
+	}
+	if (error.code == AVC_GONE)
+		guard->dying_until_ns = now_ns() + DYING_NS;
+	/* Of a dying app init's report tells; this is for one that is only away. */
+	if (error.code == AVC_GONE && guard->target.pid && pidfd_ended(guard->target.pidfd)) {
+		if (ticket)
+			emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
+	/* A child process may be gone at the next look: the generations there are
+	 * stay good for a while. */
+	if (error.code == AVC_UNSUPPORTED && passing && guard->count &&
+	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
+		emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
+	if (error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED || error.code == AVC_BUSY) {
+		unprotect(guard, ticket, &error);
+		return;
+	}
+	event.kind = AVC_EVENT_MISSED;
+	event.ticket = ticket;
+	event.error = error;
+	emit(guard, &event);
+}

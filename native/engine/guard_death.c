@@ -1,0 +1,199 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What follows a death: a restore, or init being told to end.
+ */
+#include <signal.h>
+#include <string.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+/* ---- death and restore --------------------------------------------------------- */
+
+static int say_restored(void *arg, struct avc_error *err)
+{
+	struct avc_guard *guard = arg;
+
+	return link_verdict(&guard->link, guard->verdict_seq, AVC_VERDICT_RESTORED, err);
+}
+
+static uint32_t restores_within(const struct avc_guard *guard, uint64_t now)
+{
+	uint32_t n = 0;
+
+	for (uint32_t i = 0; i < RESTORES_MAX; i++)
+		n += guard->restored_at[i] &&
+		     now - guard->restored_at[i] < guard->config.restore_window_ns;
+	return n;
+}
+
+/* Whether this death is to be followed by a restore; else why not. */
+static bool is_abnormal(const struct avc_guard *guard, const struct avc_report *report,
+			enum avc_reason *reason)
+{
+	const struct avc_config *config = &guard->config;
+	const int status = report->status;
+
+	if (report->flags & AVC_REPORT_STOP_ASKED) {
+		*reason = AVC_REASON_STOPPED;
+		return false;
+	}
+	if (guard->restore_asked) {
+		*reason = guard->restore_asked;
+		return true;
+	}
+	if (WIFSIGNALED(status)) {
+		*reason = config->restore_on_signal ? AVC_REASON_SIGNAL : AVC_REASON_POLICY;
+		return config->restore_on_signal;
+	}
+	if (WEXITSTATUS(status) == 0) {
+		*reason = AVC_REASON_CLEAN_EXIT;
+		return false;
+	}
+	if (config->restore_on_exit || config->restore_on_status[WEXITSTATUS(status)]) {
+		*reason = AVC_REASON_EXIT;
+		return true;
+	}
+	*reason = AVC_REASON_POLICY;
+	return false;
+}
+
+static void give_up(struct avc_guard *guard, const struct avc_report *report,
+		    enum avc_reason reason, const struct avc_error *error)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_GAVE_UP);
+	struct avc_error ignored = { 0 };
+
+	(void)link_verdict(&guard->link, report->seq, AVC_VERDICT_GIVE_UP, &ignored);
+	event.reason = reason;
+	event.wait_status = report->status;
+	event.died_ns = report->reaped_ns;
+	event.error = *error;
+	event.ticket = guard->restore_ticket;
+	emit(guard, &event);
+	drop_all(guard);
+	unhold(&guard->target);
+	target_close(&guard->target);
+}
+
+/* The newest generation; when restores are used up, the one before it. */
+static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
+		       enum avc_reason reason, struct avc_error *error)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_RESTORED);
+	struct target *target = &guard->target;
+	const struct avc_config *config = &guard->config;
+	/* It keeps the dead app's memory: letting go of that takes its time. */
+	const pid_t old_holder = target->holder;
+	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
+
+	event.ticket = guard->restore_ticket;
+	while (guard->count) {
+		struct generation *generation = &guard->generations[guard->count - 1];
+		struct restore_times times;
+		pid_t pid;
+
+		struct avc_error failed = { 0 }, notes = { 0 };
+
+		guard->verdict_seq = report->seq;
+		if (restore(target, generation, &guard->link, config, guard->timer,
+			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
+			    &failed)) {
+			if (!error->code)
+				*error = failed;
+			drop_generation(guard, guard->count - 1);
+			kill_lost(guard);
+			continue;
+		}
+		/* If this fails it has died already: the next report tells. */
+		target->infected = target_open(target, pid,
+					       pad_slot(&target->pad, generation->slot)->pid,
+					       &failed) == 0;
+		guard->restores++;
+		guard->lineage = generation->lineage;
+		guard->restored_from = generation->number;
+		guard->proved = false;
+		if (reason != AVC_REASON_COMMAND) {
+			guard->restored_ns = now_ns();
+			guard->restored_at[guard->crash_restores++ % RESTORES_MAX] =
+				guard->restored_ns;
+		}
+		event.reason = reason;
+		event.app_pid = pid;
+		event.app_pid_inside = target->inside;
+		event.wait_status = report->status;
+		event.died_ns = report->reaped_ns;
+		event.restore_ns = times.restore_ns;
+		event.fork_ns = times.fork_ns;
+		event.threads_ns = times.threads_ns;
+		event.threads = generation->threads;
+		event.generation = generation->number;
+		event.generations = guard->count;
+		event.attempt = attempt;
+		event.restores = guard->restores;
+		/* Of a newer generation that would not; or what is not as it was. */
+		event.error = error->code ? *error : notes;
+		event.age_ns = report->reaped_ns - generation->taken_ns;
+		event.at_ns = now_ns();
+		emit(guard, &event);
+		break;
+	}
+	if (old_holder)
+		unhold(target);
+	return guard->count > 0;
+}
+
+void died(struct avc_guard *guard, const struct avc_report *report)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
+	struct avc_error error = { 0 };
+	enum avc_reason reason;
+	pid_t keep[AVC_KEEP_MAX + 2];
+
+	urgent_begin();
+	event.wait_status = report->status;
+	event.died_ns = report->reaped_ns;
+	emit(guard, &event);
+	target_close(&guard->target);
+	kill_lost(guard);
+	if (!is_abnormal(guard, report, &reason)) {
+		give_up(guard, report, reason, &error);
+		goto out;
+	}
+	if (reason != AVC_REASON_COMMAND && guard->count) {
+		const uint32_t restores = restores_within(guard, now_ns());
+
+		count_crash(guard, reason == AVC_REASON_UNHEALTHY);
+		if (reason == AVC_REASON_UNHEALTHY)
+			drop_unhealthy(guard);
+		choose(guard, restores >= guard->config.restore_max);
+		if (!guard->count) {
+			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
+			     "it was restored %u time(s) already", guard->restores);
+			give_up(guard, report, AVC_REASON_LIMIT, &error);
+			goto out;
+		}
+	}
+	link_kill_leftovers(&guard->link, keep, known_tracees(guard, keep));
+	if (!guard->count) {
+		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
+		give_up(guard, report, AVC_REASON_EMPTY, &error);
+	} else if (!bring_back(guard, report, reason, &error)) {
+		give_up(guard, report, AVC_REASON_FAILED, &error);
+	} else if (guard->target.pid) {
+		/* A death in quick succession should be as cheap as the first. */
+		struct avc_error no_holder = { 0 };
+
+		if (hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns,
+			 &no_holder))
+			/* The next checkpoint tries again, and tells. */
+			guard->dying_until_ns = now_ns() + DYING_NS;
+	}
+	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
+						   : UINT64_MAX;
+out:
+	urgent_end();
+	guard->restore_asked = AVC_REASON_NONE;
+	guard->restore_ticket = 0;
+}

@@ -1,0 +1,251 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Which generations are held, and what has become of those that were.
+ */
+#include <poll.h>
+#include <string.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+#define CONTAINER_END_MS 20
+
+/* ---- generations ------------------------------------------------------------ */
+
+void drop_generation(struct avc_guard *guard, uint32_t i)
+{
+	/* Disarmed first: a death in between is then final at once. */
+	if (guard->count == 1 && guard->link.ctl)
+		link_arm(&guard->link, false);
+	generation_drop(&guard->generations[i]);
+	guard->count--;
+	memmove(&guard->generations[i], &guard->generations[i + 1],
+		(guard->count - i) * sizeof *guard->generations);
+}
+
+void drop_all(struct avc_guard *guard)
+{
+	while (guard->count)
+		drop_generation(guard, 0);
+}
+
+uint32_t free_slot(const struct avc_guard *guard)
+{
+	for (uint32_t slot = 0;; slot++) {
+		bool used = false;
+
+		for (uint32_t i = 0; i < guard->count; i++)
+			used |= guard->generations[i].slot == slot;
+		if (!used)
+			return slot;
+	}
+}
+
+/* Given up before its time; the event is to be emitted. */
+static struct avc_event lost_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason)
+{
+	const struct generation lost = guard->generations[i];
+	struct avc_event event;
+
+	drop_generation(guard, i);
+	event = event_new(guard, AVC_EVENT_DROPPED);
+	event.reason = reason;
+	event.generation = lost.number;
+	event.age_ns = event.at_ns - lost.taken_ns;
+	event.attempt = lost.crashes > lost.lost ? lost.crashes : lost.lost;
+	return event;
+}
+
+void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason, uint64_t ticket)
+{
+	struct avc_event event = lost_generation(guard, i, reason);
+
+	event.ticket = ticket;
+	emit(guard, &event);
+}
+
+/* What we trace and know of: templates, holder, the app. */
+int known_tracees(const struct avc_guard *guard, pid_t keep[AVC_KEEP_MAX + 2])
+{
+	int count = 0;
+
+	for (uint32_t i = 0; i < guard->count; i++)
+		keep[count++] = guard->generations[i].template;
+	if (guard->target.holder)
+		keep[count++] = guard->target.holder;
+	if (guard->target.pid)
+		keep[count++] = guard->target.pid;
+	return count;
+}
+
+void kill_lost(struct avc_guard *guard)
+{
+	pid_t keep[AVC_KEEP_MAX + 2];
+
+	link_kill_lost(&guard->link, keep, known_tracees(guard, keep));
+	guard->target.lost = false;
+}
+
+static bool is_known(pid_t tid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	if (tid == guard->target.holder)
+		return true;
+	for (uint32_t i = 0; i < guard->count; i++)
+		if (guard->generations[i].template == tid)
+			return true;
+	for (uint32_t i = 0; i < guard->target.thread_count; i++)
+		if (guard->target.threads[i].tid == tid && guard->target.threads[i].attached)
+			return true;
+	return false;
+}
+
+/* An app that is killed while its threads are being stopped may leave a thread that
+ * was just being made: attached to us, unheard of, and in the way of its leader's end. */
+void reap_unknown(const struct avc_guard *guard)
+{
+	while (tracee_reap_unknown(is_known, guard))
+		;
+}
+
+/* Templates that were killed, from inside the container or by the OOM killer. */
+void reap_dead(struct avc_guard *guard)
+{
+	struct avc_event events[AVC_KEEP_MAX];
+	struct pollfd news[] = {
+		{ .fd = guard->link.init_pidfd, .events = POLLIN },
+		{ .fd = guard->link.report_fd, .events = POLLIN },
+	};
+	uint32_t count = 0;
+
+	/* With its PID namespace everything dies, and init last, once we have
+	 * reaped what is ours: then it is no news.  A death does not wait. */
+	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
+		for (uint32_t i = guard->count; i-- > 0;)
+			if (pidfd_ended(guard->generations[i].pidfd))
+				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
+		if (guard->target.holder && pidfd_ended(guard->target.holder_pidfd))
+			unhold(&guard->target);
+		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
+			return;
+		if (news[1].revents)
+			break;
+	}
+	for (uint32_t i = 0; i < count; i++)
+		emit(guard, &events[i]);
+}
+
+/* ---- which generations are worth keeping ------------------------------------------
+ *
+ * A bug that is in the state and not in the moment comes back with every restore, and
+ * with every checkpoint taken after one.  So for restore_window_ns after a restore the
+ * process is on probation: checkpoints of it are of the same lineage as the generation
+ * it came from, carry that one's crashes, and take the place of their own kind, so that
+ * what is older is still there to go back to.
+ */
+
+static bool on_probation(const struct avc_guard *guard)
+{
+	return guard->restored_ns &&
+	       now_ns() - guard->restored_ns < guard->config.restore_window_ns;
+}
+
+static int newest_vouched(const struct avc_guard *guard)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (guard->generations[i].vouched)
+			return (int)i;
+	return -1;
+}
+
+static int newest_seen(const struct avc_guard *guard)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (guard->generations[i].seen && !guard->generations[i].vouched)
+			return (int)i;
+	return -1;
+}
+
+/* Which one goes next, if one must. */
+uint32_t dispensable(const struct avc_guard *guard, bool probation)
+{
+	const int vouched = newest_vouched(guard), seen = newest_seen(guard);
+
+	if (probation)
+		for (uint32_t i = guard->count; i-- > 0;)
+			if (guard->generations[i].lineage == guard->lineage && (int)i != vouched &&
+			    (int)i != seen)
+				return i;
+	for (uint32_t i = 0; i < guard->count; i++)
+		if ((int)i != vouched && (int)i != seen)
+			return i;
+	return vouched == 0 && guard->count > 1 ? 1 : 0;
+}
+
+/* Takes in a new generation, its lineage known. */
+void keep_generation(struct avc_guard *guard, struct generation *fresh)
+{
+	const bool probation = on_probation(guard);
+
+	if (!probation) {
+		guard->restored_ns = 0;
+		guard->lineage = ++guard->lineages;
+	}
+	fresh->lineage = guard->lineage;
+	for (uint32_t i = 0; i < guard->count; i++)
+		if (guard->generations[i].lineage == guard->lineage &&
+		    guard->generations[i].crashes > fresh->crashes)
+			fresh->crashes = guard->generations[i].crashes;
+	while (guard->count >= guard->room)
+		drop_generation(guard, dispensable(guard, probation));
+	guard->generations[guard->count++] = *fresh;
+	/* Only a health check can say that a process does not hang. */
+	if (!guard->vouching)
+		guard->proved = true;
+}
+
+/* The process that ran is gone, and nobody wanted that: what it came from is suspect.
+ * A hang takes its time to be noticed, so that a hung one is on probation until it was
+ * healthy once. */
+void count_crash(struct avc_guard *guard, bool hung)
+{
+	const bool probation = on_probation(guard) ||
+			       (hung && guard->restored_from && !guard->proved);
+
+	for (uint32_t i = 0; i < guard->count; i++) {
+		struct generation *generation = &guard->generations[i];
+
+		if (generation->lineage == guard->lineage)
+			generation->crashes = probation ? generation->crashes + 1 : 0;
+		if (generation->number == guard->restored_from)
+			generation->lost = probation && !guard->proved ? generation->lost + 1 : 0;
+	}
+}
+
+/* Of a hung process, checkpoints may have been taken for as long as nobody noticed. */
+void drop_unhealthy(struct avc_guard *guard)
+{
+	const int vouched = newest_vouched(guard);
+	const uint32_t good = vouched < 0 ? 0 : (uint32_t)vouched;
+
+	while (guard->count > good + 1)
+		lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
+}
+
+/* Leaves the generation to restore from as the newest, or none. */
+void choose(struct avc_guard *guard, bool used_up)
+{
+	const uint32_t max = guard->config.restore_max;
+
+	while (guard->count) {
+		const struct generation *newest = &guard->generations[guard->count - 1];
+		const uint32_t tries = guard->count > 1 ? (max + 1) / 2 : max;
+
+		if (!(used_up && (newest->crashes || newest->lost)) &&
+		    newest->lost < (tries ? tries : 1))
+			break;
+		lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
+	}
+}

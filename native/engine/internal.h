@@ -1,0 +1,640 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The engine's own declarations.  Everything here runs in the guard's thread
+ * unless said otherwise; one guard is one tracer thread.
+ *
+ *   guard.c      the thread: waits, obeys, tells; guard_*.c: see guard.h
+ *   link.c       to avckpt-init: control page, reports, verdicts
+ *   freeze.c     one checkpoint: stop everything, read it, clone it, let go
+ *   restore.c    a template becomes the app again
+ *   generation.c templates kept
+ *   pending.c    signals that have not been delivered
+ *   timers.c     interval timers, POSIX timers
+ *   attributes.c scheduling, credentials, prctl settings
+ *   sandbox.c    restoring an app that has a seccomp filter of its own
+ *   memory.c     memory that a clone does not carry as it is
+ *   infect.c     pad and holder brought into a live app
+ *   target.c     the app's process and its threads
+ *   setup.c      lists of calls that a restored process makes
+ *   files*.c     descriptors: looked at, put back
+ *   pad.c        the pad as the engine sees it, code run in a target
+ *   tracee.c     ptrace: seize, stop, wait, release
+ *   rewind.c     interrupted system calls
+ *   support.c    what can not be protected; quiescence
+ *   lastpid.c    the next PID of another PID namespace
+ *   urgent.c     a CPU at once while an app waits for us
+ *   proc.c       /proc
+ */
+#ifndef AVCKPT_INTERNAL_H
+#define AVCKPT_INTERNAL_H
+
+#include <pthread.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <sys/types.h>
+
+#include "arch.h"
+#include "avckpt/ctl.h"
+#include "avckpt/engine.h"
+#include "inject.h"
+
+#define NS_PER_MS UINT64_C(1000000)
+#define NS_PER_S UINT64_C(1000000000)
+#define THREADS_MAX 4096
+#define OLD_PADS_MAX 128
+#define SOCKETS_MAX 64
+/* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13; glibc before 2.35 lacks the name. */
+#define PTRACE_GET_RSEQ 0x420f
+
+#define warn_unused __attribute__((warn_unused_result))
+
+/* ---- error.c --------------------------------------------------------------- */
+
+/* Fills *err in unless it holds an error already.  Always returns -1. */
+int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const char *operation,
+	 const char *syscall, const char *detail, ...) __attribute__((format(printf, 7, 8)));
+/* The same with the code that suits errno: ESRCH gone, EPERM denied, else kernel. */
+int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
+	       const char *detail, ...) __attribute__((format(printf, 5, 6)));
+uint64_t now_ns(void);
+void close_fd(int *fd);
+
+/* ---- proc.c ---------------------------------------------------------------- */
+
+struct proc_stat {
+	char state;
+	pid_t parent, group, session, tty_group;
+	uint32_t tty;
+	uint64_t start; /* clock ticks after boot */
+};
+
+/* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
+ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
+int proc_stat(pid_t pid, struct proc_stat *stat);
+/* The number of a task in its own (innermost) PID namespace, or -1. */
+pid_t proc_inside(pid_t tid);
+/* Children of a (single-threaded) process; returns how many (at most max), or -1. */
+int proc_children(pid_t pid, pid_t *children, int max);
+/* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
+int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
+/* Size of the address space in pages (statm), or -1. */
+long proc_vm_pages(pid_t pid);
+/* The PID a pidfd stands for, in our namespace, or -1. */
+pid_t proc_pidfd_pid(int pidfd);
+int proc_pidfd_open(pid_t pid);
+bool pidfd_ended(int pidfd);
+enum mapping_flag {
+	MAPPING_DONTFORK = 1,   /* dc */
+	MAPPING_WIPEONFORK = 2, /* wf */
+	MAPPING_DEVICE = 4,     /* io */
+	MAPPING_LOCKED = 8,     /* lo */
+	MAPPING_DROPPABLE = 16  /* dp */
+};
+
+struct mapping {
+	avc_remote start, end;
+	uint64_t offset, inode;
+	char mode[5]; /* "rwxp"                                           */
+	bool shared;
+	uint32_t flags; /* enum mapping_flag; of "smaps" only               */
+	char name[64];  /* its beginning                                    */
+};
+
+/* Calls fn for every mapping of /proc/PID/maps or (slow) smaps; stops when it
+ * returns < 0.  0 or -1. */
+int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
+		  void *arg);
+
+/* What is of interest in /proc/PID/status. */
+struct proc_status {
+	int64_t locked_kb;       /* -1: it has no memory any more                    */
+	pid_t inside;            /* in the innermost PID namespace                   */
+	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
+	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	uint32_t groups;         /* a hash                                           */
+	uint32_t no_new_privs, seccomp, seccomp_filters;
+};
+
+int proc_status(pid_t tid, struct proc_status *status);
+/* "/proc/PID/NAME" opened, or -1 with errno. */
+int proc_open(pid_t pid, const char *name, int flags);
+
+/* ---- threads and targets ---------------------------------------------------- */
+
+/* The call a thread was in when it was stopped last. */
+struct call {
+	long nr;
+	avc_remote pc, sp;
+	uint64_t arg[3];
+};
+
+/* What is remembered of an interrupted call between two stops (rewind.c). */
+struct rewound {
+	long nr; /* -1: nothing                                      */
+	avc_remote pc, sp;
+	int argument;      /* which one is the timeout, -1: none was changed   */
+	uint64_t original; /* that argument as the app passed it               */
+	uint64_t value;    /* and as we left it                                */
+	uint64_t at_ns;
+	uint64_t limit_ns; /* of a socket: how long the call may take          */
+};
+
+/* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
+struct scheduling {
+	uint8_t attr[48] __attribute__((aligned(8)));
+	int32_t io_priority;
+	int32_t reserved;
+};
+
+struct creds {
+	uint32_t uid[3], gid[3]; /* real, effective, saved                      */
+	uint32_t fsuid, fsgid;
+	uint32_t caps[6]; /* as capget(2) has them                            */
+	uint32_t securebits, no_new_privs;
+	uint32_t death_signal, subreaper;
+	int32_t seccomp;   /* mode                                             */
+	uint64_t slack_ns; /* of timers                                        */
+};
+
+struct thread {
+	pid_t tid; /* in our namespace                                 */
+	bool seen; /* there at this freeze                             */
+	bool attached, stopped;
+	int block;             /* of the slot, main thread 0; -1: not in the image */
+	bool borrowed;         /* sent into the pad; regs and sigmask are its own  */
+	struct arch_regs regs; /* as of the stop, EINTR already mended          */
+	uint64_t sigmask;
+	uint64_t robust_list, robust_bytes;
+	uint64_t rseq;
+	uint32_t rseq_bytes, rseq_signature;
+	uint64_t affinity[INJ_CPU_WORDS];
+	uint32_t affinity_bytes;
+	/* Asked of the thread itself, or slow to read; kept between checkpoints
+	 * as long as it looks like the same thread. */
+	bool known;
+	uint32_t asked; /* checkpoints since                                */
+	pid_t inside;
+	uint64_t known_tls;
+	uint64_t clear_tid;
+	uint64_t altstack[3]; /* sp, flags, size                                */
+	char name[16];
+	struct creds creds;
+	struct scheduling scheduling; /* at this freeze                         */
+	int timeout_cell;             /* of inj_control.timeout, -1: none                 */
+	struct call call;
+	struct rewound rewound;
+	uint64_t stopped_ns;
+	bool signalled; /* was just about to run a handler                  */
+};
+
+struct pad {
+	avc_remote base; /* 0: none                                          */
+	size_t bytes;
+	uint8_t *map; /* our view of the same pages                       */
+	struct inj_control *control;
+	uint32_t slots, threads_max;
+	size_t slot_bytes, block_bytes;
+};
+
+struct files;
+
+/* The live main process of the app. */
+struct target {
+	pid_t pid; /* 0: none                                          */
+	pid_t inside;
+	int pidfd, task_dirfd, mem_fd, timers_fd;
+	struct pad pad;
+	bool infected; /* the pad is known to be in this process           */
+	pid_t holder;  /* 0: none                                          */
+	int holder_pidfd;
+	struct thread *threads;
+	uint32_t thread_count, thread_room;
+	uint64_t cells_used; /* bit mask over inj_control.timeout               */
+	uint64_t nonce;
+	/* Pads that a guard which died left behind; they go with the second
+	 * checkpoint, when no thread can be in them any more. */
+	struct {
+		avc_remote base;
+		size_t bytes;
+	} old_pad[OLD_PADS_MAX];
+	uint32_t old_pads, checkpoints;
+	/* A thread died while it may have been cloning: there may be a tracee that
+	 * nobody knows (link_kill_lost). */
+	bool lost;
+	bool childless;      /* it had no child process at the last checkpoint   */
+	long surveyed_pages; /* size when its mappings were looked at last      */
+	int sockets[SOCKETS_MAX];
+	uint32_t socket_count;
+	struct pending *pending;
+	struct timers *timers;
+	struct memory *memory;
+	uint64_t shm_bytes;     /* shared memory that is rolled back, at most       */
+	uint32_t plain_filters; /* seccomp filters of init: the container's        */
+	pid_t init;             /* avckpt-init                                      */
+	struct files *files_before, *files_image; /* files.c                   */
+	uint32_t files_seen;
+	bool tcp_moved; /* bytes of connections are to be counted           */
+};
+
+struct generation {
+	uint64_t number; /* 0: unused                                        */
+	pid_t template;
+	int pidfd;
+	uint32_t slot;
+	uint32_t threads;
+	uint64_t taken_ns;
+	bool quiescent;
+	/* Taken from a process that had been restored lately: of the same lineage
+	 * as what that one was restored from, and as suspect. */
+	uint32_t lineage;
+	uint32_t crashes;      /* of its lineage, soon after a restore             */
+	uint32_t lost;         /* restores from it that came to nothing            */
+	bool seen;             /* held when the app was healthy; again so: vouched */
+	bool vouched;          /* the app was healthy well after it was taken      */
+	struct arch_regs base; /* a user context of the template                */
+	long vm_pages;         /* of the app when it was taken                     */
+	bool sandboxed;        /* has seccomp filters of its own                   */
+	struct timer_image *timers;
+	struct attributes *attributes;
+	struct mem_image *image;      /* of memory that is not in the template       */
+	struct avc_error notice;      /* what of it can not be put back              */
+	struct files *files;          /* descriptors                                     */
+	struct avc_error files_error; /* why they could not be read             */
+};
+
+struct link {
+	int init_pidfd, ctl_fd, report_fd, verdict_fd;
+	pid_t init, init_inside;
+	struct avc_ctl *ctl;
+	int pidns_fd; /* of the container                                 */
+};
+
+/* ---- tracee.c ---------------------------------------------------------------- */
+
+/* The one signal the library uses, thread-directed, to end a wait(2) in time. */
+int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
+void tracee_deadline_set(timer_t timer, uint64_t ns);
+void tracee_deadline_clear(timer_t timer);
+
+enum stop_kind {
+	STOP_TRAP,  /* our PTRACE_INTERRUPT, or a new tracee's first stop     */
+	STOP_GROUP, /* job control: the app is stopped by a signal            */
+	STOP_FORK,  /* FORK, VFORK, CLONE event; `message` is the child       */
+	STOP_SYSCALL,
+	STOP_SIGNAL,   /* about to receive `signal`                              */
+	STOP_EXIT,     /* gone; reaped                                           */
+	STOP_DYING,    /* killed, to be reaped later (stragglers())              */
+	STOP_DEADLINE, /* did not stop in time                                   */
+	STOP_NONE,     /* WNOHANG: nothing new                                   */
+	STOP_OTHER
+};
+
+struct stop {
+	enum stop_kind kind;
+	int event, signal, status;
+	pid_t message;
+};
+
+/* From now on a wait also ends (as at the deadline) when *word is not 0; NULL: no more. */
+void tracee_watch(const uint32_t *word);
+/* Waits for the next stop of one tracee of this thread; options: 0 or WNOHANG. */
+struct stop tracee_wait(pid_t tid, int options);
+/* For a running tracee that was interrupted (or is new): waits until it is in a
+ * plain trap stop (STOP_TRAP); signals that come in between are delivered.  A new
+ * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
+ * STOP_TRAP is an error; after STOP_GROUP it is stopped nevertheless. */
+enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
+/* From a stop of another kind to a plain trap stop, on the kernel's way back to
+ * the app, where it sees to interrupted calls and signals. */
+int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
+/* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
+ * that a thread has brought forth when it was killed is a tracee nobody heard of. */
+bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
+/* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
+void tracee_kill(pid_t pid);
+/* Is this thread the one that traces it? */
+bool tracee_is_ours(pid_t tid);
+#define TRACE_OPTIONS_APP \
+	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
+
+/* ---- pad.c ------------------------------------------------------------------- */
+
+/* Maps the pages at `base` of process `pid` here and fills in code and control. */
+int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t nonce,
+	     struct avc_error *err) warn_unused;
+size_t pad_layout(struct pad *pad, uint32_t slots, uint32_t threads_max);
+void pad_close(struct pad *pad);
+struct inj_slot *pad_slot(const struct pad *pad, uint32_t slot);
+avc_remote pad_remote(const struct pad *pad, const void *local);
+bool pad_contains(const struct pad *pad, avc_remote address);
+/* Block of thread `i` in a slot, its signal frame, the top of its stack. */
+struct inj_thread *pad_thread(const struct pad *pad, uint32_t slot, uint32_t i);
+void *pad_frame(const struct pad *pad, uint32_t slot, uint32_t i);
+void *pad_stack(const struct pad *pad, uint32_t slot, uint32_t i);
+
+uint8_t *pad_setup(const struct pad *pad, uint32_t slot); /* INJ_SETUP_BYTES */
+uint8_t *pad_files(const struct pad *pad, uint32_t slot); /* INJ_FILES_BYTES */
+
+/* Prepares a list of calls; returns the next call to fill in. */
+void call_begin(struct inj_call *call, enum inj_after after);
+struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
+			     uint64_t d, uint64_t e);
+/* Sends a stopped task into the pad to make the calls.  `base` is a user context
+ * of the task.  For a thread of the app use borrow(). */
+int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, struct inj_call *call,
+	     struct avc_error *err) warn_unused;
+/* Resumes it until all calls were made; it is in a plain trap stop then. */
+int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+/* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
+ * not let it, fails with AVC_KERNEL, and it is in a plain trap stop.  The clone is the
+ * last of the calls. */
+int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+		  struct avc_error *err) warn_unused;
+/* The same; `meanwhile` is called once while the kernel clones. */
+int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* In what a guard that died left behind? */
+bool in_old_pad(const struct target *target, avc_remote address);
+/* The same for a stopped thread of the app, which gets home by itself if we die:
+ * borrow, pad_run*, give_back.  give_back() needs a plain trap stop. */
+/* Only while it runs what is ours: of its own it must not do anything unseen. */
+int suspend_seccomp(const struct thread *thread, bool suspend, struct avc_error *err) warn_unused;
+int borrow(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+int give_back(struct thread *thread, struct avc_error *err);
+
+/* ---- setup.c ------------------------------------------------------------------- */
+
+/* The lists of calls of one slot, while they are being made.  Used by
+ * generation_finish() and what it calls, in this order: setup_begin(), any number
+ * of the others, setup_end(). */
+struct setup {
+	const struct pad *pad;
+	struct inj_slot *slot;
+	uint8_t *memory;
+	size_t used;
+	uint64_t *tail[INJ_STAGES]; /* where the next one's address goes        */
+	uint64_t *thread_tail;
+	bool full;
+	struct avc_error notice; /* what can not be put back, the first of it */
+	struct inj_setup spare;  /* written to when there is no room         */
+};
+
+void setup_begin(struct setup *setup, const struct pad *pad, uint32_t slot);
+/* One more call for a stage or (after setup_thread()) for a thread; `name` is for
+ * messages.  To be filled in further: call.arg[5], store, flags. */
+struct inj_setup *setup_add(struct setup *setup, enum inj_stage stage, const char *name, long nr,
+			    uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e);
+void setup_thread(struct setup *setup, struct inj_thread *thread);
+struct inj_setup *setup_add_thread(struct setup *setup, const char *name, long nr, uint64_t a,
+				   uint64_t b, uint64_t c, uint64_t d, uint64_t e);
+/* A copy of `bytes` bytes where the target can read it; the target's address. */
+avc_remote setup_data(struct setup *setup, const void *data, size_t bytes);
+/* -1 if there was not enough room for it all. */
+int setup_end(const struct setup *setup, pid_t pid, struct avc_error *err) warn_unused;
+/* After a restore: the first call of the slot that was allowed to fail, and did. */
+const struct inj_setup *setup_failed(const struct pad *pad, uint32_t slot);
+/* The same for one stage; calls without a name do not count. */
+const struct inj_setup *setup_failed_stage(const struct pad *pad, uint32_t slot,
+					   enum inj_stage stage);
+/* The name of a call by the target's address of it. */
+const char *setup_name(const struct pad *pad, avc_remote address);
+
+/* ---- pending.c ------------------------------------------------------------------ */
+
+struct pending *pending_new(void);
+/* While everything is stopped: those of all threads that are in the image.  Sets
+ * thread.signalled. */
+void pending_read(struct target *target);
+/* Is there such a signal; of a POSIX timer, if timer >= 0? */
+bool pending_contains(const struct pending *pending, int signal, int timer);
+/* When the app runs again: one thread's, after setup_thread(); the process's. */
+void pending_setup_thread(const struct target *target, const struct thread *thread,
+			  struct setup *setup);
+void pending_setup(const struct target *target, struct setup *setup);
+
+/* ---- timers.c -------------------------------------------------------------------- */
+
+struct timers *timers_new(void);
+/* While everything is stopped: what to call first in the list; when that was done. */
+void timers_ask(struct target *target, struct inj_call *call);
+void timers_answer(struct target *target, const struct inj_call *call, uint64_t took_ns);
+/* When the app runs again. */
+int timers_setup(struct target *target, struct generation *generation, struct setup *setup,
+		 struct avc_error *err) warn_unused;
+/* Before a restore: what is left of them now. */
+void timers_advance(const struct timer_image *image, uint64_t now);
+
+/* ---- attributes.c ----------------------------------------------------------------- */
+
+#define ATTRIBUTES_ASK_BYTES 96
+/* While it is stopped, from outside. */
+void scheduling_read(pid_t tid, struct scheduling *scheduling);
+/* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
+ * leave them.  Returns the first of the calls. */
+struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
+void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *creds);
+/* When the app runs again: each thread, after setup_thread(); the process. */
+int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
+			    const struct thread *thread, struct setup *setup,
+			    struct avc_error *err) warn_unused;
+int attributes_keep(const struct target *target, struct generation *generation,
+		    struct avc_error *err) warn_unused;
+/* Before the restored threads go: what can be done from outside only. */
+void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
+
+/* ---- sandbox.c --------------------------------------------------------------------- */
+
+struct sandbox;
+/* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
+struct sandbox *sandbox_begin(pid_t child, struct avc_error *err);
+/* Waits while *state is INJ_IDLE; false when it ended or was too late. */
+bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
+/* The end of it: killed, or let go to where the threads of the slot were. */
+void sandbox_end(struct sandbox *sandbox);
+void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot);
+
+/* ---- memory.c ------------------------------------------------------------------ */
+
+struct memory *memory_new(void);
+void memory_forget(struct memory *memory); /* it is another program         */
+void memory_free(struct memory *memory);
+/* Room for what is to be copied in the freeze; *image NULL: nothing. */
+int memory_prepare(const struct memory *memory, struct mem_image **image,
+		   struct avc_error *err) warn_unused;
+void mem_image_free(struct mem_image *image);
+/* While everything is stopped: copies; and what to call before the clone. */
+void memory_copy(const struct target *target, struct mem_image *image);
+void memory_dofork(const struct memory *memory, struct inj_call *call);
+/* The template is smaller than the app: always fails, with EAGAIN if the next
+ * attempt will be better. */
+int memory_learn(struct target *target, long missing_pages, struct avc_error *err);
+/* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
+int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
+		  struct setup *setup, struct avc_error *err) warn_unused;
+/* At a restore, before anything runs. */
+int memory_put_back(const struct mem_image *image, struct avc_error *err) warn_unused;
+
+/* ---- infect.c ----------------------------------------------------------------- */
+
+/* Brings the pad into the app, through its main thread.  The other threads run. */
+int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+	   struct avc_error *err) warn_unused;
+/* Makes the holder; unhold() drops it. */
+int hold(struct target *target, timer_t timer, uint64_t deadline_ns,
+	 struct avc_error *err) warn_unused;
+void unhold(struct target *target);
+
+/* ---- target.c ----------------------------------------------------------------- */
+
+void target_init(struct target *target);
+int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err) warn_unused;
+/* Forgets the process (the pad stays mapped here: templates live in it). */
+void target_close(struct target *target);
+/* The entry for a tid; NULL when there is no room. */
+struct thread *thread_find(struct target *target, pid_t tid);
+struct thread *thread_add(struct target *target, pid_t tid, struct avc_error *err);
+void threads_forget_unseen(struct target *target);
+/* Attaches and interrupts; thread_await() then waits for the stop, reads the
+ * registers and mends the interrupted call. */
+int thread_stop(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_await(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+/* Lets it go on as if nothing had been.  A thread that could not be stopped stays
+ * attached: a straggler. */
+void thread_release(struct thread *thread);
+/* Looks after stragglers without waiting; returns how many are left. */
+uint32_t stragglers(struct target *target);
+/* What ptrace can read of a stopped thread: mask, robust list, rseq. */
+int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
+/* Asks a stopped thread what only it can tell (clear_child_tid, sigaltstack). */
+int ask(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+/* The threads there are now; those that ended are forgotten. */
+int take_stock(struct target *target, struct avc_error *err) warn_unused;
+/* Gets known every thread that is not yet, one at a time, before a freeze. */
+int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns,
+	     struct avc_error *err) warn_unused;
+/* Where a thread inside a restartable sequence has to go on (rseq(2)). */
+void rseq_fixup(int mem_fd, struct thread *thread);
+
+/* ---- files*.c (files.h) --------------------------------------------------------- */
+
+/* Before a freeze: what can be known of the app's descriptors while it runs. */
+int files_prepare(struct target *target, struct avc_error *err) warn_unused;
+/* During it: what is of this instant. */
+int files_capture(struct target *target, struct generation *generation, struct avc_error *err);
+/* After it. */
+void files_settle(struct target *target, struct generation *generation);
+void files_forget(struct target *target);
+void files_free(struct files *files);
+/* Makes the table of a dead app, which its templates hold, the generation's again, and
+ * lists what the restored process has to do itself.  What could not be put back is
+ * told in *notes; -1 is for what must not go on. */
+int files_restore(struct target *target, struct generation *generation,
+		  const struct avc_config *config, pid_t init, struct avc_error *notes,
+		  struct avc_error *err) warn_unused;
+/* Whether the restored process could do it all. */
+void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struct avc_error *notes);
+/* -1 if a file open for writing was written since, with AVC_UNSUPPORTED and which.
+ * `pid` is a process that has the table as it is now. */
+int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
+		       struct avc_error *err) warn_unused;
+
+/* ---- freeze.c ------------------------------------------------------------------ */
+
+struct freeze_times {
+	uint64_t freeze_ns, stop_ns, clone_ns;
+};
+
+/* Takes one checkpoint into *generation (slot and number given by the caller).
+ * On return the app runs, whatever happened. */
+int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
+	   struct generation *generation, struct freeze_times *times,
+	   struct avc_error *err) warn_unused;
+
+/* ---- generation.c -------------------------------------------------------------- */
+
+/* After the app runs again: finishes the template and its slot. */
+int generation_finish(struct target *target, struct generation *generation,
+		      struct avc_error *err) warn_unused;
+void generation_drop(struct generation *generation);
+void oom_score_adj_set(pid_t pid, const char *value);
+
+/* ---- restore.c ------------------------------------------------------------------ */
+
+struct restore_times {
+	uint64_t restore_ns, fork_ns, threads_ns;
+	struct avc_error notice; /* what could not be put back                  */
+};
+
+/* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
+ * there, before anything runs: it sends the verdict.  On success *pid is the new
+ * main process. */
+int restore(struct target *target, struct generation *generation, const struct link *link,
+	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
+	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
+	    struct restore_times *times, struct avc_error *notes,
+	    struct avc_error *err) warn_unused;
+
+/* ---- urgent.c -------------------------------------------------------------------- */
+
+/* The calling thread gets a CPU before others from here to the other; best effort.
+ * May be nested. */
+void urgent_begin(void);
+void urgent_end(void);
+
+/* ---- lastpid.c ------------------------------------------------------------------- */
+
+struct last_pid;
+/* Starts a helper task inside the PID namespace; it serves the slot's requests
+ * until last_pid_stop().  last_pid_set() is the engine's own request. */
+struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
+int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
+void last_pid_stop(struct last_pid *helper);
+
+/* ---- rewind.c --------------------------------------------------------------------- */
+
+/* A thread that just stopped: remembers which call it is in.  If that was only interrupted
+ * by us, the thread is set to make it again, with what is left of its timeout. */
+void rewind_call(struct target *target, struct thread *thread);
+/* Just before it goes on: takes off what the stop has added to a wait. */
+void rewind_count_stop(const struct target *target, const struct thread *thread);
+/* Registers as the app had them, before rewind_call() changed a timeout or the
+ * kernel made restart_syscall(2) of the call. */
+void rewind_original(const struct thread *thread, struct arch_regs *regs);
+void rewind_forget(struct target *target, struct thread *thread);
+
+/* ---- support.c --------------------------------------------------------------------- */
+
+/* Looks at a running app for what can not be protected.  0, or -1 with
+ * AVC_UNSUPPORTED and the reason in words; *passing if that may be over soon. */
+int support_check(struct target *target, bool *passing, struct avc_error *err) warn_unused;
+/* True if this looks like a moment at which nobody is in the middle of anything. */
+bool quiescent(const struct target *target);
+
+/* ---- link.c -------------------------------------------------------------------------- */
+
+void link_init(struct link *link);
+/* True once the app's main process runs a program of its own. */
+bool link_app_started(const struct link *link, pid_t app);
+/* 1: connected, 0: init is not ready yet, -1: error. */
+int link_open(struct link *link, struct avc_error *err) warn_unused;
+void link_close(struct link *link);
+/* The app's main process in our namespace, 0 if it is not there (yet). */
+pid_t link_app(const struct link *link);
+void link_arm(struct link *link, bool armed);
+bool link_stop_asked(const struct link *link);
+int link_report(struct link *link, struct avc_report *report);
+int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind,
+		 struct avc_error *err);
+/* Kills what the dead app left behind (children of init but those in keep[]). */
+/* Kills and reaps the children of init that are tracees of ours but not in keep[]:
+ * clones of which we never heard, because the thread that made them was killed before
+ * it could tell.  They would keep the app's number (as a process group's) and, as
+ * zombies, the container from ending. */
+void link_kill_lost(const struct link *link, const pid_t *keep, int keep_count);
+void link_kill_leftovers(const struct link *link, const pid_t *keep, int keep_count);
+
+/* ---- engine.c --------------------------------------------------------------------------- */
+
+void engine_emit(struct avc_engine *engine, const struct avc_event *event);
+
+#endif

@@ -1,0 +1,238 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The guard's end of the protocol in avckpt/ctl.h.
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/file.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define CHILDREN_MAX 1024
+
+void link_init(struct link *link)
+{
+	*link = (struct link){
+		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .pidns_fd = -1
+	};
+}
+
+/* init's descriptor number of the control page, or -1. */
+static int find_ctl(pid_t init)
+{
+	char path[64], target[64];
+	struct dirent *entry;
+	int found = -1;
+	DIR *dir;
+
+	snprintf(path, sizeof path, "/proc/%d/fd", init);
+	dir = opendir(path);
+	if (!dir)
+		return -1;
+	while (found < 0 && (entry = readdir(dir))) {
+		ssize_t n = readlinkat(dirfd(dir), entry->d_name, target, sizeof target - 1);
+
+		if (n <= 0)
+			continue;
+		target[n] = 0;
+		if (!strcmp(target, "/memfd:" AVC_CTL_NAME " (deleted)"))
+			found = atoi(entry->d_name);
+	}
+	closedir(dir);
+	return found;
+}
+
+static int open_fd_of(pid_t init, int number, int flags, bool pipe)
+{
+	char name[32];
+	struct stat st;
+	int fd;
+
+	snprintf(name, sizeof name, "fd/%d", number);
+	fd = proc_open(init, name, flags | O_NONBLOCK);
+	if (fd >= 0 && pipe && (fstat(fd, &st) || !S_ISFIFO(st.st_mode))) {
+		close(fd);
+		errno = EPROTO;
+		return -1;
+	}
+	return fd;
+}
+
+static int connect_all(struct link *link, int number, struct avc_error *err)
+{
+	const struct avc_ctl *ctl;
+	struct stat st;
+
+	link->ctl_fd = open_fd_of(link->init, number, O_RDWR, false);
+	if (link->ctl_fd < 0)
+		return fail_errno(err, link->init, "attach", "open(fd)",
+				  "its control page can not be opened");
+	if (flock(link->ctl_fd, LOCK_EX | LOCK_NB))
+		return fail(err, AVC_BUSY, errno, link->init, "attach", "flock",
+			    "another avckpt guards it already");
+	if (fstat(link->ctl_fd, &st) || st.st_size < (off_t)sizeof *ctl)
+		return fail(err, AVC_PROTOCOL, 0, link->init, "attach", "",
+			    "its control page is too small");
+	link->ctl = mmap(NULL, sizeof *ctl, PROT_READ | PROT_WRITE, MAP_SHARED, link->ctl_fd, 0);
+	if (link->ctl == MAP_FAILED) {
+		link->ctl = NULL;
+		return fail_errno(err, link->init, "attach", "mmap",
+				  "its control page can not be mapped");
+	}
+	ctl = link->ctl;
+	if (ctl->version != AVC_CTL_VERSION)
+		return fail(
+			err, AVC_PROTOCOL, 0, link->init, "attach", "",
+			"avckpt-init speaks version %u, this is version %u: restart the container",
+			ctl->version, (unsigned int)AVC_CTL_VERSION);
+	link->report_fd = open_fd_of(link->init, ctl->report_fd, O_RDONLY, true);
+	link->verdict_fd = open_fd_of(link->init, ctl->verdict_fd, O_WRONLY, true);
+	link->pidns_fd = proc_open(link->init, "ns/pid", O_RDONLY);
+	if (link->report_fd < 0 || link->verdict_fd < 0 || link->pidns_fd < 0)
+		return fail_errno(err, link->init, "attach", "open(fd)",
+				  "its pipes can not be opened");
+	link->init_inside = ctl->init_pid;
+	return 0;
+}
+
+int link_open(struct link *link, struct avc_error *err)
+{
+	int number, pidfd = link->init_pidfd;
+	uint64_t magic = 0;
+
+	link->init = proc_pidfd_pid(pidfd);
+	if (link->init <= 0)
+		return fail(err, AVC_GONE, ESRCH, 0, "attach", "",
+			    "the container's main process has ended");
+	number = find_ctl(link->init);
+	if (number < 0 || pidfd_ended(pidfd))
+		return 0;
+	/* The magic is written last: before that the page is not to be trusted. */
+	link->ctl_fd = open_fd_of(link->init, number, O_RDONLY, false);
+	if (link->ctl_fd >= 0 && pread(link->ctl_fd, &magic, sizeof magic, 0) < 0)
+		magic = 0;
+	close_fd(&link->ctl_fd);
+	if (magic != AVC_CTL_MAGIC)
+		return 0;
+	if (connect_all(link, number, err) == 0)
+		return 1;
+	link_close(link);
+	link->init_pidfd = pidfd;
+	return -1;
+}
+
+/* Everything but the pidfd, which is the guard's. */
+void link_close(struct link *link)
+{
+	if (link->ctl)
+		munmap(link->ctl, sizeof *link->ctl);
+	link->ctl = NULL;
+	close_fd(&link->ctl_fd); /* lets the lock go */
+	close_fd(&link->report_fd);
+	close_fd(&link->verdict_fd);
+	close_fd(&link->pidns_fd);
+}
+
+pid_t link_app(const struct link *link)
+{
+	const int32_t inside = __atomic_load_n(&link->ctl->app_pid, __ATOMIC_ACQUIRE);
+	pid_t children[CHILDREN_MAX];
+	int count = proc_children(link->init, children, CHILDREN_MAX);
+
+	for (int i = 0; inside > 0 && i < count; i++)
+		if (proc_inside(children[i]) == inside)
+			return children[i];
+	return 0;
+}
+
+bool link_app_started(const struct link *link, pid_t app)
+{
+	char path[64];
+	struct stat own, theirs;
+
+	snprintf(path, sizeof path, "/proc/%d/exe", link->init);
+	if (stat(path, &own))
+		return false;
+	snprintf(path, sizeof path, "/proc/%d/exe", app);
+	if (stat(path, &theirs))
+		return false;
+	return own.st_dev != theirs.st_dev || own.st_ino != theirs.st_ino;
+}
+
+void link_arm(struct link *link, bool armed)
+{
+	__atomic_store_n(&link->ctl->armed, armed, __ATOMIC_RELEASE);
+}
+
+bool link_stop_asked(const struct link *link)
+{
+	const uint64_t asked = __atomic_load_n(&link->ctl->stop_asked_ns, __ATOMIC_ACQUIRE);
+
+	return asked && now_ns() - asked < AVC_CTL_STOP_MS * NS_PER_MS;
+}
+
+int link_report(struct link *link, struct avc_report *report)
+{
+	return read(link->report_fd, report, sizeof *report) == sizeof *report ? 1 : 0;
+}
+
+int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind, struct avc_error *err)
+{
+	const struct avc_verdict verdict = { .seq = seq, .kind = kind };
+
+	/* A reader that is gone raises SIGPIPE, which this thread has blocked. */
+	if (write(link->verdict_fd, &verdict, sizeof verdict) != sizeof verdict)
+		return fail_errno(err, link->init, "tell init", "write", "init does not listen");
+	return 0;
+}
+
+static bool contains(const pid_t *list, int count, pid_t pid)
+{
+	for (int i = 0; i < count; i++)
+		if (list[i] == pid)
+			return true;
+	return false;
+}
+
+void link_kill_lost(const struct link *link, const pid_t *keep, int keep_count)
+{
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(link->init, children, CHILDREN_MAX);
+
+	for (int i = 0; i < count; i++)
+		if (!contains(keep, keep_count, children[i]) && tracee_is_ours(children[i]))
+			tracee_kill(children[i]);
+}
+
+void link_kill_leftovers(const struct link *link, const pid_t *keep, int keep_count)
+{
+	/* What a killed process leaves becomes init's child in its turn. */
+	for (int round = 0; round < 8; round++) {
+		pid_t children[CHILDREN_MAX];
+		const int count = proc_children(link->init, children, CHILDREN_MAX);
+		bool any = false;
+
+		for (int i = 0; i < count; i++) {
+			struct proc_stat stat;
+
+			if (contains(keep, keep_count, children[i]) ||
+			    proc_stat(children[i], &stat) || stat.parent != link->init ||
+			    stat.state == 'Z')
+				continue;
+			kill(children[i], SIGKILL);
+			any = true;
+		}
+		if (!any)
+			return;
+		usleep(200);
+	}
+}

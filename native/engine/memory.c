@@ -1,0 +1,542 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Memory that a clone does not carry as it is.
+ *
+ * - MADV_DONTFORK: missing in the clone.  A process that was found to have such
+ *   areas is told MADV_DOFORK for its whole address space in the same breath as it
+ *   is cloned, so there is no moment at which a new one could be missed.  Its own
+ *   forks then copy those areas, too.  (Only a device's are left: those can not.)
+ * - MADV_WIPEONFORK: zeroes in the clone.  The app's flag must stay, for others rely on
+ *   it for their safety (random number generators); so the contents are read while
+ *   the app is stopped and written into the template, which gets the flag off, and the
+ *   restored process on again.
+ * - Shared memory that is nobody else's: is not copied by a clone.  Read while the app
+ *   is stopped, up to a limit, and written back at a restore.
+ * - Locked memory: a clone's is not.
+ *
+ * What areas there are of these kinds is known from the template before; whether
+ * that was right is seen in the new template, when the app runs again.  If not, the
+ * checkpoint is taken once more.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define AREAS_MAX 64
+#define HOLES_MAX 8
+#define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
+#define SMAPS_SHARE 50       /* the long file is read in at most 1/50 of the time */
+
+struct area {
+	avc_remote start, end;
+	uint64_t offset, inode;
+	bool wiped; /* MADV_WIPEONFORK; else shared memory                     */
+	int fd;     /* of the shared memory                                    */
+};
+
+struct areas {
+	uint32_t count;
+	bool too_many;
+	struct area area[AREAS_MAX];
+};
+
+struct locked {
+	uint32_t count;
+	struct {
+		avc_remote start, end;
+	} area[AREAS_MAX];
+};
+
+/* What is known of a target's memory from one checkpoint to the next. */
+struct memory {
+	bool dontfork;
+	/* Where a device (or the kernel's vvar) is mapped: madvise(2) stops there. */
+	uint32_t holes;
+	struct {
+		avc_remote start, end;
+	} hole[HOLES_MAX];
+	struct areas areas;
+	uint64_t layout; /* a hash of the mappings when the areas were read */
+	uint64_t read_ns, cost_ns;
+	uint64_t left_bytes; /* shared memory beyond the limit                  */
+	struct locked locked;
+	int64_t locked_kb;
+	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
+};
+
+struct mem_image {
+	struct areas areas; /* descriptors are duplicates                      */
+	bool whole;         /* everything could be read                        */
+	size_t bytes;
+	uint8_t data[];
+};
+
+static size_t area_bytes(const struct area *a)
+{
+	return a->end - a->start;
+}
+
+static void areas_close(struct areas *areas)
+{
+	for (uint32_t i = 0; i < areas->count; i++)
+		if (!areas->area[i].wiped)
+			close_fd(&areas->area[i].fd);
+	areas->count = 0;
+}
+
+struct memory *memory_new(void)
+{
+	return calloc(1, sizeof(struct memory));
+}
+
+void memory_forget(struct memory *memory)
+{
+	areas_close(&memory->areas);
+	*memory = (struct memory){ 0 };
+}
+
+void memory_free(struct memory *memory)
+{
+	if (memory)
+		memory_forget(memory);
+	free(memory);
+}
+
+void mem_image_free(struct mem_image *image)
+{
+	if (image)
+		areas_close(&image->areas);
+	free(image);
+}
+
+/* ---- before and during a freeze ------------------------------------------------ */
+
+int memory_prepare(const struct memory *memory, struct mem_image **image, struct avc_error *err)
+{
+	size_t bytes = 0;
+
+	*image = NULL;
+	for (uint32_t i = 0; i < memory->areas.count; i++)
+		bytes += area_bytes(&memory->areas.area[i]);
+	if (!bytes)
+		return 0;
+	*image = malloc(sizeof **image + bytes);
+	if (!*image)
+		return fail_errno(err, 0, "keep memory", "malloc", "out of memory");
+	(*image)->areas.count = 0;
+	(*image)->whole = true;
+	(*image)->bytes = bytes;
+	memset((*image)->data, 0, bytes); /* page faults now, not in the freeze */
+	for (uint32_t i = 0; i < memory->areas.count; i++) {
+		struct area *a = &(*image)->areas.area[i];
+
+		*a = memory->areas.area[i];
+		if (!a->wiped)
+			a->fd = fcntl(a->fd, F_DUPFD_CLOEXEC, 3);
+		(*image)->areas.count++;
+		if (!a->wiped && a->fd < 0)
+			return fail_errno(err, 0, "keep memory", "fcntl", "out of descriptors");
+	}
+	return 0;
+}
+
+static bool read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
+{
+	while (bytes) {
+		const ssize_t n = pread(fd, to, bytes, at);
+
+		if (n <= 0)
+			return false;
+		to += n;
+		at += n;
+		bytes -= (size_t)n;
+	}
+	return true;
+}
+
+void memory_copy(const struct target *target, struct mem_image *image)
+{
+	uint8_t *to = image ? image->data : NULL;
+
+	for (uint32_t i = 0; image && i < image->areas.count; i++) {
+		const struct area *a = &image->areas.area[i];
+		const bool done = a->wiped ? read_whole(target->mem_fd, to, area_bytes(a),
+							(off_t)a->start)
+					   : read_whole(a->fd, to, area_bytes(a), (off_t)a->offset);
+
+		image->whole = image->whole && done;
+		to += area_bytes(a);
+	}
+}
+
+/* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
+void memory_dofork(const struct memory *memory, struct inj_call *call)
+{
+	avc_remote at = 4096;
+
+	if (!memory->dontfork)
+		return;
+	for (uint32_t i = 0; i < memory->holes; i++) {
+		if (memory->hole[i].start > at)
+			call_add(call, SYS_madvise, at, memory->hole[i].start - at, MADV_DOFORK, 0,
+				 0);
+		at = memory->hole[i].end;
+	}
+	call_add(call, SYS_madvise, at, ARCH_USER_END - at, MADV_DOFORK, 0, 0);
+}
+
+/* ---- mappings, from /proc ------------------------------------------------------------ */
+
+struct dontfork {
+	struct memory *memory;
+	bool found, device;
+};
+
+static int find_dontfork(const struct mapping *m, void *arg)
+{
+	struct dontfork *look = arg;
+	struct memory *memory = look->memory;
+
+	if (m->flags & MAPPING_DONTFORK) {
+		if (m->flags & MAPPING_DEVICE)
+			look->device = true;
+		else
+			look->found = true;
+	}
+	if (!(m->flags & MAPPING_DEVICE) || m->start >= ARCH_USER_END)
+		return 0;
+	if (memory->holes && memory->hole[memory->holes - 1].end == m->start) {
+		memory->hole[memory->holes - 1].end = m->end;
+		return 0;
+	}
+	if (memory->holes == HOLES_MAX)
+		return -1;
+	memory->hole[memory->holes].start = m->start;
+	memory->hole[memory->holes++].end = m->end;
+	return 0;
+}
+
+int memory_learn(struct target *target, long missing_pages, struct avc_error *err)
+{
+	struct memory *memory = target->memory;
+	struct dontfork look = { .memory = memory };
+	int result;
+
+	memory->holes = 0;
+	result = proc_mappings(target->pid, "smaps", find_dontfork, &look);
+	memory->dontfork = !result && (memory->dontfork || look.found);
+	if (look.device)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "it uses a device's memory, which a clone does not inherit");
+	if (!memory->dontfork)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "%ld kB of its memory are not inherited by a clone", missing_pages * 4);
+	/* Known before, it should not be missing again; but a device may have been
+	 * mapped since, at which the call stopped. */
+	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep template", "",
+		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
+		    missing_pages * 4);
+}
+
+struct survey {
+	const struct target *target;
+	struct areas *areas;
+	uint64_t layout, shared_bytes, limit;
+	uint64_t left_bytes;
+};
+
+static uint64_t hash(uint64_t h, uint64_t value)
+{
+	h = (h ^ value) * UINT64_C(0x9E3779B97F4A7C15);
+	return h ^ h >> 29;
+}
+
+static bool is_pad(const struct target *target, avc_remote at)
+{
+	if (pad_contains(&target->pad, at))
+		return true;
+	for (uint32_t i = 0; i < target->old_pads; i++)
+		if (at - target->old_pad[i].base < target->old_pad[i].bytes)
+			return true;
+	return false;
+}
+
+/* Anonymous memory can be shared with descendants only, and there are none. */
+static bool is_shared(const struct mapping *m)
+{
+	return m->shared && (!strcmp(m->name, "/dev/zero (deleted)") ||
+			     !strcmp(m->name, "/anon_hugepage (deleted)"));
+}
+
+static int hash_mapping(const struct mapping *m, void *arg)
+{
+	struct survey *survey = arg;
+
+	survey->layout = hash(hash(hash(survey->layout, m->start), m->end),
+			      m->inode ^ m->offset << 8 ^ (uint64_t)m->shared);
+	return 0;
+}
+
+static int find_area(const struct mapping *m, void *arg)
+{
+	struct survey *survey = arg;
+	struct areas *areas = survey->areas;
+	/* What the kernel may drop at any time (vDSO getrandom's state) may be
+	 * wiped as well, and is better so: nothing random comes twice. */
+	const bool wiped = (m->flags & (MAPPING_WIPEONFORK | MAPPING_DROPPABLE)) ==
+			   MAPPING_WIPEONFORK;
+
+	hash_mapping(m, arg);
+	if ((!wiped && !is_shared(m)) || is_pad(survey->target, m->start))
+		return 0;
+	if (!wiped) {
+		survey->shared_bytes += m->end - m->start;
+		if (survey->shared_bytes > survey->limit) {
+			survey->left_bytes += m->end - m->start;
+			return 0;
+		}
+	}
+	if (areas->count == AREAS_MAX) {
+		areas->too_many = true;
+		return 0;
+	}
+	areas->area[areas->count++] = (struct area){
+		.start = m->start,
+		.end = m->end,
+		.offset = m->offset,
+		.inode = m->inode,
+		.wiped = wiped,
+		.fd = -1,
+	};
+	return 0;
+}
+
+static bool same_area(const struct area *a, const struct area *b)
+{
+	return a->start == b->start && a->end == b->end && a->offset == b->offset &&
+	       a->inode == b->inode && a->wiped == b->wiped;
+}
+
+static bool same_areas(const struct areas *a, const struct areas *b)
+{
+	if (a->count != b->count)
+		return false;
+	for (uint32_t i = 0; i < a->count; i++)
+		if (!same_area(&a->area[i], &b->area[i]))
+			return false;
+	return true;
+}
+
+/* The shared memory itself, by the mapping of the template. */
+static int open_area(pid_t template, struct area *a, struct avc_error *err)
+{
+	char name[64];
+
+	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)a->start,
+		 (unsigned long)a->end);
+	a->fd = proc_open(template, name, O_RDWR);
+	if (a->fd < 0)
+		return fail_errno(err, template, "keep memory", "open(map_files)",
+				  "shared memory can not be reached");
+	return 0;
+}
+
+/* Takes `found` for what is there from now on. */
+static int remember(struct target *target, pid_t template, struct areas *found,
+		    struct avc_error *err)
+{
+	struct memory *memory = target->memory;
+	uint64_t wiped = 0;
+
+	areas_close(&memory->areas);
+	memory->areas.count = 0;
+	if (found->too_many)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			    "it has more than %d areas of shared or MADV_WIPEONFORK memory",
+			    AREAS_MAX);
+	for (uint32_t i = 0; i < found->count; i++) {
+		struct area *a = &found->area[i];
+
+		if (!a->wiped && open_area(template, a, err))
+			return -1;
+		wiped += a->wiped ? area_bytes(a) : 0;
+		memory->areas.area[memory->areas.count++] = *a;
+	}
+	if (wiped > WIPED_MAX) {
+		areas_close(&memory->areas);
+		return fail(
+			err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			"%llu kB of its memory are wiped in a clone (MADV_WIPEONFORK), which is too much to copy",
+			(unsigned long long)wiped / 1024);
+	}
+	return 0;
+}
+
+/* Were the areas that were copied those that there are?  Of the long file only as
+ * often as it is worth it, and when the layout has changed. */
+static int check_areas(struct target *target, const struct generation *generation,
+		       struct avc_error *err)
+{
+	static const struct areas none;
+	struct memory *memory = target->memory;
+	const struct areas *copied = generation->image ? &generation->image->areas : &none;
+	struct survey survey = { .target = target, .limit = target->shm_bytes };
+	struct areas *found;
+	uint64_t start = now_ns();
+	int result = 0;
+
+	if (proc_mappings(generation->template, "maps", hash_mapping, &survey))
+		return fail_errno(err, generation->template, "keep memory", "read(maps)",
+				  "it was killed");
+	if (survey.layout == memory->layout &&
+	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
+		goto out;
+	found = calloc(1, sizeof *found);
+	if (!found)
+		return fail_errno(err, 0, "keep memory", "calloc", "out of memory");
+	start = now_ns();
+	survey = (struct survey){ .target = target, .limit = target->shm_bytes, .areas = found };
+	if (proc_mappings(generation->template, "smaps", find_area, &survey))
+		result = fail_errno(err, generation->template, "keep memory", "read(smaps)",
+				    "it was killed");
+	memory->read_ns = now_ns();
+	memory->cost_ns = memory->read_ns - start;
+	memory->left_bytes = survey.left_bytes;
+	if (!result && !same_areas(found, copied)) {
+		result = remember(target, generation->template, found, err);
+		if (!result)
+			result = fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep memory", "",
+				      "it has new shared or MADV_WIPEONFORK memory");
+	}
+	memory->layout = result ? 0 : survey.layout;
+	free(found);
+out:
+	if (!result && generation->image && !generation->image->whole)
+		result = fail(err, AVC_DEADLINE, 0, target->pid, "keep memory", "",
+			      "its shared memory can not be read");
+	return result;
+}
+
+/* ---- when the app runs again ------------------------------------------------------------- */
+
+/* Puts the wiped areas into the template, which is stopped. */
+static int fill_wiped(struct target *target, struct generation *generation, struct setup *setup,
+		      struct avc_error *err)
+{
+	struct inj_call *call = &setup->slot->template_call;
+	const struct mem_image *image = generation->image;
+	const uint8_t *from = image ? image->data : NULL;
+	int mem_fd = -1, result = 0;
+
+	call_begin(call, INJ_AFTER_PARK);
+	for (uint32_t i = 0; !result && image && i < image->areas.count; i++) {
+		const struct area *a = &image->areas.area[i];
+
+		if (a->wiped && mem_fd < 0)
+			mem_fd = proc_open(generation->template, "mem", O_RDWR);
+		if (a->wiped &&
+		    pwrite(mem_fd, from, area_bytes(a), (off_t)a->start) != (ssize_t)area_bytes(a))
+			result = fail_errno(err, generation->template, "keep memory", "write(mem)",
+					    "it was killed");
+		if (a->wiped) {
+			call_add(call, SYS_madvise, a->start, area_bytes(a), MADV_KEEPONFORK, 0, 0);
+			setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise, a->start,
+				  area_bytes(a), MADV_WIPEONFORK, 0, 0);
+		}
+		if (call->count == INJ_CALLS_MAX || (call->count && i + 1 == image->areas.count)) {
+			if (pad_send(&target->pad, generation->template, &generation->base, call,
+				     err) ||
+			    pad_run(generation->template, call, err))
+				result = -1;
+			call_begin(call, INJ_AFTER_PARK);
+		}
+		from += area_bytes(a);
+	}
+	close_fd(&mem_fd);
+	return result;
+}
+
+static int find_locked(const struct mapping *m, void *arg)
+{
+	struct locked *locked = arg;
+
+	if (!(m->flags & MAPPING_LOCKED))
+		return 0;
+	if (locked->count && locked->area[locked->count - 1].end == m->start) {
+		locked->area[locked->count - 1].end = m->end;
+		return 0;
+	}
+	if (locked->count == AREAS_MAX)
+		return 0; /* the last ones stay unlocked: nothing breaks */
+	locked->area[locked->count].start = m->start;
+	locked->area[locked->count++].end = m->end;
+	return 0;
+}
+
+/* Pages become locked as they are touched (MLOCK_ONFAULT): to bring them all in at once
+ * would make a copy of all that memory before the process may run. */
+static void lock_again(struct target *target, int64_t locked_kb, struct setup *setup)
+{
+	struct memory *memory = target->memory;
+	const uint64_t start = now_ns();
+
+	if (locked_kb == 0)
+		memory->locked.count = 0;
+	if (locked_kb > 0 &&
+	    (locked_kb != memory->locked_kb || memory->layout != memory->locked_layout ||
+	     start - memory->locked_read_ns > memory->locked_cost_ns * SMAPS_SHARE)) {
+		struct locked found = { 0 };
+
+		/* Of one that has just died there is nothing to be seen any more; what
+		 * was known of it is right, as a rule. */
+		if (proc_mappings(target->pid, "smaps", find_locked, &found) == 0 && found.count) {
+			memory->locked = found;
+			memory->locked_kb = locked_kb;
+			memory->locked_layout = memory->layout;
+		}
+		memory->locked_read_ns = now_ns();
+		memory->locked_cost_ns = memory->locked_read_ns - start;
+	}
+	for (uint32_t i = 0; i < memory->locked.count; i++)
+		setup_add(setup, INJ_BEFORE, "mlock2", SYS_mlock2, memory->locked.area[i].start,
+			  memory->locked.area[i].end - memory->locked.area[i].start, MLOCK_ONFAULT,
+			  0, 0)
+			->flags = INJ_MAY_FAIL;
+}
+
+int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
+		  struct setup *setup, struct avc_error *err)
+{
+	if (check_areas(target, generation, err) || fill_wiped(target, generation, setup, err))
+		return -1;
+	lock_again(target, locked_kb, setup);
+	if (target->memory->left_bytes && !setup->notice.code)
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
+		     (unsigned long long)target->memory->left_bytes / 1024);
+	return 0;
+}
+
+int memory_put_back(const struct mem_image *image, struct avc_error *err)
+{
+	const uint8_t *from = image ? image->data : NULL;
+
+	for (uint32_t i = 0; image && i < image->areas.count; i++) {
+		const struct area *a = &image->areas.area[i];
+
+		if (!a->wiped &&
+		    pwrite(a->fd, from, area_bytes(a), (off_t)a->offset) != (ssize_t)area_bytes(a))
+			return fail_errno(err, 0, "restore", "pwrite",
+					  "shared memory can not be written");
+		from += area_bytes(a);
+	}
+	return 0;
+}

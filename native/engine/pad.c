@@ -1,0 +1,300 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The pad as the engine sees it (inject/inject.h says what it is), and code run
+ * in a stopped task on it.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/futex.h>
+#include <signal.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "inject_blob.h"
+#include "internal.h"
+
+#define PAGE 4096u
+
+static size_t page_up(size_t n)
+{
+	return (n + PAGE - 1) & ~(size_t)(PAGE - 1);
+}
+
+/* A block: struct inj_thread, stack (growing down), signal frame.  With AVX-512
+ * it all fits one page. */
+static size_t block_stack_top(void)
+{
+	return 896;
+}
+_Static_assert(sizeof(struct inj_thread) <= 320, "leave most of it to the stack");
+
+size_t pad_layout(struct pad *pad, uint32_t slots, uint32_t threads_max)
+{
+	pad->slots = slots;
+	pad->threads_max = threads_max;
+	pad->block_bytes = page_up(block_stack_top() + arch_frame_bytes());
+	pad->slot_bytes = page_up(sizeof(struct inj_slot)) + INJ_SETUP_BYTES + INJ_FILES_BYTES +
+			  threads_max * pad->block_bytes;
+	pad->bytes = INJ_SLOTS_OFFSET + slots * pad->slot_bytes;
+	return pad->bytes;
+}
+
+int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t nonce,
+	     struct avc_error *err)
+{
+	char name[64];
+	void *map;
+	int fd;
+
+	/* Needs CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN (proc(5), map_files). */
+	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)base,
+		 (unsigned long)(base + bytes));
+	fd = proc_open(pid, name, O_RDWR);
+	if (fd < 0)
+		return fail_errno(err, pid, "infect", "open(map_files)",
+				  "the pad can not be reached");
+	map = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	close(fd);
+	if (map == MAP_FAILED)
+		return fail_errno(err, pid, "infect", "mmap", "the pad can not be mapped");
+	pad->base = base;
+	pad->map = map;
+	pad->control = (struct inj_control *)(pad->map + INJ_CODE_BYTES);
+	memcpy(pad->map, inject_blob, sizeof inject_blob);
+	pad->control->nonce = nonce;
+	pad->control->magic = INJ_MAGIC;
+	return 0;
+}
+
+void pad_close(struct pad *pad)
+{
+	if (pad->map)
+		munmap(pad->map, pad->bytes);
+	*pad = (struct pad){ 0 };
+}
+
+struct inj_slot *pad_slot(const struct pad *pad, uint32_t slot)
+{
+	return (struct inj_slot *)(pad->map + INJ_SLOTS_OFFSET + slot * pad->slot_bytes);
+}
+
+avc_remote pad_remote(const struct pad *pad, const void *local)
+{
+	return pad->base + (avc_remote)((const uint8_t *)local - pad->map);
+}
+
+bool pad_contains(const struct pad *pad, avc_remote address)
+{
+	return pad->base && address >= pad->base && address < pad->base + pad->bytes;
+}
+
+uint8_t *pad_setup(const struct pad *pad, uint32_t slot)
+{
+	return (uint8_t *)pad_slot(pad, slot) + page_up(sizeof(struct inj_slot));
+}
+
+uint8_t *pad_files(const struct pad *pad, uint32_t slot)
+{
+	return pad_setup(pad, slot) + INJ_SETUP_BYTES;
+}
+
+static uint8_t *block(const struct pad *pad, uint32_t slot, uint32_t i)
+{
+	return pad_files(pad, slot) + INJ_FILES_BYTES + i * pad->block_bytes;
+}
+
+struct inj_thread *pad_thread(const struct pad *pad, uint32_t slot, uint32_t i)
+{
+	return (struct inj_thread *)block(pad, slot, i);
+}
+
+void *pad_stack(const struct pad *pad, uint32_t slot, uint32_t i)
+{
+	return block(pad, slot, i) + block_stack_top();
+}
+
+void *pad_frame(const struct pad *pad, uint32_t slot, uint32_t i)
+{
+	return block(pad, slot, i) + block_stack_top();
+}
+
+void call_begin(struct inj_call *call, enum inj_after after)
+{
+	call->done = 0;
+	call->count = 0;
+	call->after = after;
+}
+
+struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
+			     uint64_t d, uint64_t e)
+{
+	struct inj_syscall *s = &call->call[call->count++];
+
+	*s = (struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, 0 }, .result = -ENOSYS };
+	return s;
+}
+
+/* A task that is killed never gets done: to be noticed at once, for its process
+ * can not be reaped before we have. */
+static int wait_done(struct inj_call *call, pid_t tid, struct avc_error *err)
+{
+	const struct timespec slice = { .tv_nsec = 500000 };
+	const uint64_t end = now_ns() + INJ_PARK_MS / 2 * NS_PER_MS;
+
+	while (!__atomic_load_n(&call->done, __ATOMIC_ACQUIRE)) {
+		struct stop stop;
+
+		syscall(SYS_futex, &call->done, FUTEX_WAIT, 0, &slice, NULL, 0);
+		if (__atomic_load_n(&call->done, __ATOMIC_ACQUIRE))
+			break;
+		stop = tracee_wait(tid, WNOHANG);
+		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
+			return fail(err, AVC_GONE, 0, tid, "run injected code", "", "it has ended");
+		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP)
+			ptrace(PTRACE_CONT, tid, NULL,
+			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+		if (now_ns() > end)
+			return fail(err, AVC_DEADLINE, 0, tid, "run injected code", "",
+				    "the task did not get to run in time");
+	}
+	return 0;
+}
+
+int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, struct inj_call *call,
+	     struct avc_error *err)
+{
+	struct arch_regs regs;
+
+	arch_call(&regs, base, pad->base + INJ_RUN_OFFSET,
+		  pad_remote(pad, call->stack + sizeof call->stack), pad_remote(pad, call));
+	if (arch_regs_set(tid, &regs))
+		return fail_errno(err, tid, "run injected code", "ptrace(SETREGS)", "it has gone");
+	return 0;
+}
+
+int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
+	if (wait_done(call, tid, err))
+		return -1;
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+		return fail_errno(err, tid, "run injected code", "ptrace(INTERRUPT)",
+				  "it has gone");
+	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
+/* It has made all its calls and not stopped: a limit of processes, or of memory. */
+static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_error *err)
+{
+	const int64_t result = call->call[(call->count - 1) % INJ_CALLS_MAX].result;
+
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
+	if (tracee_await(tid, NULL, err) != STOP_TRAP)
+		return -1;
+	return fail(err, AVC_KERNEL, (int)-result, tid, "clone", "clone",
+		    "it may not have another process: %s", strerror((int)-result));
+}
+
+int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
+{
+	return pad_run_clone_while(tid, call, NULL, NULL, child, err);
+}
+
+int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			void *arg, pid_t *child, struct avc_error *err)
+{
+	int signal = 0;
+
+	for (;;) {
+		struct stop stop;
+
+		if (ptrace(PTRACE_CONT, tid, NULL, (long)signal))
+			return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
+		if (meanwhile)
+			meanwhile(arg);
+		meanwhile = NULL;
+		tracee_watch(&call->done);
+		stop = tracee_wait(tid, 0);
+		tracee_watch(NULL);
+		switch (stop.kind) {
+		case STOP_FORK:
+			*child = stop.message;
+			return 0;
+		case STOP_EXIT:
+		case STOP_DYING:
+			return fail(err, AVC_GONE, 0, tid, "clone", "", "it has ended");
+		case STOP_DEADLINE:
+			if (!__atomic_load_n(&call->done, __ATOMIC_ACQUIRE))
+				return fail(err, AVC_DEADLINE, 0, tid, "clone", "clone",
+					    "not done in time");
+			return clone_refused(tid, call, err);
+		default:
+			/* SIGSTOP, SIGCONT and job control make stops of their own
+			 * (ptrace(2), PTRACE_EVENT_STOP). */
+			signal = stop.kind == STOP_SIGNAL ? stop.signal : 0;
+		}
+	}
+}
+
+bool in_old_pad(const struct target *target, avc_remote address)
+{
+	for (uint32_t i = 0; i < target->old_pads; i++)
+		if (address - target->old_pad[i].base < target->old_pad[i].bytes)
+			return true;
+	return false;
+}
+
+int suspend_seccomp(const struct thread *thread, bool suspend, struct avc_error *err)
+{
+	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL,
+		   (long)(TRACE_OPTIONS_APP | (suspend ? PTRACE_O_SUSPEND_SECCOMP : 0))))
+		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",
+				  "it has gone");
+	return 0;
+}
+
+int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+{
+	const uint64_t all = ~UINT64_C(0);
+	struct inj_control *control = target->pad.control;
+	struct arch_regs home;
+
+	/* Homes are places of the app's, never of a pad that will be taken away. */
+	if (in_old_pad(target, arch_pc(&thread->regs)))
+		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
+			    "still on its way home from a guard that died");
+	/* The kernel forgets a restartable sequence as soon as the thread is
+	 * seen elsewhere: it has to go on where the kernel would send it. */
+	rseq_fixup(target->mem_fd, thread);
+	home = thread->regs;
+	arch_resume(&home);
+	arch_home_set(&control->home, &home, thread->sigmask);
+	/* Registers first: if we die between the two, the thread is in the pad
+	 * with its own mask and goes home with it.  The other way round it would
+	 * be in the app with every signal blocked, for ever. */
+	if (suspend_seccomp(thread, true, err) ||
+	    pad_send(&target->pad, thread->tid, &thread->regs, &control->runner, err))
+		return -1;
+	thread->borrowed = true;
+	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
+		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
+				  "it has gone");
+	return 0;
+}
+
+int give_back(struct thread *thread, struct avc_error *err)
+{
+	/* The mask first, for the same reason. */
+	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
+	    arch_regs_set(thread->tid, &thread->regs))
+		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
+	thread->borrowed = false;
+	return suspend_seccomp(thread, false, err);
+}

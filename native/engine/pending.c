@@ -1,0 +1,178 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Signals that have been sent and not delivered: read from the queues while
+ * everything is stopped (PTRACE_PEEKSIGINFO, ptrace(2)), queued again by the
+ * restored threads themselves, which may give any siginfo to their own process.
+ */
+#include <errno.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+
+#include "internal.h"
+
+#define PENDING_MAX 1024
+#define AT_ONCE 32
+
+struct pending {
+	uint32_t count;
+	bool too_many;
+	struct {
+		int block; /* of the thread, -1: of the process                    */
+		siginfo_t info;
+	} signal[PENDING_MAX];
+	siginfo_t buffer[AT_ONCE];
+};
+
+struct pending *pending_new(void)
+{
+	return calloc(1, sizeof(struct pending));
+}
+
+/* A thread that was killed meanwhile has none any more: nor has the whole process. */
+static void read_queue(struct pending *pending, pid_t tid, int block)
+{
+	struct __ptrace_peeksiginfo_args args = {
+		.flags = block < 0 ? PTRACE_PEEKSIGINFO_SHARED : 0,
+		/* Nearly always there is none: one is enough to find out. */
+		.nr = 1,
+	};
+
+	for (;;) {
+		const long n = ptrace(PTRACE_PEEKSIGINFO, tid, &args, pending->buffer);
+
+		for (long i = 0; i < n; i++) {
+			if (pending->count == PENDING_MAX) {
+				pending->too_many = true;
+				return;
+			}
+			pending->signal[pending->count].block = block;
+			pending->signal[pending->count++].info = pending->buffer[i];
+		}
+		if (n < args.nr)
+			return;
+		args.off += (uint64_t)n;
+		args.nr = AT_ONCE;
+	}
+}
+
+/* Signals that the app has handlers for, as in sigset_t; 0 if it can not be told. */
+static uint64_t caught(pid_t pid)
+{
+	char buf[4096], *line;
+
+	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
+		return 0;
+	line = strstr(buf, "\nSigCgt:");
+	return line ? strtoull(line + 8, NULL, 16) : 0;
+}
+
+static bool takes(const struct thread *t, int signal)
+{
+	return t->block >= 0 && !(t->sigmask >> (signal - 1) & 1);
+}
+
+/* A thread that was just about to run a handler: its call is cut short by the signal,
+ * so it has to get that, also one that any thread could take.  (One that is ignored
+ * is queued only because we trace.) */
+static void assign(struct target *target)
+{
+	struct pending *pending = target->pending;
+	const uint64_t handled = pending->count ? caught(target->pid) : 0;
+
+	for (uint32_t k = 0; k < pending->count; k++) {
+		const int signal = pending->signal[k].info.si_signo;
+		struct thread *found = NULL;
+
+		if (!(handled >> (signal - 1) & 1))
+			continue;
+		for (uint32_t i = 0; i < target->thread_count; i++) {
+			struct thread *t = &target->threads[i];
+
+			/* The kernel, too, likes to give the main thread such a one. */
+			if (takes(t, signal) &&
+			    (pending->signal[k].block == t->block ||
+			     (pending->signal[k].block < 0 && (!found || t->block == 0))))
+				found = t;
+		}
+		if (found) {
+			found->signalled = true;
+			pending->signal[k].block = found->block;
+		}
+	}
+}
+
+void pending_read(struct target *target)
+{
+	struct pending *pending = target->pending;
+
+	pending->count = 0;
+	pending->too_many = false;
+	for (uint32_t i = 0; i < target->thread_count; i++) {
+		struct thread *t = &target->threads[i];
+
+		t->signalled = false;
+		if (t->block < 0)
+			continue;
+		if (t->block == 0)
+			read_queue(pending, t->tid, -1);
+		read_queue(pending, t->tid, t->block);
+	}
+	assign(target);
+}
+
+bool pending_contains(const struct pending *pending, int signal, int timer)
+{
+	for (uint32_t i = 0; i < pending->count; i++) {
+		const siginfo_t *info = &pending->signal[i].info;
+
+		if (info->si_signo == signal &&
+		    (timer < 0 || (info->si_code == SI_TIMER && info->si_timerid == timer)))
+			return true;
+	}
+	return false;
+}
+
+/* A process that is stopped while it is being put together would never be ready. */
+static bool can_be_queued(const siginfo_t *info)
+{
+	return info->si_signo != SIGSTOP && info->si_signo != SIGKILL;
+}
+
+void pending_setup_thread(const struct target *target, const struct thread *thread,
+			  struct setup *setup)
+{
+	const struct pending *pending = target->pending;
+
+	for (uint32_t i = 0; i < pending->count; i++) {
+		const siginfo_t *info = &pending->signal[i].info;
+
+		if (pending->signal[i].block == thread->block && can_be_queued(info))
+			setup_add_thread(setup, "rt_tgsigqueueinfo", SYS_rt_tgsigqueueinfo,
+					 (uint64_t)target->inside, (uint64_t)thread->inside,
+					 (uint64_t)info->si_signo,
+					 setup_data(setup, info, sizeof *info), 0)
+				->flags = INJ_MAY_FAIL;
+	}
+}
+
+void pending_setup(const struct target *target, struct setup *setup)
+{
+	const struct pending *pending = target->pending;
+
+	for (uint32_t i = 0; i < pending->count; i++) {
+		const siginfo_t *info = &pending->signal[i].info;
+
+		if (pending->signal[i].block < 0 && can_be_queued(info))
+			setup_add(setup, INJ_AFTER, "rt_sigqueueinfo", SYS_rt_sigqueueinfo,
+				  (uint64_t)target->inside, (uint64_t)info->si_signo,
+				  setup_data(setup, info, sizeof *info), 0, 0)
+				->flags = INJ_MAY_FAIL;
+	}
+	if (pending->too_many && !setup->notice.code)
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		     "more than %d signals are pending; the others are lost at a restore",
+		     PENDING_MAX);
+}

@@ -1,0 +1,273 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * /proc, see proc(5).
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+int proc_open(pid_t pid, const char *name, int flags)
+{
+	char path[96];
+
+	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
+	return open(path, flags | O_CLOEXEC);
+}
+
+ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size)
+{
+	int fd = proc_open(pid, name, O_RDONLY), saved;
+	ssize_t n;
+
+	if (fd < 0)
+		return -1;
+	n = read(fd, buf, size - 1);
+	saved = errno;
+	close(fd);
+	errno = saved;
+	if (n >= 0)
+		buf[n] = 0;
+	return n;
+}
+
+int proc_stat(pid_t pid, struct proc_stat *stat)
+{
+	char buf[1024], *p;
+	int tty;
+	unsigned long long start;
+
+	if (proc_read(pid, "stat", buf, sizeof buf) < 0)
+		return -1;
+	/* The name may hold anything, also ") R": the last ')' ends it. */
+	p = strrchr(buf, ')');
+	if (!p ||
+	    sscanf(p + 1,
+		   " %c %d %d %d %d %d %*u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %*d %*d %llu",
+		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
+		   &stat->tty_group, &start) != 7) {
+		errno = EPROTO;
+		return -1;
+	}
+	stat->tty = (uint32_t)tty;
+	stat->start = start;
+	return 0;
+}
+
+pid_t proc_inside(pid_t tid)
+{
+	char buf[4096], *line, *last, *end;
+
+	if (proc_read(tid, "status", buf, sizeof buf) < 0)
+		return -1;
+	line = strstr(buf, "\nNSpid:");
+	if (!line)
+		return -1;
+	line++;
+	end = strchr(line, '\n');
+	if (end)
+		*end = 0;
+	last = strrchr(line, '\t');
+	return last ? atoi(last) : -1;
+}
+
+int proc_children(pid_t pid, pid_t *children, int max)
+{
+	char name[48], buf[8192], *p = buf;
+	int count = 0;
+
+	snprintf(name, sizeof name, "task/%d/children", pid);
+	if (proc_read(pid, name, buf, sizeof buf) < 0)
+		return -1;
+	while (count < max) {
+		char *next;
+		long child = strtol(p, &next, 10);
+
+		if (next == p)
+			break;
+		children[count++] = (pid_t)child;
+		p = next;
+	}
+	return count;
+}
+
+static const struct {
+	char name[3];
+	enum mapping_flag flag;
+} mapping_flags[] = {
+	{ "dc", MAPPING_DONTFORK }, { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
+	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },
+};
+
+static uint32_t parse_flags(const char *p)
+{
+	uint32_t flags = 0;
+
+	for (; *p == ' '; p += strlen(p) > 3 ? 3 : strlen(p))
+		for (size_t i = 0; i < sizeof mapping_flags / sizeof *mapping_flags; i++)
+			if (!strncmp(p + 1, mapping_flags[i].name, 2))
+				flags |= mapping_flags[i].flag;
+	return flags;
+}
+
+static bool parse_mapping(const char *line, struct mapping *m)
+{
+	unsigned long start, end, offset, inode;
+	int name = 0;
+
+	*m = (struct mapping){ 0 };
+	if (sscanf(line, "%lx-%lx %4s %lx %*x:%*x %lu %n", &start, &end, m->mode, &offset, &inode,
+		   &name) < 5)
+		return false;
+	m->start = start;
+	m->end = end;
+	m->offset = offset;
+	m->inode = inode;
+	m->shared = m->mode[3] == 's';
+	snprintf(m->name, sizeof m->name, "%.*s", (int)strcspn(line + name, "\n"), line + name);
+	return true;
+}
+
+int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
+		  void *arg)
+{
+	const bool smaps = !strcmp(file, "smaps");
+	struct mapping m = { 0 };
+	char path[64], *line = NULL;
+	size_t size = 0;
+	int result = 0;
+	FILE *maps;
+
+	snprintf(path, sizeof path, "/proc/%d/%s", pid, file);
+	maps = fopen(path, "re");
+	if (!maps)
+		return -1;
+	while (!result && getline(&line, &size, maps) > 0) {
+		if (smaps && !strncmp(line, "VmFlags:", 8)) {
+			m.flags = parse_flags(line + 8);
+			result = fn(&m, arg);
+		} else if (!smaps || !(line[0] >= 'A' && line[0] <= 'Z')) {
+			if (parse_mapping(line, &m) && !smaps)
+				result = fn(&m, arg);
+		}
+	}
+	if (ferror(maps))
+		result = -1;
+	free(line);
+	fclose(maps);
+	return result < 0 ? -1 : 0;
+}
+
+static void parse_ids(const char *p, uint32_t id[4])
+{
+	sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]);
+}
+
+int proc_status(pid_t tid, struct proc_status *status)
+{
+	static const char *const caps[5] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
+					     "CapAmb:" };
+	char buf[8192], *line, *save = NULL;
+
+	*status = (struct proc_status){ .locked_kb = -1 };
+	if (proc_read(tid, "status", buf, sizeof buf) <= 0)
+		return -1;
+	for (line = strtok_r(buf, "\n", &save); line; line = strtok_r(NULL, "\n", &save)) {
+		const char *value = strchr(line, '\t');
+
+		if (!value)
+			continue;
+		if (!strncmp(line, "NSpid:", 6))
+			status->inside = atoi(strrchr(line, '\t') + 1);
+		else if (!strncmp(line, "VmLck:", 6))
+			status->locked_kb = strtoll(value, NULL, 10);
+		else if (!strncmp(line, "Uid:", 4))
+			parse_ids(value, status->uid);
+		else if (!strncmp(line, "Gid:", 4))
+			parse_ids(value, status->gid);
+		else if (!strncmp(line, "Groups:", 7))
+			for (; *value; value++)
+				status->groups = status->groups * 31 + (unsigned char)*value;
+		else if (!strncmp(line, "NoNewPrivs:", 11))
+			status->no_new_privs = (uint32_t)atoi(value);
+		else if (!strncmp(line, "Seccomp:", 8))
+			status->seccomp = (uint32_t)atoi(value);
+		else if (!strncmp(line, "Seccomp_filters:", 16))
+			status->seccomp_filters = (uint32_t)atoi(value);
+		else
+			for (int i = 0; i < 5; i++)
+				if (!strncmp(line, caps[i], 7))
+					status->caps[i] = strtoull(value, NULL, 16);
+	}
+	return 0;
+}
+
+struct linux_dirent64 {
+	uint64_t d_ino;
+	int64_t d_off;
+	unsigned short d_reclen;
+	unsigned char d_type;
+	char d_name[];
+};
+
+int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg)
+{
+	char buf[16384] __attribute__((aligned(8)));
+
+	if (lseek(task_dirfd, 0, SEEK_SET) < 0)
+		return -1;
+	for (;;) {
+		long n = syscall(SYS_getdents64, task_dirfd, buf, sizeof buf);
+
+		if (n < 0)
+			return -1;
+		if (n == 0)
+			return 0;
+		for (long at = 0; at < n;) {
+			struct linux_dirent64 *entry = (struct linux_dirent64 *)(buf + at);
+
+			at += entry->d_reclen;
+			if (entry->d_name[0] != '.' && fn((pid_t)atoi(entry->d_name), arg) < 0)
+				return -1;
+		}
+	}
+}
+
+long proc_vm_pages(pid_t pid)
+{
+	char buf[128];
+
+	if (proc_read(pid, "statm", buf, sizeof buf) <= 0)
+		return -1;
+	return atol(buf);
+}
+
+pid_t proc_pidfd_pid(int pidfd)
+{
+	char name[48], buf[1024], *line;
+
+	snprintf(name, sizeof name, "fdinfo/%d", pidfd);
+	if (proc_read(getpid(), name, buf, sizeof buf) < 0)
+		return -1;
+	line = strstr(buf, "Pid:");
+	return line ? atoi(line + 4) : -1;
+}
+
+int proc_pidfd_open(pid_t pid)
+{
+	return (int)syscall(SYS_pidfd_open, pid, 0);
+}
+
+bool pidfd_ended(int pidfd)
+{
+	struct pollfd p = { .fd = pidfd, .events = POLLIN };
+
+	return poll(&p, 1, 0) == 1;
+}

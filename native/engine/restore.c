@@ -1,0 +1,236 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A template becomes the app again: it forks a process with the app's own PID,
+ * which puts itself together (inject.c, inj_restore) and waits until everything
+ * is there; then all its threads go at once.  The new process is not traced.
+ */
+#include <errno.h>
+#include <linux/futex.h>
+#include <poll.h>
+#include <sched.h>
+#include <signal.h>
+#include <string.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "inject_blob.h"
+#include "internal.h"
+
+#define TRIES 8 /* at once */
+#define TRY_NS NS_PER_S
+#define TRY_AGAIN_NS (NS_PER_MS / 2)
+#define READY_NS (2 * NS_PER_S)
+#define FORK_NS (5 * NS_PER_S)
+
+static const char *const step_names[] = {
+	[INJ_STEP_SESSION] = "setsid",
+	[INJ_STEP_GROUP] = "setpgid",
+	[INJ_STEP_TTY] = "ioctl(TIOCSPGRP)",
+	[INJ_STEP_ROBUST] = "set_robust_list",
+	[INJ_STEP_RSEQ] = "rseq",
+	[INJ_STEP_THREAD] = "clone",
+	[INJ_STEP_TID] = "clone",
+	[INJ_STEP_BASE] = "arch_prctl",
+};
+
+/* Waits while *word == value; false after `end`. */
+static bool wait_word(uint32_t *word, uint32_t value, uint64_t end)
+{
+	const struct timespec slice = { .tv_nsec = 20 * (long)NS_PER_MS };
+
+	while (__atomic_load_n(word, __ATOMIC_ACQUIRE) == value) {
+		if (now_ns() > end)
+			return false;
+		syscall(SYS_futex, word, FUTEX_WAIT, value, &slice, NULL, 0);
+	}
+	return true;
+}
+
+static void reset(const struct pad *pad, uint32_t slot_number)
+{
+	struct inj_slot *slot = pad_slot(pad, slot_number);
+
+	slot->state = INJ_IDLE;
+	slot->go = 0;
+	slot->ready = 0;
+	slot->running = 0;
+	slot->error = 0;
+	slot->error_at = INJ_STEP_NONE;
+	slot->error_tid = 0;
+	slot->error_setup = 0;
+	slot->block_bytes = (uint32_t)pad->block_bytes;
+	slot->blocks = pad_remote(pad, pad_thread(pad, slot_number, 0));
+}
+
+/* One fork of the template; the child is sent to inj_restore() and let go. */
+static int fork_template(struct target *target, struct generation *generation, pid_t *pid,
+			 int *pidfd, bool again, struct sandbox **sandbox, struct avc_error *err)
+{
+	const struct pad *pad = &target->pad;
+	struct inj_slot *slot = pad_slot(pad, generation->slot);
+	struct inj_call *call = &slot->template_call;
+	struct arch_regs regs;
+	pid_t child = 0;
+
+	/* The first time there are calls of files_restore() before it. */
+	if (again)
+		call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	if (pad_send(pad, generation->template, &generation->base, call, err) ||
+	    pad_run_clone(generation->template, call, &child, err))
+		return -1;
+	if (tracee_await(child, NULL, err) != STOP_TRAP)
+		return -1;
+	/* Its stack is the first thread's, in the slot. */
+	arch_call(&regs, &generation->base, pad->base + INJ_RESTORE_OFFSET,
+		  pad_remote(pad, pad_stack(pad, generation->slot, 0)), pad_remote(pad, slot));
+	close_fd(pidfd);
+	*pidfd = proc_pidfd_open(child);
+	if (*pidfd >= 0 && generation->sandboxed && arch_regs_set(child, &regs) == 0) {
+		*sandbox = sandbox_begin(child, err);
+		if (!*sandbox) {
+			tracee_kill(child);
+			return -1;
+		}
+	} else if (*pidfd < 0 || arch_regs_set(child, &regs) ||
+		   ptrace(PTRACE_DETACH, child, NULL, 0L)) {
+		fail_errno(err, child, "restore", "ptrace(DETACH)", "the new process was killed");
+		tracee_kill(child);
+		return -1;
+	}
+	*pid = child;
+	/* The template can come to rest meanwhile. */
+	return tracee_settle(generation->template, err);
+}
+
+static int describe_failure(const struct pad *pad, const struct inj_slot *slot,
+			    struct avc_error *err)
+{
+	const char *name = slot->error_at < sizeof step_names / sizeof *step_names
+				   ? step_names[slot->error_at]
+				   : NULL;
+
+	if (slot->error_at == INJ_STEP_TID)
+		return fail(err, AVC_KERNEL, slot->error, slot->pid, "restore", "clone",
+			    "thread number %d is taken by somebody else", slot->error_tid);
+	if (slot->error_at == INJ_STEP_SETUP)
+		return fail(err, AVC_KERNEL, slot->error, slot->pid, "restore",
+			    setup_name(pad, slot->error_setup), "thread %d could not be put back",
+			    slot->error_tid);
+	return fail(err, AVC_KERNEL, slot->error, slot->pid, "restore", name,
+		    "thread %d could not be put back", slot->error_tid);
+}
+
+/* Forks until the number that comes out is the app's; in a PID namespace that is
+ * shared somebody else may fork in between. */
+static int rebuild(struct target *target, struct generation *generation, struct last_pid *helper,
+		   pid_t *pid, int *pidfd, struct sandbox **sandbox, struct restore_times *times,
+		   struct avc_error *err)
+{
+	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
+
+	const uint64_t end = now_ns() + TRY_NS;
+
+	for (int i = 0; i < TRIES || now_ns() < end; i++) {
+		uint64_t start;
+
+		/* The dead app's number may be free only some time after it was
+		 * reaped; see spawn() in inject.c. */
+		if (i >= TRIES)
+			usleep(TRY_AGAIN_NS / 1000);
+		start = now_ns();
+		reset(&target->pad, generation->slot);
+		timers_advance(generation->timers, start);
+		if (last_pid_set(helper, slot->pid - 1, err) ||
+		    fork_template(target, generation, pid, pidfd, i > 0, sandbox, err))
+			return -1;
+		times->fork_ns = now_ns() - start;
+		start = now_ns();
+		if (*sandbox ? !sandbox_wait(*sandbox, &slot->state, start + READY_NS)
+			     : !wait_word(&slot->state, INJ_IDLE, start + READY_NS))
+			return fail(err, AVC_KERNEL, ETIMEDOUT, *pid, "restore", "",
+				    "the new process does not answer");
+		times->threads_ns = now_ns() - start;
+		if (slot->state == INJ_READY)
+			return 0;
+		if (*sandbox)
+			sandbox_end(*sandbox);
+		*sandbox = NULL;
+		if (slot->state == INJ_FAILED)
+			return describe_failure(&target->pad, slot, err);
+	}
+	return fail(err, AVC_KERNEL, EEXIST, slot->pid, "restore", "clone",
+		    "the PID is taken by somebody else");
+}
+
+/* What was allowed to fail, and did: to be told. */
+static void note_failed(const struct pad *pad, uint32_t slot, pid_t pid, struct avc_error *notice)
+{
+	const struct inj_setup *s = setup_failed(pad, slot);
+
+	if (s)
+		fail(notice, AVC_KERNEL, (int)-s->call.result, pid, "restore",
+		     setup_name(pad, pad_remote(pad, s)), "not everything could be put back");
+}
+
+int restore(struct target *target, struct generation *generation, const struct link *link,
+	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
+	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
+	    struct restore_times *times, struct avc_error *notes, struct avc_error *err)
+{
+	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
+	struct last_pid *helper = last_pid_start(link->pidns_fd, slot, err);
+	struct sandbox *sandbox = NULL;
+	int result, pidfd = -1;
+
+	*pid = 0;
+	*times = (struct restore_times){ 0 };
+	if (!helper)
+		return -1;
+	tracee_deadline_set(timer, FORK_NS);
+	result = files_restore(target, generation, config, link->init, notes, err);
+	if (!result)
+		result = rebuild(target, generation, helper, pid, &pidfd, &sandbox, times, err);
+	tracee_deadline_clear(timer);
+	last_pid_stop(helper);
+	if (!result)
+		note_failed(&target->pad, generation->slot, *pid, notes);
+	if (!result)
+		files_check_calls(&target->pad, generation->slot, slot->pid, notes);
+	if (!result)
+		attributes_put_back(generation->attributes, *pid, notes);
+	if (!result)
+		result = memory_put_back(generation->image, err);
+	if (!result)
+		result = ready(arg, err);
+	if (result) {
+		/* It waits for `go`: nothing of the app's has run.  The numbers it
+		 * holds must be free before another generation is tried. */
+		if (sandbox)
+			sandbox_end(sandbox);
+		if (pidfd >= 0) {
+			struct pollfd gone = { .fd = pidfd, .events = POLLIN };
+
+			syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
+			poll(&gone, 1, 1000);
+			close_fd(&pidfd);
+		}
+		*pid = 0;
+		return -1;
+	}
+	if (sandbox)
+		sandbox_go(sandbox, &target->pad, generation->slot);
+	__atomic_store_n(&slot->go, 1, __ATOMIC_RELEASE);
+	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+	for (uint64_t end = now_ns() + READY_NS;;) {
+		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
+
+		if (running == slot->threads || now_ns() > end || pidfd_ended(pidfd))
+			break; /* or it has died again already */
+		wait_word(&slot->running, running, now_ns() + NS_PER_MS);
+	}
+	times->restore_ns = now_ns() - died_ns;
+	close_fd(&pidfd);
+	return 0;
+}

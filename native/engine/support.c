@@ -1,0 +1,160 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What can not be protected, found while the app runs; and whether this is a
+ * good moment.
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+static const struct {
+	const char *prefix, *reason;
+} unsupported_fds[] = {
+	{ "anon_inode:[io_uring]", "it uses io_uring" },
+	{ "anon_inode:[userfaultfd]", "it uses userfaultfd" },
+	{ "anon_inode:[perf_event]", "it has performance counters open" },
+	{ "/dev/nvidia", "it has a GPU device open" },
+	{ "/dev/dri/", "it has a GPU device open" },
+	{ "/dev/kfd", "it has a GPU device open" },
+	{ "/dev/kvm", "it runs virtual machines" },
+};
+
+static int check_descriptors(struct target *target, struct avc_error *err)
+{
+	char path[64], link[128];
+	struct dirent *entry;
+	int result = 0;
+	DIR *dir;
+
+	snprintf(path, sizeof path, "/proc/%d/fd", target->pid);
+	dir = opendir(path);
+	if (!dir)
+		return fail_errno(err, target->pid, "check", "open(fd)", "it has ended");
+	target->socket_count = 0;
+	while (!result && (entry = readdir(dir))) {
+		ssize_t n = readlinkat(dirfd(dir), entry->d_name, link, sizeof link - 1);
+
+		if (n <= 0)
+			continue;
+		link[n] = 0;
+		if (!strncmp(link, "socket:", 7) && target->socket_count < SOCKETS_MAX)
+			target->sockets[target->socket_count++] = atoi(entry->d_name);
+		for (size_t i = 0; i < sizeof unsupported_fds / sizeof *unsupported_fds; i++)
+			if (!strncmp(link, unsupported_fds[i].prefix,
+				     strlen(unsupported_fds[i].prefix)))
+				result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+					      "%s", unsupported_fds[i].reason);
+	}
+	closedir(dir);
+	return result;
+}
+
+/* Only when its size has changed: the file is long. */
+static int check_mappings(struct target *target, struct avc_error *err)
+{
+	const long pages = proc_vm_pages(target->pid);
+	char path[64], line[512];
+	int result = 0;
+	FILE *maps;
+
+	if (pages == target->surveyed_pages)
+		return 0;
+	snprintf(path, sizeof path, "/proc/%d/maps", target->pid);
+	maps = fopen(path, "re");
+	if (!maps)
+		return fail_errno(err, target->pid, "check", "open(maps)", "it has ended");
+	while (!result && fgets(line, sizeof line, maps))
+		if (strstr(line, " /[aio]"))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				      "it uses kernel AIO");
+	fclose(maps);
+	target->surveyed_pages = result ? -1 : pages;
+	return result;
+}
+
+struct children {
+	pid_t pid;
+	int count;
+};
+
+static int count_children(pid_t tid, void *arg)
+{
+	struct children *children = arg;
+	char name[64], buf[256];
+
+	/* A child hangs on the thread that forked it. */
+	snprintf(name, sizeof name, "task/%d/children", tid);
+	if (proc_read(children->pid, name, buf, sizeof buf) > 0)
+		for (const char *p = buf; *p; p++)
+			children->count += *p == ' ';
+	return 0;
+}
+
+static int check_children(struct target *target, struct avc_error *err)
+{
+	struct children children = { .pid = target->pid };
+
+	if (proc_tasks(target->task_dirfd, count_children, &children))
+		return fail_errno(err, target->pid, "check", "getdents64", "it has ended");
+	if (children.count)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			    "it has child processes (%d); only single processes are protected yet",
+			    children.count);
+	return 0;
+}
+
+int support_check(struct target *target, bool *passing, struct avc_error *err)
+{
+	*passing = false;
+	if (check_descriptors(target, err) || check_mappings(target, err))
+		return -1;
+	/* Thread by thread only when the last checkpoint did not find that it has none. */
+	*passing = !target->childless && check_children(target, err) != 0;
+	return *passing ? -1 : 0;
+}
+
+/* By way of the process: a second entry for each thread in the kernel's memory of
+ * /proc would make its end longer (see ask()). */
+static int is_awake(pid_t tid, void *arg)
+{
+	const pid_t pid = *(const pid_t *)arg;
+	char name[48], buf[512], *p;
+
+	snprintf(name, sizeof name, "task/%d/stat", tid);
+	if (proc_read(pid, name, buf, sizeof buf) <= 0)
+		return 0;
+	p = strrchr(buf, ')');
+	return p && p[1] == ' ' && p[2] == 'R' ? -1 : 0;
+}
+
+static bool unread_bytes(const struct target *target)
+{
+	for (uint32_t i = 0; i < target->socket_count; i++) {
+		int fd = (int)syscall(SYS_pidfd_getfd, target->pidfd, target->sockets[i], 0),
+		    bytes = 0;
+
+		if (fd < 0)
+			continue; /* closed since */
+		if (ioctl(fd, FIONREAD, &bytes))
+			bytes = 0; /* not one that bytes come from */
+		close(fd);
+		if (bytes)
+			return true;
+	}
+	return false;
+}
+
+bool quiescent(const struct target *target)
+{
+	pid_t pid = target->pid;
+
+	return proc_tasks(target->task_dirfd, is_awake, &pid) == 0 && !unread_bytes(target);
+}

@@ -1,0 +1,221 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * ptrace(2), the parts every other file needs.
+ *
+ * Waiting: a guard waits for its own tracees only (__WNOTHREAD), so guards in
+ * one process do not steal each other's news.  The rest of that process must not
+ * call waitpid(-1).
+ */
+#include <errno.h>
+#include <sched.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define TICK_NS (2 * (long)NS_PER_MS)
+
+#ifndef sigev_notify_thread_id
+#define sigev_notify_thread_id _sigev_un._tid
+#endif
+
+static void nothing(int signal)
+{
+	(void)signal;
+}
+
+static int timer_signal(void)
+{
+	return SIGRTMAX - 2;
+}
+
+static void install_handler(void)
+{
+	struct sigaction action = { .sa_handler = nothing }; /* no SA_RESTART: wait(2) ends */
+
+	sigaction(timer_signal(), &action, NULL);
+}
+
+int tracee_timer_new(timer_t *timer, struct avc_error *err)
+{
+	static pthread_once_t once = PTHREAD_ONCE_INIT;
+	struct sigevent event = { .sigev_notify = SIGEV_THREAD_ID, .sigev_signo = timer_signal() };
+	sigset_t set;
+
+	pthread_once(&once, install_handler);
+	sigfillset(&set);
+	sigdelset(&set, timer_signal());
+	pthread_sigmask(SIG_SETMASK, &set, NULL);
+	event.sigev_notify_thread_id = (pid_t)syscall(SYS_gettid);
+	if (timer_create(CLOCK_MONOTONIC, &event, timer))
+		return fail_errno(err, 0, "start guard", "timer_create",
+				  "no timer for the deadline");
+	return 0;
+}
+
+static __thread uint64_t deadline_ns; /* CLOCK_MONOTONIC */
+static __thread const uint32_t *watched;
+
+void tracee_watch(const uint32_t *word)
+{
+	watched = word;
+}
+
+/* Ticks before the deadline, to look whether what we wait for is dying, and after
+ * it: a tick that comes just before the thread has entered wait(2) is lost. */
+void tracee_deadline_set(timer_t timer, uint64_t ns)
+{
+	struct itimerspec t = { .it_interval.tv_nsec = TICK_NS, .it_value.tv_nsec = TICK_NS };
+
+	deadline_ns = now_ns() + ns;
+	timer_settime(timer, 0, &t, NULL);
+}
+
+void tracee_deadline_clear(timer_t timer)
+{
+	struct itimerspec t = { 0 };
+
+	timer_settime(timer, 0, &t, NULL);
+	deadline_ns = 0;
+}
+
+/* A killed leader is not reported as long as there are threads of it that were not
+ * waited for, and those are waited for one after the other: by us. */
+static bool is_dying(pid_t tid)
+{
+	struct proc_stat stat;
+
+	return proc_stat(tid, &stat) || stat.state == 'Z' || stat.state == 'X';
+}
+
+struct stop tracee_wait(pid_t tid, int options)
+{
+	struct stop stop = { .kind = STOP_OTHER };
+	unsigned long message = 0;
+	pid_t r;
+
+	do {
+		r = waitpid(tid, &stop.status, __WALL | __WNOTHREAD | options);
+		if (r < 0 && errno == EINTR) {
+			stop.kind = is_dying(tid) ? STOP_DYING : STOP_DEADLINE;
+			if (stop.kind == STOP_DYING || (deadline_ns && now_ns() >= deadline_ns) ||
+			    (watched && __atomic_load_n(watched, __ATOMIC_ACQUIRE)))
+				return stop;
+			r = -2;
+		}
+	} while (r == -2);
+	if (r == 0) {
+		stop.kind = STOP_NONE;
+		return stop;
+	}
+	if (r < 0 || !WIFSTOPPED(stop.status)) {
+		stop.kind = STOP_EXIT;
+		return stop;
+	}
+	stop.signal = WSTOPSIG(stop.status);
+	stop.event = stop.status >> 16;
+	switch (stop.event) {
+	case 0:
+		stop.kind = stop.signal == (SIGTRAP | 0x80) ? STOP_SYSCALL : STOP_SIGNAL;
+		break;
+	case PTRACE_EVENT_STOP:
+		stop.kind = stop.signal == SIGTRAP ? STOP_TRAP : STOP_GROUP;
+		break;
+	case PTRACE_EVENT_FORK:
+	case PTRACE_EVENT_VFORK:
+	case PTRACE_EVENT_CLONE:
+		stop.kind = STOP_FORK;
+		ptrace(PTRACE_GETEVENTMSG, tid, NULL, &message);
+		stop.message = (pid_t)message;
+	}
+	return stop;
+}
+
+enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
+{
+	for (;;) {
+		struct stop stop = tracee_wait(tid, 0);
+		int signal = 0;
+
+		switch (stop.kind) {
+		case STOP_TRAP:
+			return stop.kind;
+		case STOP_FORK:
+			if (child)
+				*child = stop.message;
+			break;
+		case STOP_SIGNAL:
+			signal = stop.signal;
+			break;
+		case STOP_SYSCALL:
+		case STOP_NONE:
+		case STOP_OTHER:
+			break;
+		case STOP_GROUP:
+			fail(err, AVC_DEADLINE, 0, tid, "stop", "",
+			     "it is stopped by a signal (job control)");
+			return stop.kind;
+		case STOP_EXIT:
+		case STOP_DYING:
+			fail(err, AVC_GONE, 0, tid, "stop", "", "it has ended");
+			return stop.kind;
+		case STOP_DEADLINE:
+			fail(err, AVC_DEADLINE, 0, tid, "stop", "", "it did not stop in time");
+			return stop.kind;
+		}
+		/* Any stop takes a pending interrupt away (kernel/signal.c, ptrace_stop):
+		 * without a new one it would just run on. */
+		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
+		    ptrace(PTRACE_CONT, tid, NULL, (long)signal)) {
+			fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
+			return STOP_OTHER;
+		}
+	}
+}
+
+int tracee_settle(pid_t tid, struct avc_error *err)
+{
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || ptrace(PTRACE_CONT, tid, NULL, 0L))
+		return fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
+	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
+bool tracee_is_ours(pid_t tid)
+{
+	char buf[4096], *line;
+
+	if (proc_read(tid, "status", buf, sizeof buf) <= 0)
+		return false;
+	line = strstr(buf, "\nTracerPid:");
+	return line && atoi(line + 11) == gettid();
+}
+
+bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg)
+{
+	siginfo_t info = { 0 };
+
+	if (waitid(P_ALL, 0, &info, WEXITED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) ||
+	    !info.si_pid || known(info.si_pid, arg))
+		return false;
+	return waitpid(info.si_pid, NULL, __WALL | __WNOTHREAD | WNOHANG) == info.si_pid;
+}
+
+void tracee_kill(pid_t pid)
+{
+	kill(pid, SIGKILL);
+	for (;;) {
+		int status;
+		pid_t r = waitpid(pid, &status, __WALL | __WNOTHREAD);
+
+		if (r == pid && (WIFEXITED(status) || WIFSIGNALED(status)))
+			return;
+		if (r < 0 && errno != EINTR)
+			return;
+	}
+}

@@ -1,0 +1,191 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * libavckpt: freeze, clone and restore.
+ *
+ * An *engine* owns a queue of events.  A *guard* protects one container: it is
+ * one native thread that makes every ptrace(2) call for that container, takes
+ * checkpoints on the interval, and restores when avckpt-init reports a death,
+ * with no call back into the caller between death and resume.
+ *
+ * Functions return 0, or -1 with *err filled in, unless said otherwise.  All
+ * of them may be called from any thread; none blocks for longer than it takes
+ * to hand a message over, except avc_guard_stop() and avc_engine_free().
+ */
+#ifndef AVCKPT_ENGINE_H
+#define AVCKPT_ENGINE_H
+
+#include <stdint.h>
+
+#include "avckpt/error.h"
+
+#define AVC_KEEP_MAX 16
+
+/* Regular files at a restore. */
+enum avc_files {
+	AVC_FILES_REWIND = 0, /* their offsets are the checkpoint's               */
+	AVC_FILES_KEEP = 1,   /* their offsets stay                               */
+	AVC_FILES_STRICT = 2  /* as REWIND; and no restore if one that is open for
+	                       * writing was written since the checkpoint         */
+};
+
+/* Established TCP connections at a restore. */
+enum avc_tcp {
+	AVC_TCP_KEEP = 0,       /* go on                                          */
+	AVC_TCP_RESET = 1,      /* are reset, and read as closed                  */
+	AVC_TCP_RESET_MOVED = 2 /* those on which bytes moved since the checkpoint */
+};
+
+/* What a guard is to do.  Durations in nanoseconds. */
+struct avc_config {
+	int32_t init_pidfd;          /* pidfd of avckpt-init; duplicated, stays the
+	                              * caller's                                  */
+	uint32_t keep;               /* generations kept, 1..AVC_KEEP_MAX         */
+	uint64_t interval_ns;        /* between checkpoints; 0: only on command   */
+	uint64_t freeze_deadline_ns; /* the app is never held longer than this to
+	                              * get it stopped; 0: 50 ms                  */
+	uint64_t quiesce_ns;         /* how long to look for a quiescent moment   */
+	/* restore_max restores within this time, then one of each older generation
+	 * that has not crashed, then give up.  A generation that dies again before
+	 * a checkpoint was possible gets half of them if there is an older one.  */
+	uint64_t restore_window_ns;
+	uint32_t restore_max;
+	uint64_t shm_bytes;             /* shared memory that is rolled back, at most */
+	uint8_t restore_on_signal;      /* killed by a signal nobody asked for       */
+	uint8_t restore_on_exit;        /* any non-zero exit status                  */
+	uint8_t files;                  /* enum avc_files                            */
+	uint8_t tcp;                    /* enum avc_tcp                              */
+	uint8_t restore_on_status[256]; /* [n] != 0: exit status n is abnormal    */
+};
+
+enum avc_event_kind {
+	AVC_EVENT_ATTACHED = 1,    /* init found and agreed with; app_pid is set  */
+	AVC_EVENT_CHECKPOINT = 2,  /* a generation was taken                      */
+	AVC_EVENT_MISSED = 3,      /* a checkpoint could not be taken; `error`.
+	                            * The guard tries again at the next interval  */
+	AVC_EVENT_UNPROTECTED = 4, /* the app can not be protected as it is;
+	                            * `error` is why.  Held generations are given
+	                            * up.  The guard looks again every interval   */
+	AVC_EVENT_DIED = 5,        /* the app died; wait_status, died_ns          */
+	AVC_EVENT_RESTORED = 6,    /* and runs again                              */
+	AVC_EVENT_GAVE_UP = 7,     /* a death that was not followed by a restore;
+	                            * `reason` and `error` say why; init ends     */
+	AVC_EVENT_ENDED = 8,       /* init is gone; the guard's last event, after
+	                            * it avc_guard_stop() returns at once         */
+	AVC_EVENT_REFUSED = 9,     /* a command could not be carried out          */
+	AVC_EVENT_DROPPED = 10     /* `generation` was given up before its time;
+	                            * `reason` is why: CRASHED (`attempt` times),
+	                            * UNHEALTHY, MEMORY, KILLED                   */
+};
+
+enum avc_reason {
+	AVC_REASON_NONE = 0,
+	AVC_REASON_SIGNAL = 1,     /* killed by a signal                          */
+	AVC_REASON_EXIT = 2,       /* non-zero exit status                        */
+	AVC_REASON_COMMAND = 3,    /* rolled back by AVC_COMMAND_RESTORE          */
+	AVC_REASON_CLEAN_EXIT = 4, /* gave up: exit status 0                      */
+	AVC_REASON_STOPPED = 5,    /* gave up: somebody asked the app to stop     */
+	AVC_REASON_POLICY = 6,     /* gave up: restore_on does not name this end  */
+	AVC_REASON_LIMIT = 7,      /* gave up: restores used up                   */
+	AVC_REASON_FAILED = 8,     /* gave up: no generation would restore        */
+	AVC_REASON_EMPTY = 9,      /* gave up: no generation is held              */
+	AVC_REASON_UNHEALTHY = 10, /* rolled back by AVC_COMMAND_UNHEALTHY        */
+	AVC_REASON_MEMORY = 11,    /* dropped: AVC_COMMAND_DROP_OLDEST            */
+	AVC_REASON_KILLED = 12,    /* dropped: somebody killed the template (the
+	                            * OOM killer takes templates first)           */
+	AVC_REASON_CRASHED = 13    /* dropped: what was restored from it, or what
+	                            * it was taken from, keeps crashing           */
+};
+
+/* One thing that happened.  Fields that mean nothing for a kind are 0. */
+struct avc_event {
+	int32_t kind;           /* enum avc_event_kind                           */
+	int32_t reason;         /* enum avc_reason                               */
+	uint64_t cookie;        /* of the guard, as given to avc_guard_start()   */
+	uint64_t ticket;        /* of the command this answers, 0: none          */
+	uint64_t at_ns;         /* CLOCK_MONOTONIC                               */
+	int32_t app_pid;        /* main process, in the caller's PID namespace   */
+	int32_t app_pid_inside; /* the same in the container's                   */
+	int32_t wait_status;    /* DIED, RESTORED, GAVE_UP: as from waitpid(2)   */
+	uint32_t threads;       /* of the checkpoint or restore                  */
+	uint64_t generation;    /* number of the generation, from 1              */
+	uint32_t generations;   /* held now                                      */
+	uint32_t attempt;       /* RESTORED: restores within the window          */
+	uint32_t quiescent;     /* CHECKPOINT: 1 if taken at a quiescent moment  */
+	uint32_t restores;      /* RESTORED: since the guard was started         */
+	/* CHECKPOINT, MISSED: first PTRACE_INTERRUPT until the last thread runs
+	 * again, and parts of it                                                 */
+	uint64_t freeze_ns;
+	uint64_t stop_ns;  /* of it, until every thread had stopped         */
+	uint64_t clone_ns; /* of it, the kernel's clone                     */
+	/* RESTORED                                                               */
+	uint64_t died_ns;    /* CLOCK_MONOTONIC when init had reaped the app  */
+	uint64_t restore_ns; /* died_ns until the last thread runs again      */
+	uint64_t fork_ns;    /* of it, cloning the template                   */
+	uint64_t threads_ns; /* of it, creating threads                       */
+	uint64_t age_ns;     /* of the generation when the app died           */
+	/* CHECKPOINT: what of it can not be put back, RESTORED: what was not (or why
+	 * not from a newer generation); else why                                 */
+	struct avc_error error;
+};
+
+enum avc_command {
+	AVC_COMMAND_CHECKPOINT = 1,  /* take one now; answered by CHECKPOINT, MISSED,
+	                             * UNPROTECTED or REFUSED                     */
+	AVC_COMMAND_RESTORE = 2,     /* kill the live app and restore the newest
+	                             * generation; RESTORED, GAVE_UP or REFUSED   */
+	AVC_COMMAND_DROP_OLDEST = 3, /* memory is short: give the oldest generation
+	                             * up and hold no more than are left, with none
+	                             * left take no checkpoints; DROPPED, REFUSED */
+	AVC_COMMAND_REFILL = 4,      /* hold `keep` generations again; no answer   */
+	AVC_COMMAND_VOUCH = 5,       /* the app is healthy: what was held already at
+	                             * the last such command is good to go back to.
+	                             * Wants `keep` of 3 or more; no answer       */
+	AVC_COMMAND_UNHEALTHY = 6    /* the app hangs: as a crash, but of what is
+	                             * held only what was vouched for is used (the
+	                             * oldest, if nothing was); as RESTORE        */
+};
+
+struct avc_engine;
+struct avc_guard;
+
+/* The library's version, "MAJOR.MINOR.PATCH"; static. */
+const char *avc_version(void);
+
+/* A new engine.  Errors: AVC_KERNEL. */
+struct avc_engine *avc_engine_new(struct avc_error *err);
+
+/* A descriptor that is readable (poll(2)) while events are queued.  It stays
+ * the engine's.  Read the events with avc_engine_next_event(), not the fd. */
+int avc_engine_event_fd(struct avc_engine *engine);
+
+/* Takes the oldest event: 1 with *event filled in, 0 if there is none.  The
+ * queue is bounded (4096); when nobody takes them, the oldest are dropped. */
+int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event);
+
+/* Frees the engine.  Every guard must have been stopped. */
+void avc_engine_free(struct avc_engine *engine);
+
+/* Can this machine and this process do it at all?  Checks architecture, kernel
+ * features and privileges without touching any process but a child of its own.
+ * Errors: AVC_UNSUPPORTED, AVC_DENIED, AVC_KERNEL. */
+int avc_engine_probe(struct avc_error *err);
+
+/* Starts a guard for the container of which config->init_pidfd is init.
+ * Returns NULL with *err filled in when the config makes no sense or the guard
+ * can not be started; what goes wrong later comes as events with `cookie`.
+ * The guard waits for init to have set itself up (bounded), then says ATTACHED.
+ * Precondition: init is visible in the caller's PID namespace and /proc. */
+struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
+				  uint64_t cookie, struct avc_error *err);
+
+/* Hands a command over.  The answer is an event with the same ticket (not 0).
+ * Errors: AVC_GONE when the guard has ended. */
+int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
+		      struct avc_error *err);
+
+/* Lets the app go (it runs on, unprotected), gives up every generation, joins
+ * the thread and frees the guard.  Blocks for as long as a checkpoint or
+ * restore that is under way. */
+void avc_guard_stop(struct avc_guard *guard);
+
+#endif

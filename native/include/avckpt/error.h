@@ -1,0 +1,37 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * How every function of libavckpt says what went wrong.
+ *
+ * The struct belongs to the caller: nothing is allocated while a target is
+ * stopped.  The first error wins; what fails later, while things are being
+ * undone, only adds to `undo_failures`.
+ */
+#ifndef AVCKPT_ERROR_H
+#define AVCKPT_ERROR_H
+
+#include <stdint.h>
+
+enum avc_code {
+	AVC_OK = 0,
+	AVC_GONE = 1,        /* the process (or its container) has ended            */
+	AVC_DENIED = 2,      /* a privilege is missing (EPERM, EACCES)              */
+	AVC_UNSUPPORTED = 3, /* this process can not be protected; `detail` is why  */
+	AVC_BUSY = 4,        /* somebody else traces or guards it                   */
+	AVC_DEADLINE = 5,    /* not stopped within the freeze deadline              */
+	AVC_PROTOCOL = 6,    /* the other side is not a (matching) avckpt-init      */
+	AVC_CONFIG = 7,      /* a value of struct avc_config makes no sense         */
+	AVC_KERNEL = 8,      /* the kernel said no where it should not have         */
+	AVC_EMPTY = 9        /* there is no generation to restore from              */
+};
+
+struct avc_error {
+	int32_t code;           /* enum avc_code                                    */
+	int32_t errnum;         /* the errno behind it, 0 if none                   */
+	int32_t pid;            /* whom it happened to, caller's namespace; 0: none */
+	uint32_t undo_failures; /* steps that could not be undone afterwards        */
+	char operation[32];     /* what was being done, e.g. "freeze"               */
+	char syscall[32];       /* the call that failed, "" if none                 */
+	char detail[160];       /* one clause for a person                          */
+};
+
+#endif
