@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds out a container's health check for the sidecar, after the container has started.
+
+`avckpt.restore.on=unhealthy` needs the health check that Podman knows of the
+container, whoever gave it: the command line, the image, Compose, the API.  Only
+`podman inspect` tells it, and that waits for the container's lock, which is
+held as long as a hook runs.  So the precreate hook leaves a process behind that
+asks when the lock is free, and writes the answer to `protocol.health_path()`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+
+from avckpt_hooks import podman, protocol, tell
+
+TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+GIVE_UP_S = 60.0
+"""How long the answer is waited for: as long as a slow image may take to start."""
+
+
+def ask_later(container: str, parent: int) -> None:
+    """Returns at once; the answer comes when the container has started.  Raises OSError."""
+    ask = podman.inspector(container, parent)  # while the parent is still there to be looked at
+    first = os.fork()
+    if first:
+        os.waitpid(first, 0)
+        return
+    # An orphan with nothing of Podman's: it must not wait for us, nor for our output.
+    status = 1
+    try:
+        os.setsid()
+        if os.fork() == 0:
+            null = os.open("/dev/null", os.O_RDWR)
+            for fd in range(3):
+                os.dup2(null, fd)
+            os.closerange(3, 256)
+            write_answer(container, ask)
+        status = 0
+    finally:
+        os._exit(status)
+
+
+def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
+    """Asks, and writes what is said: the health check as `podman inspect` has it, or null."""
+    try:
+        found = json.loads(ask(time.monotonic() + GIVE_UP_S))[0]["Config"].get("Healthcheck")
+        answer = {"healthcheck": found}
+    except (podman.Unknown, ValueError, LookupError, AttributeError) as error:
+        answer = {"healthcheck": None, "error": str(error)}
+        tell.journal(f"avckpt: container {container[:12]}: its health check can not be found out: {error}")
+    path = protocol.health_path(container)
+    os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
+    temporary = f"{path}.{os.getpid()}"
+    try:
+        with open(temporary, "w") as file:
+            json.dump(answer, file)
+        os.replace(temporary, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise

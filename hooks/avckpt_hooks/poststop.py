@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The poststop hook: a protected container has stopped.
+
+The OCI runtime runs it on the host with the container's state on standard
+input.  It never fails; a sidecar that is away finds out by itself (the record
+is gone, and so is the process).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+
+from avckpt_hooks import protocol, tell
+
+
+def main() -> int:
+    """Removes the container's record and tells the sidecar.  Always 0."""
+    try:
+        container = json.loads(sys.stdin.buffer.read())["id"]
+        if not protocol.is_container_id(container):
+            return 0
+        for path in (protocol.record_path(container), protocol.health_path(container)):
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(path)
+        protocol.exchange(protocol.Deregister(id=container).encode())
+    except (ConnectionRefusedError, FileNotFoundError):
+        pass  # no sidecar
+    except Exception as error:  # noqa: BLE001 - whatever goes wrong here, the container is cleaned up
+        tell.journal(f"avckpt: poststop: {type(error).__name__}: {error}")
+    return 0

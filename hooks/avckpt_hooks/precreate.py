@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The precreate hook: puts avckpt-init in front of a protected container's command.
+
+Podman runs it on the host for *every* container it starts, with the OCI
+configuration on standard input, and takes the configuration from its standard
+output.  Anything that is not a protected container passes byte for byte.
+
+It is the only hook that Podman's hooks directory names.  The other two it adds
+to the configuration of a protected container itself: Podman matches hooks
+before this one has stamped its annotations, so that they would have to be
+started for every container to find out that they have nothing to do.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from avckpt_hooks import VERSION, podman, tell
+
+TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
+if TYPE_CHECKING:
+    from typing import Any
+
+INIT_PATH = "/run/avckpt-init"
+"""Where a protected container has its init."""
+
+WAIT_MS = 2000
+"""How long init waits for a sidecar that lives but does not answer."""
+
+HOOK_TIMEOUT_S = 5
+"""After this the OCI runtime kills our hooks; they bound themselves to less."""
+
+_MARK = b'"avckpt.'
+"""Without it in a text of JSON, no label or annotation of ours is in there."""
+_OTHER_INITS = ("/run/podman-init", "/dev/init")
+_SYSTEMD = ("/sbin/init", "/usr/sbin/init", "/lib/systemd/systemd", "/usr/lib/systemd/systemd")
+
+
+class Refused(Exception):
+    """The container must not start; the text is one line for the user."""
+
+
+def main() -> int:
+    """Standard input to standard output.  Non-zero: the container must not start."""
+    config = sys.stdin.buffer.read()
+    parent = os.getppid()
+    try:
+        config = rewrite(config, parent)
+    except Refused as refused:
+        line = f"avckpt: {refused}"
+        tell.journal(line)
+        if not podman.is_service(parent):
+            tell.parent(line, parent)
+            return 1
+        config = spoil(config, line)
+    except Exception as error:  # noqa: BLE001 - whatever goes wrong here, the app runs
+        warn(f"a container runs unprotected: {type(error).__name__}: {error}", parent)
+    sys.stdout.buffer.write(config)
+    sys.stdout.buffer.flush()
+    return 0
+
+
+def rewrite(config: bytes, parent: int) -> bytes:
+    """The configuration a container is to be started with.  Raises Refused."""
+    container, spec = "", b"{}"
+    try:
+        container = podman.container_id(config)
+        spec = podman.generate_spec(container, parent)
+    except podman.Unknown as unknown:
+        if _MARK not in config:
+            warn(
+                f"cannot read a container's labels ({unknown}): if avckpt.enable is one of them, it runs unprotected",
+                parent,
+            )
+    if _MARK not in spec and _MARK not in config:
+        return config
+    return _rewrite_labelled(config, container, spec, parent)
+
+
+def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -> bytes:
+    import json
+
+    from avckpt_hooks import labels
+
+    data = json.loads(config)
+    about = json.loads(spec)
+    name = about.get("name") or container[:12] or "?"
+    annotations = data.get("annotations") or {}
+    try:
+        wanted = labels.merge(about.get("labels") or {}, annotations)
+        policy = labels.parse_policy(wanted)
+    except labels.LabelError as error:
+        raise Refused(f"container {name}: {error}") from error
+    if not policy.enable:
+        return config
+    reason = _unprotectable(data)
+    if reason:
+        warn(f"container {name} runs unprotected: {reason}", parent)
+        return config
+    if data["process"]["args"][0] == INIT_PATH:  # the hook stands in two directories
+        return config
+    told = _tell_if_alone(name, parent)
+    put_init_in_front(data)
+    data["annotations"] = {
+        **annotations,
+        **wanted,
+        "avckpt.name": name,
+        "avckpt.version": VERSION,
+    }
+    add_hooks(data, told)
+    if policy.restore_on.unhealthy:
+        _ask_for_health(container, name, parent)
+    return json.dumps(data, separators=(",", ":")).encode()
+
+
+def _ask_for_health(container: str, name: str, parent: int) -> None:
+    from avckpt_hooks import health
+
+    try:
+        health.ask_later(container, parent)
+    except (OSError, podman.Unknown) as error:
+        warn(f"container {name} is not rolled back when unhealthy: its health check is not known ({error})", parent)
+
+
+def put_init_in_front(data: dict[str, Any]) -> None:
+    """Makes avckpt-init the container's main process.  Changes `data`."""
+    args = data["process"]["args"]
+    # --init's own init would only stand between ours and the app.
+    if args[0] in _OTHER_INITS:
+        args = args[2:] if args[1:2] == ["--"] else args[1:]
+    stop_signal = (data.get("annotations") or {}).get("org.opencontainers.image.stopSignal", "15")
+    if not stop_signal.isdecimal():
+        stop_signal = "15"
+    data["process"]["args"] = [
+        INIT_PATH,
+        "--wait-ms",
+        str(WAIT_MS),
+        "--stop-signal",
+        stop_signal,
+        "--",
+        *args,
+    ]
+    # Last, so that no mount on /run (a tmpfs of --read-only, say) hides it.
+    data.setdefault("mounts", []).append(
+        {
+            "destination": INIT_PATH,
+            "type": "bind",
+            "source": init_binary(),
+            "options": ["bind", "ro", "nosuid", "nodev", "rprivate"],
+        }
+    )
+
+
+def add_hooks(data: dict[str, Any], told: bool) -> None:
+    """Has the OCI runtime call our other two hooks.  Changes `data`."""
+    env = [f"{name}={os.environ[name]}" for name in ("PATH", "AVCKPT_RUN_DIR") if name in os.environ]
+    hooks = data.get("hooks") or {}
+    for stage, more in (("prestart", ["--told"] if told else []), ("poststop", [])):
+        hook = {
+            "path": os.path.abspath(sys.argv[0]),
+            "args": ["avckpt-hook", stage, *more],
+            "env": env,
+            "timeout": HOOK_TIMEOUT_S,
+        }
+        hooks[stage] = [*(hooks.get(stage) or []), hook]
+    data["hooks"] = hooks
+
+
+def spoil(config: bytes, line: str) -> bytes:
+    """A configuration that can not start, so that `line` is the reason given.
+
+    A client of Podman's REST service sees what Podman says, and of a failed
+    precreate hook that is the exit status only.  Of a hook that is not there,
+    runtimes say the path.
+    """
+    import json
+
+    data = json.loads(config)
+    hooks = data.get("hooks") or {}
+    hooks["prestart"] = [{"path": line, "args": ["avckpt"]}]
+    data["hooks"] = hooks
+    return json.dumps(data).encode()
+
+
+def init_binary() -> str:
+    """The avckpt-init that belongs to this hook.  "" if there is none."""
+    beside = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
+    for path in (f"{beside}/avckpt-init", f"{beside}/../native/build/avckpt-init"):
+        if os.access(path, os.X_OK):
+            return os.path.realpath(path)
+    return ""
+
+
+def warn(line: str, parent: int) -> bool:
+    """Tells the user and the journal.  True if the user can see it."""
+    line = f"avckpt: {line}"
+    tell.journal(line)
+    return tell.parent(line, parent) and not podman.is_service(parent)
+
+
+def _unprotectable(data: dict[str, Any]) -> str:
+    """Why a container is better left as it is; "" if nothing speaks against it."""
+    if os.environ.get("_CONTAINERS_ROOTLESS_UID") or not _is_host_root():
+        return "only containers of root can be protected, and this Podman is rootless"
+    args = (data.get("process") or {}).get("args") or [""]
+    if args[0] in _SYSTEMD:
+        return f"its command is {args[0]}, and systemd must itself be PID 1"
+    if not init_binary():
+        return "avckpt-init is missing; run `avckpt install` again"
+    return ""
+
+
+def _is_host_root() -> bool:
+    if os.geteuid() != 0:
+        return False
+    with open("/proc/self/uid_map") as file:
+        return file.read().split() == ["0", "0", "4294967295"]
+
+
+def _tell_if_alone(name: str, parent: int) -> bool:
+    """Warns when no sidecar listens.  True if the user has been told so."""
+    import socket
+
+    from avckpt_hooks import protocol
+
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.setblocking(False)
+            connection.connect(protocol.hooks_socket())
+    except BlockingIOError:  # it listens, and is busy
+        return False
+    except OSError as error:
+        return warn(
+            f"container {name} runs unprotected until the sidecar is started "
+            f"({protocol.hooks_socket()}: {error.strerror})",
+            parent,
+        )
+    return False

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a hook says something to the person who started a container.
+
+Podman throws the standard error of a precreate hook away, and crun that of
+every stage.  Their own standard error is where a person looks: `podman run`'s
+terminal for a hook that Podman runs, the container's log (`podman logs`) for
+one that the OCI runtime runs, as conmon gives the runtime the container's.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+
+_WAIT_MS = 200
+_LINE_MAX = 2000  # well below PIPE_BUF: a line is written whole or not at all
+_SYS_PIDFD_GETFD = 438  # the same on every architecture
+
+
+def parent(line: str, pid: int | None = None) -> bool:
+    """Writes one line to the standard error of the parent (or `pid`).
+
+    True if somebody can read it there.  Never raises, never waits longer than
+    _WAIT_MS for a reader.
+    """
+    try:
+        fd = _stderr_of(os.getppid() if pid is None else pid)
+    except OSError:
+        return False
+    try:
+        return _write(fd, line)
+    except OSError:
+        return False
+    finally:
+        os.close(fd)
+
+
+def journal(line: str) -> None:
+    """Hands one line to syslog (and so to journald).  Never raises."""
+    import syslog
+
+    syslog.openlog("avckpt", syslog.LOG_PID, syslog.LOG_DAEMON)
+    syslog.syslog(syslog.LOG_WARNING, line)
+
+
+def _stderr_of(pid: int) -> int:
+    """A descriptor for `pid`'s standard error.  Raises OSError."""
+    # The descriptor itself, by pidfd_getfd(2), and not a second opening of the
+    # same file: with `2>file` a second one has an offset of its own and each
+    # writer overwrites the other; a socket can not be opened at all.
+    try:
+        return _borrow(pid, 2)
+    except OSError:
+        flags = os.O_WRONLY | os.O_APPEND | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC
+        return os.open(f"/proc/{pid}/fd/2", flags)
+
+
+def _borrow(pid: int, number: int) -> int:
+    import ctypes
+
+    pidfd = os.pidfd_open(pid)
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        fd: int = libc.syscall(_SYS_PIDFD_GETFD, pidfd, number, 0)
+        if fd < 0:
+            raise OSError(ctypes.get_errno(), "pidfd_getfd")
+        return fd
+    finally:
+        os.close(pidfd)
+
+
+def _write(fd: int, line: str) -> bool:
+    import select
+
+    status = os.fstat(fd)
+    if stat.S_ISCHR(status.st_mode) and status.st_rdev == os.makedev(1, 3):  # /dev/null
+        return False
+    # A raw terminal (podman run -t has set it so) does not go to column 1 by itself.
+    end = "\r\n" if os.isatty(fd) else "\n"
+    poll = select.poll()
+    poll.register(fd, select.POLLOUT)
+    if not stat.S_ISREG(status.st_mode) and not poll.poll(_WAIT_MS):
+        return False
+    packet = (line[:_LINE_MAX] + end).encode(errors="replace")
+    return os.write(fd, packet) == len(packet)
