@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the things are that avckpt installs or starts.
+
+There are two homes: inside the installed package (a wheel), and a checkout of
+the sources.  The package's own copy wins, so that an installed avckpt never
+picks up a stray build.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from avckpt.errors import ConfigError
+
+PACKAGE = Path(__file__).resolve().parent
+CHECKOUT = PACKAGE.parent.parent
+
+
+def init_binary() -> Path:
+    """The static program avckpt-init.  Raises ConfigError when it is nowhere."""
+    return _program("avckpt-init")
+
+
+def inside_binary() -> Path:
+    """The static program avckpt-inside (`inside.py`).  Raises ConfigError when it is nowhere."""
+    return _program("avckpt-inside")
+
+
+def hooks_source() -> Path:
+    """The directory of the Python package avckpt_hooks.  Raises ConfigError when it is nowhere."""
+    candidates = (PACKAGE.parent / "avckpt_hooks", CHECKOUT / "hooks" / "avckpt_hooks")
+    for path in candidates:
+        if (path / "__init__.py").is_file():
+            return path
+    raise ConfigError(_nowhere("the package avckpt_hooks", candidates, "install avckpt again"))
+
+
+def oci_hooks_source() -> Path:
+    """The directory of the hook JSON files.  Raises ConfigError when it is nowhere."""
+    candidates = (PACKAGE / "oci-hooks.d", CHECKOUT / "oci-hooks.d")
+    for path in candidates:
+        if any(path.glob("*.json")):
+            return path
+    raise ConfigError(_nowhere("the directory oci-hooks.d", candidates, "install avckpt again"))
+
+
+def _program(name: str) -> Path:
+    candidates = (PACKAGE / "libexec" / name, CHECKOUT / "native" / "build" / name)
+    for path in candidates:
+        if path.is_file() and os.access(path, os.X_OK):
+            return path
+    raise ConfigError(_nowhere(f"the program {name}", candidates, "build it with: make -C native"))
+
+
+def _nowhere(what: str, candidates: tuple[Path, ...], remedy: str) -> str:
+    return f"{what} is not in {' or '.join(str(path) for path in candidates)}: {remedy}"

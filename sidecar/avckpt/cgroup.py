@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Control groups of a container as files: where they are, memory and limit, frozen or not.
+
+Version 1, 2 and hybrids of both.  Paths are the host's: the sidecar's own view
+may be a namespace with a part of the tree only, so process 1's mounts are asked
+first (the sidecar runs with the host's PID namespace).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+log = logging.getLogger("avckpt")
+
+CLONE_NEWCGROUP = 0x02000000
+OWN_MOUNTS = Path("/run/avckpt-cgroup")
+"""In the sidecar's own file system."""
+UNLIMITED_BYTES = 1 << 62
+"""Version 1 writes "no limit" as a number near 2**63."""
+
+
+def see_whole_tree() -> None:
+    """Makes every container's groups visible to this process.  Best effort; call it before there are threads.
+
+    In a cgroup namespace of our own /proc/PID/cgroup would read as
+    `/../../...`, and of version 1 even a privileged container has only its own
+    part of each hierarchy mounted: what is missing is mounted once more.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    with contextlib.suppress(OSError):
+        fd = os.open("/proc/1/ns/cgroup", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            if libc.setns(fd, CLONE_NEWCGROUP) != 0:
+                log.debug("the host's cgroup namespace can not be entered: %s", os.strerror(ctypes.get_errno()))
+        finally:
+            os.close(fd)
+    whole = {mount.controllers for mount in _mounts("self") if mount.root == "/"}
+    for line in Path("/proc/self/cgroup").read_text().splitlines():
+        _, names, _ = line.split(":", 2)
+        controllers = frozenset(names.split(",")) - {""}
+        if controllers in whole or os.path.isdir("/proc/1/root/sys/fs/cgroup"):
+            continue
+        where = OWN_MOUNTS / (names.replace("=", "-") or "unified")
+        options = names if not names.startswith("name=") else f"none,{names}"
+        kind = b"cgroup" if controllers else b"cgroup2"
+        try:
+            where.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            log.debug("%s can not be made: %s", where, error)
+            return
+        if libc.mount(b"avckpt", bytes(where), kind, 0, options.encode() if controllers else None) != 0:
+            log.debug("cgroup %s can not be mounted: %s", names, os.strerror(ctypes.get_errno()))
+
+
+@dataclass(frozen=True)
+class Mount:
+    """One mounted hierarchy."""
+
+    version: int
+    controllers: frozenset[str]
+    """Of version 1, `name=...` included; empty for version 2."""
+    root: str
+    """Which part of the hierarchy is mounted."""
+    where: Path
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The control groups of one process."""
+
+    directories: tuple[Path, ...]
+    """One per hierarchy."""
+    memory: Path | None
+    """Where its memory is counted; None: nowhere that we can see."""
+    freezer: Path | None
+    memory_version: int = 2
+
+    @property
+    def procs(self) -> list[Path]:
+        """Files to write a PID to, so that it belongs to the same groups."""
+        return [directory / "cgroup.procs" for directory in self.directories]
+
+    def memory_limit_bytes(self) -> int | None:
+        """The hard limit; None: there is none (or the group is gone)."""
+        if self.memory is None:
+            return None
+        text = _read(self.memory / ("memory.max" if self.memory_version == 2 else "memory.limit_in_bytes"))
+        limit = int(text) if text.isdecimal() else UNLIMITED_BYTES
+        return limit if limit < UNLIMITED_BYTES else None
+
+    def memory_used_bytes(self) -> int | None:
+        """What counts against the limit and can not simply be given back: usage less clean file pages."""
+        if self.memory is None:
+            return None
+        text = _read(self.memory / ("memory.current" if self.memory_version == 2 else "memory.usage_in_bytes"))
+        if not text.isdecimal():
+            return None
+        prefix = "" if self.memory_version == 2 else "total_"
+        stat = dict(line.split(" ", 1) for line in _read(self.memory / "memory.stat").splitlines() if " " in line)
+        cache = sum(int(stat.get(prefix + key, 0)) for key in ("inactive_file", "active_file"))
+        return max(int(text) - cache, 0)
+
+    def is_frozen(self) -> bool:
+        """Whether it is paused (podman pause)."""
+        if self.freezer is None:
+            return False
+        state = _read(self.freezer / "freezer.state")
+        return state in ("FROZEN", "FREEZING") or "frozen 1" in _read(self.freezer / "cgroup.events").splitlines()
+
+
+def groups_of(pid: int) -> Groups:
+    """The groups of `pid` that can be seen.  Raises OSError when the process is gone."""
+    directories: list[Path] = []
+    memory = freezer = unified = None
+    version = 2
+    for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
+        _, names, path = line.split(":", 2)
+        controllers = frozenset(names.split(",")) - {""}
+        directory = _directory(controllers, path)
+        if directory is None:
+            continue
+        directories.append(directory)
+        if not controllers:
+            unified = directory
+        if "memory" in controllers:
+            memory, version = directory, 1
+        if "freezer" in controllers:
+            freezer = directory
+    if memory is None and unified is not None and (unified / "memory.max").exists():
+        memory = unified
+    return Groups(tuple(directories), memory, freezer or unified, version)
+
+
+def _directory(controllers: frozenset[str], path: str) -> Path | None:
+    for owner, prefix in (("1", "/proc/1/root"), ("self", "")):
+        for mount in _mounts(owner):
+            if mount.controllers != controllers or (mount.version == 2) != (not controllers):
+                continue
+            inner = os.path.relpath(path, mount.root)
+            if inner.startswith(".."):
+                continue
+            directory = Path(f"{prefix}{mount.where}") / inner
+            if os.path.isdir(directory):  # pathlib raises where we may not look
+                return directory
+    return None
+
+
+def _mounts(owner: str) -> list[Mount]:
+    try:
+        lines = Path(f"/proc/{owner}/mountinfo").read_text().splitlines()
+    except OSError:
+        return []
+    mounts = []
+    for line in lines:
+        # proc(5): id parent dev root where options... - type source super-options
+        before, _, after = line.partition(" - ")
+        words, (kind, _, options) = before.split(), after.split(" ", 2)
+        if kind == "cgroup2":
+            mounts.append(Mount(2, frozenset(), words[3], Path(words[4])))
+        elif kind == "cgroup":
+            named = frozenset(options.split(",")) - {"rw", "ro", "xattr", "noprefix", "clone_children"}
+            mounts.append(
+                Mount(1, frozenset(o for o in named if not o.startswith("release_agent")), words[3], Path(words[4]))
+            )
+    return mounts
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands `avckpt check`, `avckpt up` and `avckpt down`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from avckpt.errors import ConfigError, ExitCode
+
+if TYPE_CHECKING:
+    from avckpt.manifest import Manifest
+    from avckpt.vehicle import Protection
+
+files_option = click.option(
+    "-f", "--file", "files", multiple=True, type=click.Path(path_type=Path), help="Compose file; default vehicle.yaml."
+)
+project_option = click.option("-p", "--project-name", "project", default="", help="As of podman-compose.")
+
+
+@click.command()
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE...]")
+@click.option("--config", "is_config", is_flag=True, help="Of the sidecar; without FILE: /etc/avckpt/config.yaml.")
+@click.option("--json", "as_json", is_flag=True, help="A JSON object instead of text.")
+def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
+    """Check every avckpt.* label and annotation of Compose files.
+
+    Without FILE, vehicle.yaml or compose.yaml of this folder.  Several files are
+    one manifest, later ones over earlier ones.  Prints "FILE:LINE: service NAME:
+    what is wrong" and ends with 1 if anything is wrong, with 0 if there are only
+    warnings or nothing.
+    """
+    sys.exit(check_config(files, as_json) if is_config else check_manifest(files, as_json))
+
+
+@click.command()
+@files_option
+@project_option
+@click.option("--install", "install_hooks", is_flag=True, help="Install the hooks if they are missing.")
+@click.option("--wait", "wait_s", type=click.FloatRange(min=0), default=30.0, show_default=True, help="Seconds.")
+@click.option("--json", "as_json", is_flag=True, help="The containers as JSON.")
+@click.argument("services", nargs=-1)
+def up(
+    files: tuple[Path, ...],
+    project: str,
+    install_hooks: bool,
+    wait_s: float,
+    as_json: bool,
+    services: tuple[str, ...],
+) -> None:
+    """Bring up the services of Compose files and wait until they are protected.
+
+    Checks the files as "avckpt check" does, sees to hooks and sidecar, then lets
+    podman-compose do it.  Ends with 5 if a container that asks for protection
+    has none after --wait seconds.
+    """
+    from avckpt_hooks import protocol
+
+    from avckpt import manifest, vehicle
+    from avckpt.compose import Compose
+
+    run_dir = Path(protocol.run_dir())
+    paths = files or (manifest.usual_file(Path()),)
+    found = manifest.check(paths)
+    print_problems(found, err=True)
+    if found.errors:
+        sys.exit(ExitCode.FAILED)
+    unknown = [name for name in services if name not in found.services]
+    if unknown:
+        raise ConfigError(f"no such service: {', '.join(unknown)}; there are {', '.join(sorted(found.services))}")
+    if found.wants_protection:
+        vehicle.prepare(run_dir, install_hooks=install_hooks, say=_say)
+    came_out = vehicle.up(Compose(paths, project), services, run_dir, wait_s, _say)
+    if as_json:
+        click.echo(json.dumps([one.to_json() for one in came_out], indent=2))
+    else:
+        _print_protection(came_out)
+    if any(one.container.wanted and not one.protected for one in came_out):
+        sys.exit(ExitCode.UNPROTECTED)
+
+
+@click.command()
+@files_option
+@project_option
+@click.option("-v", "--volumes", is_flag=True, help="Also remove the project's volumes.")
+@click.argument("services", nargs=-1)
+def down(files: tuple[Path, ...], project: str, volumes: bool, services: tuple[str, ...]) -> None:
+    """Stop and remove what "avckpt up" brought up.  Hooks and sidecar stay."""
+    from avckpt import manifest
+    from avckpt.compose import Compose
+
+    Compose(files or (manifest.usual_file(Path()),), project).down(services, volumes, _say)
+
+
+def check_manifest(files: Sequence[Path], as_json: bool) -> ExitCode:
+    """Checks Compose files that belong together.  Raises ConfigError when none is named and none is here."""
+    from avckpt import manifest
+
+    found = manifest.check(files or [manifest.usual_file(Path())])
+    if as_json:
+        click.echo(json.dumps(found.to_json(), indent=2))
+    else:
+        print_problems(found)
+        click.echo(summary(found))
+    return ExitCode.FAILED if found.errors else ExitCode.OK
+
+
+def check_config(files: Sequence[Path], as_json: bool) -> ExitCode:
+    """Checks the sidecar's configuration files, each by itself.  Raises ConfigError when a named one is not there."""
+    from avckpt import config
+
+    for path in files:
+        if not path.exists():
+            raise ConfigError(f"{path}: no such file")
+    problems = [problem for path in files or [config.default_path()] for problem in config.examine(path)[1]]
+    if as_json:
+        listed = [{"file": p.place.file, "line": p.place.line, "message": p.message} for p in problems]
+        click.echo(json.dumps({"problems": listed}, indent=2))
+    else:
+        for problem in problems:
+            click.echo(f"{click.style(str(problem.place), fg='red')}: {problem.message}")
+        click.echo(_count(len(problems), "problem") if problems else "no problems")
+    return ExitCode.FAILED if problems else ExitCode.OK
+
+
+def print_problems(found: Manifest, err: bool = False) -> None:
+    """A line for each."""
+    for problem in found.problems:
+        colour = "red" if problem in found.errors else "yellow"
+        place = str(problem.place)
+        click.echo(click.style(place, fg=colour) + str(problem)[len(place) :], err=err)
+
+
+def summary(found: Manifest) -> str:
+    """One line: who is to be protected, and whether anything is wrong."""
+    wanted = [service.name for service in found.services.values() if service.enabled]
+    open_ones = [service.name for service in found.services.values() if service.enabled is None]
+    text = f"{_count(len(found.services), 'service')}, to be protected: {', '.join(wanted) or 'none'}"
+    if open_ones:
+        text += f"; depends on the environment: {', '.join(open_ones)}"
+    problems = len(found.problems) - len(found.errors)
+    counts = [_count(n, what) for n, what in ((len(found.errors), "problem"), (problems, "warning")) if n]
+    return f"{text}; {' and '.join(counts) or 'no problems'}"
+
+
+def _say(line: str) -> None:
+    """Progress; standard output is for the outcome."""
+    click.echo(line, err=True)
+
+
+def _print_protection(came_out: Sequence[Protection]) -> None:
+    width = max((len(one.container.name) for one in came_out), default=0)
+    for one in came_out:
+        colour = "green" if one.protected else "red" if one.container.wanted else None
+        line = f"{one.container.name:<{width}}  {click.style(one.state, fg=colour)}"
+        click.echo(f"{line}: {one.why}" if one.why else line)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

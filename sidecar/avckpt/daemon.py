@@ -1,0 +1,398 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sidecar's daemon: one guard per protected container.
+
+asyncio, one thread.  It sleeps until something happens: a hook's request, an
+event of the engine, an init that ends, a request on the API, a signal.  What is
+urgent (death to resume) happens in the engine's own threads, not here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import fcntl
+import itertools
+import logging
+import os
+import signal
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from avckpt_hooks.labels import Notify, parse_policy
+from avckpt_hooks.protocol import Deregister, Register
+
+from avckpt import __version__, cgroup, native
+from avckpt.api import ApiServer
+from avckpt.caretaker import Caretaker
+from avckpt.config import Configuration
+from avckpt.errors import (
+    AvckptError,
+    Busy,
+    ConfigError,
+    DeadlineMissed,
+    Denied,
+    LabelsWrong,
+    NothingToRestore,
+    TargetGone,
+    Unprotected,
+)
+from avckpt.event_record import Cause, EventRecord, Kind, of_guard
+from avckpt.events import Command, Event, EventKind, GuardConfig, why_not_restored
+from avckpt.feed import Feed
+from avckpt.history import History
+from avckpt.journal import Journal
+from avckpt.listener import HookListener
+from avckpt.metrics import Metrics
+from avckpt.notify import Notifier
+from avckpt.policy import config_of_labels
+from avckpt.process import has_ended, pid_of
+from avckpt.protected import Protected
+from avckpt.records import adoptable
+from avckpt.registry import Registry
+
+log = logging.getLogger("avckpt")
+
+COMMAND_TIMEOUT_S = 30.0
+"""How long a command waits for the engine's answer."""
+
+
+@dataclass
+class Watch:
+    """What the daemon holds for one live container: its own pidfd of init, and the guard."""
+
+    container: Protected
+    pidfd: int
+    labels: Mapping[str, str]
+    notify: Notify | None = None
+    notify_self: Notify | None = None
+    rolling_back: Cause | None = None
+    """Why a roll back was commanded whose answer has not come yet."""
+    freezes_s: dict[int, float] = field(default_factory=dict)
+    """Freeze times of the generations that may still be held, by number."""
+    journal: Journal = field(default_factory=Journal)
+    guard: native.Guard | None = None
+
+
+class Daemon:
+    """All the sidecar's state.  `run()` it once."""
+
+    def __init__(self, run_dir: Path, config_path: Path) -> None:
+        self.run_dir = run_dir
+        self.configuration = Configuration(config_path)
+        self.registry = Registry()
+        self.feed = Feed()
+        self.history = History(run_dir / "history.jsonl")
+        self.metrics = Metrics()
+        self.notifier = Notifier(self._tell_of_notification)
+        self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
+        self.started_at = time.time()
+        self._engine = native.Engine()
+        self._watches: dict[int, Watch] = {}
+        self._cookies = itertools.count(1)
+        self._tickets = itertools.count(1)
+        self._answers: dict[int, tuple[int, asyncio.Future[tuple[Event, EventRecord]]]] = {}
+        self._endings: set[asyncio.Task[None]] = set()
+
+    async def run(self) -> None:
+        """Serves until SIGTERM or SIGINT, then lets every container run on unprotected.
+
+        Raises OSError when a socket can not be made.
+        """
+        loop = asyncio.get_running_loop()
+        stop = asyncio.Event()
+        for signum in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(signum, stop.set)
+        loop.add_signal_handler(signal.SIGHUP, self._reload_on_signal)
+        try:
+            self.configuration.load()
+        except ConfigError as error:
+            # A wrong interval protects better than no sidecar does.
+            log.error("the built-in defaults hold: %s", error)
+        loop.add_reader(self._engine.event_fd, self._take_events)
+        api = ApiServer(self, self.run_dir / "api.sock")
+        # Listen first, adopt second: a container that starts in between then
+        # comes twice, not never.
+        hooks = HookListener(self.run_dir / "hooks.sock", self._hook)
+        try:
+            self.caretaker.start()
+            await api.start()
+            self._adopt()
+            log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
+            await stop.wait()
+            log.info("asked to stop: %d container(s) run on unprotected", len(self._watches))
+        finally:
+            hooks.close()
+            self.feed.close()
+            await api.close()
+            await self.notifier.close()
+            await self.caretaker.close()
+            for watch in list(self._watches.values()):
+                self._begin_end(watch)
+            while self._endings:
+                await asyncio.wait(self._endings)
+            loop.remove_reader(self._engine.event_fd)
+            self._engine.close()
+            self.history.close()
+
+    async def command(self, name: str, command: Command, cause: Cause = Cause.MANUAL) -> tuple[Protected, EventRecord]:
+        """Gives a command to a container and waits for the answer; `cause` is why a roll back is asked for.
+
+        Raises NoSuchContainer, Ambiguous, Unprotected, NothingToRestore,
+        DeadlineMissed, TargetGone, or the engine's own error.
+        """
+        container = self.registry.find(name)
+        watch = self._watches[container.cookie]
+        if watch.guard is None:
+            raise Unprotected(f"{container.label} runs unprotected: {container.reason}")
+        if command is Command.RESTORE and container.generations == 0:
+            raise NothingToRestore(f"{container.label} has nothing to go back to: {container.reason}")
+        ticket = next(self._tickets)
+        answer: asyncio.Future[tuple[Event, EventRecord]] = asyncio.get_running_loop().create_future()
+        self._answers[ticket] = (container.cookie, answer)
+        try:
+            if command is Command.RESTORE:
+                watch.rolling_back = cause
+            watch.guard.command(command, ticket)
+            event, record = await asyncio.wait_for(answer, COMMAND_TIMEOUT_S)
+        except asyncio.TimeoutError as error:
+            raise DeadlineMissed(f"{container.label}: no answer within {COMMAND_TIMEOUT_S:g} s") from error
+        finally:
+            del self._answers[ticket]
+            if command is Command.RESTORE:
+                watch.rolling_back = None
+        check_answer(container.label, event)
+        return container, record
+
+    def reload(self) -> list[str]:
+        """Takes the configuration file as it is now, for containers that start from now on.
+
+        Returns the running ones that would be guarded differently if they
+        started now.  Raises ConfigError, and nothing changes, when the file is
+        wrong.
+        """
+        self.configuration.load()
+        log.info("%s was read", self.configuration.path)
+        return [watch.container.label for watch in self._watches.values() if self._is_outdated(watch)]
+
+    def _reload_on_signal(self) -> None:
+        try:
+            self.reload()
+        except ConfigError as error:
+            log.error("the new configuration was refused, what was in force stays so: %s", error)
+
+    def _is_outdated(self, watch: Watch) -> bool:
+        try:
+            return self._config_of(watch.labels, watch.container.name) != watch.container.config
+        except LabelsWrong:
+            return True
+
+    def _config_of(self, labels: Mapping[str, str], name: str) -> GuardConfig:
+        return config_of_labels(self.configuration.defaults.under(labels, name))
+
+    # Hooks and records
+
+    def _hook(self, request: Register | Deregister, pidfd: int | None) -> None:
+        if isinstance(request, Deregister):
+            # Nothing to do: init's pidfd says the same, and can not be taken
+            # for that of a later run.
+            log.debug("%s: stopped, says its hook", request.id[:12])
+        elif pidfd is not None:
+            self._watch(request, pidfd, adopted=False)
+
+    def _adopt(self) -> None:
+        for record, pidfd in adoptable(self.run_dir / "containers"):
+            try:
+                self._watch(record, pidfd, adopted=True)
+            except AvckptError as error:
+                log.error("%s: runs unprotected: %s", record.name or record.id[:12], error)
+
+    def _watch(self, request: Register, pidfd: int, *, adopted: bool) -> None:
+        """Starts protecting a container.  `pidfd` is ours from here on, whatever happens."""
+        with closed_on_error(pidfd):
+            if has_ended(pidfd):
+                raise TargetGone("the container has ended already")
+            known = self.registry.by_id(request.id)
+            if known is not None and not has_ended(self._watches[known.cookie].pidfd):
+                # Both are alive, so the same PID is the same process.
+                if known.init_pid == pid_of(pidfd):
+                    os.close(pidfd)
+                    return
+                raise Busy(f"another run of {known.label} is guarded", pid=known.init_pid)
+            container = Protected(
+                id=request.id,
+                name=request.name,
+                cookie=next(self._cookies),
+                init_pid=pid_of(pidfd),
+                config=self._config_of(request.annotations, request.name),
+                registered_at=time.time(),
+                adopted=adopted,
+            )
+            policy = parse_policy(self.configuration.defaults.under(request.annotations, request.name))
+            container.group = policy.group
+        watch = Watch(container, pidfd, request.annotations, policy.notify, policy.notify_self)
+        self.registry.add(container)
+        self._watches[container.cookie] = watch
+        asyncio.get_running_loop().add_reader(pidfd, self._begin_end, watch)
+        how = "adopted" if adopted else "registered"
+        self.tell(watch, EventRecord(Kind.REGISTERED, detail=f"{how}, init {container.init_pid}"))
+        try:
+            watch.guard = self._engine.start_guard(pidfd, container.config, container.cookie)
+        except AvckptError as error:
+            container.fail(str(error))
+            self.tell(watch, EventRecord(Kind.UNPROTECTED, error=error))
+        else:
+            self.caretaker.begin(watch, policy)
+
+    # Events
+
+    def tell(self, watch: Watch, record: EventRecord) -> EventRecord:
+        """Tells everybody of something that has happened to a container; returns it as it was told.
+
+        Says whose it is, and when (now), where the record does not.
+        """
+        container = watch.container
+        record = dataclasses.replace(
+            record,
+            container=container.label,
+            id=container.id,
+            group=container.group,
+            at=record.at or time.time(),
+            monotonic_s=record.monotonic_s or time.monotonic(),
+        )
+        line = watch.journal.line(record)
+        if line is not None and line[0] >= logging.INFO:
+            record = self.history.add(record)
+        self.notifier.take(record, container, self._watches.values())
+        if line is not None:
+            log.log(line[0], "%s: %s", container.label, line[1])
+        self.metrics.take(record)
+        self.feed.publish(record)
+        return record
+
+    def _tell_of_notification(self, container: Protected, kind: Kind, detail: str) -> None:
+        watch = self._watches.get(container.cookie)
+        if watch is not None:
+            self.tell(watch, EventRecord(kind, detail=detail))
+
+    def _take_events(self) -> None:
+        while (event := self._engine.next_event()) is not None:
+            watch = self._watches.get(event.cookie)
+            if watch is None:
+                continue  # the last words of a guard that has been stopped
+            container = watch.container
+            at = time.time() - (time.monotonic_ns() - event.at_ns) / 1e9
+            container.apply(event, at)
+            if event.kind is EventKind.ENDED:
+                continue  # which is told once the container's own end is known
+            record = self.tell(watch, self._record(watch, event, at))
+            _, answer = self._answers.get(event.ticket, (0, None))
+            if answer is not None and not answer.done():
+                answer.set_result((event, record))
+
+    def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
+        if event.kind is EventKind.CHECKPOINT:
+            watch.freezes_s[event.generation] = event.freeze_s
+            while len(watch.freezes_s) > watch.container.config.keep:
+                del watch.freezes_s[min(watch.freezes_s)]
+        freeze_s = watch.freezes_s.get(event.generation) if event.kind is EventKind.RESTORED else None
+        return of_guard(event, at=at, freeze_s=freeze_s, commanded=watch.rolling_back)
+
+    # The end of a container, or of the sidecar
+
+    def _begin_end(self, watch: Watch) -> None:
+        loop = asyncio.get_running_loop()
+        if not loop.remove_reader(watch.pidfd):
+            return  # it has begun already
+        self.caretaker.end(watch)
+        task = loop.create_task(self._end(watch))
+        self._endings.add(task)
+        task.add_done_callback(self._endings.discard)
+
+    async def _end(self, watch: Watch) -> None:
+        container = watch.container
+        if watch.guard is not None:
+            # Blocks for as long as a checkpoint that is under way.
+            await asyncio.get_running_loop().run_in_executor(None, watch.guard.stop)
+            self._take_events()  # it may just have said how the container ended
+        ended = has_ended(watch.pidfd)
+        os.close(watch.pidfd)
+        del self._watches[container.cookie]
+        self.registry.remove(container)
+        if ended:
+            container.end(time.time())
+            self.tell(watch, EventRecord(Kind.ENDED, detail=container.reason))
+            self.metrics.forget_all_but(each.label for each in self.registry.live() + self.registry.ended())
+        for cookie, answer in list(self._answers.values()):
+            if cookie == container.cookie and not answer.done():
+                answer.set_exception(TargetGone(f"{container.label} ended before it could be done"))
+
+
+def check_answer(label: str, event: Event) -> None:
+    """Raises what the answer to a command says went wrong, with the container's name."""
+    if event.kind in (EventKind.CHECKPOINT, EventKind.RESTORED):
+        return
+    if event.kind is EventKind.GAVE_UP:
+        raise AvckptError(f"{label} was not restored and ended: {why_not_restored(event.reason, event.error)}")
+    if event.kind is EventKind.UNPROTECTED:
+        raise Unprotected(f"{label} runs unprotected: {event.error}")
+    if event.error is None:
+        raise AvckptError(f"{label}: answered with {event.kind.name.lower()}")
+    error = event.error
+    raise type(error)(
+        error.detail,
+        container=label,
+        operation=error.operation,
+        syscall=error.syscall,
+        errno=error.errno,
+        pid=error.pid,
+        undo_failures=error.undo_failures,
+    )
+
+
+@contextmanager
+def closed_on_error(fd: int) -> Iterator[None]:
+    """Closes `fd` when the body raises."""
+    try:
+        yield
+    except BaseException:
+        os.close(fd)
+        raise
+
+
+@contextmanager
+def only_one(run_dir: Path) -> Iterator[None]:
+    """Holds the lock that says there is a sidecar.  Raises Busy when another one holds it."""
+    fd = os.open(run_dir / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
+            raise Busy(
+                f"a sidecar is running already (pid {holder or 'unknown'}, {run_dir}): stop it first, or use that one"
+            ) from error
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+        yield
+    finally:
+        os.close(fd)  # which unlocks; the file stays, or two could lock two files
+
+
+def serve(run_dir: Path, config_path: Path) -> None:
+    """Runs the sidecar in the foreground until it is told to stop.
+
+    Raises Denied or Unsupported when this process or machine can not do it,
+    Busy when there is a sidecar already.
+    """
+    native.probe()
+    cgroup.see_whole_tree()
+    try:
+        run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
+        with only_one(run_dir):
+            asyncio.run(Daemon(run_dir, config_path).run())
+    except OSError as error:
+        kind = Denied if isinstance(error, PermissionError) else AvckptError
+        raise kind(f"{error.filename or run_dir} can not be used", errno=error.errno or 0) from error

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sidecar's end of the hooks' socket.
+
+Podman holds a container's lock while its hook waits for our answer, so the
+handler must answer at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Union
+
+from avckpt_hooks import protocol
+from avckpt_hooks.protocol import Deregister, Register
+
+from avckpt.errors import AvckptError
+
+log = logging.getLogger("avckpt")
+
+Handler = Callable[[Union[Register, Deregister], Union[int, None]], None]
+"""Takes a request and its pidfd (the handler's to close).  Raises AvckptError to refuse."""
+
+MAX_WAITING = 64
+"""Connections that have not sent their request yet."""
+
+
+def bind_socket(path: Path, kind: socket.SocketKind) -> socket.socket:
+    """A listening Unix socket that only root may connect to; replaces what a killed sidecar left behind."""
+    path.unlink(missing_ok=True)
+    listening = socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+    # The mode must be right before anybody can connect: connect(2) is checked
+    # against the inode, and fchmod(2) on a socket does not reach it.
+    old = os.umask(0o177)
+    try:
+        listening.bind(str(path))
+    except OSError:
+        listening.close()
+        raise
+    finally:
+        os.umask(old)
+    listening.listen(MAX_WAITING)
+    return listening
+
+
+class HookListener:
+    """Accepts hooks, one request and one reply per connection.  Runs in the event loop that is running."""
+
+    def __init__(self, path: Path, handler: Handler) -> None:
+        self._path = path
+        self._handler = handler
+        self._loop = asyncio.get_running_loop()
+        self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._socket = bind_socket(path, socket.SOCK_SEQPACKET)
+        self._loop.add_reader(self._socket, self._accept)
+
+    def close(self) -> None:
+        """Ends every connection and removes the socket."""
+        self._loop.remove_reader(self._socket)
+        self._socket.close()
+        for connection in list(self._timers):
+            self._drop(connection)
+        self._path.unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._socket.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            return
+        connection.setblocking(False)
+        if len(self._timers) >= MAX_WAITING:
+            connection.close()
+            return
+        self._timers[connection] = self._loop.call_later(protocol.TIMEOUT_S, self._drop, connection)
+        self._loop.add_reader(connection, self._serve, connection)
+
+    def _serve(self, connection: socket.socket) -> None:
+        try:
+            error = self._answer(connection)
+            connection.send(protocol.encode_reply(error))
+        except BlockingIOError:
+            return  # not readable after all
+        except OSError as problem:
+            log.debug("a hook went away: %s", problem)
+        self._drop(connection)
+
+    def _answer(self, connection: socket.socket) -> str | None:
+        try:
+            request, pidfd = protocol.receive_request(connection)
+            self._handler(request, pidfd)
+        except (AvckptError, protocol.ProtocolError) as error:
+            log.warning("refused a hook's request: %s", error)
+            return str(error)
+        return None
+
+    def _drop(self, connection: socket.socket) -> None:
+        timer = self._timers.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+            self._loop.remove_reader(connection)
+            connection.close()

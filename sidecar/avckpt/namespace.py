@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starts a program as PID 1 of a PID namespace of its own.
+
+Python has unshare(2) and setns(2) only from 3.12 on, and mount(2) not at all:
+they are called through the C library.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import struct
+from collections.abc import Iterable, Iterator
+from typing import NoReturn
+
+from avckpt.errors import AvckptError, Denied, KernelError, Unsupported
+
+CLONE_NEWNS = 0x00020000
+CLONE_NEWPID = 0x20000000
+MS_NOSUID, MS_NODEV, MS_NOEXEC = 2, 4, 8
+MS_REC, MS_PRIVATE = 0x4000, 0x40000
+
+_STEPS = ("setpgid", "unshare", "mount", "mount", "execve")
+_FAILURE = struct.Struct("ii")
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable[int]) -> int:
+    """Starts `path` with a /proc of its own and its own process group; returns its PID in our namespace.
+
+    With `tty` (a descriptor of our controlling terminal) the new group becomes
+    the terminal's foreground group.  Signals in `ignored` are ignored in the
+    new process, SIGPIPE and SIGXFSZ, which Python itself ignores, are not.
+
+    Raises Denied, Unsupported or KernelError when it can not be started; then
+    nothing is left behind.  Precondition: this process has one thread.
+    """
+    with contextlib.ExitStack() as undo:
+        own = os.open("/proc/self/ns/pid", os.O_RDONLY | os.O_CLOEXEC)
+        undo.callback(os.close, own)
+        failed, tell = os.pipe()
+        undo.callback(os.close, failed)
+        try:
+            with _children_in_new_namespace(own):
+                pid = os.fork()
+                if pid == 0:
+                    _become(path, argv, tty, ignored, tell)
+        finally:
+            os.close(tell)
+        # The child's end closes when its exec succeeds.
+        message = os.read(failed, _FAILURE.size)
+    if message:
+        os.waitpid(pid, 0)
+        step, errno = _FAILURE.unpack(message)
+        raise _problem(_STEPS[step], errno)
+    return pid
+
+
+@contextlib.contextmanager
+def _children_in_new_namespace(own: int) -> Iterator[None]:
+    """Children forked in the body are in a new PID namespace.
+
+    Undone at once: while it lasts this process can not start a thread, clone(2).
+    """
+    if _libc.unshare(CLONE_NEWPID) != 0:
+        raise _problem("unshare", ctypes.get_errno())
+    try:
+        yield
+    finally:
+        if _libc.setns(own, CLONE_NEWPID) != 0:
+            raise _problem("setns", ctypes.get_errno())
+
+
+def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int], tell: int) -> NoReturn:
+    """The child's way to the program; never returns, and runs nothing of the parent's."""
+    step = 0
+    try:
+        signal.set_wakeup_fd(-1)
+        os.setpgid(0, 0)
+        if tty is not None:
+            # We are in the background already: without this tcsetpgrp(3) stops us.
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})
+            os.tcsetpgrp(tty, os.getpgrp())
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTTOU})
+        step = 1
+        _check(_libc.unshare(CLONE_NEWNS))
+        step = 2
+        _check(_libc.mount(b"none", b"/", None, MS_REC | MS_PRIVATE, None))
+        step = 3
+        _check(_libc.mount(b"proc", b"/proc", b"proc", MS_NOSUID | MS_NODEV | MS_NOEXEC, None))
+        step = 4
+        # Python ignores them; what it starts should not.
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+        for signum in ignored:
+            signal.signal(signum, signal.SIG_IGN)
+        os.execv(path, argv)
+    except OSError as error:
+        os.write(tell, _FAILURE.pack(step, error.errno or 0))
+    finally:
+        os._exit(125)
+
+
+def _check(result: int) -> None:
+    if result != 0:
+        raise OSError(ctypes.get_errno(), "")
+
+
+def _problem(syscall: str, errno: int) -> AvckptError:
+    kind: type[AvckptError] = KernelError
+    if isinstance(OSError(errno, ""), PermissionError):
+        kind = Denied
+    elif syscall == "unshare":
+        kind = Unsupported
+    detail = "a PID namespace for the program can not be made"
+    if kind is Denied:
+        detail += ": it takes root (CAP_SYS_ADMIN)"
+    return kind(detail, syscall=syscall, errno=errno)

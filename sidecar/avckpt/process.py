@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Naming a process so that PID reuse can not confuse it: a pidfd, or a PID with its start time."""
+
+from __future__ import annotations
+
+import os
+import select
+from pathlib import Path
+
+from avckpt.errors import TargetGone
+
+
+def start_time(pid: int) -> int:
+    """When `pid` started, in clock ticks since boot: field 22 of /proc/PID/stat, proc(5).
+
+    Raises TargetGone when there is no such process.
+    """
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_bytes()
+    except (FileNotFoundError, ProcessLookupError) as error:
+        raise TargetGone("no such process", pid=pid) from error
+    # Field 2 is the name in parentheses and may hold anything, parentheses too.
+    fields = stat[stat.rindex(b")") + 2 :].split()
+    return int(fields[22 - 3])
+
+
+def open_pidfd(pid: int, started: int) -> int:
+    """A pidfd of the process that has this PID *and* this start time; the caller closes it.
+
+    Raises TargetGone when that process has ended, whoever has its PID now.
+    """
+    try:
+        pidfd = os.pidfd_open(pid)
+    except ProcessLookupError as error:
+        raise TargetGone("no such process", syscall="pidfd_open", errno=error.errno or 0, pid=pid) from error
+    # Looked at only now: the pidfd holds one process for good, so if the start
+    # time is right after it was opened it was opened on the right one.  The
+    # other way round the PID could change hands in between.
+    try:
+        found = start_time(pid)
+        if found != started or has_ended(pidfd):
+            raise TargetGone("its PID belongs to another process now", pid=pid)
+    except BaseException:
+        os.close(pidfd)
+        raise
+    return pidfd
+
+
+def has_ended(pidfd: int) -> bool:
+    """Whether the process of a pidfd has ended (a zombie has)."""
+    poller = select.poll()
+    poller.register(pidfd, select.POLLIN)
+    return bool(poller.poll(0))
+
+
+def pid_of(pidfd: int) -> int:
+    """The PID behind a pidfd, in our own PID namespace; 0 when it is not visible here or has ended.
+
+    For people, and for telling whether two *live* pidfds are the same process.
+    """
+    for line in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines():
+        if line.startswith("Pid:"):
+            return max(int(line.split()[1]), 0)
+    return 0
