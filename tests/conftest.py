@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures for tests on real containers, and what to show when one fails."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable, Generator, Iterator
+
+import harness
+import pytest
+from harness import CommandFailed, ContainerFactory, Podman, Sidecar
+
+CONTAINERS = pytest.StashKey[ContainerFactory]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Signals as a login shell would leave them.
+
+    make starts programs with posix_spawn(3), whose child, in glibc, ignores the
+    two signals that libc keeps for itself (32 and 33), and what is ignored stays
+    so over execve(2): every program under test would inherit it from `make test`.
+    """
+    for number in (32, 33):
+        reset_if_ignored(number)
+
+
+def reset_if_ignored(number: int) -> None:
+    """SIG_IGN becomes SIG_DFL.  By the system call itself: libc's sigaction() refuses these two."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    rt_sigaction = {"x86_64": 13, "aarch64": 134}[platform.machine()]
+    # struct kernel_sigaction: handler, flags, (restorer,) mask; all zero is SIG_DFL.
+    now = (ctypes.c_ulong * 4)()
+    default = (ctypes.c_ulong * 4)()
+    if libc.syscall(rt_sigaction, number, None, now, 8) != 0:
+        raise OSError(ctypes.get_errno(), "rt_sigaction")
+    if now[0] == signal.SIG_IGN and libc.syscall(rt_sigaction, number, default, None, 8) != 0:
+        raise OSError(ctypes.get_errno(), "rt_sigaction")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whatever takes the fixture `podman` is marked so."""
+    for item in items:
+        if "podman" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.podman)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Adds logs to the report of a failed test, while its containers are still there."""
+    report = yield
+    if report.failed:
+        for title, text in evidence(item):
+            report.sections.append((title, text))
+    return report
+
+
+def evidence(item: pytest.Item) -> Iterator[tuple[str, str]]:
+    """What a person wants to see of a test that failed: its containers' logs, `avckpt ps`, the sidecar's log."""
+    funcargs: dict[str, object] = getattr(item, "funcargs", {})
+    factory = item.stash.get(CONTAINERS, None)
+    for made in factory.made if factory is not None else []:
+        yield f"podman logs {made.name}", attempt(made.logs)
+    sidecar = funcargs.get("sidecar")
+    if isinstance(sidecar, Sidecar):
+        yield "avckpt ps --json", attempt(lambda: sidecar.avckpt("ps", "--json").stdout)
+        yield "podman logs avckpt-sidecar", attempt(sidecar.logs)
+
+
+def attempt(look: Callable[[], str]) -> str:
+    """Evidence is best effort: a failure to get it must not hide the test's own."""
+    try:
+        return look()[-8000:]
+    except (CommandFailed, subprocess.TimeoutExpired, OSError) as error:
+        return f"(could not be had: {error})"
+
+
+@pytest.fixture(scope="session")
+def podman() -> Podman:
+    """Root's Podman, which can start containers (`make setup` sees to that)."""
+    if shutil.which("podman") is None:
+        pytest.skip("no Podman on this machine: run `make setup`")
+    if os.geteuid() != 0:
+        pytest.skip("not root: avckpt protects containers of root's Podman")
+    return Podman()
+
+
+@pytest.fixture(scope="session")
+def base_image(podman: Podman) -> str:
+    """Name of the base image: Debian with python3 and redis-server."""
+    if podman.run("image", "exists", harness.BASE_IMAGE, check=False).status != 0:
+        pytest.fail(f"no image {harness.BASE_IMAGE}: run `make setup`")
+    return harness.BASE_IMAGE
+
+
+@pytest.fixture
+def container(request: pytest.FixtureRequest, podman: Podman, base_image: str) -> Iterator[ContainerFactory]:
+    """Makes containers: `container("sleep", "60")`, `container.protected(...)`.  All are removed after the test."""
+    factory = ContainerFactory(podman, f"avckpt-test-{os.getpid()}-{abs(hash(request.node.nodeid)) % 10**8:08d}")
+    request.node.stash[CONTAINERS] = factory
+    yield factory
+    factory.close()
+
+
+@pytest.fixture(scope="session")
+def machine(podman: Podman) -> Iterator[None]:
+    """This machine's hooks and sidecar are ours for the session."""
+    with harness.machine_lock(timeout_s=100):
+        yield
+
+
+@pytest.fixture(scope="session")
+def session_sidecar(machine: None, podman: Podman, base_image: str) -> Iterator[Sidecar]:
+    """Started once; take the fixture `sidecar`."""
+    if podman.run("image", "exists", harness.SIDECAR_IMAGE, check=False).status != 0:
+        pytest.fail(f"no image {harness.SIDECAR_IMAGE}: run `make setup`")
+    with harness.running_sidecar(podman) as sidecar:
+        yield sidecar
+
+
+@pytest.fixture
+def sidecar(session_sidecar: Sidecar) -> Sidecar:
+    """The sidecar container runs and the hooks are installed.  A test may kill it: the next test gets a new one."""
+    if not session_sidecar.running:
+        session_sidecar.restart()
+    return session_sidecar
+
+
+@pytest.fixture
+def free_port() -> Callable[[], int]:
+    """Gives a free TCP port at each call."""
+    return harness.free_port

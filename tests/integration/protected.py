@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A victim in a protected container of a real Podman, with its board."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness import ROOT, Container, ContainerFactory, Sidecar, wait_until
+from native.board import Board, Seen
+
+QUICK = {"interval": "100ms", "restore.max": "60/60s"}
+
+
+@dataclass
+class ProtectedVictim:
+    """What a test on a protected container needs at hand."""
+
+    sidecar: Sidecar
+    container: Container
+    board: Board
+
+    def see(self) -> Seen:
+        return self.board.see()
+
+    @property
+    def app(self) -> int:
+        """The victim's PID on the host; waits while it is being restored."""
+
+        def look() -> int:
+            try:
+                return self.sidecar.app_pid(self.container)
+            except LookupError:
+                return 0
+
+        return wait_until(look, 10, "the application is there")
+
+    def wait_beats(self, n: int = 20, timeout_s: float = 10.0) -> None:
+        """Waits for beats, and for nothing to be wrong."""
+        wanted = self.see().beats + n
+        wait_until(lambda: self.see().beats >= wanted, timeout_s, f"{n} beats of {self.container.name}")
+        assert self.see().violations == 0, self.container.logs()
+
+    def kill(self, signum: int) -> dict[str, Any]:
+        """Kills the victim as it is now, and waits for the restore; the entry of `avckpt ps` after it."""
+        entry = self.sidecar.find(self.container)
+        assert entry is not None
+        os.kill(self.app, signum)
+        after = self.sidecar.wait_restores(self.container, entry["restores"] + 1)
+        self.wait_beats()
+        return after
+
+
+def start_victim(
+    sidecar: Sidecar,
+    factory: ContainerFactory,
+    folder: Path,
+    command: str,
+    *,
+    labels: Mapping[str, str] = QUICK,
+    options: Sequence[str] = (),
+    generation: int = 2,
+) -> ProtectedVictim:
+    """Starts `command` (a victim and its arguments) and waits for that generation (0: does not wait)."""
+    subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
+    folder.chmod(0o755)
+    board = Board(folder / "board")
+    program, *args = command.split()
+    container = factory.protected(
+        f"/victims/{program}",
+        *args,
+        *("--board", "/board/board"),
+        labels=labels,
+        options=[
+            *("--volume", f"{ROOT}/tests/victims/build:/victims:ro", "--volume", f"{folder}:/board", *options),
+        ],
+    )
+    victim = ProtectedVictim(sidecar, container, board)
+    wait_until(lambda: victim.see().ready == 1, 10, f"{command} is ready")
+    if generation:
+        sidecar.wait_generation(container, generation)
+    return victim
+
+
+def ours(container: Container) -> list[int]:
+    """Templates and holder in a container, by their PIDs on the host."""
+    init = container.pid
+    children = Path(f"/proc/{init}/task/{init}/children").read_text().split()
+    return [int(pid) for pid in children if Path(f"/proc/{pid}/comm").read_text().startswith("avckpt-")]

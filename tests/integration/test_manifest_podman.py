@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`avckpt up` and `avckpt down` with podman-compose and real containers, and podman-compose alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from harness import (
+    BASE_IMAGE,
+    CONFIG_DIR,
+    ROOT,
+    Completed,
+    Container,
+    Podman,
+    Sidecar,
+    avckpt_command,
+    run,
+    wait_until,
+)
+
+COUNT = "import itertools, time\nfor i in itertools.count():\n  print('n', i, flush=True); time.sleep(0.02)\n"
+SERVICES = f"""\
+x-node: &node
+  image: {BASE_IMAGE}
+  network_mode: host
+  stop_grace_period: 1s
+  volumes: [./count.py:/count.py:ro]
+  command: [python3, /count.py]
+services:
+  by-map:
+    <<: *node
+    labels: {{avckpt.enable: true, avckpt.interval: 100ms}}
+  by-list:
+    <<: *node
+    labels: [avckpt.enable=true, "avckpt.interval=${{INTERVAL:-150ms}}"]
+  by-annotation:
+    <<: *node
+    annotations: {{avckpt.enable: "true", avckpt.interval: 200ms}}
+  plain:
+    <<: *node
+"""
+
+
+@dataclass
+class Project:
+    """A folder with a vehicle.yaml."""
+
+    name: str
+    path: Path
+    podman: Podman
+
+    def write(self, services: str) -> None:
+        self.path.write_text(f"name: {self.name}\n{services}")
+        self.path.with_name("count.py").write_text(COUNT)
+
+    def avckpt(self, command: str, *args: str, check: bool = True, env: dict[str, str] | None = None) -> Completed:
+        return run([*avckpt_command(), command, "-f", str(self.path), *args], check=check, env=env, timeout_s=90)
+
+    def compose(self, *args: str, check: bool = True) -> Completed:
+        return run([sys.executable, "-m", "podman_compose", "-f", str(self.path), *args], check=check, timeout_s=90)
+
+    def ids(self) -> list[str]:
+        label = f"label=io.podman.compose.project={self.name}"
+        return self.podman.run("ps", "-aq", "--no-trunc", "--filter", label).stdout.split()
+
+    def container(self, service: str) -> Container:
+        name = f"{self.name}_{service}_1"
+        return Container(self.podman, name, self.podman.inspect(name)["Id"])
+
+    def remove(self) -> None:
+        # The pod takes its containers along, also those that others depend on.
+        self.podman.run("pod", "rm", "--force", "--ignore", "--time", "0", f"pod_{self.name}", shielded=True)
+
+
+@pytest.fixture
+def project(podman: Podman, sidecar: Sidecar, tmp_path: Path) -> Iterator[Project]:
+    made = Project(f"avckpt-test-{os.getpid()}", tmp_path / "vehicle.yaml", podman)
+    yield made
+    made.remove()
+
+
+def states(done: Completed) -> dict[str, bool]:
+    return {entry["service"]: entry["protected"] for entry in json.loads(done.stdout)}
+
+
+def test_up_protects_what_podman_compose_alone_protects_too(project: Project, sidecar: Sidecar) -> None:
+    project.write(SERVICES)
+    expected = {"by-map": True, "by-list": True, "by-annotation": True, "plain": False}
+    done = project.avckpt("up", "--json")
+    assert states(done) == expected
+    intervals = {
+        entry["name"].split("_")[1]: entry["interval_s"] for entry in sidecar.ps() if project.name in entry["name"]
+    }
+    assert intervals == {"by-map": 0.1, "by-list": 0.15, "by-annotation": 0.2}
+    by_list = project.container("by-list")
+    os.kill(sidecar.app_pid(by_list), signal.SIGKILL)
+    sidecar.wait_restores(by_list)
+    assert by_list.logs().splitlines().count("n 0") == 1
+    # A second time it finds everything as it should be.
+    ids = project.ids()
+    assert states(project.avckpt("up", "--json")) == expected
+    assert project.ids() == ids
+    project.avckpt("down")
+    assert project.ids() == []
+    assert sidecar.running
+
+    project.compose("up", "-d")
+    for service in ("by-map", "by-list", "by-annotation"):
+        sidecar.wait_generation(project.container(service))
+    assert sidecar.find(project.container("plain")) is None
+    project.compose("down")
+
+
+def test_only_the_services_that_are_named(project: Project, sidecar: Sidecar) -> None:
+    project.write(SERVICES)
+    assert states(project.avckpt("up", "--json", "by-map")) == {"by-map": True}
+    assert len(project.ids()) == 1
+    done = project.avckpt("up", "by-mop", check=False)
+    assert done.status == 1
+    assert done.stderr.startswith("avckpt: no such service: by-mop; there are by-annotation, ")
+
+
+def test_a_wrong_label_starts_nothing(project: Project) -> None:
+    project.write(SERVICES.replace("avckpt.interval: 200ms", "avckpt.intervall: 200ms"))
+    done = project.avckpt("up", check=False)
+    assert done.status == 1
+    assert done.stderr.startswith(
+        f"{project.path}:17: service by-annotation: annotation avckpt.intervall: unknown label"
+    )
+    assert project.ids() == []
+
+
+def test_who_is_not_protected_is_named_with_the_reason(project: Project) -> None:
+    project.write(
+        SERVICES.replace(
+            "  plain:\n    <<: *node\n",
+            '  plain:\n    <<: *node\n    command: ["sh", "-c", "exit 3"]\n    labels: [avckpt.enable=true]\n',
+        )
+    )
+    done = project.avckpt("up", "--wait", "20", check=False)
+    assert done.status == 5
+    lines = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
+    assert lines.pop(f"{project.name}_plain_1").startswith("unprotected: it has exited with status 3 (podman logs ")
+    assert set(lines.values()) == {"protected"}
+    assert done.took_s < 15  # nobody waits for what has ended
+
+
+def test_a_dependency_that_does_not_start_hangs_nobody(project: Project) -> None:
+    text = SERVICES + "    depends_on: [by-list]\n"
+    project.write(text.replace("avckpt.interval=${INTERVAL:-150ms}", "avckpt.interval=${INTERVAL}"))
+    done = project.avckpt("up", check=False, env={"INTERVAL": "soon"})
+    assert done.status == 1
+    assert "label avckpt.interval=soon: not a duration" in done.stderr  # the hook's own words
+    last = done.stderr.splitlines()[-1]
+    name = f"{project.name}_by-list_1"
+    assert last.startswith(f"avckpt: podman-compose up was ended: it waited in vain for {name} to become running; ")
+    assert f"{name} did not start and is created" in last
+    assert done.took_s < 30
+    assert project.container("by-map").status == "running"
+
+
+def test_hooks_are_installed_only_when_asked_for(project: Project, sidecar: Sidecar) -> None:
+    project.write(SERVICES)
+    sidecar.avckpt("uninstall")
+    try:
+        done = project.avckpt("up", check=False)
+        assert done.status == 1
+        assert "hooks: not installed" in done.stderr
+        assert "avckpt up --install" in done.stderr
+        assert project.ids() == []
+        assert states(project.avckpt("up", "--install", "--json", "by-map")) == {"by-map": True}
+    finally:
+        sidecar.avckpt("install")
+        sidecar.restart()  # its mount of /etc/avckpt is that of the old folder
+
+
+def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Project, sidecar: Sidecar) -> None:
+    config = CONFIG_DIR / "config.yaml"
+    if config.exists():
+        pytest.skip(f"{config} is in use on this machine")
+    project.write(SERVICES.replace(", avckpt.interval: 100ms", ""))
+    sidecar.stop()
+    try:
+        config.write_text(f"names:\n  {project.name}*:\n    interval: 300ms\n    keep: 3\n")
+        done = project.avckpt("up", "--json")
+        assert "starting the container avckpt-sidecar" in done.stderr
+        assert states(done)["by-map"]
+        entries = {entry["name"].split("_")[1]: entry for entry in sidecar.ps()}
+        assert entries["by-map"]["interval_s"] == 0.3
+        assert entries["by-list"]["interval_s"] == 0.15  # its label wins
+        assert entries["by-list"]["keep"] == 3
+        # Stopped, not removed: it is started again, and adopts.
+        project.podman.run("stop", "--time", "5", "avckpt-sidecar")
+        config.write_text("defaults:\n  keep: few\n")
+        said = project.avckpt("up").stderr
+        assert "again" in said
+        assert "warning: the sidecar goes by older or built-in defaults: /etc/avckpt/config.yaml:2: " in said
+        assert {entry["name"].split("_")[1]: entry for entry in sidecar.ps()}["by-map"]["interval_s"] == 3.0
+        config.write_text("defaults:\n  keep: 5\n")
+        project.podman.run("kill", "--signal", "HUP", "avckpt-sidecar")
+        wait_until(lambda: "config.yaml was read" in sidecar.logs(), 5, "the sidecar has read it")
+    finally:
+        config.unlink(missing_ok=True)
+        sidecar.restart()
+
+
+def test_without_a_sidecar_to_start_it_says_so(
+    project: Project, sidecar: Sidecar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from avckpt import sidecar_container
+    from avckpt.errors import SidecarUnreachable
+
+    sidecar.stop()
+    try:
+        monkeypatch.setattr(sidecar_container, "IMAGE", "localhost/avckpt-no-such-image")
+        with pytest.raises(SidecarUnreachable, match="make setup"):
+            sidecar_container.ensure(Path("/run/avckpt"), lambda line: None)
+    finally:
+        sidecar.restart()
+
+
+def test_the_example_goes_on_through_crashes(project: Project, sidecar: Sidecar, free_port: Callable[[], int]) -> None:
+    text = (ROOT / "examples" / "vehicle.yaml").read_text()
+    # A user may have it running.
+    text = text.replace("name: avckpt-vehicle", f"name: {project.name}").replace("vehicle-", f"{project.name}-")
+    project.path.write_text(text)
+    project.path.with_name("pipeline.py").write_text((ROOT / "examples" / "pipeline.py").read_text())
+    ports = {"FILTER_PORT": str(free_port()), "MONITOR_PORT": str(free_port()), "CRASH_EVERY_S": "2"}
+    done = project.avckpt("up", "--json", env=ports)
+    assert states(done) == {"monitor": True, "filter": True, "source": False}
+    names = {entry["service"]: entry["name"] for entry in json.loads(done.stdout)}
+    monitor, smooth = (Container(project.podman, names[name], "") for name in ("monitor", "filter"))
+    log = monitor.wait_for_log("the filter CRASHED and went on", 60, count=2)
+    monitor.wait_for_log("readings", 20, count=log.count("readings") + 1)
+    assert smooth.logs().count("started as PID") == 1
+    assert "hung up" not in monitor.logs()
+    project.avckpt("down", env=ports)
+    assert project.ids() == []

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A command that the sidecar runs in a container is what `podman exec` would make of it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from avckpt.cgroup import groups_of
+from avckpt.errors import TargetGone
+from avckpt.inside import OUTPUT_BYTES, Done, _sealed_program, run_inside
+from harness import Container, ContainerFactory, wait_until
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root")
+
+WHO = (
+    "id; pwd; hostname; echo $GREETING; ulimit -n; cat /proc/self/cgroup; "
+    "grep -E '^(Cap|Seccomp|NoNewPrivs)' /proc/self/status"
+)
+OPTIONS = ["--env", "GREETING=hello there", "--hostname", "within"]
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def inside() -> Iterator[Callable[[Container], Run]]:
+    """Runs commands in a container."""
+    pidfds = []
+
+    def of(container: Container) -> Run:
+        pidfd = os.pidfd_open(container.pid)
+        pidfds.append(pidfd)
+
+        def run(*command: str, timeout_s: float = 10.0, stdin: bytes = b"") -> Done:
+            return asyncio.run(run_inside(pidfd, command, timeout_s=timeout_s, stdin=stdin, env={"ADDED": "by us"}))
+
+        return run
+
+    yield of
+    for pidfd in pidfds:
+        os.close(pidfd)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        ["--user", "1000:1000", "--group-add", "33", "--workdir", "/tmp"],
+        ["--cap-drop", "all", "--security-opt", "no-new-privileges", "--read-only"],
+        ["--security-opt", "seccomp=unconfined", "--cap-add", "SYS_PTRACE", "--network", "host"],
+    ],
+    ids=["plain", "user", "confined", "unconfined"],
+)
+def test_it_is_as_podman_exec_has_it(
+    container: ContainerFactory, inside: Callable[[Container], Run], options: list[str]
+) -> None:
+    made = container("sleep", "1000", options=[*OPTIONS, *options])
+    done = inside(made)("sh", "-c", WHO)
+    assert done.status == 0
+    assert done.output.splitlines() == made.exec("sh", "-c", WHO).stdout.splitlines()
+
+
+def test_input_output_and_status(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
+    run = inside(container("sleep", "1000"))
+    assert run("cat", stdin=b"an event").output == "an event"
+    done = run("sh", "-c", "echo $ADDED; echo err >&2; exit 7")
+    assert (done.status, done.output) == (7, "by us\nerr")
+    assert run("sh", "-c", "kill -SEGV $$").status == 139
+    assert run("no-such-program").status == 127
+    assert run("/etc/passwd").status == 126
+
+
+def test_it_is_killed_when_its_time_is_up(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
+    made = container("sleep", "1000")
+    before = time.monotonic()
+    done = inside(made)("sh", "-c", "echo begun; sleep 555 & sleep 666; true", timeout_s=0.5)
+    assert done.timed_out
+    assert done.output == "begun"
+    assert time.monotonic() - before < 3
+
+    def left() -> str:
+        return made.exec("ps", "-eo", "args").stdout
+
+    assert "sleep 1000" in left()
+    wait_until(lambda: "sleep 555" not in left() and "sleep 666" not in left(), 5, "nothing of it is left")
+
+
+def test_an_endless_writer_fills_nothing(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
+    done = inside(container("sleep", "1000"))("yes", timeout_s=0.3)
+    assert done.timed_out
+    assert len(done.output) <= OUTPUT_BYTES
+
+
+def test_what_goes_on_in_the_background_is_not_waited_for(
+    container: ContainerFactory, inside: Callable[[Container], Run]
+) -> None:
+    done = inside(container("sleep", "1000"))("sh", "-c", "sleep 20 & echo done")
+    assert (done.status, done.output) == (0, "done")
+    assert done.took_s < 5
+
+
+def test_nothing_of_ours_can_be_written_to_in_there(container: ContainerFactory) -> None:
+    """Who enters a container can be reached there as /proc/PID/exe: that must not be the host's file."""
+    made = container("sleep", "1000")
+    pidfd = os.pidfd_open(made.pid)
+
+    async def look() -> None:
+        task = asyncio.create_task(run_inside(pidfd, ["sleep", "3"], timeout_s=10))
+        await asyncio.sleep(1)
+        (helper,) = [
+            int(pid)
+            for pid in Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"avckpt-inside\0")
+        ]
+        assert Path(f"/proc/{helper}/exe").readlink() == Path("/memfd:avckpt-inside (deleted)")
+        await task
+        with pytest.raises(PermissionError):  # sealed: also for a second writer, once nobody runs it
+            os.write(os.open(f"/proc/self/fd/{_sealed_program()}", os.O_RDWR), b"x")
+
+    try:
+        asyncio.run(look())
+    finally:
+        os.close(pidfd)
+
+
+def test_a_container_that_has_ended(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
+    made = container("sleep", "1000")
+    run = inside(made)
+    made.remove()
+    with pytest.raises(TargetGone):
+        run("true")
+
+
+def test_its_groups(container: ContainerFactory) -> None:
+    made = container("sleep", "1000", options=["--memory", "64m"])
+    groups = groups_of(made.pid)
+    assert groups.memory_limit_bytes() == 64 << 20
+    used = groups.memory_used_bytes()
+    assert used is not None
+    assert 0 < used < 64 << 20
+    assert not groups.is_frozen()
+    made.podman.run("pause", made.name)
+    try:
+        assert groups.is_frozen()
+    finally:
+        made.podman.run("unpause", made.name)
+    assert groups_of(container("sleep", "1000").pid).memory_limit_bytes() is None

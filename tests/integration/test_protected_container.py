@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Protected containers of every kind, whose application is killed in every way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from harness import ContainerFactory, Sidecar, wait_until
+from integration.protected import QUICK, ours, start_victim
+
+OPTIONS = {
+    "root": [],
+    "user": ["--user", "1000:1000"],
+    "read-only": ["--read-only"],
+    "terminal": ["-t"],
+    "host network": ["--network=host"],
+    "nothing allowed": ["--cap-drop=all", "--security-opt=no-new-privileges", "--network=none"],
+}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, options: list[str]) -> None:
+    """SIGKILL, a real SIGSEGV, abort(), exit(3): to Podman and everybody inside nothing has happened."""
+    victim = start_victim(sidecar, container, tmp_path, "crash", options=options)
+    made = victim.container
+    before = made.inspect()["State"]
+    inside = sidecar.wait_generation(made)["app_pid_inside"]
+    deaths = {
+        signal.SIGKILL: "killed by SIGKILL",
+        signal.SIGUSR1: "killed by SIGSEGV",
+        signal.SIGUSR2: "killed by SIGABRT",
+        signal.SIGHUP: "exited with status 3",
+    }
+    for n, (signum, death) in enumerate(deaths.items(), 1):
+        entry = victim.kill(signum)
+        assert (entry["state"], entry["last_death"]) == ("protected", death)
+        assert (entry["restores"], entry["app_pid_inside"]) == (n, inside)
+    after = made.inspect()["State"]
+    assert (after["Status"], after["StartedAt"], after["Pid"]) == ("running", before["StartedAt"], before["Pid"])
+    assert made.exec("pgrep", "-x", "crash").stdout.split() == [str(inside)]
+    processes = made.podman.run("top", made.name, "pid", "comm").stdout
+    assert [line.split() for line in processes.splitlines() if line.split()[1] == "crash"] == [[str(inside), "crash"]]
+    assert victim.see().starts == 1
+    assert made.logs().split() == ["ready"]
+
+
+def test_threads_of_an_unprivileged_user(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    """Twenty threads with every kind of lock, default seccomp profile, killed ten times."""
+    victim = start_victim(sidecar, container, tmp_path, "threads 20 20", options=["--user", "1000:1000"])
+    for n in range(10):
+        time.sleep(0.03 * n)
+        os.kill(victim.app, signal.SIGKILL)
+        victim.wait_beats()
+    assert sidecar.wait_restores(victim.container, 10)["state"] == "protected"
+    assert victim.see().starts == 1
+
+
+def test_pause_and_unpause(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    """A frozen container is left alone, and protected again afterwards."""
+    victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
+    made = victim.container
+    for _ in range(3):
+        made.podman.run("pause", made.name)
+        beats = victim.see().beats
+        time.sleep(0.5)
+        assert victim.see().beats <= beats + 1
+        made.podman.run("unpause", made.name, timeout_s=10)
+        victim.wait_beats()
+    entry = sidecar.find(made)
+    assert entry is not None
+    sidecar.wait_generation(made, entry["generation"] + 2)
+    assert victim.kill(signal.SIGKILL)["state"] == "protected"
+
+
+def test_killed_while_paused(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    """It can only die once it is unpaused, and is restored then."""
+    victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
+    made = victim.container
+    app = victim.app
+    made.podman.run("pause", made.name)
+    os.kill(app, signal.SIGKILL)
+    time.sleep(0.3)
+    made.podman.run("unpause", made.name)
+    sidecar.wait_restores(made, 1)
+    victim.wait_beats()
+    assert made.status == "running"
+
+
+def test_podman_restart_keeps_protection(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
+    made = victim.container
+    first_init = made.pid
+    made.podman.run("restart", "--time", "5", made.name)
+    wait_until(lambda: victim.see().starts == 2 and victim.see().ready == 1, 10, "it has started again")
+    assert made.pid != first_init
+    sidecar.wait_generation(made, 1)
+    assert victim.kill(signal.SIGKILL)["restores"] == 1
+    assert victim.see().starts == 2
+
+
+def test_nothing_is_left_of_a_removed_container(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
+    pids = ours(victim.container)
+    assert len(pids) == 3, "two templates, one holder"
+    started = time.monotonic()
+    victim.container.remove()
+    assert time.monotonic() - started < 5
+    wait_until(lambda: not [pid for pid in pids if Path(f"/proc/{pid}").exists()], 5, "templates are gone")
+    wait_until(lambda: sidecar.find(victim.container) is None, 5, "the sidecar has forgotten it")
+
+
+def test_restart_policy_before_the_first_checkpoint(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
+) -> None:
+    """Nothing to restore from: Podman does what it always did."""
+    victim = start_victim(
+        sidecar, container, tmp_path, "crash", labels={"interval": "1m"}, options=["--restart=on-failure"], generation=0
+    )
+    sidecar.wait_for(victim.container, lambda entry: entry["app_pid"] > 0, "guard")
+    os.kill(victim.app, signal.SIGUSR1)
+    wait_until(lambda: victim.see().starts == 2, 15, "Podman has started it again")
+    wait_until(lambda: victim.container.status == "running", 10, "it runs")
+    sidecar.wait_for(victim.container, lambda entry: entry["state"] == "starting", "its new guard")
+
+
+def test_restart_policy_when_restores_are_used_up(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
+) -> None:
+    victim = start_victim(
+        sidecar,
+        container,
+        tmp_path,
+        "crash",
+        labels={**QUICK, "keep": "1", "restore.max": "2/60s"},
+        options=["--restart=on-failure"],
+    )
+    for _ in range(2):
+        victim.kill(signal.SIGKILL)
+    assert victim.see().starts == 1
+    os.kill(victim.app, signal.SIGKILL)
+    wait_until(lambda: victim.see().starts == 2, 15, "Podman has started it again")
+    # And it is protected as at its first start.
+    sidecar.wait_generation(victim.container, 2)
+    assert victim.kill(signal.SIGKILL)["restores"] == 1
+
+
+def test_a_clean_exit_ends_the_container(sidecar: Sidecar, container: ContainerFactory) -> None:
+    made = container.protected("sh", "-c", "exec sleep 1", labels=QUICK)
+    sidecar.wait_generation(made)
+    assert made.wait() == 0
+
+
+@pytest.mark.parametrize(("signum", "status"), [("TERM", 143), ("KILL", 137)])
+def test_podman_kill_is_no_crash(sidecar: Sidecar, container: ContainerFactory, signum: str, status: int) -> None:
+    made = container.protected("sleep", "1000", labels=QUICK)
+    sidecar.wait_generation(made)
+    made.signal(signum)
+    assert made.wait() == status
+
+
+@pytest.mark.parametrize(("command", "why"), [("forker", "child processes"), ("unsupported aio", "AIO")])
+def test_what_can_not_be_protected_runs_and_is_told(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, command: str, why: str
+) -> None:
+    victim = start_victim(sidecar, container, tmp_path, command, generation=0)
+    entry = sidecar.wait_for(victim.container, lambda entry: entry["state"] == "unprotected", "unprotected")
+    assert why in entry["reason"]
+    shown = sidecar.avckpt("ps").stdout
+    line = next(line for line in shown.splitlines() if line.startswith(victim.container.name))
+    assert "unprotected" in line
+    assert why in line
+    refused = sidecar.avckpt("checkpoint", victim.container.name, check=False)
+    assert refused.status == 5
+    assert refused.stderr.count("\n") == 1
+    assert victim.container.name in refused.stderr
+    assert why in refused.stderr
+    victim.wait_beats()

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon with real avckpt-init processes, registered by the real hooks."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from harness import avckpt_command, run, wait_until
+from local_sidecar import ON_COMMAND, QUICK, LocalSidecar, children, ended, local_sidecar
+
+SLEEPER = ["sleep", "1000"]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+
+
+@pytest.fixture
+def idle_sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
+    with local_sidecar(tmp_path) as sidecar:
+        yield sidecar
+
+
+@pytest.fixture
+def local(idle_sidecar: LocalSidecar) -> LocalSidecar:
+    idle_sidecar.start()
+    return idle_sidecar
+
+
+def test_a_registered_container_is_protected(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    row = local.wait_for(web, state="protected")
+    assert row["name"] == "web"
+    assert row["app_pid"] == web.app_pid
+    assert row["app_pid_inside"] == 2
+    assert row["init_pid"] == web.init_pid
+    assert row["interval_s"] == 0.1
+    assert 0 < row["last_freeze_s"] < 5
+    assert not row["adopted"]
+    local.wait_for(web, generations=2)
+    assert row["reason"] == ""
+
+
+def test_a_killed_application_comes_back_under_its_pid(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    for restores in (1, 2):
+        os.kill(web.app_pid, signal.SIGKILL)
+        row = local.wait_for(web, restores=restores, state="protected")
+        assert row["app_pid_inside"] == 2
+        assert row["last_death"] == "killed by SIGKILL"
+        assert 0 < row["last_restore_s"] < 5
+        assert children(web.init_pid)
+    assert not ended(web)
+    assert "web: died: killed by SIGKILL" in local.log
+    assert local.log.count("web: killed by SIGKILL, restored in") == 2
+
+
+def checkpoint(local: LocalSidecar, *args: str) -> str:
+    """Takes one; a busy machine may miss the freeze deadline, and says so."""
+    deadline = time.monotonic() + 20
+    while True:
+        done = local.avckpt("checkpoint", *args, check=False)
+        if done.status == 0:
+            return done.stdout
+        assert done.status == 1
+        assert done.stderr.startswith("avckpt: web: ")
+        assert "in time" in done.stderr
+        assert time.monotonic() < deadline, done
+
+
+def test_commands_on_a_container(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER, ON_COMMAND)
+    local.wait_for(web, app_pid_inside=2)
+    early = local.avckpt("restore", "web", check=False)
+    assert early.status == 5
+    assert early.stderr == "avckpt: web has nothing to go back to: no checkpoint yet\n"
+    taken = json.loads(checkpoint(local, web.id[:8], "--json"))
+    assert taken["event"]["kind"] == "checkpoint"
+    assert taken["container"]["checkpoints"] == 1
+    assert re.match(r"web: generation \d+, 1 thread\(s\), frozen \d", checkpoint(local, "web"))
+    back = json.loads(local.avckpt("restore", "web", "--json").stdout)
+    assert back["event"]["kind"] == "restored"
+    assert back["event"]["reason"] == "manual"
+    assert back["container"]["restores"] == 1
+    assert not ended(web)
+
+
+def test_a_container_that_is_stopped_is_forgotten(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    signal.pidfd_send_signal(web.pidfd, signal.SIGTERM)
+    assert web.status() == 128 + signal.SIGTERM
+    web.hook("poststop")
+    row = local.wait_for(web, state="ended")
+    assert row["ended_at"] is not None
+    assert row["restores"] == 0
+    assert local.ps() == []
+    assert list((local.run_dir / "containers").iterdir()) == []
+    gone = local.avckpt("checkpoint", "web", check=False)
+    assert gone.status == 4
+
+
+def test_a_container_that_is_killed_whole_is_forgotten(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    signal.pidfd_send_signal(web.pidfd, signal.SIGKILL)
+    web.status()
+    local.wait_for(web, state="ended")
+    # Nothing of ours keeps what it held: no guard, no pidfd.
+    assert local.process is not None
+    pidfds = [fd.readlink() for fd in Path(f"/proc/{local.process.pid}/fd").iterdir()]
+    assert not [fd for fd in pidfds if "pidfd" in str(fd)]
+
+
+def test_a_restarted_container_is_protected_again(local: LocalSidecar) -> None:
+    first = local.protected("web", SLEEPER)
+    local.wait_for(first, state="protected")
+    first.close()
+    local.containers.remove(first)
+    second = local.container("web", SLEEPER, container_id=first.id)
+    assert second.hook("prestart", QUICK) == ""
+    local.wait_for(second, state="protected")
+    assert [row["init_pid"] for row in local.ps()] == [second.init_pid]
+    assert len(local.ps("-a")) == 2
+
+
+def test_registering_twice_is_registering_once(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    assert web.hook("prestart", QUICK) == ""
+    assert len(local.ps()) == 1
+    assert local.row(web)["state"] == "protected"
+
+
+def test_labels_that_a_sidecar_can_not_honour_are_refused(local: LocalSidecar) -> None:
+    web = local.container("web", SLEEPER)
+    said = web.hook("prestart", {"avckpt.enable": "true", "avckpt.keep": "many"})
+    assert "web runs unprotected" in said
+    assert "avckpt.keep=many" in said
+    assert local.ps() == []
+
+
+def test_what_is_no_avckpt_init_is_waited_for_and_left_alone(local: LocalSidecar) -> None:
+    """A container that was created but not started looks so, too."""
+    web = local.container("web", SLEEPER)
+    web.init_pid = web.app_pid  # the hook is told of a plain program
+    assert web.hook("prestart", QUICK) == ""
+    time.sleep(0.5)
+    assert local.wait_for(web, state="starting")["reason"] == "avckpt-init has not started yet"
+    for command in ("restore", "checkpoint"):
+        refused = local.avckpt(command, "web", check=False)
+        assert refused.status == 5
+        assert "avckpt-init has not started yet" in refused.stderr
+    assert not ended(web)
+
+
+def test_what_can_not_be_protected_runs_unprotected_and_says_so(local: LocalSidecar) -> None:
+    web = local.protected("web", ["sh", "-c", "sleep 1000; true"])
+    row = local.wait_for(web, state="unprotected")
+    assert "child process" in row["reason"]
+    refused = local.avckpt("checkpoint", "web", check=False)
+    assert refused.status == 5
+    assert refused.stderr.startswith("avckpt: web runs unprotected: ")
+    assert local.log.count("web: runs unprotected") == 1
+    assert not ended(web)
+
+
+def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:
+    web = idle_sidecar.container("web", SLEEPER)
+    said = web.hook("prestart", QUICK)
+    assert "runs unprotected: no sidecar listens" in said
+    (idle_sidecar.run_dir / "containers" / ("d" * 64 + ".json")).write_text(
+        json.dumps(
+            {"version": 1, "id": "d" * 64, "name": "old", "pid": 1, "starttime": 1, "bundle": "", "annotations": {}}
+        )
+    )
+    idle_sidecar.start()
+    row = idle_sidecar.wait_for(web, state="protected")
+    assert row["adopted"]
+    assert [path.stem for path in (idle_sidecar.run_dir / "containers").iterdir()] == [web.id]
+
+
+def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    app = web.app_pid
+    assert local.stop() == 0
+    assert sorted(path.name for path in local.run_dir.iterdir()) == ["containers", "history.jsonl", "lock"]
+    assert not ended(web)
+    # Templates are gone, the application is not traced any more and runs.
+    wait_until(lambda: children(web.init_pid) == [app], 5, "only the application is left")
+    status = Path(f"/proc/{app}/status").read_text()
+    assert "TracerPid:\t0" in status
+    assert "State:\tS" in status
+    os.kill(app, signal.SIGKILL)
+    assert web.status() == 128 + signal.SIGKILL
+
+
+def test_sigkill_leaves_the_application_running_and_the_next_one_takes_over(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    app = web.app_pid
+    assert local.stop(signal.SIGKILL) == -signal.SIGKILL
+    assert (local.run_dir / "hooks.sock").exists()
+    wait_until(lambda: children(web.init_pid) == [app], 5, "only the application is left")
+    assert not ended(web)
+    local.start()
+    row = local.wait_for(web, state="protected")
+    assert row["adopted"]
+    os.kill(app, signal.SIGKILL)
+    local.wait_for(web, restores=1, state="protected")
+
+
+def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSidecar) -> None:
+    web = local.container("web", SLEEPER)
+    assert local.process is not None
+    local.process.send_signal(signal.SIGSTOP)
+    try:
+        started = time.monotonic()
+        said = web.hook("prestart", QUICK)
+        took_s = time.monotonic() - started
+    finally:
+        local.process.send_signal(signal.SIGCONT)
+    assert "did not answer within 1 s" in said
+    assert took_s < 2.5
+    # What the hook had sent was not lost.
+    local.wait_for(web, state="protected")
+    os.kill(web.app_pid, signal.SIGKILL)
+    local.wait_for(web, restores=1)
+
+
+def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> None:
+    second = local.avckpt("sidecar", check=False)
+    assert second.status == 1
+    assert second.stderr.count("\n") == 1
+    assert local.process is not None
+    assert f"a sidecar is running already (pid {local.process.pid}" in second.stderr
+    assert local.ps() == []
+
+
+def test_without_privileges_it_says_so(tmp_path: Path) -> None:
+    refused = run(
+        ["setpriv", "--bounding-set=-sys_ptrace,-sys_admin", "--inh-caps=-all", *avckpt_command(), "sidecar"],
+        env={"AVCKPT_RUN_DIR": str(tmp_path / "run")},
+        check=False,
+    )
+    assert refused.status == 1
+    assert refused.stderr.startswith("avckpt: ")
+    assert refused.stderr.count("\n") == 1
+    assert "CAP_SYS_" in refused.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_sockets_are_for_root_only(local: LocalSidecar) -> None:
+    for name in ("api.sock", "hooks.sock"):
+        assert stat.S_IMODE((local.run_dir / name).stat().st_mode) == 0o600
+    assert stat.S_IMODE(local.run_dir.stat().st_mode) == 0o755
+
+
+def test_an_idle_sidecar_sleeps(local: LocalSidecar) -> None:
+    """At most a handful of wake-ups: a periodic task would show."""
+    assert local.process is not None
+    path = Path(f"/proc/{local.process.pid}/status")
+
+    def switches() -> int:
+        return int(path.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
+
+    time.sleep(0.5)
+    before = switches()
+    time.sleep(3)
+    assert switches() - before <= 2
+
+
+def test_info(local: LocalSidecar) -> None:
+    from avckpt.client import Client
+
+    info = Client(local.run_dir).info()
+    assert local.process is not None
+    assert info["pid"] == local.process.pid
+    assert info["containers"] == 0
+    assert info["version"] == run([*avckpt_command(), "--version"]).stdout.split()[1]

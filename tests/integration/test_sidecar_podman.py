@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sidecar as it is meant to run: in its container, with hooks and real containers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from harness import Container, ContainerFactory, Podman, Sidecar
+
+COUNTER = "import time\nfor i in range(10**9):\n    print('n', i, flush=True)\n    time.sleep(0.02)"
+COUNT = ("python3", "-c", COUNTER)
+QUICK = {"interval": "100ms"}
+
+
+def numbers(container: Container) -> list[int]:
+    return [int(line.split()[1]) for line in container.logs().splitlines() if line.startswith("n ")]
+
+
+def test_a_container_lives_through_kill_and_ends_with_stop(container: ContainerFactory, sidecar: Sidecar) -> None:
+    web = container.protected(*COUNT, labels=QUICK)
+    entry = sidecar.wait_generation(web, 2)
+    assert entry["name"] == web.name
+    assert entry["state"] == "protected"
+    assert entry["init_pid"] == web.pid
+    init = web.pid
+    for restores, signum in enumerate((signal.SIGKILL, signal.SIGSEGV), 1):
+        os.kill(sidecar.app_pid(web), signum)
+        entry = sidecar.wait_restores(web, restores)
+        assert entry["last_death"] == f"killed by {signum.name}"
+    assert (web.status, web.pid) == ("running", init)
+    seen = numbers(web)
+    time.sleep(0.5)
+    assert max(numbers(web)) > max(seen)
+    # It went back by moments, not to its start.
+    assert numbers(web).count(0) == 1
+    done = web.podman.run("stop", "--time", "9", web.name, timeout_s=20)
+    assert done.took_s < 5
+    assert web.exit_code == 128 + signal.SIGTERM
+    [ended] = [entry for entry in sidecar.ps("-a") if entry["id"] == web.id]
+    assert ended["state"] == "ended"
+    assert sidecar.find(web) is None
+    log = sidecar.logs()
+    for words in ("registered", "protected: first checkpoint", "killed by SIGSEGV, restored in", "ended: "):
+        assert f"{web.name}: {words}" in log
+
+
+def test_a_paused_container_is_missed_and_goes_on(
+    container: ContainerFactory, sidecar: Sidecar, podman: Podman
+) -> None:
+    web = container.protected(*COUNT, labels=QUICK)
+    sidecar.wait_generation(web)
+    podman.run("pause", web.name)
+    try:
+        entry = sidecar.wait_for(web, lambda entry: entry["missed"] >= 1, "a missed checkpoint")
+        assert entry["state"] == "protected"
+        assert entry["reason"].startswith("checkpoint missed: ")
+    finally:
+        podman.run("unpause", web.name)
+    sidecar.wait_generation(web, entry["generation"] + 2)
+    seen = max(numbers(web))
+    time.sleep(0.5)
+    assert max(numbers(web)) > seen
+    assert sidecar.logs().count(f"{web.name}: checkpoint missed") == 1
+
+
+def test_a_killed_sidecar_is_replaced_by_one_that_adopts(container: ContainerFactory, sidecar: Sidecar) -> None:
+    web = container.protected(*COUNT, labels=QUICK)
+    sidecar.wait_generation(web)
+    app = sidecar.app_pid(web)
+    sidecar.kill()
+    assert web.status == "running"
+    assert sidecar.app_pid(web) == app
+    sidecar.restart()
+    assert sidecar.wait_generation(web)["adopted"]
+    os.kill(app, signal.SIGKILL)
+    sidecar.wait_restores(web)
+    assert numbers(web).count(0) == 1

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Builds what the native tests run."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def make(folder: str, *goals: str) -> None:
+    """Runs make; its output is the error when it fails."""
+    done = subprocess.run(
+        ["make", "-s", "-C", str(ROOT / folder), *goals],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.fixture(scope="session")
+def init_built() -> None:
+    """native/build/avckpt-init is there and up to date."""
+    make("native", "build/avckpt-init")
+
+
+@pytest.fixture(scope="session")
+def victims_built() -> Path:
+    """The folder of the built tests/victims."""
+    make("tests/victims")
+    return ROOT / "tests/victims/build"

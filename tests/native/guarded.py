@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A victim below avckpt-init in a PID namespace of its own, guarded by a process that a test can see into."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from avckpt.events import GuardConfig
+from harness import app_pid, wait_until
+from native.board import Board, Seen
+from native.init_peer import ROOT, Init, children_of, state_of
+
+PEER = Path(__file__).with_name("guard_peer.py")
+BUILD = ROOT / "tests/victims/build"
+PATIENCE_S = 15.0
+
+Json = dict[str, Any]
+
+
+def config(interval_s: float = 0.0, **changes: Any) -> GuardConfig:
+    """Restores as often as it takes, looks for no quiet moment; 0: checkpoints on command only."""
+    plain = GuardConfig(
+        interval_s=interval_s,
+        keep=2,
+        restore_on_signal=True,
+        restore_on_exit=True,
+        restore_on_statuses=frozenset(),
+        restore_max=64,
+        restore_window_s=0.5,
+        quiesce_s=0.0,
+    )
+    return dataclasses.replace(plain, **changes)
+
+
+class GuardProcess:
+    """guard_peer.py; see there.  A context manager that kills it."""
+
+    def __init__(self, guard_config: GuardConfig, inits: Sequence[int]) -> None:
+        fields = dataclasses.asdict(guard_config)
+        fields["restore_on_statuses"] = sorted(guard_config.restore_on_statuses)
+        self.process = subprocess.Popen(
+            [sys.executable, str(PEER), json.dumps(fields), *map(str, inits)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.events: list[Json] = []
+        self._news = threading.Condition()
+        self._ended = False
+        self._tickets = 0
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.wait("started")
+
+    def __enter__(self) -> GuardProcess:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.kill()
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self._reader.join()
+        self.process.stdin.close()
+        self.process.stdout.close()
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.process.kill()
+        self.process.wait()
+
+    def fds(self) -> int:
+        """How many descriptors it has."""
+        return len(os.listdir(f"/proc/{self.pid}/fd"))
+
+    def mark(self) -> int:
+        """A moment: give it to wait() as `since`."""
+        with self._news:
+            return len(self.events)
+
+    def wait(
+        self, what: str, *, since: int = 0, count: int = 1, cookie: int = 0, timeout_s: float = PATIENCE_S
+    ) -> Json:
+        """The `count`th event of the kind `what` after `since`.  Fails with what came instead."""
+        return self.wait_for(
+            lambda event: event.get("kind") == what and cookie in (0, event.get("cookie")),
+            f"{count} x {what}",
+            since=since,
+            count=count,
+            timeout_s=timeout_s,
+        )
+
+    def wait_for(
+        self,
+        fits: Callable[[Json], bool],
+        what: str,
+        *,
+        since: int = 0,
+        count: int = 1,
+        timeout_s: float = PATIENCE_S,
+    ) -> Json:
+        """The `count`th event after `since` that fits."""
+        deadline = time.monotonic() + timeout_s
+        at, found = since, 0
+        with self._news:
+            while True:
+                while at < len(self.events):
+                    found += fits(self.events[at])
+                    at += 1
+                    if found == count:
+                        return self.events[at - 1]
+                left = deadline - time.monotonic()
+                if left <= 0 or self._ended or not self._news.wait(left):
+                    raise AssertionError(f"no {what}; but {self.events[since:][-12:]}")
+
+    def command(self, name: str, cookie: int = 1, timeout_s: float = PATIENCE_S) -> Json:
+        """`checkpoint` or `restore`, once init was found; returns the answer."""
+        self.wait("attached", cookie=cookie)
+        ticket = self._say(f"{name} {cookie} %d")
+        return self.wait_for(lambda event: event.get("ticket") == ticket, f"answer to {name}", timeout_s=timeout_s)
+
+    def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
+        """`n` checkpoints back to back."""
+        self.wait("attached", cookie=cookie)
+        ticket = self._say(f"burst {cookie} %d {n}")
+        return self.wait_for(lambda event: event.get("burst") == ticket, f"end of {n} checkpoints", timeout_s=timeout_s)
+
+    def stop(self) -> None:
+        """Stops the guards, in good order; the process stays."""
+        since = self.mark()
+        self._say("stop")
+        self.wait("stopped", since=since)
+
+    def _say(self, line: str) -> int:
+        assert self.process.stdin is not None
+        self._tickets += 1
+        self.process.stdin.write((line % self._tickets if "%d" in line else line) + "\n")
+        self.process.stdin.flush()
+        return self._tickets
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._news:
+                self.events.append(json.loads(line))
+                self._news.notify_all()
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+
+
+class Victim(Init):
+    """A program of tests/victims below avckpt-init, with its board."""
+
+    def __init__(self, command: str, folder: Path, *, options: Sequence[str] = (), with_board: bool = True) -> None:
+        program, *args = command.split()
+        self.command = command
+        self.board = Board(folder / f"board-{Path(program).name}-{time.monotonic_ns()}")
+        self.output_path = self.board.path.with_suffix(".out")
+        if with_board:
+            args += ["--board", str(self.board.path)]
+        self._file = self.output_path.open("wb")
+        super().__init__(
+            [BUILD / program, *args], pid1=True, options=options, stdout=self._file.fileno(), stderr=subprocess.STDOUT
+        )
+
+    def __enter__(self) -> Victim:
+        super().__enter__()
+        wait_until(lambda: self.see().ready or self.popen.poll() is not None, PATIENCE_S, f"{self.command} is ready")
+        assert self.popen.poll() is None, self.said
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        super().__exit__(kind, error, trace)
+        self._file.close()
+        self.board.page.close()
+
+    @property
+    def said(self) -> str:
+        """All its output."""
+        return self.output_path.read_text(errors="replace")
+
+    def see(self) -> Seen:
+        return self.board.see()
+
+    @property
+    def app(self) -> int:
+        """The victim's PID in our namespace; waits while it is being restored."""
+
+        def look() -> int:
+            try:
+                return app_pid(self.pid)
+            except LookupError:
+                return 0
+
+        return wait_until(look, PATIENCE_S, f"{self.command} is there", every_s=0.001)
+
+    def kill_app(self, signum: int = signal.SIGKILL) -> None:
+        """Kills the victim, as it is now."""
+        os.kill(self.app, signum)
+
+    def others(self) -> list[int]:
+        """Children of init that are not the victim, zombies included."""
+        app = self.app
+        return [pid for pid in children_of(self.pid) if pid != app]
+
+    def wait_beats(self, n: int = 5, timeout_s: float = PATIENCE_S) -> None:
+        """Waits for `n` more beats.  Fails when the victim has ended, or found something wrong."""
+        wanted = self.see().beats + n
+        wait_until(lambda: self.see().beats >= wanted or self.popen.poll() is not None, timeout_s, "beats", 0.002)
+        self.check()
+
+    def check(self) -> None:
+        """It runs, was started once, and has found nothing wrong."""
+        seen = self.see()
+        assert seen.violations == 0, self.said
+        assert "VIOLATION" not in self.said, self.said
+        assert self.popen.poll() is None, f"avckpt-init ended with {self.popen.poll()}: {self.said}"
+        assert seen.starts == 1
+
+
+def inside(pid: int) -> int:
+    """A task's number in its own PID namespace."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    line = next(line for line in status.splitlines() if line.startswith("NSpid:"))
+    return int(line.split()[-1])
+
+
+def threads(pid: int) -> dict[int, str]:
+    """Threads of a process: inner TID and name."""
+    found = {}
+    for tid in os.listdir(f"/proc/{pid}/task"):
+        task = Path(f"/proc/{pid}/task/{tid}")
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            found[inside(int(tid))] = (task / "comm").read_text().strip()
+    return found
+
+
+def pads(pid: int) -> int:
+    """Mappings of ours in a process."""
+    return Path(f"/proc/{pid}/maps").read_text().count("/dev/zero (deleted)")
+
+
+def kill_at_random(
+    guard: GuardProcess, victim: Victim, kills: int, pause_s: tuple[float, float], seed: int = 1, cookie: int = 1
+) -> None:
+    """Kills the victim again and again, and sees each time that it goes on."""
+    rng = random.Random(seed)
+    guard.wait("checkpoint", cookie=cookie)
+    pid = inside(victim.app)
+    for _ in range(kills):
+        time.sleep(rng.uniform(*pause_s))
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since, cookie=cookie)
+        victim.wait_beats(3)
+        assert inside(victim.app) == pid
+        assert victim.see().pid == pid
+
+
+__all__ = [
+    "BUILD",
+    "GuardProcess",
+    "Victim",
+    "children_of",
+    "config",
+    "inside",
+    "kill_at_random",
+    "pads",
+    "state_of",
+    "threads",
+]

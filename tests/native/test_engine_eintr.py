@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blocked system calls under checkpoints: no EINTR, and timeouts that come when they should."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from native.guarded import GuardProcess, Victim, config
+
+CHECKPOINTS = 10_000
+KINDS_AT = 8
+UNWOKEN = {9, 10, 11, 19}
+"""Places on the board of kinds that nothing wakes: the three sleeps; and io_getevents, which "all" leaves out."""
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@pytest.mark.slow
+def test_no_eintr_over_ten_thousand_checkpoints(tmp_path: Path) -> None:
+    """One process with a thread in each call: every checkpoint stops them all."""
+    # Above clone's way: one generation, so that the cost is the freeze and not the bookkeeping.
+    with Victim("eintr all 0", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
+        # A few may miss their deadline on a busy machine.
+        done = guard.burst(CHECKPOINTS + 100)
+        assert done["taken"] >= CHECKPOINTS, done
+        calls = victim.see().counter[KINDS_AT : KINDS_AT + 20]
+        victim.wait_beats(20)
+        victim.check()
+        assert victim.see().counter[1] == 0
+        # None is stuck in a call whose wake-up was lost: each comes back once more.
+        later = victim.see().counter[KINDS_AT : KINDS_AT + 20]
+        stuck = [n for n in range(20) if n not in UNWOKEN and later[n] == calls[n]]
+        assert stuck == [], f"of {victim.command}, as listed in eintr.c: {stuck}"
+
+
+@pytest.mark.parametrize(("seconds", "interval_s", "late_s"), [(2.0, 0.1, 0.4), (3.0, 0.004, 0.4), (0.3, 0.02, 0.4)])
+def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, tmp_path: Path) -> None:
+    """A relative timeout is not begun again by every checkpoint, and none ends early (the victim sees to that)."""
+    # Sockets' timeouts end at a checkpoint: two intervals.  The rest is for a busy machine, and less
+    # than what a wait that forgets the time it was stopped adds up to in the second case.
+    command = f"eintr all {seconds} --quiet --late {late_s}"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        time.sleep(2.2 * seconds)
+        seen = victim.see()
+        victim.check()
+        counts = seen.counter[KINDS_AT : KINDS_AT + 19]
+        timed = [n for n in counts if n]
+        assert len(timed) == 16, f"kinds that have come back at all: {counts}"
+        assert min(timed) >= 2, counts
+        assert seen.counter[1] == 0
+
+
+def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
+    """It begins again, at most in full: never early, never for ever."""
+    with (
+        Victim("eintr all 0.5 --quiet --late 2", tmp_path) as victim,
+        GuardProcess(config(0.05), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint", count=3)
+        for _ in range(3):
+            time.sleep(0.3)
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+        calls = victim.see().counter[KINDS_AT : KINDS_AT + 19]
+        time.sleep(1.5)
+        victim.check()
+        later = victim.see().counter[KINDS_AT : KINDS_AT + 19]
+        assert sum(after > before for before, after in zip(calls, later)) == 16, (calls, later)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every victim under fast checkpoints, killed at random moments: it goes on, and finds nothing wrong."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from native.guarded import GuardProcess, Victim, config, kill_at_random
+
+KILLS = 12
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "threads 20 16",
+        "threads 4 1 --no-churn",
+        "leave 8",
+        "fpu 4",
+        "rseq 4",
+        "signals 6 --pending",
+        "busy 16",
+        "crash",
+        "tcpecho 0",
+        "idle 20 40",
+        "mappings 0 --inherited",
+    ],
+)
+@pytest.mark.parametrize("interval_s", [0.05])
+def test_killed_at_random_moments(command: str, interval_s: float, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
+        kill_at_random(guard, victim, KILLS, (0.0, 3 * interval_s))
+        victim.wait_beats(20)
+
+
+@pytest.mark.parametrize("how", ["segv", "kill"])
+def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
+    """Hundreds of times, in the middle of whatever is being done to it; then it ends, and nothing hangs."""
+    again = config(0.02, restore_window_s=0.001)
+    with Victim(f"crash {how} 0.3 --threads 6", tmp_path) as victim, GuardProcess(again, [victim.pid]) as guard:
+        guard.wait("restored")
+        time.sleep(4)
+        if victim.popen.poll() is None:
+            # It would go on for ever: no two deaths are within the window.
+            guard.wait("restored", since=guard.mark(), count=3)
+            victim.kill(signal.SIGKILL)
+        # init can not end before every tracee was reaped.
+        victim.end(5)
+        assert guard.wait("ended")
+        assert sum(event["kind"] == "restored" for event in guard.events if "kind" in event) > 20

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The engine under AddressSanitizer, LeakSanitizer and UndefinedBehaviorSanitizer."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from harness import wait_until
+from native.guarded import Victim
+from native.init_peer import ROOT
+
+SOURCE = Path(__file__).with_name("sanitized_guard.c")
+FLAGS = [
+    "-std=gnu11",
+    "-D_GNU_SOURCE",
+    "-g",
+    "-pthread",
+    "-fsanitize=address,undefined",
+    "-fno-sanitize-recover=undefined",
+]
+
+
+@pytest.fixture(scope="module")
+def guard_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    subprocess.run(["make", "-s", "-C", str(ROOT / "native"), "SANITIZE=1"], check=True, timeout=300)
+    program = tmp_path_factory.mktemp("sanitized") / "guard"
+    library = ROOT / "native/build-san/libavckpt.a"
+    subprocess.run(
+        ["cc", *FLAGS, f"-I{ROOT}/native/include", str(SOURCE), str(library), "-o", str(program)],
+        check=True,
+        timeout=120,
+    )
+    return program
+
+
+class Guard:
+    """The sanitized guard of one victim, and what it has said."""
+
+    def __init__(self, popen: subprocess.Popen[bytes], output: Path) -> None:
+        self.popen = popen
+        self._output = output
+
+    @property
+    def said(self) -> str:
+        return self._output.read_text(errors="replace")
+
+    def count(self, event: str) -> int:
+        return sum(line.split(" ", 1)[0] == event for line in self.said.splitlines())
+
+    def wait(self, event: str, count: int) -> None:
+        wait_until(lambda: self.count(event) >= count or self.popen.poll() is not None, 30, f"{count} x {event}")
+        assert self.popen.poll() is None, self.said
+
+
+@contextmanager
+def guarding(program: Path, victim: Victim, interval_ms: int, commands: int, output: Path) -> Iterator[Guard]:
+    """Ends it with SIGTERM; then nothing may have been found, leaks included."""
+    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=1:detect_stack_use_after_return=0"}
+    with output.open("wb") as file:
+        popen = subprocess.Popen(
+            [program, str(victim.pid), str(interval_ms), str(commands)],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        )
+    guard = Guard(popen, output)
+    try:
+        yield guard
+        popen.send_signal(signal.SIGTERM)
+        status = popen.wait(timeout=30)
+    finally:
+        popen.kill()
+        popen.wait()
+    assert "Sanitizer" not in guard.said, guard.said
+    assert "runtime error" not in guard.said, guard.said
+    assert status == 0, guard.said
+
+
+@pytest.mark.parametrize("command", ["threads 8 4", "crash", "busy 4"])
+def test_kills_and_restores(command: str, guard_program: Path, tmp_path: Path) -> None:
+    rng = random.Random(command)
+    with Victim(command, tmp_path) as victim:
+        with guarding(guard_program, victim, 30, 3, tmp_path / "guard.out") as guard:
+            guard.wait("checkpoint", 4)
+            for n in range(1, 9):
+                time.sleep(rng.uniform(0.01, 0.2))
+                victim.kill_app()
+                guard.wait("restored", n)
+                victim.wait_beats(3)
+        # The guard has gone in good order: the victim runs on, without it.
+        victim.wait_beats(5)
+        assert victim.others() == []
+
+
+def test_the_container_ends_first(guard_program: Path, tmp_path: Path) -> None:
+    output = tmp_path / "guard.out"
+    with Victim("idle 4 3", tmp_path) as victim, guarding(guard_program, victim, 20, 0, output) as guard:
+        guard.wait("checkpoint", 3)
+        os.kill(victim.pid, signal.SIGKILL)
+        wait_until(lambda: guard.count("ended") == 1, 10, "the end is noticed")

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process that holds the engine is killed at random moments: no application notices, no template ever runs."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from avckpt.events import GuardConfig
+from harness import wait_until
+from native.guarded import PEER, GuardProcess, Victim, config, pads, threads
+
+KILLS = 500
+NEVER_RESTARTED = {"epoll_wait", "epoll_pwait", "epoll_pwait2", "semop", "semtimedop", "sigtimedwait"}
+UNWOKEN = [9, 10, 11, 19]
+CALLS_OF_READ = 8 + 12
+"""On the board of eintr.c; see there."""
+STORM = PEER.with_name("kill_storm.py")
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *victims: Victim) -> dict[str, object]:
+    """Runs kill_storm.py; what it says at the end."""
+    fields = {**dataclasses.asdict(guard_config), "restore_on_statuses": []}
+    done = subprocess.run(
+        [
+            *(sys.executable, str(STORM), json.dumps(fields), str(kills), str(max_ms), str(seed)),
+            *(str(victim.pid) for victim in victims),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(PEER.parent.parent), *sys.path])},
+    )
+    assert done.returncode == 0, done.stderr + "".join(victim.said for victim in victims)
+    assert done.stderr == ""
+    said: dict[str, object] = json.loads(done.stdout)
+    return said
+
+
+@pytest.mark.slow
+def test_no_application_notices(tmp_path: Path) -> None:
+    """Three kinds of application at once: each kill hits three guards, whatever they are doing."""
+    with contextlib.ExitStack() as stack:
+        victims = [stack.enter_context(Victim(command, tmp_path)) for command in ("threads 6 4", "fpu 2", "signals 4")]
+        names = [threads(victim.app) for victim in victims[1:]]
+        pids = [victim.app for victim in victims]
+        said = storm(config(0.002), KILLS, 40, 1, *victims)
+        assert said["kills"] == KILLS
+        assert said["left"] == []
+        assert said["unprotected"] == 0
+        # The storm has hit what it was to hit: guards before, in and after checkpoints.
+        hit = said["hit"]
+        assert isinstance(hit, int)
+        assert KILLS / 4 < hit < KILLS
+        for victim in victims:
+            victim.wait_beats(50)
+        assert [victim.app for victim in victims] == pids
+        assert [threads(victim.app) for victim in victims[1:]] == names
+        # And the next guard protects as if nothing had been.
+        with GuardProcess(config(0.05), [victim.pid for victim in victims]) as guard:
+            for cookie, victim in enumerate(victims, 1):
+                guard.wait("checkpoint", cookie=cookie, count=3)
+                since = guard.mark()
+                victim.kill_app()
+                guard.wait("restored", since=since, cookie=cookie)
+                victim.wait_beats(20)
+
+
+def test_blocked_calls_go_on(tmp_path: Path) -> None:
+    """A guard that dies between stopping a thread and mending its call can not undo the stop.
+
+    Calls that the kernel never makes again by itself (signal(7)) then answer EINTR, once, as after
+    SIGSTOP and SIGCONT.  No other call may, and none may be lost.
+    """
+    with Victim("eintr all 0", tmp_path) as victim, Victim("signals 4 --pending", tmp_path) as signals:
+        said = storm(config(0.002), 60, 40, 2, victim, signals)
+        assert said["left"] == []
+        signals.wait_beats(20)
+        calls = victim.see().counter[8:28]
+        wait_until(lambda: victim.see().counter[CALLS_OF_READ] > calls[12] + 3, 5, "a few wake-ups")
+        later = victim.see().counter[8:28]
+        assert [n for n in range(20) if later[n] == calls[n]] == UNWOKEN
+        answered = set(re.findall(r"(\w+) answered (\w+)", victim.said))
+        assert answered <= {(call, "EINTR") for call in NEVER_RESTARTED}
+        assert victim.popen.poll() is None
+
+
+def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
+    """Each guard maps pages of its own into the application; its successor takes them away."""
+    with Victim("threads 4 1", tmp_path) as victim:
+        storm(config(0.002), 20, 40, 3, victim)
+        with GuardProcess(config(0.02), [victim.pid]) as guard:
+            guard.wait("checkpoint", count=6)
+            wait_until(lambda: pads(victim.app) <= 2, 5, f"old pads go; there are {pads(victim.app)}")
+        victim.wait_beats(20)

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Descriptors after a restore: those of the checkpoint, whatever was done to them since."""
+
+from __future__ import annotations
+
+import random
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from avckpt.events import Files, Tcp
+from harness import wait_until
+from native.guarded import GuardProcess, Json, Victim, config
+
+KILLS = 6
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def checkpoint(guard: GuardProcess) -> Json:
+    """Takes one, once the guard has found the victim."""
+    guard.wait("attached")
+    return guard.command("checkpoint")
+
+
+def disturb(victim: Victim) -> None:
+    """Makes the victim change its descriptors, and waits until it has."""
+    before = victim.see().counter[2]
+    victim.kill_app(signal.SIGUSR1)
+    wait_until(lambda: victim.see().counter[2] > before or victim.see().violations, 5, "it has", 0.001)
+
+
+def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json:
+    """Kills it, and waits until it is there again, and has looked at its descriptors."""
+    before = victim.see().counter[1]
+    since = guard.mark()
+    victim.kill_app()
+    event = guard.wait("restored", since=since)
+    if looks:
+        wait_until(lambda: victim.see().counter[1] > before or victim.see().violations, 5, "it has looked", 0.001)
+    victim.check()
+    return event
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        *("opened", "closed", "replaced", "deleted", "offset", "lost"),
+        *("content", "events", "timer", "epoll", "flags", "locks"),
+    ],
+)
+def test_as_at_the_checkpoint(scenario: str, tmp_path: Path) -> None:
+    """From one generation many times, then from a later one: each time nothing is missing, and nothing is left."""
+    with (
+        Victim(f"descriptors {scenario} {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        for _ in range(2):
+            taken = checkpoint(guard)
+            assert taken["kind"] == "checkpoint", taken
+            for _kill in range(KILLS):
+                disturb(victim)
+                event = restored(victim, guard)
+                assert "error" not in event, event
+            victim.wait_beats()
+            if scenario == "timer":
+                break  # it goes off once
+
+
+def test_a_file_that_is_gone_reads_as_empty_and_is_told(tmp_path: Path) -> None:
+    with Victim(f"descriptors gone {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        event = restored(victim, guard)
+        error = event["error"]["detail"]
+        assert "gone (deleted)" in error
+        assert "is not there any more" in error
+
+
+def test_offsets_stay_with_keep(tmp_path: Path) -> None:
+    with (
+        Victim(f"descriptors keep {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(files=Files.KEEP), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        for _ in range(3):
+            disturb(victim)
+            restored(victim, guard)
+
+
+@pytest.fixture
+def memory() -> Iterator[Path]:
+    """A folder for the board: mapped for writing, it would be data if it were on a disk."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        yield Path(path)
+
+
+def test_strict_does_not_restore_over_a_written_file(tmp_path: Path, memory: Path) -> None:
+    with (
+        Victim(f"descriptors strict {tmp_path}", memory) as victim,
+        GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+    ):
+        time.sleep(0.05)
+        checkpoint(guard)
+        victim.kill_app(signal.SIGUSR1)
+        time.sleep(0.1)
+        answer = guard.command("restore")
+        assert answer["kind"] == "refused", answer
+        assert "data was written since the checkpoint" in str(answer["error"])
+        assert victim.popen.poll() is None
+        victim.kill_app()
+        gave_up = guard.wait("gave_up")
+        assert "avckpt.files=strict" in str(gave_up["error"])
+        assert "data was written since the checkpoint" in str(gave_up["error"])
+        assert victim.popen.wait(5) == 128 + signal.SIGKILL
+
+
+def test_strict_restores_when_nothing_was_written(tmp_path: Path, memory: Path) -> None:
+    with (
+        Victim(f"descriptors quiet {tmp_path}", memory) as victim,
+        GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+    ):
+        time.sleep(0.05)
+        checkpoint(guard)
+        for n in range(1, 4):
+            victim.kill_app()
+            guard.wait("restored", count=n)
+            time.sleep(0.05)
+        assert victim.popen.poll() is None
+
+
+class Client:
+    """One connection to tests/victims/tcpecho."""
+
+    def __init__(self, victim: Victim) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5)
+        self.stream = self.socket.makefile("rw")
+
+    def ask(self, line: str) -> str:
+        """The answer, without the newline."""
+        self.stream.write(line + "\n")
+        self.stream.flush()
+        return self.stream.readline().rstrip("\n")
+
+    def is_reset(self) -> bool:
+        """True once the other side has reset it; False if nothing of the kind comes."""
+        self.socket.settimeout(0.5)
+        try:
+            return self.socket.recv(1) == b""
+        except ConnectionResetError:
+            return True
+        except TimeoutError:
+            return False
+
+
+def test_connections_are_reset_on_demand(tmp_path: Path) -> None:
+    with (
+        Victim("tcpecho 0", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.RESET), [victim.pid]) as guard,
+    ):
+        client = Client(victim)
+        assert client.ask("hello") == "1 hello"
+        checkpoint(guard)
+        for n in range(1, 4):
+            victim.kill_app()
+            guard.wait("restored", count=n)
+            assert n > 1 or client.is_reset()
+            assert Client(victim).ask("again") == "1 again"
+        victim.check()
+
+
+def test_only_connections_that_moved_are_reset(tmp_path: Path) -> None:
+    with (
+        Victim("tcpecho 0", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.RESET_MOVED), [victim.pid]) as guard,
+    ):
+        still, moved = Client(victim), Client(victim)
+        assert (still.ask("a"), moved.ask("b")) == ("1 a", "1 b")
+        checkpoint(guard)
+        late = Client(victim)
+        assert (moved.ask("c"), late.ask("d")) == ("2 c", "1 d")
+        victim.kill_app()
+        guard.wait("restored")
+        assert moved.is_reset()
+        assert late.is_reset()
+        assert still.ask("e") == "2 e"
+        assert not still.is_reset()
+
+
+def test_connections_go_on_by_default(tmp_path: Path) -> None:
+    with Victim("tcpecho 0", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        client = Client(victim)
+        assert client.ask("a") == "1 a"
+        checkpoint(guard)
+        assert client.ask("b") == "2 b"
+        victim.kill_app()
+        guard.wait("restored")
+        assert client.ask("c") == "2 c"
+
+
+@pytest.mark.parametrize("scenario", ["opened", "closed", "replaced", "content", "events", "epoll", "flags", "locks"])
+def test_killed_at_random_moments(scenario: str, tmp_path: Path) -> None:
+    """Before, while and after it changes things, and while it looks at them; the guard keeps nothing of the app's."""
+    rng = random.Random(scenario)
+    with (
+        Victim(f"descriptors {scenario} {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        restored(victim, guard, looks=False)
+        fds = guard.fds()
+        for n in range(40):
+            if n % 10 == 9:
+                disturb(victim)
+                restored(victim, guard)
+                assert guard.command("checkpoint")["kind"] == "checkpoint"
+            victim.kill_app(signal.SIGUSR1)
+            time.sleep(rng.choice((0.0, rng.uniform(0.0, 0.003))))
+            event = restored(victim, guard, looks=False)
+            assert "error" not in event, event
+        disturb(victim)
+        restored(victim, guard)
+        assert guard.fds() <= fds + 2  # the second generation's

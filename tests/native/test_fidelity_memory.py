@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory that a fork does not carry as it is, is there after a restore."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from native.guarded import GuardProcess, Victim, config, kill_at_random
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def flagged(pid: int, flag: str) -> list[str]:
+    """Mappings of a process with a flag of smaps' VmFlags."""
+    found, header = [], ""
+    for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
+        if line.startswith("VmFlags:"):
+            if flag in line.split():
+                found.append(header)
+        elif not line[0].isupper():
+            header = line.split()[0]
+    return found
+
+
+@pytest.mark.parametrize("command", ["mappings", "mappings 0", "mappings 3000"])
+def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
+    """The victim compares all of it with one version number all the time."""
+    with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
+        wiped, locked = flagged(victim.app, "wf"), flagged(victim.app, "lo")
+        assert wiped
+        kill_at_random(guard, victim, 30, (0.01, 0.15))
+        # Its own forks are to find it wiped, now as before.
+        assert flagged(victim.app, "wf") == wiped
+        assert flagged(victim.app, "lo") == locked
+
+
+def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:
+    """A random number generator relies on it: it must hold at every moment."""
+    with Victim("mappings", tmp_path) as victim, GuardProcess(config(0.01), [victim.pid]) as guard:
+        wiped = flagged(victim.app, "wf")
+        guard.wait("checkpoint", count=3)
+        for _ in range(200):
+            assert flagged(victim.app, "wf") == wiped
+
+
+def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) -> None:
+    with (
+        Victim("idle 0 1", tmp_path) as plain,
+        Victim("mappings 8000 --inherited", tmp_path) as victim,
+        GuardProcess(config(0.05), [plain.pid, victim.pid]) as guard,
+    ):
+        told = guard.wait("checkpoint", cookie=2)["error"]["message"]
+        assert "8000 kB of shared memory are more than avckpt.shm allows" in told
+        assert not guard.wait("checkpoint", cookie=1).get("error")
+
+
+NODE = """
+const crypto = require('crypto'), fs = require('fs');
+const board = fs.openSync(process.argv[process.argv.indexOf('--board') + 1], 'r+');
+const sum = text => crypto.createHash('sha256').update(text).digest('hex');
+const kept = new Map();
+let laps = 0;
+function write(word, value) {
+    const bytes = Buffer.alloc(8);
+    bytes.writeBigUInt64LE(BigInt(value));
+    fs.writeSync(board, bytes, 0, 8, 8 * word);
+}
+function beat() {
+    const bytes = Buffer.alloc(8);
+    fs.readSync(board, bytes, 0, 8, 24);
+    write(3, bytes.readBigUInt64LE() + 1n);
+}
+function lap() {
+    const key = laps % 3000, old = kept.get(key);
+    if (old && sum(old.text) !== old.sum) {
+        console.log('VIOLATION: ' + key);
+        process.exit(99);
+    }
+    const text = Array.from({length: 50}, (_, i) => 'x' + laps * i).join(',');
+    kept.set(key, {text, sum: sum(text)});
+    if (++laps % 50 === 0) beat();
+    setImmediate(lap);
+}
+setInterval(beat, 5);
+write(1, 1);
+write(2, process.pid);
+write(8, 1);
+lap();
+"""
+
+
+@pytest.mark.skipif(not shutil.which("node"), reason="Node.js is not installed")
+def test_node(tmp_path: Path) -> None:
+    """V8 marks its heap MADV_DONTFORK; here it grows and shrinks all the time."""
+    script = tmp_path / "app.js"
+    script.write_text(NODE)
+    command = f"{shutil.which('node')} {script}"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(0.1), [victim.pid]) as guard:
+        assert flagged(victim.app, "dc")
+        kill_at_random(guard, victim, 30, (0.05, 0.4))

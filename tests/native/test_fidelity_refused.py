@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can not be protected runs on as if avckpt were not there, and it is told why."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from native.guarded import GuardProcess, Victim, config
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@pytest.mark.parametrize(
+    ("command", "why"),
+    [
+        ("unsupported iouring", "io_uring"),
+        ("unsupported aio", "AIO"),
+        ("unsupported userfault", "userfaultfd"),
+        ("forker", "child processes (1)"),
+    ],
+)
+def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        told = guard.wait("unprotected")
+        assert told["error"]["kind"] == "unsupported"
+        assert why in told["error"]["message"]
+        since = guard.mark()
+        time.sleep(0.3)
+        # Once, not at every look.
+        assert [e for e in guard.events[since:] if e["kind"] == "unprotected"] == []
+        answer = guard.command("checkpoint")
+        assert why in answer["error"]["message"]
+        victim.wait_beats(20)
+        assert victim.others() == [] or command == "forker"
+        victim.kill_app()
+        # Nothing to restore from: the end is the app's own, at once.
+        assert victim.end(2) == 128 + signal.SIGKILL
+
+
+def test_a_tracer_of_its_own(tmp_path: Path) -> None:
+    """Somebody's debugger comes first; when it leaves, protection comes back."""
+    with Victim("unsupported traced", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        app = guard.wait("attached")["app_pid"]
+        told = guard.wait("unprotected")
+        status = Path(f"/proc/{app}/status").read_text()
+        tracer = int(status.split("TracerPid:")[1].split()[0])
+        assert f"traced by process {tracer}" in told["error"]["message"]
+        since = guard.mark()
+        os.kill(tracer, signal.SIGKILL)
+        guard.wait("checkpoint", since=since)
+        victim.wait_beats(20)
+
+
+def test_for_a_while(tmp_path: Path) -> None:
+    """A child that comes and goes: protected, not, and protected again."""
+    with Victim("forker 0.4 0.4", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        guard.wait("unprotected")
+        since = guard.mark()
+        guard.wait("checkpoint", since=since)
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        victim.wait_beats(20)
+
+
+def test_stopped_by_job_control(tmp_path: Path) -> None:
+    """Checkpoints are missed while it is stopped, it stays stopped, and they come again."""
+    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        app = victim.app
+        os.kill(app, signal.SIGSTOP)
+        since = guard.mark()
+        guard.wait("missed", since=since, count=3)
+        beats = victim.see().beats
+        time.sleep(0.2)
+        assert victim.see().beats == beats
+        since = guard.mark()
+        os.kill(app, signal.SIGCONT)
+        guard.wait("checkpoint", since=since)
+        victim.wait_beats(20)
+        assert victim.app == app

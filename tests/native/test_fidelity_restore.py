@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a restored application is: the same process to itself, to its peers, and to whoever looks at it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from harness import wait_until
+from native.guarded import GuardProcess, Victim, children_of, config, inside, pads, state_of, threads
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def test_one_generation_restored_many_times(tmp_path: Path) -> None:
+    """Each time from the very same image: nothing of one life is in the next."""
+    with Victim("threads 8 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        taken = guard.command("checkpoint")
+        assert taken["kind"] == "checkpoint", taken
+        names = threads(victim.app)
+        laps = []
+        for n in range(20):
+            since = guard.mark()
+            victim.kill_app(signal.SIGSEGV if n % 2 else signal.SIGKILL)
+            restored = guard.wait("restored", since=since)
+            assert restored["generation"] == taken["generation"]
+            victim.wait_beats(1)
+            laps.append(victim.see().counter[0])
+            # The workers; who lives shortly may be there or not.
+            assert {tid: name for tid, name in threads(victim.app).items() if tid <= 10} == {
+                tid: name for tid, name in names.items() if tid <= 10
+            }
+            time.sleep(0.02)
+        # Counted on, it would have grown twentyfold.
+        assert max(laps[-5:]) < 2 * max(laps[:5]) + 200, laps
+        victim.wait_beats(50)
+
+
+def test_restore_on_command(tmp_path: Path) -> None:
+    """A live application is rolled back, and its counters with it."""
+    with Victim("busy 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.command("restore")["kind"] == "refused"
+        guard.command("checkpoint")
+        pid = inside(victim.app)
+        at = victim.see().counter[1]
+        wait_until(lambda: victim.see().counter[1] > at + 1000, 10, "it works")
+        before = victim.see().counter[1]
+        answer = guard.command("restore")
+        assert (answer["kind"], answer["reason"]) == ("restored", "command")
+        wait_until(lambda: victim.see().counter[1] < before, 5, "it has gone back")
+        assert inside(victim.app) == pid
+        victim.wait_beats(20)
+
+
+def test_names_in_the_process_list(tmp_path: Path) -> None:
+    """Templates and holder say what they are; the restored application is called what it was."""
+    with Victim("idle 1 5", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        before = threads(victim.app)
+        command_line = Path(f"/proc/{victim.app}/cmdline").read_bytes()
+        for _ in range(3):
+            guard.command("checkpoint")
+        others = [Path(f"/proc/{pid}/comm").read_text().strip() for pid in victim.others()]
+        assert sorted(others) == ["avckpt-hold", "avckpt-tmpl", "avckpt-tmpl"]
+        scores = [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in victim.others()]
+        assert sorted(scores)[1:] == [1000, 1000]
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        victim.wait_beats()
+        assert threads(victim.app) == before
+        assert Path(f"/proc/{victim.app}/cmdline").read_bytes() == command_line
+        assert Path(f"/proc/{victim.app}/comm").read_text() == "idle\n"
+        assert int(Path(f"/proc/{victim.app}/oom_score_adj").read_text()) == int(
+            Path(f"/proc/{victim.pid}/oom_score_adj").read_text()
+        )
+
+
+def test_process_group_and_session_stay(tmp_path: Path) -> None:
+    with Victim("idle 1 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+
+        def groups() -> tuple[int, int]:
+            status = Path(f"/proc/{victim.app}/status").read_text()
+            lines = dict(line.split(":\t", 1) for line in status.splitlines() if ":\t" in line)
+            return int(lines["NSpgid"].split()[-1]), int(lines["NSsid"].split()[-1])
+
+        before = groups()
+        guard.command("checkpoint")
+        for _ in range(2):
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            victim.wait_beats()
+            assert groups() == before
+
+
+def test_a_template_that_is_killed_is_a_lost_generation(tmp_path: Path) -> None:
+    """From inside the container, as somebody's cleaning script may do it."""
+    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        first = guard.command("checkpoint")
+        guard.command("checkpoint")
+        for pid in victim.others():
+            os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: not victim.others(), 5, "they are gone, and reaped")
+        victim.wait_beats(20)
+        third = guard.command("checkpoint")
+        assert third["generation"] == first["generation"] + 2
+        assert third["generations"] == 1
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        victim.wait_beats(20)
+
+
+def test_nothing_is_left_behind(tmp_path: Path) -> None:
+    """No process, zombie, mapping or descriptor more after many checkpoints and restores, and none after the end."""
+    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+
+        def cycle(restores: int) -> tuple[int, int, int, int]:
+            guard.burst(30)
+            assert len(victim.others()) == 3, "two templates and the holder"
+            for _ in range(restores):
+                since = guard.mark()
+                victim.kill_app()
+                guard.wait("restored", since=since)
+                victim.wait_beats(2)
+                guard.burst(5)
+            return (guard.fds(), pads(victim.app), len(children_of(victim.pid)), mappings(guard.pid))
+
+        first = cycle(3)
+        second = cycle(20)
+        assert second[:3] == first[:3], "descriptors of the guard, pads in the application, children of init"
+        assert second[3] <= first[3] + 2, "mappings of the guard"
+        assert [state_of(pid) for pid in children_of(victim.pid)].count("Z") == 0
+        guard.stop()
+        wait_until(lambda: children_of(victim.pid) == [victim.app], 5, "templates and holder are gone")
+        victim.wait_beats(20)
+
+
+def mappings(pid: int) -> int:
+    return len(Path(f"/proc/{pid}/maps").read_text().splitlines())
+
+
+@pytest.fixture
+def echo(tmp_path: Path) -> Iterator[tuple[Victim, GuardProcess, socket.socket]]:
+    """tcpecho, its guard, and a connection to it."""
+    with Victim("tcpecho 0", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        peer = socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5)
+        with contextlib.closing(peer):
+            yield victim, guard, peer
+
+
+def ask(peer: socket.socket, line: str) -> str:
+    peer.sendall(line.encode() + b"\n")
+    answer = b""
+    while not answer.endswith(b"\n"):
+        data = peer.recv(4096)
+        assert data, "the connection is over"
+        answer += data
+    return answer.decode().rstrip()
+
+
+def test_a_connection_goes_on(echo: tuple[Victim, GuardProcess, socket.socket]) -> None:
+    victim, guard, peer = echo
+    assert ask(peer, "one") == "1 one"
+    guard.command("checkpoint")
+    assert ask(peer, "two") == "2 two"
+    for _ in range(10):
+        since = guard.mark()
+        victim.kill_app()
+        # Asked while nobody is there: the kernel keeps the question.
+        assert ask(peer, "again") == "2 again"  # it knows of one line, as of the checkpoint
+        guard.wait("restored", since=since)
+    assert ask(peer, "pid").endswith(f"pid {inside(victim.app)}")
+
+
+def test_what_is_closed_after_a_checkpoint_is_closed(echo: tuple[Victim, GuardProcess, socket.socket]) -> None:
+    """Though templates were made while it was open: the peer sees the end, the port is free."""
+    victim, guard, peer = echo
+    port = victim.see().counter[1]
+    for _ in range(3):
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+    assert ask(peer, "close") == "1 close"
+    peer.settimeout(1)
+    assert peer.recv(1) == b""
+    with socket.create_connection(("127.0.0.1", port), 5) as second:
+        guard.command("checkpoint")
+        assert ask(second, "listenclose") == "1 listenclose"
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port), 1)
+        with socket.socket() as taker:
+            # Of connections that were accepted there the port is not free; for a listener it is.
+            taker.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            taker.bind(("127.0.0.1", port))
+            taker.listen()
+
+
+def test_a_peer_sees_the_end_of_an_app_that_is_not_restored(tmp_path: Path) -> None:
+    """Templates must not keep its connections open."""
+    unsaved = config(restore_on_signal=False)
+    with (
+        Victim("tcpecho 0", tmp_path) as victim,
+        GuardProcess(unsaved, [victim.pid]) as guard,
+        socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5) as peer,
+    ):
+        guard.command("checkpoint")
+        victim.kill_app()
+        assert guard.wait("gave_up")["reason"] == "policy"
+        with contextlib.suppress(ConnectionResetError):
+            assert peer.recv(1) == b""
+        assert victim.end() == 128 + signal.SIGKILL
+
+
+def test_an_exit_status_that_is_not_restored_is_inits(tmp_path: Path) -> None:
+    only_signals = config(restore_on_exit=False)
+    with Victim("crash", tmp_path) as victim, GuardProcess(only_signals, [victim.pid]) as guard:
+        guard.command("checkpoint")
+        victim.kill_app(signal.SIGUSR2)  # abort()
+        assert guard.wait("restored")["wait_status"] & 0x7F == signal.SIGABRT
+        victim.wait_beats()
+        victim.kill_app(signal.SIGHUP)  # exit(3)
+        assert guard.wait("gave_up")["reason"] == "policy"
+        assert victim.end() == 3
+
+
+def test_restores_are_used_up(tmp_path: Path) -> None:
+    """The newest keeps crashing, then the one before it, and then it is over, with the app's own status."""
+    few = config(restore_max=2, restore_window_s=60.0)
+    with Victim("crash", tmp_path) as victim, GuardProcess(few, [victim.pid]) as guard:
+        first = guard.command("checkpoint")["generation"]
+        second = guard.command("checkpoint")["generation"]
+        used = []
+        for _ in range(2):
+            since = guard.mark()
+            victim.kill_app()
+            used.append(guard.wait("restored", since=since)["generation"])
+            victim.wait_beats()
+        assert used == [second, first]
+        victim.kill_app()
+        assert guard.wait("gave_up")["reason"] == "limit"
+        assert victim.end() == 128 + signal.SIGKILL

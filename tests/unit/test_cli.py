@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line without a sidecar: usage, messages, exit statuses, what is loaded."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from avckpt import cli
+from avckpt.client import Client
+from avckpt.errors import NothingToRestore
+from avckpt.events import Command
+from click.testing import CliRunner, Result
+
+
+@pytest.fixture(autouse=True)
+def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("AVCKPT_RUN_DIR", str(tmp_path))
+    return tmp_path
+
+
+def avckpt(*args: str) -> Result:
+    return CliRunner().invoke(cli.main, args)
+
+
+def row(**fields: object) -> dict[str, object]:
+    return {
+        "id": "ab" * 32,
+        "name": "web",
+        "state": "protected",
+        "generations": 2,
+        "keep": 2,
+        "memory_bytes": 1_500_000,
+        "last_checkpoint_at": 0.0,
+        "last_freeze_s": 0.00251,
+        "restores": 1,
+        "last_restore_s": 0.0063,
+        "reason": "",
+        **fields,
+    }
+
+
+@pytest.mark.parametrize("args", [["ps"], ["ps", "--json"], ["checkpoint", "web"], ["restore", "web"]])
+def test_without_a_sidecar_one_line_says_how_to_start_it(args: list[str], run_dir: Path) -> None:
+    result = avckpt(*args)
+    assert result.exit_code == 3
+    assert result.stdout == ""
+    assert result.stderr.startswith(
+        f"avckpt: the sidecar is not running (no {run_dir}/api.sock): start it with: podman run"
+    )
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_sidecar_that_was_killed_leaves_a_socket_that_is_no_sidecar(run_dir: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as left_behind:
+        left_behind.bind(str(run_dir / "api.sock"))
+    result = avckpt("ps")
+    assert result.exit_code == 3
+    assert "nobody listens on" in result.stderr
+
+
+def test_an_answer_that_is_no_sidecars(run_dir: Path) -> None:
+    program = (
+        "import socket,sys; s=socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); print(flush=True);"
+        "c,_=s.accept(); c.recv(9999); c.sendall(b'HTTP/1.0 200 OK\\r\\n\\r\\n[1]'); c.close()"
+    )
+    path = str(run_dir / "api.sock")
+    with subprocess.Popen([sys.executable, "-c", program, path], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        server.stdout.readline()
+        result = avckpt("ps")
+    assert result.exit_code == 1
+    assert "makes no sense" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "args",
+    [["checkpoint"], ["restore", "a", "b"], ["ps", "--nonsense"], ["nonsense"], ["run"], ["run", "-l", "x", "true"]],
+)
+def test_wrong_usage(args: list[str]) -> None:
+    assert avckpt(*args).exit_code == 2
+
+
+@pytest.mark.parametrize("label", ["avckpt.group=chain", "avckpt.notify.self=signal:USR1"])
+def test_a_plain_program_has_nobody_who_notifies_it(label: str) -> None:
+    result = avckpt("run", "-l", label, "--", "true")
+    assert result.exit_code == 2
+    assert f"label {label.partition('=')[0]}: it takes containers and the sidecar, leave it out" in result.stderr
+
+
+def test_help_documents_the_exit_statuses() -> None:
+    text = avckpt("--help").stdout
+    for words in ("3 the sidecar", "4 no such container", "5 the container"):
+        assert words in text.replace("\n", " ").replace("  ", " ")
+
+
+def test_the_sidecars_errors_decide_the_exit_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Client, name: str, command: Command) -> Any:
+        raise NothingToRestore(f"{name} has nothing to go back to")
+
+    monkeypatch.setattr(Client, "command", refuse)
+    result = avckpt("restore", "web")
+    assert result.exit_code == 5
+    assert result.stderr == "avckpt: web has nothing to go back to\n"
+
+
+def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        row(),
+        row(name="", state="starting", last_freeze_s=None, last_checkpoint_at=None, reason="[red]no[/red] " * 20),
+    ]
+    monkeypatch.setattr(Client, "containers", lambda self, ended: rows)
+    lines = avckpt("ps").stdout.splitlines()
+    assert lines[0].split()[:3] == ["NAME", "STATE", "GENERATIONS"]
+    assert lines[1].split()[:3] == ["web", "protected", "2/2"]
+    assert "2.51 ms" in lines[1]
+    assert "6.30 ms" in lines[1]
+    # The short id where there is no name; markup is text; one line, however long.
+    assert lines[2].split()[:2] == ["abababababab", "starting"]
+    assert lines[2].count("[red]no[/red]") == 20
+    assert len(lines) == 3
+
+
+def test_json_is_what_the_api_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def containers(self: Client, ended: bool) -> list[dict[str, object]]:
+        asked.append(ended)
+        return [row()]
+
+    monkeypatch.setattr(Client, "containers", containers)
+    assert json.loads(avckpt("ps", "-a", "--json").stdout) == [row()]
+    assert asked == [True]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="it takes root to become somebody else")
+def test_who_may_not_ask_is_told(run_dir: Path) -> None:
+    run_dir.chmod(0o700)
+    pid = os.fork()
+    if pid == 0:
+        os.setuid(65534)
+        result = avckpt("ps")
+        os._exit(0 if result.exit_code == 1 and "is for root only" in result.stderr else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+
+
+def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
+    program = "import avckpt.cli, avckpt.client, sys; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    for heavy in ("rich", "aiohttp", "asyncio", "cffi", "podman", "_cffi_backend"):
+        assert f"'{heavy}'" not in loaded

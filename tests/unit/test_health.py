@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a health check is, and when an application is unhealthy."""
+
+from __future__ import annotations
+
+import pytest
+from avckpt.health import HealthCheck, Pulse, describe, health_check_of
+from avckpt.inside import Done
+
+S = 1_000_000_000
+
+
+def test_as_podman_inspect_has_it() -> None:
+    found = health_check_of(
+        {"Test": ["CMD-SHELL", "test -e /x"], "StartPeriod": 3 * S, "Interval": 2 * S, "Timeout": S, "Retries": 2}
+    )
+    assert found == HealthCheck(("/bin/sh", "-c", "test -e /x"), 2.0, 1.0, 2, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("test", "command"),
+    [
+        (["CMD", "curl", "-f", "localhost"], ("curl", "-f", "localhost")),
+        (["curl", "-f"], ("curl", "-f")),
+        (["CMD-SHELL", "a || b"], ("/bin/sh", "-c", "a || b")),
+    ],
+)
+def test_commands(test: list[str], command: tuple[str, ...]) -> None:
+    found = health_check_of({"Test": test})
+    assert found is not None
+    assert found.command == command
+    assert (found.interval_s, found.timeout_s, found.retries, found.start_period_s) == (30, 30, 3, 0)
+
+
+@pytest.mark.parametrize("nothing", [None, {}, {"Test": ["NONE"]}, {"Test": []}, {"Test": ["CMD"]}])
+def test_none(nothing: object) -> None:
+    assert health_check_of(nothing) is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "x",
+        {"Test": "true"},
+        {"Test": ["CMD", 1]},
+        {"Test": ["a", "b"], "Interval": "1s"},
+        {"Test": ["a", "b"], "Retries": -1},
+    ],
+)
+def test_what_is_no_health_check(wrong: object) -> None:
+    with pytest.raises(ValueError):
+        health_check_of(wrong)
+
+
+def pulse(**changes: float) -> Pulse:
+    return Pulse(HealthCheck(("true",), **{"retries": 3, **changes}))  # type: ignore[arg-type]
+
+
+def test_so_many_failures_in_a_row() -> None:
+    counting = pulse()
+    said = [counting.take(healthy, 100.0) for healthy in (False, False, True, False, False, False, False)]
+    assert said == [False, False, False, False, False, True, False]
+
+
+def test_failures_within_the_start_period_do_not_count_until_one_has_passed() -> None:
+    counting = pulse(retries=1, start_period_s=10.0)
+    assert not counting.take(False, 9.9)
+    assert counting.take(False, 10.1)
+    counting = pulse(retries=1, start_period_s=10.0)
+    assert not counting.take(True, 1.0)
+    assert counting.take(False, 2.0)
+
+
+def test_how_it_failed_in_words() -> None:
+    check = HealthCheck(("true",), timeout_s=1.5)
+    assert describe(Done(137, True, "", 1.5), check) == "no answer within 1.5 s"
+    assert describe(Done(7, False, "curl: (7)\n  refused" + "x" * 500, 0.1), check).startswith(
+        "status 7: curl: (7) refused"
+    )
+    assert len(describe(Done(7, False, "x" * 500, 0.1), check)) < 140

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The history: bounded, numbered, and whole whatever happened to the sidecar that wrote it."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from avckpt.event_record import EventRecord, Kind
+from avckpt.history import History
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "history.jsonl"
+
+
+def died(at: float = 0.0, detail: str = "") -> EventRecord:
+    return EventRecord(Kind.DIED, container="web", at=at, wait_status=9, detail=detail)
+
+
+def test_events_are_numbered_and_found_again_by_the_next_sidecar(path: Path) -> None:
+    history = History(path)
+    first, second = history.add(died(10.0)), history.add(died(20.0))
+    assert first.seq > 0
+    assert second.seq == first.seq + 1
+    after_restart = History(path)
+    assert after_restart.after() == [first, second]
+    assert after_restart.add(died(30.0)).seq == second.seq + 1
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_after_and_since(path: Path) -> None:
+    history = History(path)
+    records = [history.add(died(float(at))) for at in (10, 20, 30)]
+    assert history.after(records[0].seq) == records[1:]
+    assert history.after(records[2].seq) == []
+    assert history.after(since=20.0) == records[1:]
+    assert history.after(records[1].seq, since=10.0) == records[2:]
+
+
+def test_a_number_of_a_history_that_was_lost_gets_everything(path: Path) -> None:
+    history = History(path)
+    records = [history.add(died()) for _ in range(3)]
+    assert history.after(records[2].seq + 1) == records
+    # The other way round: numbers of a lost one are smaller than all new ones.
+    path.unlink()
+    time.sleep(1.1)
+    assert History(path).add(died()).seq > records[0].seq
+
+
+def test_it_is_bounded_in_memory_and_in_the_file(path: Path) -> None:
+    history = History(path, limit=10)
+    longest = 0
+    for number in range(95):
+        history.add(died(float(number)))
+        longest = max(longest, len(path.read_bytes().splitlines()))
+    assert 10 <= longest <= 20
+    assert [record.at for record in history.after()] == [float(n) for n in range(85, 95)]
+    assert [record.at for record in History(path, limit=10).after()] == [float(n) for n in range(85, 95)]
+    assert os.listdir(path.parent) == [path.name]
+
+
+@pytest.mark.parametrize(
+    "junk", [b'{"kind": "died", "at": 1', b"\x00\xff\x00\n", b"[1]\n", b"{}\n", b'{"kind": "novelty"}\n', b"\n"]
+)
+def test_a_torn_or_foreign_line_costs_that_line_only(path: Path, junk: bytes) -> None:
+    first = History(path).add(died(1.0))
+    with path.open("ab") as file:
+        file.write(junk)
+    history = History(path)
+    assert history.after() == [first]
+    second = history.add(died(2.0))
+    assert History(path).after() == [first, second]
+    assert len(path.read_bytes().splitlines()) == 2
+
+
+def test_what_can_not_be_written_is_kept_in_memory_and_said_once(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path.mkdir()
+    history = History(path)
+    records = [history.add(died()) for _ in range(3)]
+    assert history.after() == records
+    assert [record.message for record in caplog.records] == [
+        f"{path} can not be used (Is a directory): events are kept in memory only"
+    ]
+
+
+def test_a_writer_that_is_killed_at_any_instant_leaves_a_history_without_a_gap(path: Path) -> None:
+    """Small limit, so that many of the kills hit a replacement of the file."""
+    program = (
+        "import sys\nfrom pathlib import Path\nfrom avckpt.history import History\n"
+        "from avckpt.event_record import EventRecord, Kind\n"
+        "h = History(Path(sys.argv[1]), limit=20)\nprint(flush=True)\n"
+        "while True: print(h.add(EventRecord(Kind.DIED, wait_status=9)).seq, flush=True)\n"
+    )
+    newest = 0
+    for _ in range(8):
+        with subprocess.Popen([sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None
+            writer.stdout.readline()
+            time.sleep(random.uniform(0.01, 0.1))
+            writer.send_signal(signal.SIGKILL)
+            told = [int(word) for word in writer.stdout.read().split()]
+        assert told
+        assert told[0] > newest
+        history = History(path, limit=20)
+        numbers = [record.seq for record in history.after()]
+        assert numbers == list(range(numbers[0], numbers[-1] + 1))
+        # What was told was kept; at most one more was kept without being told.
+        assert numbers[-1] - told[-1] in (0, 1)
+        newest = numbers[-1]
+        history.close()
+    assert all(json.loads(line)["kind"] == "died" for line in path.read_text().splitlines())

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The precreate hook on configurations that Podman 4.3.1 really gave it.
+
+`hooks_samples/` holds them with what `podman generate spec` said of the same
+container; the seccomp profile was taken out, for it is long and nothing looks
+at it.  The hook's Podman is a program that prints that answer.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from avckpt_hooks import podman
+
+SAMPLES = Path(__file__).parent / "hooks_samples"
+CHECKOUT = Path(__file__).resolve().parents[2]
+HOOK = CHECKOUT / "hooks" / "avckpt-hook"
+PROTECTED = ["labelled", "init", "readonly_tty_user", "no_cgroups", "pod"]
+
+
+@dataclass
+class Result:
+    status: int
+    out: bytes
+    said: str
+    asked: str
+    """The arguments that Podman was called with."""
+
+    @property
+    def config(self) -> dict[str, Any]:
+        config: dict[str, Any] = json.loads(self.out)
+        return config
+
+
+Hook = Callable[..., Result]
+
+
+@pytest.fixture
+def hook(tmp_path: Path) -> Hook:
+    """Runs the real hook program below a process that is called like Podman's."""
+    if not (CHECKOUT / "native" / "build" / "avckpt-init").exists():
+        pytest.fail("avckpt-init is not built: run make -C native")
+
+    def run(config: bytes, spec: str | None, arguments: tuple[str, ...] = ("run",)) -> Result:
+        bin_dir = tmp_path / "bin"
+        bin_dir.mkdir(exist_ok=True)
+        fake = bin_dir / "podman"
+        answer = f"cat {tmp_path}/spec" if spec is not None else "echo 'Error: no such container' >&2; exit 125"
+        fake.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/asked\n{answer}\n')
+        fake.chmod(0o755)
+        (tmp_path / "spec").write_text(spec or "")
+        (tmp_path / "asked").write_text("")
+        env = {"PATH": f"{bin_dir}:{os.environ['PATH']}", "AVCKPT_RUN_DIR": str(tmp_path / "run")}
+        # A shell is the hook's parent; "; exit $?" keeps it from becoming the hook
+        # itself.  Not dash: while it waits its own standard error is the hook's.
+        done = subprocess.run(
+            ["bash", "-c", f"{HOOK} precreate 2>/dev/null; exit $?", *arguments],
+            input=config,
+            capture_output=True,
+            env=env,
+            timeout=20,
+            check=False,
+        )
+        return Result(done.returncode, done.stdout, done.stderr.decode(), (tmp_path / "asked").read_text())
+
+    return run
+
+
+def sample(name: str) -> tuple[bytes, str]:
+    return (SAMPLES / f"{name}.config.json").read_bytes(), (SAMPLES / f"{name}.spec.json").read_text()
+
+
+def with_labels(spec: str, **labels: str) -> str:
+    data = json.loads(spec)
+    data["labels"] = {f"avckpt.{key.replace('_', '.')}": value for key, value in labels.items()}
+    return json.dumps(data)
+
+
+def test_an_unlabelled_container_passes_byte_for_byte(hook: Hook) -> None:
+    config, spec = sample("plain")
+    config = config.replace(b'","', b'" ,\n"')  # formatting that no serialiser would give back
+    result = hook(config, spec)
+    assert result.out == config
+    assert (result.status, result.said) == (0, "")
+
+
+def test_an_unprotected_container_passes_byte_for_byte(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    result = hook(config, with_labels(spec, enable="false", interval="1s"))
+    assert result.out == config
+
+
+@pytest.mark.parametrize("name", PROTECTED)
+def test_init_is_put_in_front_and_nothing_else_touched(hook: Hook, name: str) -> None:
+    config, spec = sample(name)
+    before = json.loads(config)
+    result = hook(config, spec)
+    assert result.status == 0
+    after = result.config
+    args = after["process"].pop("args")
+    dashes = args.index("--")
+    assert args[:dashes] == [
+        "/run/avckpt-init",
+        "--wait-ms",
+        "2000",
+        "--stop-signal",
+        "2" if name == "init" else "15",
+    ]
+    original = before["process"].pop("args")
+    assert args[dashes + 1 :] == (original[2:] if name == "init" else original)
+    assert after["process"] == before["process"]
+    assert after["linux"] == before["linux"]
+    mount = after["mounts"].pop()
+    assert after["mounts"] == before["mounts"]
+    assert mount["destination"] == "/run/avckpt-init"
+    assert os.access(mount["source"], os.X_OK)
+    assert {"bind", "ro", "nosuid", "nodev"} <= set(mount["options"])
+    assert "noexec" not in mount["options"]
+    stamped = {key: value for key, value in after["annotations"].items() if key not in before["annotations"]}
+    assert stamped.pop("avckpt.version")
+    assert stamped.pop("avckpt.name") == "web"
+    labels = {key: value for key, value in json.loads(spec)["labels"].items() if key.startswith("avckpt.")}
+    assert stamped == labels
+    assert json.loads(spec)["name"] == "web"
+
+
+def test_the_other_two_hooks_are_added_behind_those_that_are_there(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    data = json.loads(config)
+    theirs = {"path": "/bin/true", "args": ["true"]}
+    data["hooks"] = {"prestart": [theirs]}
+    hooks = hook(json.dumps(data).encode(), spec).config["hooks"]
+    assert hooks["prestart"][0] == theirs
+    for stage in ("prestart", "poststop"):
+        ours = hooks[stage][-1]
+        assert ours["path"] == str(HOOK)
+        assert ours["args"][:2] == ["avckpt-hook", stage]
+        assert any(entry.startswith("PATH=") for entry in ours["env"])
+        assert any(entry.startswith("AVCKPT_RUN_DIR=") for entry in ours["env"])
+
+
+def test_a_second_time_changes_nothing(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    once = hook(config, spec).out
+    assert hook(once, spec).out == once
+
+
+def test_a_bad_label_fails_and_tells_the_one_who_started_podman(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    result = hook(config, with_labels(spec, enable="true", interval="banana"))
+    assert result.status != 0
+    assert result.out == b""
+    assert result.said.startswith("avckpt: container web: label avckpt.interval=banana: not a duration; allowed: ")
+    assert result.said.count("\n") == 1
+
+
+def test_a_client_of_the_rest_service_finds_the_reason_in_the_configuration(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    result = hook(config, with_labels(spec, enable="true", keep="99"), ("system", "service"))
+    assert result.status == 0
+    [broken] = result.config["hooks"]["prestart"]
+    assert broken["path"].startswith("avckpt: container web: label avckpt.keep=99: ")
+
+
+def test_without_a_sidecar_the_user_is_told(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    result = hook(config, spec)
+    assert "container web runs unprotected until the sidecar is started" in result.said
+    assert "--told" in result.config["hooks"]["prestart"][-1]["args"]
+
+
+def test_labels_that_can_not_be_read_let_the_container_start_and_are_said(hook: Hook) -> None:
+    config, _ = sample("plain")
+    result = hook(config, None)
+    assert (result.status, result.out) == (0, config)
+    assert "cannot read a container's labels (podman generate spec: Error: no such container)" in result.said
+
+
+def test_annotations_are_enough_when_labels_can_not_be_read(hook: Hook) -> None:
+    config, _ = sample("readonly_tty_user")
+    assert hook(config, None).config["process"]["args"][0] == "/run/avckpt-init"
+
+
+def test_systemd_is_left_alone(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    data = json.loads(config)
+    data["process"]["args"] = ["/sbin/init"]
+    config = json.dumps(data).encode()
+    result = hook(config, spec)
+    assert result.out == config
+    assert "systemd must itself be PID 1" in result.said
+
+
+def test_nonsense_on_standard_input_comes_out_again(hook: Hook) -> None:
+    result = hook(b'{"avckpt.": ', None)
+    assert (result.status, result.out) == (0, b'{"avckpt.": ')
+    assert "runs unprotected" in result.said
+
+
+def test_podman_is_asked_for_the_container_of_the_configuration(hook: Hook) -> None:
+    config, spec = sample("pod")
+    wanted = podman.container_id(config)
+    assert hook(config, spec).asked.split() == ["generate", "spec", "-c", "-n=false", wanted]
+
+
+@pytest.mark.parametrize("name", ["plain", *PROTECTED])
+def test_the_id_is_that_of_the_container(name: str) -> None:
+    config, _ = sample(name)
+    found = podman.container_id(config)
+    [mounted] = [m["source"] for m in json.loads(config)["mounts"] if m["destination"] == "/etc/hostname"]
+    assert mounted.endswith(f"-containers/{found}/userdata/hostname")
+    # Podman names a container's host after its id.
+    assert f"HOSTNAME={found[:12]}" in json.loads(config)["process"]["env"] or name == "pod"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "machine.slice:libpod:{id}",
+        "/machine.slice/libpod-{id}.scope",
+        "machine-libpod_pod_{other}.slice:libpod:{id}",
+        "/libpod_parent/{other}/libpod-{id}",
+        "/libpod_parent/libpod-{id}/container",
+    ],
+)
+def test_the_id_in_every_shape_of_a_cgroup_path(path: str) -> None:
+    path = path.format(id="ab" * 32, other="cd" * 32)
+    config = json.dumps(
+        {"annotations": {"cgroupsPath": "ef" * 32}, "linux": {"cgroupsPath": path}}, separators=(",", ":")
+    )
+    assert podman.container_id(config.encode()) == "ab" * 32
+
+
+def test_the_id_without_a_cgroup_and_without_containerenv() -> None:
+    config, _ = sample("readonly_tty_user")
+    wanted = podman.container_id(config)
+    data = json.loads(config)
+    del data["linux"]["cgroupsPath"]
+    assert podman.container_id(json.dumps(data).encode()) == wanted
+
+
+def test_no_id_is_said_so() -> None:
+    with pytest.raises(podman.Unknown):
+        podman.container_id(b'{"linux":{"cgroupsPath":"/split"},"mounts":[]}')
+
+
+@pytest.mark.parametrize(
+    ("line", "flags"),
+    [
+        ("podman run x", []),
+        ("podman --root /a --runroot=/b run --root /c x", ["--root=/a", "--runroot=/b"]),
+        ("podman --log-level debug --remote=false --root /a run", ["--root=/a"]),
+        (
+            "podman --syslog --hooks-dir /h --storage-opt a=b --storage-opt=c=d create",
+            ["--storage-opt=a=b", "--storage-opt=c=d"],
+        ),
+        ("podman --tmpdir", []),
+    ],
+)
+def test_the_flags_that_say_where_containers_are(line: str, flags: list[str]) -> None:
+    assert podman.store_flags(line.split()) == flags
+
+
+def test_flags_behind_the_subcommand_are_found_when_looked_for() -> None:
+    assert podman.store_flags(["podman", "run", "--root", "/c", "-d", "x"], anywhere=True) == ["--root=/c"]

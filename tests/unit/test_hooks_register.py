@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""prestart and poststop, as real programs, against a sidecar of any temper."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from avckpt_hooks import protocol
+
+HOOK = Path(__file__).resolve().parents[2] / "hooks" / "avckpt-hook"
+ID = "ab" * 32
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("AVCKPT_RUN_DIR", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def process() -> Iterator[subprocess.Popen[bytes]]:
+    """Stands for a container's main process."""
+    child = subprocess.Popen(["sleep", "60"])
+    yield child
+    child.kill()
+    child.wait()
+
+
+@pytest.fixture
+def listener(run_dir: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(protocol.hooks_socket())
+        listener.listen(1)
+        yield listener
+
+
+def call(stage: str, state: dict[str, Any] | bytes, *arguments: str) -> tuple[str, float]:
+    """Runs a hook below a shell; returns what it told the shell's standard error, and how long it took."""
+    stdin = state if isinstance(state, bytes) else json.dumps(state).encode()
+    started = time.monotonic()
+    done = subprocess.run(
+        ["bash", "-c", f'{HOOK} {stage} "$@" 2>/dev/null; exit $?', "hook", *arguments],
+        input=stdin,
+        capture_output=True,
+        timeout=20,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert done.stdout == b""
+    return done.stderr.decode(), time.monotonic() - started
+
+
+def state_of(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    annotations = {"avckpt.version": "0.1.0", "avckpt.enable": "true", "avckpt.name": "web"}
+    return {"id": ID, "pid": process.pid, "bundle": "/b", "status": "created", "annotations": annotations}
+
+
+def answer(listener: socket.socket, reply: Callable[[socket.socket, Any, int | None], object]) -> threading.Thread:
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            request, pidfd = protocol.receive_request(connection)
+            reply(connection, request, pidfd)
+            if pidfd is not None:
+                os.close(pidfd)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    return thread
+
+
+def test_prestart_registers_with_a_pidfd(listener: socket.socket, process: subprocess.Popen[bytes]) -> None:
+    seen: list[protocol.Register] = []
+
+    def reply(connection: socket.socket, request: Any, pidfd: int | None) -> None:
+        assert pidfd is not None
+        signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+        seen.append(request)
+        connection.send(protocol.encode_reply())
+
+    thread = answer(listener, reply)
+    said, _ = call("prestart", state_of(process))
+    thread.join()
+    assert said == ""
+    assert process.wait(timeout=5) == -signal.SIGKILL
+    [request] = seen
+    assert (request.id, request.name, request.pid, request.bundle) == (ID, "web", process.pid, "/b")
+    assert request.annotations["avckpt.enable"] == "true"
+    record = json.loads(Path(protocol.record_path(ID)).read_text())
+    assert record == request.record()
+    assert protocol.Register.from_record(record).record() == record
+
+
+def test_prestart_records_the_start_time_of_a_process_with_an_odd_name(run_dir: Path) -> None:
+    script = "import ctypes, time; ctypes.CDLL(None).prctl(15, b') R 7 (x'); print(flush=True); time.sleep(60)"
+    with subprocess.Popen(["/usr/bin/python3", "-c", script], stdout=subprocess.PIPE) as odd:
+        assert odd.stdout is not None
+        odd.stdout.readline()
+        call("prestart", state_of(odd))
+        record = json.loads(Path(protocol.record_path(ID)).read_text())
+        boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+        odd.kill()
+    ticks = os.sysconf("SC_CLK_TCK")
+    assert boot_s - 10 < record["starttime"] / ticks <= boot_s
+
+
+def test_prestart_without_a_sidecar_leaves_a_record_and_says_so(
+    run_dir: Path, process: subprocess.Popen[bytes]
+) -> None:
+    said, _ = call("prestart", state_of(process))
+    why = f"no sidecar listens on {run_dir}/hooks.sock (No such file or directory)"
+    assert said == f"avckpt: container web runs unprotected: {why}\n"
+    assert Path(protocol.record_path(ID)).exists()
+    said, _ = call("prestart", state_of(process), "--told")
+    assert said == ""
+
+
+def test_prestart_passes_a_refusal_on(listener: socket.socket, process: subprocess.Popen[bytes]) -> None:
+    thread = answer(listener, lambda c, _, __: c.send(protocol.encode_reply("too many")))
+    said, _ = call("prestart", state_of(process))
+    thread.join()
+    assert "the sidecar said: too many" in said
+
+
+@pytest.mark.parametrize("temper", ["never accepts", "never answers", "hangs up", "talks nonsense", "full"])
+def test_a_hook_ends_soon_whatever_the_sidecar_does(
+    listener: socket.socket, process: subprocess.Popen[bytes], temper: str
+) -> None:
+    thread = None
+    waiting: list[socket.socket] = []
+    hold = threading.Event()
+    if temper == "never answers":
+        thread = answer(listener, lambda c, _, __: hold.wait(10))
+    elif temper == "hangs up":
+        thread = answer(listener, lambda c, _, __: None)
+    elif temper == "talks nonsense":
+        thread = answer(listener, lambda c, _, __: c.send(b"\xff[]"))
+    elif temper == "full":
+        for _ in range(10):
+            waiting.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+            waiting[-1].setblocking(False)
+            try:
+                waiting[-1].connect(protocol.hooks_socket())
+            except BlockingIOError:
+                break
+        else:
+            pytest.fail("the backlog never filled up")
+    said, took_s = call("prestart", state_of(process))
+    hold.set()
+    if thread:
+        thread.join()
+    for connection in waiting:
+        connection.close()
+    assert "container web runs unprotected" in said
+    assert took_s < protocol.TIMEOUT_S + 1.0
+
+
+def test_poststop_removes_the_record_and_deregisters(listener: socket.socket, process: subprocess.Popen[bytes]) -> None:
+    seen: list[object] = []
+
+    def reply(connection: socket.socket, request: Any, pidfd: int | None) -> None:
+        seen.append((request.id, pidfd, type(request)))
+        connection.send(protocol.encode_reply())
+
+    record = Path(protocol.record_path(ID))
+    record.parent.mkdir()
+    record.write_text("{}")
+    thread = answer(listener, reply)
+    call("poststop", {"id": ID, "status": "stopped"})
+    thread.join()
+    assert seen == [(ID, None, protocol.Deregister)]
+    assert not record.exists()
+
+
+def test_poststop_without_a_sidecar(run_dir: Path) -> None:
+    record = Path(protocol.record_path(ID))
+    record.parent.mkdir()
+    record.write_text("{}")
+    call("poststop", {"id": ID})
+    assert not record.exists()
+    call("poststop", {"id": ID})
+
+
+def test_poststop_touches_nothing_outside_its_directory(run_dir: Path) -> None:
+    outside = run_dir / "precious.json"
+    outside.write_text("{}")
+    (run_dir / "containers").mkdir()
+    call("poststop", {"id": "../precious"})
+    assert outside.exists()
+
+
+@pytest.mark.parametrize("stage", ["prestart", "poststop"])
+@pytest.mark.parametrize("state", [b"", b"nonsense", b"[]", b"{}", b'{"id": 5}'])
+def test_no_state_makes_a_hook_fail(run_dir: Path, stage: str, state: bytes) -> None:
+    call(stage, state)
+
+
+def test_a_process_that_is_gone_is_no_reason_to_fail(run_dir: Path, process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    said, _ = call("prestart", state_of(process))
+    assert "container web runs unprotected" in said
+
+
+@pytest.mark.parametrize(
+    ("packet", "fds", "why"),
+    [
+        (b"{}", 0, "unknown op None"),
+        (b"[]", 0, "not a JSON object"),
+        (b"\xff", 0, "not JSON"),
+        (b'{"op": "deregister", "version": 2, "id": "%s"}' % ID.encode(), 0, "protocol version 2"),
+        (b'{"op": "deregister", "version": 1, "id": "../x"}', 0, "not a container id"),
+        (
+            b'{"op": "deregister", "version": 1, "id": "%s"}' % ID.encode(),
+            1,
+            "0 descriptor(s) wanted with the request, 1",
+        ),
+        (b'{"op": "register", "version": 1, "id": "%s"}' % ID.encode(), 1, "'name' is None"),
+    ],
+)
+def test_the_receiver_refuses_and_keeps_no_descriptor(packet: bytes, fds: int, why: str) -> None:
+    before = set(os.listdir("/proc/self/fd"))
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, struct.pack(f"{fds}i", *[0] * fds))] if fds else []
+        ours.sendmsg([packet], rights)
+        with pytest.raises(protocol.ProtocolError, match=why.replace("(", r"\(").replace(")", r"\)")):
+            protocol.receive_request(theirs)
+    assert set(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_registration_needs_its_pidfd() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    request = protocol.Register(id=ID, name="web", pid=1, starttime=1, bundle="", annotations={})
+    with ours, theirs:
+        ours.send(request.encode())
+        with pytest.raises(protocol.ProtocolError, match="1 descriptor"):
+            protocol.receive_request(theirs)
+        assert not select.select([theirs], [], [], 0)[0]
+
+
+def test_a_look_whether_a_sidecar_listens_is_no_bad_request() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        ours.close()
+        with pytest.raises(ConnectionResetError):
+            protocol.receive_request(theirs)

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""avckpt install and uninstall, on a root directory of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import avckpt
+import avckpt_hooks
+import pytest
+from avckpt import artifacts, install
+from avckpt.errors import ConfigError
+
+if os.geteuid() != 0:
+    pytest.skip("avckpt install needs root", allow_module_level=True)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A host with a Python, systemd's folders and a Podman configuration."""
+    for folder in ("usr/bin", "usr/local/bin", "etc/containers/containers.conf.d", "etc/tmpfiles.d", "run"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "usr/bin/python3").symlink_to("/usr/bin/python3")
+    return tmp_path
+
+
+def tree(root: Path) -> dict[str, tuple[int, bytes]]:
+    """Everything under `root`: mode, and content or target."""
+
+    def walk() -> Iterator[tuple[str, tuple[int, bytes]]]:
+        for path in sorted(root.rglob("*")):
+            mode = path.lstat().st_mode
+            content = b""
+            if stat.S_ISLNK(mode):
+                content = os.readlink(path).encode()
+            elif stat.S_ISREG(mode):
+                content = path.read_bytes()
+            yield str(path.relative_to(root)), (mode, content)
+
+    return dict(walk())
+
+
+def test_everything_is_in_its_place(root: Path) -> None:
+    os.umask(0o077)
+    try:
+        done = install.install(root)
+    finally:
+        os.umask(0o022)
+    assert not [line for line in done if line.startswith("warning")]
+    libexec = root / "usr/local/libexec/avckpt"
+    assert (libexec / "avckpt-init").read_bytes() == artifacts.init_binary().read_bytes()
+    assert stat.S_IMODE((libexec / "avckpt-init").stat().st_mode) == 0o755
+    # Users of containers come here too.
+    for folder in (libexec, libexec / "avckpt_hooks", root / "usr/local/share/avckpt/oci-hooks.d", root / "run/avckpt"):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o755
+    modules = {path.name for path in (libexec / "avckpt_hooks").glob("*.py")}
+    assert modules == {path.name for path in artifacts.hooks_source().glob("*.py")}
+    [hook_json] = (root / "usr/local/share/avckpt/oci-hooks.d").glob("*.json")
+    assert json.loads(hook_json.read_text())["hook"]["path"] == "/usr/local/libexec/avckpt/avckpt-hook"
+    done_by = subprocess.run([libexec / "avckpt-hook"], capture_output=True, text=True, check=False)
+    assert "give one of precreate, prestart, poststop" in done_by.stderr
+    conf = (root / "etc/containers/containers.conf.d/50-avckpt.conf").read_text()
+    assert conf.endswith('hooks_dir = ["/usr/share/containers/oci/hooks.d", "/usr/local/share/avckpt/oci-hooks.d"]\n')
+
+
+def test_uninstall_removes_exactly_that(root: Path) -> None:
+    (root / "etc/containers/containers.conf.d/60-mine.conf").write_text("[containers]\n")
+    before = tree(root)
+    install.install(root)
+    assert tree(root) != before
+    install.uninstall(root)
+    assert tree(root) == before
+    assert install.uninstall(root) == ["nothing is installed"]
+
+
+def test_uninstall_leaves_what_others_put_there(root: Path) -> None:
+    install.install(root)
+    kept = [root / "run/avckpt/api.sock", root / "usr/local/share/avckpt/oci-hooks.d/mine.json"]
+    for path in kept:
+        path.write_text("mine")
+    done = install.uninstall(root)
+    assert [path.read_text() for path in kept] == ["mine", "mine"]
+    assert "left /run/avckpt: it holds other files" in done
+    assert not (root / "usr/local/libexec").exists()
+
+
+def test_again_changes_nothing_that_matters(root: Path) -> None:
+    install.install(root)
+    once = tree(root)
+    install.install(root)
+    assert tree(root) == once
+    install.uninstall(root)
+    assert not (root / "usr/local/libexec").exists()
+
+
+def test_an_upgrade_replaces_files_and_never_writes_into_them(root: Path) -> None:
+    install.install(root)
+    init = root / "usr/local/libexec/avckpt/avckpt-init"
+    init.write_bytes(b"of an older version")
+    with init.open("rb") as mounted:  # as a running container has it
+        install.install(root)
+        assert mounted.read() == b"of an older version"
+    assert init.read_bytes() == artifacts.init_binary().read_bytes()
+    assert not [name for name in tree(root) if name.endswith(".new")]
+
+
+def test_an_upgrade_removes_what_only_the_old_version_had(root: Path) -> None:
+    install.install(root)
+    manifest = root / "usr/local/share/avckpt/manifest.json"
+    old = root / "usr/local/libexec/avckpt/avckpt_hooks/old.py"
+    old.write_text("")
+    data = json.loads(manifest.read_text())
+    data["files"].append("/usr/local/libexec/avckpt/avckpt_hooks/old.py")
+    data["version"] = "0.0.1"
+    manifest.write_text(json.dumps(data))
+    done = install.install(root)
+    assert not old.exists()
+    assert any("old.py: this version has no use for it" in line for line in done)
+    assert json.loads(manifest.read_text())["version"] == avckpt.__version__
+    install.uninstall(root)
+    assert not (root / "usr/local/libexec").exists()
+
+
+def test_the_users_hook_directories_stay_in_force(root: Path) -> None:
+    conf = root / "etc/containers/containers.conf"
+    conf.write_text("[engine]\nhooks_dir = [\n  \"/etc/mine\", # comment\n  '/opt/other',\n]\n")
+    install.install(root)
+    install.install(root)
+    text = (root / "etc/containers/containers.conf.d/50-avckpt.conf").read_text()
+    assert text.endswith('hooks_dir = ["/etc/mine", "/opt/other", "/usr/local/share/avckpt/oci-hooks.d"]\n')
+    conf.write_text('[engine]\nhooks_dir = ["/etc/new"]\n')
+    install.install(root)
+    text = (root / "etc/containers/containers.conf.d/50-avckpt.conf").read_text()
+    assert text.endswith('hooks_dir = ["/etc/new", "/usr/local/share/avckpt/oci-hooks.d"]\n')
+
+
+def test_a_configuration_that_wins_over_ours_is_said(root: Path) -> None:
+    (root / "etc/containers/containers.conf.d/99-mine.conf").write_text('[engine]\nhooks_dir = ["/etc/mine"]\n')
+    [warning] = [line for line in install.install(root) if line.startswith("warning: ")]
+    assert warning == (
+        "warning: Podman does not look into /usr/local/share/avckpt/oci-hooks.d: "
+        'write hooks_dir = ["/etc/mine", "/usr/local/share/avckpt/oci-hooks.d"] '
+        "under [engine] in /etc/containers/containers.conf.d/99-mine.conf"
+    )
+
+
+def test_another_python_of_the_system(root: Path) -> None:
+    (root / "usr/bin/python3").unlink()
+    (root / "usr/local/bin/python3").symlink_to(sys.executable)
+    install.install(root)
+    first = (root / "usr/local/libexec/avckpt/avckpt_hooks/__main__.py").read_text().splitlines()[0]
+    assert first == "#!/usr/local/bin/python3 -IBS"
+
+
+def test_without_a_python_nothing_is_installed(root: Path) -> None:
+    """A hook that can not start would fail every `podman run`."""
+    (root / "usr/bin/python3").unlink()
+    before = tree(root)
+    with pytest.raises(ConfigError, match="the hooks need the system's Python"):
+        install.install(root)
+    assert tree(root) == before
+
+
+def test_an_installation_that_breaks_off_can_be_removed(root: Path) -> None:
+    (root / "usr/local/share/avckpt").mkdir(parents=True)
+    (root / "usr/local/share/avckpt/oci-hooks.d").write_text("in the way")
+    before = tree(root)
+    with pytest.raises(ConfigError, match="can not be written"):
+        install.install(root)
+    assert not (root / "etc/containers/containers.conf.d/50-avckpt.conf").exists()
+    install.uninstall(root)
+    assert tree(root) == before
+
+
+def test_a_damaged_manifest_is_said(root: Path) -> None:
+    install.install(root)
+    (root / "usr/local/share/avckpt/manifest.json").write_text("{")
+    for action in (install.install, install.uninstall):
+        with pytest.raises(ConfigError, match="is damaged"):
+            action(root)
+
+
+def test_hooks_and_sidecar_are_of_one_version() -> None:
+    assert avckpt.__version__ == avckpt_hooks.VERSION

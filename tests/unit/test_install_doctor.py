@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""avckpt doctor: what it says of machines that this one is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+from pathlib import Path
+
+import avckpt
+import pytest
+from avckpt import doctor
+from avckpt.doctor import Facts, PodmanFacts, Status
+
+GOOD = Facts(
+    kernel="6.1.0-18-amd64",
+    machine="x86_64",
+    capabilities=(1 << 41) - 1,
+    in_container=False,
+    yama_scope=1,
+    ns_last_pid=True,
+    map_files=True,
+    pidfd=True,
+    podman=PodmanFacts("4.3.1", "crun", False, "/usr/share/containers/seccomp.json"),
+    hooks_dir_problems=(),
+    installed_version=avckpt.__version__,
+    missing_files=(),
+    hook_problem="",
+    init_problem="",
+    sidecar_version=avckpt.__version__,
+    sidecar_problem="",
+    engine_problem="",
+)
+REMOTE = PodmanFacts("4.3.1", "crun", False, "", remote=True)
+
+
+def test_a_good_machine() -> None:
+    found = doctor.judge(GOOD)
+    assert {check.status for check in found} == {Status.OK}
+    assert {check.remedy for check in found} == {""}
+    names = [check.name for check in found]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "status", "detail", "remedy"),
+    [
+        ({"machine": "riscv64"}, "processor", "fail", "riscv64 is not supported", "x86_64"),
+        ({"kernel": "5.10.0-28-amd64"}, "kernel", "fail", "Linux 5.10.0-28-amd64 is too old", "5.13 or newer"),
+        ({"kernel": "5.13"}, "kernel", "ok", "Linux 5.13", ""),
+        ({"ns_last_pid": False}, "kernel features", "fail", "ns_last_pid", "CONFIG_CHECKPOINT_RESTORE=y"),
+        ({"map_files": False, "pidfd": False}, "kernel features", "fail", "pidfd_open", "CONFIG_CHECKPOINT_RESTORE=y"),
+        ({"yama_scope": 3}, "ptrace", "fail", "ptrace_scope=3", "boot again"),
+        ({"yama_scope": None}, "ptrace", "ok", "no Yama", ""),
+        ({"capabilities": 1 << 19}, "privileges", "warn", "lacks CAP_SYS_ADMIN", "as root"),
+        ({"capabilities": 1 << 21, "in_container": True}, "privileges", "fail", "CAP_SYS_PTRACE", "--privileged"),
+        ({"engine_problem": "no"}, "engine", "fail", "no", "install avckpt again"),
+        ({"engine_problem": "no", "capabilities": 0}, "engine", "warn", "no", "mend"),
+        ({"podman": "podman is not here"}, "podman", "fail", "podman is not here", "install podman"),
+        ({"podman": "x", "in_container": True}, "podman", "warn", "inside a container", "on the host"),
+        ({"podman": REMOTE}, "podman", "fail", "remote", "machine of the containers"),
+        ({"podman": PodmanFacts("4.3.1", "crun", True, "")}, "podman", "fail", "rootless", "sudo"),
+        ({"podman": PodmanFacts("3.4.4", "crun", False, "")}, "podman", "warn", "3.4.4 was never tried", "4.3"),
+        ({"podman": PodmanFacts("5.4.2", "kata", False, "")}, "runtime", "warn", "kata was never tried", "crun"),
+        ({"installed_version": None}, "hooks", "fail", "not installed", "avckpt install"),
+        ({"missing_files": ("/a", "/b", "/c", "/d")}, "hooks", "fail", "/a, /b, /c ...", "avckpt install"),
+        ({"hook_problem": "bad interpreter"}, "hooks", "fail", "bad interpreter", "avckpt install"),
+        ({"installed_version": "0.0.1"}, "hooks", "warn", "version 0.0.1", "avckpt install"),
+        ({"init_problem": "/i is not static"}, "init", "fail", "/i is not static", "avckpt install"),
+        ({"hooks_dir_problems": ("it is hidden: write this",)}, "hooks_dir", "fail", "it is hidden", "write this"),
+        ({"sidecar_version": None, "sidecar_problem": "is away: start it"}, "sidecar", "fail", "is away", "start it"),
+        ({"sidecar_version": "0.0.1"}, "sidecar", "warn", "version 0.0.1", "build its image again"),
+    ],
+)
+def test_what_is_wrong_is_said_with_a_remedy(
+    change: dict[str, object], name: str, status: str, detail: str, remedy: str
+) -> None:
+    found = doctor.judge(dataclasses.replace(GOOD, **change))  # type: ignore[arg-type]
+    [check] = [check for check in found if check.name == name]
+    assert check.status.value == status
+    assert detail in check.detail
+    assert remedy in check.remedy
+    assert all(check.remedy for check in found if check.status is not Status.OK)
+
+
+def test_looking_at_this_machine_ends_in_verdicts() -> None:
+    found = {check.name: check for check in doctor.checks()}
+    assert found["kernel"].detail.startswith("Linux ")
+    assert {"processor", "ptrace", "engine", "podman", "hooks", "sidecar"} <= set(found)
+
+
+def test_an_init_must_be_static(tmp_path: Path) -> None:
+    assert doctor.init_problem(tmp_path / "none") == f"{tmp_path}/none: No such file or directory"
+    script = tmp_path / "script"
+    script.write_text("#!/bin/sh\n")
+    assert "is not executable" in doctor.init_problem(script)
+    script.chmod(0o755)
+    assert "is not a 64-bit program" in doctor.init_problem(script)
+    for kind, options in (("dynamic", []), ("static", ["-static"])):
+        program = tmp_path / kind
+        subprocess.run(
+            ["cc", *options, "-x", "c", "-o", program, "-"], input=b"int main(void) { return 0; }", check=True
+        )
+        assert doctor.init_problem(program) == ("" if kind == "static" else f"{program} is not static")

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`avckpt check` on Compose files as people have them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from avckpt import cli
+from avckpt.manifest import Kind, Manifest, Severity, check
+from avckpt_hooks.labels import LABELS
+from click.testing import CliRunner
+
+SHARED = """\
+x-protect: &protect
+  avckpt.enable: true
+  avckpt.interval: 500ms
+
+services:
+  camera:
+    image: camera
+  filter:
+    image: filter
+    labels:
+      <<: *protect
+      avckpt.interval: 200ms
+      org.example.team: perception
+  monitor:
+    image: monitor
+    labels:
+      - avckpt.enable=yes
+      - "avckpt.keep=3"
+      - org.example.team=perception
+  planner:
+    image: planner
+    annotations:
+      avckpt.enable: "true"
+"""
+
+
+def checked(path: Path, text: str) -> Manifest:
+    path.write_text(text)
+    return check([path])
+
+
+def lines(manifest: Manifest) -> list[str]:
+    """The problems, without the folder's name."""
+    return [str(problem).rpartition("/")[2] for problem in manifest.problems]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "v.yaml"
+
+
+def test_maps_lists_annotations_anchors_and_merge_keys(path: Path) -> None:
+    manifest = checked(path, SHARED)
+    assert lines(manifest) == []
+    assert {name: service.enabled for name, service in manifest.services.items()} == {
+        "camera": False,
+        "filter": True,
+        "monitor": True,
+        "planner": True,
+    }
+    interval = manifest.services["filter"].settings[Kind.LABEL]["avckpt.interval"]
+    assert (interval.value, interval.place.line) == ("200ms", 12)
+    # What comes by an anchor stands where the anchor is.
+    assert manifest.services["filter"].settings[Kind.LABEL]["avckpt.enable"].place.line == 2
+
+
+@pytest.mark.parametrize(
+    ("labels", "problem"),
+    [
+        ("{avckpt.enable: true, avckpt.kep: 3}", "label avckpt.kep: unknown label; did you mean avckpt.keep?"),
+        ("{avckpt.interval: 5}", "label avckpt.interval=5: a duration needs a unit"),
+        ("{avckpt.interval: }", 'label avckpt.interval="": not a duration'),
+        ("{avckpt.keep: [1, 2]}", "avckpt.keep: a list, not a single value"),
+        ("[avckpt.enable]", 'label avckpt.enable="": neither true nor false'),
+        ("[avckpt.enable: true]", "avckpt.enable: in a list, write it as avckpt.enable=VALUE"),
+        ("avckpt.enable=maybe", "label avckpt.enable=maybe: neither true nor false"),
+        ("[avckpt_enable=true]", "avckpt_enable is no label of avckpt's; did you mean avckpt.enable?"),
+        ("{Avckpt.Restore-On: exit}", "Avckpt.Restore-On is no label of avckpt's; did you mean avckpt.restore.on?"),
+        ("[avckpt.version=1]", "label avckpt.version=1: avckpt sets this itself"),
+        ("['avckpt.nonsense=${X}']", "label avckpt.nonsense: unknown label"),
+        ("[avckpt.keep=2, avckpt.keep=3]", "label avckpt.keep: line 3 says 2"),
+    ],
+)
+def test_a_problem_is_one_line_with_file_line_and_service(path: Path, labels: str, problem: str) -> None:
+    manifest = checked(path, f"services:\n  web:\n    labels: {labels}\n")
+    assert len(manifest.errors) == 1, lines(manifest)
+    line = str(manifest.errors[0])
+    assert line.startswith(f"{path}:3: service web: {problem}")
+    assert "\n" not in line
+
+
+def test_an_annotation_is_called_one(path: Path) -> None:
+    manifest = checked(path, "services:\n  web:\n    annotations:\n      avckpt.keep: 0\n")
+    assert lines(manifest)[0].startswith("v.yaml:4: service web: annotation avckpt.keep=0: not within 1 to 16")
+
+
+def test_label_and_annotation_must_agree(path: Path) -> None:
+    text = "services:\n  web:\n    labels: [avckpt.enable=true]\n    annotations:\n      avckpt.enable: '{}'\n"
+    assert lines(checked(path, text.format("true"))) == []
+    [line] = lines(checked(path, text.format("false")))
+    assert line.startswith(
+        "v.yaml:5: service web: label avckpt.enable=true: the annotation of the same name says false"
+    )
+
+
+def test_what_the_environment_decides_is_left_alone(path: Path) -> None:
+    text = (
+        "services:\n  web:\n    labels: ['avckpt.enable=${ON:-true}', 'avckpt.interval=$INTERVAL', 'avckpt.keep=0']\n"
+    )
+    manifest = checked(path, text)
+    assert [line.split(":")[3] for line in lines(manifest)] == [" label avckpt.keep=0"]
+    assert manifest.services["web"].enabled is None
+    assert manifest.wants_protection
+    # A doubled dollar is a dollar.
+    manifest = checked(path, "services:\n  web:\n    labels: ['avckpt.interval=$$5']\n")
+    assert "avckpt.interval=$5: not a duration" in lines(manifest)[0]
+
+
+def test_settings_without_enable_are_worth_a_warning(path: Path) -> None:
+    manifest = checked(path, "services:\n  a:\n    labels: [avckpt.keep=3]\n  b:\n    labels: [avckpt.enable=false]\n")
+    assert [(problem.service, problem.severity) for problem in manifest.problems] == [("a", Severity.WARNING)]
+    assert "without avckpt.enable=true the container is not protected" in lines(manifest)[0]
+
+
+def test_extends_in_a_file_and_beyond(path: Path) -> None:
+    base = path.with_name("base.yaml")
+    base.write_text("services:\n  node:\n    labels:\n      avckpt.enable: true\n      avckpt.keep: none\n")
+    manifest = checked(
+        path,
+        "services:\n"
+        "  a: {extends: {file: base.yaml, service: node}}\n"
+        "  b: {extends: {service: a}, labels: {avckpt.keep: 3}}\n"
+        "  c: {extends: b}\n",
+    )
+    [line] = lines(manifest)
+    assert line.startswith("base.yaml:5: service a: label avckpt.keep=none")
+    keep = [manifest.services[name].settings[Kind.LABEL]["avckpt.keep"].value for name in "abc"]
+    assert keep == ["none", "3", "3"]
+    assert all(service.enabled for service in manifest.services.values())
+
+
+@pytest.mark.parametrize(
+    ("extends", "problem"),
+    [
+        ("nobody", "v.yaml:2: service a: extends nobody, and there is no such service"),
+        ("{file: no.yaml, service: x}", "v.yaml:2: service a: "),
+        ("{file: other.yaml, service: x}", "v.yaml:2: service a: extends x, and there is no such service in "),
+        ("a", "v.yaml:2: service a: extends itself, by way of a"),
+    ],
+)
+def test_extends_that_lead_nowhere(path: Path, extends: str, problem: str) -> None:
+    path.with_name("other.yaml").write_text("services: {y: {}}\n")
+    manifest = checked(path, f"services:\n  a: {{extends: {extends}}}\n")
+    assert len(manifest.problems) == 1
+    assert str(manifest.problems[0]).replace(f"{path.parent}/v.yaml", "v.yaml").startswith(problem)
+
+
+def test_include_and_several_files(path: Path) -> None:
+    path.with_name("more.yaml").write_text("services:\n  b:\n    labels: [avckpt.enabled=true]\n")
+    over = path.with_name("over.yaml")
+    over.write_text("services:\n  a:\n    labels: {avckpt.interval: 1s}\n")
+    path.write_text(
+        "include:\n  - more.yaml\n  - {path: gone.yaml}\nservices:\n  a:\n    labels: [avckpt.enable=true]\n"
+    )
+    manifest = check([path, over])
+    found = lines(manifest)
+    assert found[0].startswith("more.yaml:3: service b: label avckpt.enabled: unknown label")
+    assert found[1].endswith("gone.yaml: No such file or directory")
+    assert str(manifest.problems[1].place) == f"{path}:3"
+    assert len(found) == 2
+    assert set(manifest.services["a"].settings[Kind.LABEL]) == {"avckpt.enable", "avckpt.interval"}
+
+
+def test_one_mistake_behind_an_anchor_is_said_once(path: Path) -> None:
+    text = "x: &x {avckpt.enable: true, avckpt.keep: 99}\nservices:\n  a: {labels: *x}\n  b: {labels: {<<: *x}}\n"
+    assert [line[:21] for line in lines(checked(path, text))] == ["v.yaml:1: service a: "]
+
+
+def test_labels_under_deploy_are_not_the_containers(path: Path) -> None:
+    manifest = checked(path, "services:\n  a:\n    deploy:\n      labels:\n        avckpt.enable: true\n")
+    assert "put it under labels" in lines(manifest)[0]
+    assert manifest.services["a"].enabled is False
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("services:\n  a: [\n", "v.yaml:3: not YAML: while parsing a flow node"),
+        ("- a\n", "v.yaml:1: not a mapping: is this a Compose file?"),
+        ("defaults: {}\n", "v.yaml:1: no services: is this a Compose file?"),
+        ("", "v.yaml:1: no services: is this a Compose file?"),
+        ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", ""),
+        ("services: {a: , b: 3, c: [1], d: {labels: }, 5: {labels: {1: 2}}}\n", ""),
+    ],
+)
+def test_files_that_are_something_else(path: Path, text: str, problem: str) -> None:
+    found = lines(checked(path, text))
+    assert len(found) == (1 if problem else 0)
+    assert "".join(found).startswith(problem)
+
+
+def avckpt(*args: object) -> tuple[int, str]:
+    result = CliRunner().invoke(cli.main, [str(arg) for arg in args])
+    return result.exit_code, result.output
+
+
+def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path.write_text(SHARED)
+    status, output = avckpt("check", path)
+    assert status == 0
+    assert output == "4 services, to be protected: filter, monitor, planner; no problems\n"
+    path.write_text(SHARED.replace("keep=3", "keep=x"))
+    status, output = avckpt("check", path)
+    assert status == 1
+    assert output.splitlines()[0].startswith(f"{path}:18: service monitor: label avckpt.keep=x: not a whole number")
+    status, output = avckpt("check", "--json", path)
+    assert status == 1
+    answer = json.loads(output)
+    assert answer["problems"][0]["line"] == 18
+    assert answer["problems"][0]["service"] == "monitor"
+    assert [service["protected"] for service in answer["services"]] == [False, True, True, True]
+    monkeypatch.chdir(path.parent)
+    assert avckpt("check")[0] == 1
+    path.rename(path.with_name("compose.yml"))
+    assert avckpt("check")[1].startswith("compose.yml:18: ")
+    assert avckpt("check", "gone.yaml") == (
+        1,
+        "gone.yaml:1: No such file or directory\n0 services, to be protected: none; 1 problem\n",
+    )
+
+
+def test_the_command_for_the_sidecars_own_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AVCKPT_CONFIG", str(path))
+    assert avckpt("check", "--config") == (0, "no problems\n")
+    path.write_text("defaults:\n  keep: 0\n")
+    status, output = avckpt("check", "--config")
+    assert (status, output.splitlines()[0][: len(str(path)) + 19]) == (1, f"{path}:2: defaults.keep: ")
+    assert json.loads(avckpt("check", "--config", "--json", path)[1])["problems"][0]["line"] == 2
+    assert avckpt("check", "--config", "gone.yaml")[0] == 1
+
+
+@pytest.mark.parametrize("label", sorted(LABELS))
+def test_every_label_is_known(path: Path, label: str) -> None:
+    manifest = checked(path, f"services:\n  a:\n    labels:\n      {label}: '?!'\n")
+    assert all("unknown label" not in line for line in lines(manifest))
+    assert len(manifest.errors) == 1

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Waiting for podman-compose, with a program in its place that does as it does; and the verdicts on containers."""
+
+from __future__ import annotations
+
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from avckpt import compose
+from avckpt.compose import Started
+from avckpt.errors import AvckptError
+from avckpt.vehicle import judge
+
+
+class Fake(compose.Compose):
+    """Runs a shell script instead of podman-compose."""
+
+    def __init__(self, script: str) -> None:
+        super().__init__([])
+        self._command = ["sh", "-c", script]
+
+
+@pytest.fixture
+def podman(tmp_path: Path) -> Path:
+    """A command that, like `podman wait`, stays."""
+    path = tmp_path / "podman"
+    path.write_text("#!/bin/sh\nsleep 60\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compose, "STUCK_S", 0.5)
+    monkeypatch.setattr(compose, "UNHEALTHY_S", 2.0)
+    monkeypatch.setattr(compose, "LOOK_EVERY_S", 0.05)
+
+
+def left_over(podman: Path) -> list[psutil.Process]:
+    return [one for one in psutil.process_iter(["cmdline"]) if str(podman) in (one.info["cmdline"] or [])]
+
+
+@pytest.mark.parametrize(
+    ("waits", "words", "least_s"),
+    [
+        ("{0} wait --condition=running a b & {0} wait --condition=running b & wait", "a to become running, b to", 0.5),
+        (
+            "{0} wait --condition=running b & {0} wait --condition=healthy a & wait",
+            "a to become healthy, b to become r",
+            2.0,
+        ),
+    ],
+)
+def test_one_that_waits_in_vain_is_ended(podman: Path, waits: str, words: str, least_s: float) -> None:
+    started = time.monotonic()
+    with pytest.raises(AvckptError, match=f"it waited in vain for {words}"):
+        Fake(waits.format(podman)).up([], lambda line: None)
+    assert least_s <= time.monotonic() - started < 10
+    assert left_over(podman) == []
+
+
+@pytest.mark.parametrize("other", ["{0} pull image", "{0} wait --condition=stopped a", "{0} start a"])
+def test_one_that_does_something_is_waited_for(podman: Path, other: str) -> None:
+    script = f"{other} & O=$!; {{0}} wait --condition=running b & W=$!; sleep 1.2; kill $O $W; exit 0"
+    Fake(script.format(podman)).up([], lambda line: None)
+
+
+def test_what_it_says_is_passed_on_but_for_ids() -> None:
+    said: list[str] = []
+    Fake(f"echo {'ab' * 32}; echo one >&2; sleep 0.3; echo two").up([], said.append)
+    assert said == ["one", "two"]
+
+
+def test_a_failure_is_told_by_its_last_words() -> None:
+    with pytest.raises(AvckptError, match="^podman-compose down failed: no such file$"):
+        Fake("echo no such file >&2; exit 4").down([], False, lambda line: None)
+    with pytest.raises(AvckptError, match="exit status 4"):
+        Fake("exit 4").down([], False, lambda line: None)
+
+
+def test_podman_compose_is_there_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "podman_compose", "--version"], capture_output=True, text=True)
+    assert "podman-compose version" in done.stdout
+
+
+def container(**more: Any) -> Started:
+    fields = {"id": "1", "name": "c", "service": "s", "status": "running", "exit_code": 0, "error": "", "wanted": True}
+    return Started(**{**fields, **more})
+
+
+@pytest.mark.parametrize(
+    ("started", "entry", "protected", "may_change", "why"),
+    [
+        (container(), {"state": "protected", "reason": ""}, True, False, ""),
+        (container(), {"state": "starting", "reason": "no checkpoint yet"}, False, True, "no checkpoint yet"),
+        (container(), {"state": "unprotected", "reason": "io_uring"}, False, True, "io_uring"),
+        (container(), {"state": "restoring", "reason": ""}, False, True, "restoring"),
+        (container(), None, False, True, "the sidecar does not know it"),
+        (container(wanted=False), None, False, False, ""),
+        (container(status="exited", exit_code=7), None, False, False, "it has exited with status 7"),
+        (
+            container(status="created", error="no such image"),
+            None,
+            False,
+            False,
+            "it did not start and is created: no ",
+        ),
+    ],
+)
+def test_verdicts(started: Started, entry: Any, protected: bool, may_change: bool, why: str) -> None:
+    verdict = judge(started, entry)
+    assert (verdict.protected, verdict.may_change) == (protected, may_change)
+    assert verdict.why.startswith(why)
+    assert bool(verdict.why) == bool(why)
+
+
+@pytest.mark.parametrize(
+    ("labels", "annotations", "wanted"),
+    [
+        ({"avckpt.enable": "True"}, None, True),
+        (None, {"avckpt.enable": "true", "avckpt.name": "c"}, True),
+        ({"avckpt.enable": "false"}, {}, False),
+        ({"avckpt.interval": "1s"}, {}, False),
+        ({"avckpt.enable": "maybe"}, {}, True),
+    ],
+)
+def test_who_wants_protection(labels: Any, annotations: Any, wanted: bool) -> None:
+    state = {"Status": "running", "ExitCode": 0}
+    config = {"Labels": labels, "Annotations": annotations}
+    assert compose._started({"Id": "1", "Name": "c", "Config": config, "State": state}).wanted is wanted

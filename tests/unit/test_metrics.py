@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What Prometheus reads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from avckpt.errors import DeadlineMissed
+from avckpt.event_record import Cause, EventRecord, Kind, Outcome
+from avckpt.metrics import Held, Metrics, private_bytes
+from avckpt.protected import State
+from prometheus_client.parser import text_string_to_metric_families
+
+
+def samples(text: bytes) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+    found = {}
+    for family in text_string_to_metric_families(text.decode()):
+        for sample in family.samples:
+            found[sample.name, frozenset(sample.labels.items())] = sample.value
+    return found
+
+
+def value(text: bytes, name: str, **labels: str) -> float | None:
+    return samples(text).get((name, frozenset(labels.items())))
+
+
+def test_events_are_counted_by_container_reason_and_outcome() -> None:
+    metrics = Metrics()
+    for _ in range(3):
+        metrics.take(EventRecord(Kind.CHECKPOINT, container="web", freeze_s=0.0015))
+    metrics.take(EventRecord(Kind.MISSED, container="web", freeze_s=0.05, error=DeadlineMissed("slow")))
+    metrics.take(
+        EventRecord(
+            Kind.RESTORED,
+            container="web",
+            reason=Cause.SIGNAL,
+            outcome=Outcome.RESTORED,
+            restore_s=0.004,
+            freeze_s=0.002,
+        )
+    )
+    metrics.take(EventRecord(Kind.GAVE_UP, container="db", reason=Cause.EXIT, outcome=Outcome.LIMIT))
+    metrics.take(EventRecord(Kind.NOTIFY_FAILED, container="db"))
+    metrics.take(EventRecord(Kind.DIED, container="db", reason=Cause.EXIT))
+    text = metrics.render([])
+    assert value(text, "avckpt_checkpoints_total", container="web") == 3
+    assert value(text, "avckpt_checkpoints_missed_total", container="web", reason="deadline") == 1
+    assert value(text, "avckpt_freeze_seconds_count", container="web") == 3
+    assert value(text, "avckpt_freeze_seconds_bucket", container="web", le="0.001") == 0
+    assert value(text, "avckpt_freeze_seconds_bucket", container="web", le="0.002") == 3
+    assert value(text, "avckpt_restore_seconds_sum", container="web") == 0.004
+    assert value(text, "avckpt_restores_total", container="web", reason="signal", outcome="restored") == 1
+    assert value(text, "avckpt_restores_total", container="db", reason="exit", outcome="limit") == 1
+    assert value(text, "avckpt_restore_seconds_count", container="db") is None
+    assert value(text, "avckpt_notifications_total", container="db", outcome="failed") == 1
+
+
+def test_gauges_are_of_live_containers_only() -> None:
+    metrics = Metrics()
+    text = metrics.render([Held("web", 0, 2, State.PROTECTED), Held("db", 0, 0, State.UNPROTECTED)])
+    assert value(text, "avckpt_generations", container="web") == 2
+    assert value(text, "avckpt_protected", container="web") == 1
+    assert value(text, "avckpt_protected", container="db") == 0
+    text = metrics.render([Held("web", 0, 2, State.RESTORING)])
+    assert value(text, "avckpt_protected", container="web") == 0
+    assert value(text, "avckpt_protected", container="db") is None
+
+
+def test_a_forgotten_container_leaves_no_series() -> None:
+    metrics = Metrics()
+    for name in ("old", "new"):
+        metrics.take(EventRecord(Kind.CHECKPOINT, container=name, freeze_s=0.001))
+        metrics.take(EventRecord(Kind.NOTIFIED, container=name))
+    metrics.forget_all_but(["new"])
+    text = metrics.render([])
+    assert b'"old"' not in text
+    assert value(text, "avckpt_checkpoints_total", container="new") == 1
+    metrics.take(EventRecord(Kind.CHECKPOINT, container="old", freeze_s=0.001))
+    assert value(metrics.render([]), "avckpt_checkpoints_total", container="old") == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="it looks into a process of root's")
+def test_private_memory_is_what_only_this_process_has() -> None:
+    program = "x = bytearray(50_000_000); x[::4096] = b'1' * len(x[::4096]); print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert 50e6 < private_bytes(process.pid) < 80e6
+        process.communicate(b"\n")
+    assert private_bytes(process.pid) == 0

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors keep every field on their way, and agree with the C headers."""
+
+from __future__ import annotations
+
+import errno
+
+import pytest
+from avckpt import errors
+from avckpt._native import ffi
+from avckpt.errors import AvckptError, Code, Denied, ExitCode, KernelError, NoSuchContainer, class_of_code, from_json
+from avckpt.events import Command, EventKind, Reason
+
+
+def test_the_line_a_person_sees() -> None:
+    error = KernelError(
+        "a thread would not stop",
+        operation="freeze",
+        syscall="ptrace(PTRACE_SEIZE)",
+        errno=errno.EPERM,
+        pid=42,
+        undo_failures=1,
+    )
+    assert str(error) == (
+        "freeze: a thread would not stop "
+        "(ptrace(PTRACE_SEIZE): Operation not permitted, pid 42, 1 step(s) could not be undone)"
+    )
+    assert str(NoSuchContainer("nobody")) == "nobody"
+    assert str(Denied("not allowed", operation="freeze", container="web")) == "web: freeze: not allowed"
+
+
+@pytest.mark.parametrize("cls", errors._CLASSES)
+def test_all_fields_cross_the_api(cls: type[AvckptError]) -> None:
+    error = cls("why", operation="restore", syscall="clone", errno=11, pid=7, undo_failures=2, container="web")
+    back = from_json(error.to_json())
+    assert type(back) is cls
+    assert back.to_json() == error.to_json()
+
+
+def test_what_a_newer_sidecar_says_is_still_an_error() -> None:
+    back = from_json({"kind": "from_the_future", "message": "so it is", "errno": "?"})
+    assert type(back) is AvckptError
+    assert str(back) == "so it is"
+    assert back.exit_code is ExitCode.FAILED
+
+
+def test_every_code_has_a_class_of_its_own() -> None:
+    classes = {class_of_code(code) for code in Code if code is not Code.OK}
+    assert len(classes) == len(Code) - 1
+    assert class_of_code(Code.DENIED) is Denied
+    assert class_of_code(12345) is AvckptError
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "prefix"),
+    [
+        (Code, "enum avc_code", "AVC_"),
+        (EventKind, "enum avc_event_kind", "AVC_EVENT_"),
+        (Reason, "enum avc_reason", "AVC_REASON_"),
+        (Command, "enum avc_command", "AVC_COMMAND_"),
+    ],
+)
+def test_enums_are_those_of_the_headers(ours: type[Code], theirs: str, prefix: str) -> None:
+    declared = {name[len(prefix) :]: value for name, value in ffi.typeof(theirs).relements.items()}
+    assert {member.name: member.value for member in ours} == declared

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which events become a line of the sidecar's log."""
+
+from __future__ import annotations
+
+import logging
+import signal
+
+import pytest
+from avckpt.errors import AvckptError, DeadlineMissed, KernelError, Unsupported
+from avckpt.event_record import EventRecord, of_guard
+from avckpt.events import Event, EventKind, Reason
+from avckpt.journal import MISSED_EVERY_S, Journal
+
+
+def missed(at_s: float) -> EventRecord:
+    return of_guard(Event(EventKind.MISSED, 1, at_ns=int(at_s * 1e9), error=DeadlineMissed("a thread did not stop")))
+
+
+def unprotected(why: str) -> EventRecord:
+    return of_guard(Event(EventKind.UNPROTECTED, 1, error=Unsupported(why)))
+
+
+def checkpoint(generation: int) -> EventRecord:
+    return of_guard(Event(EventKind.CHECKPOINT, 1, generation=generation, threads=3, freeze_s=0.00123, quiescent=True))
+
+
+def test_only_the_first_checkpoint_is_worth_a_line() -> None:
+    journal = Journal()
+    assert journal.line(checkpoint(1)) == (
+        logging.INFO,
+        "protected: first checkpoint, generation 1, 3 thread(s), frozen 1.23 ms",
+    )
+    level, _ = journal.line(checkpoint(2)) or (0, "")
+    assert level == logging.DEBUG
+
+
+def test_missed_checkpoints_are_counted_not_repeated() -> None:
+    journal = Journal()
+    first = journal.line(missed(100.0))
+    assert first is not None
+    assert first[0] == logging.WARNING
+    assert journal.line(missed(101.0)) is None
+    assert journal.line(missed(102.0)) is None
+    later = journal.line(missed(100.0 + MISSED_EVERY_S))
+    assert later is not None
+    assert later[1].endswith("(and 2 more since this was last said)")
+
+
+def test_unprotected_is_said_once_per_reason() -> None:
+    journal = Journal()
+    assert journal.line(unprotected("it has children")) == (
+        logging.WARNING,
+        "runs unprotected: it has children",
+    )
+    assert journal.line(unprotected("it has children")) is None
+    assert journal.line(unprotected("it has an io_uring")) is not None
+
+
+def test_protection_that_comes_back_is_said() -> None:
+    journal = Journal()
+    journal.line(checkpoint(1))
+    journal.line(unprotected("it has children"))
+    level, text = journal.line(checkpoint(2)) or (0, "")
+    assert level == logging.INFO
+    assert text.startswith("protected")
+    assert journal.line(unprotected("it has children")) is not None
+
+
+def test_a_death_and_its_restore() -> None:
+    journal = Journal()
+    assert journal.line(of_guard(Event(EventKind.DIED, 1, wait_status=signal.SIGSEGV))) == (
+        logging.INFO,
+        "died: killed by SIGSEGV",
+    )
+    restored = Event(
+        EventKind.RESTORED,
+        1,
+        wait_status=signal.SIGSEGV,
+        restore_s=0.0061,
+        age_s=1.25,
+        generation=4,
+        threads=21,
+        restores=2,
+    )
+    assert journal.line(of_guard(restored)) == (
+        logging.WARNING,
+        "killed by SIGSEGV, restored in 6.1 ms from generation 4 (1.2 s old), 21 thread(s), restore 2",
+    )
+
+
+def test_a_rollback_on_command_is_no_crash() -> None:
+    line = Journal().line(of_guard(Event(EventKind.RESTORED, 1, reason=Reason.COMMAND, wait_status=signal.SIGKILL)))
+    assert line is not None
+    assert line[1].startswith("rolled back on command, restored in ")
+
+
+@pytest.mark.parametrize(
+    ("reason", "level", "words"),
+    [
+        (Reason.STOPPED, logging.INFO, "it was asked to stop"),
+        (Reason.CLEAN_EXIT, logging.INFO, "it ended by itself"),
+        (Reason.LIMIT, logging.ERROR, "avckpt.restore.max are used up"),
+        (Reason.EMPTY, logging.ERROR, "no checkpoint was held"),
+    ],
+)
+def test_a_restore_that_did_not_happen(reason: Reason, level: int, words: str) -> None:
+    line = Journal().line(of_guard(Event(EventKind.GAVE_UP, 1, wait_status=1 << 8, reason=reason)))
+    assert line is not None
+    assert line[0] == level
+    assert words in line[1]
+    assert "exited with status 1" in line[1]
+
+
+def test_a_failed_restore_names_the_error() -> None:
+    error: AvckptError = KernelError("the PID was taken", operation="restore", syscall="clone", errno=11)
+    line = Journal().line(of_guard(Event(EventKind.GAVE_UP, 1, wait_status=9, reason=Reason.FAILED, error=error)))
+    assert line is not None
+    assert "restore: the PID was taken (clone: Resource temporarily unavailable)" in line[1]

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From labels to what the engine is told."""
+
+from __future__ import annotations
+
+import pytest
+from avckpt.errors import LabelsWrong
+from avckpt.events import Files, GuardConfig, Tcp
+from avckpt.policy import config_of_labels
+from avckpt.run import config_of_run
+
+
+def test_defaults_are_those_of_the_label_table() -> None:
+    assert config_of_labels({"avckpt.enable": "true"}) == GuardConfig(
+        interval_s=3.0,
+        keep=2,
+        restore_on_signal=True,
+        restore_on_exit=True,
+        restore_on_statuses=frozenset(),
+        restore_max=5,
+        restore_window_s=60.0,
+        quiesce_s=0.02,
+    )
+
+
+def test_every_label_arrives() -> None:
+    config = config_of_labels(
+        {
+            "avckpt.enable": "true",
+            "avckpt.interval": "250ms",
+            "avckpt.keep": "7",
+            "avckpt.restore.on": "signal,3,99",
+            "avckpt.restore.max": "9/2m",
+            "avckpt.quiesce": "0",
+            "avckpt.files": "strict",
+            "avckpt.tcp": "reset-moved",
+            "avckpt.version": "0.1.0",
+            "avckpt.name": "web",
+            "io.podman.annotations.foo": "bar",
+        }
+    )
+    assert config == GuardConfig(
+        interval_s=0.25,
+        keep=7,
+        restore_on_signal=True,
+        restore_on_exit=False,
+        restore_on_statuses=frozenset({3, 99}),
+        restore_max=9,
+        restore_window_s=120.0,
+        quiesce_s=0.0,
+        files=Files.STRICT,
+        tcp=Tcp.RESET_MOVED,
+    )
+
+
+def test_a_wrong_label_is_one_line() -> None:
+    with pytest.raises(LabelsWrong, match=r"^label avckpt\.keep=none: .*whole number") as caught:
+        config_of_labels({"avckpt.enable": "true", "avckpt.keep": "none"})
+    assert "\n" not in str(caught.value)
+
+
+def test_run_implies_enable() -> None:
+    assert config_of_run({"avckpt.interval": "1s"}).interval_s == 1.0
+
+
+@pytest.mark.parametrize(
+    "labels", [{"avckpt.enable": "false"}, {"app": "web"}, {"avckpt.intervall": "1s"}, {"avckpt.tcp": "drop"}]
+)
+def test_run_refuses_what_it_can_not_honour(labels: dict[str, str]) -> None:
+    with pytest.raises(LabelsWrong):
+        config_of_run(labels)

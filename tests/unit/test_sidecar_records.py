@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records of running containers: which are adopted, which removed.  With real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from avckpt.errors import TargetGone
+from avckpt.process import has_ended, open_pidfd, pid_of, start_time
+from avckpt.records import adoptable, remove_if
+from avckpt_hooks.protocol import Register
+
+
+@pytest.fixture
+def sleeper() -> Iterator[subprocess.Popen[bytes]]:
+    """A process, killed and reaped in the end."""
+    process = subprocess.Popen(["sleep", "60"])
+    yield process
+    process.kill()
+    process.wait()
+
+
+def record(directory: Path, digit: str, pid: int, started: int) -> Path:
+    register = Register(id=digit * 64, name=f"n{digit}", pid=pid, starttime=started, bundle="/b", annotations={})
+    path = directory / f"{register.id}.json"
+    path.write_text(json.dumps(register.record()))
+    return path
+
+
+def test_a_living_container_is_adopted(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
+    path = record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
+    [(register, pidfd)] = list(adoptable(tmp_path))
+    assert register.name == "na"
+    assert pid_of(pidfd) == sleeper.pid
+    assert path.exists()
+    os.close(pidfd)
+
+
+def test_a_reused_pid_is_not(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
+    path = record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid) - 1)
+    before = len(os.listdir("/proc/self/fd"))
+    assert list(adoptable(tmp_path)) == []
+    assert not path.exists()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_an_ended_one_is_not(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
+    started = start_time(sleeper.pid)
+    pidfd = open_pidfd(sleeper.pid, started)
+    assert not has_ended(pidfd)
+    sleeper.kill()
+    os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOWAIT)  # it is a zombie now
+    assert has_ended(pidfd)
+    with pytest.raises(TargetGone):
+        open_pidfd(sleeper.pid, started)
+    path = record(tmp_path, "a", sleeper.pid, started)
+    assert list(adoptable(tmp_path)) == []
+    assert not path.exists()
+    sleeper.wait()
+    with pytest.raises(TargetGone):
+        open_pidfd(sleeper.pid, started)
+    os.close(pidfd)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"version": 1, "id": "../../etc/passwd"}', '{"version": 99}'])
+def test_what_is_no_record_is_left_alone(tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / ("b" * 64 + ".json")
+    path.write_text(text)
+    assert list(adoptable(tmp_path)) == []
+    assert path.exists()
+    assert str(path) in caplog.text
+
+
+def test_one_bad_record_does_not_hide_the_others(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
+    (tmp_path / ("0" * 64 + ".json")).write_text("{")
+    record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
+    [(_, pidfd)] = list(adoptable(tmp_path))
+    os.close(pidfd)
+
+
+def test_a_record_replaced_meanwhile_stays(tmp_path: Path) -> None:
+    path = tmp_path / ("c" * 64 + ".json")
+    path.write_text("new")
+    remove_if(path, b"old")
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+    remove_if(path, b"new")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_start_time_survives_a_wild_name(tmp_path: Path) -> None:
+    program = tmp_path / "a) R 1 (b"
+    program.symlink_to("/bin/sleep")
+    with subprocess.Popen([str(program), "60"]) as process:
+        try:
+            assert start_time(process.pid) >= start_time(os.getpid())
+        finally:
+            process.kill()

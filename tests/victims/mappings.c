@@ -1,0 +1,181 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * mappings [SHARED_KB] [--inherited]: memory of every kind a plain fork does not carry as it is,
+ * and kinds that are easily forgotten.  Each is written and read all the time.
+ *
+ * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
+ * - anonymous, MADV_WIPEONFORK: zeroes in a fork
+ * - anonymous, read-only, PROT_NONE guards between them: protections stay
+ * - private mapping of a file, pages changed
+ * - private mapping of a file that has been deleted
+ * - the heap (brk), which goes on growing where it was
+ * - locked memory (mlock), as far as the limits allow
+ * - anonymous shared memory of SHARED_KB (64; 0: none), which must be of one
+ *   instant with the private memory
+ * - mappings that come and go all the time
+ *
+ * With --inherited the first two are ordinary memory.
+ */
+#include <setjmp.h>
+#include <signal.h>
+#include <sys/resource.h>
+
+#include "victim.h"
+
+enum { WORDS = 512, PAGES = 16, BYTES = PAGES * 4096 };
+
+struct region {
+	const char *name;
+	uint64_t *at;
+	size_t words;
+};
+
+static uint64_t version; /* of everything; in ordinary memory */
+static sigjmp_buf trap;
+
+static void on_fault(int sig)
+{
+	siglongjmp(trap, sig);
+}
+
+static void *map(int protection, int flags, int fd)
+{
+	void *at = mmap(NULL, BYTES, protection, flags, fd, 0);
+
+	must(at != MAP_FAILED, "mmap");
+	return at;
+}
+
+static int make_file(void)
+{
+	static char page[4096];
+	int fd = open("/tmp", O_TMPFILE | O_RDWR | O_CLOEXEC, 0600), i;
+
+	if (fd < 0) { /* a file system without it */
+		char name[] = "/tmp/victim-mappings-XXXXXX";
+
+		fd = mkstemp(name);
+		must(fd >= 0 && !unlink(name), "mkstemp");
+	}
+	memset(page, 'f', sizeof(page));
+	for (i = 0; i < PAGES; i++)
+		must(write(fd, page, sizeof(page)) == (ssize_t)sizeof(page), "write");
+	return fd;
+}
+
+static void write_all(const struct region *regions, int n)
+{
+	size_t w;
+	int i;
+
+	for (i = 0; i < n; i++)
+		for (w = 0; w < regions[i].words; w++)
+			regions[i].at[w] = mix(w, version);
+}
+
+static void check_all(const struct region *regions, int n)
+{
+	size_t w;
+	int i;
+
+	for (i = 0; i < n; i++)
+		for (w = 0; w < regions[i].words; w++)
+			CHECK(regions[i].at[w] == mix(w, version),
+			      "%s: word %zu is %lx, not of version %lu", regions[i].name, w,
+			      regions[i].at[w], version);
+}
+
+/* Touching it must fault, now as in the beginning. */
+static void check_fault(volatile uint64_t *at, bool by_writing, const char *what)
+{
+	if (sigsetjmp(trap, 1) == 0) {
+		if (by_writing)
+			*at = 1;
+		else
+			(void)*at;
+		violation("%s did not fault", what);
+	}
+}
+
+static void come_and_go(void)
+{
+	uint64_t *at = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+
+	CHECK(at[17] == 0, "a new mapping is not empty");
+	at[17] = version;
+	CHECK(!mprotect(at, 4096, PROT_READ), "mprotect: %s", strerror(errno));
+	CHECK(at[17] == version, "a mapping forgot");
+	CHECK(!munmap(at, BYTES), "munmap: %s", strerror(errno));
+}
+
+int main(int argc, char **argv)
+{
+	struct sigaction act = { .sa_handler = on_fault };
+	struct region regions[8];
+	size_t shared_kb, lap;
+	uint64_t *read_only, *none, *heap;
+	char *brk_at;
+	bool inherited;
+	int n = 0, fd;
+
+	inherited = victim_flag(&argc, argv, "--inherited");
+	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited]");
+	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
+	sigaction(SIGSEGV, &act, NULL);
+
+	regions[n++] =
+		(struct region){ "MADV_DONTFORK memory",
+				 map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1),
+				 BYTES / 8 };
+	must(inherited || !madvise(regions[n - 1].at, BYTES, MADV_DONTFORK), "MADV_DONTFORK");
+	regions[n++] =
+		(struct region){ "MADV_WIPEONFORK memory",
+				 map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1),
+				 BYTES / 8 };
+	must(inherited || !madvise(regions[n - 1].at, BYTES, MADV_WIPEONFORK), "MADV_WIPEONFORK");
+	fd = make_file();
+	/* The second half stays the file's own. */
+	regions[n++] = (struct region){ "a private file mapping",
+					map(PROT_READ | PROT_WRITE, MAP_PRIVATE, fd), BYTES / 16 };
+	close(fd);
+	regions[n++] =
+		(struct region){ "locked memory",
+				 map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1),
+				 BYTES / 8 };
+	board->counter[1] = mlock(regions[n - 1].at, BYTES) == 0;
+	heap = sbrk(BYTES);
+	must(heap != (void *)-1, "sbrk");
+	regions[n++] = (struct region){ "the heap", heap, BYTES / 8 };
+	if (shared_kb) {
+		void *at = mmap(NULL, shared_kb << 10, PROT_READ | PROT_WRITE,
+				MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+
+		must(at != MAP_FAILED, "mmap");
+		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };
+	}
+	read_only = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	read_only[3] = 333;
+	must(!mprotect(read_only, BYTES, PROT_READ), "mprotect");
+	none = map(PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	write_all(regions, n);
+	victim_ready();
+	for (lap = 0;; lap++) {
+		check_all(regions, n);
+		version++;
+		write_all(regions, n);
+		check_fault(none, false, "PROT_NONE memory");
+		check_fault(read_only, true, "read-only memory");
+		CHECK(read_only[3] == 333, "read-only memory changed");
+		CHECK(((char *)regions[2].at)[BYTES - 1] == 'f', "the file's own page is %x",
+		      ((unsigned char *)regions[2].at)[BYTES - 1]);
+		come_and_go();
+		if (lap % 1024 == 0 && lap < 65536) {
+			brk_at = sbrk(4096);
+			CHECK(brk_at != (void *)-1, "sbrk: %s", strerror(errno));
+			memset(brk_at, 1, 4096);
+		}
+		board->counter[0]++;
+		beat();
+		nap_us(500);
+	}
+}

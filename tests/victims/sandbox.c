@@ -1,0 +1,80 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * sandbox [--kill]: puts itself under a seccomp filter that allows little more than
+ * sleeping and looking at the clock; anything else is EPERM, with --kill the end.  Two
+ * threads see that the filter holds.
+ */
+#include <linux/filter.h>
+#include <linux/seccomp.h>
+#include <pthread.h>
+#include <stddef.h>
+#include <sys/prctl.h>
+
+#include "victim.h"
+
+#define ALLOW(nr)                                        \
+	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
+
+static bool kills;
+static volatile bool started, confined;
+
+static void confine(void)
+{
+	struct sock_filter filter[] = {
+		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
+		ALLOW(SYS_clock_nanosleep),
+		ALLOW(SYS_restart_syscall),
+		ALLOW(SYS_clock_gettime),
+		ALLOW(SYS_rt_sigreturn),
+		ALLOW(SYS_write),
+		ALLOW(SYS_gettid),
+		ALLOW(SYS_getpid),
+		ALLOW(SYS_exit_group),
+		BPF_STMT(BPF_RET | BPF_K,
+			 kills ? SECCOMP_RET_KILL_PROCESS : SECCOMP_RET_ERRNO | EPERM),
+	};
+	struct sock_fprog program = { sizeof(filter) / sizeof(*filter), filter };
+
+	must(!prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "PR_SET_NO_NEW_PRIVS");
+	must(!syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC, &program),
+	     "seccomp");
+}
+
+static void check(void)
+{
+	/* The other filter would end it: that it is there shows when a test looks. */
+	if (!kills && confined)
+		CHECK(syscall(SYS_getppid) < 0 && errno == EPERM, "the filter is gone");
+	count(0, 1);
+}
+
+static void *work(void *arg)
+{
+	(void)arg;
+	started = true;
+	for (;;) {
+		nap_us(1000);
+		check();
+	}
+	return NULL;
+}
+
+int main(int argc, char **argv)
+{
+	pthread_t thread;
+
+	kills = victim_flag(&argc, argv, "--kill");
+	victim_start(&argc, argv, 0, "[--kill]");
+	must(!pthread_create(&thread, NULL, work, NULL), "pthread_create");
+	while (!started)
+		nap_us(1000);
+	confine();
+	confined = true;
+	victim_ready();
+	for (;;) {
+		nap_us(1000);
+		check();
+		beat();
+	}
+}

@@ -1,0 +1,180 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * unsupported KIND [AFTER_SECONDS [FOR_SECONDS]]: a process that can not be
+ * checkpointed, from AFTER_SECONDS after its start (0), for FOR_SECONDS (0: for
+ * ever; not every kind can be undone).  Beats every 1 ms; counter 0 is 1 while it
+ * is as it says.
+ *
+ *   iouring   has an io_uring
+ *   aio       has a kernel AIO context
+ *   traced    somebody else traces it
+ *   sysvshm   has a SysV shared memory segment attached
+ *   sysvsem   has SysV semaphores with undo
+ *   shared    64 MB of anonymous shared memory
+ *   userfault has a userfaultfd
+ */
+#include <linux/aio_abi.h>
+#include <linux/io_uring.h>
+#include <sched.h>
+#include <signal.h>
+#include <sys/ipc.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/sem.h>
+#include <sys/shm.h>
+#include <sys/wait.h>
+
+#include "victim.h"
+
+static int fd = -1, pipe_fd[2];
+static void *memory;
+static aio_context_t aio;
+
+static bool start_iouring(void)
+{
+	struct io_uring_params params = { 0 };
+
+	fd = (int)syscall(SYS_io_uring_setup, 4, &params);
+	return fd >= 0;
+}
+
+static bool start_userfault(void)
+{
+	fd = (int)syscall(SYS_userfaultfd, O_CLOEXEC | 1 /* UFFD_USER_MODE_ONLY */);
+	return fd >= 0;
+}
+
+static void stop_fd(void)
+{
+	close(fd);
+}
+
+static bool start_aio(void)
+{
+	return syscall(SYS_io_setup, 4, &aio) == 0;
+}
+
+static void stop_aio(void)
+{
+	syscall(SYS_io_destroy, aio);
+}
+
+/* The tracer is no child of ours: a grandchild, left to init. */
+static bool start_traced(void)
+{
+	pid_t me = getpid(), pid;
+	char c = 0;
+
+	if (pipe(pipe_fd) < 0)
+		return false;
+	prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY); /* where Yama asks for it */
+	pid = fork();
+	if (pid == 0) {
+		if (fork() != 0)
+			_exit(0);
+		c = ptrace(PTRACE_SEIZE, me, NULL, NULL) == 0;
+		if (write(pipe_fd[1], &c, 1) != 1)
+			_exit(1);
+		/* Ends with the victim, and when told to. */
+		for (;;) {
+			int status;
+
+			if (waitpid(me, &status, 0) < 0 || !WIFSTOPPED(status))
+				_exit(0);
+			/* Signals go on; what stops us by ptrace goes on, too. */
+			ptrace(PTRACE_CONT, me, NULL, status >> 16 ? 0 : WSTOPSIG(status));
+		}
+	}
+	waitpid(pid, NULL, 0);
+	return read(pipe_fd[0], &c, 1) == 1 && c;
+}
+
+static bool start_sysvshm(void)
+{
+	int id = shmget(IPC_PRIVATE, 1 << 20, 0600);
+
+	if (id < 0)
+		return false;
+	memory = shmat(id, NULL, 0);
+	shmctl(id, IPC_RMID, NULL); /* goes when we go */
+	return memory != (void *)-1;
+}
+
+static void stop_sysvshm(void)
+{
+	shmdt(memory);
+}
+
+static bool start_sysvsem(void)
+{
+	struct sembuf give = { .sem_op = 1, .sem_flg = SEM_UNDO };
+	int id;
+
+	if (unshare(CLONE_NEWIPC) < 0 && errno != EPERM)
+		return false;
+	id = semget(IPC_PRIVATE, 1, 0600);
+	return id >= 0 && semop(id, &give, 1) == 0;
+}
+
+static bool start_shared(void)
+{
+	memory = mmap(NULL, 64 << 20, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+	if (memory == MAP_FAILED)
+		return false;
+	memset(memory, 7, 64 << 20);
+	return true;
+}
+
+static void stop_shared(void)
+{
+	munmap(memory, 64 << 20);
+}
+
+static const struct kind {
+	const char *name;
+	bool (*start)(void);
+	void (*stop)(void);
+} kinds[] = {
+	{ "iouring", start_iouring, stop_fd },     { "aio", start_aio, stop_aio },
+	{ "traced", start_traced, NULL },          { "sysvshm", start_sysvshm, stop_sysvshm },
+	{ "sysvsem", start_sysvsem, NULL },        { "shared", start_shared, stop_shared },
+	{ "userfault", start_userfault, stop_fd },
+};
+
+int main(int argc, char **argv)
+{
+	const struct kind *kind = kinds, *end = kinds + sizeof(kinds) / sizeof(kinds[0]);
+	uint64_t from_ns, to_ns = 0;
+
+	victim_start(&argc, argv, 1, "KIND [AFTER_SECONDS [FOR_SECONDS]]");
+	while (kind < end && strcmp(kind->name, argv[1]))
+		kind++;
+	if (kind == end) {
+		fprintf(stderr, "unsupported: no kind is called %s\n", argv[1]);
+		return 2;
+	}
+	from_ns = now_ns() + (uint64_t)((argc > 2 ? atof(argv[2]) : 0) * 1e9);
+	if (argc > 3 && atof(argv[3]) > 0)
+		to_ns = from_ns + (uint64_t)(atof(argv[3]) * 1e9);
+	board->counter[0] = 0;
+	while (now_ns() < from_ns || !board->counter[0]) {
+		if (now_ns() >= from_ns) {
+			if (!kind->start())
+				unavailable(kind->name);
+			board->counter[0] = 1;
+		}
+		if (!board->ready)
+			victim_ready();
+		beat();
+		nap_us(1000);
+	}
+	for (;;) {
+		if (to_ns && now_ns() >= to_ns && kind->stop) {
+			kind->stop();
+			to_ns = 0;
+			board->counter[0] = 0;
+		}
+		beat();
+		nap_us(1000);
+	}
+}
