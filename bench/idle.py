@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What protection costs while nothing happens: CPU and memory, at an interval of 3 s.
+
+For a minute the same program (tests/victims/idle.c, 100 MB, 20 threads, awake
+once a second) runs in a container without a label, in a container with
+`avckpt.enable=true`, and under `avckpt run`; all at once, so that what else the
+machine is doing falls on all of them.  CPU times are the scheduler's own
+(/proc/PID/task/TID/schedstat, ns), also those of templates that came and went.
+
+    python bench/idle.py [--seconds 60] [--json]
+
+Needs what `make demo` needs.  Ends with 1 when something could not be measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(ROOT / "tests"))
+
+from harness import (  # noqa: E402 - tests, whose folder is no package
+    SIDECAR_NAME,
+    CommandFailed,
+    ContainerFactory,
+    Podman,
+    avckpt_command,
+    machine_lock,
+    running_sidecar,
+)
+
+from bench.subjects import VICTIMS, BenchFailed, build, eventually  # noqa: E402
+
+MEGABYTES, THREADS = 100, 20
+PROGRAM = ["idle", str(MEGABYTES), str(THREADS), "--beat-us", "1000000"]
+INTERVAL = "3s"
+SETTLE_S = 7.0
+"""Before it counts: the first checkpoints bring the engine's code into the program."""
+LOOK_EVERY_S = 0.25
+LIMIT_PERCENT = 1.0
+LOCK_PATIENCE_S = 600.0
+
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+
+
+def descendants(pid: int) -> list[int]:
+    """A process and everything below it, as it is now."""
+    found, at = [pid], 0
+    while at < len(found):
+        with contextlib.suppress(OSError):
+            for task in os.listdir(f"/proc/{found[at]}/task"):
+                found += map(int, Path(f"/proc/{found[at]}/task/{task}/children").read_text().split())
+        at += 1
+    return found
+
+
+@dataclass
+class Meter:
+    """CPU time of a changing set of processes, since begin()."""
+
+    name: str
+    pids: Callable[[], list[int]]
+    _seen: dict[tuple[int, int], int] = field(default_factory=dict)
+    total_ns: int = 0
+    _counts: bool = False
+
+    def begin(self) -> None:
+        """Counts from now on."""
+        self.look()
+        self.total_ns = 0
+        self._counts = True
+
+    def look(self) -> None:
+        """To be called often: what a task used after the last look before its end is lost."""
+        for pid in self.pids():
+            with contextlib.suppress(OSError):
+                for task in map(int, os.listdir(f"/proc/{pid}/task")):
+                    used = int(Path(f"/proc/{pid}/task/{task}/schedstat").read_text().split()[0])
+                    before = self._seen.get((pid, task), 0 if self._counts else used)
+                    # Less than before: a new task with an old number.
+                    self.total_ns += used - before if used >= before else used
+                    self._seen[pid, task] = used
+
+
+def memory_kb(pid: int) -> dict[str, int]:
+    """Sizes in kB: what is this process' alone, and its page tables."""
+    rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    status = Path(f"/proc/{pid}/status").read_text()
+
+    def value(text: str, key: str) -> int:
+        return next((int(line.split()[1]) for line in text.splitlines() if line.startswith(key + ":")), 0)
+
+    return {
+        "private": value(rollup, "Private_Clean") + value(rollup, "Private_Dirty"),
+        "pss": value(rollup, "Pss"),
+        "rss": value(rollup, "Rss"),
+        "page_tables": value(status, "VmPTE"),
+    }
+
+
+def templates(init_pid: int) -> list[int]:
+    """The templates among the children of an avckpt-init."""
+    found = []
+    for pid in descendants(init_pid)[1:]:
+        with contextlib.suppress(OSError):
+            if Path(f"/proc/{pid}/comm").read_text().strip() == "avckpt-tmpl":
+                found.append(pid)
+    return found
+
+
+@contextlib.contextmanager
+def avckpt_run() -> Iterator[int]:
+    """The program under `avckpt run`; the PID of the latter."""
+    command = [*avckpt_command(), "run", "--label", f"avckpt.interval={INTERVAL}", "--"]
+    process = subprocess.Popen([*command, str(VICTIMS / "build" / PROGRAM[0]), *PROGRAM[1:]], stdout=subprocess.DEVNULL)
+    try:
+        eventually(lambda: len(templates(process.pid)) > 0 or process.poll() is not None, "avckpt run protects")
+        if process.poll() is not None:
+            raise BenchFailed(f"avckpt run ended with {process.returncode}")
+        yield process.pid
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGTERM)
+        process.wait(10)
+
+
+@dataclass(frozen=True)
+class Idle:
+    """Percent of one core, and sizes in MB."""
+
+    seconds: float
+    sidecar_percent: float
+    container_protected_percent: float
+    container_plain_percent: float
+    run_percent: float
+    run_program_percent: float
+    template_private_mb: float
+    template_page_tables_mb: float
+    sidecar_rss_mb: float
+
+    @property
+    def added_percent(self) -> float:
+        """By protecting one container: the sidecar's, and what the container uses more."""
+        return self.sidecar_percent + self.container_protected_percent - self.container_plain_percent
+
+    @property
+    def run_added_percent(self) -> float:
+        """The same for `avckpt run`, against the plain container's program."""
+        return self.run_percent + self.run_program_percent - self.container_plain_percent
+
+
+def measure(seconds: float) -> Idle:
+    """Raises BenchFailed, CommandFailed, TimeoutError."""
+    podman = Podman()
+    factory = ContainerFactory(podman, "avckpt-bench-idle")
+    options = ["--network=none", "--volume", f"{VICTIMS / 'build'}:/victims:ro"]
+    command = [f"/victims/{PROGRAM[0]}", *PROGRAM[1:]]
+    with machine_lock(LOCK_PATIENCE_S), running_sidecar(podman) as sidecar, contextlib.ExitStack() as undo:
+        undo.callback(factory.close)
+        plain = factory(*command, options=options).pid
+        protected = factory.protected(*command, options=options, labels={"interval": INTERVAL})
+        sidecar.wait_generation(protected)
+        init = protected.pid
+        sidecar_pid = podman.inspect(SIDECAR_NAME)["State"]["Pid"]
+        run_pid = undo.enter_context(avckpt_run())
+        meters = {
+            "sidecar": Meter("sidecar", lambda: descendants(sidecar_pid)),
+            "protected": Meter("protected", lambda: descendants(init)),
+            "plain": Meter("plain", lambda: descendants(plain)),
+            "run": Meter("run", lambda: [run_pid]),
+            "program": Meter("program", lambda: descendants(run_pid)[1:]),
+        }
+        time.sleep(SETTLE_S)
+        for meter in meters.values():
+            meter.begin()
+        started = time.monotonic()
+        while time.monotonic() - started < seconds:
+            time.sleep(LOOK_EVERY_S)
+            for meter in meters.values():
+                meter.look()
+        took_s = time.monotonic() - started
+        held = [memory_kb(pid) for pid in templates(init)]
+        if not held:
+            raise BenchFailed("the container has no template any more")
+        percent = {name: meter.total_ns / 1e9 / took_s * 100 for name, meter in meters.items()}
+        return Idle(
+            seconds=round(took_s, 1),
+            sidecar_percent=round(percent["sidecar"], 3),
+            container_protected_percent=round(percent["protected"], 3),
+            container_plain_percent=round(percent["plain"], 3),
+            run_percent=round(percent["run"], 3),
+            run_program_percent=round(percent["program"], 3),
+            template_private_mb=round(max(m["private"] for m in held) / 1024, 2),
+            template_page_tables_mb=round(max(m["page_tables"] for m in held) / 1024, 2),
+            sidecar_rss_mb=round(sum(memory_kb(pid)["rss"] for pid in descendants(sidecar_pid)) / 1024, 1),
+        )
+
+
+def show(idle: Idle) -> None:
+    table = Table(title=f"percent of one core over {idle.seconds:.0f} s, interval {INTERVAL}", title_justify="left")
+    for heading in ("program", "of avckpt", "of program", "added", f"limit {LIMIT_PERCENT:g}"):
+        table.add_column(heading, justify="right")
+    table.add_row("not protected", "", f"{idle.container_plain_percent:.3f}", "", "")
+    for name, ours, program, added in (
+        ("container, sidecar", idle.sidecar_percent, idle.container_protected_percent, idle.added_percent),
+        ("avckpt run", idle.run_percent, idle.run_program_percent, idle.run_added_percent),
+    ):
+        verdict = "[green]holds[/]" if added < LIMIT_PERCENT else "[red]does not hold[/]"
+        table.add_row(name, f"{ours:.3f}", f"{program:.3f}", f"{added:.3f}", verdict)
+    console.print(table)
+    console.print(
+        f"a template of {MEGABYTES} MB that was not written to since: {idle.template_private_mb} MB of its own, "
+        f"{idle.template_page_tables_mb} MB page tables; the sidecar's RSS: {idle.sidecar_rss_mb} MB"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Measures what protection costs while nothing happens.")
+    parser.add_argument("--seconds", type=float, default=60.0, help="how long (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
+    args = parser.parse_args()
+    try:
+        build()
+        idle = measure(args.seconds)
+    except (BenchFailed, CommandFailed, TimeoutError) as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return 1
+    if args.json:
+        print(json.dumps({**idle.__dict__, "added_percent": round(idle.added_percent, 3)}, indent=1))
+    else:
+        show(idle)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
