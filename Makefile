@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+#
+# What a person can do here.  Needs make, git and python3; `make setup` gets the
+# rest.  The long steps are scripts, so that they can be run and read alone.
+
+SHELL  := /bin/bash
+PYTHON ?= python3
+VENV   := .venv/bin
+# `make test T=tcp` runs the tests whose names match; T may be any pytest -k expression.
+T      ?=
+# `make test JUNIT=build/junit.xml` writes the results for a machine, too.
+JUNIT  ?=
+# More arguments for pytest, e.g. PYTEST_ARGS=-x.
+PYTEST_ARGS ?=
+# `make test TESTS=tests/unit` takes one kind only.
+TESTS  ?= $(wildcard tests/unit tests/native tests/platform tests/integration)
+
+export PYTHON
+
+help: ## this list
+	@printf 'avckpt keeps Podman containers alive through crashes.\n\n'
+	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
+		while IFS='|' read -r name what; do printf "  %-20s %s\n" "$$name" "$$what"; done
+
+setup: setup-build setup-images ## install and build everything that demo and test need
+
+setup-build: ## the part of setup that makes .venv and compiles (no Podman needed)
+	@scripts/setup-system.sh
+	@scripts/setup-venv.sh
+
+setup-images: ## the part of setup that makes Podman work and builds the images
+	@scripts/setup-base.sh
+	@scripts/setup-podman.sh
+	@scripts/setup-sidecar.sh
+
+demo: setup ## kill a protected container's application twice and watch it go on
+	@$(VENV)/python scripts/demo.py
+
+test: setup ## every test (T=expression selects, TESTS=folder narrows)
+	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
+
+lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
+	@scripts/lint.sh
+
+bench: setup ## measure freeze, reap and restore beside a plain fork()
+	@$(VENV)/python bench/run.py
+
+clean: ## remove what was built here (images and the base's cache stay)
+	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
+	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
+	find hooks sidecar native tests scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
+
+clean-system: clean ## also remove images, cached base and what setup-podman.sh changed
+	scripts/setup-podman.sh --undo
+	scripts/clean-images.sh
+
+.PHONY: help setup setup-build setup-images demo test lint bench clean clean-system
+.DEFAULT_GOAL := help

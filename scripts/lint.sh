@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+#
+# Every style check; goes on after the first that fails, so that one run shows
+# all there is to mend.
+
+# shellcheck source=scripts/lib.sh
+. "$(dirname "$0")/lib.sh"
+
+cd "$ROOT"
+status=0
+check() {
+	printf '%s==>%s %s\n' "$BOLD" "$PLAIN" "$1"
+	shift
+	"$@" || status=1
+}
+
+mapfile -t shell < <(git ls-files --cached --others --exclude-standard 'scripts/*.sh' .ci/run)
+mapfile -t c < <(git ls-files --cached --others --exclude-standard '*.c' '*.h')
+
+check "ruff check" .venv/bin/ruff check .
+check "ruff format" .venv/bin/ruff format --check --diff .
+mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests bench 2>/dev/null)
+check "mypy --strict" .venv/bin/mypy "${typed[@]}"
+if have shellcheck; then
+	check "shellcheck" shellcheck -x "${shell[@]}"
+else
+	note "shellcheck is not installed: shell scripts were not checked"
+fi
+if have clang-format; then
+	check "clang-format" clang-format --dry-run --Werror "${c[@]}"
+else
+	note "clang-format is not installed: the C code's style was not checked"
+fi
+exit "$status"

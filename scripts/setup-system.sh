@@ -1,0 +1,95 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+#
+# Finds out which system packages are missing and, on a system with apt,
+# installs them.  Elsewhere says what is needed and why.
+#
+# Everything is found by looking for what is needed, not for the package's name:
+# a Podman from anywhere is as good as Debian's.
+
+# shellcheck source=scripts/lib.sh
+. "$(dirname "$0")/lib.sh"
+
+PATH=$PATH:/usr/sbin:/sbin
+PYTHON=${PYTHON:-python3}
+
+has_static_libc() { # avckpt-init is static: it must run in any container
+	local out status=0
+	out=$(mktemp)
+	echo 'int main(void) { return 0; }' | cc -x c -static -o "$out" - 2>/dev/null || status=1
+	rm -f "$out"
+	return "$status"
+}
+has_python() { have "$PYTHON" && "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 9))'; }
+has_venv() { has_python && "$PYTHON" -c 'import venv, ensurepip' 2>/dev/null; }
+has_python_headers() {
+	has_python && [ -f "$("$PYTHON" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')/Python.h" ]
+}
+has_runtime() { have crun || have runc; }
+has_bootstrap() { have mmdebstrap || have debootstrap; }
+has_conmon() { have conmon || [ -x /usr/libexec/podman/conmon ] || [ -x /usr/lib/podman/conmon ]; }
+in_podman_dirs() {
+	local dir
+	for dir in /usr/lib/podman /usr/libexec/podman /usr/local/lib/podman /usr/local/libexec/podman; do
+		if [ -x "$dir/$1" ]; then return 0; fi
+	done
+	return 1
+}
+has_netavark() { in_podman_dirs netavark; }
+has_catatonit() { have catatonit || in_podman_dirs catatonit; }
+
+# need | Debian's package | check | what for.  "optional" is installed where apt
+# can, and its absence elsewhere is no more than a remark.
+NEEDS="
+required|podman|have podman|runs the containers
+required|conmon|has_conmon|watches a container's main process for Podman
+required|crun|has_runtime|the OCI runtime (crun or runc)
+required|gcc|have cc|compiles the engine and avckpt-init
+required|libc6-dev|has_static_libc|C headers and the static C library: avckpt-init is a static program
+required|binutils|have ld|links the code that is injected
+required|python3|has_python|Python 3.9 or newer
+required|python3-venv|has_venv|the virtual environment in .venv
+required|python3-dev|has_python_headers|Python.h: the engine's Python binding is a C extension
+required|mmdebstrap|has_bootstrap|makes the base image from Debian packages, without a registry
+required|iproute2|have ip|looks at the host's network
+optional|netavark|has_netavark|bridge networks for containers
+optional|iptables|have iptables|bridge networks for containers (Podman 4)
+optional|nftables|have nft|bridge networks for containers (Podman 5)
+optional|runc|have runc|the tests run on both OCI runtimes
+optional|catatonit|has_catatonit|pods and 'podman run --init'
+"
+
+missing=() missing_required=()
+while IFS='|' read -r need package check why; do
+	[ -n "$need" ] || continue
+	if ! $check; then
+		missing+=("$package")
+		if [ "$need" = required ]; then missing_required+=("$package"); fi
+		note "missing: $package - $why"
+	fi
+done <<<"$NEEDS"
+
+if [ ${#missing[@]} = 0 ]; then
+	note "system packages: everything is there"
+	exit 0
+fi
+
+manual="${missing_required[*]:-}"
+if ! have apt-get; then
+	if [ -z "$manual" ]; then
+		warn "no apt here; the optional packages above were not installed"
+		exit 0
+	fi
+	die "no apt here: install what is missing with your own package manager (names as in Debian): $manual"
+fi
+if [ "$(id -u)" != 0 ]; then
+	[ -n "$manual" ] || exit 0
+	die "not root: run 'sudo apt-get install ${missing[*]}', then make again"
+fi
+
+# A third-party source that is down must not keep us from Debian's own packages.
+step apt-update "refreshing the package lists" apt-get update ||
+	warn "some package lists could not be refreshed; going on with what there is"
+step apt-install "installing ${missing[*]}" \
+	env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=180 install -y --no-install-recommends "${missing[@]}" ||
+	die "apt-get could not install: ${missing[*]}"
