@@ -15,7 +15,6 @@
 
 #include "guard.h"
 
-#define FREEZE_DEADLINE_NS (50 * NS_PER_MS)
 #define LOOK_AGAIN_NS (20 * NS_PER_MS)   /* for init to set itself up        */
 #define LOOK_SELDOM_NS (250 * NS_PER_MS) /* after LOOK_OFTEN_NS of that      */
 #define LOOK_OFTEN_NS (5 * NS_PER_S)
@@ -94,6 +93,13 @@ static void vouch(struct avc_guard *guard)
 	}
 }
 
+static void unvouch(struct avc_guard *guard)
+{
+	guard->vouching = false;
+	for (uint32_t i = 0; i < guard->count; i++)
+		guard->generations[i].vouched = guard->generations[i].seen = false;
+}
+
 static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason reason)
 {
 	struct avc_error error = { 0 };
@@ -155,6 +161,9 @@ static void obey(struct avc_guard *guard, const struct command *command)
 	case AVC_COMMAND_VOUCH:
 		vouch(guard);
 		break;
+	case AVC_COMMAND_UNVOUCH:
+		unvouch(guard);
+		break;
 	}
 }
 
@@ -164,6 +173,7 @@ static void carry_out(struct avc_guard *guard)
 	eventfd_t ignored;
 
 	(void)eventfd_read(guard->wake_fd, &ignored);
+	take_config(guard);
 	while (take_command(guard, &command)) {
 		if (!guard->attached)
 			refuse(guard, command.ticket, AVC_EMPTY, "avckpt-init has not started yet");
@@ -312,17 +322,6 @@ static void *guard_main(void *arg)
 
 /* ---- the interface ---------------------------------------------------------------------- */
 
-static int check_config(const struct avc_config *config, struct avc_error *err)
-{
-	if (config->keep < 1 || config->keep > AVC_KEEP_MAX)
-		return fail(err, AVC_CONFIG, EINVAL, 0, "start guard", "", "keep must be 1 to %d",
-			    AVC_KEEP_MAX);
-	if (config->restore_max > RESTORES_MAX)
-		return fail(err, AVC_CONFIG, EINVAL, 0, "start guard", "",
-			    "restore_max must be at most %d", RESTORES_MAX);
-	return 0;
-}
-
 struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
 				  uint64_t cookie, struct avc_error *err)
 {
@@ -330,7 +329,7 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	int result;
 
 	*err = (struct avc_error){ 0 };
-	if (check_config(config, err))
+	if (config_check(config, err))
 		return NULL;
 	guard = calloc(1, sizeof *guard);
 	if (!guard) {
@@ -338,9 +337,6 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 		return NULL;
 	}
 	guard->engine = engine;
-	guard->config = *config;
-	if (!guard->config.freeze_deadline_ns)
-		guard->config.freeze_deadline_ns = FREEZE_DEADLINE_NS;
 	guard->cookie = cookie;
 	guard->room = config->keep;
 	guard->started_ns = now_ns();
@@ -352,7 +348,7 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	guard->target.memory = memory_new();
 	guard->target.pending = pending_new();
 	guard->target.timers = timers_new();
-	guard->target.shm_bytes = config->shm_bytes;
+	config_set(guard, config);
 	guard->link.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 3);
 	guard->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	if (!guard->target.threads || !guard->target.memory || !guard->target.pending ||
@@ -384,7 +380,7 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
 	int result = 0;
 
 	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNHEALTHY)
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNVOUCH)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
 	pthread_mutex_lock(&guard->lock);
 	if (guard->ended)

@@ -36,7 +36,6 @@ int find_app(struct avc_guard *guard, struct avc_error *err)
 		return fail(err, AVC_DEADLINE, 0, 0, "attach", "",
 			    "the application has not been started yet");
 	guard->target.init = guard->link.init;
-	guard->target.tcp_moved = guard->config.tcp == AVC_TCP_RESET_MOVED;
 	if (proc_status(guard->link.init, &init) == 0)
 		guard->target.plain_filters = init.seccomp_filters;
 	return target_open(&guard->target, app, proc_inside(app), err);
@@ -73,7 +72,8 @@ static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err
 
 	if (find_app(guard, err) || support_check(target, passing, err) || take_stock(target, err))
 		return -1;
-	if (target->infected && target->thread_count > target->pad.threads_max)
+	if (target->infected && (target->thread_count > target->pad.threads_max ||
+				 guard->config.keep >= target->pad.slots))
 		target->infected = false;
 	if (!target->infected) {
 		/* Templates of another pad are of another program or too small. */

@@ -173,17 +173,20 @@ def restore(name: str, as_json: bool) -> None:
 def reload(as_json: bool) -> None:
     """Have the sidecar read /etc/avckpt/config.yaml again.
 
-    If anything in it is wrong, it is refused and the old one stays in force.
-    It holds for containers that start from then on.
+    It holds for containers that run, too; what it changes is told.  If anything
+    in it is wrong, it is refused and the old one stays in force.
     """
     answer = _client().reload()
     if as_json:
         click.echo(json.dumps(answer, indent=2))
         return
     config = answer["config"]
-    click.echo(f"{config['path']}: in force")
-    if answer["unchanged"]:
-        click.echo(f"until they are restarted, these go on as before: {', '.join(answer['unchanged'])}")
+    click.echo(f"{config['path']}: {'in force' if config['found'] else 'not there, the built-in defaults hold'}")
+    for one in answer["containers"]:
+        changes = ", ".join(f"{c['setting']} {c['before'] or 'none'} -> {c['after'] or 'none'}" for c in one["changes"])
+        click.echo(f"{one['container']}: {changes or 'goes on as before: ' + one['problem']}")
+    if not answer["containers"]:
+        click.echo("it changes nothing for the containers that run")
 
 
 @main.command()

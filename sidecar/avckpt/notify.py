@@ -40,8 +40,12 @@ class Watched(Protocol):
 
     container: Protected
     pidfd: int
-    notify: Notify | None
-    notify_self: Notify | None
+
+    @property
+    def notify(self) -> Notify | None: ...
+
+    @property
+    def notify_self(self) -> Notify | None: ...
 
 
 Tell = Callable[[Protected, Kind, str], None]
