@@ -96,7 +96,7 @@ class LocalSidecar:
             self.process = subprocess.Popen(
                 [*avckpt_command(), "sidecar"], stderr=log, env={**os.environ, **self.env}, stdin=subprocess.DEVNULL
             )
-        wait_until(self._answers, 15, "the sidecar answers")
+        wait_until(self._answers, 60, "the sidecar answers")
 
     def stop(self, signum: int = signal.SIGTERM) -> int:
         """Ends it by a signal; its exit status as subprocess has it."""
