@@ -109,8 +109,8 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
         "avckpt.version": VERSION,
     }
     add_hooks(data, told)
-    if policy.restore_on.unhealthy:
-        _ask_for_health(container, name, parent)
+    # Always: the sidecar's configuration may say avckpt.restore.on=unhealthy, now or later.
+    _ask_for_health(container, name, parent)
     return json.dumps(data, separators=(",", ":")).encode()
 
 
@@ -120,7 +120,7 @@ def _ask_for_health(container: str, name: str, parent: int) -> None:
     try:
         health.ask_later(container, parent)
     except (OSError, podman.Unknown) as error:
-        warn(f"container {name} is not rolled back when unhealthy: its health check is not known ({error})", parent)
+        tell.journal(f"avckpt: container {name}: its health check can not be found out: {error}")
 
 
 def put_init_in_front(data: dict[str, Any]) -> None:

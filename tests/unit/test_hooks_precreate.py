@@ -207,7 +207,7 @@ def test_nonsense_on_standard_input_comes_out_again(hook: Hook) -> None:
 def test_podman_is_asked_for_the_container_of_the_configuration(hook: Hook) -> None:
     config, spec = sample("pod")
     wanted = podman.container_id(config)
-    assert hook(config, spec).asked.split() == ["generate", "spec", "-c", "-n=false", wanted]
+    assert hook(config, spec).asked.splitlines()[0].split() == ["generate", "spec", "-c", "-n=false", wanted]
 
 
 @pytest.mark.parametrize("name", ["plain", *PROTECTED])
