@@ -276,6 +276,9 @@ class Daemon:
         if problem is not None:
             detail = f"{self.configuration.path} does not hold for it"
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail=detail, error=problem))
+        if not settings.policy.enable:
+            container.listen()
+            return
         try:
             watch.guard = self._engine.start_guard(pidfd, container.config, container.cookie)
         except AvckptError as error:
