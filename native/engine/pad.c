@@ -181,8 +181,12 @@ int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
-	if (wait_done(call, tid, err))
+	if (wait_done(call, tid, err)) {
+		/* Without a stop of its own it would go home and stay a tracee for ever;
+		 * now it stops as soon as it gets to run, and straggle() sends it home. */
+		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		return -1;
+	}
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "run injected code", "ptrace(INTERRUPT)",
 				  "it has gone");

@@ -224,7 +224,10 @@ static bool straggle(struct target *target, struct thread *thread)
 		thread->borrowed = false;
 		return false;
 	case STOP_FORK:
-		if (thread->borrowed)
+		/* A borrowed thread may have found home by itself, and what it starts
+		 * there is the app's: to kill one thread is to kill them all. */
+		if (thread->borrowed && arch_regs_get(tid, &now) == 0 &&
+		    pad_contains(&target->pad, arch_pc(&now)))
 			tracee_kill(stop.message); /* our clone, too late */
 		else
 			adopt(target, stop.message, &ignored);
