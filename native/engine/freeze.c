@@ -272,6 +272,9 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 	if (!cloned)
 		return -1;
 	target->checkpoints++;
+	if (pending_deadly(target->pending))
+		return fail(err, AVC_GONE, 0, target->pid, "freeze", "",
+			    "it is just being ended by signal %d", pending_deadly(target->pending));
 	/* What that means, support_check() says at the next attempt. */
 	if (!target->childless)
 		return fail(err, AVC_DEADLINE, ECHILD, target->pid, "freeze", "",

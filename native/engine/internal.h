@@ -405,6 +405,8 @@ struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
  * thread.signalled. */
 void pending_read(struct target *target);
+/* One that the app dies of as soon as it runs again; 0: none. */
+int pending_deadly(const struct pending *pending);
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
