@@ -158,7 +158,7 @@ class Subject(ABC):
         return None
 
 
-class _Below(Idle):
+class Below(Idle):
     """The server below avckpt-init in a PID namespace of its own, to be used with Guarded."""
 
     def __init__(self, board: Board, command: Sequence[str]) -> None:
@@ -197,7 +197,7 @@ class AvckptEngine(Subject):
 
     def start(self) -> None:
         self.port = free_port()
-        self._below = self._undo.enter_context(_Below(self.board, self.command(PROGRAMS, self.folder)))
+        self._below = self._undo.enter_context(Below(self.board, self.command(PROGRAMS, self.folder)))
         self._guarded = self._undo.enter_context(Guarded(self._below))
 
     def checkpoint(self) -> Taken:
@@ -509,6 +509,7 @@ class CriuPodmanRunc(CriuPodman):
 __all__ = [
     "AvckptEngine",
     "AvckptPodman",
+    "Below",
     "ColdCommand",
     "ColdStart",
     "CommandFailed",

@@ -78,13 +78,15 @@ class Client:
         inside: Path | None = None,
         every_us: int = ASK_EVERY_US,
         log: Path | None = None,
+        seconds: float | None = None,
     ) -> None:
         self.board = Board(folder / f"client-{port}")
-        self._log = log
         command = [*enter, str(program), "127.0.0.1", str(port), "--every-us", str(every_us)]
         command += ["--board", str((inside or folder) / self.board.path.name)]
         if log is not None:
             command += ["--log", str(log)]
+        if seconds is not None:
+            command += ["--seconds", str(seconds)]
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
     def __enter__(self) -> Client:
@@ -97,6 +99,15 @@ class Client:
         self._process.wait()
         self.board.page.close()
         self.board.path.unlink(missing_ok=True)
+
+    def wait_end(self) -> None:
+        """Until `seconds` are over and the log is whole.  Raises BenchFailed."""
+        try:
+            status = self._process.wait(30)
+        except subprocess.TimeoutExpired:
+            raise BenchFailed("the client does not end") from None
+        if status != 0:
+            raise BenchFailed(f"the client has ended with {status}")
 
     @property
     def answers(self) -> int:
