@@ -45,6 +45,10 @@ lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where ins
 bench: setup ## measure freeze, reap and restore beside a plain fork()
 	@$(VENV)/python bench/run.py
 
+bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against the age of the checkpoint
+	@scripts/setup-ros2.sh
+	@$(VENV)/python bench/ros2.py
+
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
@@ -54,5 +58,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test lint bench clean clean-system
+.PHONY: help setup setup-build setup-images demo test lint bench bench-ros2 clean clean-system
 .DEFAULT_GOAL := help

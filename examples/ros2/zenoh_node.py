@@ -18,13 +18,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import struct
 import sys
 import time
 from typing import Any
 
 import zenoh  # type: ignore[import-not-found,unused-ignore]
-from kept import Kept
+from kept import Kept  # type: ignore[import-not-found,unused-ignore]
 
 FIELDS = struct.Struct("<3Q")
 RECORD = struct.Struct("<4Q")
@@ -36,7 +37,7 @@ class Node:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.skip = options.after_restore == "skip"
-        self.log = open(options.log, "wb", buffering=0) if options.log else None
+        self.log = os.open(options.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) if options.log else None
         self.padding = bytes(options.size)
         self.heard = 0
         self.sent = 0
@@ -53,7 +54,7 @@ class Node:
             return
         self.heard = sent
         if self.log is not None:
-            self.log.write(RECORD.pack(now, count, sent, heard))
+            os.write(self.log, RECORD.pack(now, count, sent, heard))
 
     def send(self) -> None:
         """One message, and before it what makes it new to the peer."""
