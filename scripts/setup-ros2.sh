@@ -14,6 +14,11 @@ IMAGE=localhost/avckpt-ros2
 WHEELS=$BUILD/wheels-ros2
 ZENOH='eclipse-zenoh==1.10.2'
 
+.venv/bin/python -c 'import matplotlib' 2>/dev/null ||
+	step matplotlib "installing matplotlib, for the plots" \
+		.venv/bin/python -m pip install --disable-pip-version-check -q 'matplotlib>=3.8' ||
+	die "matplotlib could not be installed"
+
 base_id=$(podman image inspect --format '{{.Id}}' "$BASE:latest") || die "no base image: make setup builds it"
 key=$(content_key examples/ros2 -- "$base_id" "$ZENOH")
 if podman image exists "$IMAGE:$key"; then
