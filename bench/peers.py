@@ -111,6 +111,8 @@ def fork_row(mb: int, threads: int, cycles: int) -> Row:
     row = Row(FORK, mb, threads, load=os.getloadavg()[0])
     with Forker(mb) as forker:
         for _ in range(cycles):
+            # Not one upon the other: the tables would be in the CPU's caches still.
+            time.sleep(0.02)
             ms = forker.fork_ms()
             row.freeze_ms.append(ms)
             row.outage_ms.append(ms)

@@ -355,7 +355,7 @@ def _criu_failed(what: str, done: Completed, log: str) -> CriuFailed:
 class InWorld(Subject):
     """What CRIU's two ways have in common: they run in the peers' world."""
 
-    cycles = 8
+    cycles = 6
 
     def __init__(self, mb: int, threads: int, folder: Path, world: World) -> None:
         super().__init__(mb, threads, folder)

@@ -54,9 +54,3 @@ else
 		die "no peers: $SUITE could not be fetched from $MIRROR (AVCKPT_MIRROR names another mirror)"
 fi
 find "$CACHE" -name "peers-*.tar" ! -name "$(basename "$tarball")" -delete
-
-if ! .venv/bin/python -c 'import matplotlib' 2>/dev/null; then
-	step matplotlib "installing matplotlib, for the plots" \
-		.venv/bin/python -m pip install --disable-pip-version-check -q 'matplotlib>=3.8' ||
-		die "matplotlib could not be installed"
-fi
