@@ -45,6 +45,15 @@ lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where ins
 bench: setup ## measure freeze, reap and restore beside a plain fork()
 	@$(VENV)/python bench/run.py
 
+bench-peers: setup ## measure avckpt beside CRIU (bare, and through Podman), cold start and a plain fork()
+	@scripts/setup-plots.sh
+	@scripts/setup-peers.sh
+	@$(VENV)/python bench/peers.py
+
+bench-cost: setup-build ## measure what checkpoints cost a request/reply server over time
+	@scripts/setup-plots.sh
+	@$(VENV)/python bench/cost.py
+
 bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against the age of the checkpoint
 	@scripts/setup-ros2.sh
 	@$(VENV)/python bench/ros2.py
@@ -58,5 +67,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test lint bench bench-ros2 clean clean-system
+.PHONY: help setup setup-build setup-images demo test lint bench bench-peers bench-cost bench-ros2 clean clean-system
 .DEFAULT_GOAL := help
