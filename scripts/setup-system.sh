@@ -57,6 +57,7 @@ optional|netavark|has_netavark|bridge networks for containers
 optional|iptables|have iptables|bridge networks for containers (Podman 4)
 optional|nftables|have nft|bridge networks for containers (Podman 5)
 optional|runc|have runc|the tests run on both OCI runtimes
+optional|g++|have c++|compiles the C++ program that the tests kill and restore
 optional|cyclonedds-dev|has_cyclonedds|a test of ROS 2's transport
 optional|cyclonedds-tools|have idlc|a test of ROS 2's transport
 optional|catatonit|has_catatonit|pods and 'podman run --init'
