@@ -58,6 +58,7 @@ RECORD = struct.Struct("<4Q")
 NS_PER_MS = 1e6
 PATIENCE_S = 30.0
 SETTLE_S = 0.5
+STEADY_S = 0.4
 NODE = "/opt/ros2/build/dds_node"
 ZENOH = "python3 /opt/ros2/zenoh_node.py"
 PEER_TOPICS = "--in from_node --out to_node --log /log/heard"
@@ -149,7 +150,7 @@ class Trial:
     in_ms: float | None
     """None with ddsperf, which does not tell."""
     steady_ms: float
-    """Largest gap that the peer saw in the second before the kill; 0 with ddsperf."""
+    """Largest gap that the peer saw in the time before the kill, STEADY_S; 0 with ddsperf."""
 
 
 class Events:
@@ -203,7 +204,7 @@ class HeardLog:
         return bool(newest) and newest[0][3] > at_ns
 
     def gaps(self, killed_ns: int) -> tuple[float | None, float | None, float]:
-        """out, in, and the largest one of the second before; ms."""
+        """out, in, and the largest one of the time before; ms."""
         before = [r for r in self.read() if r[0] <= killed_ns]
         last_out, last_in = before[-1][0], max(r[3] for r in before[-100:])
         out = heard = None
@@ -212,7 +213,7 @@ class HeardLog:
                 out = (now - last_out) / NS_PER_MS
             if heard is None and heard_ns > killed_ns:
                 heard = (heard_ns - last_in) / NS_PER_MS
-        steady = [r[0] for r in before if r[0] > killed_ns - 1e9]
+        steady = [r[0] for r in before if r[0] > killed_ns - STEADY_S * 1e9]
         return out, heard, max((b - a for a, b in zip(steady, steady[1:])), default=0) / NS_PER_MS
 
 
