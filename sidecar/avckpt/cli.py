@@ -305,7 +305,7 @@ def _print_table(containers: list[Json]) -> None:
         table.add_row(
             _called(c),
             Text(c["state"], style=STATE_STYLES.get(c["state"], "")),
-            f"{c['generations']}/{c['keep']}",
+            "-" if c["state"] == "listening" else f"{c['generations']}/{c['keep']}",
             f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
             "-" if c["last_checkpoint_at"] is None else f"{max(now - c['last_checkpoint_at'], 0):.0f} s ago",
             _ms(c["last_freeze_s"]),

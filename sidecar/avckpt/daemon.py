@@ -193,6 +193,8 @@ class Daemon:
         try:
             after = self._settings_of(watch.labels, container.name)
             changed = tuple(changes(watch.settings, after))
+            if not after.policy.enable:  # it only listens
+                changed = tuple(change for change in changed if change.setting in ("group", "notify"))
             if not changed:
                 return None
             if watch.guard is not None:

@@ -107,7 +107,9 @@ def test_up_protects_what_podman_compose_alone_protects_too(project: Project, si
     ids = project.ids()
     assert states(project.avckpt("up", "--json")) == expected
     assert project.ids() == ids
-    project.avckpt("down")
+    gone = json.loads(project.avckpt("down", "--json").stdout)
+    assert {one["service"] for one in gone} == set(expected)
+    assert {one["id"] for one in gone} == set(ids)
     assert project.ids() == []
     assert sidecar.running
 

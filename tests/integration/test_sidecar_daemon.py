@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
 import os
 import re
@@ -13,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.process import has_ended
 from harness import avckpt_command, run, wait_until
 from local_sidecar import ON_COMMAND, QUICK, LocalSidecar, children, ended, local_sidecar
 
@@ -233,6 +236,36 @@ def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSi
     local.wait_for(web, state="protected")
     os.kill(web.app_pid, signal.SIGKILL)
     local.wait_for(web, restores=1)
+
+
+def test_crashes_are_restored_while_the_event_loop_hangs(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    assert local.process is not None
+    with stopped_thread(local.process.pid):
+        for _ in range(3):
+            app = os.pidfd_open(web.app_pid)
+            signal.pidfd_send_signal(app, signal.SIGKILL)
+            wait_until(lambda app=app: has_ended(app), 10, "it has died")  # type: ignore[misc]
+            os.close(app)
+            wait_until(lambda: web.app_pid, 10, "it is there again")
+        assert not ended(web)
+    assert local.wait_for(web, restores=3, state="protected")["last_death"] == "killed by SIGKILL"
+
+
+@contextlib.contextmanager
+def stopped_thread(tid: int) -> Iterator[None]:
+    """One thread stands still, the others of its process go on: by ptrace(2)."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    seize, interrupt, detach = 0x4206, 0x4207, 17
+    arguments = (ctypes.c_long(tid), ctypes.c_void_p(), ctypes.c_void_p())
+    assert libc.ptrace(seize, *arguments) == 0, os.strerror(ctypes.get_errno())
+    try:
+        assert libc.ptrace(interrupt, *arguments) == 0
+        os.waitpid(tid, 0)
+        yield
+    finally:
+        assert libc.ptrace(detach, *arguments) == 0
 
 
 def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> None:
