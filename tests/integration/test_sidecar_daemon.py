@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import json
 import os
 import re
 import signal
 import stat
+import struct
+import subprocess
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.process import has_ended
 from harness import avckpt_command, run, wait_until
 from local_sidecar import ON_COMMAND, QUICK, LocalSidecar, children, ended, local_sidecar
 
@@ -244,11 +247,9 @@ def test_crashes_are_restored_while_the_event_loop_hangs(local: LocalSidecar) ->
     assert local.process is not None
     with stopped_thread(local.process.pid):
         for _ in range(3):
-            app = os.pidfd_open(web.app_pid)
-            signal.pidfd_send_signal(app, signal.SIGKILL)
-            wait_until(lambda app=app: has_ended(app), 10, "it has died")  # type: ignore[misc]
-            os.close(app)
-            wait_until(lambda: web.app_pid, 10, "it is there again")
+            app = wait_until(lambda: web.app_pid, 10, "it is there")
+            os.kill(app, signal.SIGKILL)
+            wait_until(lambda app=app: web.app_pid not in (0, app), 10, "it is there again")  # type: ignore[misc]
         assert not ended(web)
     assert local.wait_for(web, restores=3, state="protected")["last_death"] == "killed by SIGKILL"
 
@@ -318,3 +319,19 @@ def test_info(local: LocalSidecar) -> None:
     assert info["pid"] == local.process.pid
     assert info["containers"] == 0
     assert info["version"] == run([*avckpt_command(), "--version"]).stdout.split()[1]
+
+
+def test_the_table_on_a_narrow_terminal(local: LocalSidecar) -> None:
+    """Nothing of it is cut off; the states have colours."""
+    local.wait_for(local.protected("web", SLEEPER), state="protected", generations=2)
+    ours, terminal = os.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 60, 0, 0))
+    environment = {**os.environ, **local.env, "TERM": "xterm"}
+    subprocess.run([*avckpt_command(), "ps"], stdout=terminal, stdin=terminal, env=environment, check=True, timeout=60)
+    os.close(terminal)
+    said = os.read(ours, 65536).decode()
+    os.close(ours)
+    assert "\x1b[32mprotected\x1b[0m" in said
+    head, line = (re.sub(r"\x1b\[[0-9;]*m", "", each).split() for each in said.splitlines()[:2])
+    assert head == "NAME STATE GENS MEMORY CHECKPOINT FREEZE RESTORES RESTORE NOTE".split()
+    assert line[:3] == ["web", "protected", "2/2"]
