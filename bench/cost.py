@@ -46,6 +46,7 @@ from harness import free_port  # noqa: E402 - tests, whose folder is no package
 from native.board import Board, Seen  # noqa: E402
 
 from bench import cost_show  # noqa: E402
+from bench.cpu_group import first_in_line  # noqa: E402
 from bench.idle import memory_kb  # noqa: E402
 from bench.peers_subjects import Below  # noqa: E402
 from bench.subjects import BenchFailed, build, children, eventually  # noqa: E402
@@ -330,6 +331,7 @@ def main() -> int:
     parser.add_argument("--memory-rates", type=_numbers, default=(1, 10, 100, 500), help="MB/s for that")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="for each cell (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS, help="where the results go (%(default)s)")
+    parser.add_argument("--first", action="store_true", help="on a machine that others use: take the CPU first")
     parser.add_argument("--show", action="store_true", help="measure nothing, make tables and plots of what is there")
     args = parser.parse_args()
     if args.show:
@@ -344,7 +346,7 @@ def main() -> int:
     try:
         build()
         build_workload()
-        with boards_folder() as folder:
+        with boards_folder() as folder, first_in_line() if args.first else contextlib.nullcontext():
             for way in ways(args.rates, args.intervals, args.kinds.split(",")):
                 console.print(f"{way} (load {os.getloadavg()[0]:.1f})", style="dim")
                 cells.append(measure(way, args.seconds, folder))

@@ -38,9 +38,10 @@ sys.path.insert(0, str(ROOT))
 sys.path.insert(0, str(ROOT / "tests"))
 
 from avckpt.errors import AvckptError  # noqa: E402
-from harness import CommandFailed, Podman, Sidecar, machine_lock, running_sidecar  # noqa: E402
+from harness import SIDECAR_NAME, CommandFailed, Podman, Sidecar, machine_lock, running_sidecar  # noqa: E402
 
 from bench import peers_show  # noqa: E402
+from bench.cpu_group import first_in_line, join  # noqa: E402
 from bench.peers_subjects import (  # noqa: E402
     AvckptEngine,
     AvckptPodman,
@@ -102,6 +103,8 @@ class Row:
     stop_outage_ms: list[float] = field(default_factory=list)
     stop_same_connection: int = 0
     stops: int = 0
+    refused: int = 0
+    """Restores that had to be tried again."""
     failures: list[str] = field(default_factory=list)
     load: float = 0.0
 
@@ -194,13 +197,17 @@ def measure(subject: Subject, row: Row, cycles: int) -> None:
                     stop_and_restore(subject, client, row)
     except CriuFailed as error:
         row.failures.append(str(error))
+    row.refused = len(subject.refused)
+    row.failures += sorted(set(subject.refused))
 
 
 class Bench:
     """Makes subjects, and what they need, once and only when it is needed."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, first: bool) -> None:
         self._folder = folder
+        self._first = first
+        self._container_options: list[str] = []
         self._undo = contextlib.ExitStack()
         self._world: World | None = None
         self._sidecar: Sidecar | None = None
@@ -208,6 +215,8 @@ class Bench:
         self.versions: dict[str, str] = {}
 
     def __enter__(self) -> Bench:
+        if self._first:
+            self._container_options = self._undo.enter_context(first_in_line())
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -215,6 +224,11 @@ class Bench:
 
     def subject(self, name: str, mb: int, threads: int) -> Subject:
         """Raises BenchFailed, CommandFailed, TimeoutError."""
+        made = self._make(name, mb, threads)
+        made.container_options = self._container_options
+        return made
+
+    def _make(self, name: str, mb: int, threads: int) -> Subject:
         kind = SUBJECTS[name]
         if issubclass(kind, InWorld):
             return kind(mb, threads, self._folder, self._the_world())
@@ -234,6 +248,8 @@ class Bench:
         if self._sidecar is None:
             self._undo.enter_context(machine_lock(LOCK_PATIENCE_S))
             self._sidecar = self._undo.enter_context(running_sidecar(Podman()))
+            if self._first:
+                join(Podman().inspect(SIDECAR_NAME)["State"]["Pid"])
         return self._sidecar
 
 
@@ -300,6 +316,7 @@ def main() -> int:
     parser.add_argument("--cycles", type=int, help="this many for everybody")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_CYCLES} cycles each")
     parser.add_argument("--output", type=Path, default=RESULTS, help="where the results go (%(default)s)")
+    parser.add_argument("--first", action="store_true", help="on a machine that others use: take the CPU first")
     parser.add_argument("--show", action="store_true", help="measure nothing, make table and plots of what is there")
     args = parser.parse_args()
     if args.show:
@@ -313,7 +330,7 @@ def main() -> int:
     try:
         build()
         build_workload()
-        with boards_folder() as folder, Bench(folder) as bench:
+        with boards_folder() as folder, Bench(folder, first=args.first) as bench:
             for name in args.subjects:
                 for mb, threads in workloads(args.mb, args.threads):
                     console.print(f"{name}: {mb} MB, {threads} threads (load {os.getloadavg()[0]:.1f})", style="dim")

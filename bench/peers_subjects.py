@@ -48,6 +48,8 @@ from bench.workload import PROGRAMS, Client, find_server  # noqa: E402
 BEAT_US = 100
 PORT_INSIDE = 5555
 """In the peers' world, whose network nobody else uses."""
+PATIENCE_S = 30.0
+"""With restores that are refused."""
 NO_CHECKPOINTS = "24h"
 """An interval that does not come up: checkpoints are taken by command."""
 
@@ -91,6 +93,9 @@ class Subject(ABC):
         self.arguments = [str(mb), str(threads)]
         self.options = ["--beat-us", str(BEAT_US)]
         self.port = 0
+        self.container_options: list[str] = []
+        self.refused: list[str] = []
+        """Restores that did not work at the first try, in the tool's own words."""
         self._undo = contextlib.ExitStack()
 
     def __enter__(self) -> Subject:
@@ -221,7 +226,14 @@ class InContainer(Subject):
         self.container: Container | None = None
 
     def _options(self) -> list[str]:
-        return ["--network=host", "-v", f"{PROGRAMS}:{PROGRAMS_INSIDE}:ro", "-v", f"{self.folder}:{BOARDS_INSIDE}"]
+        return [
+            *self.container_options,
+            "--network=host",
+            "-v",
+            f"{PROGRAMS}:{PROGRAMS_INSIDE}:ro",
+            "-v",
+            f"{self.folder}:{BOARDS_INSIDE}",
+        ]
 
     def run_of_container(self) -> tuple[str, int]:
         assert self.container is not None
@@ -423,11 +435,22 @@ class CriuBare(InWorld):
 
     def crash(self) -> Recovered:
         self.kill()
-        return Recovered(self._restore())
+        return Recovered(self._restore_patiently())
 
     def stop_and_restore(self) -> None:
         self._dump()
-        self._restore()
+        self._restore_patiently()
+
+    def _restore_patiently(self) -> float:
+        """As a supervisor would: what the dead process' connections left in the kernel can be in the way."""
+        until = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return self._restore()
+            except CriuFailed as error:
+                if time.monotonic() > until:
+                    raise
+                self.refused.append(str(error))
 
     def _world_bytes(self, name: str) -> bytes:
         done = subprocess.run(
@@ -448,7 +471,8 @@ class CriuPodman(InWorld):
         self._undo.callback(self._podman, "rm", "--force", "--ignore", "--time", "0", self._name)
         mounts = ["-v", f"{PROGRAMS_INSIDE}:{PROGRAMS_INSIDE}:ro", "-v", f"{BOARDS_INSIDE}:{BOARDS_INSIDE}"]
         self._podman(
-            *("run", "--detach", "--pull=never", "--name", self._name, "--network=host", *mounts),
+            *("run", "--detach", "--pull=never", "--name", self._name, "--network=host"),
+            *(*self.container_options, *mounts),
             *(IMAGE, *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE)),
         )
         self._static_dir = self._podman("inspect", "--format", "{{.StaticDir}}", self._name).stdout.strip()
@@ -476,15 +500,19 @@ class CriuPodman(InWorld):
         return Taken(took_ms, freeze, int(size) / 1024)
 
     def _restore(self) -> float:
-        started = time.monotonic()
+        until = time.monotonic() + PATIENCE_S
         # Podman hears of the death from conmon; until then it does not restore ("is running or paused").
         while True:
             done = self._podman("container", "restore", "--keep", "--tcp-established", self._name, check=False)
             if done.status == 0:
                 return done.took_s * 1e3
-            if "is running or paused" not in done.stderr or time.monotonic() - started > 60:
-                log = self._world.run("cat", f"{self._static_dir}/restore.log", check=False).stdout
-                raise _criu_failed("podman container restore", done, log)
+            if "is running or paused" in done.stderr and time.monotonic() < until:
+                continue
+            log = self._world.run("cat", f"{self._static_dir}/restore.log", check=False).stdout
+            error = _criu_failed("podman container restore", done, log)
+            if time.monotonic() > until:
+                raise error
+            self.refused.append(str(error))
 
     def crash(self) -> Recovered:
         self.kill()
