@@ -332,7 +332,8 @@ def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:
 
 def _judge(service: Service) -> Iterator[Problem]:
     """Everything that is wrong with the settings of a service."""
-    alone, wrong = ({"avckpt.group": "any"}, False)  # which avckpt.notify asks for
+    alone = {"avckpt.group": "any"}  # which avckpt.notify asks for
+    right: dict[str, Setting] = {}
     for kind, setting in service.all_settings():
         value = {setting.key: setting.final}
         try:
@@ -343,18 +344,16 @@ def _judge(service: Service) -> Iterator[Problem]:
                 merge(value, {})
             parse_policy(value if setting.key == ENABLE else {**alone, **value})
         except LabelError as error:
-            wrong = True
             yield Problem(setting.place, service.name, str(error).replace("label", kind.value, 1))
+        else:
+            right[setting.key] = setting
     yield from _judge_both(service)
-    if not wrong:
-        yield from _judge_together(service)
+    if not any(setting.is_open for _, setting in service.all_settings()):
+        yield from _judge_together(service, right)
 
 
-def _judge_together(service: Service) -> Iterator[Problem]:
-    """Values that are right by themselves.  Where the environment has a say, nobody can know."""
-    settings = {setting.key: setting for _, setting in service.all_settings()}
-    if any(setting.is_open for setting in settings.values()):
-        return
+def _judge_together(service: Service, settings: Mapping[str, Setting]) -> Iterator[Problem]:
+    """Of values that are right by themselves.  Where the environment has a say, nobody can know."""
     try:
         parse_policy({key: setting.final for key, setting in settings.items()})
     except LabelError as error:
