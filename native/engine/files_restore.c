@@ -531,9 +531,6 @@ int files_restore(struct target *target, struct generation *generation,
 				   .notes = notes };
 	int result = -1;
 
-	if (config->files == AVC_FILES_STRICT &&
-	    files_check_strict(generation, generation->template, generation->pidfd, init, err))
-		return -1;
 	work.now = files_new(work.want->count + 64);
 	work.local = filled(work.want->count, -1);
 	work.source = filled(work.want->count, -1);

@@ -248,6 +248,7 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 	if (!result) {
 		generation->vm_pages = proc_vm_pages(target->pid);
 		memory_copy(target, generation->image);
+		files_mapped_copy(generation->mapped);
 		generation->taken_ns = now_ns();
 		/* The deadline is for getting things stopped; the clone of a big
 		 * process takes its time. */

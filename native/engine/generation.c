@@ -142,7 +142,8 @@ static int fill_slot(struct target *target, struct generation *generation,
 		return -1;
 	if (timers_setup(target, generation, &setup, err))
 		return -1;
-	generation->notice = setup.notice;
+	if (setup.notice.code)
+		generation->notice = setup.notice;
 	slot->threads = generation->threads;
 	slot->pid = target->inside;
 	slot->group = group_inside;
@@ -183,5 +184,6 @@ void generation_drop(struct generation *generation)
 	free(generation->timers);
 	free(generation->attributes);
 	files_free(generation->files);
+	files_mapped_free(generation->mapped);
 	*generation = (struct generation){ .pidfd = -1 };
 }

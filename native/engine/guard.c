@@ -113,9 +113,9 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 		return;
 	}
 	/* An app that hangs is better started anew than left as it is. */
-	if (guard->config.files == AVC_FILES_STRICT && reason == AVC_REASON_COMMAND &&
-	    files_check_strict(&guard->generations[guard->count - 1], guard->target.pid,
-			       guard->target.pidfd, guard->link.init, &error)) {
+	if (reason == AVC_REASON_COMMAND &&
+	    check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
+			 guard->target.pidfd, &error)) {
 		emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
@@ -403,6 +403,7 @@ void avc_guard_stop(struct avc_guard *guard)
 	pthread_mutex_unlock(&guard->lock);
 	eventfd_write(guard->wake_fd, 1);
 	pthread_join(guard->thread, NULL);
+	files_written_free(guard->written);
 	close_fd(&guard->wake_fd);
 	pthread_mutex_destroy(&guard->lock);
 	free(guard->target.threads);

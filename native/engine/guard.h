@@ -59,6 +59,7 @@ struct avc_guard {
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	uint32_t verdict_seq;
+	struct files_written *written; /* avckpt.files=strict; NULL: not yet        */
 };
 
 /* ---- guard.c: what is told ------------------------------------------------- */
@@ -90,6 +91,9 @@ void keep_generation(struct avc_guard *guard, struct generation *fresh);
 void count_crash(struct avc_guard *guard, bool hung);
 void drop_unhealthy(struct avc_guard *guard);
 void choose(struct avc_guard *guard, bool used_up);
+void note_written(struct avc_guard *guard);
+int check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid, int pidfd,
+		 struct avc_error *err) warn_unused;
 
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 

@@ -91,6 +91,18 @@ static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err
 	return 0;
 }
 
+/* avckpt.files=strict: from here on, nothing is written that is not seen. */
+static void watch_files(struct avc_guard *guard, struct generation *fresh)
+{
+	struct target *target = &guard->target;
+
+	if (!guard->written)
+		guard->written = files_written_new();
+	if (guard->written)
+		files_written_watch(guard->written, target->pid, &fresh->notice);
+	fresh->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+}
+
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	struct target *target = &guard->target;
@@ -102,8 +114,12 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		generation_drop(&fresh);
 		return -1;
 	}
+	if (guard->config.files == AVC_FILES_STRICT)
+		watch_files(guard, &fresh);
 	touch_slot(&target->pad, fresh.slot, target->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
+	/* What is written between here and the freeze counts as written after it. */
+	note_written(guard);
 	result = freeze(target, guard->timer, guard->config.freeze_deadline_ns, &fresh, &times,
 			err);
 	event->freeze_ns = times.freeze_ns;

@@ -236,6 +236,8 @@ struct target {
 	bool tcp_moved; /* bytes of connections are to be counted           */
 };
 
+#define FILES_NAME 81 /* of a file, for people                                  */
+
 struct generation {
 	uint64_t number; /* 0: unused                                        */
 	pid_t template;
@@ -260,6 +262,9 @@ struct generation {
 	struct avc_error notice;      /* what of it can not be put back              */
 	struct files *files;          /* descriptors                                     */
 	struct avc_error files_error; /* why they could not be read             */
+	/* avckpt.files=strict */
+	struct files_mapped *mapped; /* NULL: it was not strict                         */
+	char written[FILES_NAME];    /* a file that was written since; "": none         */
 };
 
 struct link {
@@ -535,10 +540,29 @@ int files_restore(struct target *target, struct generation *generation,
 		  struct avc_error *err) warn_unused;
 /* Whether the restored process could do it all. */
 void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struct avc_error *notes);
-/* -1 if a file open for writing was written since, with AVC_UNSUPPORTED and which.
- * `pid` is a process that has the table as it is now. */
+/* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
+ * that has the table as it is now, `holder` one that has the memory. */
 int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
+		       pid_t holder, struct avc_error *err) warn_unused;
+
+/* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
+ * out of memory. */
+struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);
+/* While everything is stopped; NULL: nothing. */
+void files_mapped_copy(struct files_mapped *mapped);
+void files_mapped_free(struct files_mapped *mapped);
+int files_mapped_check(const struct generation *generation, pid_t holder,
 		       struct avc_error *err) warn_unused;
+
+/* files_written.c: what is written in the container's mount namespace. */
+struct files_written *files_written_new(void);
+void files_written_free(struct files_written *written);
+/* From now on; *notice if it can not be. */
+void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice);
+/* Whether a file was written since the last time this was asked, and which; inherited
+ * ones in `files` (may be NULL) do not count. */
+bool files_written_since(struct files_written *written, const struct files *files,
+			 char name[FILES_NAME]);
 
 /* ---- freeze.c ------------------------------------------------------------------ */
 

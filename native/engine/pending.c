@@ -136,8 +136,8 @@ static int find_deadly(const struct target *target, const struct dispositions *d
 		for (uint32_t i = 0; i < target->thread_count; i++) {
 			const struct thread *t = &target->threads[i];
 
-			if (takes(t, signal) && (pending->signal[k].block < 0 ||
-						 pending->signal[k].block == t->block))
+			if (takes(t, signal) &&
+			    (pending->signal[k].block < 0 || pending->signal[k].block == t->block))
 				return signal;
 		}
 	}
