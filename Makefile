@@ -19,7 +19,7 @@ export PYTHON
 
 help: ## this list
 	@printf 'avckpt keeps Podman containers alive through crashes.\n\n'
-	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
+	@sed -n 's/^\([a-z][a-z0-9-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
 		while IFS='|' read -r name what; do printf "  %-20s %s\n" "$$name" "$$what"; done
 
 setup: setup-build setup-images ## install and build everything that demo and test need
