@@ -64,10 +64,14 @@ class Project:
         self.path.with_name("count.py").write_text(COUNT)
 
     def avckpt(self, command: str, *args: str, check: bool = True, env: dict[str, str] | None = None) -> Completed:
-        return run([*avckpt_command(), command, "-f", str(self.path), *args], check=check, env=env, timeout_s=PATIENCE_S)
+        return run(
+            [*avckpt_command(), command, "-f", str(self.path), *args], check=check, env=env, timeout_s=PATIENCE_S
+        )
 
     def compose(self, *args: str, check: bool = True) -> Completed:
-        return run([sys.executable, "-m", "podman_compose", "-f", str(self.path), *args], check=check, timeout_s=PATIENCE_S)
+        return run(
+            [sys.executable, "-m", "podman_compose", "-f", str(self.path), *args], check=check, timeout_s=PATIENCE_S
+        )
 
     def ids(self) -> list[str]:
         label = f"label=io.podman.compose.project={self.name}"
