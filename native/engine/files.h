@@ -100,6 +100,8 @@ struct file {
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
 	int tcp_state; /* 0: no TCP                                                 */
+	/* In the middle of a message, as far as can be told (files_stream.c)      */
+	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */
 	uint8_t *content;
 	uint32_t content_bytes;
@@ -149,6 +151,16 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 const char *file_put_content(int fd, int other_fd, const struct file *want);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
+
+/* files_stream.c */
+/* Whether bytes are just coming in; whether some that were to go out did not fit. */
+bool file_is_coming(int fd);
+bool file_is_going(int fd);
+/* Looks at epoll sets for who waits to write on. */
+void files_find_going(struct files *files);
+/* avckpt.tcp=messages: a connection that a restore leaves between two messages goes on,
+ * one that can be brought there is, any other is reset.  Returns NULL or what failed. */
+const char *file_put_stream(int fd, const struct file *want, const struct file *now);
 
 /* files_make.c */
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why

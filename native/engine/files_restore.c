@@ -484,6 +484,9 @@ static void put_states(struct files_work *work)
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
 			note(work, w, file_reset_tcp(fd));
+		else if (n && n->tcp_state == 1 /* TCP_ESTABLISHED */ &&
+			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
+			note(work, w, file_put_stream(fd, w, n));
 		close(fd);
 	}
 }
@@ -542,6 +545,10 @@ int files_restore(struct target *target, struct generation *generation,
 	if (files_look(work.now, generation->template, generation->pidfd, FILES_NOW, work.want,
 		       init, err))
 		goto out;
+	if (config->tcp == AVC_TCP_MESSAGES) {
+		files_find_going(work.want);
+		files_find_going(work.now);
+	}
 	work.claimed_by = filled(work.now->count, -1);
 	if (!work.claimed_by) {
 		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");

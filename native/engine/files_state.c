@@ -92,6 +92,8 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 		unacknowledged = 0;
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
 	file->tcp_taken = info.bytes_received - (uint64_t)unread;
+	file->tcp_coming = file_is_coming(fd);
+	file->tcp_going = file_is_going(fd);
 }
 
 /* Asks sock_diag(7) for the other end of a Unix socket. */

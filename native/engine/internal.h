@@ -233,7 +233,8 @@ struct target {
 	pid_t init;             /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
-	bool tcp_moved; /* bytes of connections are to be counted           */
+	bool tcp_moved;    /* bytes of connections are to be counted           */
+	bool tcp_messages; /* quiescent is only who is between two messages    */
 };
 
 #define FILES_NAME 81 /* of a file, for people                                  */

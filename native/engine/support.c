@@ -13,7 +13,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "files.h"
 
 static const struct {
 	const char *prefix, *reason;
@@ -145,6 +145,8 @@ static bool unread_bytes(const struct target *target)
 			continue; /* closed since */
 		if (ioctl(fd, FIONREAD, &bytes))
 			bytes = 0; /* not one that bytes come from */
+		if (target->tcp_messages && file_is_coming(fd))
+			bytes = 1;
 		close(fd);
 		if (bytes)
 			return true;
