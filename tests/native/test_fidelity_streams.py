@@ -6,6 +6,7 @@ from __future__ import annotations
 import socket
 import struct
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,12 +34,16 @@ def send(client: socket.socket, body: bytes) -> None:
     client.sendall(struct.pack("<I", len(body)) + body)
 
 
+def more_than(victim: Victim, counter: int, before: int, action: Callable[[], None] = lambda: None) -> None:
+    """Does something, and waits until a counter of the board is greater than that."""
+    action()
+    wait_until(lambda: victim.see().counter[counter] > before, 10, f"counter {counter} of the board grows", 0.001)
+
+
 def sent(victim: Victim, client: socket.socket, messages: int = 1) -> None:
     """Sends some, one after another, and waits until each was taken."""
     for _ in range(messages):
-        whole = victim.see().counter[0]
-        send(client, SHORT)
-        wait_until(lambda before=whole: victim.see().counter[0] > before, 10, "the message is taken", 0.001)
+        more_than(victim, 0, victim.see().counter[0], lambda: send(client, SHORT))
 
 
 def is_reset(client: socket.socket) -> bool:
@@ -116,10 +121,10 @@ def test_a_message_cut_by_the_checkpoint_ends_the_connection(tmp_path: Path) -> 
         for n in range(1, 4):
             whole, read = victim.see().counter[0], victim.see().counter[4]
             client.sendall(struct.pack("<I", len(LONG)) + LONG[:30_000])
-            wait_until(lambda at=read: victim.see().counter[4] > at + 20_000, 10, "it reads the message", 0.001)
+            more_than(victim, 4, read + 20_000)
             guard.command("checkpoint")
             client.sendall(LONG[30_000:])
-            wait_until(lambda before=whole: victim.see().counter[0] > before, 10, "the message is whole", 0.001)
+            more_than(victim, 0, whole)
             time.sleep(SILENT_S)
             victim.kill_app()
             guard.wait("restored", count=n)
