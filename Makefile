@@ -60,6 +60,14 @@ bench-cost: setup-build ## measure what checkpoints cost a request/reply server 
 	@scripts/setup-plots.sh
 	@$(VENV)/python bench/cost.py
 
+bench-ros: setup ## crash nodes of a ROS pipeline, beside cold start: latency, recovery, messages cut in half, costs
+	@scripts/setup-ros.sh
+	@$(VENV)/python bench/ros.py
+
+bench-ros-long: setup ## the same pipeline: 1,000 crashes, one every one or two seconds (half an hour)
+	@scripts/setup-ros.sh
+	@$(VENV)/python bench/ros_endurance.py
+
 bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against the age of the checkpoint
 	@scripts/setup-ros2.sh
 	@$(VENV)/python bench/ros2.py
@@ -73,5 +81,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test test-programs lint bench bench-peers bench-cost bench-ros2 clean clean-system
+.PHONY: help setup setup-build setup-images demo test test-programs lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 clean clean-system
 .DEFAULT_GOAL := help
