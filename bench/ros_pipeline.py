@@ -30,7 +30,7 @@ RESULTS = Path("/tmp/avckpt-ros")
 PERIOD_S = 0.1
 LOST_M = 1.0
 """A pose this far from the truth is none: matching has lost track."""
-NODES = {"voxel": "ros-voxel", "ndt": "ros-ndt"}
+NODES = {"voxel": "ros-voxel", "ndt": "ros-ndt", "watch": "ros-watch"}
 NODE_NAMES = {"voxel": "voxel_grid_filter", "ndt": "ndt_matching"}
 SERVICES = ("roscore", "monitor", "ndt", "watch", "voxel", "player")
 START_S = 60.0
@@ -218,7 +218,8 @@ class Pipeline:
             inside = self.ruler.inside(stream.taken) if stream is not None else None
             for pidfd in pidfds:
                 signal.pidfd_send_signal(pidfd, number)
-                signal.pidfd_send_signal(pidfd, signal.SIGCONT)
+                with contextlib.suppress(ProcessLookupError):  # SIGKILL does not wait for it
+                    signal.pidfd_send_signal(pidfd, signal.SIGCONT)
         return at, inside
 
     def _wait_inside(self, stream: Stream, rng: random.Random) -> None:
