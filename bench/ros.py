@@ -152,6 +152,7 @@ def latency_runs(protect: bool, runs: int, tcp: str, rng: random.Random) -> Iter
             if protect:
                 found = [e for e in events(at - 0.01) if e["kind"] == "restored" and e["container"] == "ros-voxel"]
                 restore_s = found[-1]["restore_s"] if found else None
+            time.sleep(max(0.0, at + AFTER_S + 0.5 - time.time()))
             frames = pipeline.log.frames(at - BEFORE_S, at + 5.0)
             try:
                 yield asdict(judge(variant, frames, at, inside or 0, restore_s))
@@ -175,7 +176,11 @@ def cut(results: list[Json], runs: int, values: Sequence[str], rng: random.Rando
             for number in range(runs):
                 place = "message" if number % 2 else ""
                 time.sleep(rng.uniform(1.2, 1.8))
-                at, inside = pipeline.crash(["voxel"], Crash("kill", place), rng)
+                try:
+                    at, inside = pipeline.crash(["voxel"], Crash("kill", place), rng)
+                except PipelineFailed as error:
+                    say(f"tcp={tcp}: not crashed, {error}")
+                    continue
                 recovered = True
                 try:
                     pipeline.wait_delivers(at + 0.001, SETTLE_S, frames=5)
