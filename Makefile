@@ -17,6 +17,10 @@ PYTEST_ARGS ?=
 # `make test TESTS=tests/unit` takes one kind only.
 TESTS  ?= $(wildcard tests/unit tests/native tests/platform tests/integration)
 
+# `make test-sqlite KILLS=20`, `make soak SECONDS=600`: shorter.
+KILLS   ?= 200
+SECONDS ?= 3600
+
 export PYTHON
 
 help: ## this list
@@ -47,6 +51,13 @@ test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times
 
 lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
 	@scripts/lint.sh
+
+test-sqlite: setup ## kill SQLite under write load in containers, strict and rewind (KILLS=200; about an hour)
+	@$(VENV)/python bench/sqlite.py --kills $(KILLS)
+
+soak: setup-build ## an hour of checkpoints, deaths and restores: does anything leak? (SECONDS=3600)
+	@$(VENV)/python -c 'import matplotlib' 2>/dev/null || $(VENV)/python -m pip install --disable-pip-version-check -q 'matplotlib>=3.6'
+	@$(VENV)/python bench/soak.py --seconds $(SECONDS)
 
 bench: setup ## measure freeze, reap and restore beside a plain fork()
 	@$(VENV)/python bench/run.py
@@ -81,5 +92,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test test-programs lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 clean clean-system
+.PHONY: help setup setup-build setup-images demo test test-programs test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 clean clean-system
 .DEFAULT_GOAL := help
