@@ -165,6 +165,8 @@ def cycle(subject: Subject, client: Client, row: Row, rng: random.Random) -> Non
     row.same_memory += after.token == before.token
     row.same_connection += after.connections == before.connections
     if conmon is not None:
+        # One whose container has ended takes its time to go.
+        time.sleep(1.0)
         row.same_run = (row.same_run or 0) + (subject.conmon() == conmon)
     row.cycles += 1
 

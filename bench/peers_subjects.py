@@ -82,6 +82,14 @@ class Recovered:
     """By the tool's own account, from the death it saw (avckpt) or from its own start."""
 
 
+def is_alive(pid: int) -> bool:
+    """A zombie is not: there may be nobody who reaps it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
 def wait_gone(pidfd: int) -> None:
     """Waits until the process is dead and reaped or a zombie.  Raises BenchFailed."""
     ready, _, _ = select.select([pidfd], [], [], 60.0)
@@ -169,7 +177,7 @@ class Subject(ABC):
 
     def conmon(self) -> int | None:
         """The container's conmon, which lives as long as Podman sees it running; None: no container."""
-        if self._conmon is None or not Path(f"/proc/{self._conmon}").exists():
+        if self._conmon is None or not is_alive(self._conmon):
             self._conmon = self._ask_conmon()
         return self._conmon
 

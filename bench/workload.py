@@ -31,12 +31,12 @@ def build_workload() -> None:
     PROGRAMS.mkdir(parents=True, exist_ok=True)
     for name in (NAME, "client"):
         command = [os.environ.get("CC", "cc"), "-std=gnu11", "-D_GNU_SOURCE", "-O2", "-Wall", "-Wextra", "-pthread"]
-        command += ["-static", f"-I{VICTIMS}", "-o", str(PROGRAMS / f"{name}.new"), f"{ROOT}/bench/{name}.c"]
+        command += ["-static", f"-I{VICTIMS}", "-o", str(PROGRAMS / f"{name}.{os.getpid()}"), f"{ROOT}/bench/{name}.c"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise BenchFailed(f"`{' '.join(command)}` failed: {done.stderr.strip()}")
         # Not over a copy that is being run.
-        (PROGRAMS / f"{name}.new").replace(PROGRAMS / name)
+        (PROGRAMS / f"{name}.{os.getpid()}").replace(PROGRAMS / name)
 
 
 @contextmanager
