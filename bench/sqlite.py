@@ -21,7 +21,6 @@ import argparse
 import json
 import os
 import random
-import sqlite3
 import statistics
 import sys
 import tempfile
@@ -182,7 +181,7 @@ def write(results: list[dict[str, Any]], path: Path) -> None:
     """In one step, so that no reader ever sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
-    head = {"sqlite": sqlite3.sqlite_version, "kernel": os.uname().release, "cases": results}
+    head = {"kernel": os.uname().release, "cases": results}
     draft.write_text(json.dumps(head, indent=1) + "\n")
     draft.replace(path)
 
