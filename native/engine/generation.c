@@ -75,18 +75,21 @@ static int quieten(struct target *target, struct generation *generation, bool se
 
 /* Fills the slot in from what freeze() has read: one block per thread. */
 static int fill_slot(struct target *target, struct generation *generation,
-		     const struct proc_stat *stat, pid_t group_inside, struct avc_error *err)
+		     const struct branch *branch, const struct proc_stat *stat, pid_t group_inside,
+		     struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
 	const struct thread *main_thread = thread_find(target, target->pid);
-	struct proc_status status;
+	struct proc_status status, own = { 0 };
 	struct setup setup;
 	int mem_fd = proc_open(generation->template, "mem", O_RDONLY);
 
 	if (mem_fd < 0)
 		return fail_errno(err, generation->template, "keep template", "open(mem)",
 				  "it was killed");
+	if (branch)
+		(void)proc_status(target->pid, &own);
 	setup_begin(&setup, pad, generation->slot);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread t = target->threads[i];
@@ -123,11 +126,15 @@ static int fill_slot(struct target *target, struct generation *generation,
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		memcpy(block->name, t.name, sizeof block->name);
 		setup_thread(&setup, block);
+		if (branch && own.groups != target->forebear_groups)
+			branch_setup_groups(branch, &setup);
 		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
 					    err)) {
 			close(mem_fd);
 			return -1;
 		}
+		if (branch && !b)
+			branch_setup_dumpable(branch, &setup);
 		pending_setup_thread(target, &t, &setup);
 	}
 	close(mem_fd);
@@ -148,12 +155,14 @@ static int fill_slot(struct target *target, struct generation *generation,
 	slot->pid = target->inside;
 	slot->group = group_inside;
 	slot->session_leader = stat->session == target->pid;
+	slot->placed = slot->fresh = target->descendant;
 	slot->tty_fd = stat->tty && stat->tty_group == stat->group ? tty_fd(target->pid, stat->tty)
 								   : -1;
 	return setup_end(&setup, target->pid, err);
 }
 
-static int finish(struct target *target, struct generation *generation, struct avc_error *err)
+static int finish(struct target *target, struct generation *generation, struct branch *branch,
+		  struct avc_error *err)
 {
 	struct proc_stat stat = { 0 };
 	long pages;
@@ -172,7 +181,9 @@ static int finish(struct target *target, struct generation *generation, struct a
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
-	return fill_slot(target, generation, &stat, group, err);
+	if (branch && branch_learn(branch, err))
+		return -1;
+	return fill_slot(target, generation, branch, &stat, group, err);
 }
 
 /* What only a process that makes another one its child has to know. */
@@ -182,7 +193,7 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 	struct proc_stat stat;
 
 	/* The holder rests again. */
-	if (tracee_settle(target->holder, err) || finish(target, branch->image, err))
+	if (tracee_settle(target->holder, err) || finish(target, branch->image, branch, err))
 		return -1;
 	if (proc_stat(target->pid, &stat))
 		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
@@ -202,13 +213,20 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 
 int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
 {
+	const struct thread *main_thread = thread_find(target, target->pid);
+	struct proc_status status = { 0 };
 	struct proc_stat stat;
 
+	if (generation->branches && (!main_thread || proc_status(target->pid, &status)))
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
 		if (!branch->target)
 			continue;
+		branch->target->forebear = &main_thread->creds;
+		branch->target->forebear_groups = status.groups;
 		if (finish_branch(branch, err))
 			return -1;
 		if (branch->image->notice.code && !generation->notice.code)
@@ -216,7 +234,7 @@ int generation_finish(struct target *target, struct generation *generation, stru
 	}
 	if (generation->branches && proc_stat(target->pid, &stat) == 0)
 		generation->session = proc_inside(stat.session);
-	return finish(target, generation, err);
+	return finish(target, generation, NULL, err);
 }
 
 void generation_close_files(struct target *target, struct generation *image)
@@ -247,6 +265,7 @@ void generation_drop(struct generation *generation)
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
+		branch_forget(branch);
 		if (!branch->image)
 			continue;
 		image_drop(branch->image);
