@@ -197,7 +197,8 @@ int attributes_keep(const struct target *target, struct generation *generation,
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
 	if (proc_read(target->pid, "oom_score_adj", kept->oom_score_adj,
-		      sizeof kept->oom_score_adj) <= 0)
+		      sizeof kept->oom_score_adj) <= 0 &&
+	    !target->descendant) /* else it has its parent's */
 		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
 	scheduling_read(generation->template, &inherited);
 	for (uint32_t i = 0; i < target->thread_count; i++) {

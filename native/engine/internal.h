@@ -264,6 +264,7 @@ struct branch {
 	int parent;                /* index of its parent's branch, or ...    */
 	pid_t inside;
 	pid_t session, group;      /* inside; 0: outside of the app           */
+	struct proc_stat stat;     /* as of the freeze                        */
 	struct manner *manner;     /* descend.c                               */
 	pid_t pid;                 /* that it was restored as last            */
 	int status;                /* of one that had ended, as from wait(2)  */
@@ -299,7 +300,6 @@ struct generation {
 	struct avc_error files_error; /* why they could not be read             */
 	struct branch *branch;        /* the other processes, parents first        */
 	uint32_t branches;
-	pid_t session;                /* of the main process, inside; 0: outside   */
 };
 
 /* One process of the app, as it was found. */
@@ -307,6 +307,7 @@ struct kin {
 	pid_t pid;
 	int parent; /* index, PARENT_INIT; the main process is 0           */
 	bool ended; /* a zombie                                         */
+	struct proc_stat stat;
 	struct target *target;
 };
 
