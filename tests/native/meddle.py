@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes a thread's floating-point registers behind its back.
+"""Changes a thread's floating-point registers, or has it make system calls, behind its back.
 
 By ptrace(2) itself: gdb 13 can not write them on a CPU whose XSAVE area is larger than it knows (AMX).
 """
@@ -10,6 +10,7 @@ import ctypes
 import os
 import struct
 
+PTRACE_SINGLESTEP, PTRACE_GETREGS, PTRACE_SETREGS = 9, 12, 13
 PTRACE_GETFPREGS, PTRACE_SETFPREGS, PTRACE_ATTACH, PTRACE_DETACH = 14, 15, 16, 17
 WALL = 0x40000000
 # Where they are in struct user_fpregs_struct (the FXSAVE area).
@@ -27,6 +28,41 @@ def set_fpu_register(tid: int, name: str, value: int) -> None:
         _ptrace(PTRACE_GETFPREGS, tid, registers)
         struct.pack_into(kind, registers, at, value)
         _ptrace(PTRACE_SETFPREGS, tid, registers)
+    finally:
+        _ptrace(PTRACE_DETACH, tid)
+
+
+# Words of struct user_regs_struct.
+REGS_WORDS = 27
+RAX, RIP, ORIG_RAX = 10, 16, 15
+ARGUMENTS = (14, 13, 12, 7, 9, 8)
+"""rdi, rsi, rdx, r10, r8, r9."""
+WORD = (1 << 64) - 1
+
+
+def remote_syscall(tid: int, number: int, *args: int) -> int:
+    """Has a thread that is blocked in a system call, and that nobody traces, make another one first; its result."""
+    saved = ctypes.create_string_buffer(REGS_WORDS * 8)
+    _ptrace(PTRACE_ATTACH, tid)
+    try:
+        os.waitpid(tid, WALL)
+        _ptrace(PTRACE_GETREGS, tid, saved)
+        registers = list(struct.unpack(f"{REGS_WORDS}Q", saved.raw))
+        if registers[ORIG_RAX] == WORD:
+            raise BlockingIOError(f"thread {tid} is not in a system call")
+        # rip is behind the `syscall` instruction, two bytes long, that it will make again.
+        registers[RIP] -= 2
+        registers[RAX], registers[ORIG_RAX] = number, WORD
+        for register, value in zip(ARGUMENTS, args):
+            registers[register] = value & WORD
+        _ptrace(PTRACE_SETREGS, tid, ctypes.create_string_buffer(struct.pack(f"{REGS_WORDS}Q", *registers)))
+        _ptrace(PTRACE_SINGLESTEP, tid)
+        os.waitpid(tid, WALL)
+        after = ctypes.create_string_buffer(REGS_WORDS * 8)
+        _ptrace(PTRACE_GETREGS, tid, after)
+        result: int = struct.unpack_from("q", after, RAX * 8)[0]
+        _ptrace(PTRACE_SETREGS, tid, saved)
+        return result
     finally:
         _ptrace(PTRACE_DETACH, tid)
 

@@ -78,7 +78,7 @@ static void have_a_child_for_a_while(long us)
 	if (child == 0) {
 		forget_children();
 		know_family("grandchild");
-		nap_us(us);
+		nap(us);
 		check_place();
 		_exit(33);
 	}
@@ -102,11 +102,11 @@ static _Noreturn void live(uint64_t number, int fd)
 	know_family("child");
 	if (write(fd, &number, sizeof(number)) != sizeof(number))
 		came_apart("child %lu: write: %s", number, strerror(errno));
-	nap_us(us / 2);
+	nap(us / 2);
 	check_place();
 	if (number % 7 == 2)
 		have_a_child_for_a_while(us / 4);
-	nap_us(us / 2);
+	nap(us / 2);
 	check_place();
 	if (!dies_by_signal(number))
 		_exit(end_of(number));
@@ -129,7 +129,7 @@ static _Noreturn void live_execed(char **argv)
 
 static pid_t start(uint64_t number, int fd, uint64_t *random)
 {
-	static _Thread_local struct timespec nap;
+	static _Thread_local struct timespec pause;
 	char n[4][24];
 	char *argv[] = {
 		(char *)"churn", (char *)"--live", n[0], n[1], n[2], n[3], (char *)board_path, NULL
@@ -148,12 +148,12 @@ static pid_t start(uint64_t number, int fd, uint64_t *random)
 	snprintf(n[1], sizeof(n[1]), "%d", fd);
 	snprintf(n[2], sizeof(n[2]), "%ld", life_ms);
 	snprintf(n[3], sizeof(n[3]), "%d", family.main);
-	nap.tv_nsec = next_random(random) % 4 == 0 ? 3000000 : 0;
+	pause.tv_nsec = next_random(random) % 4 == 0 ? 3000000 : 0;
 	pid = vfork();
 	if (pid == 0) {
 		/* With its parent suspended all the while. */
-		if (nap.tv_nsec)
-			clock_nanosleep(CLOCK_MONOTONIC, 0, &nap, NULL);
+		if (pause.tv_nsec)
+			clock_nanosleep(CLOCK_MONOTONIC, 0, &pause, NULL);
 		execv("/proc/self/exe", argv);
 		_exit(127);
 	}
@@ -280,7 +280,7 @@ static void *bear_and_bury(void *arg)
 			bear(me);
 		if (me->count)
 			reap(me);
-		nap_us((long)(next_random(&me->random) % 1500));
+		nap((long)(next_random(&me->random) % 1500));
 	}
 	return NULL;
 }
@@ -375,6 +375,6 @@ int main(int argc, char **argv)
 			CHECK(ticks[i] < STUCK_TICKS, "thread %d is stuck at lap %lu", i, seen[i]);
 		}
 		beat();
-		nap_over_signals(2000);
+		nap(2000);
 	}
 }

@@ -19,7 +19,7 @@
 
 #include "victim.h"
 
-enum { CHILDREN_MAX = 256, APART_S = 10 };
+enum { CHILDREN_MAX = 256, APART_S = 4 };
 
 /* Of this process. */
 static struct {
@@ -87,14 +87,17 @@ static inline void watch_sigchld(void)
 	signal(SIGPIPE, SIG_IGN);
 }
 
-/* A nap of a thread that takes signals. */
-static inline void nap_over_signals(long us)
+/* A nap that nothing may cut short but SIGCHLD. */
+static inline void nap(long us)
 {
 	struct timespec ts = { us / 1000000, us % 1000000 * 1000 };
+	uint64_t before = sigchlds;
 	int err;
 
-	while ((err = clock_nanosleep(CLOCK_MONOTONIC, 0, &ts, &ts)) != 0)
-		CHECK(err == EINTR, "a nap ended with %s", strerror(err));
+	while ((err = clock_nanosleep(CLOCK_MONOTONIC, 0, &ts, &ts)) != 0) {
+		CHECK(err == EINTR && sigchlds != before, "a nap ended with %s", strerror(err));
+		before = sigchlds;
+	}
 }
 
 /* To be called by every process once its place in the tree is what it shall be. */

@@ -53,7 +53,7 @@ static _Noreturn void work(int number)
 		count(0, 16);
 		if (number <= 24)
 			board->counter[7 + number] = laps;
-		nap_us(5000);
+		nap(5000);
 	}
 }
 
@@ -118,7 +118,7 @@ int main(int argc, char **argv)
 		start(i, private_mb);
 	for (i = 1; i <= workers && i <= 24; i++)
 		while (!__atomic_load_n(&board->counter[7 + i], __ATOMIC_RELAXED) && board_path)
-			nap_us(1000);
+			nap(1000);
 	victim_ready();
 	for (;; page = page + 1 < pages ? page + 1 : 0) {
 		check_place();
@@ -127,6 +127,6 @@ int main(int argc, char **argv)
 			CHECK(memory[page * PAGE_WORDS] == belongs(page, 0), "page %zu holds %lx",
 			      page, memory[page * PAGE_WORDS]);
 		beat();
-		nap_us(1000);
+		nap(1000);
 	}
 }

@@ -14,7 +14,7 @@
 
 #include "family.h"
 
-enum { JOBS = 2, STUCK_LAPS = 5000 };
+enum { JOBS = 2, STUCK_LAPS = 10000 };
 
 static struct shared {
 	pthread_mutex_t lock;
@@ -49,7 +49,7 @@ static _Noreturn void run_job(int job, int which)
 		      getpgrp());
 		check_terminal();
 		shared->laps[job * 2 + which]++;
-		nap_us(1500);
+		nap(1500);
 	}
 }
 
@@ -62,7 +62,7 @@ static void start_job(int job)
 		setpgid(0, 0);
 		know_family("job");
 		while (!shared->changes)
-			nap_us(500);
+			nap(500);
 		run_job(job, 0);
 	}
 	add_child(first);
@@ -74,7 +74,7 @@ static void start_job(int job)
 		setpgid(0, first);
 		know_family("job");
 		while (!shared->changes)
-			nap_us(500);
+			nap(500);
 		run_job(job, 1);
 	}
 	add_child(second);
@@ -150,7 +150,7 @@ static _Noreturn void lead(const char *path, bool with_stopped)
 			check_nothing_to_wait_for();
 		check_children_file();
 		shared->laps[JOBS * 2]++;
-		nap_us(1000);
+		nap(1000);
 	}
 }
 
@@ -182,7 +182,7 @@ int main(int argc, char **argv)
 	watch_sigchld();
 	for (i = 0; i <= JOBS * 2; i++)
 		while (!shared->laps[i])
-			nap_us(1000);
+			nap(1000);
 	victim_ready();
 	for (;;) {
 		check_place();
@@ -195,6 +195,6 @@ int main(int argc, char **argv)
 				came_apart("process %d of the terminal is stuck", i);
 		}
 		beat();
-		nap_us(1500);
+		nap(1500);
 	}
 }

@@ -20,7 +20,7 @@
 #include "channel.h"
 #include "common.h"
 
-enum { STUCK_LAPS = 5000 };
+enum { STUCK_LAPS = 10000 };
 
 enum kind { PLAIN, SESSION, GROUP, MEMBER, EXECED, ZOMBIES, WAITER, REAPER, KINDS };
 static const char *const kinds[KINDS] = { "plain",  "session", "group",  "member",
@@ -45,7 +45,7 @@ static _Noreturn void stay(const char *name)
 	for (;;) {
 		check_place();
 		check_nothing_to_wait_for();
-		nap_us(lap_us * 2);
+		nap(lap_us * 2);
 	}
 }
 
@@ -114,7 +114,7 @@ static void adopt(void)
 		orphan = fork();
 		if (orphan == 0) {
 			while (getppid() == parent)
-				nap_us(1000);
+				nap(1000);
 			close(fds[0]);
 			close(fds[1]);
 			stay("adopted");
@@ -127,7 +127,7 @@ static void adopt(void)
 	close(fds[0]);
 	close(fds[1]);
 	while (sigchlds == 0)
-		nap_us(1000);
+		nap(1000);
 	sigchlds = 0;
 	add_child(orphan);
 }
@@ -177,7 +177,7 @@ static void *take_part(void *arg)
 		check_place();
 		if (shared)
 			meet(&me);
-		nap_us(lap_us + (long)(next_random(&me.random) % (uint64_t)lap_us));
+		nap(lap_us + (long)(next_random(&me.random) % (uint64_t)lap_us));
 	}
 	return NULL;
 }
@@ -216,7 +216,7 @@ static _Noreturn void work(void)
 			check_zombies();
 		else if (self.kind != WAITER)
 			check_nothing_to_wait_for();
-		nap_us(lap_us / 2 + (long)(next_random(&me.random) % (uint64_t)lap_us));
+		nap(lap_us / 2 + (long)(next_random(&me.random) % (uint64_t)lap_us));
 	}
 }
 
@@ -287,7 +287,7 @@ static _Noreturn void be_worker(void)
 		must(setpgid(0, 0) == 0, "setpgid");
 	else if (self.kind == MEMBER) {
 		while (!shared->leader[self.number - 1])
-			nap_us(500);
+			nap(500);
 		must(setpgid(0, shared->leader[self.number - 1]) == 0, "setpgid");
 	}
 	shared->leader[self.number] = getpid();
@@ -374,18 +374,18 @@ static void start_orphan(void)
 		setsid();
 		forget_children();
 		while (getppid() == parent)
-			nap_us(1000);
+			nap(1000);
 		know_family("orphan");
 		for (;;) {
 			check_place();
 			check_nothing_to_wait_for();
 			meet(&me);
-			nap_us(lap_us);
+			nap(lap_us);
 		}
 	}
 	must(waitpid(child, NULL, 0) == child, "waitpid");
 	while (!shared->slot[(workers + 1) * threads])
-		nap_us(1000);
+		nap(1000);
 	sigchlds = 0;
 }
 
@@ -455,7 +455,7 @@ static _Noreturn void be_main(void)
 			check_children_file();
 		check_laps();
 		beat();
-		nap_us(lap_us);
+		nap(lap_us);
 	}
 }
 
@@ -469,7 +469,7 @@ static void wait_for_workers(void)
 
 		while (bytes == 0) {
 			must(ioctl(ends[i].in.fd, FIONREAD, &bytes) == 0, "FIONREAD");
-			nap_us(500);
+			nap(500);
 		}
 		shared->group[i] = getpgid(family.child[i - 1]);
 		shared->session[i] = getsid(family.child[i - 1]);
