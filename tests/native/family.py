@@ -104,6 +104,48 @@ def kill_main(victim: Victim, signum: int = signal.SIGKILL) -> None:
     os.kill(main_process(victim), signum)
 
 
+def places(victim: Victim) -> list[tuple[int, int, int, int, str, bool]]:
+    """Who is where; for a tree that does not change, to be compared with another moment's."""
+    return sorted(member.place for member in members(victim))
+
+
+def strangers(victim: Victim, allowed: int = 0) -> list[Member]:
+    """Children of init that are neither the application's nor avckpt's.  `allowed`: so many orphans are its own."""
+    main = victim.see().pid
+    found = (look(pid) for pid in children_of(victim.pid))
+    others = [m for m in found if m and m.inside != main and not m.name.startswith("avckpt-") and not m.is_zombie]
+    return others if len(others) > allowed else []
+
+
+def wait_whole(victim: Victim, allowed: int = 0) -> None:
+    """Nobody of it is left stopped by a tracer, and nobody is there who does not belong to it."""
+    wait_until(
+        lambda: not any(m.state == "t" for m in members(victim)) or victim.see().violations,
+        PATIENCE_S,
+        f"every process of {victim.command} runs",
+    )
+    # What was killed may have to be reaped yet.
+    wait_until(lambda: not strangers(victim, allowed), PATIENCE_S, f"{strangers(victim, allowed)} are gone")
+
+
+def progress(victim: Victim) -> None:
+    """Its main process beats, and what the others do goes on, too."""
+    before = victim.see().counter[:3]
+    victim.wait_beats(5)
+    wait_until(
+        lambda: any(now > was for was, now in zip(before, victim.see().counter[:3])) or victim.see().violations,
+        PATIENCE_S,
+        f"the processes of {victim.command} go on",
+    )
+    victim.check()
+
+
+def ours(victim: Victim, name: str = "avckpt-") -> list[int]:
+    """Templates ("avckpt-tmpl") and holders ("avckpt-hold") in its container."""
+    found = [look(pid) for pid in children_of(victim.pid)]
+    return [m.pid for m in found if m is not None and m.name.startswith(name) and not m.is_zombie]
+
+
 def pss_kb(pid: int) -> int:
     """Proportional set size: what a process has of memory when shared pages are divided."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text()
@@ -112,4 +154,18 @@ def pss_kb(pid: int) -> int:
     return int(found[1])
 
 
-__all__ = ["Member", "children_of", "descendants", "kill_main", "look", "main_process", "members", "pss_kb"]
+__all__ = [
+    "Member",
+    "children_of",
+    "descendants",
+    "kill_main",
+    "look",
+    "main_process",
+    "members",
+    "ours",
+    "places",
+    "progress",
+    "pss_kb",
+    "strangers",
+    "wait_whole",
+]
