@@ -11,6 +11,7 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
+#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/sysmacros.h>
@@ -152,7 +153,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 	return setup_end(&setup, target->pid, err);
 }
 
-int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+static int finish(struct target *target, struct generation *generation, struct avc_error *err)
 {
 	struct proc_stat stat = { 0 };
 	long pages;
@@ -167,21 +168,93 @@ int generation_finish(struct target *target, struct generation *generation, stru
 	if (group <= 0)
 		group = target->inside;
 	pages = proc_vm_pages(generation->template);
-	if (quieten(target, generation, stat.session == target->pid, err))
+	if (quieten(target, generation, target->descendant || stat.session == target->pid, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
 	return fill_slot(target, generation, &stat, group, err);
 }
 
+/* What only a process that makes another one its child has to know. */
+static int finish_branch(struct branch *branch, struct avc_error *err)
+{
+	struct target *target = branch->target;
+	struct proc_stat stat;
+
+	/* The holder rests again. */
+	if (tracee_settle(target->holder, err) || finish(target, branch->image, err))
+		return -1;
+	if (proc_stat(target->pid, &stat))
+		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
+	branch->session = proc_inside(stat.session);
+	branch->group = proc_inside(stat.group);
+	for (int i = 0; i < RLIM_NLIMITS && i < 16; i++) {
+		struct rlimit limit;
+
+		if (prlimit(target->pid, (enum __rlimit_resource)i, NULL, &limit))
+			return fail_errno(err, target->pid, "keep template", "prlimit",
+					  "it has ended");
+		branch->limit[i][0] = limit.rlim_cur;
+		branch->limit[i][1] = limit.rlim_max;
+	}
+	return 0;
+}
+
+int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct proc_stat stat;
+
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		if (!branch->target)
+			continue;
+		if (finish_branch(branch, err))
+			return -1;
+		if (branch->image->notice.code && !generation->notice.code)
+			generation->notice = branch->image->notice;
+	}
+	if (generation->branches && proc_stat(target->pid, &stat) == 0)
+		generation->session = proc_inside(stat.session);
+	return finish(target, generation, err);
+}
+
+void generation_close_files(struct target *target, struct generation *image)
+{
+	struct inj_call *call = &pad_slot(&target->pad, image->slot)->template_call;
+	struct avc_error ignored = { 0 };
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	if (pad_send(&target->pad, image->template, &image->base, call, &ignored) ||
+	    pad_run(image->template, call, &ignored))
+		return; /* it was killed, and has nothing open any more */
+}
+
+static void image_drop(struct generation *image)
+{
+	if (image->template)
+		tracee_kill(image->template);
+	close_fd(&image->pidfd);
+	mem_image_free(image->image);
+	free(image->timers);
+	free(image->attributes);
+	files_free(image->files);
+}
+
 void generation_drop(struct generation *generation)
 {
-	if (generation->template)
-		tracee_kill(generation->template);
-	close_fd(&generation->pidfd);
-	mem_image_free(generation->image);
-	free(generation->timers);
-	free(generation->attributes);
-	files_free(generation->files);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		if (!branch->image)
+			continue;
+		image_drop(branch->image);
+		free(branch->image);
+		if (branch->target)
+			branch->target->images--;
+	}
+	free(generation->branch);
+	image_drop(generation);
 	*generation = (struct generation){ .pidfd = -1 };
 }

@@ -4,6 +4,7 @@
  */
 #include <signal.h>
 #include <string.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -149,7 +150,6 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
 	struct avc_error error = { 0 };
 	enum avc_reason reason;
-	pid_t keep[AVC_KEEP_MAX + 2];
 
 	urgent_begin();
 	event.wait_status = report->status;
@@ -175,7 +175,11 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 			goto out;
 		}
 	}
-	link_kill_leftovers(&guard->link, keep, known_tracees(guard, keep));
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->pid)
+			syscall(SYS_pidfd_send_signal, guard->tree.member[i]->pidfd, SIGKILL, NULL,
+				0);
+	link_kill_leftovers(&guard->link, is_ours, guard);
 	if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
 		give_up(guard, report, AVC_REASON_EMPTY, &error);

@@ -6,7 +6,10 @@
  *   guard.c      the thread: waits, obeys, tells; guard_*.c: see guard.h
  *   link.c       to avckpt-init: control page, reports, verdicts
  *   freeze.c     one checkpoint: stop everything, read it, clone it, let go
- *   restore.c    a template becomes the app again
+ *   restore.c    templates become the app again
+ *   descend.c    a restored process makes its children
+ *   remap.c      ... and their memory
+ *   tree.c       the processes of an app
  *   generation.c templates kept
  *   pending.c    signals that have not been delivered
  *   timers.c     interval timers, POSIX timers
@@ -43,6 +46,7 @@
 #define THREADS_MAX 4096
 #define OLD_PADS_MAX 128
 #define SOCKETS_MAX 64
+#define PROCESSES_MAX 512 /* of one app                                     */
 /* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13; glibc before 2.35 lacks the name. */
 #define PTRACE_GET_RSEQ 0x420f
 
@@ -65,12 +69,15 @@ struct proc_stat {
 	char state;
 	pid_t parent, group, session, tty_group;
 	uint32_t tty;
+	int threads;
 	uint64_t start; /* clock ticks after boot */
 };
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 int proc_stat(pid_t pid, struct proc_stat *stat);
+/* How a zombie has ended, as wait(2) says it; 0 if that can not be found out. */
+int proc_exit_status(pid_t pid);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
 /* Children of a (single-threaded) process; returns how many (at most max), or -1. */
@@ -234,8 +241,28 @@ struct target {
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool tcp_moved; /* bytes of connections are to be counted           */
+	/* Of a process that is not the main one (tree.c). */
+	bool descendant;
+	uint64_t start;               /* when it began; tells it from one with its number */
+	uint32_t images;              /* generations that have one of it                  */
+	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	bool frozen, frozen_new;      /* stopped in this freeze; and only found in it      */
 };
 
+/* What a generation has of a process that is not the main one. */
+struct branch {
+	struct target *target;     /* NULL: it had ended, and nobody had waited for it */
+	struct generation *image;  /* of this process alone                   */
+	int parent;                /* index of its parent's branch, or ...    */
+	pid_t inside;
+	pid_t session, group;      /* inside; 0: outside of the app           */
+	int status;                /* of one that had ended, as from wait(2)  */
+	uint64_t limit[16][2];     /* getrlimit(2)                            */
+};
+#define PARENT_MAIN (-1)
+#define PARENT_INIT (-2)
+
+/* Also the image of one process of several: then what is of the whole is unused. */
 struct generation {
 	uint64_t number; /* 0: unused                                        */
 	pid_t template;
@@ -260,6 +287,32 @@ struct generation {
 	struct avc_error notice;      /* what of it can not be put back              */
 	struct files *files;          /* descriptors                                     */
 	struct avc_error files_error; /* why they could not be read             */
+	struct branch *branch;        /* the other processes, parents first        */
+	uint32_t branches;
+	pid_t session;                /* of the main process, inside; 0: outside   */
+};
+
+/* One process of the app, as it was found. */
+struct kin {
+	pid_t pid;
+	int parent; /* index, PARENT_INIT; the main process is 0           */
+	bool ended; /* a zombie                                         */
+	struct target *target;
+};
+
+/* All processes of an app (tree.c). */
+struct tree {
+	struct target *main;
+	pid_t init;
+	uint32_t slots; /* of a pad                                         */
+	struct kin *kin; /* parents before children                        */
+	uint32_t count;
+	struct target **member; /* of those that are not the main process; those
+				 * that have ended as long as there are images of them */
+	uint32_t members;
+	/* Is this child of init one of our own? */
+	bool (*is_ours)(pid_t pid, const void *arg);
+	const void *arg;
 };
 
 struct link {
@@ -350,6 +403,10 @@ int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused
  * last of the calls. */
 int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		  struct avc_error *err) warn_unused;
+/* The same in two parts, for several at a time. */
+int pad_start(pid_t tid, struct avc_error *err) warn_unused;
+int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+		    struct avc_error *err) warn_unused;
 /* The same; `meanwhile` is called once while the kernel clones. */
 int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			void *arg, pid_t *child, struct avc_error *err) warn_unused;
@@ -479,14 +536,32 @@ int memory_put_back(const struct mem_image *image, struct avc_error *err) warn_u
 /* Brings the pad into the app, through its main thread.  The other threads run. */
 int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 	   struct avc_error *err) warn_unused;
+/* The same while everything is stopped. */
+int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err) warn_unused;
+/* The holder of one that is not the main process, by its stopped main thread. */
+int hold_stopped(struct target *target, pid_t init, struct avc_error *err) warn_unused;
 /* Makes the holder; unhold() drops it. */
 int hold(struct target *target, timer_t timer, uint64_t deadline_ns,
 	 struct avc_error *err) warn_unused;
 void unhold(struct target *target);
 
+/* ---- tree.c --------------------------------------------------------------------- */
+
+/* Looks who there is; new ones are opened, and those that are gone closed.  Sets *fresh
+ * to how many are new. */
+int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_unused;
+/* Frees those that have ended and of which there is no image. */
+void tree_sweep(struct tree *tree);
+/* It is gone, or another program: what it had open must not stay open by us. */
+void tree_let_go(struct tree *tree, struct target *target);
+void tree_free(struct tree *tree);
+
 /* ---- target.c ----------------------------------------------------------------- */
 
 void target_init(struct target *target);
+/* Room for threads and all else that a target has; false: out of memory. */
+bool target_make_room(struct target *target);
+void target_free_room(struct target *target);
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err) warn_unused;
 /* Forgets the process (the pad stays mapped here: templates live in it). */
 void target_close(struct target *target);
@@ -546,7 +621,7 @@ struct freeze_times {
 
 /* Takes one checkpoint into *generation (slot and number given by the caller).
  * On return the app runs, whatever happened. */
-int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
+int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns,
 	   struct generation *generation, struct freeze_times *times,
 	   struct avc_error *err) warn_unused;
 
@@ -556,6 +631,8 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 int generation_finish(struct target *target, struct generation *generation,
 		      struct avc_error *err) warn_unused;
 void generation_drop(struct generation *generation);
+/* Closes what the template of a process that has ended still has open. */
+void generation_close_files(struct target *target, struct generation *image);
 void oom_score_adj_set(pid_t pid, const char *value);
 
 /* ---- restore.c ------------------------------------------------------------------ */
@@ -605,8 +682,10 @@ void rewind_forget(struct target *target, struct thread *thread);
 /* ---- support.c --------------------------------------------------------------------- */
 
 /* Looks at a running app for what can not be protected.  0, or -1 with
- * AVC_UNSUPPORTED and the reason in words; *passing if that may be over soon. */
-int support_check(struct target *target, bool *passing, struct avc_error *err) warn_unused;
+ * AVC_UNSUPPORTED and the reason in words. */
+int support_check(struct target *target, struct avc_error *err) warn_unused;
+/* Is what was brought into the (running) process still there?  exec(2) takes it away. */
+bool infected_still(const struct target *target);
 /* True if this looks like a moment at which nobody is in the middle of anything. */
 bool quiescent(const struct target *target);
 
@@ -625,13 +704,15 @@ bool link_stop_asked(const struct link *link);
 int link_report(struct link *link, struct avc_report *report);
 int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind,
 		 struct avc_error *err);
-/* Kills what the dead app left behind (children of init but those in keep[]). */
-/* Kills and reaps the children of init that are tracees of ours but not in keep[]:
+/* Kills and reaps the children of init that are tracees of ours but not known:
  * clones of which we never heard, because the thread that made them was killed before
  * it could tell.  They would keep the app's number (as a process group's) and, as
  * zombies, the container from ending. */
-void link_kill_lost(const struct link *link, const pid_t *keep, int keep_count);
-void link_kill_leftovers(const struct link *link, const pid_t *keep, int keep_count);
+void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),
+		    const void *arg);
+/* Kills what the dead app left behind: children of init, but those to keep. */
+void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
+			 const void *arg);
 
 /* ---- engine.c --------------------------------------------------------------------------- */
 

@@ -202,24 +202,18 @@ static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_erro
 		    "it may not have another process: %s", strerror((int)-result));
 }
 
-int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
+int pad_start(pid_t tid, struct avc_error *err)
 {
-	return pad_run_clone_while(tid, call, NULL, NULL, child, err);
+	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+		return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
+	return 0;
 }
 
-int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
-			void *arg, pid_t *child, struct avc_error *err)
+int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
 {
-	int signal = 0;
-
 	for (;;) {
 		struct stop stop;
 
-		if (ptrace(PTRACE_CONT, tid, NULL, (long)signal))
-			return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
-		if (meanwhile)
-			meanwhile(arg);
-		meanwhile = NULL;
 		tracee_watch(&call->done);
 		stop = tracee_wait(tid, 0);
 		tracee_watch(NULL);
@@ -238,9 +232,26 @@ int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile
 		default:
 			/* SIGSTOP, SIGCONT and job control make stops of their own
 			 * (ptrace(2), PTRACE_EVENT_STOP). */
-			signal = stop.kind == STOP_SIGNAL ? stop.signal : 0;
+			if (ptrace(PTRACE_CONT, tid, NULL,
+				   (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
+				return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
 		}
 	}
+}
+
+int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
+{
+	return pad_run_clone_while(tid, call, NULL, NULL, child, err);
+}
+
+int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			void *arg, pid_t *child, struct avc_error *err)
+{
+	if (pad_start(tid, err))
+		return -1;
+	if (meanwhile)
+		meanwhile(arg);
+	return pad_await_clone(tid, call, child, err);
 }
 
 bool in_old_pad(const struct target *target, avc_remote address)

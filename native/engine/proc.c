@@ -50,15 +50,25 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 	p = strrchr(buf, ')');
 	if (!p ||
 	    sscanf(p + 1,
-		   " %c %d %d %d %d %d %*u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %*d %*d %llu",
+		   " %c %d %d %d %d %d %*u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
-		   &stat->tty_group, &start) != 7) {
+		   &stat->tty_group, &stat->threads, &start) != 8) {
 		errno = EPROTO;
 		return -1;
 	}
 	stat->tty = (uint32_t)tty;
 	stat->start = start;
 	return 0;
+}
+
+int proc_exit_status(pid_t pid)
+{
+	char buf[1024], *p;
+
+	if (proc_read(pid, "stat", buf, sizeof buf) <= 0)
+		return 0;
+	p = strrchr(buf, ' '); /* the last field */
+	return p ? atoi(p + 1) : 0;
 }
 
 pid_t proc_inside(pid_t tid)

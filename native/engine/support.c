@@ -10,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -80,45 +81,39 @@ static int check_mappings(struct target *target, struct avc_error *err)
 	return result;
 }
 
-struct children {
-	pid_t pid;
-	int count;
-};
-
-static int count_children(pid_t tid, void *arg)
+/* Its children are made by their parents, which have to have what their children have. */
+static int check_descendant(const struct target *target, struct avc_error *err)
 {
-	struct children *children = arg;
-	char name[64], buf[256];
+	static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "user", "cgroup", "pid" };
+	struct proc_status status;
 
-	/* A child hangs on the thread that forked it. */
-	snprintf(name, sizeof name, "task/%d/children", tid);
-	if (proc_read(children->pid, name, buf, sizeof buf) > 0)
-		for (const char *p = buf; *p; p++)
-			children->count += *p == ' ';
-	return 0;
-}
+	for (size_t i = 0; i < sizeof spaces / sizeof *spaces; i++) {
+		char path[64];
+		struct stat own, inits;
 
-static int check_children(struct target *target, struct avc_error *err)
-{
-	struct children children = { .pid = target->pid };
-
-	if (proc_tasks(target->task_dirfd, count_children, &children))
-		return fail_errno(err, target->pid, "check", "getdents64", "it has ended");
-	if (children.count)
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->pid, spaces[i]);
+		if (stat(path, &own))
+			return fail_errno(err, target->pid, "check", "stat(ns)", "it has ended");
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->init, spaces[i]);
+		if (stat(path, &inits) || own.st_ino != inits.st_ino)
+			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				    "process %d has a %s namespace of its own", target->inside,
+				    spaces[i]);
+	}
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.seccomp == 1 || status.seccomp_filters > target->plain_filters)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
-			    "it has child processes (%d); only single processes are protected yet",
-			    children.count);
+			    "process %d is not the main one and has a seccomp filter of its own",
+			    target->inside);
 	return 0;
 }
 
-int support_check(struct target *target, bool *passing, struct avc_error *err)
+int support_check(struct target *target, struct avc_error *err)
 {
-	*passing = false;
 	if (check_descriptors(target, err) || check_mappings(target, err))
 		return -1;
-	/* Thread by thread only when the last checkpoint did not find that it has none. */
-	*passing = !target->childless && check_children(target, err) != 0;
-	return *passing ? -1 : 0;
+	return target->descendant ? check_descendant(target, err) : 0;
 }
 
 /* By way of the process: a second entry for each thread in the kernel's memory of

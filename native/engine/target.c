@@ -25,6 +25,28 @@ void target_init(struct target *target)
 	};
 }
 
+bool target_make_room(struct target *target)
+{
+	target->threads = calloc(THREADS_MAX, sizeof *target->threads);
+	target->thread_room = THREADS_MAX;
+	target->memory = memory_new();
+	target->pending = pending_new();
+	target->timers = timers_new();
+	return target->threads && target->memory && target->pending && target->timers;
+}
+
+void target_free_room(struct target *target)
+{
+	free(target->threads);
+	memory_free(target->memory);
+	free(target->pending);
+	free(target->timers);
+	target->threads = NULL;
+	target->memory = NULL;
+	target->pending = NULL;
+	target->timers = NULL;
+}
+
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err)
 {
 	target->pid = pid;

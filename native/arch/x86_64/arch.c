@@ -221,17 +221,58 @@ size_t arch_frame_bytes(void)
 	return xstate_room() + ((sizeof(struct frame) + 63) & ~(size_t)63);
 }
 
-int arch_frame_read_xstate(pid_t tid, void *frame)
+/* AMX's tiles, the one state that the kernel makes room for only when a thread
+ * first uses it (arch/x86/kernel/fpu/xstate.c, XFEATURE_MASK_USER_DYNAMIC).  Of a
+ * thread that has not, it takes no frame that is larger than what comes before, and
+ * sets it back to the legacy registers only (fpu/signal.c,
+ * check_xstate_in_sigframe()). */
+#define TILE_DATA 18
+#define TILE_DATA_BIT (UINT64_C(1) << TILE_DATA)
+#define XSTATE_BV_OFFSET 512
+
+static size_t xstate_bytes_without_tiles(void)
 {
-	struct iovec iov = { frame, arch_xstate_bytes() };
+	static size_t bytes;
+	unsigned int size, offset, c, d;
+
+	if (!__atomic_load_n(&bytes, __ATOMIC_RELAXED)) {
+		size_t found = arch_xstate_bytes();
+
+		/* Leaf 0xd, one subleaf for each state: where it begins. */
+		if (__get_cpuid_count(0xd, TILE_DATA, &size, &offset, &c, &d) && size && offset &&
+		    offset + size == found)
+			found = offset;
+		__atomic_store_n(&bytes, found, __ATOMIC_RELAXED);
+	}
+	return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
+}
+
+static bool uses_tiles(const uint8_t *xstate)
+{
+	uint64_t present;
+
+	memcpy(&present, xstate + XSTATE_BV_OFFSET, sizeof present);
+	return present & TILE_DATA_BIT;
+}
+
+static int read_xstate(pid_t tid, void *frame, size_t bytes)
+{
+	struct iovec iov = { frame, bytes };
 
 	if (ptrace(PTRACE_GETREGSET, tid, NT_X86_XSTATE, &iov) == -1)
 		return -1;
-	if (iov.iov_len != arch_xstate_bytes()) {
+	if (iov.iov_len != bytes) {
 		errno = EOVERFLOW;
 		return -1;
 	}
 	return 0;
+}
+
+int arch_frame_read_xstate(pid_t tid, void *frame)
+{
+	if (read_xstate(tid, frame, xstate_bytes_without_tiles()))
+		return -1;
+	return uses_tiles(frame) ? read_xstate(tid, frame, arch_xstate_bytes()) : 0;
 }
 
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
@@ -239,7 +280,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 {
 	const struct user_regs_struct *r = &regs->r;
 	uint8_t *xstate = frame;
-	const size_t bytes = arch_xstate_bytes();
+	const bool tiles = uses_tiles(xstate);
+	const size_t bytes = tiles ? arch_xstate_bytes() : xstate_bytes_without_tiles();
 	const uint32_t magic2 = SW_MAGIC2;
 	struct sw_bytes sw = { .magic1 = SW_MAGIC1,
 			       .extended_bytes = (uint32_t)(bytes + sizeof magic2),
@@ -248,6 +290,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 
 	/* ptrace leaves XCR0 where the signal frame wants its features. */
 	memcpy(&sw.features, xstate + SW_OFFSET, sizeof sw.features);
+	if (!tiles)
+		sw.features &= ~TILE_DATA_BIT;
 	memcpy(xstate + SW_OFFSET, &sw, sizeof sw);
 	memcpy(xstate + bytes, &magic2, sizeof magic2);
 
