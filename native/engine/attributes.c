@@ -152,17 +152,18 @@ static bool has_less(const struct creds *from, const struct creds *to)
 int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
 			    const struct thread *t, struct setup *setup, struct avc_error *err)
 {
-	const struct creds *from = &main_thread->creds, *to = &t->creds;
+	/* One that is not the main process is made from that, as are its threads. */
+	const struct creds *from = target->descendant ? target->forebear : &main_thread->creds;
+	const struct creds *to = &t->creds;
 
 	if (to->death_signal)
 		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
 				 to->death_signal, 0, 0, 0);
-	if (t == main_thread) {
-		if (to->subreaper)
-			setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl,
-					 PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+	if (t == main_thread && to->subreaper)
+		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
+				 0, 0);
+	if (t == main_thread && !target->descendant)
 		return 0;
-	}
 	if (to->slack_ns && to->slack_ns != from->slack_ns)
 		setup_add_thread(setup, "prctl(TIMERSLACK)", SYS_prctl, PR_SET_TIMERSLACK,
 				 to->slack_ns, 0, 0, 0)
@@ -172,8 +173,9 @@ int attributes_setup_thread(const struct target *target, const struct thread *ma
 			    "its threads differ in their seccomp filters (thread %d)", t->inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "thread %d has privileges that the main thread has given up",
-			    t->inside);
+			    "%s %d has privileges that the main %s has given up",
+			    target->descendant ? "process" : "thread", t->inside,
+			    target->descendant ? "process" : "thread");
 	lower(from, to, setup);
 	return 0;
 }
@@ -195,13 +197,15 @@ int attributes_keep(const struct target *target, struct generation *generation,
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
 	if (proc_read(target->pid, "oom_score_adj", kept->oom_score_adj,
-		      sizeof kept->oom_score_adj) <= 0)
+		      sizeof kept->oom_score_adj) <= 0 &&
+	    !target->descendant) /* else it has its parent's */
 		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
 	scheduling_read(generation->template, &inherited);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		const struct thread *t = &target->threads[i];
 
-		if (t->block < 0 || same_scheduling(&t->scheduling, &inherited))
+		if (t->block < 0 ||
+		    (!target->descendant && same_scheduling(&t->scheduling, &inherited)))
 			continue;
 		kept->thread[kept->count].inside = t->inside;
 		kept->thread[kept->count++].scheduling = t->scheduling;

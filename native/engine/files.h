@@ -122,8 +122,6 @@ struct files *files_new(uint32_t room);
 int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
 	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
 struct file *files_find(const struct files *files, int fd);
-/* A duplicate of the descriptor of a process, or -1. */
-int files_borrow(int pidfd, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
 
 /* files_info.c */
@@ -166,6 +164,10 @@ struct files_work {
 	struct generation *generation;
 	const struct avc_config *config;
 	pid_t init;
+	/* A task that has the table as it was at the death: the template, or the holder;
+	 * 0: the table is gone. */
+	pid_t table;
+	int table_pidfd;
 	struct files *want, *now;
 	int *local;      /* of want, by group leader: a descriptor of ours, or -1  */
 	int *claimed_by; /* of now: leader (index in want) of the group that has it */

@@ -150,7 +150,7 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
 
 	if (!n)
 		return -1;
-	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->generation->template, n->fd);
+	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->table, n->fd);
 	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
 	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
 }
@@ -171,7 +171,7 @@ static void share_port(const struct files_work *work, const struct file *w)
 		if (work->now->file[k].kind != FILE_SOCKET)
 			continue;
 		/* The port is at the same place in an IPv6 address. */
-		fd = files_borrow(work->generation->pidfd, work->now->file[k].fd);
+		fd = files_borrow(work->table_pidfd, work->now->file[k].fd);
 		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
 		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
 			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
@@ -190,8 +190,8 @@ static void gather(struct files_work *work)
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
 		if (work->source[group] >= 0)
-			work->local[group] = files_borrow(work->generation->pidfd,
-							  work->now->file[work->source[group]].fd);
+			work->local[group] = files_borrow(
+				work->table_pidfd, work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
 	}
@@ -329,7 +329,7 @@ static int lowest_free(const struct numbers *numbers, const struct files *avoid)
 	return -1;
 }
 
-static int send_one(int socket, int fd)
+int files_send(int socket, int fd)
 {
 	uint8_t byte = 0, control[CMSG_SPACE(sizeof fd)] __attribute__((aligned(8))) = { 0 };
 	struct iovec io = { &byte, 1 };
@@ -376,7 +376,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		to = lowest_free(numbers, NULL);
-		if (send_one(ours, from)) {
+		if (files_send(ours, from)) {
 			note(work, w, "it could not be handed over");
 			continue;
 		}
@@ -463,6 +463,15 @@ const struct file *files_now_of(const struct files_work *work, uint32_t i)
 	return source < 0 ? NULL : &work->now->file[source];
 }
 
+/* A duplicate of what is at this place of the table now. */
+static int borrow_placed(const struct files_work *work, const struct file *w)
+{
+	const int local = work->local[files_leader(work->want, w)];
+
+	return local >= 0 ? fcntl(local, F_DUPFD_CLOEXEC, 0)
+			  : files_borrow(work->table_pidfd, w->fd);
+}
+
 static void put_states(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -474,7 +483,7 @@ static void put_states(struct files_work *work)
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
 		    !n->lock_count && !w->lock_count)
 			continue;
-		fd = files_borrow(work->generation->pidfd, w->fd);
+		fd = borrow_placed(work, w);
 		if (fd < 0) {
 			note(work, w, "it could not be put in its place");
 			continue;
@@ -497,8 +506,8 @@ static void put_contents(struct files_work *work)
 
 		if (!other || files_leader(work->want, w) != i)
 			continue;
-		fd = files_borrow(work->generation->pidfd, w->fd);
-		other_fd = files_borrow(work->generation->pidfd, other->fd);
+		fd = borrow_placed(work, w);
+		other_fd = borrow_placed(work, other);
 		if (fd >= 0 && other_fd >= 0 &&
 		    (w->content_bytes || w->content_lost ||
 		     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
@@ -519,6 +528,49 @@ static void *filled(uint32_t count, int value)
 	return array;
 }
 
+static int work_begin(struct files_work *work, struct avc_error *err)
+{
+	const struct avc_config *config = work->config;
+
+	if (config->files == AVC_FILES_STRICT && work->table &&
+	    files_check_strict(work->generation, work->table, work->table_pidfd, work->init, err))
+		return -1;
+	work->now = files_new(work->want->count + 64);
+	work->local = filled(work->want->count, -1);
+	work->source = filled(work->want->count, -1);
+	work->lost = calloc(work->want->count + 1, sizeof *work->lost);
+	if (!work->now || !work->local || !work->source || !work->lost)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
+				      work->want, work->init, err))
+		return -1;
+	work->claimed_by = filled(work->now->count, -1);
+	if (!work->claimed_by)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	find_staying(work);
+	find_moved(work);
+	break_pairs(work);
+	return 0;
+}
+
+static void work_end(struct files_work *work)
+{
+	if (work->problems > 1) {
+		char rest[32];
+
+		snprintf(rest, sizeof rest, " (and %u more)", work->problems - 1);
+		strncat(work->notes->detail, rest,
+			sizeof work->notes->detail - strlen(work->notes->detail) - 1);
+	}
+	for (uint32_t i = 0; work->local && i < work->want->count; i++)
+		close_fd(&work->local[i]);
+	free(work->local);
+	free(work->source);
+	free(work->lost);
+	free(work->claimed_by);
+	files_free(work->now);
+}
+
 int files_restore(struct target *target, struct generation *generation,
 		  const struct avc_config *config, pid_t init, struct avc_error *notes,
 		  struct avc_error *err)
@@ -527,33 +579,15 @@ int files_restore(struct target *target, struct generation *generation,
 				   .generation = generation,
 				   .config = config,
 				   .init = init,
+				   .table = generation->template,
+				   .table_pidfd = generation->pidfd,
 				   .want = generation->files,
 				   .notes = notes };
 	int result = -1;
 
-	if (config->files == AVC_FILES_STRICT &&
-	    files_check_strict(generation, generation->template, generation->pidfd, init, err))
-		return -1;
-	work.now = files_new(work.want->count + 64);
-	work.local = filled(work.want->count, -1);
-	work.source = filled(work.want->count, -1);
-	work.lost = calloc(work.want->count + 1, sizeof *work.lost);
-	if (!work.now || !work.local || !work.source || !work.lost) {
-		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	if (work_begin(&work, err))
 		goto out;
-	}
-	if (files_look(work.now, generation->template, generation->pidfd, FILES_NOW, work.want,
-		       init, err))
-		goto out;
-	work.claimed_by = filled(work.now->count, -1);
-	if (!work.claimed_by) {
-		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
-		goto out;
-	}
 	call_begin(&pad_slot(&target->pad, generation->slot)->template_call, INJ_AFTER_PARK);
-	find_staying(&work);
-	find_moved(&work);
-	break_pairs(&work);
 	gather(&work);
 	/* What is left on the list is made just before the fork (restore.c). */
 	if (close_new(&work, err) || set_cloexec(&work, err) ||
@@ -566,20 +600,62 @@ int files_restore(struct target *target, struct generation *generation,
 	put_contents(&work);
 	files_list_calls(&work);
 	close_list(&work);
-	if (work.problems > 1) {
-		char rest[32];
+	result = 0;
+out:
+	work_end(&work);
+	return result;
+}
 
-		snprintf(rest, sizeof rest, " (and %u more)", work.problems - 1);
-		strncat(notes->detail, rest, sizeof notes->detail - strlen(notes->detail) - 1);
+int files_collect(struct target *target, struct generation *image, const struct avc_config *config,
+		  pid_t init, struct files_table *table, struct avc_error *notes,
+		  struct avc_error *err)
+{
+	struct files_work work = { .target = target,
+				   .generation = image,
+				   .config = config,
+				   .init = init,
+				   .table = target->holder,
+				   .table_pidfd = target->holder_pidfd,
+				   .want = image->files,
+				   .notes = notes };
+	int result = -1;
+
+	*table = (struct files_table){ 0 };
+	if (work_begin(&work, err))
+		goto out;
+	/* It is a new table: everything has to be put in its place. */
+	for (uint32_t i = 0; i < work.want->count; i++)
+		work.lost[i] = true;
+	gather(&work);
+	make_lost(&work);
+	put_states(&work);
+	put_contents(&work);
+	files_list_calls(&work);
+	table->entry = calloc(work.want->count + 1, sizeof *table->entry);
+	if (!table->entry) {
+		fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+		goto out;
+	}
+	for (uint32_t i = 0; i < work.want->count; i++) {
+		const struct file *w = &work.want->file[i];
+		const int local = work.local[files_leader(work.want, w)];
+
+		if (local < 0)
+			continue; /* told already */
+		table->entry[table->count].fd = w->fd;
+		table->entry[table->count].cloexec = w->cloexec;
+		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
 	}
 	result = 0;
 out:
-	for (uint32_t i = 0; work.local && i < work.want->count; i++)
-		close_fd(&work.local[i]);
-	free(work.local);
-	free(work.source);
-	free(work.lost);
-	free(work.claimed_by);
-	files_free(work.now);
+	work_end(&work);
 	return result;
+}
+
+void files_table_free(struct files_table *table)
+{
+	for (uint32_t i = 0; i < table->count; i++)
+		close_fd(&table->entry[i].ours);
+	free(table->entry);
+	*table = (struct files_table){ 0 };
 }

@@ -285,6 +285,16 @@ static int prepare_stopped(struct tree *tree, struct target *target, struct avc_
 	return target->files_image ? 0 : files_prepare(target, err);
 }
 
+/* Of the leader of a session or group, as the app knows it; 0: it is none of the app's,
+ * or gone. */
+static pid_t number_inside(const struct tree *tree, pid_t pid)
+{
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->kin[i].pid == pid)
+			return tree->kin[i].target ? tree->kin[i].target->inside : proc_inside(pid);
+	return 0;
+}
+
 /* The kin that were there are the branches, in the same order. */
 static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
@@ -304,6 +314,9 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 		branch->parent = kin->parent == PARENT_INIT ? PARENT_INIT : index[kin->parent];
 		branch->inside = kin->ended ? proc_inside(kin->pid) : kin->target->inside;
 		branch->target = kin->target;
+		branch->stat = kin->stat;
+		branch->session = number_inside(tree, kin->stat.session);
+		branch->group = number_inside(tree, kin->stat.group);
 		if (kin->ended) {
 			if (branch->parent == PARENT_INIT || branch->inside <= 0)
 				continue; /* init is just about to wait for it */

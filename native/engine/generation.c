@@ -75,7 +75,8 @@ static int quieten(struct target *target, struct generation *generation, bool se
 
 /* Fills the slot in from what freeze() has read: one block per thread. */
 static int fill_slot(struct target *target, struct generation *generation,
-		     const struct proc_stat *stat, pid_t group_inside, struct avc_error *err)
+		     const struct branch *branch, const struct proc_stat *stat, pid_t group_inside,
+		     struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
@@ -87,6 +88,12 @@ static int fill_slot(struct target *target, struct generation *generation,
 	if (mem_fd < 0)
 		return fail_errno(err, generation->template, "keep template", "open(mem)",
 				  "it was killed");
+	if (proc_status(target->pid, &status) &&
+	    (!branch || proc_status(generation->template, &status))) {
+		close(mem_fd);
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
+	}
 	setup_begin(&setup, pad, generation->slot);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread t = target->threads[i];
@@ -123,17 +130,18 @@ static int fill_slot(struct target *target, struct generation *generation,
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		memcpy(block->name, t.name, sizeof block->name);
 		setup_thread(&setup, block);
+		if (branch && status.groups != target->forebear_groups)
+			branch_setup_groups(branch, &setup);
 		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
 					    err)) {
 			close(mem_fd);
 			return -1;
 		}
+		if (branch && !b)
+			branch_setup_dumpable(branch, &setup);
 		pending_setup_thread(target, &t, &setup);
 	}
 	close(mem_fd);
-	if (proc_status(target->pid, &status))
-		return fail_errno(err, target->pid, "keep template", "open(status)",
-				  "it has ended");
 	generation->sandboxed = status.seccomp == 1 ||
 				status.seccomp_filters > target->plain_filters;
 	if (memory_finish(target, generation, status.locked_kb, &setup, err))
@@ -148,52 +156,54 @@ static int fill_slot(struct target *target, struct generation *generation,
 	slot->pid = target->inside;
 	slot->group = group_inside;
 	slot->session_leader = stat->session == target->pid;
+	slot->placed = slot->fresh = target->descendant;
 	slot->tty_fd = stat->tty && stat->tty_group == stat->group ? tty_fd(target->pid, stat->tty)
 								   : -1;
 	return setup_end(&setup, target->pid, err);
 }
 
-static int finish(struct target *target, struct generation *generation, struct avc_error *err)
+static int finish(struct target *target, struct generation *generation, struct branch *branch,
+		  const struct proc_stat *stat, struct avc_error *err)
 {
-	struct proc_stat stat = { 0 };
 	long pages;
 	pid_t group;
 
 	generation->pidfd = proc_pidfd_open(generation->template);
-	if (generation->pidfd < 0 || proc_stat(target->pid, &stat))
-		return fail_errno(err, target->pid, "keep template", "pidfd_open", "it has ended");
+	if (generation->pidfd < 0)
+		return fail_errno(err, generation->template, "keep template", "pidfd_open",
+				  "it was killed");
 	/* Nothing but the app's own group, or one whose leader is visible, can be
 	 * put back. */
-	group = stat.group == target->pid ? target->inside : proc_inside(stat.group);
+	group = stat->group == target->pid ? target->inside : proc_inside(stat->group);
 	if (group <= 0)
 		group = target->inside;
 	pages = proc_vm_pages(generation->template);
-	if (quieten(target, generation, target->descendant || stat.session == target->pid, err))
+	if (quieten(target, generation, branch || stat->session == target->pid, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
-	return fill_slot(target, generation, &stat, group, err);
+	if (branch && branch_learn(branch, err))
+		return -1;
+	return fill_slot(target, generation, branch, stat, group, err);
 }
 
-/* What only a process that makes another one its child has to know. */
+/* What only a process that makes another one its child has to know.  This one may have
+ * ended meanwhile: a shell's children live for milliseconds. */
 static int finish_branch(struct branch *branch, struct avc_error *err)
 {
 	struct target *target = branch->target;
-	struct proc_stat stat;
 
 	/* The holder rests again. */
-	if (tracee_settle(target->holder, err) || finish(target, branch->image, err))
+	if (tracee_settle(target->holder, err) ||
+	    finish(target, branch->image, branch, &branch->stat, err))
 		return -1;
-	if (proc_stat(target->pid, &stat))
-		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
-	branch->session = proc_inside(stat.session);
-	branch->group = proc_inside(stat.group);
 	for (int i = 0; i < RLIM_NLIMITS && i < 16; i++) {
 		struct rlimit limit;
 
-		if (prlimit(target->pid, (enum __rlimit_resource)i, NULL, &limit))
-			return fail_errno(err, target->pid, "keep template", "prlimit",
-					  "it has ended");
+		if (prlimit(target->pid, (enum __rlimit_resource)i, NULL, &limit) &&
+		    prlimit(branch->image->template, (enum __rlimit_resource)i, NULL, &limit))
+			return fail_errno(err, branch->image->template, "keep template", "prlimit",
+					  "it was killed");
 		branch->limit[i][0] = limit.rlim_cur;
 		branch->limit[i][1] = limit.rlim_max;
 	}
@@ -202,21 +212,28 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 
 int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
 {
+	const struct thread *main_thread = thread_find(target, target->pid);
+	struct proc_status status = { 0 };
 	struct proc_stat stat;
 
+	if (generation->branches && (!main_thread || proc_status(target->pid, &status)))
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
 		if (!branch->target)
 			continue;
+		branch->target->forebear = &main_thread->creds;
+		branch->target->forebear_groups = status.groups;
 		if (finish_branch(branch, err))
 			return -1;
 		if (branch->image->notice.code && !generation->notice.code)
 			generation->notice = branch->image->notice;
 	}
-	if (generation->branches && proc_stat(target->pid, &stat) == 0)
-		generation->session = proc_inside(stat.session);
-	return finish(target, generation, err);
+	if (proc_stat(target->pid, &stat))
+		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
+	return finish(target, generation, NULL, &stat, err);
 }
 
 void generation_close_files(struct target *target, struct generation *image)
@@ -247,6 +264,7 @@ void generation_drop(struct generation *generation)
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
+		branch_forget(branch);
 		if (!branch->image)
 			continue;
 		image_drop(branch->image);

@@ -201,9 +201,15 @@ struct pad {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
+	int fd; /* of those pages                                              */
 };
+/* How it is mapped in two parts. */
+#define PAD_CODE_PROT (PROT_READ | PROT_EXEC)
+#define PAD_DATA_PROT (PROT_READ | PROT_WRITE)
+#define PAD_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
 
 struct files;
+struct last_pid;
 
 /* The live main process of the app. */
 struct target {
@@ -246,6 +252,8 @@ struct target {
 	uint64_t start;               /* when it began; tells it from one with its number */
 	uint32_t images;              /* generations that have one of it                  */
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	const struct creds *forebear; /* what a process that is made from the main one has */
+	uint32_t forebear_groups;     /* a hash                                            */
 	bool frozen, frozen_new;      /* stopped in this freeze; and only found in it      */
 };
 
@@ -256,6 +264,9 @@ struct branch {
 	int parent;                /* index of its parent's branch, or ...    */
 	pid_t inside;
 	pid_t session, group;      /* inside; 0: outside of the app           */
+	struct proc_stat stat;     /* as of the freeze                        */
+	struct manner *manner;     /* descend.c                               */
+	pid_t pid;                 /* that it was restored as last            */
 	int status;                /* of one that had ended, as from wait(2)  */
 	uint64_t limit[16][2];     /* getrlimit(2)                            */
 };
@@ -289,7 +300,6 @@ struct generation {
 	struct avc_error files_error; /* why they could not be read             */
 	struct branch *branch;        /* the other processes, parents first        */
 	uint32_t branches;
-	pid_t session;                /* of the main process, inside; 0: outside   */
 };
 
 /* One process of the app, as it was found. */
@@ -297,6 +307,7 @@ struct kin {
 	pid_t pid;
 	int parent; /* index, PARENT_INIT; the main process is 0           */
 	bool ended; /* a zombie                                         */
+	struct proc_stat stat;
 	struct target *target;
 };
 
@@ -606,6 +617,22 @@ void files_free(struct files *files);
 int files_restore(struct target *target, struct generation *generation,
 		  const struct avc_config *config, pid_t init, struct avc_error *notes,
 		  struct avc_error *err) warn_unused;
+/* The same for a process that gets a table of its own: what is to be in it. */
+struct files_table {
+	uint32_t count;
+	struct {
+		int fd, ours;
+		bool cloexec;
+	} *entry; /* by fd, ascending                                        */
+};
+int files_collect(struct target *target, struct generation *image, const struct avc_config *config,
+		  pid_t init, struct files_table *table, struct avc_error *notes,
+		  struct avc_error *err) warn_unused;
+void files_table_free(struct files_table *table);
+/* A duplicate of a descriptor of another process, or -1. */
+int files_borrow(int pidfd, int fd);
+/* One descriptor over a socket (unix(7), SCM_RIGHTS). */
+int files_send(int socket, int fd);
 /* Whether the restored process could do it all. */
 void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struct avc_error *notes);
 /* -1 if a file open for writing was written since, with AVC_UNSUPPORTED and which.
@@ -651,6 +678,68 @@ int restore(struct target *target, struct generation *generation, const struct l
 	    struct restore_times *times, struct avc_error *notes,
 	    struct avc_error *err) warn_unused;
 
+/* ---- descend.c ------------------------------------------------------------------- */
+
+/* A task that a restored process has forked, and that is made what a template is. */
+struct puppet {
+	pid_t pid;
+	const struct pad *pad;   /* the one it runs in                              */
+	struct inj_call *call;
+	struct arch_regs base;
+	struct inj_syscall *list; /* in the pad: calls not made yet                  */
+	uint32_t listed, list_max;
+	int socket;               /* ours, through which it gets descriptors; -1     */
+};
+
+/* One more call; puppet_flush() makes them.  The first that fails is told. */
+void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
+		 uint64_t e, uint64_t f);
+int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err) warn_unused;
+/* It gets a descriptor: number 1, until that is closed. */
+int puppet_give(struct puppet *puppet, int fd, struct avc_error *err) warn_unused;
+
+/* After the app runs again: what only the template can tell. */
+int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
+/* To a thread's calls. */
+void branch_setup_groups(const struct branch *branch, struct setup *setup);
+void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
+void branch_forget(struct branch *branch);
+
+/* All processes of a generation, of which the main one is there; each is stopped. */
+struct family;
+struct family *family_new(struct target *main, struct generation *generation,
+			  const struct avc_config *config, const struct link *link,
+			  struct last_pid *helper, struct avc_error *err);
+/* The main process (a stopped tracee) brings forth the others. */
+int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
+		struct avc_error *err) warn_unused;
+/* They put themselves together, one after the other, but for the main one. */
+int family_start(struct family *family, struct avc_error *notes, struct avc_error *err) warn_unused;
+void family_go(struct family *family);
+void family_kill(struct family *family);
+void family_free(struct family *family);
+/* PID of a branch's process, when all of it is there. */
+pid_t family_pid(const struct family *family, uint32_t branch);
+
+/* ---- remap.c ----------------------------------------------------------------------- */
+
+/* Makes the memory of a puppet that of `template`; it is a fork of `parent`'s and runs
+ * in the pad of `target` already. */
+int remap(struct puppet *puppet, const struct target *target, pid_t template, pid_t parent,
+	  avc_remote touched, struct avc_error *err) warn_unused;
+
+/* ---- restore.c, for one process of several ----------------------------------------- */
+
+/* Lets a stopped process that is what its template is put itself together; waits until
+ * it has; tells what of it failed; lets it go. */
+int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
+		  pid_t pid, struct avc_error *err) warn_unused;
+int restore_await(struct target *target, struct generation *image, pid_t pid,
+		  struct avc_error *err) warn_unused;
+void restore_note(struct target *target, struct generation *image, pid_t pid,
+		  struct avc_error *notes);
+void restore_go(struct target *target, struct generation *image);
+
 /* ---- urgent.c -------------------------------------------------------------------- */
 
 /* The calling thread gets a CPU before others from here to the other; best effort.
@@ -660,11 +749,12 @@ void urgent_end(void);
 
 /* ---- lastpid.c ------------------------------------------------------------------- */
 
-struct last_pid;
 /* Starts a helper task inside the PID namespace; it serves the slot's requests
  * until last_pid_stop().  last_pid_set() is the engine's own request. */
 struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
+/* From now on those of another slot. */
+void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 
 /* ---- rewind.c --------------------------------------------------------------------- */

@@ -59,9 +59,11 @@ int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t
 		return fail_errno(err, pid, "infect", "open(map_files)",
 				  "the pad can not be reached");
 	map = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-	close(fd);
-	if (map == MAP_FAILED)
+	if (map == MAP_FAILED) {
+		close(fd);
 		return fail_errno(err, pid, "infect", "mmap", "the pad can not be mapped");
+	}
+	pad->fd = fd;
 	pad->base = base;
 	pad->map = map;
 	pad->control = (struct inj_control *)(pad->map + INJ_CODE_BYTES);
@@ -73,8 +75,10 @@ int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t
 
 void pad_close(struct pad *pad)
 {
-	if (pad->map)
+	if (pad->map) {
 		munmap(pad->map, pad->bytes);
+		close(pad->fd);
+	}
 	*pad = (struct pad){ 0 };
 }
 

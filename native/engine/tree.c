@@ -194,6 +194,8 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 			kin->pid = 0; /* it was waited for just now */
 			continue;
 		}
+		if (i)
+			kin->stat = stat;
 		if (i && is_zombie(&stat)) {
 			kin->ended = true;
 			continue;

@@ -286,7 +286,9 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 		say(slot, INJ_WRONG_PID);
 		leave();
 	}
-	if (slot->session_leader) {
+	if (slot->placed) {
+		/* by the engine: its children were to have them, too */
+	} else if (slot->session_leader) {
 		r = SYS0(__NR_setsid);
 		if (r < 0)
 			fail(slot, INJ_STEP_SESSION, me->tid, r);
@@ -306,7 +308,7 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_BEFORE]);
 	for (uint32_t i = 1; i < slot->threads; i++)
 		spawn(slot, thread_of(slot, i), &last);
-	set_up(slot, me, 1);
+	set_up(slot, me, !slot->fresh);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) != slot->threads) {
 		uint32_t n;
 
