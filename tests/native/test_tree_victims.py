@@ -212,7 +212,7 @@ def take_the_terminal(victim: Victim) -> None:
 DEEDS: dict[str, tuple[str, Callable[[Victim], None], str]] = {
     "killed worker": ("tree 8", kill_a_worker, r"child \d+: code 2, status 9|child \d+, status 9|SIGCHLD|channel"),
     "stopped worker": ("tree 8", stop_a_worker, r"child \d+: code 5|status 137f|SIGCHLD with code 5"),
-    "killed parent": ("tree 8", kill_a_parent, "my parent was|child|SIGCHLD|channel"),
+    "killed parent": ("tree 8", kill_a_parent, "child|SIGCHLD|channel"),
     "bytes lost from a pipe": ("tree 8", read_from_a_pipe, r"channel \d+: record \d+ is"),
     "bytes too many in a pipe": ("tree 8", write_into_a_pipe, r"channel \d+: record \d+ is 0"),
     "a token too many": ("tree 8", take_a_token, r"tokens are out"),
