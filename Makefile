@@ -19,7 +19,7 @@ export PYTHON
 
 help: ## this list
 	@printf 'avckpt keeps Podman containers alive through crashes.\n\n'
-	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
+	@sed -n 's/^\([a-z][a-z0-9-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
 		while IFS='|' read -r name what; do printf "  %-20s %s\n" "$$name" "$$what"; done
 
 setup: setup-build setup-images ## install and build everything that demo and test need
@@ -45,6 +45,19 @@ lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where ins
 bench: setup ## measure freeze, reap and restore beside a plain fork()
 	@$(VENV)/python bench/run.py
 
+bench-peers: setup ## measure avckpt beside CRIU (bare, and through Podman), cold start and a plain fork()
+	@scripts/setup-plots.sh
+	@scripts/setup-peers.sh
+	@$(VENV)/python bench/peers.py
+
+bench-cost: setup-build ## measure what checkpoints cost a request/reply server over time
+	@scripts/setup-plots.sh
+	@$(VENV)/python bench/cost.py
+
+bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against the age of the checkpoint
+	@scripts/setup-ros2.sh
+	@$(VENV)/python bench/ros2.py
+
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
@@ -54,5 +67,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test lint bench clean clean-system
+.PHONY: help setup setup-build setup-images demo test lint bench bench-peers bench-cost bench-ros2 clean clean-system
 .DEFAULT_GOAL := help

@@ -36,6 +36,7 @@ in_podman_dirs() {
 	return 1
 }
 has_netavark() { in_podman_dirs netavark; }
+has_cyclonedds() { echo "#include <dds/dds.h>" | cc -x c -fsyntax-only - 2>/dev/null; }
 has_catatonit() { have catatonit || in_podman_dirs catatonit; }
 
 # need | Debian's package | check | what for.  "optional" is installed where apt
@@ -56,6 +57,9 @@ optional|netavark|has_netavark|bridge networks for containers
 optional|iptables|have iptables|bridge networks for containers (Podman 4)
 optional|nftables|have nft|bridge networks for containers (Podman 5)
 optional|runc|have runc|the tests run on both OCI runtimes
+optional|g++|have c++|compiles the C++ program that the tests kill and restore
+optional|cyclonedds-dev|has_cyclonedds|a test of ROS 2's transport
+optional|cyclonedds-tools|have idlc|a test of ROS 2's transport
 optional|catatonit|has_catatonit|pods and 'podman run --init'
 "
 

@@ -339,8 +339,20 @@ class Sidecar:
         return found
 
     def app_pid(self, container: Container) -> int:
-        """The app's main process, in the host's PID namespace: the one child of avckpt-init that is no template."""
-        return app_pid(container.pid)
+        """The app's main process, in the host's PID namespace: the one child of avckpt-init that is no template.
+
+        Raises LookupError when there is not one for a second: it is being restored.
+        """
+        init = container.pid
+        deadline = time.monotonic() + 1
+        while True:
+            try:
+                return app_pid(init)
+            except LookupError:
+                # In a checkpoint the clone has the app's name until it is given its own.
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.005)
 
     @property
     def running(self) -> bool:

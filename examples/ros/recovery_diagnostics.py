@@ -50,6 +50,9 @@ LEVELS = {
 }
 """How much each kind of event matters."""
 
+NO_NEWS = ("notified", "configured")
+"""Kinds of events that say nothing of how a container stands."""
+
 SHOWN = ("reason", "outcome", "generation", "age_s", "lost_s", "freeze_s", "restore_s", "attempt", "restores")
 """Fields of an event that become values of a status."""
 
@@ -102,7 +105,7 @@ class Board:
 
     def take(self, event: dict[str, Any]) -> Status | None:
         """Takes in an event; the container's new status, None if this one changes nothing."""
-        if event["kind"] == "notified":
+        if event["kind"] in NO_NEWS:
             return None
         status = status_of(event, self._hold_s)
         with self._lock:

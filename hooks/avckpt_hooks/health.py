@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds out a container's health check for the sidecar, after the container has started.
 
-`avckpt.restore.on=unhealthy` needs the health check that Podman knows of the
-container, whoever gave it: the command line, the image, Compose, the API.  Only
-`podman inspect` tells it, and that waits for the container's lock, which is
+`restore.on` with `unhealthy`, in a label or in the sidecar's configuration,
+needs the health check that Podman knows of the container, whoever gave it: the
+command line, the image, Compose, the API.  Only `podman inspect` tells it, and
+that waits for the container's lock, which is
 held as long as a hook runs.  So the precreate hook leaves a process behind that
 asks when the lock is free, and writes the answer to `protocol.health_path()`.
 """
@@ -54,6 +55,8 @@ def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
         answer = {"healthcheck": found}
     except (podman.Unknown, ValueError, LookupError, AttributeError) as error:
         answer = {"healthcheck": None, "error": str(error)}
+        if _has_ended(container):
+            return
         tell.journal(f"avckpt: container {container[:12]}: its health check can not be found out: {error}")
     path = protocol.health_path(container)
     os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
@@ -62,7 +65,16 @@ def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
         with open(temporary, "w") as file:
             json.dump(answer, file)
         os.replace(temporary, path)
+        if _has_ended(container):  # and the poststop hook was here already
+            os.unlink(path)
+    except FileNotFoundError:
+        return
     except OSError:
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         raise
+
+
+def _has_ended(container: str) -> bool:
+    """Its record is there from before its start until the poststop hook."""
+    return not os.path.exists(protocol.record_path(container))

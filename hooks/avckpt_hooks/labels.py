@@ -9,7 +9,8 @@ Decided here, because no label table says it:
   different values is an error: nobody can know which was meant.
 - Unknown names and malformed values are errors whether `avckpt.enable` is true
   or not: `avckpt.enabled=true` must not quietly start an unprotected container.
-- Without `avckpt.enable` a container is not protected, whatever else is set.
+- Without `avckpt.enable` a container is not protected, whatever else is set;
+  with `avckpt.group` and `avckpt.notify` it hears of the recoveries of others.
 """
 
 from __future__ import annotations
@@ -94,6 +95,11 @@ class Policy:
     """Of the recoveries of others in the group."""
     notify_self: Notify | None = None
     """Of its own."""
+
+    @property
+    def listens(self) -> bool:
+        """It wants to hear of others, which takes no protection of its own."""
+        return self.notify is not None and bool(self.group)
 
 
 def parse_policy(mapping: Mapping[str, str]) -> Policy:

@@ -15,6 +15,9 @@ import sys
 
 from avckpt_hooks import protocol, tell
 
+PATIENCE_S = 0.1
+"""For the sidecar's answer: it sees the end of the process anyway."""
+
 
 def main() -> int:
     """Removes the container's record and tells the sidecar.  Always 0."""
@@ -25,9 +28,9 @@ def main() -> int:
         for path in (protocol.record_path(container), protocol.health_path(container)):
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(path)
-        protocol.exchange(protocol.Deregister(id=container).encode())
-    except (ConnectionRefusedError, FileNotFoundError):
-        pass  # no sidecar
+        protocol.exchange(protocol.Deregister(id=container).encode(), timeout_s=PATIENCE_S)
+    except (ConnectionRefusedError, FileNotFoundError, TimeoutError):
+        pass  # no sidecar, or a stuck one
     except Exception as error:  # noqa: BLE001 - whatever goes wrong here, the container is cleaned up
         tell.journal(f"avckpt: poststop: {type(error).__name__}: {error}")
     return 0

@@ -92,8 +92,14 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
         policy = labels.parse_policy(wanted)
     except labels.LabelError as error:
         raise Refused(f"container {name}: {error}") from error
-    if not policy.enable:
+    if not policy.enable and not (policy.listens and _is_ours()):
         return config
+    annotations = {**annotations, **wanted, "avckpt.name": name, "avckpt.version": VERSION}
+    if not policy.enable:
+        # Nothing of it is touched: the sidecar only has to know that it runs.
+        data["annotations"] = annotations
+        add_hooks(data, told=True)
+        return json.dumps(data, separators=(",", ":")).encode()
     reason = _unprotectable(data)
     if reason:
         warn(f"container {name} runs unprotected: {reason}", parent)
@@ -102,15 +108,10 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
         return config
     told = _tell_if_alone(name, parent)
     put_init_in_front(data)
-    data["annotations"] = {
-        **annotations,
-        **wanted,
-        "avckpt.name": name,
-        "avckpt.version": VERSION,
-    }
+    data["annotations"] = annotations
     add_hooks(data, told)
-    if policy.restore_on.unhealthy:
-        _ask_for_health(container, name, parent)
+    # Always: the sidecar's configuration may say avckpt.restore.on=unhealthy, now or later.
+    _ask_for_health(container, name, parent)
     return json.dumps(data, separators=(",", ":")).encode()
 
 
@@ -120,7 +121,7 @@ def _ask_for_health(container: str, name: str, parent: int) -> None:
     try:
         health.ask_later(container, parent)
     except (OSError, podman.Unknown) as error:
-        warn(f"container {name} is not rolled back when unhealthy: its health check is not known ({error})", parent)
+        tell.journal(f"avckpt: container {name}: its health check can not be found out: {error}")
 
 
 def put_init_in_front(data: dict[str, Any]) -> None:
@@ -201,7 +202,7 @@ def warn(line: str, parent: int) -> bool:
 
 def _unprotectable(data: dict[str, Any]) -> str:
     """Why a container is better left as it is; "" if nothing speaks against it."""
-    if os.environ.get("_CONTAINERS_ROOTLESS_UID") or not _is_host_root():
+    if not _is_ours():
         return "only containers of root can be protected, and this Podman is rootless"
     args = (data.get("process") or {}).get("args") or [""]
     if args[0] in _SYSTEMD:
@@ -211,8 +212,9 @@ def _unprotectable(data: dict[str, Any]) -> str:
     return ""
 
 
-def _is_host_root() -> bool:
-    if os.geteuid() != 0:
+def _is_ours() -> bool:
+    """Whether this is root's Podman."""
+    if os.environ.get("_CONTAINERS_ROOTLESS_UID") or os.geteuid() != 0:
         return False
     with open("/proc/self/uid_map") as file:
         return file.read().split() == ["0", "0", "4294967295"]

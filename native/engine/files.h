@@ -10,6 +10,8 @@
  *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
  *   files_strict.c  whether a file was written (avckpt.files=strict)
+ *   files_mapped.c  the same of files that are mapped
+ *   files_written.c the same of files that are not open any more
  *
  * Looking is done on a duplicate (pidfd_getfd(2)) that lives for microseconds: while
  * it is there the app's close(2) closes nothing.

@@ -510,11 +510,6 @@ static void *filled(uint32_t count, int value)
 
 int files_work_begin(struct files_work *work, struct avc_error *err)
 {
-	const struct avc_config *config = work->config;
-
-	if (config->files == AVC_FILES_STRICT && work->table &&
-	    files_check_strict(work->generation, work->table, work->table_pidfd, work->init, err))
-		return -1;
 	work->now = files_new(work->want->count + 64);
 	work->local = filled(work->want->count, -1);
 	work->source = filled(work->want->count, -1);

@@ -3,7 +3,6 @@
  * avckpt.files=strict: memory does not go back behind files that were written (files.h).
  */
 #include <fcntl.h>
-#include <stdio.h>
 #include <string.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -32,38 +31,19 @@ static bool was_written(const struct files *want, const struct file *w, const st
 	       real_ns(&w->modified) + TICK_NS > want->taken_ns;
 }
 
-static int check_mapped(pid_t template, struct avc_error *err)
-{
-	char path[64], line[512];
-	FILE *maps;
-	int result = 0;
-
-	snprintf(path, sizeof path, "/proc/%d/maps", template);
-	maps = fopen(path, "re");
-	if (!maps)
-		return fail_errno(err, template, "restore", "open(maps)", "the template has ended");
-	while (!result && fgets(line, sizeof line, maps)) {
-		char mode[5], name[256];
-		unsigned long ino;
-
-		if (sscanf(line, "%*s %4s %*s %*s %lu %255s", mode, &ino, name) == 3 &&
-		    !strcmp(mode, "rw-s") && ino && strncmp(name, "/dev/", 5) &&
-		    strncmp(name, "/memfd:", 7) && strncmp(name, "/SYSV", 5) &&
-		    strncmp(name, "/run/", 5))
-			result = fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
-				      "avckpt.files=strict: %.80s is mapped for writing", name);
-	}
-	fclose(maps);
-	return result;
-}
-
 int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
-		       struct avc_error *err)
+		       pid_t holder, struct avc_error *err)
 {
 	const struct files *want = generation->files;
 	struct files *now = files_new(want->count + 64);
 	int result = -1;
 
+	if (generation->written[0]) {
+		fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+		     "avckpt.files=strict: %.80s was written since the checkpoint",
+		     generation->written);
+		goto out;
+	}
 	if (!now || files_look(now, pid, pidfd, FILES_NOW, generation->files, init, err))
 		goto out;
 	for (uint32_t i = 0; i < want->count; i++) {
@@ -101,7 +81,7 @@ int files_check_strict(const struct generation *generation, pid_t pid, int pidfd
 			goto out;
 		}
 	}
-	result = check_mapped(generation->template, err);
+	result = files_mapped_check(generation, holder, err);
 out:
 	files_free(now);
 	return result;

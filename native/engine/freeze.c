@@ -335,9 +335,12 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
-static int read_branch(struct tree *tree, struct branch *branch, struct avc_error *err)
+static int read_branch(struct tree *tree, struct branch *branch, bool strict, struct avc_error *err)
 {
 	struct target *target = branch->target;
+
+	if (strict)
+		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
 
 	if (prepare_stopped(tree, target, err) || check_pad(target, err))
 		return -1;
@@ -346,6 +349,7 @@ static int read_branch(struct tree *tree, struct branch *branch, struct avc_erro
 		return -1;
 	branch->image->vm_pages = proc_vm_pages(target->pid);
 	memory_copy(target, branch->image->image);
+	files_mapped_copy(branch->image->mapped);
 	return 0;
 }
 
@@ -407,7 +411,7 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
-		    read_branch(tree, &generation->branch[i], err))
+		    read_branch(tree, &generation->branch[i], generation->mapped != NULL, err))
 			return -1;
 	return 0;
 }
@@ -487,6 +491,7 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	if (!result) {
 		generation->vm_pages = proc_vm_pages(target->pid);
 		memory_copy(target, generation->image);
+		files_mapped_copy(generation->mapped);
 		generation->taken_ns = now_ns();
 		result = start_clones(generation, err);
 	}
@@ -515,6 +520,9 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	if (!cloned || result)
 		return -1;
 	target->checkpoints++;
+	if (pending_deadly(target->pending))
+		return fail(err, AVC_GONE, 0, target->pid, "freeze", "",
+			    "it is just being ended by signal %d", pending_deadly(target->pending));
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target)
 			generation->branch[i].target->checkpoints++;

@@ -151,7 +151,8 @@ static int fill_slot(struct target *target, struct generation *generation,
 		return -1;
 	if (timers_setup(target, generation, &setup, err))
 		return -1;
-	generation->notice = setup.notice;
+	if (setup.notice.code)
+		generation->notice = setup.notice;
 	slot->threads = generation->threads;
 	slot->pid = target->inside;
 	slot->group = group_inside;
@@ -271,6 +272,7 @@ static void image_drop(struct generation *image)
 	free(image->timers);
 	free(image->attributes);
 	files_free(image->files);
+	files_mapped_free(image->mapped);
 }
 
 void generation_drop(struct generation *generation)

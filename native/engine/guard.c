@@ -15,7 +15,6 @@
 
 #include "guard.h"
 
-#define FREEZE_DEADLINE_NS (50 * NS_PER_MS)
 #define LOOK_AGAIN_NS (20 * NS_PER_MS)   /* for init to set itself up        */
 #define LOOK_SELDOM_NS (250 * NS_PER_MS) /* after LOOK_OFTEN_NS of that      */
 #define LOOK_OFTEN_NS (5 * NS_PER_S)
@@ -94,6 +93,13 @@ static void vouch(struct avc_guard *guard)
 	}
 }
 
+static void unvouch(struct avc_guard *guard)
+{
+	guard->vouching = false;
+	for (uint32_t i = 0; i < guard->count; i++)
+		guard->generations[i].vouched = guard->generations[i].seen = false;
+}
+
 static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason reason)
 {
 	struct avc_error error = { 0 };
@@ -107,9 +113,9 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 		return;
 	}
 	/* An app that hangs is better started anew than left as it is. */
-	if (guard->config.files == AVC_FILES_STRICT && reason == AVC_REASON_COMMAND &&
-	    files_check_strict(&guard->generations[guard->count - 1], guard->target.pid,
-			       guard->target.pidfd, guard->link.init, &error)) {
+	if (reason == AVC_REASON_COMMAND &&
+	    check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
+			 guard->target.pidfd, &error)) {
 		emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
@@ -155,6 +161,9 @@ static void obey(struct avc_guard *guard, const struct command *command)
 	case AVC_COMMAND_VOUCH:
 		vouch(guard);
 		break;
+	case AVC_COMMAND_UNVOUCH:
+		unvouch(guard);
+		break;
 	}
 }
 
@@ -164,6 +173,7 @@ static void carry_out(struct avc_guard *guard)
 	eventfd_t ignored;
 
 	(void)eventfd_read(guard->wake_fd, &ignored);
+	take_config(guard);
 	while (take_command(guard, &command)) {
 		if (!guard->attached)
 			refuse(guard, command.ticket, AVC_EMPTY, "avckpt-init has not started yet");
@@ -355,17 +365,6 @@ static void *guard_main(void *arg)
 
 /* ---- the interface ---------------------------------------------------------------------- */
 
-static int check_config(const struct avc_config *config, struct avc_error *err)
-{
-	if (config->keep < 1 || config->keep > AVC_KEEP_MAX)
-		return fail(err, AVC_CONFIG, EINVAL, 0, "start guard", "", "keep must be 1 to %d",
-			    AVC_KEEP_MAX);
-	if (config->restore_max > RESTORES_MAX)
-		return fail(err, AVC_CONFIG, EINVAL, 0, "start guard", "",
-			    "restore_max must be at most %d", RESTORES_MAX);
-	return 0;
-}
-
 struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
 				  uint64_t cookie, struct avc_error *err)
 {
@@ -373,7 +372,7 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	int result;
 
 	*err = (struct avc_error){ 0 };
-	if (check_config(config, err))
+	if (config_check(config, err))
 		return NULL;
 	guard = calloc(1, sizeof *guard);
 	if (!guard) {
@@ -381,9 +380,6 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 		return NULL;
 	}
 	guard->engine = engine;
-	guard->config = *config;
-	if (!guard->config.freeze_deadline_ns)
-		guard->config.freeze_deadline_ns = FREEZE_DEADLINE_NS;
 	guard->cookie = cookie;
 	guard->room = config->keep;
 	guard->started_ns = now_ns();
@@ -398,7 +394,7 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 		.is_ours = is_ours,
 		.arg = guard,
 	};
-	guard->target.shm_bytes = config->shm_bytes;
+	config_set(guard, config);
 	guard->link.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 3);
 	guard->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	if (!target_make_room(&guard->target) || !guard->tree.kin || !guard->tree.member ||
@@ -429,7 +425,7 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
 	int result = 0;
 
 	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNHEALTHY)
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNVOUCH)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
 	pthread_mutex_lock(&guard->lock);
 	if (guard->ended)
@@ -452,6 +448,7 @@ void avc_guard_stop(struct avc_guard *guard)
 	pthread_mutex_unlock(&guard->lock);
 	eventfd_write(guard->wake_fd, 1);
 	pthread_join(guard->thread, NULL);
+	files_written_free(guard->written);
 	close_fd(&guard->wake_fd);
 	pthread_mutex_destroy(&guard->lock);
 	target_free_room(&guard->target);

@@ -4,6 +4,7 @@
  * thread runs any of it.
  *
  *   guard.c             waits, obeys, tells; the public interface
+ *   guard_configure.c   what it is told to do
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
  *   guard_death.c       what follows a death
@@ -34,6 +35,8 @@ struct avc_guard {
 	pthread_mutex_t lock;
 	struct command commands[COMMANDS_MAX];
 	uint32_t command_count;
+	struct avc_config next_config; /* to be taken over, if one waits         */
+	bool config_waiting;
 	bool stop, ended;
 	/* The thread's own. */
 	timer_t timer;
@@ -61,6 +64,7 @@ struct avc_guard {
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	uint32_t verdict_seq;
+	struct files_written *written; /* avckpt.files=strict; NULL: not yet        */
 };
 
 /* ---- guard.c: what is told ------------------------------------------------- */
@@ -70,6 +74,12 @@ void emit(struct avc_guard *guard, const struct avc_event *event);
 void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
 		const struct avc_error *error);
 void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
+
+/* ---- guard_configure.c ----------------------------------------------------- */
+
+int config_check(const struct avc_config *config, struct avc_error *err);
+void config_set(struct avc_guard *guard, const struct avc_config *config);
+void take_config(struct avc_guard *guard);
 
 /* ---- guard_generations.c --------------------------------------------------- */
 
@@ -90,6 +100,9 @@ void keep_generation(struct avc_guard *guard, struct generation *fresh);
 void count_crash(struct avc_guard *guard, bool hung);
 void drop_unhealthy(struct avc_guard *guard);
 void choose(struct avc_guard *guard, bool used_up);
+void note_written(struct avc_guard *guard);
+int check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid, int pidfd,
+		 struct avc_error *err) warn_unused;
 
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 

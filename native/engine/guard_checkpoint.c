@@ -38,7 +38,6 @@ int find_app(struct avc_guard *guard, struct avc_error *err)
 		return fail(err, AVC_DEADLINE, 0, 0, "attach", "",
 			    "the application has not been started yet");
 	guard->target.init = guard->link.init;
-	guard->target.tcp_moved = guard->config.tcp == AVC_TCP_RESET_MOVED;
 	if (proc_status(guard->link.init, &init) == 0)
 		guard->target.plain_filters = init.seccomp_filters;
 	return target_open(&guard->target, app, proc_inside(app), err);
@@ -87,7 +86,8 @@ static int prepare_process(struct avc_guard *guard, struct target *target, struc
 		return -1;
 	if (target->descendant && !infected_still(target))
 		target->infected = false;
-	if (target->infected && target->thread_count > target->pad.threads_max)
+	if (target->infected && (target->thread_count > target->pad.threads_max ||
+				 guard->config.keep >= target->pad.slots))
 		target->infected = false;
 	if (!target->infected) {
 		if (target->descendant)
@@ -97,7 +97,7 @@ static int prepare_process(struct avc_guard *guard, struct target *target, struc
 		unhold(target);
 		for (uint32_t i = 0; i < target->thread_count; i++)
 			target->threads[i].known = false;
-		if (infect(target, guard->tree.slots, guard->timer, deadline, err))
+		if (infect(target, guard->config.keep + 1, guard->timer, deadline, err))
 			return -1;
 	}
 	if (acquaint(target, guard->timer, deadline, err))
@@ -115,13 +115,18 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 	if (find_app(guard, err))
 		return -1;
 	tree->init = guard->link.init;
+	tree->slots = guard->config.keep + 1;
 	if (tree_look(tree, &fresh, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct target *target = tree->kin[i].target;
 		struct avc_error failed = { 0 };
 
-		if (!target || prepare_process(guard, target, &failed) == 0)
+		if (!target)
+			continue;
+		target->shm_bytes = guard->target.shm_bytes;
+		target->tcp_moved = guard->target.tcp_moved;
+		if (prepare_process(guard, target, &failed) == 0)
 			continue;
 		/* One that is ending is seen to by the freeze. */
 		if (i == 0 || failed.code != AVC_GONE) {
@@ -180,6 +185,18 @@ static int files_errors(const struct generation *generation, struct avc_error *e
 	return 0;
 }
 
+/* avckpt.files=strict: from here on, nothing is written that is not seen. */
+static void watch_files(struct avc_guard *guard, struct generation *fresh)
+{
+	struct target *target = &guard->target;
+
+	if (!guard->written)
+		guard->written = files_written_new();
+	if (guard->written)
+		files_written_watch(guard->written, target->pid, &fresh->notice);
+	fresh->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+}
+
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	struct target *target = &guard->target;
@@ -191,12 +208,16 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		generation_drop(&fresh);
 		return -1;
 	}
+	if (guard->config.files == AVC_FILES_STRICT)
+		watch_files(guard, &fresh);
 	touch_slot(&target->pad, fresh.slot, target->thread_count);
 	for (uint32_t i = 1; i < guard->tree.count; i++)
 		if (guard->tree.kin[i].target && guard->tree.kin[i].target->infected)
 			touch_slot(&guard->tree.kin[i].target->pad, fresh.slot,
 				   guard->tree.kin[i].target->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
+	/* What is written between here and the freeze counts as written after it. */
+	note_written(guard);
 	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
 			&times, err);
 	event->freeze_ns = times.freeze_ns;

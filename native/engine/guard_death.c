@@ -132,6 +132,14 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 
 		struct avc_error failed = { 0 }, notes = { 0 };
 
+		/* What was written since the newest was written since all others, also
+		 * where that can not be seen any more. */
+		if (check_strict(guard, generation, generation->template, generation->pidfd,
+				 &failed)) {
+			*error = failed;
+			drop_all(guard);
+			break;
+		}
 		guard->verdict_seq = report->seq;
 		if (restore(target, generation, &guard->link, config, guard->timer,
 			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,

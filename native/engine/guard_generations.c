@@ -315,3 +315,40 @@ void choose(struct avc_guard *guard, bool used_up)
 		lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
 	}
 }
+
+/* ---- avckpt.files=strict ----------------------------------------------------- */
+
+/* Before the next generation is taken, and before one is restored: no generation is
+ * good any more after a file was written. */
+void note_written(struct avc_guard *guard)
+{
+	const struct files *known = guard->count ? guard->generations[guard->count - 1].files
+						 : NULL;
+	char name[FILES_NAME];
+
+	if (!guard->written || !files_written_since(guard->written, known, name))
+		return;
+	for (uint32_t i = 0; i < guard->count; i++)
+		memcpy(guard->generations[i].written, name, sizeof name);
+}
+
+/* Whether it may be restored, in a container that is strict.  A process that has the
+ * table of descriptors as it is now. */
+int check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid, int pidfd,
+		 struct avc_error *err)
+{
+	if (guard->config.files != AVC_FILES_STRICT)
+		return 0;
+	note_written(guard);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct target *target = generation->branch[i].target;
+
+		/* What one that has ended before has written, note_written() knows. */
+		if (target && target->holder &&
+		    files_check_strict(generation->branch[i].image, target->holder,
+				       target->holder_pidfd, guard->link.init, target->holder, err))
+			return -1;
+	}
+	return files_check_strict(generation, pid, pidfd, guard->link.init, guard->target.holder,
+				  err);
+}

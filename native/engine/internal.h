@@ -258,6 +258,8 @@ struct target {
 	bool frozen, frozen_new;      /* stopped in this freeze; and only found in it      */
 };
 
+#define FILES_NAME 81 /* of a file, for people                                  */
+
 /* What a generation has of a process that is not the main one. */
 struct branch {
 	struct target *target;     /* NULL: it had ended, and nobody had waited for it */
@@ -299,6 +301,9 @@ struct generation {
 	struct avc_error notice;      /* what of it can not be put back              */
 	struct files *files;          /* descriptors                                     */
 	struct avc_error files_error; /* why they could not be read             */
+	/* avckpt.files=strict */
+	struct files_mapped *mapped; /* NULL: it was not strict                         */
+	char written[FILES_NAME];    /* a file that was written since; "": none         */
 	struct branch *branch;        /* the other processes, parents first        */
 	uint32_t branches;
 };
@@ -473,6 +478,8 @@ struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
  * thread.signalled. */
 void pending_read(struct target *target);
+/* One that the app dies of as soon as it runs again; 0: none. */
+int pending_deadly(const struct pending *pending);
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
@@ -635,10 +642,29 @@ int files_borrow(int pidfd, int fd);
 int files_send(int socket, int fd);
 /* Whether the restored process could do it all. */
 void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struct avc_error *notes);
-/* -1 if a file open for writing was written since, with AVC_UNSUPPORTED and which.
- * `pid` is a process that has the table as it is now. */
+/* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
+ * that has the table as it is now, `holder` one that has the memory. */
 int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
+		       pid_t holder, struct avc_error *err) warn_unused;
+
+/* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
+ * out of memory. */
+struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);
+/* While everything is stopped; NULL: nothing. */
+void files_mapped_copy(struct files_mapped *mapped);
+void files_mapped_free(struct files_mapped *mapped);
+int files_mapped_check(const struct generation *generation, pid_t holder,
 		       struct avc_error *err) warn_unused;
+
+/* files_written.c: what is written in the container's mount namespace. */
+struct files_written *files_written_new(void);
+void files_written_free(struct files_written *written);
+/* From now on; *notice if it can not be. */
+void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice);
+/* Whether a file was written since the last time this was asked, and which; inherited
+ * ones in `files` (may be NULL) do not count. */
+bool files_written_since(struct files_written *written, const struct files *files,
+			 char name[FILES_NAME]);
 
 /* ---- freeze.c ------------------------------------------------------------------ */
 

@@ -18,6 +18,9 @@
 #include "inject_blob.h"
 #include "internal.h"
 
+#define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
+#define PARKED_NS NS_PER_S
+
 #define PAGE 4096u
 
 static size_t page_up(size_t n)
@@ -143,12 +146,16 @@ struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_
 	return s;
 }
 
-/* A task that is killed never gets done: to be noticed at once, for its process
+/* A thread of the app has others waiting for it, and goes home after INJ_PARK_MS.
+ * Templates and holders stay, and a template that waits for a CPU is no reason to
+ * restore an older one.
+ *
+ * A task that is killed never gets done: to be noticed at once, for its process
  * can not be reaped before we have. */
 static int wait_done(struct inj_call *call, pid_t tid, struct avc_error *err)
 {
 	const struct timespec slice = { .tv_nsec = 500000 };
-	const uint64_t end = now_ns() + INJ_PARK_MS / 2 * NS_PER_MS;
+	const uint64_t end = now_ns() + (call->after == INJ_AFTER_PARK ? PARKED_NS : HOMEWARD_NS);
 
 	while (!__atomic_load_n(&call->done, __ATOMIC_ACQUIRE)) {
 		struct stop stop;
@@ -185,8 +192,12 @@ int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
-	if (wait_done(call, tid, err))
+	if (wait_done(call, tid, err)) {
+		/* Without a stop of its own it would go home and stay a tracee for ever;
+		 * now it stops as soon as it gets to run, and straggle() sends it home. */
+		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		return -1;
+	}
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "run injected code", "ptrace(INTERRUPT)",
 				  "it has gone");

@@ -19,6 +19,7 @@
 struct pending {
 	uint32_t count;
 	bool too_many;
+	int deadly; /* 0: none                                             */
 	struct {
 		int block; /* of the thread, -1: of the process                    */
 		siginfo_t info;
@@ -58,15 +59,25 @@ static void read_queue(struct pending *pending, pid_t tid, int block)
 	}
 }
 
-/* Signals that the app has handlers for, as in sigset_t; 0 if it can not be told. */
-static uint64_t caught(pid_t pid)
-{
-	char buf[4096], *line;
+/* Signals that the app handles, and those that it ignores, as in sigset_t. */
+struct dispositions {
+	uint64_t caught, ignored;
+};
 
+static bool read_dispositions(pid_t pid, struct dispositions *dispositions)
+{
+	char buf[4096], *ignored, *caught;
+
+	*dispositions = (struct dispositions){ 0 };
 	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
-		return 0;
-	line = strstr(buf, "\nSigCgt:");
-	return line ? strtoull(line + 8, NULL, 16) : 0;
+		return false;
+	ignored = strstr(buf, "\nSigIgn:");
+	caught = strstr(buf, "\nSigCgt:");
+	if (!ignored || !caught)
+		return false;
+	dispositions->ignored = strtoull(ignored + 8, NULL, 16);
+	dispositions->caught = strtoull(caught + 8, NULL, 16);
+	return true;
 }
 
 static bool takes(const struct thread *t, int signal)
@@ -77,10 +88,10 @@ static bool takes(const struct thread *t, int signal)
 /* A thread that was just about to run a handler: its call is cut short by the signal,
  * so it has to get that, also one that any thread could take.  (One that is ignored
  * is queued only because we trace.) */
-static void assign(struct target *target)
+static void assign(struct target *target, const struct dispositions *dispositions)
 {
 	struct pending *pending = target->pending;
-	const uint64_t handled = pending->count ? caught(target->pid) : 0;
+	const uint64_t handled = dispositions->caught;
 
 	for (uint32_t k = 0; k < pending->count; k++) {
 		const int signal = pending->signal[k].info.si_signo;
@@ -104,11 +115,42 @@ static void assign(struct target *target)
 	}
 }
 
+static bool ends_by_default(int signal)
+{
+	return signal != SIGCHLD && signal != SIGURG && signal != SIGWINCH && signal != SIGCONT &&
+	       signal != SIGSTOP && signal != SIGTSTP && signal != SIGTTIN && signal != SIGTTOU;
+}
+
+/* A process that has got a deadly signal and was stopped by us before it could die of
+ * it: every restore of such an image would die at once. */
+static int find_deadly(const struct target *target, const struct dispositions *dispositions)
+{
+	const struct pending *pending = target->pending;
+	const uint64_t spared = dispositions->caught | dispositions->ignored;
+
+	for (uint32_t k = 0; k < pending->count; k++) {
+		const int signal = pending->signal[k].info.si_signo;
+
+		if (!ends_by_default(signal) || spared >> (signal - 1) & 1)
+			continue;
+		for (uint32_t i = 0; i < target->thread_count; i++) {
+			const struct thread *t = &target->threads[i];
+
+			if (takes(t, signal) &&
+			    (pending->signal[k].block < 0 || pending->signal[k].block == t->block))
+				return signal;
+		}
+	}
+	return 0;
+}
+
 void pending_read(struct target *target)
 {
 	struct pending *pending = target->pending;
+	struct dispositions dispositions;
 
 	pending->count = 0;
+	pending->deadly = 0;
 	pending->too_many = false;
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread *t = &target->threads[i];
@@ -120,7 +162,15 @@ void pending_read(struct target *target)
 			read_queue(pending, t->tid, -1);
 		read_queue(pending, t->tid, t->block);
 	}
-	assign(target);
+	if (pending->count && read_dispositions(target->pid, &dispositions)) {
+		assign(target, &dispositions);
+		pending->deadly = find_deadly(target, &dispositions);
+	}
+}
+
+int pending_deadly(const struct pending *pending)
+{
+	return pending->deadly;
 }
 
 bool pending_contains(const struct pending *pending, int signal, int timer)

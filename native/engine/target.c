@@ -246,7 +246,10 @@ static bool straggle(struct target *target, struct thread *thread)
 		thread->borrowed = false;
 		return false;
 	case STOP_FORK:
-		if (thread->borrowed)
+		/* A borrowed thread may have found home by itself, and what it starts
+		 * there is the app's: to kill one thread is to kill them all. */
+		if (thread->borrowed && arch_regs_get(tid, &now) == 0 &&
+		    pad_contains(&target->pad, arch_pc(&now)))
 			tracee_kill(stop.message); /* our clone, too late */
 		else
 			adopt(target, stop.message, &ignored);
@@ -443,13 +446,15 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 {
 	uint32_t again = 0;
 
+	/* All of them first: there is one way home in the pad, and it may still need it. */
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		if (target->threads[i].attached)
+			return fail(err, AVC_DEADLINE, 0, target->threads[i].tid, "stop", "",
+				    "a thread has not come back from an earlier attempt yet");
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread *t = &target->threads[i];
 		struct avc_error gone = { 0 };
 
-		if (t->attached)
-			return fail(err, AVC_DEADLINE, 0, t->tid, "stop", "",
-				    "a thread has not come back from an earlier attempt yet");
 		if (t->known) {
 			t->asked++;
 			if (t->asked < ASK_AGAIN_AFTER || again == ASK_AGAIN_AT_ONCE)

@@ -538,6 +538,20 @@ static void reap(void)
 		finish(self.status);
 }
 
+/* The stop key stops the app, and where init leads the session there is no shell
+ * that could continue it: the terminal would be dead for good.  As the main process
+ * of its container the app would not have been stopped in the first place. */
+static void continue_stopped(void)
+{
+	siginfo_t info = { 0 };
+
+	if (self.fd[TTY] < 0 || getsid(0) != self.pid || self.waiting)
+		return;
+	if (waitid(P_PID, (id_t)self.app_pid, &info, WSTOPPED | WNOHANG) == 0 &&
+	    info.si_pid == self.app_pid && info.si_status == SIGTSTP)
+		kill(-self.app_pid, SIGCONT);
+}
+
 static void take_signals(void)
 {
 	struct signalfd_siginfo info;
@@ -662,6 +676,7 @@ int main(int argc, char **argv)
 		if (self.waiting)
 			take_verdict();
 		reap();
+		continue_stopped();
 		wait_event();
 		take_signals();
 	}

@@ -44,6 +44,7 @@ from avckpt.openapi import document
 from avckpt.pressure import held_bytes, templates_of
 from avckpt.protected import Protected
 from avckpt.registry import Registry
+from avckpt.reload import Reloaded
 
 log = logging.getLogger("avckpt")
 
@@ -80,8 +81,8 @@ class Backend(Protocol):
     async def command(self, name: str, command: Command) -> tuple[Protected, EventRecord]:
         """Gives a command to a container and waits for the answer.  Raises AvckptError."""
 
-    def reload(self) -> list[str]:
-        """Takes a new configuration file; who goes on as before.  Raises ConfigError."""
+    def reload(self) -> list[Reloaded]:
+        """Takes a new configuration file; for whom it changes something.  Raises ConfigError."""
 
 
 class ApiServer:
@@ -141,8 +142,13 @@ class ApiServer:
         return web.json_response({"container": container.to_json(), "event": event.to_json()})
 
     async def _reload(self, request: web.Request) -> web.Response:
-        unchanged = self._backend.reload()
-        return web.json_response({"config": self._backend.configuration.to_json(), "unchanged": unchanged})
+        outcomes = self._backend.reload()
+        return web.json_response(
+            {
+                "config": self._backend.configuration.to_json(),
+                "containers": [outcome.to_json() for outcome in outcomes],
+            }
+        )
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
         """Server-sent events: what is kept, then what comes, until either end has enough."""

@@ -65,13 +65,21 @@ class Caretaker(Generic[W]):
             if groups.memory_limit_bytes() is not None:
                 care.groups = groups
         if policy.restore_on.unhealthy:
-            answer = self._health_dir / f"{ward.container.id}.json"
-            tell = self._tell
-            care.health = asyncio.get_running_loop().create_task(
-                watch_health(ward, answer, lambda record: tell(ward, record))
-            )
-            care.health.add_done_callback(_log_failure)
+            self._watch_health(care)
         self._look_if_needed()
+
+    def change(self, ward: W, policy: Policy) -> None:
+        """Another policy holds from now on; a health check that goes on keeps its count."""
+        care = self._cares.get(ward.container.cookie)
+        if care is None:
+            return
+        if policy.restore_on.unhealthy:
+            if care.health is None or care.health.done():
+                self._watch_health(care)
+        elif care.health is not None:
+            care.health.cancel()
+            care.health = None
+            self._order(care, Command.UNVOUCH)
 
     def end(self, ward: W) -> None:
         """Its guard is about to be stopped.  A second call does nothing."""
@@ -93,6 +101,14 @@ class Caretaker(Generic[W]):
             if self._host.fd is not None:
                 asyncio.get_running_loop().remove_reader(self._host.fd)
             self._host.close()
+
+    def _watch_health(self, care: _Care[W]) -> None:
+        ward, tell = care.ward, self._tell
+        answer = self._health_dir / f"{ward.container.id}.json"
+        care.health = asyncio.get_running_loop().create_task(
+            watch_health(ward, answer, lambda record: tell(ward, record))
+        )
+        care.health.add_done_callback(_log_failure)
 
     def _must_look(self) -> bool:
         blind = self._host is not None and self._host.fd is None

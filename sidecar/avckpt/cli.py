@@ -173,17 +173,20 @@ def restore(name: str, as_json: bool) -> None:
 def reload(as_json: bool) -> None:
     """Have the sidecar read /etc/avckpt/config.yaml again.
 
-    If anything in it is wrong, it is refused and the old one stays in force.
-    It holds for containers that start from then on.
+    It holds for containers that run, too; what it changes is told.  If anything
+    in it is wrong, it is refused and the old one stays in force.
     """
     answer = _client().reload()
     if as_json:
         click.echo(json.dumps(answer, indent=2))
         return
     config = answer["config"]
-    click.echo(f"{config['path']}: in force")
-    if answer["unchanged"]:
-        click.echo(f"until they are restarted, these go on as before: {', '.join(answer['unchanged'])}")
+    click.echo(f"{config['path']}: {'in force' if config['found'] else 'not there, the built-in defaults hold'}")
+    for one in answer["containers"]:
+        changes = ", ".join(f"{c['setting']} {c['before'] or 'none'} -> {c['after'] or 'none'}" for c in one["changes"])
+        click.echo(f"{one['container']}: {changes or 'goes on as before: ' + one['problem']}")
+    if not answer["containers"]:
+        click.echo("it changes nothing for the containers that run")
 
 
 @main.command()
@@ -285,33 +288,37 @@ def _print_table(containers: list[Json]) -> None:
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in (
-        "NAME",
-        "STATE",
-        "GENERATIONS",
-        "MEMORY",
-        "LAST CHECKPOINT",
-        "FREEZE",
-        "RESTORES",
-        "LAST RESTORE",
-        "NOTE",
-    ):
-        table.add_column(column, no_wrap=column != "NOTE", overflow="fold")
-    now = time.time()
-    for c in containers:
-        table.add_row(
-            _called(c),
-            Text(c["state"], style=STATE_STYLES.get(c["state"], "")),
-            f"{c['generations']}/{c['keep']}",
-            f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
-            "-" if c["last_checkpoint_at"] is None else f"{max(now - c['last_checkpoint_at'], 0):.0f} s ago",
-            _ms(c["last_freeze_s"]),
-            str(c["restores"]),
-            _ms(c["last_restore_s"]),
-            c["reason"],
-        )
-    # Into a pipe nothing is wrapped: a line is a container.
-    Console(width=None if sys.stdout.isatty() else 1000, highlight=False, markup=False).print(table)
+    rows = [_row(container) for container in containers]
+    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows)]
+    for name, width in zip(COLUMNS[:-1], widths):
+        table.add_column(name, no_wrap=True, min_width=width)
+    table.add_column(COLUMNS[-1], overflow="fold")
+    for name, state, *others in rows:
+        table.add_row(name, Text(state, style=STATE_STYLES.get(state, "")), *others)
+    # Into a pipe nothing is wrapped: a line is a container.  On a terminal only the
+    # note is; where even the rest is too wide, the terminal wraps it and nothing is lost.
+    width = max(Console().width, sum(widths[:-1]) + 2 * len(widths) + NOTE_LEAST) if sys.stdout.isatty() else 1000
+    Console(width=width, highlight=False, markup=False).print(table)
+
+
+COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")
+"""Generations, what they hold, age and freeze time of the newest; restores, and how long the last one took."""
+NOTE_LEAST = 16
+
+
+def _row(c: Json) -> tuple[str, ...]:
+    age_s = None if c["last_checkpoint_at"] is None else max(time.time() - c["last_checkpoint_at"], 0)
+    return (
+        _called(c),
+        c["state"],
+        "-" if c["state"] == "listening" else f"{c['generations']}/{c['keep']}",
+        f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
+        "-" if age_s is None else f"{age_s:.0f} s ago",
+        _ms(c["last_freeze_s"]),
+        str(c["restores"]),
+        _ms(c["last_restore_s"]),
+        c["reason"],
+    )
 
 
 def _ms(seconds: float | None) -> str:

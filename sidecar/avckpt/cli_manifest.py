@@ -88,13 +88,20 @@ def up(
 @files_option
 @project_option
 @click.option("-v", "--volumes", is_flag=True, help="Also remove the project's volumes.")
+@click.option("--json", "as_json", is_flag=True, help="The containers that are gone, as JSON.")
 @click.argument("services", nargs=-1)
-def down(files: tuple[Path, ...], project: str, volumes: bool, services: tuple[str, ...]) -> None:
+def down(files: tuple[Path, ...], project: str, volumes: bool, as_json: bool, services: tuple[str, ...]) -> None:
     """Stop and remove what "avckpt up" brought up.  Hooks and sidecar stay."""
     from avckpt import manifest
     from avckpt.compose import Compose
 
-    Compose(files or (manifest.usual_file(Path()),), project).down(services, volumes, _say)
+    compose = Compose(files or (manifest.usual_file(Path()),), project)
+    before = compose.containers() if as_json else []
+    compose.down(services, volumes, _say)
+    if as_json:
+        left = {one.id for one in compose.containers()}
+        gone = [{"service": one.service, "name": one.name, "id": one.id} for one in before if one.id not in left]
+        click.echo(json.dumps(gone, indent=2))
 
 
 def check_manifest(files: Sequence[Path], as_json: bool) -> ExitCode:

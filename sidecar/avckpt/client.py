@@ -51,7 +51,7 @@ class Client:
         return self._request("POST", f"/v1/containers/{quote(name, safe='')}/{command.name.lower()}")
 
     def reload(self) -> Json:
-        """Has the configuration file read again; returns {"config": ..., "unchanged": [names]}."""
+        """Has the configuration file read again; returns {"config": ..., "containers": [...]}."""
         return self._request("POST", "/v1/reload")
 
     def history(self, since: float | None = None) -> list[Json]:

@@ -35,6 +35,8 @@ from avckpt.yamlfile import Place, Unreadable
 
 PATH = Path("/etc/avckpt/config.yaml")
 ENABLE = f"{PREFIX}enable"
+GROUP = f"{PREFIX}group"
+NOTIFY = f"{PREFIX}notify"
 
 
 def default_path() -> Path:
@@ -60,6 +62,9 @@ class Defaults:
             if fnmatch.fnmatchcase(name, pattern):
                 merged.update(settings)
         merged.update(labels)
+        # Without a group there is nobody to hear of; who writes that into a label is told so.
+        if GROUP not in merged and NOTIFY not in labels:
+            merged.pop(NOTIFY, None)
         return merged
 
 
@@ -84,23 +89,27 @@ class Configuration:
         """Why the file as it is now was refused; empty: it is in force."""
         self.loaded_at: float | None = None
         """When what is in force was read; None: nothing was, the built-in defaults hold."""
+        self.found = False
+        """Whether there was a file then."""
 
     def load(self) -> None:
         """Takes the file as it is now; a file that is not there says nothing.
 
         Raises ConfigError, and all stays as it was, when anything in it is wrong.
         """
+        found = self.path.exists()
         try:
             self.defaults = read(self.path)
         except ConfigError as error:
             self.problem = str(error)
             raise
+        self.found = found
         self.problem = ""
         self.loaded_at = time.time()
 
     def to_json(self) -> dict[str, object]:
         """For the API."""
-        return {"path": str(self.path), "loaded_at": self.loaded_at, "problem": self.problem}
+        return {"path": str(self.path), "found": self.found, "loaded_at": self.loaded_at, "problem": self.problem}
 
 
 def read(path: Path) -> Defaults:
@@ -134,7 +143,8 @@ def examine(path: Path) -> tuple[Defaults, list[Problem]]:
         _prefixed(said.get("defaults")),
         tuple((pattern, _prefixed(settings)) for pattern, settings in (said.get("names") or {}).items()),
     )
-    return defaults, problems
+    problems += _contradictions(defaults, root, path)
+    return defaults, sorted(problems, key=lambda problem: problem.place)
 
 
 @lru_cache(maxsize=1)
@@ -156,8 +166,7 @@ def _model() -> type[BaseModel]:
 def _check(key: str, value: str) -> str:
     """Has a value parsed as that of the label `key`."""
     try:
-        # What is not implemented yet is refused for enabled containers only.
-        parse_policy({ENABLE: "true", key: value})
+        parse_policy({key: value})
     except LabelError as error:
         raise ValueError(f"{error.why}; {error.allowed}") from None
     return value
@@ -185,6 +194,24 @@ def _repetitions(root: yaml.Node | None, path: Path) -> Iterator[Problem]:
                 place = yamlfile.place_of(key, path)
                 yield Problem(place, f"{key.value}: given in line {seen[key.value]} already; remove one of them")
             seen[key.value] = key.start_mark.line + 1
+
+
+def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> Iterator[Problem]:
+    """Values that are right by themselves, and not together."""
+    names = yamlfile.lookup(root, "names")
+    common = yamlfile.lookup(root, "defaults")
+    seen = set()
+    for pattern, settings in (("", {}), *defaults.by_name):
+        try:
+            parse_policy({**defaults.common, **settings})
+        except LabelError as error:
+            node = yamlfile.lookup(names, pattern) if error.key in settings else common
+            key = error.key[len(PREFIX) :]
+            places = [yamlfile.place_of(found, path) for found, _ in yamlfile.entries(node) if found.value == key]
+            problem = Problem(max(places), f"{key}: {error.value}: {error.why}; {error.allowed}")
+            if problem not in seen:
+                seen.add(problem)
+                yield problem
 
 
 def _mappings(root: yaml.Node | None) -> Iterator[yaml.Node | None]:

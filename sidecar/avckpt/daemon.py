@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avckpt_hooks.labels import Notify, parse_policy
+from avckpt_hooks.labels import Notify
 from avckpt_hooks.protocol import Deregister, Register
 
 from avckpt import __version__, cgroup, native
@@ -40,18 +40,19 @@ from avckpt.errors import (
     Unprotected,
 )
 from avckpt.event_record import Cause, EventRecord, Kind, of_guard
-from avckpt.events import Command, Event, EventKind, GuardConfig, why_not_restored
+from avckpt.events import Command, Event, EventKind, why_not_restored
 from avckpt.feed import Feed
 from avckpt.history import History
 from avckpt.journal import Journal
 from avckpt.listener import HookListener
 from avckpt.metrics import Metrics
 from avckpt.notify import Notifier
-from avckpt.policy import config_of_labels
+from avckpt.policy import Settings, changes, settings_of
 from avckpt.process import has_ended, pid_of
 from avckpt.protected import Protected
 from avckpt.records import adoptable
 from avckpt.registry import Registry
+from avckpt.reload import Reloaded
 
 log = logging.getLogger("avckpt")
 
@@ -66,14 +67,23 @@ class Watch:
     container: Protected
     pidfd: int
     labels: Mapping[str, str]
-    notify: Notify | None = None
-    notify_self: Notify | None = None
+    settings: Settings
     rolling_back: Cause | None = None
     """Why a roll back was commanded whose answer has not come yet."""
     freezes_s: dict[int, float] = field(default_factory=dict)
     """Freeze times of the generations that may still be held, by number."""
     journal: Journal = field(default_factory=Journal)
     guard: native.Guard | None = None
+
+    @property
+    def notify(self) -> Notify | None:
+        """How it wants to hear of others."""
+        return self.settings.policy.notify
+
+    @property
+    def notify_self(self) -> Notify | None:
+        """How it wants to hear of its own recoveries."""
+        return self.settings.policy.notify_self
 
 
 class Daemon:
@@ -166,16 +176,41 @@ class Daemon:
         check_answer(container.label, event)
         return container, record
 
-    def reload(self) -> list[str]:
-        """Takes the configuration file as it is now, for containers that start from now on.
+    def reload(self) -> list[Reloaded]:
+        """Takes the configuration file as it is now, for every container.
 
-        Returns the running ones that would be guarded differently if they
-        started now.  Raises ConfigError, and nothing changes, when the file is
-        wrong.
+        Running ones keep their guard and what it holds.  Returns those for which
+        something changed, or should have.  Raises ConfigError, and nothing
+        changes, when the file is wrong.
         """
         self.configuration.load()
         log.info("%s was read", self.configuration.path)
-        return [watch.container.label for watch in self._watches.values() if self._is_outdated(watch)]
+        outcomes = [self._reconfigure(watch) for watch in list(self._watches.values())]
+        return [outcome for outcome in outcomes if outcome is not None]
+
+    def _reconfigure(self, watch: Watch) -> Reloaded | None:
+        container = watch.container
+        try:
+            after = self._settings_of(watch.labels, container.name)
+            changed = tuple(changes(watch.settings, after))
+            if not after.policy.enable:  # it only listens
+                changed = tuple(change for change in changed if change.setting in ("group", "notify"))
+            if not changed:
+                return None
+            if watch.guard is not None:
+                watch.guard.configure(after.config)
+        except TargetGone:
+            return None  # it is ending at this moment
+        except AvckptError as error:
+            self.tell(watch, EventRecord(Kind.CONFIGURED, detail="goes on with its old settings", error=error))
+            return Reloaded(container.label, (), str(error))
+        watch.settings = after
+        container.config = after.config
+        container.group = after.policy.group
+        self.caretaker.change(watch, after.policy)
+        outcome = Reloaded(container.label, changed)
+        self.tell(watch, EventRecord(Kind.CONFIGURED, detail=f"new settings: {outcome.what}"))
+        return outcome
 
     def _reload_on_signal(self) -> None:
         try:
@@ -183,14 +218,16 @@ class Daemon:
         except ConfigError as error:
             log.error("the new configuration was refused, what was in force stays so: %s", error)
 
-    def _is_outdated(self, watch: Watch) -> bool:
-        try:
-            return self._config_of(watch.labels, watch.container.name) != watch.container.config
-        except LabelsWrong:
-            return True
+    def _settings_of(self, labels: Mapping[str, str], name: str) -> Settings:
+        """The labels over the file.  Raises LabelsWrong when they do not go together."""
+        return settings_of(self.configuration.defaults.under(labels, name))
 
-    def _config_of(self, labels: Mapping[str, str], name: str) -> GuardConfig:
-        return config_of_labels(self.configuration.defaults.under(labels, name))
+    def _settings_at_start(self, labels: Mapping[str, str], name: str) -> tuple[Settings, LabelsWrong | None]:
+        """The same, and what is wrong: then the labels alone hold.  Raises LabelsWrong when they are the problem."""
+        try:
+            return self._settings_of(labels, name), None
+        except LabelsWrong as error:
+            return settings_of(labels), error
 
     # Hooks and records
 
@@ -221,30 +258,36 @@ class Daemon:
                     os.close(pidfd)
                     return
                 raise Busy(f"another run of {known.label} is guarded", pid=known.init_pid)
+            settings, problem = self._settings_at_start(request.annotations, request.name)
             container = Protected(
                 id=request.id,
                 name=request.name,
                 cookie=next(self._cookies),
                 init_pid=pid_of(pidfd),
-                config=self._config_of(request.annotations, request.name),
+                config=settings.config,
                 registered_at=time.time(),
                 adopted=adopted,
             )
-            policy = parse_policy(self.configuration.defaults.under(request.annotations, request.name))
-            container.group = policy.group
-        watch = Watch(container, pidfd, request.annotations, policy.notify, policy.notify_self)
+            container.group = settings.policy.group
+        watch = Watch(container, pidfd, request.annotations, settings)
         self.registry.add(container)
         self._watches[container.cookie] = watch
         asyncio.get_running_loop().add_reader(pidfd, self._begin_end, watch)
         how = "adopted" if adopted else "registered"
         self.tell(watch, EventRecord(Kind.REGISTERED, detail=f"{how}, init {container.init_pid}"))
+        if problem is not None:
+            detail = f"{self.configuration.path} does not hold for it"
+            self.tell(watch, EventRecord(Kind.CONFIGURED, detail=detail, error=problem))
+        if not settings.policy.enable:
+            container.listen()
+            return
         try:
             watch.guard = self._engine.start_guard(pidfd, container.config, container.cookie)
         except AvckptError as error:
             container.fail(str(error))
             self.tell(watch, EventRecord(Kind.UNPROTECTED, error=error))
         else:
-            self.caretaker.begin(watch, policy)
+            self.caretaker.begin(watch, settings.policy)
 
     # Events
 

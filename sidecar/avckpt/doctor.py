@@ -57,6 +57,18 @@ class PodmanFacts:
 
 
 @dataclass(frozen=True)
+class ConfigFacts:
+    """The file with defaults for all containers."""
+
+    path: str
+    found: bool
+    problem: str
+    """Why it was refused, or would be; empty: it is right."""
+    outdated: bool = False
+    """It was written after the sidecar had read it last."""
+
+
+@dataclass(frozen=True)
 class Facts:
     """Everything that is looked at; None: could not be found out."""
 
@@ -84,6 +96,7 @@ class Facts:
     sidecar_problem: str
     engine_problem: str
     """What the engine's own probe said; empty: it is content."""
+    config: ConfigFacts
 
 
 KERNEL_LEAST = (5, 13)  # PTRACE_GET_RSEQ_CONFIGURATION, the newest call that the engine needs
@@ -106,9 +119,9 @@ def judge(facts: Facts) -> list[Check]:
                 "podman", Status.WARN, "not looked at: this is inside a container", "run avckpt doctor on the host too"
             )
         )
-        found.append(_judge_sidecar(facts))
-        return found
-    return [*found, *_judge_podman(facts), *_judge_installation(facts), _judge_sidecar(facts)]
+        return [*found, _judge_sidecar(facts), _judge_config(facts.config)]
+    found += [*_judge_podman(facts), *_judge_installation(facts)]
+    return [*found, _judge_sidecar(facts), _judge_config(facts.config)]
 
 
 def _judge_machine(facts: Facts) -> Iterator[Check]:
@@ -228,10 +241,21 @@ def _judge_sidecar(facts: Facts) -> Check:
     return Check("sidecar", Status.OK, f"answers, version {facts.sidecar_version}")
 
 
+def _judge_config(config: ConfigFacts) -> Check:
+    if config.problem:
+        return Check("config", Status.WARN, f"refused: {config.problem}", "mend it, then run: sudo avckpt reload")
+    if config.outdated:
+        return Check(
+            "config", Status.WARN, f"{config.path} has changed since the sidecar read it", "run: sudo avckpt reload"
+        )
+    shown = config.path if config.found else f"no {config.path}: the built-in defaults hold"
+    return Check("config", Status.OK, shown)
+
+
 def gather() -> Facts:
     """Looks at this machine.  Changes nothing."""
     installed, missing, broken = _installation()
-    version, problem = _sidecar()
+    info, problem = _sidecar()
     return Facts(
         kernel=platform.release(),
         machine=platform.machine(),
@@ -247,9 +271,10 @@ def gather() -> Facts:
         missing_files=missing,
         hook_problem=broken or (_hook_problem() if installed and not missing else ""),
         init_problem=init_problem(INIT_PROGRAM) if installed else "",
-        sidecar_version=version,
+        sidecar_version=str(info["version"]) if info else None,
         sidecar_problem=problem,
         engine_problem=_engine_problem(),
+        config=_config(info),
     )
 
 
@@ -321,17 +346,38 @@ def _podman() -> PodmanFacts | str:
         return f"podman info: unexpected answer ({error})"
 
 
-def _sidecar() -> tuple[str | None, str]:
+def _sidecar() -> tuple[dict[str, Any], str]:
+    """What it says of itself, empty when it does not answer, and why not."""
     from avckpt_hooks import protocol
 
     from avckpt.client import Client
 
     try:
-        return str(Client(Path(protocol.run_dir())).info()["version"]), ""
+        info = Client(Path(protocol.run_dir())).info()
     except AvckptError as error:
-        return None, str(error)
-    except (OSError, KeyError) as error:
-        return None, f"the sidecar does not answer as it should ({error}): start it again"
+        return {}, str(error)
+    except OSError as error:
+        return {}, f"the sidecar does not answer as it should ({error}): start it again"
+    if "version" not in info:
+        return {}, "the sidecar does not say its version: start it again"
+    return info, ""
+
+
+def _config(info: dict[str, Any]) -> ConfigFacts:
+    """What the sidecar goes by; without one, what it would."""
+    from avckpt import config
+
+    said = info.get("config") or {}
+    if not said:
+        path = config.default_path()
+        problems = "; ".join(map(str, config.examine(path)[1]))
+        return ConfigFacts(str(path), path.exists(), problems)
+    try:
+        written_at = os.stat(said["path"]).st_mtime
+    except OSError:
+        written_at = 0.0
+    outdated = not said["problem"] and written_at > (said["loaded_at"] or 0.0)
+    return ConfigFacts(said["path"], bool(said.get("found")), said["problem"], outdated)
 
 
 def _engine_problem() -> str:

@@ -30,6 +30,7 @@ class Kind(str, enum.Enum):
     GAVE_UP = "gave_up"
     DROPPED = "dropped"
     HEALTH = "health"
+    CONFIGURED = "configured"
     REFUSED = "refused"
     ENDED = "ended"
     NOTIFIED = "notified"
@@ -283,6 +284,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
     Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
     Kind.HEALTH: lambda record: record.detail,
+    Kind.CONFIGURED: lambda record: f"{record.detail}: {record.error}" if record.error else record.detail,
     Kind.REFUSED: lambda record: f"command refused: {record.error}",
     Kind.ENDED: lambda record: f"ended: {record.detail}" if record.detail else "ended",
     Kind.NOTIFIED: lambda record: record.detail,

@@ -80,6 +80,7 @@ class Command(enum.IntEnum):
     REFILL = 4
     VOUCH = 5
     UNHEALTHY = 6
+    UNVOUCH = 7
 
 
 class Files(enum.IntEnum):

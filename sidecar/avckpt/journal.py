@@ -18,6 +18,7 @@ LEVELS = {
     Kind.GAVE_UP: logging.ERROR,
     Kind.DROPPED: logging.WARNING,
     Kind.HEALTH: logging.WARNING,
+    Kind.CONFIGURED: logging.INFO,
     Kind.REFUSED: logging.WARNING,
     Kind.ENDED: logging.INFO,
     Kind.NOTIFIED: logging.DEBUG,
@@ -47,6 +48,8 @@ class Journal:
             return self._lost(record)
         if kind is Kind.GAVE_UP and record.outcome in EXPECTED:
             return logging.INFO, record.message
+        if kind is Kind.CONFIGURED and record.error is not None:
+            return logging.WARNING, record.message
         return LEVELS[kind], record.message
 
     def _checkpoint(self, record: EventRecord) -> tuple[int, str]:

@@ -332,8 +332,8 @@ def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:
 
 def _judge(service: Service) -> Iterator[Problem]:
     """Everything that is wrong with the settings of a service."""
-    # What is not implemented yet is refused for enabled containers only.
-    enable = {} if service.enabled is False else {ENABLE: "true"}
+    alone = {"avckpt.group": "any"}  # which avckpt.notify asks for
+    right: dict[str, Setting] = {}
     for kind, setting in service.all_settings():
         value = {setting.key: setting.final}
         try:
@@ -342,14 +342,28 @@ def _judge(service: Service) -> Iterator[Problem]:
                 continue
             if kind is Kind.LABEL:
                 merge(value, {})
-            parse_policy(value if setting.key == ENABLE else {**value, **enable})
+            parse_policy(value if setting.key == ENABLE else {**alone, **value})
         except LabelError as error:
             yield Problem(setting.place, service.name, str(error).replace("label", kind.value, 1))
+        else:
+            right[setting.key] = setting
     yield from _judge_both(service)
+    if not any(setting.is_open for _, setting in service.all_settings()):
+        yield from _judge_together(service, right)
+
+
+def _judge_together(service: Service, settings: Mapping[str, Setting]) -> Iterator[Problem]:
+    """Of values that are right by themselves.  Where the environment has a say, nobody can know."""
+    try:
+        parse_policy({key: setting.final for key, setting in settings.items()})
+    except LabelError as error:
+        yield Problem(settings[error.key].place, service.name, str(error))
 
 
 def _doubts(service: Service) -> Iterator[Problem]:
     """What can be honoured, but is hardly meant."""
+    if {"avckpt.group", "avckpt.notify"} <= set(_keys(service)):
+        return  # it hears of others
     if service.enabled is False and not any(key == ENABLE for key in _keys(service)):
         for _, setting in service.all_settings():
             message = f"{setting.key} has no effect: without {ENABLE}=true the container is not protected"

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from avckpt.event_record import EventRecord, Kind
+from avckpt.pressure import held_bytes, templates_of
 from avckpt.protected import Protected, State
 
 Metric = TypeVar("Metric", Counter, Histogram)
@@ -27,12 +27,17 @@ class Held:
 
     container: str
     init_pid: int
+    app_pid: int
     generations: int
     state: State
 
+    def memory_bytes(self) -> int:
+        """What giving all its generations up would free, as `avckpt ps` has it."""
+        return held_bytes(self.app_pid, templates_of(self.init_pid)) if self.generations else 0
+
     @classmethod
     def of(cls, container: Protected) -> Held:
-        return cls(container.label, container.init_pid, container.generations, container.state)
+        return cls(container.label, container.init_pid, container.app_pid, container.generations, container.state)
 
 
 class Metrics:
@@ -68,7 +73,7 @@ class Metrics:
         self._generations = self._gauge("avckpt_generations", "Generations held")
         self._memory = self._gauge(
             "avckpt_generations_memory_bytes",
-            "Memory of its own that each container's generations hold: private pages of the templates",
+            "Memory that a container's generations hold and its application does not use",
         )
         self._protected = self._gauge("avckpt_protected", "1 while at least one generation is held, else 0")
         self._labels: dict[str, set[tuple[Counter | Histogram, tuple[str, ...]]]] = {}
@@ -99,13 +104,13 @@ class Metrics:
     def render(self, live: Iterable[Held]) -> bytes:
         """The text that Prometheus reads.
 
-        Takes milliseconds for each GB that templates map: not for the event loop's thread.
+        Takes milliseconds for each GB that application and templates map: not for the event loop's thread.
         """
         for gauge in (self._generations, self._memory, self._protected):
             gauge.clear()
         for held in live:
             self._generations.labels(held.container).set(held.generations)
-            self._memory.labels(held.container).set(generations_bytes(held.init_pid))
+            self._memory.labels(held.container).set(held.memory_bytes())
             self._protected.labels(held.container).set(held.state is State.PROTECTED)
         return generate_latest(self._registry)
 
@@ -118,32 +123,3 @@ class Metrics:
     def _of(self, metric: Metric, *labels: str) -> Metric:
         self._labels.setdefault(labels[0], set()).add((metric, labels))
         return metric.labels(*labels)
-
-
-def generations_bytes(init_pid: int) -> int:
-    """Private memory of the templates below an avckpt-init, in bytes; what ends meanwhile counts nothing."""
-    return sum(private_bytes(pid) for pid in templates(init_pid))
-
-
-def templates(init_pid: int) -> Iterator[int]:
-    """The templates below an avckpt-init: its children of that name."""
-    try:
-        children = Path(f"/proc/{init_pid}/task/{init_pid}/children").read_text().split()
-    except OSError:
-        return
-    for child in children:
-        try:
-            name = Path(f"/proc/{child}/comm").read_text().strip()
-        except OSError:
-            continue
-        if name == "avckpt-tmpl":
-            yield int(child)
-
-
-def private_bytes(pid: int) -> int:
-    """Pages that only this process maps, proc(5) smaps_rollup; 0 when it has ended."""
-    try:
-        text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    except OSError:
-        return 0
-    return sum(int(line.split()[1]) * 1024 for line in text.splitlines() if line.startswith("Private_"))

@@ -60,6 +60,19 @@ class Guard:
             if lib.avc_guard_command(self._guard, int(command), ticket, err) != 0:
                 raise _error(err)
 
+    def configure(self, config: GuardConfig) -> None:
+        """Has it go by other settings from its next checkpoint and the next death on; what it holds stays.
+
+        Raises ConfigError for values that make no sense, TargetGone when the
+        guard has ended.
+        """
+        err = ffi.new("struct avc_error *")
+        with self._lock:
+            if self._guard is None:
+                raise TargetGone("its guard has ended", operation="configure")
+            if lib.avc_guard_configure(self._guard, _config(-1, config), err) != 0:
+                raise _error(err)
+
     def stop(self) -> None:
         """Lets the app run on unprotected and gives up every generation.
 

@@ -40,8 +40,12 @@ class Watched(Protocol):
 
     container: Protected
     pidfd: int
-    notify: Notify | None
-    notify_self: Notify | None
+
+    @property
+    def notify(self) -> Notify | None: ...
+
+    @property
+    def notify_self(self) -> Notify | None: ...
 
 
 Tell = Callable[[Protected, Kind, str], None]
@@ -165,16 +169,18 @@ async def _app_of(receiver: _Receiver) -> int:
     deadline = loop.time() + APP_TIMEOUT_S
     while True:
         try:
-            return _open_app(receiver.container)
+            return _open_app(receiver.container, receiver.pidfd)
         except TargetGone:
             if loop.time() > deadline or has_ended(receiver.pidfd):
                 raise
         await asyncio.sleep(0.02)
 
 
-def _open_app(container: Protected) -> int:
+def _open_app(container: Protected, init_pidfd: int) -> int:
     """A pidfd of its application as it is known at this moment.  Raises TargetGone."""
     pid = container.app_pid
+    if pid == container.init_pid:  # there is no avckpt-init
+        return os.dup(init_pidfd)
     try:
         pidfd = os.pidfd_open(pid)
     except OSError as error:

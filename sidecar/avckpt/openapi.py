@@ -141,8 +141,26 @@ _ERROR = _object(
 _CONFIGURATION = _object(
     {
         "path": _text("the file with the defaults for all containers"),
+        "found": {"type": "boolean", "description": "whether there was such a file"},
         "loaded_at": _or_null(_TIME),
         "problem": _text("why the file as it is now was refused; empty: it is in force"),
+    }
+)
+
+
+_RELOADED = _object(
+    {
+        "container": _text("its name"),
+        "changes": _array(
+            _object(
+                {
+                    "setting": _text("a label without its prefix"),
+                    "before": _text("as in a label; empty: none"),
+                    "after": _text("the same, now"),
+                }
+            )
+        ),
+        "problem": _text("why it goes on as before; empty: it does not"),
     }
 )
 
@@ -238,10 +256,8 @@ _PATHS: Json = {
             "operationId": "reload",
             "summary": "Read the configuration file again",
             "responses": _answer(
-                "it is in force for containers that start from now on",
-                _object(
-                    {"config": _ref("Configuration"), "unchanged": _array(_text("a container that goes on as before"))}
-                ),
+                "it is in force; containers that run and for which something changed, or should have",
+                _object({"config": _ref("Configuration"), "containers": _array(_RELOADED)}),
             ),
         }
     },

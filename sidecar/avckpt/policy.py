@@ -4,11 +4,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from avckpt_hooks.labels import KEEP_MAX, LabelError, Policy, parse_policy
+from avckpt_hooks.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy
 
 from avckpt.errors import LabelsWrong
 from avckpt.events import Files, GuardConfig, Tcp
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What holds for one container."""
+
+    said: Mapping[str, str]
+    """Label by label, as somebody wrote it; what is not there is the built-in default."""
+    policy: Policy
+    config: GuardConfig
+
+
+@dataclass(frozen=True)
+class Change:
+    """One setting that is another one now.  Texts as in a label; empty: there is none."""
+
+    setting: str
+    """The label without its prefix."""
+    before: str
+    after: str
+
+    def __str__(self) -> str:
+        return f"{self.setting} {self.before or 'none'} -> {self.after or 'none'}"
 
 
 def guard_config(policy: Policy) -> GuardConfig:
@@ -29,9 +53,30 @@ def guard_config(policy: Policy) -> GuardConfig:
     )
 
 
-def config_of_labels(labels: Mapping[str, str]) -> GuardConfig:
+def settings_of(labels: Mapping[str, str]) -> Settings:
     """What the labels (or annotations) of a container say.  Raises LabelsWrong with one line for a person."""
     try:
-        return guard_config(parse_policy(labels))
+        policy = parse_policy(labels)
     except LabelError as error:
         raise LabelsWrong(str(error)) from error
+    said = {key: value.strip() for key, value in labels.items() if key in LABELS}
+    return Settings(said, policy, guard_config(policy))
+
+
+def config_of_labels(labels: Mapping[str, str]) -> GuardConfig:
+    """The engine's part of what the labels say.  Raises LabelsWrong."""
+    return settings_of(labels).config
+
+
+def changes(before: Settings, after: Settings) -> list[Change]:
+    """What is different, in alphabetical order; 3s and 3000ms are not."""
+    found = []
+    for key in sorted(LABELS):
+        texts = [settings.said.get(key, LABELS[key].default) for settings in (before, after)]
+        if texts[0] != texts[1] and _meaning(key, texts[0]) != _meaning(key, texts[1]):
+            found.append(Change(key[len(PREFIX) :], texts[0], texts[1]))
+    return found
+
+
+def _meaning(key: str, text: str) -> object:
+    return LABELS[key].parse(text) if text else None

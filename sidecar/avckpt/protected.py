@@ -18,6 +18,8 @@ class State(enum.Enum):
     """At least one generation is held."""
     UNPROTECTED = "unprotected"
     """It runs as if avckpt were not there; `reason` says why."""
+    LISTENING = "listening"
+    """Not to be protected: it only wants to hear of others in its group."""
     RESTORING = "restoring"
     """The app died; nothing runs at this moment."""
     ENDED = "ended"
@@ -134,6 +136,11 @@ class Protected:
         self.generations = 0
         self.memory_bytes = 0
         self.ended_at = at
+
+    def listen(self) -> None:
+        """It is told of others, and has no guard: its main process is its application."""
+        self.app_pid = self.init_pid
+        self._to(State.LISTENING, "only hears of others in its group: avckpt.enable is not true")
 
     def fail(self, reason: str) -> None:
         """There is no guard for it, and why."""

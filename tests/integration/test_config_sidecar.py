@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from harness import wait_until
-from local_sidecar import LocalSidecar, local_sidecar
+from local_sidecar import Container, LocalSidecar, local_sidecar
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
 
@@ -26,6 +26,23 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
         yield made
 
 
+def kinds(sidecar: LocalSidecar, name: str) -> list[str]:
+    """What the history says of a container."""
+    lines = sidecar.avckpt("events", "--json").stdout.splitlines()
+    return [event["kind"] for event in map(json.loads, lines) if event["container"] == name]
+
+
+def take(sidecar: LocalSidecar, name: str) -> None:
+    """A checkpoint, as soon as there is something to take one of."""
+    wait_until(lambda: sidecar.avckpt("checkpoint", name, check=False).status == 0, 20, "a checkpoint", every_s=0.2)
+
+
+def kill_and_wait(sidecar: LocalSidecar, container: Container, restores: int) -> dict[str, object]:
+    """Kills the application; what `avckpt ps` says once it has been restored so often."""
+    os.kill(container.app_pid, signal.SIGKILL)
+    return sidecar.wait_for(container, restores=restores, state="protected")
+
+
 def test_it_holds_for_containers_that_start_and_labels_win(sidecar: LocalSidecar) -> None:
     sidecar.config.write_text("defaults: {interval: 200ms, keep: 3}\nnames: {quick*: {interval: 100ms}}\n")
     sidecar.start()
@@ -36,18 +53,96 @@ def test_it_holds_for_containers_that_start_and_labels_win(sidecar: LocalSidecar
     ]
     assert [(row["interval_s"], row["keep"]) for row in rows] == [(0.2, 3), (0.1, 3), (0.15, 3)]
 
-    sidecar.config.write_text("defaults: {interval: 400ms, keep: 3}\nnames: {quick*: {interval: 100ms}}\n")
-    said = sidecar.avckpt("reload").stdout
-    assert "in force" in said
-    # Who is affected goes on as before, and is named; who is not, is not.
-    assert said.splitlines()[1].endswith("go on as before: plain")
-    assert sidecar.row(sidecar.containers[0])["interval_s"] == 0.2
-    again = sidecar.protected("plain-2", NAP, ENABLE)
-    assert sidecar.wait_for(again, state="protected")["interval_s"] == 0.4
-    # A sidecar that starts anew adopts by the new one.
-    sidecar.stop()
+
+def test_a_new_one_holds_for_running_containers_and_takes_nothing_from_them(sidecar: LocalSidecar) -> None:
+    sidecar.config.write_text("defaults: {interval: 1h, keep: 3}\n")
     sidecar.start()
-    assert sidecar.wait_for(sidecar.containers[0], state="protected")["interval_s"] == 0.4
+    plain = sidecar.protected("plain", NAP, ENABLE)
+    own = sidecar.protected("own", NAP, {**ENABLE, "avckpt.interval": "30m", "avckpt.keep": "3"})
+    for name in ("plain", "own"):
+        take(sidecar, name)
+    assert kill_and_wait(sidecar, plain, 1)["generation"] == 1
+
+    sidecar.config.write_text("defaults: {interval: 100ms, keep: 2, restore.on: 'signal,3'}\n")
+    said = sidecar.avckpt("reload").stdout.splitlines()
+    assert said == [
+        f"{sidecar.config}: in force",
+        "plain: interval 1h -> 100ms, keep 3 -> 2, restore.on signal,exit -> signal,3",
+        "own: restore.on signal,exit -> signal,3",
+    ]
+    # What was held stays until checkpoints at the new interval take its place.
+    row = sidecar.row(plain)
+    assert (row["state"], row["restores"], row["interval_s"], row["keep"]) == ("protected", 1, 0.1, 2)
+    assert row["generations"] >= 1
+    wait_until(lambda: sidecar.row(plain)["generation"] >= 4, 10, "it is checkpointed at the new interval")
+    assert sidecar.row(plain)["generations"] == 2
+    assert sidecar.row(own)["generation"] == 1  # its label has won
+    assert "configured" in kinds(sidecar, "plain")
+    assert not {"unprotected", "dropped"} & set(kinds(sidecar, "plain"))
+    assert kill_and_wait(sidecar, plain, 2)["last_death"] == "killed by SIGKILL"
+    assert sidecar.avckpt("reload").stdout.splitlines()[1:] == ["it changes nothing for the containers that run"]
+
+
+def test_more_generations_for_a_running_container(sidecar: LocalSidecar) -> None:
+    """Which takes more room than its guard had made in the application."""
+    sidecar.config.write_text("defaults: {interval: 100ms, keep: 1}\n")
+    sidecar.start()
+    plain = sidecar.protected("plain", NAP, ENABLE)
+    sidecar.wait_for(plain, state="protected", generations=1)
+    sidecar.config.write_text("defaults: {interval: 100ms, keep: 9}\n")
+    assert sidecar.avckpt("reload").stdout.splitlines()[1:] == ["plain: keep 1 -> 9"]
+    sidecar.wait_for(plain, state="protected", generations=9)
+    for restores in (1, 2, 3):
+        kill_and_wait(sidecar, plain, restores)
+    sidecar.wait_for(plain, generations=9)
+    assert "unprotected" not in kinds(sidecar, "plain")
+
+
+def test_ends_are_judged_by_the_new_one(sidecar: LocalSidecar) -> None:
+    exits = [sys.executable, "-c", "import time, sys\ntime.sleep(1)\nwhile True:\n  time.sleep(1.5)\n  sys.exit(3)"]
+    sidecar.config.write_text("defaults: {interval: 100ms}\n")
+    sidecar.start()
+    made = sidecar.protected("exits", exits, ENABLE)
+    sidecar.wait_for(made, state="protected")
+    sidecar.config.write_text("defaults: {interval: 100ms, restore.on: signal}\n")
+    assert "exits: restore.on signal,exit -> signal" in sidecar.avckpt("reload").stdout
+    assert made.status(20) == 3
+
+
+def test_one_that_its_labels_contradict_is_named_and_goes_on(sidecar: LocalSidecar) -> None:
+    sidecar.start()
+    made = sidecar.protected("single", NAP, {**ENABLE, "avckpt.interval": "100ms", "avckpt.keep": "1"})
+    sidecar.wait_for(made, state="protected")
+    sidecar.config.write_text("defaults: {restore.on: 'signal,unhealthy'}\n")
+    said = sidecar.avckpt("reload").stdout.splitlines()
+    assert said[1].startswith("single: goes on as before: label avckpt.keep=1: too few for avckpt.restore.on=unhealthy")
+    assert sidecar.row(made)["state"] == "protected"
+    assert kill_and_wait(sidecar, made, 1)
+    # One that starts is not left alone for that: its labels alone hold.
+    again = sidecar.protected("single-2", NAP, {**ENABLE, "avckpt.interval": "100ms", "avckpt.keep": "1"})
+    sidecar.wait_for(again, state="protected")
+    assert f"single-2: {sidecar.config} does not hold for it: label avckpt.keep=1" in sidecar.log
+
+
+def test_a_group_and_who_is_told(sidecar: LocalSidecar, tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    sidecar.config.write_text("defaults: {interval: 100ms}\n")
+    sidecar.start()
+    one, other = (sidecar.protected(name, NAP, ENABLE) for name in ("one", "other"))
+    for each in (one, other):
+        sidecar.wait_for(each, state="protected")
+    sidecar.config.write_text(
+        "defaults: {interval: 100ms, group: cars}\n"
+        f"names:\n  other: {{notify: \"exec:sh -c 'echo $AVCKPT_CONTAINER >>{told}'\"}}\n"
+    )
+    assert "one: group none -> cars" in sidecar.avckpt("reload").stdout
+    kill_and_wait(sidecar, one, 1)
+    wait_until(lambda: told.exists() and told.read_text() == "one\n", 10, "the other one was told")
+    # Without a file everything is as the labels say.
+    sidecar.config.unlink()
+    said = sidecar.avckpt("reload").stdout
+    assert f"{sidecar.config}: not there, the built-in defaults hold" in said
+    assert sidecar.row(one)["group"] == ""
 
 
 def test_a_broken_one_is_refused_and_the_old_one_stays(sidecar: LocalSidecar) -> None:
@@ -57,6 +152,11 @@ def test_a_broken_one_is_refused_and_the_old_one_stays(sidecar: LocalSidecar) ->
     refused = sidecar.avckpt("reload", check=False)
     assert refused.status == 1
     assert refused.stderr.startswith(f"avckpt: {sidecar.config}:3: defaults.kep: unknown key; did you mean keep?")
+    doctor = json.loads(sidecar.avckpt("doctor", "--json", check=False).stdout)
+    found = next(check for check in doctor if check["name"] == "config")
+    assert found["status"] == "warn"
+    assert f"{sidecar.config}:3: defaults.kep" in found["detail"]
+    assert found["remedy"] == "mend it, then run: sudo avckpt reload"
     first = sidecar.protected("first", NAP, ENABLE)
     assert sidecar.wait_for(first, state="protected")["interval_s"] == 0.2
 
@@ -65,12 +165,13 @@ def test_a_broken_one_is_refused_and_the_old_one_stays(sidecar: LocalSidecar) ->
     wait_until(lambda: "the new configuration was refused" in sidecar.log, 5, "the signal is answered in the log")
     sidecar.config.write_text("defaults: {interval: 300ms}\n")
     sidecar.process.send_signal(signal.SIGHUP)
-    wait_until(lambda: "config.yaml was read" in sidecar.log, 5, "the mended file is taken")
-    second = sidecar.protected("second", NAP, ENABLE)
-    assert sidecar.wait_for(second, state="protected")["interval_s"] == 0.3
+    wait_until(lambda: "first: new settings: interval 200ms -> 300ms" in sidecar.log, 5, "the mended file is taken")
+    assert sidecar.row(first)["interval_s"] == 0.3
     answer = json.loads(sidecar.avckpt("reload", "--json").stdout)
-    assert answer["unchanged"] == ["first"]
+    assert answer["containers"] == []
     assert answer["config"]["problem"] == ""
+    doctor = json.loads(sidecar.avckpt("doctor", "--json", check=False).stdout)
+    assert next(check for check in doctor if check["name"] == "config")["status"] == "ok"
 
 
 def test_a_sidecar_that_starts_with_a_broken_one_protects_all_the_same(sidecar: LocalSidecar) -> None:

@@ -325,6 +325,18 @@ def test_wrong_requests_are_json_errors(local: LocalSidecar, method: str, target
     assert json.loads(body)["error"]["kind"] == kind
 
 
+def scrape(local: LocalSidecar) -> dict[str, float]:
+    """Every sample of /metrics."""
+    status, content_type, body = get(local, "/metrics")
+    assert status == 200
+    assert content_type.startswith("text/plain")
+    found = {}
+    for family in text_string_to_metric_families(body.decode()):
+        for sample in family.samples:
+            found[f"{sample.name}{sorted(sample.labels.values())}"] = sample.value
+    return found
+
+
 def test_metrics_of_a_crash(local: LocalSidecar) -> None:
     program = "import time\nx = bytearray(20_000_000)\nwhile 1:\n  x[::4096] = bytes(len(x[::4096])); time.sleep(.05)"
     web = local.protected("web", ["python3", "-c", program])
@@ -332,25 +344,34 @@ def test_metrics_of_a_crash(local: LocalSidecar) -> None:
     crash(local, web)
     local.wait_for(web, generations=2)
 
-    def scrape() -> dict[str, float]:
-        status, content_type, body = get(local, "/metrics")
-        assert status == 200
-        assert content_type.startswith("text/plain")
-        found = {}
-        for family in text_string_to_metric_families(body.decode()):
-            for sample in family.samples:
-                found[f"{sample.name}{sorted(sample.labels.values())}"] = sample.value
-        return found
-
     row = local.row(web)
-    metrics = scrape()
+    metrics = scrape(local)
     assert metrics["avckpt_checkpoints_total['web']"] >= row["checkpoints"] >= 2
     assert metrics["avckpt_freeze_seconds_count['web']"] - metrics["avckpt_checkpoints_total['web']"] in (-1, 0)
     assert metrics["avckpt_restores_total['restored', 'signal', 'web']"] == 1
     assert metrics["avckpt_restore_seconds_sum['web']"] == pytest.approx(row["last_restore_s"])
     assert metrics["avckpt_protected['web']"] == 1
     # The application writes to all of its 20 MB between two generations.
-    wait_until(lambda: scrape()["avckpt_generations_memory_bytes['web']"] > 15e6, 5, "memory of the templates")
+    wait_until(lambda: scrape(local)["avckpt_generations_memory_bytes['web']"] > 15e6, 5, "memory of the templates")
     signal.pidfd_send_signal(web.pidfd, signal.SIGKILL)
     local.wait_for(web, state="ended")
-    assert "avckpt_protected['web']" not in scrape()
+    assert "avckpt_protected['web']" not in scrape(local)
+
+
+def test_memory_that_several_generations_hold_together_counts_once(local: LocalSidecar, tmp_path: Path) -> None:
+    """It is nobody's private memory, and is there all the same."""
+    again = tmp_path / "again"
+    program = (
+        "import os, time\nx = bytearray(30_000_000)\nx[::4096] = b'1' * len(x[::4096])\n"
+        f"print('ready', flush=True)\nwhile not os.path.exists({str(again)!r}): time.sleep(.02)\n"
+        "x[::4096] = b'2' * len(x[::4096])\nprint('written', flush=True)\ntime.sleep(1000)"
+    )
+    web = local.protected("web", ["python3", "-c", program], ON_COMMAND)
+    wait_until(lambda: "ready" in web.output.read_text(), 20, "it has its memory")
+    for number in (1, 2):
+        wait_until(lambda: local.avckpt("checkpoint", "web", check=False).status == 0, 20, "a checkpoint", every_s=0.2)
+        local.wait_for(web, generations=number)
+    again.touch()
+    wait_until(lambda: "written" in web.output.read_text(), 20, "it has written to all of it")
+    assert 29e6 < scrape(local)["avckpt_generations_memory_bytes['web']"] < 36e6
+    assert 29e6 < local.row(web)["memory_bytes"] < 36e6

@@ -34,6 +34,37 @@ def test_a_signal_goes_from_container_to_container(sidecar: Sidecar, container: 
     wait_until(lambda: "USR1" in friend.logs(), 5, "the signal comes")
 
 
+def test_one_that_is_not_protected_itself_hears_too(sidecar: Sidecar, container: ContainerFactory) -> None:
+    group = {f"avckpt.{key}": value for key, value in GROUP.items() if key == "group"}
+    friend = container("python3", "-uc", LISTENER, labels={**group, "avckpt.notify": "signal:USR1"})
+    command = {"avckpt.notify": "exec:sh -c 'echo $AVCKPT_CONTAINER >> /tmp/heard'"}
+    other = container("sleep", "1000", labels={**group, **command})
+    web = container.protected("sleep", "1000", labels=GROUP)
+    wait_until(lambda: "READY" in friend.logs(), 10, "the other one listens")
+    sidecar.wait_generation(web)
+    for each in (friend, other):
+        entry = sidecar.find(each)
+        assert entry is not None
+        assert (entry["state"], entry["generations"]) == ("listening", 0)
+        assert sidecar.avckpt("checkpoint", each.name, check=False).status == 5
+    assert friend.exec("cat", "/proc/1/comm").stdout == "python3\n"
+    crash(sidecar, web)
+    wait_until(lambda: friend.logs().count("USR1") == 1, 10, "the signal comes")
+    sidecar.restart()
+    sidecar.wait_generation(web)
+    crash(sidecar, web)
+    wait_until(lambda: friend.logs().count("USR1") == 2, 10, "the signal comes from a new sidecar, too")
+
+    def heard() -> str:
+        return other.exec("cat", "/tmp/heard", check=False).stdout
+
+    wait_until(lambda: heard() == f"{web.name}\n" * 2, 10, "the command has run")
+    # Its end is its own.
+    os.kill(friend.pid, signal.SIGKILL)
+    assert friend.wait() == 137
+    wait_until(lambda: sidecar.find(friend) is None, 10, "the sidecar has heard of it")
+
+
 @pytest.mark.parametrize(
     ("options", "user"),
     [

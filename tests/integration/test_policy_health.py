@@ -139,3 +139,22 @@ def test_a_paused_container_is_not_unhealthy(sidecar: Sidecar, container: Contai
 def test_one_generation_is_too_few(sidecar: Sidecar, container: ContainerFactory) -> None:
     with pytest.raises(AssertionError, match=r"avckpt.keep=1: too few for avckpt.restore.on=unhealthy"):
         container.protected("sleep", "1", labels={"keep": "1", "restore.on": "unhealthy"})
+
+
+def test_the_check_is_known_whatever_the_labels_say(sidecar: Sidecar, container: ContainerFactory) -> None:
+    """The sidecar's configuration may ask for it, now or later."""
+    made = container.protected("sleep", "60", options=check("exit 3"))
+    path = RUN_DIR / "health" / f"{made.id}.json"
+    wait_until(path.exists, 20, "the health check is known")
+    assert json.loads(path.read_text())["healthcheck"]["Test"] == ["CMD-SHELL", "exit 3"]
+    made.remove()
+    assert not path.exists()
+
+
+def test_one_that_has_ended_leaves_nothing_behind(sidecar: Sidecar, container: ContainerFactory) -> None:
+    made = [container.protected("true") for _ in range(3)]
+    for each in made:
+        each.wait()
+    time.sleep(3)  # for those who still ask
+    left = {path.name for path in (RUN_DIR / "health").glob("*")}
+    assert not left & {f"{each.id}.json" for each in made}

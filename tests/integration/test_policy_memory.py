@@ -24,7 +24,7 @@ def start(sidecar: Sidecar, factory: ContainerFactory, folder: Path, mb: int, li
         folder,
         f"hoard {mb}",
         labels={"interval": "1h"},
-        options=["--memory", f"{limit_mb}m", "--memory-swap", f"{limit_mb}m"],
+        options=["--memory", f"{limit_mb}m", "--memory-swap", f"{limit_mb}m"] if limit_mb else [],
         generation=0,
     )
 

@@ -3,11 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import fcntl
 import json
 import os
 import re
 import signal
 import stat
+import struct
+import subprocess
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -235,6 +241,34 @@ def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSi
     local.wait_for(web, restores=1)
 
 
+def test_crashes_are_restored_while_the_event_loop_hangs(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER)
+    local.wait_for(web, state="protected")
+    assert local.process is not None
+    with stopped_thread(local.process.pid):
+        for _ in range(3):
+            app = wait_until(lambda: web.app_pid, 10, "it is there")
+            os.kill(app, signal.SIGKILL)
+            wait_until(lambda app=app: web.app_pid not in (0, app), 10, "it is there again")  # type: ignore[misc]
+        assert not ended(web)
+    assert local.wait_for(web, restores=3, state="protected")["last_death"] == "killed by SIGKILL"
+
+
+@contextlib.contextmanager
+def stopped_thread(tid: int) -> Iterator[None]:
+    """One thread stands still, the others of its process go on: by ptrace(2)."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    seize, interrupt, detach = 0x4206, 0x4207, 17
+    arguments = (ctypes.c_long(tid), ctypes.c_void_p(), ctypes.c_void_p())
+    assert libc.ptrace(seize, *arguments) == 0, os.strerror(ctypes.get_errno())
+    try:
+        assert libc.ptrace(interrupt, *arguments) == 0
+        os.waitpid(tid, 0)
+        yield
+    finally:
+        assert libc.ptrace(detach, *arguments) == 0
+
+
 def test_a_second_sidecar_refuses_and_the_first_goes_on(local: LocalSidecar) -> None:
     second = local.avckpt("sidecar", check=False)
     assert second.status == 1
@@ -285,3 +319,19 @@ def test_info(local: LocalSidecar) -> None:
     assert info["pid"] == local.process.pid
     assert info["containers"] == 0
     assert info["version"] == run([*avckpt_command(), "--version"]).stdout.split()[1]
+
+
+def test_the_table_on_a_narrow_terminal(local: LocalSidecar) -> None:
+    """Nothing of it is cut off; the states have colours."""
+    local.wait_for(local.protected("web", SLEEPER), state="protected", generations=2)
+    ours, terminal = os.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 60, 0, 0))
+    environment = {**os.environ, **local.env, "TERM": "xterm"}
+    subprocess.run([*avckpt_command(), "ps"], stdout=terminal, stdin=terminal, env=environment, check=True, timeout=60)
+    os.close(terminal)
+    said = os.read(ours, 65536).decode()
+    os.close(ours)
+    assert "\x1b[32mprotected\x1b[0m" in said
+    head, line = (re.sub(r"\x1b\[[0-9;]*m", "", each).split() for each in said.splitlines()[:2])
+    assert head == ["NAME", "STATE", "GENS", "MEMORY", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE"]
+    assert line[:3] == ["web", "protected", "2/2"]

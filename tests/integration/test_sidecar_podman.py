@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
 from typing import TYPE_CHECKING
 
+from harness import CONFIG_DIR, SIDECAR_NAME, wait_until
+
 if TYPE_CHECKING:
-    from harness import Container, ContainerFactory, Podman, Sidecar
+    from harness import Completed, Container, ContainerFactory, Podman, Sidecar
 
 COUNTER = "import time\nfor i in range(10**9):\n    print('n', i, flush=True)\n    time.sleep(0.02)"
 COUNT = ("python3", "-c", COUNTER)
@@ -79,3 +82,30 @@ def test_a_killed_sidecar_is_replaced_by_one_that_adopts(container: ContainerFac
     os.kill(app, signal.SIGKILL)
     sidecar.wait_restores(web)
     assert numbers(web).count(0) == 1
+
+
+def test_the_command_line_in_its_container(container: ContainerFactory, sidecar: Sidecar, podman: Podman) -> None:
+    def inside(*args: str, check: bool = True) -> Completed:
+        return podman.run("exec", SIDECAR_NAME, "avckpt", *args, check=check)
+
+    web = container.protected(*COUNT, labels={"interval": "1h"})
+    wait_until(lambda: inside("checkpoint", web.name, check=False).status == 0, 20, "a checkpoint", every_s=0.2)
+    [row] = [entry for entry in json.loads(inside("ps", "--json").stdout) if entry["id"] == web.id]
+    here = sidecar.find(web)
+    assert here is not None
+    assert {key: row[key] for key in ("name", "state", "generation", "app_pid")} == {
+        key: here[key] for key in ("name", "state", "generation", "app_pid")
+    }
+    assert web.name in inside("ps").stdout
+    assert f"{web.name}: back at generation 1" in inside("restore", web.id[:12]).stdout
+    assert sidecar.wait_restores(web)["state"] == "protected"
+    events = [json.loads(line) for line in inside("events", "--json", "--since", "1h").stdout.splitlines()]
+    assert "restored" in {event["kind"] for event in events if event["id"] == web.id}
+    assert f"{CONFIG_DIR}/config.yaml" in inside("reload").stdout
+    assert inside("check", "--config").stdout == "no problems\n"
+    assert "_AVCKPT_COMPLETE" in inside("completion", "bash").stdout
+    doctor = inside("doctor")
+    assert "run avckpt doctor on the host too" in doctor.stdout
+    assert "sidecar: answers" in doctor.stdout
+    statuses = [inside(*words, check=False).status for words in (("restore", "nobody"), ("restore",), ("ps", "--jsn"))]
+    assert statuses == [4, 2, 2]

@@ -123,11 +123,21 @@ def test_crash_on_a_terminal_is_not_final(init: Phoenix, terminal: Terminal) -> 
         assert init.popen.poll() is None
 
 
-def test_stop_key_and_continue(init: Phoenix, terminal: Terminal) -> None:
+def test_stop_key_does_not_stop_what_nobody_could_continue(init: Phoenix, terminal: Terminal) -> None:
     pid = place(init)[0]
-    terminal.type(b"\x1a")
+    for _ in range(3):
+        terminal.type(b"\x1a")
+        terminal.read_until(b"^Z")  # echoed when the signal has been sent
+        assert place(init)[0] == pid
+
+
+def test_stopped_by_a_signal_it_stays_so(init: Phoenix, terminal: Terminal) -> None:
+    """Somebody wants it to stand still."""
+    pid = place(init)[0]
+    os.kill(pid, signal.SIGSTOP)
     eventually("the stop", lambda: state_of(pid) == "T")
     eventually("init to go on", lambda: state_of(init.pid) == "S")
+    assert state_of(pid) == "T"
     init.kill(signal.SIGCONT)
     assert place(init)[0] == pid
 

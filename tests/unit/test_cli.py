@@ -117,7 +117,7 @@ def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     monkeypatch.setattr(Client, "containers", lambda self, ended: rows)
     lines = avckpt("ps").stdout.splitlines()
-    assert lines[0].split()[:3] == ["NAME", "STATE", "GENERATIONS"]
+    assert lines[0].split()[:3] == ["NAME", "STATE", "GENS"]
     assert lines[1].split()[:3] == ["web", "protected", "2/2"]
     assert "2.51 ms" in lines[1]
     assert "6.30 ms" in lines[1]

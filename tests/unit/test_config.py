@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 from avckpt.config import Configuration, Defaults, examine, read
-from avckpt.errors import ConfigError
-from avckpt.policy import config_of_labels
+from avckpt.errors import ConfigError, LabelsWrong
+from avckpt.policy import changes, config_of_labels, settings_of
 from avckpt_hooks.labels import LABELS
 
+ENABLED = {"avckpt.enable": "true"}
 GOOD = """\
 defaults:
   interval: 500ms
@@ -76,6 +77,11 @@ def test_no_file_is_no_mistake(path: Path) -> None:
         ("- interval\n", "1: the file: not a mapping"),
         ("defaults:\n  interval: [3s\nnames:\n", "3: not YAML: while parsing a flow sequence"),
         ("defaults: &a\n  keep: [*a]\n", "1: nested too deeply"),
+        ("defaults:\n  restore.on: unhealthy\n  keep: 1\n", "3: keep: 1: too few for avckpt.restore.on=unhealthy"),
+        (
+            "defaults:\n  restore.on: unhealthy\nnames:\n  a: {interval: 1s}\n  b:\n    keep: 1\n",
+            "6: keep: 1: too few for avckpt.restore.on=unhealthy",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(path: Path, text: str, problem: str) -> None:
@@ -105,6 +111,24 @@ def test_every_label_but_enable_may_have_a_default(path: Path, label: str) -> No
     assert len(found) == 1
     assert ("can not be a default" in found[0]) == (key == "enable")
     assert "unknown key" not in found[0]
+
+
+def test_a_receiver_by_default_takes_a_group(path: Path) -> None:
+    path.write_text("defaults: {notify: 'signal:USR1'}\n")
+    defaults = read(path)
+    assert settings_of(defaults.under(ENABLED, "a")).policy.notify is None
+    grouped = settings_of(defaults.under({**ENABLED, "avckpt.group": "g"}, "a"))
+    assert grouped.policy.notify is not None
+    # In a label it is a mistake, and said.
+    with pytest.raises(LabelsWrong, match="without a group"):
+        settings_of(defaults.under({**ENABLED, "avckpt.notify": "signal:USR1"}, "a"))
+
+
+def test_what_changes_is_what_means_something_else() -> None:
+    before = settings_of({**ENABLED, "avckpt.interval": "3s", "avckpt.keep": "2", "avckpt.group": "a"})
+    after = settings_of({**ENABLED, "avckpt.interval": "3000ms", "avckpt.files": " keep "})
+    assert [str(change) for change in changes(before, after)] == ["files rewind -> keep", "group a -> none"]
+    assert changes(before, before) == []
 
 
 def test_a_broken_file_leaves_everything_as_it_was(path: Path) -> None:

@@ -207,7 +207,7 @@ def test_nonsense_on_standard_input_comes_out_again(hook: Hook) -> None:
 def test_podman_is_asked_for_the_container_of_the_configuration(hook: Hook) -> None:
     config, spec = sample("pod")
     wanted = podman.container_id(config)
-    assert hook(config, spec).asked.split() == ["generate", "spec", "-c", "-n=false", wanted]
+    assert hook(config, spec).asked.splitlines()[0].split() == ["generate", "spec", "-c", "-n=false", wanted]
 
 
 @pytest.mark.parametrize("name", ["plain", *PROTECTED])
@@ -270,3 +270,21 @@ def test_the_flags_that_say_where_containers_are(line: str, flags: list[str]) ->
 
 def test_flags_behind_the_subcommand_are_found_when_looked_for() -> None:
     assert podman.store_flags(["podman", "run", "--root", "/c", "-d", "x"], anywhere=True) == ["--root=/c"]
+
+
+def test_one_that_only_listens_is_made_known_and_not_touched(hook: Hook) -> None:
+    config, spec = sample("plain")
+    before = json.loads(config)
+    result = hook(config, with_labels(spec, group="g", notify="signal:USR1"))
+    assert (result.status, result.said) == (0, "")
+    after = result.config
+    annotations, hooks = after.pop("annotations"), after.pop("hooks")
+    assert (
+        annotations.items() >= {"avckpt.group": "g", "avckpt.notify": "signal:USR1", "avckpt.version": "0.1.0"}.items()
+    )
+    assert {"prestart", "poststop"} <= hooks.keys()
+    for each in ("annotations", "hooks"):
+        before.pop(each, None)
+    assert after == before
+    # Without a group there is nobody to hear of, and nothing to do.
+    assert hook(config, with_labels(spec, notify="signal:USR1")).out == config

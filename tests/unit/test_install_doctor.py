@@ -10,7 +10,7 @@ from pathlib import Path
 import avckpt
 import pytest
 from avckpt import doctor
-from avckpt.doctor import Facts, PodmanFacts, Status
+from avckpt.doctor import ConfigFacts, Facts, PodmanFacts, Status
 
 GOOD = Facts(
     kernel="6.1.0-18-amd64",
@@ -30,6 +30,7 @@ GOOD = Facts(
     sidecar_version=avckpt.__version__,
     sidecar_problem="",
     engine_problem="",
+    config=ConfigFacts("/etc/avckpt/config.yaml", True, ""),
 )
 REMOTE = PodmanFacts("4.3.1", "crun", False, "", remote=True)
 
@@ -68,6 +69,9 @@ def test_a_good_machine() -> None:
         ({"installed_version": "0.0.1"}, "hooks", "warn", "version 0.0.1", "avckpt install"),
         ({"init_problem": "/i is not static"}, "init", "fail", "/i is not static", "avckpt install"),
         ({"hooks_dir_problems": ("it is hidden: write this",)}, "hooks_dir", "fail", "it is hidden", "write this"),
+        ({"config": ConfigFacts("/c", True, "/c:3: x")}, "config", "warn", "refused: /c:3: x", "avckpt reload"),
+        ({"config": ConfigFacts("/c", True, "", True)}, "config", "warn", "/c has changed", "avckpt reload"),
+        ({"config": ConfigFacts("/c", False, "")}, "config", "ok", "no /c: the built-in defaults hold", ""),
         ({"sidecar_version": None, "sidecar_problem": "is away: start it"}, "sidecar", "fail", "is away", "start it"),
         ({"sidecar_version": "0.0.1"}, "sidecar", "warn", "version 0.0.1", "build its image again"),
     ],

@@ -155,6 +155,8 @@ def test_a_container_that_would_hear_of_nobody_is_told() -> None:
     with pytest.raises(LabelError, match=r"without a group there is nobody to hear of; add avckpt\.group=NAME"):
         parse_policy({**ON, **label})
     assert parse_policy(label).notify is not None
+    assert not parse_policy(label).listens
+    assert parse_policy({**label, "avckpt.group": "g"}).listens
     assert parse_policy({**ON, "avckpt.notify.self": "signal:USR1"}).notify_self is not None
 
 

@@ -249,3 +249,23 @@ def test_every_label_is_known(path: Path, label: str) -> None:
     manifest = checked(path, f"services:\n  a:\n    labels:\n      {label}: '?!'\n")
     assert all("unknown label" not in line for line in lines(manifest))
     assert len(manifest.errors) == 1
+
+
+def test_one_that_hears_of_its_group_is_no_mistake(path: Path) -> None:
+    receiver = "    labels: [avckpt.group=g, 'avckpt.notify=signal:USR1']\n"
+    both = checked(path, f"services:\n  a:\n{receiver}  b:\n{receiver.replace('[', '[avckpt.enable=true, ')}")
+    assert lines(both) == []
+    assert [service.enabled for service in both.services.values()] == [False, True]
+    alone = checked(path, "services:\n  a:\n    labels:\n    - avckpt.enable=true\n    - avckpt.notify=signal:USR1\n")
+    assert lines(alone) == [
+        "v.yaml:5: service a: label avckpt.notify=signal:USR1: without a group there is nobody to hear of; "
+        "add avckpt.group=NAME, or use avckpt.notify.self for its own recoveries"
+    ]
+
+
+def test_values_that_do_not_go_together(path: Path) -> None:
+    labels = "      avckpt.enable: true\n      avckpt.restore.on: unhealthy\n      avckpt.keep: 1\n"
+    text = f"services:\n  a:\n    labels:\n{labels}"
+    assert lines(checked(path, text))[0].startswith(
+        "v.yaml:6: service a: label avckpt.keep=1: too few for avckpt.restore.on=unhealthy"
+    )

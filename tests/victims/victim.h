@@ -120,7 +120,7 @@ static inline void must(bool worked, const char *what)
 	_exit(1);
 }
 
-static inline _Noreturn void unavailable(const char *what)
+__attribute__((noreturn)) static inline void unavailable(const char *what)
 {
 	fprintf(stderr, "victim: %s: %s; not available here\n", what, strerror(errno));
 	_exit(UNAVAILABLE_STATUS);
@@ -132,7 +132,7 @@ static inline void board_open(const char *path)
 
 	must(fd >= 0, path);
 	must(ftruncate(fd, BOARD_BYTES) == 0, "ftruncate");
-	board = mmap(NULL, BOARD_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	board = (struct board *)mmap(NULL, BOARD_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
 	must(board != MAP_FAILED, "mmap");
 	close(fd);
 }

@@ -140,9 +140,11 @@ enum avc_command {
 	AVC_COMMAND_VOUCH = 5,       /* the app is healthy: what was held already at
 	                             * the last such command is good to go back to.
 	                             * Wants `keep` of 3 or more; no answer       */
-	AVC_COMMAND_UNHEALTHY = 6    /* the app hangs: as a crash, but of what is
+	AVC_COMMAND_UNHEALTHY = 6,   /* the app hangs: as a crash, but of what is
 	                             * held only what was vouched for is used (the
 	                             * oldest, if nothing was); as RESTORE        */
+	AVC_COMMAND_UNVOUCH = 7      /* nobody says any more whether the app is
+	                             * healthy; no answer                         */
 };
 
 struct avc_engine;
@@ -182,6 +184,14 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
  * Errors: AVC_GONE when the guard has ended. */
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
 		      struct avc_error *err);
+
+/* New settings for a guard that runs (their init_pidfd is not looked at).  They hold
+ * from the next checkpoint and the next death on.  Held generations stay, up to the
+ * new `keep`; when that is more than the guard was ever told, they give way to new ones
+ * at the next checkpoint.  Returns before they are in force.
+ * Errors: AVC_CONFIG, and nothing changes; AVC_GONE when the guard has ended. */
+int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config,
+			struct avc_error *err);
 
 /* Lets the app go (it runs on, unprotected), gives up every generation, joins
  * the thread and frees the guard.  Blocks for as long as a checkpoint or

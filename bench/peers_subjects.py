@@ -1,0 +1,552 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who is compared: each starts bench/server.c, takes checkpoints of it, kills it and has it back.
+
+Every subject gets what is best for it: CRIU's images are in memory, and it is called
+in the moment that the process is dead, as a supervisor that loses no time would.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+from avckpt.artifacts import init_binary  # noqa: E402
+from avckpt.client import Client as Api  # noqa: E402
+from avckpt.events import Command  # noqa: E402
+from harness import (  # noqa: E402 - tests, whose folder is no package
+    RUN_DIR,
+    CommandFailed,
+    Completed,
+    Container,
+    ContainerFactory,
+    Podman,
+    Sidecar,
+    free_port,
+)
+from native.board import Board  # noqa: E402
+
+from bench.idle import memory_kb  # noqa: E402
+from bench.peers_world import BOARDS_INSIDE, IMAGE, PROGRAMS_INSIDE, World  # noqa: E402
+from bench.subjects import BenchFailed, Guarded, Idle, children, eventually  # noqa: E402
+from bench.workload import PROGRAMS, Client, find_server  # noqa: E402
+
+BEAT_US = 100
+PORT_INSIDE = 5555
+"""In the peers' world, whose network nobody else uses."""
+PATIENCE_S = 30.0
+"""With restores that are refused."""
+NO_CHECKPOINTS = "24h"
+"""An interval that does not come up: checkpoints are taken by command."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """One checkpoint."""
+
+    took_ms: float
+    """The whole command or call."""
+    tool_freeze_ms: float | None
+    """How long everything stood still, by the tool's own account."""
+    memory_mb: float
+    """What it holds right after it was taken."""
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """One recovery."""
+
+    tool_restore_ms: float | None
+    """By the tool's own account, from the death it saw (avckpt) or from its own start."""
+
+
+def wait_gone(pidfd: int) -> None:
+    """Waits until the process is dead and reaped or a zombie.  Raises BenchFailed."""
+    ready, _, _ = select.select([pidfd], [], [], 60.0)
+    if not ready:
+        raise BenchFailed("a killed process does not end within 60 s")
+
+
+class Subject(ABC):
+    """A context manager around one running server."""
+
+    name: str
+    cycles: int = 10
+
+    def __init__(self, mb: int, threads: int, folder: Path) -> None:
+        self.folder = folder
+        self.board = Board(folder / f"server-{uuid.uuid4().hex[:12]}")
+        self.arguments = [str(mb), str(threads)]
+        self.options = ["--beat-us", str(BEAT_US)]
+        self.port = 0
+        self.container_options: list[str] = []
+        self.refused: list[str] = []
+        """Restores that did not work at the first try, in the tool's own words."""
+        self._undo = contextlib.ExitStack()
+
+    def __enter__(self) -> Subject:
+        try:
+            self._undo.callback(self._forget_board)
+            self.start()
+            eventually(lambda: self.board.see().ready == 1, f"{self.name}: the server has touched its memory")
+        except BaseException:
+            self._undo.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._undo.close()
+
+    def _forget_board(self) -> None:
+        self.board.page.close()
+        self.board.path.unlink(missing_ok=True)
+
+    def command(self, programs: Path, boards: Path) -> list[str]:
+        """The server, by the paths that it has where it runs."""
+        port = str(self.port or PORT_INSIDE)
+        return [
+            f"{programs}/server",
+            *self.arguments,
+            port,
+            *self.options,
+            "--board",
+            f"{boards}/{self.board.path.name}",
+        ]
+
+    def client(self) -> Client:
+        """One that can reach it."""
+        return Client(self.folder, self.port)
+
+    def app_pid(self) -> int:
+        """The server's process, in our PID namespace."""
+        return find_server(self.board.path)
+
+    def kill(self) -> None:
+        """SIGKILL; returns when the process is dead."""
+        pidfd = os.pidfd_open(self.app_pid())
+        try:
+            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+            wait_gone(pidfd)
+        finally:
+            os.close(pidfd)
+
+    @abstractmethod
+    def start(self) -> None:
+        """Starts the server; undone by callbacks on `_undo`."""
+
+    @abstractmethod
+    def checkpoint(self) -> Taken | None:
+        """None: this subject takes none."""
+
+    @abstractmethod
+    def crash(self) -> Recovered:
+        """Kills the server and sees to it that it comes back."""
+
+    def run_of_container(self) -> tuple[str, int] | None:
+        """The container's id and its conmon, which lives as long as Podman sees it running; None: no container."""
+        return None
+
+
+class Below(Idle):
+    """The server below avckpt-init in a PID namespace of its own, to be used with Guarded."""
+
+    def __init__(self, board: Board, command: Sequence[str]) -> None:
+        self.board = board
+        unshare = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child=KILL", str(init_binary())]
+        self._process = subprocess.Popen(
+            [*unshare, "--wait-ms", "2000", "--", *command], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
+        self.init_pid = 0
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        if self.init_pid:
+            eventually(lambda: not Path(f"/proc/{self.init_pid}").exists(), "the server's namespace has ended")
+
+
+def templates_mb(init_pid: int) -> float:
+    """What the templates below avckpt-init hold: pages that they alone have, and page tables."""
+    held = 0
+    for child in children(init_pid):
+        with contextlib.suppress(OSError):
+            if Path(f"/proc/{child}/comm").read_text().strip() == "avckpt-tmpl":
+                memory = memory_kb(child)
+                held += memory["private"] + memory["page_tables"]
+    return held / 1024
+
+
+class AvckptEngine(Subject):
+    """avckpt without Podman: the engine in this process."""
+
+    name = "avckpt engine"
+    cycles = 20
+
+    def start(self) -> None:
+        self.port = free_port()
+        self._below = self._undo.enter_context(Below(self.board, self.command(PROGRAMS, self.folder)))
+        self._guarded = self._undo.enter_context(Guarded(self._below))
+
+    def checkpoint(self) -> Taken:
+        started = time.monotonic()
+        event = self._guarded.checkpoint()
+        took_ms = (time.monotonic() - started) * 1e3
+        return Taken(took_ms, event.freeze_s * 1e3, templates_mb(self._below.init_pid) / max(1, event.generations))
+
+    def crash(self) -> Recovered:
+        return Recovered(self._guarded.kill(self.app_pid()).restore_ms)
+
+
+class InContainer(Subject):
+    """What containers of the host's Podman have in common.  The host's network: 127.0.0.1."""
+
+    def __init__(self, mb: int, threads: int, folder: Path, podman: Podman) -> None:
+        super().__init__(mb, threads, folder)
+        self._podman = podman
+        self._factory = ContainerFactory(podman, f"avckpt-bench-{os.getpid()}")
+        self._undo.callback(self._factory.close)
+        self.container: Container | None = None
+
+    def _options(self) -> list[str]:
+        return [
+            *self.container_options,
+            "--network=host",
+            "-v",
+            f"{PROGRAMS}:{PROGRAMS_INSIDE}:ro",
+            "-v",
+            f"{self.folder}:{BOARDS_INSIDE}",
+        ]
+
+    def run_of_container(self) -> tuple[str, int]:
+        assert self.container is not None
+        found = self.container.inspect()
+        return found["Id"], found["State"]["ConmonPid"]
+
+
+class AvckptPodman(InContainer):
+    """avckpt as it is used: a labelled container and the sidecar."""
+
+    name = "avckpt"
+    cycles = 20
+
+    def __init__(self, mb: int, threads: int, folder: Path, sidecar: Sidecar) -> None:
+        super().__init__(mb, threads, folder, sidecar.podman)
+        self._sidecar = sidecar
+        self._api = Api(RUN_DIR)
+
+    def start(self) -> None:
+        self.port = free_port()
+        self.container = self._factory.protected(
+            *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE),
+            options=self._options(),
+            labels={"interval": NO_CHECKPOINTS, "restore.max": "64/1s"},
+        )
+        # The first one also comes after an interval, so by command.
+        self._sidecar.wait_for(self.container, lambda entry: entry["app_pid"] > 0, "its application", 60.0)
+        self._api.command(self.container.name, Command.CHECKPOINT)
+
+    def checkpoint(self) -> Taken:
+        assert self.container is not None
+        started = time.monotonic()
+        event = self._api.command(self.container.name, Command.CHECKPOINT)["event"]
+        took_ms = (time.monotonic() - started) * 1e3
+        entry = self._sidecar.find(self.container) or {}
+        held = templates_mb(self.container.pid) / max(1, entry.get("generations", 1))
+        return Taken(took_ms, event["freeze_s"] * 1e3, held)
+
+    def crash(self) -> Recovered:
+        assert self.container is not None
+        before = (self._sidecar.find(self.container) or {})["restores"]
+        self.kill()
+        entry = self._sidecar.wait_restores(self.container, before + 1)
+        restore_s = entry.get("last_restore_s")
+        return Recovered(None if restore_s is None else restore_s * 1e3)
+
+
+class ColdStart(InContainer):
+    """No checkpoint: Podman starts the container again, by its restart policy."""
+
+    name = "restart policy"
+    cycles = 6
+    policy = "always"
+
+    def start(self) -> None:
+        self.port = free_port()
+        self.container = self._factory(
+            *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE), options=[*self._options(), f"--restart={self.policy}"]
+        )
+
+    def checkpoint(self) -> None:
+        return None
+
+    def crash(self) -> Recovered:
+        self.kill()
+        return Recovered(None)
+
+
+class ColdCommand(ColdStart):
+    """The same by `podman start`, called in the moment of death."""
+
+    name = "podman start"
+    policy = "no"
+
+    def crash(self) -> Recovered:
+        assert self.container is not None
+        self.kill()
+        started = time.monotonic()
+        # Until conmon has told it, Podman takes the container for running, and does nothing.
+        while True:
+            done = self._podman.run("start", self.container.name, check=False)
+            with contextlib.suppress(LookupError):
+                self.app_pid()
+                break
+            if time.monotonic() - started > 60:
+                raise BenchFailed(f"podman start does not start it: {done}")
+        return Recovered(done.took_s * 1e3)
+
+
+def stats(data: bytes) -> dict[int, dict[int, int]]:
+    """CRIU's stats-dump or stats-restore: {1: dump, 2: restore}, each {number of the field: value}.
+
+    Two magic numbers, a length, and a protobuf message of messages of integers (CRIU's images/stats.proto).
+    """
+
+    def varint(at: int) -> tuple[int, int]:
+        value = shift = 0
+        while True:
+            byte = data[at]
+            at += 1
+            value |= (byte & 0x7F) << shift
+            shift += 7
+            if not byte & 0x80:
+                return value, at
+
+    found: dict[int, dict[int, int]] = {}
+    at = 12
+    while at < len(data):
+        key, at = varint(at)
+        length, at = varint(at)
+        end = at + length
+        fields = found.setdefault(key >> 3, {})
+        while at < end:
+            field, at = varint(at)
+            fields[field >> 3], at = varint(at)
+    return found
+
+
+class CriuFailed(BenchFailed):
+    """CRIU could not do it; the message has its own words."""
+
+
+def _criu_failed(what: str, done: Completed, log: str) -> CriuFailed:
+    errors = [line.strip() for line in log.splitlines() if "Error (" in line]
+    # Without the time in front, and without the one that is there in every run as soon as
+    # CAP_SYS_RESOURCE is missing, and harms nothing.
+    said = [line.split(") ", 1)[-1] for line in errors if "RLIMIT_NOFILE" not in line]
+    return CriuFailed(f"{what} ended with {done.status}: {' | '.join(said) or done.stderr.strip()[-600:]}")
+
+
+class InWorld(Subject):
+    """What CRIU's two ways have in common: they run in the peers' world."""
+
+    cycles = 6
+
+    def __init__(self, mb: int, threads: int, folder: Path, world: World) -> None:
+        super().__init__(mb, threads, folder)
+        self._world = world
+
+    def client(self) -> Client:
+        return Client(
+            self.folder,
+            PORT_INSIDE,
+            enter=self._world.enter,
+            program=PROGRAMS_INSIDE / "client",
+            inside=BOARDS_INSIDE,
+        )
+
+    @abstractmethod
+    def stop_and_restore(self) -> None:
+        """What CRIU is made for: the process is dumped and ended, and comes back from the images."""
+
+    def _kill_left(self) -> None:
+        with contextlib.suppress(LookupError):
+            self.kill()
+
+
+class CriuBare(InWorld):
+    """CRIU's own command line on a process without a container."""
+
+    name = "CRIU"
+    _images = "/tmp/images"
+
+    def start(self) -> None:
+        self._undo.callback(self._kill_left)
+        self._world.start(*self.command(PROGRAMS_INSIDE, BOARDS_INSIDE))
+
+    def _dump(self, *more: str) -> float:
+        inner = Path(f"/proc/{self.app_pid()}/status").read_text().split("NSpid:")[1].split("\n")[0].split()[-1]
+        self._world.run("rm", "-rf", self._images)
+        self._world.run("mkdir", self._images)
+        # -v1: the log costs time.
+        done = self._world.run(
+            *("criu", "dump", "-t", inner, "-D", self._images, "--tcp-established", "-o", "dump.log", "-v1", *more),
+            check=False,
+        )
+        if done.status != 0:
+            raise _criu_failed(
+                "criu dump", done, self._world.run("cat", f"{self._images}/dump.log", check=False).stdout
+            )
+        return done.took_s * 1e3
+
+    def checkpoint(self) -> Taken:
+        took_ms = self._dump("--leave-running")
+        dump = stats(self._world_bytes("stats-dump"))[1]
+        size = self._world.run("du", "-sk", self._images).stdout.split()[0]
+        # Fields 1 and 2: time to stop everything, and time it stood still then, us.
+        return Taken(took_ms, (dump[1] + dump[2]) / 1e3, int(size) / 1024)
+
+    def _restore(self) -> float:
+        # Without a pipe to us: the restored process would hold it.
+        done = self._world.run(
+            *("criu", "restore", "-d", "-D", self._images, "--tcp-established", "-o", "restore.log", "-v1"), check=False
+        )
+        if done.status != 0:
+            log = self._world.run("cat", f"{self._images}/restore.log", check=False).stdout
+            raise _criu_failed("criu restore", done, log)
+        return done.took_s * 1e3
+
+    def crash(self) -> Recovered:
+        self.kill()
+        return Recovered(self._restore_patiently())
+
+    def stop_and_restore(self) -> None:
+        self._dump()
+        self._restore_patiently()
+
+    def _restore_patiently(self) -> float:
+        """As a supervisor would: what the dead process' connections left in the kernel can be in the way."""
+        until = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return self._restore()
+            except CriuFailed as error:
+                if time.monotonic() > until:
+                    raise
+                self.refused.append(str(error))
+
+    def _world_bytes(self, name: str) -> bytes:
+        done = subprocess.run(
+            [*self._world.enter, "cat", f"{self._images}/{name}"], capture_output=True, check=True, timeout=30
+        )
+        return done.stdout
+
+
+class CriuPodman(InWorld):
+    """CRIU through Podman: `podman container checkpoint` and `restore`."""
+
+    runtime = "crun"
+    name = "CRIU, Podman, crun"
+
+    def start(self) -> None:
+        self._world.import_image()
+        self._name = f"server-{uuid.uuid4().hex[:8]}"
+        self._undo.callback(self._podman, "rm", "--force", "--ignore", "--time", "0", self._name)
+        mounts = ["-v", f"{PROGRAMS_INSIDE}:{PROGRAMS_INSIDE}:ro", "-v", f"{BOARDS_INSIDE}:{BOARDS_INSIDE}"]
+        self._podman(
+            *("run", "--detach", "--pull=never", "--name", self._name, "--network=host"),
+            *(*self.container_options, *mounts),
+            *(IMAGE, *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE)),
+        )
+        self._static_dir = self._podman("inspect", "--format", "{{.StaticDir}}", self._name).stdout.strip()
+
+    def _podman(self, *args: str, check: bool = True) -> Completed:
+        return self._world.run("podman", "--runtime", self.runtime, *args, check=check)
+
+    def _checkpoint(self, *more: str) -> tuple[float, dict[str, int]]:
+        done = self._podman(
+            *("container", "checkpoint", "--keep", "--tcp-established", "--print-stats", *more, self._name), check=False
+        )
+        if done.status != 0:
+            log = self._world.run("cat", f"{self._static_dir}/dump.log", check=False).stdout
+            raise _criu_failed("podman container checkpoint", done, log)
+        try:
+            told: dict[str, int] = json.loads(done.stdout)["container_statistics"][0]["criu_statistics"]
+        except (ValueError, KeyError, IndexError, TypeError):
+            told = {}
+        return done.took_s * 1e3, told
+
+    def checkpoint(self) -> Taken:
+        took_ms, told = self._checkpoint("--leave-running")
+        size = self._world.run("du", "-sk", f"{self._static_dir}/checkpoint").stdout.split()[0]
+        freeze = (told["freezing_time"] + told["frozen_time"]) / 1e3 if told else None
+        return Taken(took_ms, freeze, int(size) / 1024)
+
+    def _restore(self) -> float:
+        until = time.monotonic() + PATIENCE_S
+        # Podman hears of the death from conmon; until then it does not restore ("is running or paused").
+        while True:
+            done = self._podman("container", "restore", "--keep", "--tcp-established", self._name, check=False)
+            if done.status == 0:
+                return done.took_s * 1e3
+            if "is running or paused" in done.stderr and time.monotonic() < until:
+                continue
+            log = self._world.run("cat", f"{self._static_dir}/restore.log", check=False).stdout
+            error = _criu_failed("podman container restore", done, log)
+            if time.monotonic() > until:
+                raise error
+            self.refused.append(str(error))
+
+    def crash(self) -> Recovered:
+        self.kill()
+        return Recovered(self._restore())
+
+    def stop_and_restore(self) -> None:
+        self._checkpoint()
+        self._restore()
+
+    def run_of_container(self) -> tuple[str, int]:
+        found = json.loads(self._podman("inspect", "--type", "container", self._name).stdout)[0]
+        return found["Id"], found["State"]["ConmonPid"]
+
+
+class CriuPodmanRunc(CriuPodman):
+    """The same with runc."""
+
+    runtime = "runc"
+    name = "CRIU, Podman, runc"
+
+
+__all__ = [
+    "AvckptEngine",
+    "AvckptPodman",
+    "Below",
+    "ColdCommand",
+    "ColdStart",
+    "CommandFailed",
+    "CriuBare",
+    "CriuFailed",
+    "CriuPodman",
+    "CriuPodmanRunc",
+    "InWorld",
+    "Recovered",
+    "Subject",
+    "Taken",
+]

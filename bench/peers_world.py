@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The peers' world: a Debian 13 with Podman 5 and CRIU 4, in memory and in namespaces of its own.
+
+Nothing of it touches the host's Podman, network or files, and it is gone with its
+first process.  scripts/setup-peers.sh has made the tarball.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import TracebackType
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+from harness import Completed, run  # noqa: E402 - tests, whose folder is no package
+
+from bench.subjects import BenchFailed, children, eventually  # noqa: E402
+from bench.workload import PROGRAMS  # noqa: E402
+
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avckpt"
+# Where the script puts them.
+PROGRAMS_INSIDE = Path("/programs")
+BOARDS_INSIDE = Path("/boards")
+IMAGE = "localhost/base"
+COMMAND_TIMEOUT_S = 120.0
+
+
+def _newest(pattern: str, setup: str) -> Path:
+    found = sorted(CACHE.glob(pattern), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise BenchFailed(f"no {CACHE / pattern}: run {setup}")
+    return found[-1]
+
+
+class World:
+    """A context manager; leaving it ends everything in it.  Raises BenchFailed, CommandFailed."""
+
+    def __init__(self, boards: Path) -> None:
+        self._boards = boards
+        self._mountpoint = Path(tempfile.mkdtemp(prefix="avckpt-peers-"))
+        self._base = _newest("base-*.tar", "make setup")
+        tarball = _newest("peers-*.tar", "scripts/setup-peers.sh")
+        command = ["unshare", "--mount", "--pid", "--net", "--ipc", "--uts", "--propagation", "private"]
+        command += ["--fork", "--kill-child", "sh", str(ROOT / "bench" / "peers_world.sh")]
+        command += [str(path) for path in (tarball, self._mountpoint, PROGRAMS, boards, CACHE)]
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+        self._has_image = False
+        self.enter: list[str] = []
+        """The command in front of a program that shall run in it."""
+
+    def __enter__(self) -> World:
+        try:
+            assert self._process.stdout is not None
+            if self._process.stdout.readline() != "up\n":
+                raise BenchFailed("the peers' world does not start; what it said is above")
+            eventually(lambda: len(children(self._process.pid)) == 1, "the peers' world has a first process")
+            (first,) = children(self._process.pid)
+            self.enter = ["nsenter", "--target", str(first), "--mount", "--pid", "--net", "--ipc", "--uts"]
+            self.enter += ["--root", "--wd", "--", "env", "PODMAN_IGNORE_CGROUPSV1_WARNING=1", "HOME=/root"]
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._has_image:
+            # So that no cgroups are left on the host.
+            self.run("podman", "rm", "--all", "--force", "--time", "0", check=False)
+        self._process.kill()
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        # Its mounts were in its own namespace.
+        self._mountpoint.rmdir()
+
+    def run(self, *args: str, check: bool = True) -> Completed:
+        """A command inside, to its end.  Raises CommandFailed."""
+        return run([*self.enter, *args], timeout_s=COMMAND_TIMEOUT_S, check=check)
+
+    def start(self, *args: str) -> None:
+        """A command inside that goes on by itself, in a session of its own."""
+        self.run("setsid", "--fork", "sh", "-c", 'exec "$@" </dev/null >/dev/null 2>&1', "sh", *args)
+
+    def import_image(self) -> None:
+        """The same base image that the host's containers start from."""
+        if not self._has_image:
+            self._has_image = True
+            self.run("podman", "import", "--quiet", f"/cache/{self._base.name}", IMAGE)
+
+    def versions(self) -> dict[str, str]:
+        """Of what is compared with."""
+        found = {}
+        for name, args in {
+            "criu": ("criu", "--version"),
+            "podman": ("podman", "--version"),
+            "crun": ("crun", "--version"),
+            "runc": ("runc", "--version"),
+        }.items():
+            match = re.search(r"\d+\.\d+[.\d]*", self.run(*args).stdout)
+            found[name] = match.group() if match else "?"
+        return found

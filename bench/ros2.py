@@ -1,0 +1,432 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long a ROS 2 node's peer hears nothing when the node is restored: CycloneDDS and zenoh.
+
+    make bench-ros2
+    .venv/bin/python bench/ros2.py --only cyclonedds --remedies none,skip --rates 100 --intervals 1
+
+Real protected containers on Podman's bridge network: a node and, unprotected, its peer; both send to each other at a
+fixed rate.  The node's application is killed with SIGKILL at random moments.  Two gaps are measured, each from the last
+message before the death to the first after it: `out`, as the peer hears the node, and `in`, as the node hears the peer
+(it tells in each message what it has heard).  ddsperf tells no more than how many pongs came: what is missing, divided
+by the rate, is the outage there.
+
+Needs root and what `make setup` and scripts/setup-ros2.sh build.  Takes the machine's sidecar and hooks for itself.
+Results of earlier runs stay in bench/results/ros2.json unless they are measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import re
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(ROOT / "tests"))
+
+from harness import (  # noqa: E402
+    Container,
+    ContainerFactory,
+    Podman,
+    Sidecar,
+    avckpt_command,
+    machine_lock,
+    running_sidecar,
+    wait_until,
+)
+
+from bench import ros2_show  # noqa: E402
+
+IMAGE = "localhost/avckpt-ros2:latest"
+RESULTS = ROOT / "bench/results/ros2.json"
+RECORD = struct.Struct("<4Q")
+NS_PER_MS = 1e6
+PATIENCE_S = 30.0
+SETTLE_S = 0.5
+STEADY_S = 0.4
+NODE = "/opt/ros2/build/dds_node"
+ZENOH = "python3 /opt/ros2/zenoh_node.py"
+PEER_TOPICS = "--in from_node --out to_node --log /log/heard"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A middleware and what is done about its numbers."""
+
+    subject: str
+    remedy: str
+    node: str
+    peer: str
+    labels: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def name(self) -> str:
+        return f"{self.subject}/{self.remedy}"
+
+
+HEAR = (("notify.self", "signal:USR1"),)
+RESET = (("tcp", "reset"),)
+CASES = (
+    Case("ddsperf", "none", "ddsperf -i {domain} pong", "ddsperf -i {domain} ping {rate}Hz"),
+    Case("cyclonedds", "none", f"{NODE} --rate {{rate}}", f"{NODE} --rate {{rate}} {PEER_TOPICS}"),
+    Case(
+        "cyclonedds",
+        "best-effort",
+        f"{NODE} --rate {{rate}} --best-effort",
+        f"{NODE} --rate {{rate}} --best-effort {PEER_TOPICS}",
+    ),
+    Case("cyclonedds", "skip", f"{NODE} --rate {{rate}} --after-restore skip", f"{NODE} --rate {{rate}} {PEER_TOPICS}"),
+    Case(
+        "cyclonedds",
+        "endpoints",
+        f"{NODE} --rate {{rate}} --after-restore endpoints",
+        f"{NODE} --rate {{rate}} {PEER_TOPICS}",
+        HEAR,
+    ),
+    Case(
+        "cyclonedds",
+        "participant",
+        f"{NODE} --rate {{rate}} --after-restore participant",
+        f"{NODE} --rate {{rate}} {PEER_TOPICS}",
+        HEAR,
+    ),
+    Case(
+        "zenoh",
+        "none",
+        f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447",
+        f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+    ),
+    Case(
+        "zenoh",
+        "skip",
+        f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447 --after-restore skip",
+        f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+    ),
+    Case(
+        "zenoh",
+        "reset",
+        f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447",
+        f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+        RESET,
+    ),
+    Case(
+        "zenoh",
+        "reset-retry",
+        f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447",
+        f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 --retry-ms 20 {PEER_TOPICS}",
+        RESET,
+    ),
+)
+
+
+@dataclass
+class Trial:
+    """One kill and what followed; a gap of None: not within PATIENCE_S."""
+
+    subject: str
+    remedy: str
+    rate_hz: int
+    interval_s: float
+    age_s: float
+    restore_ms: float
+    freeze_ms: float
+    """Median of all checkpoints of this container."""
+    out_ms: float | None
+    in_ms: float | None
+    """None with ddsperf, which does not tell."""
+    steady_ms: float
+    """Largest gap that the peer saw in the time before the kill, STEADY_S; 0 with ddsperf."""
+
+
+class Events:
+    """`avckpt events --follow --all`, as long as the block lasts."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [*avckpt_command(), "events", "--follow", "--all", "--json"], stdout=subprocess.PIPE, text=True
+        )
+        self._seen: list[dict[str, Any]] = []
+        self._thread = threading.Thread(target=self._read, daemon=True)
+
+    def __enter__(self) -> Events:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        self._process.wait()
+        self._thread.join()
+
+    def of(self, container: Container, kind: str) -> list[dict[str, Any]]:
+        """So far, in their order."""
+        return [event for event in list(self._seen) if event["id"] == container.id and event["kind"] == kind]
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._seen.append(json.loads(line))
+
+
+class HeardLog:
+    """What a peer (dds_node, zenoh_node) has heard: arrays of (now, count, sent, heard), in ns."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def read(self, last_bytes: int = 0) -> list[tuple[int, ...]]:
+        """All of it, or about the end of it."""
+        if not self._path.exists():
+            return []
+        with self._path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END) // RECORD.size * RECORD.size
+            file.seek(max(0, size - last_bytes // RECORD.size * RECORD.size) if last_bytes else 0)
+            data = file.read()
+        return list(RECORD.iter_unpack(data[: len(data) // RECORD.size * RECORD.size]))
+
+    def heard_since(self, at_ns: int) -> bool:
+        """Do both directions work again: has the node heard what was sent after `at_ns`, and said so?"""
+        newest = self.read(RECORD.size)
+        return bool(newest) and newest[0][3] > at_ns
+
+    def gaps(self, killed_ns: int) -> tuple[float | None, float | None, float]:
+        """out, in, and the largest one of the time before; ms."""
+        before = [r for r in self.read() if r[0] <= killed_ns]
+        last_out, last_in = before[-1][0], max(r[3] for r in before[-100:])
+        out = heard = None
+        for now, _, sent, heard_ns in self.read():
+            if out is None and sent > killed_ns:
+                out = (now - last_out) / NS_PER_MS
+            if heard is None and heard_ns > killed_ns:
+                heard = (heard_ns - last_in) / NS_PER_MS
+        steady = [r[0] for r in before if r[0] > killed_ns - STEADY_S * 1e9]
+        return out, heard, max((b - a for a, b in zip(steady, steady[1:])), default=0) / NS_PER_MS
+
+
+class PongCounts:
+    """ddsperf ping's own report: a line about once a second, with the number of pongs since the last one."""
+
+    LINE = re.compile(r"^\[\d+\] +(\d+\.\d+) .* mean .* cnt (\d+)$", re.MULTILINE)
+
+    def __init__(self, path: Path, rate_hz: int) -> None:
+        self._path = path
+        self._rate_hz = rate_hz
+
+    def lines(self) -> list[tuple[float, int]]:
+        """(seconds since its start, pongs)"""
+        if not self._path.exists():
+            return []
+        return [(float(at), int(count)) for at, count in self.LINE.findall(self._path.read_text())]
+
+    def wait_whole_second(self, after: int) -> int:
+        """Waits for the second line after the first `after` ones that lacks next to nothing; how many there are."""
+
+        def whole() -> int:
+            lines = self.lines()
+            good = [count >= 0.95 * self._rate_hz for _, count in lines[after:]]
+            return len(lines) if good[1:].count(True) >= 1 else 0
+
+        return wait_until(whole, PATIENCE_S, "ddsperf's pongs come again", every_s=0.1)
+
+    def missing_ms(self, first: int, last: int) -> float:
+        """Of the pongs between the ends of two lines, by their numbers."""
+        lines = self.lines()
+        expected = (lines[last - 1][0] - lines[first - 1][0]) * self._rate_hz
+        return 1000 * max(0.0, expected - sum(count for _, count in lines[first:last])) / self._rate_hz
+
+
+def measure(case: Case, rate_hz: int, interval_s: float, restores: int, world: World) -> list[Trial]:
+    """Starts a pair, kills its node `restores` times."""
+    with world.pair(case, rate_hz, interval_s) as (node, folder):
+        kill = kill_ddsperf if case.subject == "ddsperf" else kill_node
+        gaps = []
+        for number in range(restores):
+            # One checkpoint at least after the restore before; then any moment between two.
+            time.sleep(SETTLE_S + interval_s * (1 + random.random()))
+            gaps.append(kill(world.sidecar, node, folder, rate_hz))
+            outage = "never" if gaps[-1][0] is None else f"{gaps[-1][0]:.0f} ms"
+            print(
+                f"{case.name} {rate_hz} Hz, every {interval_s:g} s: {number + 1} of {restores}, {outage}",
+                flush=True,
+            )
+        wait_until(
+            lambda: len(world.events.of(node, "restored")) >= restores, PATIENCE_S, f"{restores} restores are told"
+        )
+        freezes = sorted(event["freeze_s"] for event in world.events.of(node, "checkpoint"))
+        return [
+            Trial(
+                subject=case.subject,
+                remedy=case.remedy,
+                rate_hz=rate_hz,
+                interval_s=interval_s,
+                age_s=round(event["age_s"], 4),
+                restore_ms=round(1e3 * event["restore_s"], 3),
+                freeze_ms=round(1e3 * freezes[len(freezes) // 2], 3),
+                out_ms=out and round(out, 1),
+                in_ms=heard and round(heard, 1),
+                steady_ms=round(steady, 1),
+            )
+            for event, (out, heard, steady) in zip(world.events.of(node, "restored"), gaps)
+        ]
+
+
+Gaps = tuple["float | None", "float | None", float]
+
+
+def kill_node(sidecar: Sidecar, node: Container, folder: Path, rate_hz: int) -> Gaps:
+    """One of ours; the peer has written down every message."""
+    heard = HeardLog(folder / "heard")
+    pid = sidecar.app_pid(node)
+    os.kill(pid, signal.SIGKILL)
+    # It may send for some more microseconds; what is sent later is sent by the restored one.
+    killed_ns = time.monotonic_ns() + 200_000
+    with contextlib.suppress(TimeoutError):
+        wait_until(lambda: heard.heard_since(killed_ns), PATIENCE_S, "both hear each other again")
+    return heard.gaps(killed_ns)
+
+
+def kill_ddsperf(sidecar: Sidecar, node: Container, folder: Path, rate_hz: int) -> Gaps:
+    """ddsperf's pong."""
+    counts = PongCounts(folder / "ping", rate_hz)
+    first = len(counts.lines())
+    os.kill(sidecar.app_pid(node), signal.SIGKILL)
+    try:
+        last = counts.wait_whole_second(first)
+    except TimeoutError:
+        return None, None, 0.0
+    return counts.missing_ms(first, last), None, 0.0
+
+
+@dataclass
+class World:
+    """What all pairs share."""
+
+    sidecar: Sidecar
+    factory: ContainerFactory
+    events: Events
+    folder: Path
+    domains: Iterator[int]
+
+    @contextlib.contextmanager
+    def pair(self, case: Case, rate_hz: int, interval_s: float) -> Iterator[tuple[Container, Path]]:
+        """A protected node and its peer, in a DDS domain of their own, that hear each other; and the peer's folder."""
+        domain = next(self.domains)
+        folder = self.folder / str(domain)
+        folder.mkdir()
+        words = {"rate": rate_hz, "domain": domain, "address": ""}
+        env = ["--env", f'CYCLONEDDS_URI=<CycloneDDS><Domain Id="{domain}"/></CycloneDDS>']
+        if case.subject == "ddsperf":  # it has an option for that, and does not want both
+            env = []
+        node = self.factory.protected(
+            *case.node.format(**words).split(),
+            labels={"interval": f"{round(1000 * interval_s)}ms", "restore.max": "60/60s", **dict(case.labels)},
+            options=env,
+            image=IMAGE,
+        )
+        words["address"] = node.ip
+        command = case.peer.format(**words).split()
+        if case.subject == "ddsperf":
+            command = ["sh", "-c", f"exec {' '.join(command)} >/log/ping"]
+        peer = self.factory(*command, options=(*env, "--volume", f"{folder}:/log"), image=IMAGE)
+        try:
+            started = time.monotonic_ns()
+            if case.subject == "ddsperf":
+                counts = PongCounts(folder / "ping", rate_hz)
+                counts.wait_whole_second(0)
+            else:
+                heard = HeardLog(folder / "heard")
+                wait_until(lambda: heard.heard_since(started), PATIENCE_S, f"the pair of {case.name} hears each other")
+            self.sidecar.wait_generation(node)
+            yield node, folder
+        finally:
+            node.remove()
+            peer.remove()
+
+
+def run(options: argparse.Namespace) -> list[Trial]:
+    """Everything that was asked for; pairs run `--parallel` at a time."""
+    podman = Podman()
+    factory = ContainerFactory(podman, f"avckpt-ros2-{os.getpid()}")
+    wanted = [
+        (case, rate, interval)
+        for case in CASES
+        if case.subject in options.only and (not options.remedies or case.remedy in options.remedies)
+        for rate in options.rates
+        for interval in options.intervals
+    ]
+    with (
+        machine_lock(timeout_s=options.wait),
+        running_sidecar(podman) as sidecar,
+        Events() as events,
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        world = World(sidecar, factory, events, Path(folder), iter(range(1, 200)))
+        try:
+            with ThreadPoolExecutor(options.parallel) as pool:
+                done = [
+                    pool.submit(measure, case, rate, interval, options.restores, world)
+                    for case, rate, interval in wanted
+                ]
+                return [trial for future in done for trial in future.result()]
+        finally:
+            factory.close()
+
+
+def merge(trials: list[Trial], path: Path) -> list[Trial]:
+    """What was measured now replaces what was measured before, case by case."""
+    now = {(t.subject, t.remedy, t.rate_hz, t.interval_s) for t in trials}
+    before = [Trial(**entry) for entry in json.loads(path.read_text())["trials"]] if path.exists() else []
+    return [t for t in before if (t.subject, t.remedy, t.rate_hz, t.interval_s) not in now] + trials
+
+
+def write(trials: list[Trial], path: Path) -> None:
+    """In one step, so that no reader ever sees half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    order = {(case.subject, case.remedy): number for number, case in enumerate(CASES)}
+    trials.sort(key=lambda t: (order.get((t.subject, t.remedy), 99), t.rate_hz, t.interval_s))
+    draft = path.with_suffix(".tmp")
+    draft.write_text('{"trials": [\n' + ",\n".join(json.dumps(asdict(trial)) for trial in trials) + "\n]}\n")
+    draft.replace(path)
+
+
+def main() -> int:
+    subjects = sorted({case.subject for case in CASES})
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--restores", type=int, default=10, help="kills per point")
+    parser.add_argument("--rates", type=lambda text: [int(part) for part in text.split(",")], default=[100, 1000])
+    parser.add_argument(
+        "--intervals", type=lambda text: [float(part) for part in text.split(",")], default=[0.1, 0.5, 1.0, 3.0]
+    )
+    parser.add_argument("--only", type=lambda text: text.split(","), default=subjects, help=",".join(subjects))
+    parser.add_argument("--remedies", type=lambda text: text.split(","), help="e.g. none,skip")
+    parser.add_argument("--parallel", type=int, default=2, help="pairs at a time")
+    parser.add_argument("--wait", type=float, default=600, help="seconds to wait for the machine")
+    parser.add_argument("--show", action="store_true", help="measure nothing: table and plots of what is there")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    if options.show:
+        trials = merge([], options.output)
+    else:
+        trials = merge(run(options), options.output)
+        write(trials, options.output)
+    print(ros2_show.table(trials))
+    ros2_show.draw(trials, options.output.with_suffix(""))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,193 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.files=strict, for files that are mapped for writing: what was in them.
+ *
+ * A write through a mapping changes the file's time when a page gets dirty, not again
+ * before the kernel has written it out, and on a tmpfs never.  So the contents are
+ * copied while everything is stopped, and compared at a restore.  What is too much to
+ * be copied (avckpt.shm), or was mapped since, counts as written.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "files.h"
+
+#define MAPPED_MAX 64
+
+struct mapped_area {
+	avc_remote start, end;
+	uint64_t offset, inode;
+	int fd;
+	uint8_t *content;
+	ssize_t bytes; /* less than the mapping where the file ends earlier; -1: unreadable */
+};
+
+struct files_mapped {
+	uint32_t count;
+	struct mapped_area area[MAPPED_MAX];
+};
+
+/* Not on a disk: what others are told through it can not be taken back anyhow. */
+static bool is_data(const struct mapping *m)
+{
+	return m->shared && m->mode[1] == 'w' && m->inode && strncmp(m->name, "/dev/", 5) &&
+	       strncmp(m->name, "/memfd:", 7) && strncmp(m->name, "/SYSV", 5) &&
+	       strncmp(m->name, "/run/", 5);
+}
+
+static ssize_t read_at(int fd, uint8_t *to, size_t bytes, uint64_t at)
+{
+	size_t done = 0;
+
+	while (done < bytes) {
+		const ssize_t n = pread(fd, to + done, bytes - done, (off_t)(at + done));
+
+		if (n < 0)
+			return -1;
+		if (n == 0)
+			break;
+		done += (size_t)n;
+	}
+	return (ssize_t)done;
+}
+
+struct look {
+	pid_t pid;
+	struct files_mapped *mapped;
+	uint64_t bytes_left;
+};
+
+static int take_area(const struct mapping *m, void *arg)
+{
+	struct look *look = arg;
+	struct files_mapped *mapped = look->mapped;
+	struct mapped_area *a = &mapped->area[mapped->count];
+	const size_t bytes = m->end - m->start;
+	char name[64];
+
+	if (!is_data(m) || mapped->count == MAPPED_MAX || bytes > look->bytes_left)
+		return 0;
+	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)m->start,
+		 (unsigned long)m->end);
+	*a = (struct mapped_area){
+		.start = m->start,
+		.end = m->end,
+		.offset = m->offset,
+		.inode = m->inode,
+		.fd = proc_open(look->pid, name, O_RDONLY | O_CLOEXEC),
+	};
+	if (a->fd < 0)
+		return 0;
+	/* A file server is asked nothing while the app stands still: it may be the app. */
+	a->content = file_is_remote(a->fd) ? NULL : malloc(bytes);
+	/* Page faults and disk reads now, not in the freeze. */
+	if (!a->content || read_at(a->fd, a->content, bytes, a->offset) < 0) {
+		free(a->content);
+		close_fd(&a->fd);
+		return 0;
+	}
+	look->bytes_left -= bytes;
+	mapped->count++;
+	return 0;
+}
+
+struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
+{
+	struct look look = {
+		.pid = pid,
+		.mapped = calloc(1, sizeof *look.mapped),
+		.bytes_left = limit_bytes,
+	};
+
+	/* What can not be had counts as written at a restore. */
+	if (look.mapped)
+		(void)proc_mappings(pid, "maps", take_area, &look);
+	return look.mapped;
+}
+
+void files_mapped_copy(struct files_mapped *mapped)
+{
+	for (uint32_t i = 0; mapped && i < mapped->count; i++) {
+		struct mapped_area *a = &mapped->area[i];
+
+		a->bytes = read_at(a->fd, a->content, a->end - a->start, a->offset);
+	}
+}
+
+void files_mapped_free(struct files_mapped *mapped)
+{
+	for (uint32_t i = 0; mapped && i < mapped->count; i++) {
+		close_fd(&mapped->area[i].fd);
+		free(mapped->area[i].content);
+	}
+	free(mapped);
+}
+
+static bool is_unchanged(const struct mapped_area *a)
+{
+	const size_t bytes = a->end - a->start;
+	uint8_t *now = malloc(bytes);
+	bool same;
+
+	same = now && a->bytes >= 0 && read_at(a->fd, now, bytes, a->offset) == a->bytes &&
+	       !memcmp(now, a->content, (size_t)a->bytes);
+	free(now);
+	return same;
+}
+
+struct check {
+	const struct files_mapped *mapped;
+	bool any;
+	struct avc_error *err;
+};
+
+static int check_known(const struct mapping *m, void *arg)
+{
+	struct check *check = arg;
+
+	check->any = true;
+	if (!is_data(m))
+		return 0;
+	for (uint32_t i = 0; i < check->mapped->count; i++) {
+		const struct mapped_area *a = &check->mapped->area[i];
+
+		if (a->start == m->start && a->end == m->end && a->offset == m->offset &&
+		    a->inode == m->inode)
+			return 0;
+	}
+	return fail(check->err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+		    "avckpt.files=strict: %.60s is mapped for writing", m->name);
+}
+
+static int check_process(pid_t pid, struct check *check)
+{
+	check->any = false;
+	if (proc_mappings(pid, "maps", check_known, check) == 0 && check->any)
+		return 0;
+	if (check->err->code)
+		return -1;
+	return fail(check->err, AVC_UNSUPPORTED, 0, pid, "restore", "open(maps)",
+		    "avckpt.files=strict: what files were mapped can not be told");
+}
+
+int files_mapped_check(const struct generation *generation, pid_t holder, struct avc_error *err)
+{
+	struct check check = { .mapped = generation->mapped, .err = err };
+
+	if (!generation->mapped)
+		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+			    "avckpt.files=strict: was set after the checkpoint");
+	/* The template has what was mapped then, the holder what was mapped at last. */
+	if (check_process(generation->template, &check) || check_process(holder, &check))
+		return -1;
+	for (uint32_t i = 0; i < check.mapped->count; i++)
+		if (!is_unchanged(&check.mapped->area[i]))
+			return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+				    "avckpt.files=strict: a file that is mapped for writing was "
+				    "written since the checkpoint");
+	return 0;
+}

@@ -1,0 +1,213 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.files=strict, for files that are opened, written and closed between two looks
+ * at the table, also by a child or by a program that was executed since: fanotify(7)
+ * tells of everything written in the container's mount namespace.
+ *
+ * The kernel queues an event within the write(2) that it is about, so after a death the
+ * queue has all of them.  Nobody waits for us, and the queue ends with our process.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/fanotify.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "files.h"
+
+struct files_written {
+	int fd;          /* -1: it can not be watched                            */
+	int errnum;      /* why                                                  */
+	uint64_t mounts; /* a hash of what was marked                            */
+};
+
+struct files_written *files_written_new(void)
+{
+	struct files_written *written = calloc(1, sizeof *written);
+
+	if (!written)
+		return NULL;
+	/* What is reported comes as an open file: a fifo must not make us wait. */
+	written->fd = fanotify_init(FAN_CLASS_NOTIF | FAN_CLOEXEC | FAN_NONBLOCK,
+				    O_RDONLY | O_CLOEXEC | O_LARGEFILE | O_NONBLOCK);
+	written->errnum = written->fd < 0 ? errno : 0;
+	return written;
+}
+
+void files_written_free(struct files_written *written)
+{
+	if (written)
+		close_fd(&written->fd);
+	free(written);
+}
+
+static bool starts_with_one_of(const char *text, const char *const *words)
+{
+	for (; *words; words++)
+		if (!strncmp(text, *words, strlen(*words)))
+			return true;
+	return false;
+}
+
+/* Where no data are, where to open a file has effects (devices), or may wait for a
+ * server (it may be the app itself). */
+static bool is_worth_it(const char *point, const char *options, const char *type)
+{
+	static const char *const places[] = { "/dev", "/proc", "/sys", NULL };
+	static const char *const types[] = { "proc",   "sysfs", "cgroup", "devpts",  "devtmpfs",
+					     "mqueue", "fuse",  "nfs",    "cifs",    "smb",
+					     "9p",     "ceph",  "afs",    "tracefs", "debugfs",
+					     "bpf",    NULL };
+
+	return strncmp(options, "ro", 2) && !starts_with_one_of(point, places) &&
+	       !starts_with_one_of(type, types);
+}
+
+/* "\040" and the like, as proc(5) writes them. */
+static void unescape(char *text)
+{
+	char *to = text;
+	unsigned int value;
+
+	for (const char *from = text; *from; to++) {
+		if (*from == '\\' && sscanf(from + 1, "%3o", &value) == 1) {
+			*to = (char)value;
+			from += 4;
+		} else {
+			*to = *from++;
+		}
+	}
+	*to = 0;
+}
+
+static void mark(struct files_written *written, pid_t pid, char *line)
+{
+	char point[2048], options[64], type[32], path[2100];
+	const char *rest = strstr(line, " - ");
+
+	if (!rest || sscanf(rest, " - %31s", type) != 1 ||
+	    sscanf(line, "%*d %*d %*s %*s %2047s %63s", point, options) != 2)
+		return;
+	if (!is_worth_it(point, options, type))
+		return;
+	unescape(point);
+	snprintf(path, sizeof path, "/proc/%d/root%s", pid, point);
+	if (fanotify_mark(written->fd, FAN_MARK_ADD | FAN_MARK_MOUNT, FAN_MODIFY, AT_FDCWD, path) &&
+	    errno != ENOENT && errno != EACCES)
+		written->errnum = errno;
+}
+
+static bool is_our_mount_namespace(pid_t pid)
+{
+	struct stat ours, theirs;
+	char path[64];
+
+	snprintf(path, sizeof path, "/proc/%d/ns/mnt", pid);
+	return stat("/proc/self/ns/mnt", &ours) || stat(path, &theirs) ||
+	       (ours.st_ino == theirs.st_ino && ours.st_dev == theirs.st_dev);
+}
+
+static uint64_t hash_line(uint64_t hash, const char *line)
+{
+	for (; *line; line++)
+		hash = (hash ^ (uint8_t)*line) * UINT64_C(0x100000001b3);
+	return hash;
+}
+
+void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice)
+{
+	char *line = NULL, path[64];
+	size_t size = 0;
+	uint64_t mounts = 1;
+	FILE *info;
+
+	if (written->fd < 0)
+		goto tell;
+	snprintf(path, sizeof path, "/proc/%d/mountinfo", pid);
+	info = fopen(path, "re");
+	if (!info)
+		return; /* it has ended */
+	while (getline(&line, &size, info) > 0)
+		mounts = hash_line(mounts, line);
+	/* What is mounted anew is marked before the checkpoint after it. */
+	if (mounts != written->mounts) {
+		written->mounts = mounts;
+		written->errnum = is_our_mount_namespace(pid) ? ENOTSUP : 0;
+		rewind(info);
+		while (!written->errnum && getline(&line, &size, info) > 0)
+			mark(written, pid, line);
+	}
+	free(line);
+	fclose(info);
+tell:
+	if (written->errnum && !notice->code)
+		fail(notice, AVC_KERNEL, written->errnum, pid, "watch files", "fanotify_mark",
+		     "avckpt.files=strict does not see files that are written and closed "
+		     "between checkpoints");
+}
+
+/* stdin, stdout and stderr are often a log that others share. */
+static bool is_inherited(const struct files *files, const struct stat *st)
+{
+	for (uint32_t i = 0; files && i < files->count; i++)
+		if (files->file[i].outside && files->file[i].ino == st->st_ino &&
+		    files->file[i].dev == st->st_dev)
+			return true;
+	return false;
+}
+
+static bool is_written_data(int fd, const struct files *files, char name[FILES_NAME])
+{
+	struct stat st;
+	char path[64];
+	ssize_t n;
+
+	if (fstat(fd, &st) || !S_ISREG(st.st_mode) || is_inherited(files, &st))
+		return false;
+	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
+	n = readlink(path, name, FILES_NAME - 1);
+	name[n < 0 ? 0 : n] = 0;
+	return true;
+}
+
+bool files_written_since(struct files_written *written, const struct files *files,
+			 char name[FILES_NAME])
+{
+	_Alignas(struct fanotify_event_metadata) char buf[4096];
+	bool found = false;
+
+	if (written->fd < 0)
+		return false;
+	for (;;) {
+		const ssize_t n = read(written->fd, buf, sizeof buf);
+		const struct fanotify_event_metadata *m = (void *)buf;
+		ssize_t left = n;
+
+		if (n < 0 && errno == EINTR)
+			continue;
+		if (n <= 0) {
+			/* A file that can not be opened for us any more was written, too. */
+			if (n < 0 && errno != EAGAIN && !found) {
+				found = true;
+				snprintf(name, FILES_NAME, "a file");
+			}
+			if (n < 0 && errno != EAGAIN && errno != EMFILE && errno != ENFILE)
+				continue;
+			return found;
+		}
+		for (; FAN_EVENT_OK(m, left); m = FAN_EVENT_NEXT(m, left)) {
+			int fd = m->fd;
+
+			if (m->mask & FAN_Q_OVERFLOW && !found) {
+				found = true;
+				snprintf(name, FILES_NAME, "a file");
+			}
+			if (fd >= 0 && !found)
+				found = is_written_data(fd, files, name);
+			close_fd(&fd);
+		}
+	}
+}

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Health checks over a restart of the sidecar and over a new configuration: a real daemon, without Podman."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from avckpt.pressure import templates_of
+from harness import wait_until
+from local_sidecar import Container, LocalSidecar, local_sidecar
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
+
+NAP = [sys.executable, "-c", "import time\nwhile True: time.sleep(0.1)"]
+QUICK = {"avckpt.enable": "true", "avckpt.interval": "100ms", "avckpt.restore.max": "60/1s"}
+UNHEALTHY = {**QUICK, "avckpt.restore.on": "signal,unhealthy"}
+
+
+@pytest.fixture
+def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
+    with local_sidecar(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def sick(tmp_path: Path) -> Path:
+    """While this file is there, checks fail."""
+    return tmp_path / "sick"
+
+
+def checked(sidecar: LocalSidecar, name: str, sick: Path, labels: dict[str, str]) -> Container:
+    """A protected container with a health check, as the hook's process leaves it for the sidecar."""
+    made = sidecar.protected(name, NAP, labels)
+    health = sidecar.run_dir / "health"
+    health.mkdir(exist_ok=True)
+    check = {
+        "Test": ["CMD-SHELL", f"test ! -e {sick}"],
+        "Interval": 200_000_000,
+        "Timeout": 5_000_000_000,
+        "Retries": 2,
+    }
+    (health / f"{made.id}.json").write_text(json.dumps({"healthcheck": check}))
+    sidecar.wait_for(made, state="protected")
+    return made
+
+
+def unhealthy(sidecar: LocalSidecar) -> int:
+    """How often somebody was rolled back because of a health check."""
+    lines = sidecar.avckpt("events", "--json").stdout.splitlines()
+    return sum(event.get("reason") == "unhealthy" and event["kind"] == "restored" for event in map(json.loads, lines))
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL])
+def test_an_adopted_container_is_checked_again(sidecar: LocalSidecar, sick: Path, signum: signal.Signals) -> None:
+    sidecar.start()
+    made = checked(sidecar, "node", sick, UNHEALTHY)
+    app = made.app_pid
+    sidecar.stop(signum)
+    sick.touch()  # nobody looks now
+    time.sleep(1)
+    sick.unlink()
+    sidecar.start()
+    sidecar.wait_for(made, adopted=True, state="protected", restores=0)
+    assert made.app_pid == app
+    sick.touch()
+    wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
+    sick.unlink()
+    wait_until(lambda: "its health check passes again" in sidecar.log, 20, "it is healthy again")
+
+
+def test_a_new_configuration_begins_and_ends_checks(sidecar: LocalSidecar, sick: Path) -> None:
+    sidecar.start()
+    made = checked(sidecar, "node", sick, QUICK)
+    sick.touch()
+    time.sleep(1)
+    assert unhealthy(sidecar) == 0
+    sick.unlink()
+
+    sidecar.config.write_text("defaults: {restore.on: 'signal,unhealthy'}\n")
+    assert "node: restore.on signal,exit -> signal,unhealthy" in sidecar.avckpt("reload").stdout
+    sidecar.wait_for(made, generations=3)  # one more than avckpt.keep
+    time.sleep(1)  # it has been healthy a few times
+    sick.touch()
+    wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
+    sick.unlink()
+    wait_until(lambda: "its health check passes again" in sidecar.log, 20, "it is healthy again")
+
+    sidecar.config.unlink()
+    assert "node: restore.on signal,unhealthy -> signal,exit" in sidecar.avckpt("reload").stdout
+    held, before = set(templates_of(made.init_pid)), unhealthy(sidecar)
+    sick.touch()
+    # What a check has vouched for is no longer held back: newer ones take its place.
+    wait_until(lambda: not held & set(templates_of(made.init_pid)), 20, "every generation is a new one")
+    assert unhealthy(sidecar) == before
+    assert sidecar.row(made)["generations"] <= 2
