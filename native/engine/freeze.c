@@ -192,7 +192,7 @@ static int clone_app(struct target *target, struct thread *main_thread,
 			if (anybody_uses(target, base, bytes))
 				break;
 			call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-			generation->vm_pages -= (long)(bytes / 4096);
+			generation->vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 		}
 	/* ECHILD, if it has none: the one question that needs no look at each thread. */
 	children = call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);

@@ -59,7 +59,7 @@ static void touch_slot(const struct pad *pad, uint32_t slot, uint32_t threads)
 	for (uint32_t i = 0; i < threads && i < pad->threads_max; i++) {
 		volatile uint8_t *frame = pad_frame(pad, slot, i);
 
-		for (size_t at = 0; at < arch_frame_bytes(); at += 4096)
+		for (size_t at = 0; at < arch_frame_bytes(); at += ARCH_PAGE_BYTES)
 			frame[at] = 0;
 		frame[arch_frame_bytes() - 1] = 0;
 		*(volatile uint64_t *)pad_thread(pad, slot, i) = 0;

@@ -109,6 +109,8 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
+	pid_t tracer;            /* a thread, in our namespace; 0: none              */
+	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t groups;         /* a hash                                           */

@@ -180,7 +180,7 @@ void memory_copy(const struct target *target, struct mem_image *image)
 /* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
 void memory_dofork(const struct memory *memory, struct inj_call *call)
 {
-	avc_remote at = 4096;
+	avc_remote at = ARCH_PAGE_BYTES;
 
 	if (!memory->dontfork)
 		return;
@@ -238,12 +238,13 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 			    "it uses a device's memory, which a clone does not inherit");
 	if (!memory->dontfork)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "%ld kB of its memory are not inherited by a clone", missing_pages * 4);
+			    "%ld kB of its memory are not inherited by a clone",
+			    missing_pages * ARCH_PAGE_BYTES / 1024);
 	/* Known before, it should not be missing again; but a device may have been
 	 * mapped since, at which the call stopped. */
 	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep template", "",
 		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
-		    missing_pages * 4);
+		    missing_pages * ARCH_PAGE_BYTES / 1024);
 }
 
 struct survey {

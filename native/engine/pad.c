@@ -18,11 +18,9 @@
 #include "inject_blob.h"
 #include "internal.h"
 
-#define PAGE 4096u
-
 static size_t page_up(size_t n)
 {
-	return (n + PAGE - 1) & ~(size_t)(PAGE - 1);
+	return (n + ARCH_PAGE_BYTES - 1) & ~(size_t)(ARCH_PAGE_BYTES - 1);
 }
 
 /* A block: struct inj_thread, stack (growing down), signal frame.  With AVX-512

@@ -58,17 +58,6 @@ static void read_queue(struct pending *pending, pid_t tid, int block)
 	}
 }
 
-/* Signals that the app has handlers for, as in sigset_t; 0 if it can not be told. */
-static uint64_t caught(pid_t pid)
-{
-	char buf[4096], *line;
-
-	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
-		return 0;
-	line = strstr(buf, "\nSigCgt:");
-	return line ? strtoull(line + 8, NULL, 16) : 0;
-}
-
 static bool takes(const struct thread *t, int signal)
 {
 	return t->block >= 0 && !(t->sigmask >> (signal - 1) & 1);
@@ -80,13 +69,15 @@ static bool takes(const struct thread *t, int signal)
 static void assign(struct target *target)
 {
 	struct pending *pending = target->pending;
-	const uint64_t handled = pending->count ? caught(target->pid) : 0;
+	struct proc_status status;
 
+	if (!pending->count || proc_status(target->pid, &status))
+		return;
 	for (uint32_t k = 0; k < pending->count; k++) {
 		const int signal = pending->signal[k].info.si_signo;
 		struct thread *found = NULL;
 
-		if (!(handled >> (signal - 1) & 1))
+		if (!(status.caught >> (signal - 1) & 1))
 			continue;
 		for (uint32_t i = 0; i < target->thread_count; i++) {
 			struct thread *t = &target->threads[i];

@@ -186,6 +186,10 @@ int proc_status(pid_t tid, struct proc_status *status)
 			continue;
 		if (!strncmp(line, "NSpid:", 6))
 			status->inside = atoi(strrchr(line, '\t') + 1);
+		else if (!strncmp(line, "TracerPid:", 10))
+			status->tracer = atoi(value);
+		else if (!strncmp(line, "SigCgt:", 7))
+			status->caught = strtoull(value, NULL, 16);
 		else if (!strncmp(line, "VmLck:", 6))
 			status->locked_kb = strtoll(value, NULL, 10);
 		else if (!strncmp(line, "Uid:", 4))

@@ -194,7 +194,7 @@ static long guess_call(const struct target *target, const struct arch_regs *regs
 {
 	const uint64_t a = arch_syscall_arg(regs, 0), b = arch_syscall_arg(regs, 1),
 		       c = arch_syscall_arg(regs, 2), d = arch_syscall_arg(regs, 3);
-	const uint64_t small = 4096;
+	const uint64_t small = ARCH_PAGE_BYTES; /* no address */
 	uint8_t code[ARCH_CODE_BYTES];
 	long nr;
 

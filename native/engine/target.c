@@ -102,16 +102,15 @@ void threads_forget_unseen(struct target *target)
 static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 {
 	const int errnum = errno;
-	char buf[4096], *line;
+	struct proc_status status;
 
 	if (errnum == EPERM) {
-		if (proc_read(tid, "status", buf, sizeof buf) <= 0 || !strstr(buf, "\nVmSize:"))
+		if (proc_status(tid, &status) || status.locked_kb < 0)
 			return fail(err, AVC_GONE, errnum, tid, "stop", "ptrace(SEIZE)",
 				    "it has ended");
-		line = strstr(buf, "\nTracerPid:");
-		if (line && atoi(line + 11))
+		if (status.tracer)
 			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
-				    "it is being traced by process %d", atoi(line + 11));
+				    "it is being traced by process %d", status.tracer);
 	}
 	errno = errnum;
 	return fail_errno(err, tid, "stop", "ptrace(SEIZE)",

@@ -16,6 +16,7 @@
 
 #define ARCH_NAME "x86-64"
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
+#define ARCH_PAGE_BYTES 4096
 
 struct arch_regs {
 	struct user_regs_struct r;
