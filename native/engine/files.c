@@ -56,6 +56,7 @@ void files_free(struct files *files)
 
 		free(f->name);
 		free(f->watch);
+		free(f->mark);
 		free(f->lock);
 		free(f->socket);
 		free(f->content);
@@ -184,6 +185,7 @@ static struct file *take_known(const struct look *look, struct file *f)
 			const int fd = f->fd, flags = f->flags;
 
 			free(f->watch);
+			free(f->mark);
 			*f = (struct file){ .fd = fd,
 					    .shared = fd,
 					    .offset = -1,

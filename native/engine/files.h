@@ -8,6 +8,7 @@
  *   files_make.c    opens and makes again what is lost
  *   files_restore.c compares two tables and makes the one the other
  *   files_calls.c   what the restored process has to do for that itself
+ *   files_watches.c inotify
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *
  * Looking is done on a duplicate (pidfd_getfd(2)) that lives for microseconds: while
@@ -49,6 +50,15 @@ struct file_watch { /* of an epoll set                                         *
 	uint64_t data;
 };
 
+struct file_mark { /* of inotify                                               */
+	int wd;
+	uint32_t mask;
+	uint64_t dev, ino; /* as the kernel has them                           */
+	uint32_t handle_bytes;
+	int handle_type;
+	uint8_t handle[128]; /* open_by_handle_at(2)                           */
+};
+
 struct file_socket {
 	int domain, type, protocol;
 	bool listening, connected;
@@ -83,10 +93,10 @@ struct file {
 	int clock, settime_flags;
 	uint64_t ticks, deadline_ns, interval_ns;
 	uint64_t mask; /* signalfd                                                  */
-	/* inotify: how many watches, and a sum over what fdinfo says of them      */
 	uint32_t watch_count;
-	uint64_t watch_sum;
 	struct file_watch *watch; /* epoll, allocated                              */
+	uint32_t mark_count;
+	struct file_mark *mark; /* inotify, allocated                              */
 	/* As fdinfo says it                                                      */
 	int told_flags;
 	uint64_t told_ino;
@@ -147,6 +157,11 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 const char *file_put_content(int fd, int other_fd, const struct file *want);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
+
+/* files_watches.c */
+/* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is
+ * (NULL: fresh).  Returns NULL or why not all of them. */
+const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init);
 
 /* files_make.c */
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why

@@ -241,8 +241,6 @@ int file_make(const struct file *want, pid_t template, pid_t init, const char **
 	case FILE_EPOLL:
 		return epoll_create1(EPOLL_CLOEXEC);
 	case FILE_INOTIFY:
-		if (want->watch_count)
-			*why = "it was closed since the checkpoint; its watches are lost";
 		return inotify_init1(IN_CLOEXEC | (nonblock ? IN_NONBLOCK : 0));
 	case FILE_OTHER:
 		break;

@@ -480,6 +480,8 @@ static void put_states(struct files_work *work)
 			continue;
 		}
 		note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		if (w->kind == FILE_INOTIFY)
+			note(work, w, file_put_marks(fd, w, n, work->init));
 		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
