@@ -528,7 +528,7 @@ static void find_owners(const struct target *target, struct files *files)
 			continue;
 		if (f->owner_type == F_OWNER_PGRP)
 			f->owner_inside = proc_inside(f->owner);
-		else if (f->owner == target->pid)
+		else if (f->owner == target->leader)
 			f->owner_inside = target->inside;
 		for (uint32_t k = 0; f->owner_type == F_OWNER_TID && k < target->thread_count; k++)
 			if (target->threads[k].tid == f->owner)

@@ -95,7 +95,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 				    "it is just starting a process");
 		if (!t->stopped)
 			continue;
-		if (next >= target->pad.threads_max && t->tid != target->pid)
+		if (next >= target->pad.threads_max && t->tid != target->leader)
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "more threads than prepared for");
 		if (!arch_is_native(&t->regs))
@@ -109,7 +109,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 		if (in_old_pad(target, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old pad");
-		t->block = t->tid == target->pid ? 0 : (int)next++;
+		t->block = t->tid == target->leader ? 0 : (int)next++;
 		if (thread_read(t, err))
 			return -1;
 		if (arch_frame_read_xstate(t->tid,
@@ -239,8 +239,8 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 	times->stop_ns = now_ns() - start;
 	main_thread = thread_find(target, target->pid);
 	if (!result && (!main_thread || !main_thread->stopped))
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			      "its main thread has ended");
+		result = fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
+			      "its main thread has just ended");
 	if (!result)
 		result = check_pad(target, err);
 	if (!result)

@@ -71,7 +71,8 @@ static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err
 	struct target *target = &guard->target;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (find_app(guard, err) || support_check(target, passing, err) || take_stock(target, err))
+	if (find_app(guard, err) || target_follow(target, err) ||
+	    support_check(target, passing, err) || take_stock(target, err))
 		return -1;
 	if (target->infected && target->thread_count > target->pad.threads_max)
 		target->infected = false;
@@ -172,7 +173,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard->misses = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
-		event.app_pid = guard->target.pid;
+		event.app_pid = guard->target.leader;
 		event.app_pid_inside = guard->target.inside;
 		emit(guard, &event);
 		return;

@@ -73,6 +73,11 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 int proc_stat(pid_t pid, struct proc_stat *stat);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
+/* A thread of the process that has not ended: the main thread, as long as it has not.
+ * 0: none. */
+pid_t proc_live_thread(pid_t pid);
+/* Until that thread has ended; a second at most. */
+void proc_await_end(pid_t tid);
 /* Children of a (single-threaded) process; returns how many (at most max), or -1. */
 int proc_children(pid_t pid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
@@ -202,8 +207,11 @@ struct files;
 
 /* The live main process of the app. */
 struct target {
-	pid_t pid; /* 0: none                                          */
-	pid_t inside;
+	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
+	 * or, when that has ended, any other (target_follow).  0: none           */
+	pid_t pid;
+	pid_t leader; /* the process's own number                            */
+	pid_t inside; /* the same in its own namespace                       */
 	int pidfd, task_dirfd, mem_fd, timers_fd;
 	struct pad pad;
 	bool infected; /* the pad is known to be in this process           */
@@ -256,6 +264,7 @@ struct generation {
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the app when it was taken                     */
 	bool sandboxed;        /* has seccomp filters of its own                   */
+	bool headless;         /* its main thread had ended                       */
 	struct timer_image *timers;
 	struct attributes *attributes;
 	struct mem_image *image;      /* of memory that is not in the template       */
@@ -490,6 +499,9 @@ void unhold(struct target *target);
 
 void target_init(struct target *target);
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err) warn_unused;
+/* Before anything else is done with it: the main thread may have ended, and others go
+ * on (pthread_exit(3)). */
+int target_follow(struct target *target, struct avc_error *err) warn_unused;
 /* Forgets the process (the pad stays mapped here: templates live in it). */
 void target_close(struct target *target);
 /* The entry for a tid; NULL when there is no room. */

@@ -15,7 +15,8 @@
 
 #include "internal.h"
 
-#define ASK_AGAIN_AFTER 8 /* checkpoints */
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h */
+#define ASK_AGAIN_AFTER 8    /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
 
 void target_init(struct target *target)
@@ -25,14 +26,43 @@ void target_init(struct target *target)
 	};
 }
 
+/* A descriptor for its table of descriptors: the main thread has none any more when it
+ * has ended, and the others have pidfds of their own since Linux 6.9. */
+static int follow(struct target *target, struct avc_error *err)
+{
+	const pid_t pid = proc_live_thread(target->leader);
+
+	if (!pid)
+		return fail(err, AVC_GONE, ESRCH, target->leader, "attach", "", "it has ended");
+	close_fd(&target->pidfd);
+	target->pid = pid;
+	target->pidfd = pid == target->leader ? proc_pidfd_open(pid)
+					      : (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
+	if (target->pidfd < 0 && errno == EINVAL)
+		return fail(err, AVC_UNSUPPORTED, EINVAL, target->leader, "attach",
+			    "pidfd_open(PIDFD_THREAD)",
+			    "its main thread has ended, which needs Linux 6.9");
+	if (target->pidfd < 0)
+		return fail_errno(err, target->leader, "attach", "pidfd_open", "it has ended");
+	return 0;
+}
+
+int target_follow(struct target *target, struct avc_error *err)
+{
+	return proc_live_thread(target->pid) == target->pid ? 0 : follow(target, err);
+}
+
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err)
 {
-	target->pid = pid;
+	target->leader = pid;
 	target->inside = inside;
-	target->pidfd = proc_pidfd_open(pid);
 	target->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
-	target->mem_fd = proc_open(pid, "mem", O_RDWR);
 	target->timers_fd = proc_open(pid, "timers", O_RDONLY);
+	if (follow(target, err)) {
+		target_close(target);
+		return -1;
+	}
+	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
 	if (target->pidfd < 0 || target->task_dirfd < 0 || target->mem_fd < 0 ||
 	    target->timers_fd < 0) {
 		fail_errno(err, pid, "attach", "open(/proc)", "its /proc can not be read");
@@ -49,6 +79,7 @@ void target_close(struct target *target)
 	close_fd(&target->mem_fd);
 	close_fd(&target->timers_fd);
 	target->pid = 0;
+	target->leader = 0;
 	target->infected = false;
 	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
 	for (uint32_t i = 0; i < target->thread_count; i++) {

@@ -208,12 +208,21 @@ static void set_up(struct inj_slot *slot, struct inj_thread *t, int first)
 	run_setup(slot, t->tid, t->setup);
 }
 
+/* Of one thread, not of its process. */
+__attribute__((section(".text.entry"))) void inj_end(void)
+{
+	for (;;)
+		SYS1(__NR_exit, 0);
+}
+
 /* Waits until the engine says that everybody goes.  An engine that died never
  * will: then init ends the container, and this process must not linger. */
-static void wait_for_go(struct inj_slot *slot)
+static void wait_for_go(struct inj_slot *slot, enum inj_go stage)
 {
-	while (!__atomic_load_n(&slot->go, __ATOMIC_ACQUIRE)) {
-		if (futex_wait(&slot->go, 0, INJ_GO_S * 1000) == -110 /* ETIMEDOUT */)
+	uint32_t go;
+
+	while ((go = __atomic_load_n(&slot->go, __ATOMIC_ACQUIRE)) < stage) {
+		if (futex_wait(&slot->go, go, INJ_GO_S * 1000) == -110 /* ETIMEDOUT */)
 			leave();
 	}
 	__atomic_add_fetch(&slot->running, 1, __ATOMIC_ACQ_REL);
@@ -226,7 +235,7 @@ void inj_thread(struct inj_slot *slot, struct inj_thread *t)
 	set_up(slot, t, 0);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) == slot->threads)
 		futex_wake(&slot->ready);
-	wait_for_go(slot);
+	wait_for_go(slot, INJ_GO_ALL);
 	inj_sigreturn(t->frame);
 }
 
@@ -316,6 +325,10 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_OWNERS]);
 	run_setup(slot, me->tid, slot->setup[INJ_AFTER]);
 	say(slot, INJ_READY);
-	wait_for_go(slot);
+	if (!me->frame) {
+		wait_for_go(slot, INJ_GO_ENDED);
+		inj_end();
+	}
+	wait_for_go(slot, INJ_GO_ALL);
 	inj_sigreturn(me->frame);
 }

@@ -109,15 +109,16 @@ enum inj_stage {
 
 /* One thread to be restored. */
 struct inj_thread {
-	uint64_t frame; /* stack pointer for rt_sigreturn(2)                */
+	/* stack pointer for rt_sigreturn(2), 0: a main thread that ends instead  */
+	uint64_t frame;
 	uint64_t stack; /* initial stack pointer of the new thread          */
 	uint64_t tls;
 	uint64_t clear_tid; /* set_tid_address(2)                               */
 	uint64_t robust_list;
 	uint64_t robust_bytes;
-	uint64_t rseq;       /* address, 0: none registered                      */
-	uint64_t other_base; /* a second base register (x86: gs), 0: none       */
-	uint64_t setup;      /* list of struct inj_setup, by the thread itself   */
+	uint64_t rseq;        /* address, 0: none registered                      */
+	uint64_t other_base;  /* a second base register (x86: gs), 0: none       */
+	uint64_t setup;       /* list of struct inj_setup, by the thread itself   */
 	uint32_t rseq_bytes;
 	uint32_t rseq_signature;
 	int32_t tid; /* inside                                           */
@@ -131,6 +132,12 @@ enum inj_state {
 	INJ_WRONG_PID = 1, /* somebody else took the number: try again          */
 	INJ_FAILED = 2,    /* error, error_at, error_tid say what               */
 	INJ_READY = 3      /* all threads exist and wait for `go`               */
+};
+
+enum inj_go {
+	INJ_GO_NOT = 0,
+	INJ_GO_ENDED = 1, /* a main thread that ends (inj_thread.frame)         */
+	INJ_GO_ALL = 2    /* to the app                                      */
 };
 
 enum inj_step {
@@ -149,7 +156,7 @@ enum inj_step {
 /* One generation's restore, in the restored process. */
 struct inj_slot {
 	uint32_t state;   /* futex, enum inj_state                          */
-	uint32_t go;      /* futex, set by the engine                       */
+	uint32_t go;      /* futex, enum inj_go, set by the engine          */
 	uint32_t ready;   /* threads that have set themselves up            */
 	uint32_t running; /* threads that are about to return to the app    */
 	/* ns_last_pid, written by the engine's helper on request               */
@@ -175,6 +182,7 @@ struct inj_slot {
 /* Entry points, at the addresses the linker put them (inject_blob.h). */
 void inj_run(struct inj_call *call);
 void inj_restore(struct inj_slot *slot);
+void inj_end(void) __attribute__((noreturn));
 
 /* Of arch/ARCH/inject.S. */
 void inj_go_home(void) __attribute__((noreturn));
