@@ -139,6 +139,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 			.rseq_bytes = t.rseq_bytes,
 			.rseq_signature = t.rseq_signature,
 			.other_base = arch_other_base(&t.regs),
+			.large_state = arch_frame_needs_room(frame) ? pad_remote(pad, frame) : 0,
 			.tid = t.inside,
 			.affinity_bytes = t.affinity_bytes,
 		};

@@ -24,7 +24,7 @@ static size_t page_up(size_t n)
 }
 
 /* A block: struct inj_thread, stack (growing down), signal frame.  With AVX-512
- * it all fits one page. */
+ * it all fits one page, with AMX three. */
 static size_t block_stack_top(void)
 {
 	return 896;

@@ -205,6 +205,8 @@ static void set_up(struct inj_slot *slot, struct inj_thread *t, int first)
 			fail(slot, INJ_STEP_BASE, t->tid, r);
 	}
 #endif
+	if (t->large_state)
+		inj_make_room(t->large_state);
 	run_setup(slot, t->tid, t->setup);
 }
 

@@ -118,6 +118,7 @@ struct inj_thread {
 	uint64_t robust_bytes;
 	uint64_t rseq;        /* address, 0: none registered                      */
 	uint64_t other_base;  /* a second base register (x86: gs), 0: none       */
+	uint64_t large_state; /* registers there is no room for yet, 0: none     */
 	uint64_t setup;       /* list of struct inj_setup, by the thread itself   */
 	uint32_t rseq_bytes;
 	uint32_t rseq_signature;
@@ -190,6 +191,7 @@ long inj_clone(uint64_t flags, uint64_t stack, uint64_t a, uint64_t b, uint64_t 
 long inj_spawn(uint64_t flags, uint64_t stack, uint64_t tls, struct inj_thread *thread,
 	       struct inj_slot *slot, int32_t tid);
 void inj_thread(struct inj_slot *slot, struct inj_thread *thread) __attribute__((noreturn));
+void inj_make_room(uint64_t state);
 void inj_sigreturn(uint64_t frame) __attribute__((noreturn));
 
 #endif

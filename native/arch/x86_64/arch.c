@@ -211,6 +211,48 @@ size_t arch_xstate_bytes(void)
 	return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
 }
 
+/* AMX tile data (arch/x86/kernel/fpu/xstate.c, XFEATURE_MASK_USER_DYNAMIC).  Of these 8 kB
+ * a thread has nothing until it first uses them, and its signal frames are by so much
+ * smaller: in one of another size rt_sigreturn(2) finds no more than the SSE registers. */
+#define DYNAMIC (UINT64_C(1) << 18)
+#define FEATURES_OFFSET 512 /* of XSTATE_BV */
+#define LEGACY_BYTES 576    /* with the header behind it */
+
+static uint64_t enabled_features(void)
+{
+	uint32_t low, high;
+
+	__asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+	return (uint64_t)high << 32 | low;
+}
+
+/* Of a thread without. */
+static size_t plain_bytes(void)
+{
+	static size_t bytes; /* see above */
+	size_t found = LEGACY_BYTES;
+
+	if (__atomic_load_n(&bytes, __ATOMIC_RELAXED))
+		return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
+	for (unsigned int i = 2; i < 63; i++) {
+		unsigned int size, offset, c, d;
+
+		if ((enabled_features() & ~DYNAMIC) >> i & 1 &&
+		    __get_cpuid_count(0xd, i, &size, &offset, &c, &d) && offset + size > found)
+			found = offset + size;
+	}
+	__atomic_store_n(&bytes, found, __ATOMIC_RELAXED);
+	return found;
+}
+
+bool arch_frame_needs_room(const void *frame)
+{
+	uint64_t features;
+
+	memcpy(&features, (const uint8_t *)frame + FEATURES_OFFSET, sizeof features);
+	return features & DYNAMIC;
+}
+
 static size_t xstate_room(void)
 {
 	return (arch_xstate_bytes() + sizeof(uint32_t) + 63) & ~(size_t)63;
@@ -223,15 +265,21 @@ size_t arch_frame_bytes(void)
 
 int arch_frame_read_xstate(pid_t tid, void *frame)
 {
-	struct iovec iov = { frame, arch_xstate_bytes() };
+	size_t bytes = plain_bytes();
 
-	if (ptrace(PTRACE_GETREGSET, tid, NT_X86_XSTATE, &iov) == -1)
-		return -1;
-	if (iov.iov_len != arch_xstate_bytes()) {
-		errno = EOVERFLOW;
-		return -1;
+	for (;;) {
+		struct iovec iov = { frame, bytes };
+
+		if (ptrace(PTRACE_GETREGSET, tid, NT_X86_XSTATE, &iov) == -1)
+			return -1;
+		if (iov.iov_len != bytes) {
+			errno = EOVERFLOW;
+			return -1;
+		}
+		if (bytes == arch_xstate_bytes() || !arch_frame_needs_room(frame))
+			return 0;
+		bytes = arch_xstate_bytes();
 	}
-	return 0;
 }
 
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
@@ -239,7 +287,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 {
 	const struct user_regs_struct *r = &regs->r;
 	uint8_t *xstate = frame;
-	const size_t bytes = arch_xstate_bytes();
+	const bool dynamic = arch_frame_needs_room(frame);
+	const size_t bytes = dynamic ? arch_xstate_bytes() : plain_bytes();
 	const uint32_t magic2 = SW_MAGIC2;
 	struct sw_bytes sw = { .magic1 = SW_MAGIC1,
 			       .extended_bytes = (uint32_t)(bytes + sizeof magic2),
@@ -248,6 +297,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 
 	/* ptrace leaves XCR0 where the signal frame wants its features. */
 	memcpy(&sw.features, xstate + SW_OFFSET, sizeof sw.features);
+	if (!dynamic)
+		sw.features &= ~DYNAMIC;
 	memcpy(xstate + SW_OFFSET, &sw, sizeof sw);
 	memcpy(xstate + bytes, &magic2, sizeof magic2);
 
