@@ -123,26 +123,6 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 	return 0;
 }
 
-/* exec puts another program in its place, and the pad is gone. */
-static int check_pad(struct target *target, struct avc_error *err)
-{
-	long nonce;
-
-	errno = 0;
-	nonce = ptrace(
-		PTRACE_PEEKDATA, target->pid,
-		(void *)(target->pad.base + INJ_CODE_BYTES + offsetof(struct inj_control, nonce)),
-		NULL);
-	if (errno == ESRCH)
-		return fail_errno(err, target->pid, "freeze", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
-		return fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
-			    "it has executed another program");
-	}
-	return 0;
-}
-
 static bool anybody_uses(const struct target *target, avc_remote base, size_t bytes)
 {
 	for (uint32_t i = 0; i < target->thread_count; i++) {
@@ -241,8 +221,6 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 	if (!result && (!main_thread || !main_thread->stopped))
 		result = fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
 			      "its main thread has just ended");
-	if (!result)
-		result = check_pad(target, err);
 	if (!result)
 		result = read_all(target, generation->slot, &generation->threads, err);
 	if (!result) {

@@ -364,6 +364,9 @@ int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 /* The same; `meanwhile` is called once while the kernel clones. */
 int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* exec puts another program in its place, at any moment, and the pad is gone: whether it
+ * is there, in a stopped thread.  If not, the target is not infected any more. */
+int pad_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
 bool in_old_pad(const struct target *target, avc_remote address);
 /* The same for a stopped thread of the app, which gets home by itself if we die:

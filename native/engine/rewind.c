@@ -129,11 +129,13 @@ static void timespec(struct target *target, struct thread *t, int argument, uint
 {
 	const uint64_t pointer = arch_syscall_arg(&t->regs, (unsigned int)argument);
 	const bool same = same_call(t, pointer);
+	struct avc_error gone = { 0 };
 	int64_t left[2], *cell;
 	int64_t ns;
 
 	/* Without a pad, or with all cells taken, it begins again in full. */
-	if (!pointer || !target->infected || take_cell(target, t) < 0)
+	if (!pointer || !target->infected || pad_check(target, t->tid, &gone) ||
+	    take_cell(target, t) < 0)
 		return;
 	cell = target->pad.control->timeout[t->timeout_cell];
 	if (same) {

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from harness import wait_until
 from native.guarded import GuardProcess, Victim, config
 
 
@@ -86,3 +87,14 @@ def test_stopped_by_job_control(tmp_path: Path) -> None:
         guard.wait("checkpoint", since=since)
         victim.wait_beats(20)
         assert victim.app == app
+
+
+def test_another_program_takes_its_place(tmp_path: Path) -> None:
+    """Again and again, at any moment: no thread of it is sent where only the old one had something."""
+    with Victim("reexec 47", tmp_path) as victim, GuardProcess(config(0.004), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        wait_until(lambda: victim.see().counter[0] > 100 or victim.popen.poll() is not None, 30, "100 programs")
+        assert victim.popen.poll() is None, [event for event in guard.events if event["kind"] == "died"]
+        assert not [event for event in guard.events if event["kind"] == "died"]
+        since = guard.mark()
+        guard.wait("checkpoint", since=since, count=3)
