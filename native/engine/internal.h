@@ -120,6 +120,7 @@ struct proc_status {
 	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t groups;         /* a hash                                           */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
+	bool shadow_stack; /* x86: CET                                        */
 };
 
 int proc_status(pid_t tid, struct proc_status *status);

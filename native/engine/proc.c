@@ -247,6 +247,8 @@ int proc_status(pid_t tid, struct proc_status *status)
 				status->groups = status->groups * 31 + (unsigned char)*value;
 		else if (!strncmp(line, "NoNewPrivs:", 11))
 			status->no_new_privs = (uint32_t)atoi(value);
+		else if (!strncmp(line, "x86_Thread_features:", 20))
+			status->shadow_stack = strstr(value, "shstk") != NULL;
 		else if (!strncmp(line, "Seccomp:", 8))
 			status->seccomp = (uint32_t)atoi(value);
 		else if (!strncmp(line, "Seccomp_filters:", 16))

@@ -111,10 +111,28 @@ static int check_children(struct target *target, struct avc_error *err)
 	return 0;
 }
 
+/* A thread's second stack would not know of what it was made to do in the pad, and return
+ * to the wrong place: so before that.  A program has it from its start, or not at all. */
+static int check_shadow_stack(struct target *target, struct avc_error *err)
+{
+	struct proc_status status;
+
+	if (target->infected)
+		return 0;
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.shadow_stack)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			    "it has shadow stacks (CET), which can not be put back; "
+			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
+	return 0;
+}
+
 int support_check(struct target *target, bool *passing, struct avc_error *err)
 {
 	*passing = false;
-	if (check_descriptors(target, err) || check_mappings(target, err))
+	if (check_shadow_stack(target, err) || check_descriptors(target, err) ||
+	    check_mappings(target, err))
 		return -1;
 	/* Thread by thread only when the last checkpoint did not find that it has none. */
 	*passing = !target->childless && check_children(target, err) != 0;

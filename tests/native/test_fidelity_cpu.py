@@ -29,3 +29,26 @@ def test_tiles(tmp_path: Path) -> None:
     with Victim("tiles 3", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 40, (0.01, 0.12))
         assert not victim.see().violations
+
+
+def test_protection_keys(tmp_path: Path) -> None:
+    """Each thread has the rights that it had, and the keys are allocated."""
+    skip_without("pkeys")
+    with Victim("pkeys 3", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 30, (0.01, 0.12))
+
+
+def test_shadow_stacks_are_refused(tmp_path: Path) -> None:
+    """A kernel that has them says so of each thread; a program compiled for them has one."""
+    if "x86_Thread_features:" not in Path("/proc/self/status").read_text():
+        pytest.skip("this kernel has no shadow stacks for programs (CONFIG_X86_USER_SHADOW_STACK)")
+    tunables = "/usr/bin/env GLIBC_TUNABLES=glibc.cpu.x86_shstk=on"
+    with Victim(f"{tunables} {BUILD / 'idle'} 0 1", tmp_path) as victim:
+        if (
+            "shstk"
+            not in Path(f"/proc/{victim.app}/status").read_text().split("x86_Thread_features:")[1].split("\n")[0]
+        ):
+            pytest.skip("this CPU or C library gives a program no shadow stack")
+        with GuardProcess(config(0.03), [victim.pid]) as guard:
+            assert "shadow stacks" in guard.wait("unprotected")["error"]["message"]
+            victim.wait_beats(20)
