@@ -93,7 +93,8 @@ enum mapping_flag {
 	MAPPING_WIPEONFORK = 2, /* wf */
 	MAPPING_DEVICE = 4,     /* io */
 	MAPPING_LOCKED = 8,     /* lo */
-	MAPPING_DROPPABLE = 16  /* dp */
+	MAPPING_DROPPABLE = 16, /* dp */
+	MAPPING_HUGETLB = 32    /* ht */
 };
 
 struct mapping {
@@ -484,10 +485,13 @@ void memory_dofork(const struct memory *memory, struct inj_call *call);
  * attempt will be better. */
 int memory_learn(struct target *target, long missing_pages, struct avc_error *err);
 /* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
+/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
+ * pages is small, and whoever writes to a shared one when it is empty is killed. */
+extern const char private_huge_pages[];
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
 /* At a restore, before anything runs. */
-int memory_put_back(const struct mem_image *image, struct avc_error *err) warn_unused;
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- infect.c ----------------------------------------------------------------- */
 

@@ -35,10 +35,15 @@
 #define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
 #define SMAPS_SHARE 50       /* the long file is read in at most 1/50 of the time */
 
+const char private_huge_pages[] =
+	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
+	"killed for want of another when it writes to one";
+
 struct area {
 	avc_remote start, end;
 	uint64_t offset, inode;
 	bool wiped; /* MADV_WIPEONFORK; else shared memory                     */
+	bool huge;  /* hugetlbfs, which does not know write(2)                */
 	int fd;     /* of the shared memory                                    */
 };
 
@@ -252,6 +257,7 @@ struct survey {
 	struct areas *areas;
 	uint64_t layout, shared_bytes, limit;
 	uint64_t left_bytes;
+	bool private_huge;
 };
 
 static uint64_t hash(uint64_t h, uint64_t value)
@@ -296,6 +302,7 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
+	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
 	if ((!wiped && !is_shared(m)) || is_pad(survey->target, m->start))
 		return 0;
 	if (!wiped) {
@@ -315,6 +322,7 @@ static int find_area(const struct mapping *m, void *arg)
 		.offset = m->offset,
 		.inode = m->inode,
 		.wiped = wiped,
+		.huge = m->flags & MAPPING_HUGETLB,
 		.fd = -1,
 	};
 	return 0;
@@ -411,6 +419,9 @@ static int check_areas(struct target *target, const struct generation *generatio
 	memory->read_ns = now_ns();
 	memory->cost_ns = memory->read_ns - start;
 	memory->left_bytes = survey.left_bytes;
+	if (!result && survey.private_huge)
+		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "", "%s",
+			      private_huge_pages);
 	if (!result && !same_areas(found, copied)) {
 		result = remember(target, generation->template, found, err);
 		if (!result)
@@ -526,18 +537,23 @@ int memory_finish(struct target *target, struct generation *generation, int64_t 
 	return 0;
 }
 
-int memory_put_back(const struct mem_image *image, struct avc_error *err)
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err)
 {
 	const uint8_t *from = image ? image->data : NULL;
+	int mem_fd = -1, result = 0;
 
-	for (uint32_t i = 0; image && i < image->areas.count; i++) {
+	for (uint32_t i = 0; !result && image && i < image->areas.count; i++) {
 		const struct area *a = &image->areas.area[i];
+		const off_t at = (off_t)(a->huge ? a->start : a->offset);
 
-		if (!a->wiped &&
-		    pwrite(a->fd, from, area_bytes(a), (off_t)a->offset) != (ssize_t)area_bytes(a))
-			return fail_errno(err, 0, "restore", "pwrite",
-					  "shared memory can not be written");
+		if (a->huge && mem_fd < 0)
+			mem_fd = proc_open(pid, "mem", O_RDWR);
+		if (!a->wiped && pwrite(a->huge ? mem_fd : a->fd, from, area_bytes(a), at) !=
+					 (ssize_t)area_bytes(a))
+			result = fail_errno(err, pid, "restore", "pwrite",
+					    "shared memory can not be written");
 		from += area_bytes(a);
 	}
-	return 0;
+	close_fd(&mem_fd);
+	return result;
 }

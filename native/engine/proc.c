@@ -149,7 +149,7 @@ static const struct {
 	enum mapping_flag flag;
 } mapping_flags[] = {
 	{ "dc", MAPPING_DONTFORK }, { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
-	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },
+	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
 };
 
 static uint32_t parse_flags(const char *p)

@@ -207,7 +207,7 @@ int restore(struct target *target, struct generation *generation, const struct l
 	if (!result)
 		attributes_put_back(generation->attributes, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, err);
+		result = memory_put_back(generation->image, *pid, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {

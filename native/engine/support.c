@@ -71,10 +71,15 @@ static int check_mappings(struct target *target, struct avc_error *err)
 	maps = fopen(path, "re");
 	if (!maps)
 		return fail_errno(err, target->pid, "check", "open(maps)", "it has ended");
-	while (!result && fgets(line, sizeof line, maps))
+	while (!result && fgets(line, sizeof line, maps)) {
 		if (strstr(line, " /[aio]"))
 			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
 				      "it uses kernel AIO");
+		/* Those of files are found in the first clone. */
+		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				      private_huge_pages);
+	}
 	fclose(maps);
 	target->surveyed_pages = result ? -1 : pages;
 	return result;

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,41 @@ def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) 
         told = guard.wait("checkpoint", cookie=2)["error"]["message"]
         assert "8000 kB of shared memory are more than avckpt.shm allows" in told
         assert not guard.wait("checkpoint", cookie=1).get("error")
+
+
+@pytest.fixture
+def huge_pages() -> Iterator[None]:
+    """A few more in the machine's pool while a test runs."""
+    pool = Path("/proc/sys/vm/nr_hugepages")
+    before = int(pool.read_text())
+    pool.write_text(str(before + 8))
+    try:
+        if int(pool.read_text()) < before + 8:
+            pytest.skip("the kernel finds no 8 huge pages")
+        yield
+    finally:
+        pool.write_text(str(before))
+
+
+@pytest.mark.usefixtures("huge_pages")
+def test_shared_huge_pages_are_rolled_back(tmp_path: Path) -> None:
+    with Victim("mappings 2048 --huge", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 15, (0.01, 0.15))
+
+
+@pytest.mark.usefixtures("huge_pages")
+@pytest.mark.parametrize("kind", ["huge", "hugefile"])
+def test_private_huge_pages_are_refused_as_long_as_there_are_any(kind: str, tmp_path: Path) -> None:
+    with (
+        Victim(f"unsupported {kind} 0.3 1", tmp_path) as victim,
+        GuardProcess(config(0.02), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint")
+        assert "private huge pages" in guard.wait("unprotected")["error"]["message"]
+        since = guard.mark()
+        assert victim.others() == []
+        victim.wait_beats(20)
+        guard.wait("checkpoint", since=since)
 
 
 NODE = """

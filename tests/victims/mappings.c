@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited]: memory of every kind a plain fork does not carry as it is,
+ * mappings [SHARED_KB] [--inherited] [--huge]: memory of every kind a plain fork does not carry as it is,
  * and kinds that are easily forgotten.  Each is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
@@ -14,7 +14,8 @@
  *   instant with the private memory
  * - mappings that come and go all the time
  *
- * With --inherited the first two are ordinary memory.
+ * With --inherited the first two are ordinary memory; with --huge the shared memory is of
+ * huge pages.
  */
 #include <setjmp.h>
 #include <signal.h>
@@ -115,11 +116,12 @@ int main(int argc, char **argv)
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited;
+	bool inherited, huge;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
-	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited]");
+	huge = victim_flag(&argc, argv, "--huge");
+	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -148,7 +150,7 @@ int main(int argc, char **argv)
 	regions[n++] = (struct region){ "the heap", heap, BYTES / 8 };
 	if (shared_kb) {
 		void *at = mmap(NULL, shared_kb << 10, PROT_READ | PROT_WRITE,
-				MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+				MAP_SHARED | MAP_ANONYMOUS | (huge ? MAP_HUGETLB : 0), -1, 0);
 
 		must(at != MAP_FAILED, "mmap");
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };

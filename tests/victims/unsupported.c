@@ -12,6 +12,8 @@
  *   sysvsem   has SysV semaphores with undo
  *   shared    64 MB of anonymous shared memory
  *   userfault has a userfaultfd
+ *   huge      private memory of huge pages
+ *   hugefile  the same, of a file (a memfd)
  */
 #include <linux/aio_abi.h>
 #include <linux/io_uring.h>
@@ -130,6 +132,35 @@ static void stop_shared(void)
 	munmap(memory, 64 << 20);
 }
 
+static bool start_huge(void)
+{
+	memory = mmap(NULL, 2 << 20, PROT_READ | PROT_WRITE,
+		      MAP_PRIVATE | MAP_ANONYMOUS | MAP_HUGETLB, -1, 0);
+	if (memory == MAP_FAILED)
+		return false;
+	memset(memory, 7, 2 << 20);
+	return true;
+}
+
+static bool start_hugefile(void)
+{
+	int file = memfd_create("huge", MFD_CLOEXEC | MFD_HUGETLB);
+
+	if (file < 0 || ftruncate(file, 2 << 20))
+		return false;
+	memory = mmap(NULL, 2 << 20, PROT_READ | PROT_WRITE, MAP_PRIVATE, file, 0);
+	close(file);
+	if (memory == MAP_FAILED)
+		return false;
+	memset(memory, 7, 2 << 20);
+	return true;
+}
+
+static void stop_huge(void)
+{
+	munmap(memory, 2 << 20);
+}
+
 static const struct kind {
 	const char *name;
 	bool (*start)(void);
@@ -138,7 +169,8 @@ static const struct kind {
 	{ "iouring", start_iouring, stop_fd },     { "aio", start_aio, stop_aio },
 	{ "traced", start_traced, NULL },          { "sysvshm", start_sysvshm, stop_sysvshm },
 	{ "sysvsem", start_sysvsem, NULL },        { "shared", start_shared, stop_shared },
-	{ "userfault", start_userfault, stop_fd },
+	{ "userfault", start_userfault, stop_fd }, { "huge", start_huge, stop_huge },
+	{ "hugefile", start_hugefile, stop_huge },
 };
 
 int main(int argc, char **argv)
