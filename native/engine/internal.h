@@ -161,8 +161,9 @@ struct creds {
 	uint32_t caps[6]; /* as capget(2) has them                            */
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
-	int32_t seccomp;   /* mode                                             */
-	uint64_t slack_ns; /* of timers                                        */
+	int32_t seccomp;     /* mode                                             */
+	uint64_t slack_ns;   /* of timers                                        */
+	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
 
 struct thread {

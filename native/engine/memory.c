@@ -527,9 +527,15 @@ static void lock_again(struct target *target, int64_t locked_kb, struct setup *s
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
+	const struct thread *main_thread = thread_find(target, target->pid);
+
 	if (check_areas(target, generation, err) || fill_wiped(target, generation, setup, err))
 		return -1;
 	lock_again(target, locked_kb, setup);
+	if (main_thread && main_thread->creds.future_lock)
+		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
+			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
 	if (target->memory->left_bytes && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
 		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",

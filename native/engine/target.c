@@ -354,7 +354,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
 	const avc_remote out = pad_remote(&target->pad, call->out);
-	struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes;
+	struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
 
 	call_begin(call, INJ_AFTER_HOME);
 	memset(call->out, 0, sizeof call->out);
@@ -365,6 +365,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	 * (fs/proc/base.c, proc_flush_pid()). */
 	inside = call_add(call, SYS_gettid, 0, 0, 0, 0, 0);
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32, 0, 0, 0);
+	locks = thread->tid == target->pid ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
 	attributes = attributes_ask(call, call->out + 64, out + 64);
 	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
 	    pad_run(thread->tid, call, err))
@@ -387,6 +388,8 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	memcpy(thread->name, call->out + 32, sizeof thread->name);
 	thread->name[sizeof thread->name - 1] = 0;
 	attributes_answer(attributes, call->out + 64, &thread->creds);
+	if (locks && locks->result > 0)
+		thread->creds.future_lock = (int32_t)locks->result;
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->known = true;
 	thread->asked = 0;

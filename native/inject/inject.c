@@ -7,6 +7,7 @@
 
 #include <asm/unistd.h>
 #include <linux/futex.h>
+#include <linux/mman.h>
 #include <linux/prctl.h>
 #include <linux/sched.h>
 
@@ -69,6 +70,23 @@ static void make_list(struct inj_syscall *s, uint64_t count)
 					  s[i].arg[3], s[i].arg[4], s[i].arg[5]);
 }
 
+/* Nothing tells but new memory: what is locked can not be dropped, and is there at once
+ * if it is not to be locked on fault only. */
+static long find_future_lock(void)
+{
+	const long at = raw_syscall(__NR_mmap, 0, 4096, PROT_READ | PROT_WRITE,
+				    MAP_PRIVATE | MAP_ANONYMOUS, (uint64_t)-1, 0);
+	uint8_t present = 0;
+	long dropped;
+
+	if (at < 0 && at > -4096)
+		return at;
+	SYS3(__NR_mincore, at, 4096, &present);
+	dropped = SYS3(__NR_madvise, at, 4096, MADV_DONTNEED);
+	SYS2(__NR_munmap, at, 4096);
+	return dropped == 0 ? 0 : MCL_FUTURE | (present & 1 ? 0 : MCL_ONFAULT);
+}
+
 __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 {
 	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++) {
@@ -76,6 +94,8 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 
 		if (s->nr == INJ_LIST)
 			make_list((struct inj_syscall *)s->arg[0], s->arg[1]);
+		else if (s->nr == INJ_FUTURE_LOCK)
+			s->result = find_future_lock();
 		else if (s->nr == __NR_clone)
 			s->result = inj_clone(s->arg[0], s->arg[1], s->arg[2], s->arg[3],
 					      s->arg[4]);

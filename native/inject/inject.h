@@ -48,6 +48,8 @@ struct inj_syscall {
 
 /* Instead of a number of a system call: arg[1] calls, struct inj_syscall at arg[0]. */
 #define INJ_LIST (-1)
+/* Likewise, with what mlockall(2) was told of memory to come for a result. */
+#define INJ_FUTURE_LOCK (-2)
 
 enum inj_after {
 	INJ_AFTER_HOME = 0, /* go back to the interrupted context (struct inj_home) */

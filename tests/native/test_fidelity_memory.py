@@ -28,7 +28,7 @@ def flagged(pid: int, flag: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("command", ["mappings", "mappings 0", "mappings 3000"])
+@pytest.mark.parametrize("command", ["mappings", "mappings 0", "mappings 3000", "mappings 64 --future"])
 def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
     """The victim compares all of it with one version number all the time."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
@@ -37,7 +37,7 @@ def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
         kill_at_random(guard, victim, 30, (0.01, 0.15))
         # Its own forks are to find it wiped, now as before.
         assert flagged(victim.app, "wf") == wiped
-        assert flagged(victim.app, "lo") == locked
+        assert set(locked) <= set(flagged(victim.app, "lo"))
 
 
 def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited] [--huge]: memory of every kind a plain fork does not carry as it is,
+ * mappings [SHARED_KB] [--inherited] [--huge] [--future]: memory of every kind a plain fork does not carry as it is,
  * and kinds that are easily forgotten.  Each is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
@@ -15,7 +15,8 @@
  * - mappings that come and go all the time
  *
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of
- * huge pages.
+ * huge pages;
+ * with --future all memory that comes is locked (mlockall).
  */
 #include <setjmp.h>
 #include <signal.h>
@@ -98,11 +99,16 @@ static void check_fault(volatile uint64_t *at, bool by_writing, const char *what
 	}
 }
 
+static bool future;
+
 static void come_and_go(void)
 {
 	uint64_t *at = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 
 	CHECK(at[17] == 0, "a new mapping is not empty");
+	if (future)
+		CHECK(madvise(at, BYTES, MADV_DONTNEED) && errno == EINVAL,
+		      "new memory is not locked");
 	at[17] = version;
 	CHECK(!mprotect(at, 4096, PROT_READ), "mprotect: %s", strerror(errno));
 	CHECK(at[17] == version, "a mapping forgot");
@@ -121,7 +127,8 @@ int main(int argc, char **argv)
 
 	inherited = victim_flag(&argc, argv, "--inherited");
 	huge = victim_flag(&argc, argv, "--huge");
-	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge]");
+	future = victim_flag(&argc, argv, "--future");
+	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge] [--future]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -160,6 +167,7 @@ int main(int argc, char **argv)
 	must(!mprotect(read_only, BYTES, PROT_READ), "mprotect");
 	none = map(PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	write_all(regions, n);
+	must(!future || !mlockall(MCL_FUTURE), "mlockall");
 	victim_ready();
 	for (lap = 0;; lap++) {
 		check_all(regions, n);
