@@ -155,13 +155,21 @@ struct scheduling {
 	int32_t reserved;
 };
 
+#define GROUPS_KEPT 32 /* of a thread; of one with more it is only known how many */
+#define NODE_WORDS 16  /* 1024 nodes of memory                                   */
+
 struct creds {
 	uint32_t uid[3], gid[3]; /* real, effective, saved                      */
 	uint32_t fsuid, fsgid;
 	uint32_t caps[6]; /* as capget(2) has them                            */
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
-	int32_t seccomp;     /* mode                                             */
+	int32_t seccomp;  /* mode                                             */
+	uint64_t filters; /* of seccomp: a hash                               */
+	int32_t group_count;
+	uint32_t group[GROUPS_KEPT]; /* supplementary                             */
+	int32_t memory_policy;       /* set_mempolicy(2), -1: the kernel has none */
+	uint64_t nodes[NODE_WORDS];
 	uint64_t slack_ns;   /* of timers                                        */
 	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
@@ -443,7 +451,7 @@ void timers_advance(const struct timer_image *image, uint64_t now);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 
-#define ATTRIBUTES_ASK_BYTES 96
+#define ATTRIBUTES_ASK_BYTES 368
 /* While it is stopped, from outside. */
 void scheduling_read(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
@@ -454,6 +462,8 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
+/* Of a stopped thread: its seccomp filters, whatever they say. */
+uint64_t filters_read(pid_t tid);
 int attributes_keep(const struct target *target, struct generation *generation,
 		    struct avc_error *err) warn_unused;
 /* Before the restored threads go: what can be done from outside only. */

@@ -390,6 +390,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	attributes_answer(attributes, call->out + 64, &thread->creds);
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
+	thread->creds.filters = filters_read(thread->tid);
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->known = true;
 	thread->asked = 0;

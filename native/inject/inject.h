@@ -63,7 +63,7 @@ struct inj_call {
 	uint32_t count;
 	uint32_t after; /* enum inj_after                                      */
 	struct inj_syscall call[INJ_CALLS_MAX];
-	uint8_t out[256]; /* where calls may leave results                      */
+	uint8_t out[512]; /* where calls may leave results                      */
 	uint8_t stack[INJ_STACK_BYTES] __attribute__((aligned(64)));
 };
 

@@ -33,10 +33,13 @@ def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
     """The victim compares all of it with one version number all the time."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
         wiped, locked = flagged(victim.app, "wf"), flagged(victim.app, "lo")
+        marks = {flag: flagged(victim.app, flag) for flag in ("hg", "nh", "dd", "mg")}
         assert wiped
+        assert any(marks.values())
         kill_at_random(guard, victim, 30, (0.01, 0.15))
         # Its own forks are to find it wiped, now as before.
         assert flagged(victim.app, "wf") == wiped
+        assert {flag: flagged(victim.app, flag) for flag in marks} == marks
         assert set(locked) <= set(flagged(victim.app, "lo"))
 
 

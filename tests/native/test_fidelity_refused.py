@@ -24,6 +24,8 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported iouring", "io_uring"),
         ("unsupported aio", "AIO"),
         ("unsupported userfault", "userfaultfd"),
+        ("unsupported filter", "differ in their seccomp filters"),
+        ("unsupported groups", "other supplementary groups"),
         ("forker", "child processes (1)"),
     ],
 )

@@ -12,12 +12,14 @@
  * - locked memory (mlock), as far as the limits allow
  * - anonymous shared memory of SHARED_KB (64; 0: none), which must be of one
  *   instant with the private memory
+ * - areas with a memory policy, and with marks (MADV_HUGEPAGE and others)
  * - mappings that come and go all the time
  *
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of
  * huge pages;
  * with --future all memory that comes is locked (mlockall).
  */
+#include <linux/mempolicy.h>
 #include <setjmp.h>
 #include <signal.h>
 #include <sys/resource.h>
@@ -115,6 +117,35 @@ static void come_and_go(void)
 	CHECK(!munmap(at, BYTES), "munmap: %s", strerror(errno));
 }
 
+static uint64_t *bound; /* to a node of memory; NULL: the kernel knows none */
+
+/* Areas of which a test compares the marks. */
+static void mark_kinds(void)
+{
+	static const int kinds[] = { MADV_HUGEPAGE, MADV_NOHUGEPAGE, MADV_DONTDUMP,
+				     MADV_MERGEABLE };
+	const unsigned long node = 1;
+
+	/* A kernel may be without one or the other. */
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++)
+		must(!madvise(map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1), BYTES,
+			      kinds[i]) ||
+			     errno == EINVAL,
+		     "madvise");
+	bound = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	if (syscall(SYS_mbind, bound, BYTES, MPOL_BIND, &node, 64, 0))
+		bound = NULL;
+}
+
+static void check_bound(void)
+{
+	int policy = -1;
+
+	CHECK(!bound || (!syscall(SYS_get_mempolicy, &policy, NULL, 0, bound, MPOL_F_ADDR) &&
+			 policy == MPOL_BIND),
+	      "the policy of an area is %d", policy);
+}
+
 int main(int argc, char **argv)
 {
 	struct sigaction act = { .sa_handler = on_fault };
@@ -162,6 +193,7 @@ int main(int argc, char **argv)
 		must(at != MAP_FAILED, "mmap");
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };
 	}
+	mark_kinds();
 	read_only = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	read_only[3] = 333;
 	must(!mprotect(read_only, BYTES, PROT_READ), "mprotect");
@@ -179,6 +211,7 @@ int main(int argc, char **argv)
 		CHECK(((char *)regions[2].at)[BYTES - 1] == 'f', "the file's own page is %x",
 		      ((unsigned char *)regions[2].at)[BYTES - 1]);
 		come_and_go();
+		check_bound();
 		if (lap % 1024 == 0 && lap < 65536) {
 			brk_at = sbrk(4096);
 			CHECK(brk_at != (void *)-1, "sbrk: %s", strerror(errno));

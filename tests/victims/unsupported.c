@@ -13,10 +13,16 @@
  *   shared    64 MB of anonymous shared memory
  *   userfault has a userfaultfd
  *   huge      private memory of huge pages
+ *   filter    one thread under a seccomp filter more than the others, which have one
+ *   groups    one thread with other groups, which the main thread may not set
  *   hugefile  the same, of a file (a memfd)
  */
 #include <linux/aio_abi.h>
+#include <linux/capability.h>
+#include <linux/filter.h>
 #include <linux/io_uring.h>
+#include <linux/seccomp.h>
+#include <pthread.h>
 #include <sched.h>
 #include <signal.h>
 #include <sys/ipc.h>
@@ -161,6 +167,63 @@ static void stop_huge(void)
 	munmap(memory, 2 << 20);
 }
 
+static bool add_filter(void)
+{
+	struct sock_filter all[] = { BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW) };
+	struct sock_fprog program = { 1, all };
+
+	return !prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) &&
+	       !syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, 0, &program);
+}
+
+static void *filtered(void *arg)
+{
+	if (!add_filter())
+		unavailable("seccomp");
+	(void)arg;
+	for (;;)
+		pause();
+	return NULL;
+}
+
+static bool start_filter(void)
+{
+	pthread_t thread;
+
+	return add_filter() && !pthread_create(&thread, NULL, filtered, NULL);
+}
+
+static void *grouped(void *arg)
+{
+	const gid_t group = 4711;
+
+	if (syscall(SYS_setgroups, 1, &group))
+		unavailable("setgroups");
+	*(volatile bool *)arg = true;
+	for (;;)
+		pause();
+	return NULL;
+}
+
+static bool start_groups(void)
+{
+	static volatile bool done;
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2] = { { 0 } };
+	pthread_t thread;
+
+	if (pthread_create(&thread, NULL, grouped, (void *)&done))
+		return false;
+	while (!done)
+		nap_us(100);
+	/* Of the main thread, which has no more than the other: but for this one, it would be
+	 * refused for that. */
+	if (syscall(SYS_capget, &header, data))
+		return false;
+	data[0].effective &= ~(1u << CAP_SETGID);
+	return !syscall(SYS_capset, &header, data);
+}
+
 static const struct kind {
 	const char *name;
 	bool (*start)(void);
@@ -170,6 +233,7 @@ static const struct kind {
 	{ "traced", start_traced, NULL },          { "sysvshm", start_sysvshm, stop_sysvshm },
 	{ "sysvsem", start_sysvsem, NULL },        { "shared", start_shared, stop_shared },
 	{ "userfault", start_userfault, stop_fd }, { "huge", start_huge, stop_huge },
+	{ "filter", start_filter, NULL },          { "groups", start_groups, NULL },
 	{ "hugefile", start_hugefile, stop_huge },
 };
 
