@@ -306,11 +306,12 @@ static int find_area(const struct mapping *m, void *arg)
 	if ((!wiped && !is_shared(m)) || is_pad(survey->target, m->start))
 		return 0;
 	if (!wiped) {
-		survey->shared_bytes += m->end - m->start;
-		if (survey->shared_bytes > survey->limit) {
+		/* One that is too large does not keep small ones from being rolled back. */
+		if (survey->shared_bytes + (m->end - m->start) > survey->limit) {
 			survey->left_bytes += m->end - m->start;
 			return 0;
 		}
+		survey->shared_bytes += m->end - m->start;
 	}
 	if (areas->count == AREAS_MAX) {
 		areas->too_many = true;

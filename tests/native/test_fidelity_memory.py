@@ -63,6 +63,12 @@ def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) 
         assert not guard.wait("checkpoint", cookie=1).get("error")
 
 
+def test_small_shared_memory_is_rolled_back_beside_a_large_one(tmp_path: Path) -> None:
+    with Victim("mappings 64 --large", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
+        assert "65536 kB of shared memory" in guard.wait("checkpoint")["error"]["message"]
+        kill_at_random(guard, victim, 10, (0.01, 0.15))
+
+
 @pytest.fixture
 def huge_pages() -> Iterator[None]:
     """A few more in the machine's pool while a test runs."""

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited] [--huge] [--future]: memory of every kind a plain fork does not carry as it is,
+ * mappings [SHARED_KB] [--inherited] [--huge] [--future] [--large]: memory of every kind a plain fork does not carry as it is,
  * and kinds that are easily forgotten.  Each is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
@@ -17,6 +17,7 @@
  *
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of
  * huge pages;
+ * with --large there are 64 MB more of shared memory, of which nothing is expected;
  * with --future all memory that comes is locked (mlockall).
  */
 #include <linux/mempolicy.h>
@@ -165,13 +166,14 @@ int main(int argc, char **argv)
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited, huge;
+	bool inherited, huge, large;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
 	huge = victim_flag(&argc, argv, "--huge");
 	future = victim_flag(&argc, argv, "--future");
-	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge] [--future]");
+	large = victim_flag(&argc, argv, "--large");
+	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge] [--future] [--large]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -205,6 +207,10 @@ int main(int argc, char **argv)
 		must(at != MAP_FAILED, "mmap");
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };
 	}
+	/* Below the other, so that it is found first. */
+	must(!large || mmap(NULL, 64 << 20, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1,
+			    0) != MAP_FAILED,
+	     "mmap");
 	mark_kinds();
 	read_only = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	read_only[3] = 333;
