@@ -109,9 +109,10 @@ struct file {
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
 	int tcp_state; /* 0: no TCP                                                 */
 	/* What can be read from it, when its other end is the app's own as well   */
-	uint8_t *content;
+	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
 	bool content_lost; /* there was something that can not be put back          */
+	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 };
 
 struct files {

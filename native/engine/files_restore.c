@@ -502,7 +502,7 @@ static void put_contents(struct files_work *work)
 		fd = files_borrow(work->generation->pidfd, w->fd);
 		other_fd = files_borrow(work->generation->pidfd, other->fd);
 		if (fd >= 0 && other_fd >= 0 &&
-		    (w->content_bytes || w->content_lost ||
+		    (w->content_bytes || w->content_lost || w->rights_lost ||
 		     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
 			note(work, w, file_put_content(fd, other_fd, w));
 		close_fd(&fd);

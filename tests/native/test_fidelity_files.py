@@ -284,3 +284,25 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
         checkpoint(guard)
         disturb(victim)
         assert "not all of what it watched" in restored(victim, guard)["error"]["detail"]
+
+
+@pytest.mark.parametrize("scenario", ["messages"])
+def test_sockets(scenario: str, tmp_path: Path) -> None:
+    """Datagrams and records are in them again, each by itself."""
+    with (
+        Victim(f"sockets {scenario} {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        for _ in range(2):
+            checkpoint(guard)
+            for _kill in range(KILLS):
+                disturb(victim)
+                event = restored(victim, guard)
+                assert "error" not in event, event
+
+
+def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
+    with Victim(f"sockets rights {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        victim.kill_app()
+        assert "descriptors that were on their way" in guard.wait("restored")["error"]["detail"]
