@@ -35,7 +35,8 @@ enum file_kind {
 	FILE_TIMERFD,
 	FILE_SIGNALFD,
 	FILE_EPOLL,
-	FILE_INOTIFY
+	FILE_INOTIFY,
+	FILE_PIDFD
 };
 
 struct file_lock {
@@ -93,6 +94,8 @@ struct file {
 	int clock, settime_flags;
 	uint64_t ticks, deadline_ns, interval_ns;
 	uint64_t mask; /* signalfd                                                  */
+	/* pidfd: in our namespace; of the app itself or a thread of it, in its own      */
+	pid_t pid, pid_inside;
 	uint32_t watch_count;
 	struct file_watch *watch; /* epoll, allocated                              */
 	uint32_t mark_count;

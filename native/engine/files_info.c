@@ -176,6 +176,8 @@ static void take_line(struct file *file, const char *key, const char *value, uin
 		file->interval_ns = nanoseconds(value);
 	else if (!strcmp(key, "sigmask"))
 		file->mask = strtoull(value, NULL, 16);
+	else if (!strcmp(key, "Pid"))
+		file->pid = atoi(value);
 	else if (!strcmp(key, "tfd"))
 		add_watch(file, value, room);
 	else if (!strcmp(key, "inotify wd"))
@@ -190,6 +192,7 @@ static const struct {
 	{ FILE_TIMERFD, "clockid" },
 	{ FILE_SIGNALFD, "sigmask" },
 	{ FILE_EPOLL, "tfd" },
+	{ FILE_PIDFD, "Pid" },
 };
 
 bool file_read_info(pid_t pid, struct file *file)

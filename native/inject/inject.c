@@ -170,12 +170,26 @@ static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t want
 	return -17; /* EEXIST */
 }
 
+static long open_pidfd(uint64_t fd, uint64_t pid, uint64_t flags, uint64_t cloexec)
+{
+	const long opened = SYS2(__NR_pidfd_open, pid, flags);
+	long r;
+
+	if (opened < 0)
+		return opened;
+	r = SYS3(__NR_dup3, opened, fd, cloexec);
+	SYS1(__NR_close, opened);
+	return r;
+}
+
 static long make_call(const struct inj_syscall *s)
 {
 	const uint64_t *arg = s->arg;
 
 	if (s->nr == INJ_TIMER_CREATE)
 		return make_timer(arg[0], arg[1], (int32_t *)arg[2], (int32_t)arg[3]);
+	if (s->nr == INJ_PIDFD_OPEN)
+		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
 	return raw_syscall(s->nr, arg[0], arg[1], arg[2], arg[3], arg[4], arg[5]);
 }
 

@@ -95,6 +95,8 @@ struct inj_setup {
 
 /* Instead of a system call: timer_create(clock, event, &id) that gives the id arg[3]. */
 #define INJ_TIMER_CREATE (-1)
+/* Likewise: pidfd_open(arg[1], arg[2]), as the descriptor arg[0] with the flags arg[3]. */
+#define INJ_PIDFD_OPEN (-2)
 
 enum inj_setup_flag {
 	INJ_MUST = 0,

@@ -286,9 +286,9 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
         assert "not all of what it watched" in restored(victim, guard)["error"]["detail"]
 
 
-@pytest.mark.parametrize("scenario", ["messages"])
+@pytest.mark.parametrize("scenario", ["messages", "pidfds"])
 def test_sockets(scenario: str, tmp_path: Path) -> None:
-    """Datagrams and records are in them again, each by itself."""
+    """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
     with (
         Victim(f"sockets {scenario} {tmp_path}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,

@@ -4,7 +4,9 @@
  *
  *   sockets SCENARIO FOLDER     see scenario.h
  */
+#include <poll.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
 
 #include "scenario.h"
 
@@ -86,12 +88,63 @@ static void rights_setup(void)
 	must(sendmsg(fd[0], &head, 0) == 1, "sendmsg");
 }
 
+/* ---- pidfds ----------------------------------------------------------------------------- */
+
+static int pidfd_of(pid_t pid, unsigned int flags)
+{
+	return (int)syscall(SYS_pidfd_open, pid, flags);
+}
+
+static void pidfds_setup(void)
+{
+	fd[0] = pidfd_of(getppid(), 0);
+	fd[1] = pidfd_of(getpid(), 0);
+	fd[2] = pidfd_of(getpid(), O_NONBLOCK);
+	fd[3] = dup(fd[1]);
+	must(fd[0] >= 0 && fd[1] >= 0 && fd[2] >= 0 && fd[3] >= 0, "pidfd_open");
+}
+
+static void pidfds_disturb(void)
+{
+	close(fd[0]);
+	close(fd[2]);
+}
+
+static void expect_process(int f, pid_t pid)
+{
+	struct pollfd p = { .fd = f, .events = POLLIN };
+	char path[48], text[512], *line;
+	ssize_t n;
+	int info;
+
+	CHECK(poll(&p, 1, 0) == 0, "the process of pidfd %d has ended", f);
+	CHECK(!syscall(SYS_pidfd_send_signal, f, 0, NULL, 0), "pidfd %d: %s", f, strerror(errno));
+	snprintf(path, sizeof path, "/proc/self/fdinfo/%d", f);
+	info = open(path, O_RDONLY);
+	n = read(info, text, sizeof text - 1);
+	close(info);
+	text[n > 0 ? n : 0] = 0;
+	line = strstr(text, "\nPid:");
+	CHECK(line && atoi(line + 5) == pid, "pidfd %d is not of %d: %s", f, pid, text);
+}
+
+static void pidfds_verify(void)
+{
+	expect_process(fd[0], getppid());
+	for (int i = 1; i <= 3; i++)
+		expect_process(fd[i], getpid());
+	CHECK(fcntl(fd[2], F_GETFL) & O_NONBLOCK && fcntl(fd[2], F_GETFD) == FD_CLOEXEC &&
+		      !fcntl(fd[3], F_GETFD),
+	      "the flags of a pidfd");
+}
+
 static void nothing(void)
 {
 }
 
 static const struct scenario scenarios[] = {
 	{ "messages", messages_setup, messages_disturb, messages_verify },
+	{ "pidfds", pidfds_setup, pidfds_disturb, pidfds_verify },
 	{ "rights", rights_setup, nothing, nothing },
 };
 
