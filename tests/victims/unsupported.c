@@ -2,7 +2,7 @@
  *
  * unsupported KIND [AFTER_SECONDS [FOR_SECONDS]]: a process that can not be
  * checkpointed, from AFTER_SECONDS after its start (0), for FOR_SECONDS (0: for
- * ever; not every kind can be undone).  Beats every 1 ms; counter 0 is 1 while it
+ * ever; not every kind can be undone); AFTER_SECONDS "signal": from SIGUSR1 on.  Beats every 1 ms; counter 0 is 1 while it
  * is as it says.
  *
  *   iouring   has an io_uring
@@ -13,6 +13,7 @@
  *   shared    64 MB of anonymous shared memory
  *   userfault has a userfaultfd
  *   huge      private memory of huge pages
+ *   nested    children would get a PID namespace of their own
  *   filter    one thread under a seccomp filter more than the others, which have one
  *   groups    one thread with other groups, which the main thread may not set
  *   hugefile  the same, of a file (a memfd)
@@ -167,6 +168,11 @@ static void stop_huge(void)
 	munmap(memory, 2 << 20);
 }
 
+static bool start_nested(void)
+{
+	return unshare(CLONE_NEWPID) == 0;
+}
+
 static bool add_filter(void)
 {
 	struct sock_filter all[] = { BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW) };
@@ -233,14 +239,16 @@ static const struct kind {
 	{ "traced", start_traced, NULL },          { "sysvshm", start_sysvshm, stop_sysvshm },
 	{ "sysvsem", start_sysvsem, NULL },        { "shared", start_shared, stop_shared },
 	{ "userfault", start_userfault, stop_fd }, { "huge", start_huge, stop_huge },
-	{ "filter", start_filter, NULL },          { "groups", start_groups, NULL },
-	{ "hugefile", start_hugefile, stop_huge },
+	{ "nested", start_nested, NULL },          { "filter", start_filter, NULL },
+	{ "groups", start_groups, NULL },          { "hugefile", start_hugefile, stop_huge },
 };
 
 int main(int argc, char **argv)
 {
 	const struct kind *kind = kinds, *end = kinds + sizeof(kinds) / sizeof(kinds[0]);
 	uint64_t from_ns, to_ns = 0;
+	bool on_signal;
+	sigset_t usr1;
 
 	victim_start(&argc, argv, 1, "KIND [AFTER_SECONDS [FOR_SECONDS]]");
 	while (kind < end && strcmp(kind->name, argv[1]))
@@ -249,11 +257,16 @@ int main(int argc, char **argv)
 		fprintf(stderr, "unsupported: no kind is called %s\n", argv[1]);
 		return 2;
 	}
-	from_ns = now_ns() + (uint64_t)((argc > 2 ? atof(argv[2]) : 0) * 1e9);
-	if (argc > 3 && atof(argv[3]) > 0)
-		to_ns = from_ns + (uint64_t)(atof(argv[3]) * 1e9);
+	sigemptyset(&usr1);
+	sigaddset(&usr1, SIGUSR1);
+	sigprocmask(SIG_BLOCK, &usr1, NULL);
+	on_signal = argc > 2 && !strcmp(argv[2], "signal");
+	from_ns = on_signal ? UINT64_MAX
+			    : now_ns() + (uint64_t)((argc > 2 ? atof(argv[2]) : 0) * 1e9);
 	board->counter[0] = 0;
 	while (now_ns() < from_ns || !board->counter[0]) {
+		if (on_signal && sigtimedwait(&usr1, NULL, &(struct timespec){ 0 }) == SIGUSR1)
+			from_ns = now_ns();
 		if (now_ns() >= from_ns) {
 			if (!kind->start())
 				unavailable(kind->name);
@@ -264,6 +277,8 @@ int main(int argc, char **argv)
 		beat();
 		nap_us(1000);
 	}
+	if (argc > 3 && atof(argv[3]) > 0)
+		to_ns = from_ns + (uint64_t)(atof(argv[3]) * 1e9);
 	for (;;) {
 		if (to_ns && now_ns() >= to_ns && kind->stop) {
 			kind->stop();
