@@ -480,6 +480,8 @@ static void put_states(struct files_work *work)
 			continue;
 		}
 		note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		if (w->kind == FILE_INOTIFY)
+			note(work, w, file_put_marks(fd, w, n, work->init));
 		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
@@ -503,7 +505,7 @@ static void put_contents(struct files_work *work)
 		fd = files_borrow(work->generation->pidfd, w->fd);
 		other_fd = files_borrow(work->generation->pidfd, other->fd);
 		if (fd >= 0 && other_fd >= 0 &&
-		    (w->content_bytes || w->content_lost ||
+		    (w->content_bytes || w->content_lost || w->rights_lost ||
 		     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
 			note(work, w, file_put_content(fd, other_fd, w));
 		close_fd(&fd);

@@ -95,7 +95,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 				    "it is just starting a process");
 		if (!t->stopped)
 			continue;
-		if (next >= target->pad.threads_max && t->tid != target->pid)
+		if (next >= target->pad.threads_max && t->tid != target->leader)
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "more threads than prepared for");
 		if (!arch_is_native(&t->regs))
@@ -109,7 +109,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 		if (in_old_pad(target, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old pad");
-		t->block = t->tid == target->pid ? 0 : (int)next++;
+		t->block = t->tid == target->leader ? 0 : (int)next++;
 		if (thread_read(t, err))
 			return -1;
 		if (arch_frame_read_xstate(t->tid,
@@ -120,26 +120,6 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 			return -1;
 	}
 	*threads = next;
-	return 0;
-}
-
-/* exec puts another program in its place, and the pad is gone. */
-static int check_pad(struct target *target, struct avc_error *err)
-{
-	long nonce;
-
-	errno = 0;
-	nonce = ptrace(
-		PTRACE_PEEKDATA, target->pid,
-		(void *)(target->pad.base + INJ_CODE_BYTES + offsetof(struct inj_control, nonce)),
-		NULL);
-	if (errno == ESRCH)
-		return fail_errno(err, target->pid, "freeze", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
-		return fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
-			    "it has executed another program");
-	}
 	return 0;
 }
 
@@ -192,7 +172,7 @@ static int clone_app(struct target *target, struct thread *main_thread,
 			if (anybody_uses(target, base, bytes))
 				break;
 			call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-			generation->vm_pages -= (long)(bytes / 4096);
+			generation->vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 		}
 	/* ECHILD, if it has none: the one question that needs no look at each thread. */
 	children = call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);
@@ -239,10 +219,8 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 	times->stop_ns = now_ns() - start;
 	main_thread = thread_find(target, target->pid);
 	if (!result && (!main_thread || !main_thread->stopped))
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			      "its main thread has ended");
-	if (!result)
-		result = check_pad(target, err);
+		result = fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
+			      "its main thread has just ended");
 	if (!result)
 		result = read_all(target, generation->slot, &generation->threads, err);
 	if (!result) {

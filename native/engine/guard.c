@@ -29,7 +29,7 @@ struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind ki
 		.kind = kind,
 		.cookie = guard->cookie,
 		.at_ns = now_ns(),
-		.app_pid = guard->target.pid,
+		.app_pid = guard->target.leader,
 		.app_pid_inside = guard->target.inside,
 		.generations = guard->count,
 		.restores = guard->restores,
@@ -122,7 +122,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	kill(guard->target.pid, SIGKILL);
+	kill(guard->target.leader, SIGKILL);
 }
 
 static bool take_command(struct avc_guard *guard, struct command *command)

@@ -58,7 +58,7 @@ static void touch_slot(const struct pad *pad, uint32_t slot, uint32_t threads)
 	for (uint32_t i = 0; i < threads && i < pad->threads_max; i++) {
 		volatile uint8_t *frame = pad_frame(pad, slot, i);
 
-		for (size_t at = 0; at < arch_frame_bytes(); at += 4096)
+		for (size_t at = 0; at < arch_frame_bytes(); at += ARCH_PAGE_BYTES)
 			frame[at] = 0;
 		frame[arch_frame_bytes() - 1] = 0;
 		*(volatile uint64_t *)pad_thread(pad, slot, i) = 0;
@@ -70,7 +70,8 @@ static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err
 	struct target *target = &guard->target;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (find_app(guard, err) || support_check(target, passing, err) || take_stock(target, err))
+	if (find_app(guard, err) || target_follow(target, err) ||
+	    support_check(target, passing, err) || take_stock(target, err))
 		return -1;
 	if (target->infected && (target->thread_count > target->pad.threads_max ||
 				 guard->config.keep >= target->pad.slots))
@@ -188,7 +189,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard->misses = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
-		event.app_pid = guard->target.pid;
+		event.app_pid = guard->target.leader;
 		event.app_pid_inside = guard->target.inside;
 		emit(guard, &event);
 		return;

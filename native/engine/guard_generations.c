@@ -74,8 +74,8 @@ int known_tracees(const struct avc_guard *guard, pid_t keep[AVC_KEEP_MAX + 2])
 		keep[count++] = guard->generations[i].template;
 	if (guard->target.holder)
 		keep[count++] = guard->target.holder;
-	if (guard->target.pid)
-		keep[count++] = guard->target.pid;
+	if (guard->target.leader)
+		keep[count++] = guard->target.leader;
 	return count;
 }
 

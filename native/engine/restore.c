@@ -52,7 +52,7 @@ static void reset(const struct pad *pad, uint32_t slot_number)
 	struct inj_slot *slot = pad_slot(pad, slot_number);
 
 	slot->state = INJ_IDLE;
-	slot->go = 0;
+	slot->go = INJ_GO_NOT;
 	slot->ready = 0;
 	slot->running = 0;
 	slot->error = 0;
@@ -174,6 +174,12 @@ static void note_failed(const struct pad *pad, uint32_t slot, pid_t pid, struct 
 		     setup_name(pad, pad_remote(pad, s)), "not everything could be put back");
 }
 
+static void let_go(struct inj_slot *slot, enum inj_go stage)
+{
+	__atomic_store_n(&slot->go, stage, __ATOMIC_RELEASE);
+	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+}
+
 int restore(struct target *target, struct generation *generation, const struct link *link,
 	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
 	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
@@ -201,7 +207,7 @@ int restore(struct target *target, struct generation *generation, const struct l
 	if (!result)
 		attributes_put_back(generation->attributes, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, err);
+		result = memory_put_back(generation->image, *pid, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {
@@ -221,8 +227,12 @@ int restore(struct target *target, struct generation *generation, const struct l
 	}
 	if (sandbox)
 		sandbox_go(sandbox, &target->pad, generation->slot);
-	__atomic_store_n(&slot->go, 1, __ATOMIC_RELEASE);
-	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+	/* As they knew it: ended.  (sandbox_go() has seen to it.) */
+	else if (generation->headless) {
+		let_go(slot, INJ_GO_ENDED);
+		proc_await_end(*pid);
+	}
+	let_go(slot, INJ_GO_ALL);
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 
