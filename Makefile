@@ -10,6 +10,8 @@ VENV   := .venv/bin
 T      ?=
 # `make test JUNIT=build/junit.xml` writes the results for a machine, too.
 JUNIT  ?=
+# Rounds of each program in `make test-programs`.
+ROUNDS ?= 200
 # More arguments for pytest, e.g. PYTEST_ARGS=-x.
 PYTEST_ARGS ?=
 # `make test TESTS=tests/unit` takes one kind only.
@@ -39,6 +41,10 @@ demo: setup ## kill a protected container's application twice and watch it go on
 test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
+test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp
+	@scripts/setup-programs.sh
+	@$(VENV)/python bench/programs.py --rounds $(ROUNDS)
+
 lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
 	@scripts/lint.sh
 
@@ -54,6 +60,14 @@ bench-cost: setup-build ## measure what checkpoints cost a request/reply server 
 	@scripts/setup-plots.sh
 	@$(VENV)/python bench/cost.py
 
+bench-ros: setup ## crash nodes of a ROS pipeline, beside cold start: latency, recovery, messages cut in half, costs
+	@scripts/setup-ros.sh
+	@$(VENV)/python bench/ros.py
+
+bench-ros-long: setup ## the same pipeline: 1,000 crashes, one every one or two seconds (half an hour)
+	@scripts/setup-ros.sh
+	@$(VENV)/python bench/ros_endurance.py
+
 bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against the age of the checkpoint
 	@scripts/setup-ros2.sh
 	@$(VENV)/python bench/ros2.py
@@ -67,5 +81,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test lint bench bench-peers bench-cost bench-ros2 clean clean-system
+.PHONY: help setup setup-build setup-images demo test test-programs lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 clean clean-system
 .DEFAULT_GOAL := help

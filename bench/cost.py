@@ -46,7 +46,7 @@ from harness import free_port  # noqa: E402 - tests, whose folder is no package
 from native.board import Board, Seen  # noqa: E402
 
 from bench import cost_show  # noqa: E402
-from bench.cpu_group import first_in_line  # noqa: E402
+from bench.cpu_group import REAL_TIME, first_in_line  # noqa: E402
 from bench.idle import memory_kb  # noqa: E402
 from bench.peers_subjects import Below  # noqa: E402
 from bench.subjects import BenchFailed, build, children, eventually  # noqa: E402
@@ -122,12 +122,12 @@ class Held:
 class Protected:
     """The server below avckpt-init; with `way.kind` "avckpt" also an engine that takes checkpoints of it."""
 
-    def __init__(self, way: Way, folder: Path) -> None:
+    def __init__(self, way: Way, folder: Path, before: Sequence[str] = ()) -> None:
         self.way = way
         self.port = free_port()
         self.board = Board(folder / f"server-{self.port}")
         self.events: list[Event] = []
-        command = [str(PROGRAMS / "server"), str(way.mb), "1", str(self.port), "--touch", str(TOUCHED)]
+        command = [*before, str(PROGRAMS / "server"), str(way.mb), "1", str(self.port), "--touch", str(TOUCHED)]
         command += ["--write-mb-s", str(way.rate_mb_s), "--board", str(self.board.path)]
         if way.kind == "fork":
             command += ["--fork-ms", str(round(way.interval_s * 1e3)), "--keep", str(way.keep)]
@@ -189,24 +189,27 @@ class Protected:
         return found
 
 
-def measure(way: Way, seconds: float, folder: Path) -> Cell:
-    """Raises BenchFailed, AvckptError."""
+def measure(way: Way, seconds: float, folder: Path, before: Sequence[str] = ()) -> Cell:
+    """`before`: words in front of both programs.  Raises BenchFailed, AvckptError."""
     load = os.getloadavg()[0]
     log = folder / "log"
-    with Protected(way, folder) as server, Client(folder, server.port, log=log, seconds=SETTLE_S + seconds) as client:
+    with (
+        Protected(way, folder, before) as server,
+        Client(folder, server.port, enter=before, log=log, seconds=SETTLE_S + seconds) as client,
+    ):
         client.wait_answers(100, "the client gets answers")
         # The first checkpoint brings the engine's code into the server.
         server.wait(SETTLE_S)
         server.events.clear()
-        before, started_ns = server.board.see(), time.monotonic_ns()
+        begin, started_ns = server.board.see(), time.monotonic_ns()
         server.wait(seconds)
-        after, ended_ns = server.board.see(), time.monotonic_ns()
+        end, ended_ns = server.board.see(), time.monotonic_ns()
         client.wait_end()
     logged = read_log(log)
     latencies = sorted(ms * 1e3 for sent, ms in zip(logged.sent_ns, logged.latency_ms) if started_ns <= sent < ended_ns)
     if len(latencies) < 1000:
         raise BenchFailed(f"only {len(latencies)} requests were answered")
-    return _cell(way, latencies, before, after, server.events, (ended_ns - started_ns) / 1e9, load)
+    return _cell(way, latencies, begin, end, server.events, (ended_ns - started_ns) / 1e9, load)
 
 
 def _cell(
@@ -240,12 +243,12 @@ def _cell(
     )
 
 
-def hold(way: Way, folder: Path) -> Held:
+def hold(way: Way, folder: Path, before: Sequence[str] = ()) -> Held:
     """What the generations hold when all of them are there and the newest is as old as it gets.
 
     Raises BenchFailed, AvckptError.
     """
-    with Protected(way, folder) as server:
+    with Protected(way, folder, before) as server:
         eventually(lambda: server.board.see().ready == 1, "the server has touched its memory")
         highest, tables = 0.0, 0.0
         # Until all are there, and then over some more intervals: what is held grows from one checkpoint
@@ -349,17 +352,17 @@ def main() -> int:
         with boards_folder() as folder, first_in_line() if args.first else contextlib.nullcontext():
             for way in ways(args.rates, args.intervals, args.kinds.split(",")):
                 console.print(f"{way} (load {os.getloadavg()[0]:.1f})", style="dim")
-                cells.append(measure(way, args.seconds, folder))
+                cells.append(measure(way, args.seconds, folder, REAL_TIME if args.first else ()))
             for mb in args.sizes:
                 for kind in ("none", "avckpt"):
                     way = Way(kind, 1.0 if kind == "avckpt" else 0.0, 10, mb)
                     console.print(f"{way} (load {os.getloadavg()[0]:.1f})", style="dim")
-                    cells.append(measure(way, args.seconds, folder))
+                    cells.append(measure(way, args.seconds, folder, REAL_TIME if args.first else ()))
             for rate in args.memory_rates:
                 for keep in args.keeps:
                     way = Way("avckpt", 1.0, rate, keep=keep)
                     console.print(f"memory: {way}", style="dim")
-                    memory.append(hold(way, folder))
+                    memory.append(hold(way, folder, REAL_TIME if args.first else ()))
     except (BenchFailed, AvckptError) as error:
         print(f"bench: {error}", file=sys.stderr)
         status = 1

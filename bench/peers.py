@@ -104,7 +104,7 @@ class Row:
     stop_same_connection: int = 0
     stops: int = 0
     refused: int = 0
-    """Restores that had to be tried again."""
+    """Checkpoints and restores that had to be tried again."""
     failures: list[str] = field(default_factory=list)
     load: float = 0.0
 
@@ -151,7 +151,7 @@ def cycle(subject: Subject, client: Client, row: Row, rng: random.Random) -> Non
         if taken.tool_freeze_ms is not None:
             row.tool_freeze_ms.append(round(taken.tool_freeze_ms, 3))
     time.sleep(rng.uniform(0.05, 0.15))
-    before, run_before = client.identity(), subject.run_of_container()
+    before, conmon = client.identity(), subject.conmon()
     answers, unanswered = client.answers, client.sent - client.answers
     client.board.forget_gap()
     recovered = subject.crash()
@@ -164,8 +164,8 @@ def cycle(subject: Subject, client: Client, row: Row, rng: random.Random) -> Non
     row.same_pid += after.pid == before.pid
     row.same_memory += after.token == before.token
     row.same_connection += after.connections == before.connections
-    if run_before is not None:
-        row.same_run = (row.same_run or 0) + (subject.run_of_container() == run_before)
+    if conmon is not None:
+        row.same_run = (row.same_run or 0) + (subject.conmon() == conmon)
     row.cycles += 1
 
 
@@ -340,7 +340,13 @@ def main() -> int:
                         continue
                     subject = bench.subject(name, mb, threads)
                     row = Row(subject.name, mb, threads)
-                    measure(subject, row, cycles or subject.cycles)
+                    try:
+                        measure(subject, row, cycles or subject.cycles)
+                    except (BenchFailed, AvckptError, CommandFailed, TimeoutError) as error:
+                        # The others can be measured all the same.
+                        print(f"bench: {error}", file=sys.stderr)
+                        status = 1
+                        continue
                     rows.append(row)
                     for failure in row.failures:
                         console.print(f"  {failure}", style="yellow")

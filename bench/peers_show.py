@@ -87,7 +87,7 @@ def failures(results: Json) -> str:
     """What could not be done, in the peer's own words."""
     return "".join(
         f"- {row['subject']}, {row['mb']} MB, {row['threads']} threads ({row['cycles']} cycles done, "
-        f"{row.get('refused', 0)} restores refused and tried again): {failure}\n"
+        f"{row.get('refused', 0)} tries again): {failure}\n"
         for row in results["rows"]
         for failure in row["failures"]
     )

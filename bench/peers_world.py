@@ -7,6 +7,7 @@ first process.  scripts/setup-peers.sh has made the tarball.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import subprocess
@@ -51,6 +52,7 @@ class World:
         command += [str(path) for path in (tarball, self._mountpoint, PROGRAMS, boards, CACHE)]
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
         self._has_image = False
+        self._first = 0
         self.enter: list[str] = []
         """The command in front of a program that shall run in it."""
 
@@ -60,8 +62,8 @@ class World:
             if self._process.stdout.readline() != "up\n":
                 raise BenchFailed("the peers' world does not start; what it said is above")
             eventually(lambda: len(children(self._process.pid)) == 1, "the peers' world has a first process")
-            (first,) = children(self._process.pid)
-            self.enter = ["nsenter", "--target", str(first), "--mount", "--pid", "--net", "--ipc", "--uts"]
+            (self._first,) = children(self._process.pid)
+            self.enter = ["nsenter", "--target", str(self._first), "--mount", "--pid", "--net", "--ipc", "--uts"]
             self.enter += ["--root", "--wd", "--", "env", "PODMAN_IGNORE_CGROUPSV1_WARNING=1", "HOME=/root"]
         except BaseException:
             self.__exit__(None, None, None)
@@ -88,6 +90,19 @@ class World:
     def start(self, *args: str) -> None:
         """A command inside that goes on by itself, in a session of its own."""
         self.run("setsid", "--fork", "sh", "-c", 'exec "$@" </dev/null >/dev/null 2>&1', "sh", *args)
+
+    def outside(self, pid: int) -> int:
+        """The number in our PID namespace of one of its processes.  Raises BenchFailed."""
+        for entry in filter(str.isdigit, os.listdir("/proc")):
+            with contextlib.suppress(OSError):
+                numbers = Path(f"/proc/{entry}/status").read_text().split("NSpid:")[1].split("\n")[0].split()
+                if len(numbers) > 1 and int(numbers[1]) == pid and self._is_inside(entry):
+                    return int(entry)
+        raise BenchFailed(f"no process {pid} in the peers' world")
+
+    def _is_inside(self, pid: str) -> bool:
+        mine, theirs = (os.readlink(f"/proc/{each}/ns/pid") for each in (self._first, pid))
+        return mine == theirs
 
     def import_image(self) -> None:
         """The same base image that the host's containers start from."""

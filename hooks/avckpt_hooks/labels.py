@@ -88,7 +88,7 @@ class Policy:
     files: str = "rewind"
     """Regular files at a restore: rewind, keep or strict."""
     tcp: str = "keep"
-    """Established TCP connections at a restore: keep, reset or reset-moved."""
+    """Established TCP connections at a restore: keep, reset, reset-moved or messages."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
     notify: Notify | None = None
@@ -326,7 +326,11 @@ LABELS: dict[str, Label] = {
         f"restores per time, 1 to {RESTORES_MAX} within 1s to 24h, as 5/60s",
         _parse_restore_max,
     ),
-    "avckpt.tcp": Label("keep", "keep, reset or reset-moved", _one_of("tcp", "keep", "reset", "reset-moved")),
+    "avckpt.tcp": Label(
+        "keep",
+        "keep, reset, reset-moved or messages",
+        _one_of("tcp", "keep", "reset", "reset-moved", "messages"),
+    ),
     "avckpt.files": Label("rewind", "rewind, keep or strict", _one_of("files", "rewind", "keep", "strict")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _ID_LENGTH = 64
-_TIMEOUT_S = 5.0
+_TIMEOUT_S = 20.0
 _SIGKILL = 9  # importing signal takes 4 ms
 _DEFAULT_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 

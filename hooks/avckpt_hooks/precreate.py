@@ -28,8 +28,10 @@ INIT_PATH = "/run/avckpt-init"
 WAIT_MS = 2000
 """How long init waits for a sidecar that lives but does not answer."""
 
-HOOK_TIMEOUT_S = 5
-"""After this the OCI runtime kills our hooks; they bound themselves to less."""
+HOOK_TIMEOUT_S = 120
+"""After this the OCI runtime kills our hooks, and then the container does not start: for what nobody has
+thought of.  They bound their own waits to seconds, but on a machine that is overloaded, while it boots for
+example, the start of Python alone may take as long as that."""
 
 _MARK = b'"avckpt.'
 """Without it in a text of JSON, no label or annotation of ours is in there."""

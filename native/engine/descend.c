@@ -774,7 +774,7 @@ int family_start(struct family *family, struct avc_error *notes, struct avc_erro
 		if (restore_await(branch->target, branch->image, member->pid, err))
 			return -1;
 		restore_note(branch->target, branch->image, member->pid, notes);
-		if (memory_put_back(branch->image->image, err))
+		if (memory_put_back(branch->image->image, member->pid, err))
 			return -1;
 	}
 	return 0;

@@ -9,6 +9,7 @@
  *   files_restore.c compares two tables and makes the one the other
  *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
+ *   files_watches.c inotify
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *   files_mapped.c  the same of files that are mapped
  *   files_written.c the same of files that are not open any more
@@ -37,7 +38,8 @@ enum file_kind {
 	FILE_TIMERFD,
 	FILE_SIGNALFD,
 	FILE_EPOLL,
-	FILE_INOTIFY
+	FILE_INOTIFY,
+	FILE_PIDFD
 };
 
 struct file_lock {
@@ -50,6 +52,15 @@ struct file_watch { /* of an epoll set                                         *
 	int fd;
 	uint32_t events;
 	uint64_t data;
+};
+
+struct file_mark { /* of inotify                                               */
+	int wd;
+	uint32_t mask;
+	uint64_t dev, ino; /* as the kernel has them                           */
+	uint32_t handle_bytes;
+	int handle_type;
+	uint8_t handle[128]; /* open_by_handle_at(2)                           */
 };
 
 struct file_socket {
@@ -86,10 +97,12 @@ struct file {
 	int clock, settime_flags;
 	uint64_t ticks, deadline_ns, interval_ns;
 	uint64_t mask; /* signalfd                                                  */
-	/* inotify: how many watches, and a sum over what fdinfo says of them      */
+	/* pidfd: in our namespace; of the app itself or a thread of it, in its own      */
+	pid_t pid, pid_inside;
 	uint32_t watch_count;
-	uint64_t watch_sum;
 	struct file_watch *watch; /* epoll, allocated                              */
+	uint32_t mark_count;
+	struct file_mark *mark; /* inotify, allocated                              */
 	/* As fdinfo says it                                                      */
 	int told_flags;
 	uint64_t told_ino;
@@ -101,10 +114,13 @@ struct file {
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
 	int tcp_state; /* 0: no TCP                                                 */
+	/* In the middle of a message, as far as can be told (files_stream.c)      */
+	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */
-	uint8_t *content;
+	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
 	bool content_lost; /* there was something that can not be put back          */
+	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 };
 
 struct files {
@@ -149,6 +165,21 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 const char *file_put_content(int fd, int other_fd, const struct file *want);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
+
+/* files_stream.c */
+/* Whether bytes are just coming in; whether some that were to go out did not fit. */
+bool file_is_coming(int fd);
+bool file_is_going(int fd);
+/* Looks at epoll sets for who waits to write on. */
+void files_find_going(struct files *files);
+/* avckpt.tcp=messages: a connection that a restore leaves between two messages goes on,
+ * one that can be brought there is, any other is reset.  Returns NULL or what failed. */
+const char *file_put_stream(int fd, const struct file *want, const struct file *now);
+
+/* files_watches.c */
+/* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is
+ * (NULL: fresh).  Returns NULL or why not all of them. */
+const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init);
 
 /* files_make.c */
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why

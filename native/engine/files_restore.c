@@ -489,10 +489,15 @@ static void put_states(struct files_work *work)
 			continue;
 		}
 		files_note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		if (w->kind == FILE_INOTIFY)
+			files_note(work, w, file_put_marks(fd, w, n, work->init));
 		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
 			files_note(work, w, file_reset_tcp(fd));
+		else if (n && n->tcp_state == 1 /* TCP_ESTABLISHED */ &&
+			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
+			files_note(work, w, file_put_stream(fd, w, n));
 		close(fd);
 	}
 }
@@ -519,6 +524,10 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
 				      work->want, work->init, err))
 		return -1;
+	if (work->config->tcp == AVC_TCP_MESSAGES) {
+		files_find_going(work->want);
+		files_find_going(work->now);
+	}
 	work->claimed_by = filled(work->now->count, -1);
 	if (!work->claimed_by)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");

@@ -98,7 +98,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 				    "it is just starting a process");
 		if (!t->stopped)
 			continue;
-		if (next >= target->pad.threads_max && t->tid != target->pid)
+		if (next >= target->pad.threads_max && t->tid != target->leader)
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "more threads than prepared for");
 		if (!arch_is_native(&t->regs))
@@ -112,7 +112,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 		if (in_old_pad(target, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old pad");
-		t->block = t->tid == target->pid ? 0 : (int)next++;
+		t->block = t->tid == target->leader ? 0 : (int)next++;
 		if (thread_read(t, err))
 			return -1;
 		if (arch_frame_read_xstate(t->tid,
@@ -123,26 +123,6 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 			return -1;
 	}
 	*threads = next;
-	return 0;
-}
-
-/* exec puts another program in its place, and the pad is gone. */
-static int check_pad(struct target *target, struct avc_error *err)
-{
-	long nonce;
-
-	errno = 0;
-	nonce = ptrace(
-		PTRACE_PEEKDATA, target->pid,
-		(void *)(target->pad.base + INJ_CODE_BYTES + offsetof(struct inj_control, nonce)),
-		NULL);
-	if (errno == ESRCH)
-		return fail_errno(err, target->pid, "freeze", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
-		return fail(err, AVC_DEADLINE, target->descendant ? EAGAIN : 0, target->pid,
-			    "freeze", "", "it has executed another program");
-	}
 	return 0;
 }
 
@@ -188,7 +168,7 @@ static void drop_old_pads(struct target *target, struct generation *generation,
 		if (anybody_uses(target, base, bytes))
 			return;
 		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-		generation->vm_pages -= (long)(bytes / 4096);
+		generation->vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 	}
 }
 
@@ -279,6 +259,9 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 /* One that was found while everything was stopped has nothing of ours yet. */
 static int prepare_stopped(struct tree *tree, struct target *target, struct avc_error *err)
 {
+	if (target->pid != target->leader)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
+			    "the main thread of process %d has ended", target->inside);
 	if (!target->infected && infect_stopped(target, tree->slots, err))
 		return -1;
 	if (!target->holder && hold_stopped(target, tree->init, err))
@@ -342,7 +325,7 @@ static int read_branch(struct tree *tree, struct branch *branch, bool strict, st
 	if (strict)
 		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
 
-	if (prepare_stopped(tree, target, err) || check_pad(target, err))
+	if (prepare_stopped(tree, target, err) || pad_check(target, target->pid, err))
 		return -1;
 	if (memory_prepare(target->memory, &branch->image->image, err) ||
 	    read_all(target, branch->image->slot, &branch->image->threads, err))
@@ -476,10 +459,8 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	times->stop_ns = now_ns() - start;
 	main_thread = thread_find(target, target->pid);
 	if (!result && (!main_thread || !main_thread->stopped))
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			      "its main thread has ended");
-	if (!result)
-		result = check_pad(target, err);
+		result = fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
+			      "its main thread has just ended");
 	if (!result)
 		result = read_all(target, generation->slot, &generation->threads, err);
 	if (!result) {

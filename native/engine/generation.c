@@ -19,6 +19,8 @@
 
 #include "internal.h"
 
+#define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
+
 /* The OOM killer is to take templates first; undone in what is restored. */
 void oom_score_adj_set(pid_t pid, const char *value)
 {
@@ -73,6 +75,26 @@ static int quieten(struct target *target, struct generation *generation, bool se
 	return 0;
 }
 
+/* A main thread that has ended while others go on: it is there again until they are,
+ * and ends again. */
+static void fill_ended(struct target *target, struct generation *generation,
+		       const struct thread *cloned, struct setup *setup)
+{
+	struct inj_thread *block = pad_thread(&target->pad, generation->slot, 0);
+
+	*block = (struct inj_thread){
+		.stack = pad_remote(&target->pad, pad_stack(&target->pad, generation->slot, 0)) -
+			 16,
+		.tid = target->inside,
+	};
+	if (proc_read(target->leader, "comm", block->name, sizeof block->name) > 0)
+		block->name[strcspn(block->name, "\n")] = 0;
+	/* fork(2) has given it that of the thread that was cloned, who wants it back. */
+	if (cloned->rseq)
+		setup_add(setup, INJ_BEFORE, "rseq", SYS_rseq, cloned->rseq, cloned->rseq_bytes,
+			  RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
+}
+
 /* Fills the slot in from what freeze() has read: one block per thread. */
 static int fill_slot(struct target *target, struct generation *generation,
 		     const struct branch *branch, const struct proc_stat *stat, pid_t group_inside,
@@ -94,6 +116,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 		return fail_errno(err, target->pid, "keep template", "open(status)",
 				  "it has ended");
 	}
+	generation->headless = target->pid != target->leader;
 	setup_begin(&setup, pad, generation->slot);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread t = target->threads[i];
@@ -106,9 +129,9 @@ static int fill_slot(struct target *target, struct generation *generation,
 		block = pad_thread(pad, generation->slot, b);
 		frame = pad_frame(pad, generation->slot, b);
 
-		/* The main thread's was seen to when it was borrowed; its own
+		/* The borrowed thread's was seen to when it was borrowed; its own
 		 * memory has been run on since. */
-		if (b)
+		if (t.tid != target->pid)
 			rseq_fixup(mem_fd, &t);
 		rewind_original(&t, &t.regs);
 		arch_rewind(&t.regs);
@@ -124,6 +147,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 			.rseq_bytes = t.rseq_bytes,
 			.rseq_signature = t.rseq_signature,
 			.other_base = arch_other_base(&t.regs),
+			.large_state = arch_frame_needs_room(frame) ? pad_remote(pad, frame) : 0,
 			.tid = t.inside,
 			.affinity_bytes = t.affinity_bytes,
 		};
@@ -142,6 +166,8 @@ static int fill_slot(struct target *target, struct generation *generation,
 		pending_setup_thread(target, &t, &setup);
 	}
 	close(mem_fd);
+	if (generation->headless)
+		fill_ended(target, generation, main_thread, &setup);
 	generation->sandboxed = status.seccomp == 1 ||
 				status.seccomp_filters > target->plain_filters;
 	if (memory_finish(target, generation, status.locked_kb, &setup, err))
@@ -156,7 +182,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 	slot->threads = generation->threads;
 	slot->pid = target->inside;
 	slot->group = group_inside;
-	slot->session_leader = stat->session == target->pid;
+	slot->session_leader = stat->session == target->leader;
 	slot->placed = slot->fresh = target->descendant;
 	slot->tty_fd = stat->tty && stat->tty_group == stat->group ? tty_fd(target->pid, stat->tty)
 								   : -1;
@@ -175,11 +201,11 @@ static int finish(struct target *target, struct generation *generation, struct b
 				  "it was killed");
 	/* Nothing but the app's own group, or one whose leader is visible, can be
 	 * put back. */
-	group = stat->group == target->pid ? target->inside : proc_inside(stat->group);
+	group = stat->group == target->leader ? target->inside : proc_inside(stat->group);
 	if (group <= 0)
 		group = target->inside;
 	pages = proc_vm_pages(generation->template);
-	if (quieten(target, generation, branch || stat->session == target->pid, err))
+	if (quieten(target, generation, branch || stat->session == target->leader, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);

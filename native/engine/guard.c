@@ -29,7 +29,7 @@ struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind ki
 		.kind = kind,
 		.cookie = guard->cookie,
 		.at_ns = now_ns(),
-		.app_pid = guard->target.pid,
+		.app_pid = guard->target.leader,
 		.app_pid_inside = guard->target.inside,
 		.generations = guard->count,
 		.restores = guard->restores,
@@ -122,7 +122,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	kill(guard->target.pid, SIGKILL);
+	kill(guard->target.leader, SIGKILL);
 }
 
 static bool take_command(struct avc_guard *guard, struct command *command)
@@ -387,6 +387,7 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	link_init(&guard->link);
 	target_init(&guard->target);
 	guard->tree = (struct tree){
+		.enabled = getenv("AVCKPT_TREES") != NULL,
 		.main = &guard->target,
 		.slots = config->keep + 1,
 		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),

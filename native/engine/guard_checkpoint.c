@@ -60,7 +60,7 @@ static void touch_slot(const struct pad *pad, uint32_t slot, uint32_t threads)
 	for (uint32_t i = 0; i < threads && i < pad->threads_max; i++) {
 		volatile uint8_t *frame = pad_frame(pad, slot, i);
 
-		for (size_t at = 0; at < arch_frame_bytes(); at += 4096)
+		for (size_t at = 0; at < arch_frame_bytes(); at += ARCH_PAGE_BYTES)
 			frame[at] = 0;
 		frame[arch_frame_bytes() - 1] = 0;
 		*(volatile uint64_t *)pad_thread(pad, slot, i) = 0;
@@ -82,7 +82,7 @@ static int prepare_process(struct avc_guard *guard, struct target *target, struc
 {
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (support_check(target, err) || take_stock(target, err))
+	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
 		return -1;
 	if (target->descendant && !infected_still(target))
 		target->infected = false;
@@ -118,6 +118,10 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 	tree->slots = guard->config.keep + 1;
 	if (tree_look(tree, &fresh, err))
 		return -1;
+	if (tree->count > 1 && !tree->enabled)
+		return fail(err, AVC_UNSUPPORTED, 0, tree->kin[1].pid, "check", "",
+			    "it has child processes (%u); only single processes are protected yet",
+			    tree->count - 1);
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct target *target = tree->kin[i].target;
 		struct avc_error failed = { 0 };
@@ -285,7 +289,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard->misses = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
-		event.app_pid = guard->target.pid;
+		event.app_pid = guard->target.leader;
 		event.app_pid_inside = guard->target.inside;
 		emit(guard, &event);
 		return;

@@ -27,7 +27,9 @@ void config_set(struct avc_guard *guard, const struct avc_config *config)
 		guard->config.freeze_deadline_ns = FREEZE_DEADLINE_NS;
 	guard->target.shm_bytes = config->shm_bytes;
 	/* A generation whose bytes were not counted has none: its connections all moved. */
-	guard->target.tcp_moved = config->tcp == AVC_TCP_RESET_MOVED;
+	guard->target.tcp_messages = config->tcp == AVC_TCP_MESSAGES;
+	guard->target.tcp_moved = config->tcp == AVC_TCP_RESET_MOVED ||
+				  config->tcp == AVC_TCP_MESSAGES;
 }
 
 /* What is held stays, unless there are more than are wanted now.  A death that comes

@@ -91,10 +91,10 @@ bool is_known_process(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->target.pid)
+	if (pid == guard->target.leader)
 		return true;
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->pid == pid)
+		if (guard->tree.member[i]->leader == pid)
 			return true;
 	return is_ours(pid, guard);
 }

@@ -80,6 +80,11 @@ int proc_stat(pid_t pid, struct proc_stat *stat);
 int proc_exit_status(pid_t pid);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
+/* A thread of the process that has not ended: the main thread, as long as it has not.
+ * 0: none. */
+pid_t proc_live_thread(pid_t pid);
+/* Until that thread has ended; a second at most. */
+void proc_await_end(pid_t tid);
 /* Children of a (single-threaded) process; returns how many (at most max), or -1. */
 int proc_children(pid_t pid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
@@ -95,7 +100,8 @@ enum mapping_flag {
 	MAPPING_WIPEONFORK = 2, /* wf */
 	MAPPING_DEVICE = 4,     /* io */
 	MAPPING_LOCKED = 8,     /* lo */
-	MAPPING_DROPPABLE = 16  /* dp */
+	MAPPING_DROPPABLE = 16, /* dp */
+	MAPPING_HUGETLB = 32    /* ht */
 };
 
 struct mapping {
@@ -116,10 +122,13 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
+	pid_t tracer;            /* a thread, in our namespace; 0: none              */
+	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t groups;         /* a hash                                           */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
+	bool shadow_stack; /* x86: CET                                        */
 };
 
 int proc_status(pid_t tid, struct proc_status *status);
@@ -153,14 +162,23 @@ struct scheduling {
 	int32_t reserved;
 };
 
+#define GROUPS_KEPT 32 /* of a thread; of one with more it is only known how many */
+#define NODE_WORDS 16  /* 1024 nodes of memory                                   */
+
 struct creds {
 	uint32_t uid[3], gid[3]; /* real, effective, saved                      */
 	uint32_t fsuid, fsgid;
 	uint32_t caps[6]; /* as capget(2) has them                            */
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
-	int32_t seccomp;   /* mode                                             */
-	uint64_t slack_ns; /* of timers                                        */
+	int32_t seccomp;  /* mode                                             */
+	uint64_t filters; /* of seccomp: a hash                               */
+	int32_t group_count;
+	uint32_t group[GROUPS_KEPT]; /* supplementary                             */
+	int32_t memory_policy;       /* set_mempolicy(2), -1: the kernel has none */
+	uint64_t nodes[NODE_WORDS];
+	uint64_t slack_ns;   /* of timers                                        */
+	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
 
 struct thread {
@@ -213,8 +231,11 @@ struct last_pid;
 
 /* The live main process of the app. */
 struct target {
-	pid_t pid; /* 0: none                                          */
-	pid_t inside;
+	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
+	 * or, when that has ended, any other (target_follow).  0: none           */
+	pid_t pid;
+	pid_t leader; /* the process's own number                            */
+	pid_t inside; /* the same in its own namespace                       */
 	int pidfd, task_dirfd, mem_fd, timers_fd;
 	struct pad pad;
 	bool infected; /* the pad is known to be in this process           */
@@ -246,7 +267,8 @@ struct target {
 	pid_t init;             /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
-	bool tcp_moved; /* bytes of connections are to be counted           */
+	bool tcp_moved;    /* bytes of connections are to be counted           */
+	bool tcp_messages; /* quiescent is only who is between two messages    */
 	/* Of a process that is not the main one (tree.c). */
 	bool descendant;
 	uint64_t start;               /* when it began; tells it from one with its number */
@@ -295,6 +317,7 @@ struct generation {
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the app when it was taken                     */
 	bool sandboxed;        /* has seccomp filters of its own                   */
+	bool headless;         /* its main thread had ended                       */
 	struct timer_image *timers;
 	struct attributes *attributes;
 	struct mem_image *image;      /* of memory that is not in the template       */
@@ -319,6 +342,7 @@ struct kin {
 
 /* All processes of an app (tree.c). */
 struct tree {
+	bool enabled; /* or else an app has to be one process alone           */
 	struct target *main;
 	pid_t init;
 	uint32_t slots; /* of a pad                                         */
@@ -426,6 +450,9 @@ int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 /* The same; `meanwhile` is called once while the kernel clones. */
 int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* exec puts another program in its place, at any moment, and the pad is gone: whether it
+ * is there, in a stopped thread.  If not, the target is not infected any more. */
+int pad_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
 bool in_old_pad(const struct target *target, avc_remote address);
 /* The same for a stopped thread of the app, which gets home by itself if we die:
@@ -501,7 +528,7 @@ void timers_advance(const struct timer_image *image, uint64_t now);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 
-#define ATTRIBUTES_ASK_BYTES 96
+#define ATTRIBUTES_ASK_BYTES 368
 /* While it is stopped, from outside. */
 void scheduling_read(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
@@ -512,6 +539,8 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
+/* Of a stopped thread: its seccomp filters, whatever they say. */
+uint64_t filters_read(pid_t tid);
 int attributes_keep(const struct target *target, struct generation *generation,
 		    struct avc_error *err) warn_unused;
 /* Before the restored threads go: what can be done from outside only. */
@@ -544,10 +573,13 @@ void memory_dofork(const struct memory *memory, struct inj_call *call);
  * attempt will be better. */
 int memory_learn(struct target *target, long missing_pages, struct avc_error *err);
 /* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
+/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
+ * pages is small, and whoever writes to a shared one when it is empty is killed. */
+extern const char private_huge_pages[];
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
 /* At a restore, before anything runs. */
-int memory_put_back(const struct mem_image *image, struct avc_error *err) warn_unused;
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
@@ -581,6 +613,9 @@ void target_init(struct target *target);
 bool target_make_room(struct target *target);
 void target_free_room(struct target *target);
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err) warn_unused;
+/* Before anything else is done with it: the main thread may have ended, and others go
+ * on (pthread_exit(3)). */
+int target_follow(struct target *target, struct avc_error *err) warn_unused;
 /* Forgets the process (the pad stays mapped here: templates live in it). */
 void target_close(struct target *target);
 /* The entry for a tid; NULL when there is no room. */

@@ -164,7 +164,7 @@ bool link_app_started(const struct link *link, pid_t app)
 	snprintf(path, sizeof path, "/proc/%d/exe", link->init);
 	if (stat(path, &own))
 		return false;
-	snprintf(path, sizeof path, "/proc/%d/exe", app);
+	snprintf(path, sizeof path, "/proc/%d/exe", proc_live_thread(app));
 	if (stat(path, &theirs))
 		return false;
 	return own.st_dev != theirs.st_dev || own.st_ino != theirs.st_ino;

@@ -21,15 +21,13 @@
 #define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
 #define PARKED_NS NS_PER_S
 
-#define PAGE 4096u
-
 static size_t page_up(size_t n)
 {
-	return (n + PAGE - 1) & ~(size_t)(PAGE - 1);
+	return (n + ARCH_PAGE_BYTES - 1) & ~(size_t)(ARCH_PAGE_BYTES - 1);
 }
 
 /* A block: struct inj_thread, stack (growing down), signal frame.  With AVX-512
- * it all fits one page. */
+ * it all fits one page, with AMX three. */
 static size_t block_stack_top(void)
 {
 	return 896;
@@ -289,12 +287,32 @@ int suspend_seccomp(const struct thread *thread, bool suspend, struct avc_error 
 	return 0;
 }
 
+int pad_check(struct target *target, pid_t tid, struct avc_error *err)
+{
+	const avc_remote at = target->pad.base + INJ_CODE_BYTES +
+			      offsetof(struct inj_control, nonce);
+	long nonce;
+
+	errno = 0;
+	nonce = ptrace(PTRACE_PEEKDATA, tid, (void *)at, NULL);
+	if (errno == ESRCH)
+		return fail_errno(err, tid, "stop", "ptrace(PEEKDATA)", "it has ended");
+	if (errno || (uint64_t)nonce != target->nonce) {
+		target->infected = false;
+		return fail(err, AVC_DEADLINE, 0, tid, "stop", "",
+			    "it has executed another program");
+	}
+	return 0;
+}
+
 int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
 	struct inj_control *control = target->pad.control;
 	struct arch_regs home;
 
+	if (pad_check(target, thread->tid, err))
+		return -1;
 	/* Homes are places of the app's, never of a pad that will be taken away. */
 	if (in_old_pad(target, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",

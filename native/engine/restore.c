@@ -53,7 +53,7 @@ static void reset(const struct pad *pad, uint32_t slot_number)
 	struct inj_slot *slot = pad_slot(pad, slot_number);
 
 	slot->state = INJ_IDLE;
-	slot->go = 0;
+	slot->go = INJ_GO_NOT;
 	slot->ready = 0;
 	slot->running = 0;
 	slot->error = 0;
@@ -220,19 +220,6 @@ int restore_await(struct target *target, struct generation *image, pid_t pid, st
 	return slot->state == INJ_READY ? 0 : describe_failure(&target->pad, slot, err);
 }
 
-static void let_run(struct target *target, struct generation *image)
-{
-	struct inj_slot *slot = pad_slot(&target->pad, image->slot);
-
-	__atomic_store_n(&slot->go, 1, __ATOMIC_RELEASE);
-	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
-}
-
-void restore_go(struct target *target, struct generation *image)
-{
-	let_run(target, image);
-}
-
 /* What was allowed to fail, and did: to be told. */
 static void note_failed(const struct pad *pad, uint32_t slot, pid_t pid, struct avc_error *notice)
 {
@@ -241,6 +228,17 @@ static void note_failed(const struct pad *pad, uint32_t slot, pid_t pid, struct 
 	if (s)
 		fail(notice, AVC_KERNEL, (int)-s->call.result, pid, "restore",
 		     setup_name(pad, pad_remote(pad, s)), "not everything could be put back");
+}
+
+static void let_go(struct inj_slot *slot, enum inj_go stage)
+{
+	__atomic_store_n(&slot->go, stage, __ATOMIC_RELEASE);
+	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+}
+
+void restore_go(struct target *target, struct generation *image)
+{
+	let_go(pad_slot(&target->pad, image->slot), INJ_GO_ALL);
 }
 
 void restore_note(struct target *target, struct generation *image, pid_t pid,
@@ -290,7 +288,7 @@ int restore(struct target *target, struct generation *generation, const struct l
 	if (!result)
 		restore_note(target, generation, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, err);
+		result = memory_put_back(generation->image, *pid, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {
@@ -313,7 +311,12 @@ int restore(struct target *target, struct generation *generation, const struct l
 	}
 	if (sandbox)
 		sandbox_go(sandbox, &target->pad, generation->slot);
-	let_run(target, generation);
+	/* As they knew it: ended.  (sandbox_go() has seen to it.) */
+	else if (generation->headless) {
+		let_go(slot, INJ_GO_ENDED);
+		proc_await_end(*pid);
+	}
+	let_go(slot, INJ_GO_ALL);
 	if (family)
 		family_go(family);
 	for (uint64_t end = now_ns() + READY_NS;;) {

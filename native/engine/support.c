@@ -14,7 +14,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "files.h"
 
 static const struct {
 	const char *prefix, *reason;
@@ -72,10 +72,15 @@ static int check_mappings(struct target *target, struct avc_error *err)
 	maps = fopen(path, "re");
 	if (!maps)
 		return fail_errno(err, target->pid, "check", "open(maps)", "it has ended");
-	while (!result && fgets(line, sizeof line, maps))
+	while (!result && fgets(line, sizeof line, maps)) {
 		if (strstr(line, " /[aio]"))
 			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
 				      "it uses kernel AIO");
+		/* Those of files are found in the first clone. */
+		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				      private_huge_pages);
+	}
 	fclose(maps);
 	target->surveyed_pages = result ? -1 : pages;
 	return result;
@@ -109,9 +114,58 @@ static int check_descendant(const struct target *target, struct avc_error *err)
 	return 0;
 }
 
+/* A thread's second stack would not know of what it was made to do in the pad, and return
+ * to the wrong place: so before that.  A program has it from its start, or not at all. */
+static int check_shadow_stack(struct target *target, struct avc_error *err)
+{
+	struct proc_status status;
+
+	if (target->infected)
+		return 0;
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.shadow_stack)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			    "it has shadow stacks (CET), which can not be put back; "
+			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
+	return 0;
+}
+
+/* unshare(2) and setns(2): its next child is the first process of another namespace.  A
+ * clone of ours would be that, and the namespace would end with it. */
+static int check_namespaces(struct target *target, struct avc_error *err)
+{
+	static const struct {
+		const char *own, *of_children, *reason;
+	} kinds[] = {
+		{ "ns/pid", "ns/pid_for_children",
+		  "its children get a PID namespace of their own (a container in the container)" },
+		{ "ns/time", "ns/time_for_children",
+		  "its children get a time namespace of their own" },
+	};
+
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++) {
+		char path[64], own[64] = "", theirs[64] = "";
+
+		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].own);
+		if (readlink(path, own, sizeof own - 1) < 0)
+			continue; /* the kernel has none of these; or it has ended */
+		/* Of a namespace in which there was no process yet nothing is told. */
+		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].of_children);
+		if (readlink(path, theirs, sizeof theirs - 1) < 0 && errno != ENOENT)
+			continue;
+		/* Behind the kind: "pid:[4026531836]". */
+		if (strcmp(own + strcspn(own, "["), theirs + strcspn(theirs, "[")) != 0)
+			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				    kinds[i].reason);
+	}
+	return 0;
+}
+
 int support_check(struct target *target, struct avc_error *err)
 {
-	if (check_descriptors(target, err) || check_mappings(target, err))
+	if (check_shadow_stack(target, err) || check_namespaces(target, err) ||
+	    check_descriptors(target, err) || check_mappings(target, err))
 		return -1;
 	return target->descendant ? check_descendant(target, err) : 0;
 }
@@ -140,6 +194,8 @@ static bool unread_bytes(const struct target *target)
 			continue; /* closed since */
 		if (ioctl(fd, FIONREAD, &bytes))
 			bytes = 0; /* not one that bytes come from */
+		if (target->tcp_messages && file_is_coming(fd))
+			bytes = 1;
 		close(fd);
 		if (bytes)
 			return true;

@@ -56,7 +56,7 @@ static int add_children(struct looking *look, const char *name)
 				break;
 			p = next;
 			if (look->parent == PARENT_INIT &&
-			    (child == look->tree->main->pid ||
+			    (child == look->tree->main->leader ||
 			     look->tree->is_ours((pid_t)child, look->tree->arg)))
 				continue;
 			result = add_kin(look->tree, (pid_t)child, look->parent, look->err);
@@ -127,7 +127,7 @@ static void target_free(struct target *target)
 static struct target *find_member(const struct tree *tree, pid_t pid, uint64_t start)
 {
 	for (uint32_t i = 0; i < tree->members; i++)
-		if (tree->member[i]->pid == pid && tree->member[i]->start == start)
+		if (tree->member[i]->leader == pid && tree->member[i]->start == start)
 			return tree->member[i];
 	return NULL;
 }
@@ -177,7 +177,7 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 
 	*fresh = 0;
 	tree->count = 0;
-	if (add_kin(tree, tree->main->pid, PARENT_INIT, err))
+	if (add_kin(tree, tree->main->leader, PARENT_INIT, err))
 		return -1;
 	tree->kin[0].target = tree->main;
 	look.pid = tree->init;

@@ -97,6 +97,7 @@ class Tcp(enum.IntEnum):
     KEEP = 0
     RESET = 1
     RESET_MOVED = 2
+    MESSAGES = 3
 
 
 @dataclass(frozen=True)

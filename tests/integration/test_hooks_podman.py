@@ -371,6 +371,29 @@ def test_a_broken_hook_does_not_keep_a_container_from_running(
     assert err.startswith("avckpt: a container runs unprotected: ")
 
 
+@pytest.mark.parametrize(("stage", "seconds"), [("precreate", 11), ("prestart", 6)])
+def test_a_slow_machine_does_not_keep_a_container_from_running(
+    podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, name: str, stage: str, seconds: int
+) -> None:
+    """A runtime that kills a hook for being late does not start the container."""
+    slow = tmp_path / "libexec"
+    shutil.copytree(ROOT / "hooks", slow, symlinks=True)
+    shutil.copy(ROOT / "native" / "build" / "avckpt-init", slow)
+    main = slow / "avckpt_hooks" / "__main__.py"
+    delay = f"import time\nif sys.argv[1] == {stage!r}:\n    time.sleep({seconds})\n"
+    main.write_text(main.read_text().replace("import sys\n", f"import sys\n{delay}", 1))
+    [hook_json] = hooks_dir.glob("*.json")
+    hook_json.write_text(hook_json.read_text().replace(str(ROOT / "hooks"), str(slow)))
+    status, out, _ = foreground(
+        Podman("--hooks-dir", str(hooks_dir)),
+        name,
+        *("--label", "avckpt.enable=true", "--network=none"),
+        image=base_image,
+    )
+    assert status == 0
+    assert out.startswith(INIT)
+
+
 def test_hooks_that_go_away_do_not_keep_a_container_from_ending(
     podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, run_dir: Path
 ) -> None:

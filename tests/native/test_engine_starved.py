@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from harness import wait_until
 from native.guarded import GuardProcess, Victim, config
 
-ENOUGH = 12
+ENOUGH = 6
 """Threads that were sent into the pad and did not get there in time."""
 
 # More important than the application, and awake nearly all the time.
@@ -59,20 +62,62 @@ def too_late(event: dict[str, object]) -> bool:
     return event.get("kind") == "missed" and "get to run in time" in str(event)
 
 
-def test_a_starved_application_is_let_go(tmp_path: Path) -> None:
-    """A thread that gets into the pad too late finds home, and what it does next is its own affair."""
-    cpus = sorted(os.sched_getaffinity(0))
-    if len(cpus) < 2:
+@pytest.fixture
+def cpus() -> tuple[int, int]:
+    """One for the application and the hog, and one for everybody else."""
+    found = sorted(os.sched_getaffinity(0))
+    if len(found) < 2:
         pytest.skip("it takes a CPU for the guard and one for the application")
-    with (
-        Victim("threads 6 1", tmp_path) as victim,
-        GuardProcess(config(0.02), [victim.pid]) as guard,
-    ):
+    return found[0], found[-1]
+
+
+def test_a_starved_application_is_let_go(cpus: tuple[int, int], tmp_path: Path) -> None:
+    """A thread that gets into the pad too late finds home, and what it does next is its own affair."""
+    with Victim("threads 6 1", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         guard.wait("checkpoint", count=3)
         put_on(cpus[0], victim.app)
-        put_on(cpus[-1], guard.pid)
+        put_on(cpus[1], guard.pid)
         with hog(cpus[0]):
             guard.wait_for(too_late, f"{ENOUGH} threads too late", count=ENOUGH, timeout_s=90)
         assert not [event for event in guard.events if event.get("kind") == "died"]
         guard.wait("checkpoint", since=guard.mark(), count=10)
+        victim.wait_beats(20)
+
+
+def test_the_next_attempt_comes_at_once(cpus: tuple[int, int], tmp_path: Path) -> None:
+    """Checkpoints on command do not wait for the one that was late: its way home must not be taken for another's."""
+    with Victim("threads 6 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.command("checkpoint")
+        put_on(cpus[0], victim.app)
+        put_on(cpus[1], guard.pid)
+        with hog(cpus[0]):
+            end = time.monotonic() + 90
+            while sum(map(too_late, guard.events)) < ENOUGH and time.monotonic() < end:
+                guard.command("checkpoint")
+        assert sum(map(too_late, guard.events)) >= ENOUGH
+        assert not [event for event in guard.events if event.get("kind") == "died"]
+        wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "checkpoints go on")
+        victim.wait_beats(20)
+
+
+def test_restored_while_starved(cpus: tuple[int, int], tmp_path: Path) -> None:
+    """The newest generation is not given up because its template waits for a CPU."""
+    with Victim("tcpecho 0", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        put_on(cpus[0], victim.app)
+        put_on(cpus[1], guard.pid)
+        with socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5) as peer:
+            peer.sendall(b"hello\n")
+            assert peer.recv(100) == b"1 hello\n"
+            wait_until(lambda: guard.command("checkpoint").get("generation") == 2, 15, "two generations")
+        # Closed since: a template has to take another socket in its place, each time.
+        with hog(cpus[0]):
+            for n in range(12):
+                since = guard.mark()
+                # It dies at once, at any moment; only its template waits for the hog.
+                put_on(cpus[1], victim.app)
+                victim.wait_beats(1)
+                time.sleep(n * 0.007)
+                victim.kill_app()
+                restored = guard.wait("restored", since=since)
+                assert restored["generation"] == 2, (n, restored)
         victim.wait_beats(20)

@@ -1,0 +1,108 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.tcp=messages: streams of messages, and where in them a connection stands.
+ *
+ * The kernel does not know where a message begins.  But a stream of messages has
+ * pauses, and between the bytes of one message there are none to speak of.  So a
+ * connection that has been silent for a moment, with nothing left unread and
+ * nothing that waits to be written, stands between two messages.
+ */
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <poll.h>
+#include <sys/epoll.h>
+#include <sys/ioctl.h>
+#include <sys/socket.h>
+
+#include "files.h"
+
+/* A sender may be kept from a CPU in the middle of a message.  Longer would be safer,
+ * and too long for a stream of 100 messages a second. */
+#define SILENCE_NS (8 * NS_PER_MS)
+/* tcpi_last_data_recv counts in ticks of the kernel's clock (HZ is 250 at least). */
+#define TICK_NS (4 * NS_PER_MS)
+/* So long is the end of a message waited for, while nobody reads. */
+#define DRAIN_NS (100 * NS_PER_MS)
+
+/* For how long nothing has come in, at least. */
+static uint64_t silent_ns(int fd)
+{
+	struct tcp_info info = { 0 };
+	socklen_t bytes = sizeof info;
+	uint64_t silent;
+
+	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) ||
+	    info.tcpi_state != TCP_ESTABLISHED)
+		return UINT64_MAX;
+	silent = info.tcpi_last_data_recv * NS_PER_MS;
+	return silent > TICK_NS ? silent - TICK_NS : 0;
+}
+
+bool file_is_coming(int fd)
+{
+	int unread = 0;
+
+	return (ioctl(fd, FIONREAD, &unread) == 0 && unread > 0) || silent_ns(fd) < SILENCE_NS;
+}
+
+bool file_is_going(int fd)
+{
+	struct pollfd writable = { .fd = fd, .events = POLLOUT };
+
+	return poll(&writable, 1, 0) == 0;
+}
+
+/* Who has written part of a message asks to be told when there is room for more.
+ * Edge-triggered, everybody asks always. */
+void files_find_going(struct files *files)
+{
+	for (uint32_t i = 0; i < files->count; i++) {
+		const struct file *epoll = &files->file[i];
+
+		for (uint32_t k = 0; epoll->kind == FILE_EPOLL && k < epoll->watch_count; k++) {
+			const struct file_watch *watch = &epoll->watch[k];
+			struct file *file = files_find(files, watch->fd);
+
+			if (file && watch->events & EPOLLOUT && !(watch->events & EPOLLET))
+				file->tcp_going = true;
+		}
+	}
+}
+
+/* Reads away what is left of a message.  False if it does not end. */
+static bool drain(int fd)
+{
+	const uint64_t begun = now_ns();
+	const uint64_t silent = silent_ns(fd);
+	uint64_t last = begun - (silent < begun ? silent : begun), now;
+
+	while ((now = now_ns()) - begun < DRAIN_NS) {
+		struct pollfd readable = { .fd = fd, .events = POLLIN };
+		/* TCP throws away what it is told to truncate, without a copy: tcp(7). */
+		const ssize_t n = recv(fd, NULL, 1 << 30, MSG_TRUNC | MSG_DONTWAIT);
+
+		if (n > 0) {
+			last = now;
+			continue;
+		}
+		if (n == 0)
+			return true; /* closed by the other side, which the app will see */
+		if (now - last >= SILENCE_NS)
+			return true;
+		poll(&readable, 1, (int)((SILENCE_NS - (now - last)) / NS_PER_MS) + 1);
+	}
+	return false;
+}
+
+const char *file_put_stream(int fd, const struct file *want, const struct file *now)
+{
+	const bool in = want->tcp_taken != now->tcp_taken;
+	const bool out = want->tcp_written != now->tcp_written;
+
+	/* The half that the app has, or the other side has, is of another message now. */
+	if ((in && want->tcp_coming) || (out && (want->tcp_going || now->tcp_going)))
+		return file_reset_tcp(fd);
+	if (in && now->tcp_coming && !drain(fd))
+		return file_reset_tcp(fd);
+	return NULL;
+}
