@@ -253,7 +253,8 @@ def hold(way: Way, folder: Path, before: Sequence[str] = ()) -> Held:
         highest, tables = 0.0, 0.0
         # Until all are there, and then over some more intervals: what is held grows from one checkpoint
         # to the next, and is least just after one.
-        server.wait((way.keep + 1) * way.interval_s)
+        server.wait(way.interval_s)
+        eventually(lambda: len(server.templates()) == way.keep, f"there are {way.keep} generations")
         until = time.monotonic() + 3 * way.interval_s
         while time.monotonic() < until:
             server.wait(way.interval_s / 10)

@@ -42,6 +42,18 @@ def _of(row: Json, key: str) -> str:
     return "-" if row[key] is None else f"{row[key]}/{row['cycles']}"
 
 
+def compact(results: Json, key: str) -> str:
+    """Markdown: medians of one figure, a row per workload, a column per subject."""
+    rows = [row for row in results["rows"] if row[key]]
+    subjects = [name for name in COLOURS if any(row["subject"] == name for row in rows)]
+    lines = ["| MB | threads | " + " | ".join(subjects) + " |", "|---:" * (len(subjects) + 2) + "|"]
+    for mb, threads in sorted({(row["mb"], row["threads"]) for row in rows}):
+        mine = {row["subject"]: row[key] for row in rows if (row["mb"], row["threads"]) == (mb, threads)}
+        cells = [_ms(mine.get(name, [])) for name in subjects]
+        lines.append(f"| {mb} | {threads} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def table(results: Json) -> str:
     """Markdown.  Medians in ms; what survived as so many of so many."""
     lines = [
@@ -133,7 +145,8 @@ def plot(results: Json, key: str, title: str, path: Path) -> None:
 
 def show(results: Json, path: Path) -> None:
     """Prints the tables, and writes them and the plots beside the results."""
-    text = table(results)
+    text = f"Freeze, ms\n\n{compact(results, 'freeze_ms')}\n"
+    text += f"Outage, ms\n\n{compact(results, 'outage_ms')}\n{table(results)}"
     if any(row["stops"] for row in results["rows"]):
         text += f"\n{stops(results)}"
     if failed := failures(results):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import select
 import signal
 import subprocess
@@ -52,6 +53,11 @@ PORT_INSIDE = 5555
 """In the peers' world, whose network nobody else uses."""
 PATIENCE_S = 30.0
 """With restores that are refused."""
+ESTABLISHED = "--tcp-established"
+CLOSED = "--tcp-close"
+"""After a crash CRIU gets no connection back: the dead process' sockets have said goodbye to their peers, and
+linger in the way of new ones (with --tcp-established: "Can't connect inet socket back: Cannot assign requested
+address").  So they are restored as closed ones where that can be said; Podman 5.4 has no option for it."""
 NO_CHECKPOINTS = "24h"
 """An interval that does not come up: checkpoints are taken by command."""
 
@@ -393,7 +399,7 @@ def _criu_failed(what: str, done: Completed, log: str) -> CriuFailed:
     errors = [line.strip() for line in log.splitlines() if "Error (" in line]
     # Without the time in front, and without the one that is there in every run as soon as
     # CAP_SYS_RESOURCE is missing, and harms nothing.
-    said = [line.split(") ", 1)[-1] for line in errors if "RLIMIT_NOFILE" not in line]
+    said = [re.sub(r"^\d+: ", "", line.split(") ", 1)[-1].strip()) for line in errors if "RLIMIT_NOFILE" not in line]
     return CriuFailed(f"{what} ended with {done.status}: {' | '.join(said) or done.stderr.strip()[-600:]}")
 
 
@@ -456,10 +462,9 @@ class CriuBare(InWorld):
         # Fields 1 and 2: time to stop everything, and time it stood still then, us.
         return Taken(took_ms, (dump[1] + dump[2]) / 1e3, int(size) / 1024)
 
-    def _restore(self) -> float:
-        # Without a pipe to us: the restored process would hold it.
+    def _restore(self, connections: str) -> float:
         done = self._world.run(
-            *("criu", "restore", "-d", "-D", self._images, "--tcp-established", "-o", "restore.log", "-v1"), check=False
+            *("criu", "restore", "-d", "-D", self._images, connections, "-o", "restore.log", "-v1"), check=False
         )
         if done.status != 0:
             log = self._world.run("cat", f"{self._images}/restore.log", check=False).stdout
@@ -468,18 +473,18 @@ class CriuBare(InWorld):
 
     def crash(self) -> Recovered:
         self.kill()
-        return Recovered(self._restore_patiently())
+        return Recovered(self._restore_patiently(CLOSED))
 
     def stop_and_restore(self) -> None:
         self._dump()
-        self._restore_patiently()
+        self._restore_patiently(ESTABLISHED)
 
-    def _restore_patiently(self) -> float:
+    def _restore_patiently(self, connections: str) -> float:
         """As a supervisor would: what the dead process' connections left in the kernel can be in the way."""
         until = time.monotonic() + PATIENCE_S
         while True:
             try:
-                return self._restore()
+                return self._restore(connections)
             except CriuFailed as error:
                 if time.monotonic() > until:
                     raise
@@ -536,7 +541,7 @@ class CriuPodman(InWorld):
         until = time.monotonic() + PATIENCE_S
         # Podman hears of the death from conmon; until then it does not restore ("is running or paused").
         while True:
-            done = self._podman("container", "restore", "--keep", "--tcp-established", self._name, check=False)
+            done = self._podman("container", "restore", "--keep", ESTABLISHED, self._name, check=False)
             if done.status == 0:
                 return done.took_s * 1e3
             if "is running or paused" in done.stderr and time.monotonic() < until:

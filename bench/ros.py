@@ -39,7 +39,7 @@ from bench.ros_pipeline import (  # noqa: E402
 )
 
 RESULTS = ROOT / "bench" / "results" / "ros.json"
-BEFORE_S, AFTER_S = 3.0, 1.0
+BEFORE_S, AFTER_S = 3.0, 2.0
 """Of the latency: what is compared, before and after a crash."""
 SETTLE_S = 10.0
 """How long a crash may take to be over."""
@@ -152,30 +152,35 @@ def latency_runs(protect: bool, runs: int, tcp: str, rng: random.Random) -> Iter
             if protect:
                 found = [e for e in events(at - 0.01) if e["kind"] == "restored" and e["container"] == "ros-voxel"]
                 restore_s = found[-1]["restore_s"] if found else None
+            time.sleep(max(0.0, at + AFTER_S + 0.5 - time.time()))
             frames = pipeline.log.frames(at - BEFORE_S, at + 5.0)
-            yield asdict(judge(variant, frames, at, inside or 0, restore_s))
+            try:
+                yield asdict(judge(variant, frames, at, inside or 0, restore_s))
+            except PipelineFailed as error:
+                yield {"variant": variant, "failed": str(error), "inside": inside}
 
 
-def latency(runs: int, tcp: str, rng: random.Random) -> list[Json]:
+def latency(results: list[Json], runs: int, tcp: str, rng: random.Random) -> None:
     """In turns, so that what else the machine does falls on both."""
-    results: list[Json] = []
     half = (runs + 1) // 2
     for protect, count in ((True, half), (False, half), (False, runs - half), (True, runs - half)):
         for run in latency_runs(protect, count, tcp, rng):
             results.append(run)
             say(f"{run['variant']}: " + (run.get("failed") or f"gap {run['gap_ms']:.0f} ms, lost {run['lost']}"))
-    return results
 
 
-def cut(runs: int, values: Sequence[str], rng: random.Random) -> list[Json]:
+def cut(results: list[Json], runs: int, values: Sequence[str], rng: random.Random) -> None:
     """Crashes in the middle of a message, for each value of avckpt.tcp."""
-    results: list[Json] = []
     for tcp in values:
         with Pipeline(protect=True, settings={"TCP": tcp}) as pipeline:
             for number in range(runs):
                 place = "message" if number % 2 else ""
                 time.sleep(rng.uniform(1.2, 1.8))
-                at, inside = pipeline.crash(["voxel"], Crash("kill", place), rng)
+                try:
+                    at, inside = pipeline.crash(["voxel"], Crash("kill", place), rng)
+                except PipelineFailed as error:
+                    say(f"tcp={tcp}: not crashed, {error}")
+                    continue
                 recovered = True
                 try:
                     pipeline.wait_delivers(at + 0.001, SETTLE_S, frames=5)
@@ -198,7 +203,6 @@ def cut(runs: int, values: Sequence[str], rng: random.Random) -> list[Json]:
                 say(f"tcp={tcp}: {results[-1]}")
                 if not recovered:
                     pipeline.mend(["voxel", "ndt"])
-    return results
 
 
 def say(line: str) -> None:
@@ -252,14 +256,20 @@ def main() -> int:
     try:
         with sidecar():
             for part in args.part.split(","):
-                if part == "latency":
-                    add(args.output, {"latency": latency(args.runs, args.tcp, rng)}, args.append)
-                elif part == "cut":
-                    add(args.output, {"cut": cut(args.runs, args.cut.split(","), rng)}, args.append)
-                elif part == "cost":
+                if part == "cost":
                     add(args.output, {"cost": cost(args.seconds, args.tcp)}, args.append)
-                else:
-                    parser.error(f"no such part: {part}")
+                    continue
+                runs: list[Json] = []
+                try:
+                    if part == "latency":
+                        latency(runs, args.runs, args.tcp, rng)
+                    elif part == "cut":
+                        cut(runs, args.runs, args.cut.split(","), rng)
+                    else:
+                        parser.error(f"no such part: {part}")
+                finally:
+                    # Half an hour's runs are not lost with the last one.
+                    add(args.output, {part: runs}, args.append)
     except (PipelineFailed, CommandFailed) as error:
         print(f"ros: {error}", file=sys.stderr)
         return 1

@@ -122,7 +122,7 @@ def cost(seconds: float, tcp: str) -> Json:
 
 def beside_checkpoints(cost_of_protected: Json) -> tuple[list[float], list[float]]:
     """Latencies, in s, of frames during which any node was frozen, and of the others."""
-    at = [one["at"] for one in cost_of_protected["checkpoints"] if one["container"] in NODES.values()]
+    at = [one["at"] for one in cost_of_protected["checkpoints"] if one["container"] in ("ros-voxel", "ros-ndt")]
     during: list[float] = []
     others: list[float] = []
     for stamp, latency, _ in cost_of_protected["frames"]:

@@ -7,6 +7,7 @@ python bench/ros_show.py [bench/results/ros.json]
 from __future__ import annotations
 
 import json
+import math
 import statistics
 import sys
 from collections.abc import Callable, Sequence
@@ -27,6 +28,7 @@ VARIANTS = ("avckpt", "cold start")
 
 def spread(values: Sequence[float], digits: int = 0) -> str:
     """Mean and standard deviation."""
+    values = [value for value in values if math.isfinite(value)]
     if not values:
         return "-"
     deviation = statistics.stdev(values) if len(values) > 1 else 0.0
@@ -97,9 +99,9 @@ def cost_table(cost: Json) -> str:
         f"| latency median / longest, ms | {statistics.median(plain):.1f} / {max(plain):.1f} "
         f"| {statistics.median([*during, *others]) * 1e3:.1f} / {max([*during, *others]) * 1e3:.1f} |"
     )
+    met = f"{statistics.median(during) * 1e3:.1f} / {max(during) * 1e3:.1f}" if during else "-"
     lines.append(
-        f"| of it scans that met a checkpoint of voxel or ndt ({len(during)} of {len(during) + len(others)}) | "
-        f"| {statistics.median(during) * 1e3:.1f} / {max(during) * 1e3:.1f} |"
+        f"| of it scans that met a checkpoint of voxel or ndt: {len(during)} of {len(during) + len(others)} | | {met} |"
     )
     for name, found in (("voxel", voxel), ("ndt", ndt)):
         freezes = [c["freeze_s"] * 1e3 for c in found]
@@ -137,6 +139,7 @@ def plot_latency(runs: list[Json], folder: Path) -> None:
     for axis, (title, value) in zip(axes, panels):
         for place, name in enumerate(VARIANTS):
             values = [value(r) for r in runs if r["variant"] == name and "failed" not in r]
+            values = [one for one in values if math.isfinite(one)]
             if not values:
                 continue
             spots = [place + 0.24 * (i / max(1, len(values) - 1) - 0.5) for i in range(len(values))]

@@ -98,15 +98,18 @@ def test_more_generations_for_a_running_container(sidecar: LocalSidecar) -> None
     assert "unprotected" not in kinds(sidecar, "plain")
 
 
-def test_ends_are_judged_by_the_new_one(sidecar: LocalSidecar) -> None:
-    exits = [sys.executable, "-c", "import time, sys\ntime.sleep(1)\nwhile True:\n  time.sleep(1.5)\n  sys.exit(3)"]
+def test_ends_are_judged_by_the_new_one(sidecar: LocalSidecar, tmp_path: Path) -> None:
+    end = tmp_path / "end"
+    program = f"import os, sys, time\nwhile not os.path.exists({str(end)!r}): time.sleep(0.05)\nsys.exit(3)"
     sidecar.config.write_text("defaults: {interval: 100ms}\n")
     sidecar.start()
-    made = sidecar.protected("exits", exits, ENABLE)
+    made = sidecar.protected("exits", [sys.executable, "-c", program], ENABLE)
     sidecar.wait_for(made, state="protected")
     sidecar.config.write_text("defaults: {interval: 100ms, restore.on: signal}\n")
     assert "exits: restore.on signal,exit -> signal" in sidecar.avckpt("reload").stdout
-    assert made.status(20) == 3
+    end.touch()
+    assert made.status(60) == 3
+    assert sidecar.row(made, "-a")["restores"] == 0
 
 
 def test_one_that_its_labels_contradict_is_named_and_goes_on(sidecar: LocalSidecar) -> None:

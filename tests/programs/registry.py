@@ -8,6 +8,7 @@ import subprocess
 from dataclasses import dataclass
 
 from harness import BASE_IMAGE, ROOT, Podman
+
 from programs import nginx, redis
 from programs.lines import LineSession
 from programs.wire import Session
@@ -34,6 +35,11 @@ class Program:
     """A C++ source that the host's compiler makes static, for the base image."""
 
 
+def compiled_by(path: str, pattern: str) -> tuple[str, ...]:
+    """A command that prints what a compiler has left of itself in a program."""
+    return ("python3", "-c", f"import re; print(re.search(rb'{pattern}', open('{path}', 'rb').read())[0].decode())")
+
+
 PROGRAMS = (
     Program("redis", "redis-server", redis.COMMAND, ("redis-server", "--version"), redis.RedisSession, in_base=True),
     Program("nginx", "nginx (one process)", nginx.COMMAND, ("nginx", "-v"), nginx.NginxSession),
@@ -46,9 +52,12 @@ PROGRAMS = (
         in_base=True,
     ),
     Program("node", "Node.js", ("node", "/sources/server_node.js"), ("node", "--version")),
-    Program("go", "Go", ("/programs/server_go",), ("sh", "-c", "strings -n 5 /programs/server_go | grep -m1 ^go1")),
+    Program("go", "Go", ("/programs/server_go",), compiled_by("/programs/server_go", r"go1\.[0-9.]+")),
     Program("jvm", "JVM", ("java", "-Xmx256m", "-cp", "/programs", "ServerJvm"), ("java", "--version")),
-    Program("cpp", "C++", ("/programs/server_cpp",), ("cat", "/programs/compiler"), compiled="server_cpp.cpp"),
+    Program(
+        *("cpp", "C++", ("/programs/server_cpp",), compiled_by("/programs/server_cpp", r"GCC: [^\0]+")),
+        compiled="server_cpp.cpp",
+    ),
 )
 
 

@@ -92,8 +92,8 @@ class Trial:
         rows = [row for row in self.client.containers(ended=True) if row["id"] == self.container.id]
         if not rows:
             raise RoundFailed("the sidecar knows nothing of the container")
-        if rows[0]["state"] in ("ended", "unprotected"):
-            raise RoundFailed(f"{rows[0]['state']}: {rows[0]['reason']}")
+        if rows[0]["state"] == "ended":
+            raise RoundFailed(f"ended: {rows[0]['reason']}")
         return rows[0]
 
     def round(self) -> Json:
@@ -120,6 +120,8 @@ class Trial:
     def checkpoint(self) -> None:
         """A checkpoint on command, beside those on the interval; what clients know before is safe after it."""
         deadline = time.monotonic() + PATIENCE_S
+        # A machine short of memory may be without protection for a while (docs/policy.md).
+        self._wait(lambda: self.row()["state"] == "protected", PATIENCE_S, "protection")
         self.load.mark()
         while True:
             try:
@@ -169,8 +171,9 @@ class Trial:
             wait_until(look, timeout_s, what)
         except TimeoutError as error:
             # A program that has ended by itself answers nobody.
-            self._expect_restores(self.row())
-            raise RoundFailed(str(error)) from error
+            row = self.row()
+            self._expect_restores(row)
+            raise RoundFailed(f"{error} ({row['state']}, {row['reason']})") from error
 
     def evidence(self) -> str:
         """What a person wants to see of a failed round."""
