@@ -600,6 +600,8 @@ void unhold(struct target *target);
 /* Looks who there is; new ones are opened, and those that are gone closed.  Sets *fresh
  * to how many are new. */
 int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_unused;
+/* Fails if the main process has children. */
+int tree_refuse(struct tree *tree, struct avc_error *err) warn_unused;
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);
 /* It is gone, or another program: what it had open must not stay open by us. */
