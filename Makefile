@@ -37,13 +37,22 @@ demo: setup ## kill a protected container's application twice and watch it go on
 	@$(VENV)/python scripts/demo.py
 
 test: setup ## every test (T=expression selects, TESTS=folder narrows)
+	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
+
+test-trees: setup ## the long form of the tests of process trees: more kills, 200 processes, PostgreSQL under load
+	@scripts/setup-trees.sh
+	@AVCKPT_LONG=1 $(VENV)/python -m pytest tests/native/test_engine_trees.py $(wildcard tests/integration/test_trees_*.py) \
+		--timeout 3000 $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
 	@scripts/lint.sh
 
 bench: setup ## measure freeze, reap and restore beside a plain fork()
 	@$(VENV)/python bench/run.py
+
+bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
+	@$(VENV)/python bench/trees.py
 
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
@@ -54,5 +63,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test lint bench clean clean-system
+.PHONY: help setup setup-build setup-images demo test test-trees lint bench bench-trees clean clean-system
 .DEFAULT_GOAL := help

@@ -7,7 +7,7 @@
 . "$(dirname "$0")/lib.sh"
 
 have podman || exit 0
-for repository in localhost/avckpt-sidecar localhost/avckpt-sidecar-build localhost/avckpt-base; do
+for repository in localhost/avckpt-sidecar localhost/avckpt-sidecar-build localhost/avckpt-trees localhost/avckpt-base; do
 	podman images --format '{{.Repository}}:{{.Tag}}' --filter "reference=$repository" |
 		while read -r image; do podman rmi "$image" || warn "$image is in use and stays"; done
 done

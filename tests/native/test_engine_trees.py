@@ -87,6 +87,14 @@ def test_nobody_sees_checkpoints(command: str, tmp_path: Path) -> None:
         wait_whole(victim, allowed=command.count("--orphan"))
 
 
+def test_an_application_that_adopts_orphans_itself_is_refused(tmp_path: Path) -> None:
+    """PR_SET_CHILD_SUBREAPER: what is made an orphan for init would become its child."""
+    with Victim("tree 8 --reaper", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        assert "adopts orphans" in guard.wait("unprotected")["error"]["message"]
+        progress(victim)
+        assert not ours(victim)
+
+
 @pytest.mark.parametrize("command", [*STATIC, *CHANGING])
 def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
