@@ -202,6 +202,12 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 		}
 		if (i) {
 			kin->target = find_member(tree, kin->pid, stat.start);
+			/* A clone of ours of which we never heard, and no orphan. */
+			if (!kin->target && kin->parent == PARENT_INIT && tracee_is_ours(kin->pid)) {
+				tree->main->lost = true;
+				kin->pid = 0;
+				continue;
+			}
 			if (!kin->target) {
 				struct avc_error gone = { 0 };
 
