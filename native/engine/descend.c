@@ -303,15 +303,13 @@ struct member {
 	int pidfd;
 	bool traced, zombie;
 	struct puppet puppet;
-	struct files_table table;
 };
 
 struct family {
 	struct target *main;
 	struct generation *generation;
-	const struct avc_config *config;
-	const struct link *link;
 	struct last_pid *helper;
+	const struct files_table *table; /* by branch                            */
 	bool flush;          /* some have had children that ended                  */
 	struct member first; /* the main process                              */
 	struct member *member; /* by branch                                   */
@@ -322,8 +320,8 @@ struct family {
 	 PTRACE_O_TRACESYSGOOD | PTRACE_O_SUSPEND_SECCOMP)
 
 struct family *family_new(struct target *main, struct generation *generation,
-			  const struct avc_config *config, const struct link *link,
-			  struct last_pid *helper, struct avc_error *err)
+			  struct last_pid *helper, const struct files_table *table,
+			  struct avc_error *err)
 {
 	struct family *family = calloc(1, sizeof *family);
 
@@ -336,9 +334,8 @@ struct family *family_new(struct target *main, struct generation *generation,
 	}
 	family->main = main;
 	family->generation = generation;
-	family->config = config;
-	family->link = link;
 	family->helper = helper;
+	family->table = table;
 	family->first.pidfd = family->first.puppet.socket = -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		family->member[i].pidfd = family->member[i].puppet.socket = -1;
@@ -689,7 +686,7 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 	    place(member, branch, notes, err))
 		return -1;
 	put_limits(puppet->pid, branch, notes);
-	if (put_files(puppet, &member->table, err))
+	if (put_files(puppet, &family->table[index], err))
 		return -1;
 	close_fd(&puppet->socket);
 	return 0;
@@ -721,10 +718,6 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		const int host = host_of(family, branch);
 		struct member *member = &family->member[i], *by = member_of(family, host);
 
-		if (branch->target &&
-		    files_collect(branch->target, branch->image, family->config,
-				  family->link->init, &member->table, notes, err))
-			return -1;
 		if (fork_host(family, by, branch, &member->pid, err))
 			return -1;
 		member->traced = true;
@@ -829,7 +822,6 @@ void family_free(struct family *family)
 	if (!family)
 		return;
 	for (uint32_t i = 0; i < family->generation->branches; i++) {
-		files_table_free(&family->member[i].table);
 		close_fd(&family->member[i].pidfd);
 		close_fd(&family->member[i].puppet.socket);
 	}

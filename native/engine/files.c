@@ -426,6 +426,15 @@ static void check_shared(struct files *files, pid_t pid)
 	}
 }
 
+/* Has anybody in the app the other end?  Of several processes that is found out when it
+ * matters, at a restore. */
+static bool may_be_ours(const struct files *files, const struct file *f)
+{
+	if (!files->several)
+		return files_other_end(files, f);
+	return !f->outside && (f->kind == FILE_PIPE || (f->socket && f->socket->peer));
+}
+
 static void keep_contents(struct look *look)
 {
 	for (uint32_t i = 0; i < look->files->count; i++) {
@@ -435,7 +444,7 @@ static void keep_contents(struct look *look)
 		/* Once for each object, from an end that can be read. */
 		if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) ||
 		    f->shared != f->fd || (f->kind != FILE_PIPE && f->kind != FILE_SOCKET) ||
-		    !files_other_end(look->files, f))
+		    !may_be_ours(look->files, f))
 			continue;
 		fd = files_borrow(look->pidfd, f->fd);
 		if (fd < 0)
@@ -566,11 +575,13 @@ int files_prepare(struct target *target, struct avc_error *err)
 	return 0;
 }
 
-int files_capture(struct target *target, struct generation *generation, struct avc_error *err)
+int files_capture(struct target *target, struct generation *generation, bool several,
+		  struct avc_error *err)
 {
 	struct files *image = target->files_image;
 
 	target->files_image = NULL;
+	image->several = several;
 	generation->files = image;
 	if (files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
 		       target->init, err))

@@ -7,6 +7,7 @@
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
  *   files_make.c    opens and makes again what is lost
  *   files_restore.c compares two tables and makes the one the other
+ *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *
@@ -106,6 +107,7 @@ struct file {
 
 struct files {
 	uint32_t count, room;
+	bool several;      /* other processes may have the other ends of pipes        */
 	bool with_tcp;     /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns; /* CLOCK_REALTIME                                       */
 	struct file *file; /* by fd, ascending                                     */
@@ -177,6 +179,17 @@ struct files_work {
 	uint32_t problems;
 	struct avc_error *notes;
 };
+
+int files_work_begin(struct files_work *work, struct avc_error *err) warn_unused;
+int files_work_gather(struct files_work *work, struct avc_error *err) warn_unused;
+int files_work_place(struct files_work *work, struct avc_error *err) warn_unused;
+void files_work_finish(struct files_work *work);
+int files_work_table(const struct files_work *work, struct files_table *table,
+		     struct avc_error *err) warn_unused;
+void files_work_end(struct files_work *work);
+/* A duplicate of what is at this place of the table now. */
+int files_borrow_placed(const struct files_work *work, const struct file *w);
+void files_note(struct files_work *work, const struct file *f, const char *problem);
 
 uint32_t files_index(const struct files *files, const struct file *file);
 /* Index of the first descriptor of the same open file description. */

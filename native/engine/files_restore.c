@@ -31,7 +31,7 @@ struct mail { /* in the pad: one recvmsg(2) that brings one descriptor          
 	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
 };
 
-static void note(struct files_work *work, const struct file *f, const char *problem)
+void files_note(struct files_work *work, const struct file *f, const char *problem)
 {
 	if (!problem)
 		return;
@@ -213,9 +213,9 @@ static void make_lost(struct files_work *work)
 		if (w->socket && w->socket->listening)
 			share_port(work, w);
 		work->local[group] = file_make(w, work->generation->template, work->init, &why);
-		note(work, w, why);
+		files_note(work, w, why);
 		if (work->local[group] < 0)
-			note(work, w, "it can not be made again");
+			files_note(work, w, "it can not be made again");
 	}
 }
 
@@ -377,7 +377,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 			continue;
 		to = lowest_free(numbers, NULL);
 		if (files_send(ours, from)) {
-			note(work, w, "it could not be handed over");
+			files_note(work, w, "it could not be handed over");
 			continue;
 		}
 		if (inject(work, err, SYS_recvmsg, (uint64_t)theirs, mail,
@@ -464,7 +464,7 @@ const struct file *files_now_of(const struct files_work *work, uint32_t i)
 }
 
 /* A duplicate of what is at this place of the table now. */
-static int borrow_placed(const struct files_work *work, const struct file *w)
+int files_borrow_placed(const struct files_work *work, const struct file *w)
 {
 	const int local = work->local[files_leader(work->want, w)];
 
@@ -483,37 +483,17 @@ static void put_states(struct files_work *work)
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
 		    !n->lock_count && !w->lock_count)
 			continue;
-		fd = borrow_placed(work, w);
+		fd = files_borrow_placed(work, w);
 		if (fd < 0) {
-			note(work, w, "it could not be put in its place");
+			files_note(work, w, "it could not be put in its place");
 			continue;
 		}
-		note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		files_note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
 		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
-			note(work, w, file_reset_tcp(fd));
+			files_note(work, w, file_reset_tcp(fd));
 		close(fd);
-	}
-}
-
-static void put_contents(struct files_work *work)
-{
-	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file *w = &work->want->file[i],
-				  *other = files_other_end(work->want, w);
-		int fd, other_fd, bytes = 0;
-
-		if (!other || files_leader(work->want, w) != i)
-			continue;
-		fd = borrow_placed(work, w);
-		other_fd = borrow_placed(work, other);
-		if (fd >= 0 && other_fd >= 0 &&
-		    (w->content_bytes || w->content_lost ||
-		     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
-			note(work, w, file_put_content(fd, other_fd, w));
-		close_fd(&fd);
-		close_fd(&other_fd);
 	}
 }
 
@@ -528,7 +508,7 @@ static void *filled(uint32_t count, int value)
 	return array;
 }
 
-static int work_begin(struct files_work *work, struct avc_error *err)
+int files_work_begin(struct files_work *work, struct avc_error *err)
 {
 	const struct avc_config *config = work->config;
 
@@ -553,7 +533,7 @@ static int work_begin(struct files_work *work, struct avc_error *err)
 	return 0;
 }
 
-static void work_end(struct files_work *work)
+void files_work_end(struct files_work *work)
 {
 	if (work->problems > 1) {
 		char rest[32];
@@ -571,74 +551,48 @@ static void work_end(struct files_work *work)
 	files_free(work->now);
 }
 
-int files_restore(struct target *target, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct avc_error *notes,
-		  struct avc_error *err)
+int files_work_gather(struct files_work *work, struct avc_error *err)
 {
-	struct files_work work = { .target = target,
-				   .generation = generation,
-				   .config = config,
-				   .init = init,
-				   .table = generation->template,
-				   .table_pidfd = generation->pidfd,
-				   .want = generation->files,
-				   .notes = notes };
-	int result = -1;
-
-	if (work_begin(&work, err))
-		goto out;
-	call_begin(&pad_slot(&target->pad, generation->slot)->template_call, INJ_AFTER_PARK);
-	gather(&work);
+	/* A table that is made anew: everything has to be put in its place. */
+	for (uint32_t i = 0; work->target->descendant && i < work->want->count; i++)
+		work->lost[i] = true;
+	gather(work);
+	if (work->target->descendant)
+		return 0;
+	call_begin(&pad_slot(&work->target->pad, work->generation->slot)->template_call,
+		   INJ_AFTER_PARK);
 	/* What is left on the list is made just before the fork (restore.c). */
-	if (close_new(&work, err) || set_cloexec(&work, err) ||
-	    (is_urgent(&work) && flush(&work, err)))
-		goto out;
-	make_lost(&work);
-	if (put_lost(&work, err))
-		goto out;
-	put_states(&work);
-	put_contents(&work);
-	files_list_calls(&work);
-	close_list(&work);
-	result = 0;
-out:
-	work_end(&work);
-	return result;
+	return close_new(work, err) || set_cloexec(work, err) ||
+			       (is_urgent(work) && flush(work, err))
+		       ? -1
+		       : 0;
 }
 
-int files_collect(struct target *target, struct generation *image, const struct avc_config *config,
-		  pid_t init, struct files_table *table, struct avc_error *notes,
-		  struct avc_error *err)
+int files_work_place(struct files_work *work, struct avc_error *err)
 {
-	struct files_work work = { .target = target,
-				   .generation = image,
-				   .config = config,
-				   .init = init,
-				   .table = target->holder,
-				   .table_pidfd = target->holder_pidfd,
-				   .want = image->files,
-				   .notes = notes };
-	int result = -1;
+	make_lost(work);
+	if (!work->target->descendant && put_lost(work, err))
+		return -1;
+	put_states(work);
+	return 0;
+}
 
-	*table = (struct files_table){ 0 };
-	if (work_begin(&work, err))
-		goto out;
-	/* It is a new table: everything has to be put in its place. */
-	for (uint32_t i = 0; i < work.want->count; i++)
-		work.lost[i] = true;
-	gather(&work);
-	make_lost(&work);
-	put_states(&work);
-	put_contents(&work);
-	files_list_calls(&work);
-	table->entry = calloc(work.want->count + 1, sizeof *table->entry);
-	if (!table->entry) {
-		fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
-		goto out;
-	}
-	for (uint32_t i = 0; i < work.want->count; i++) {
-		const struct file *w = &work.want->file[i];
-		const int local = work.local[files_leader(work.want, w)];
+void files_work_finish(struct files_work *work)
+{
+	files_list_calls(work);
+	if (!work->target->descendant)
+		close_list(work);
+}
+
+int files_work_table(const struct files_work *work, struct files_table *table,
+		     struct avc_error *err)
+{
+	table->entry = calloc(work->want->count + 1, sizeof *table->entry);
+	if (!table->entry)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const int local = work->local[files_leader(work->want, w)];
 
 		if (local < 0)
 			continue; /* told already */
@@ -646,10 +600,7 @@ int files_collect(struct target *target, struct generation *image, const struct 
 		table->entry[table->count].cloexec = w->cloexec;
 		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
 	}
-	result = 0;
-out:
-	work_end(&work);
-	return result;
+	return 0;
 }
 
 void files_table_free(struct files_table *table)

@@ -171,7 +171,8 @@ static void capture_files(void *arg)
 {
 	struct capture *capture = arg;
 
-	files_capture(capture->target, capture->generation, &capture->generation->files_error);
+	files_capture(capture->target, capture->generation, capture->generation->branches > 0,
+		      &capture->generation->files_error);
 }
 
 /* Pads of guards that died, and of the process that forked this one. */
@@ -428,7 +429,8 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 
 		if (!branch->target)
 			continue;
-		if (files_capture(branch->target, branch->image, err) || await_clone(branch, err))
+		if (files_capture(branch->target, branch->image, true, err) ||
+		    await_clone(branch, err))
 			return -1;
 		branch->image->taken_ns = generation->taken_ns;
 	}

@@ -605,19 +605,15 @@ void rseq_fixup(int mem_fd, struct thread *thread);
 
 /* Before a freeze: what can be known of the app's descriptors while it runs. */
 int files_prepare(struct target *target, struct avc_error *err) warn_unused;
-/* During it: what is of this instant. */
-int files_capture(struct target *target, struct generation *generation, struct avc_error *err);
+/* During it: what is of this instant.  `several`: the app has other processes, which may
+ * have the other ends of pipes. */
+int files_capture(struct target *target, struct generation *generation, bool several,
+		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
 void files_forget(struct target *target);
 void files_free(struct files *files);
-/* Makes the table of a dead app, which its templates hold, the generation's again, and
- * lists what the restored process has to do itself.  What could not be put back is
- * told in *notes; -1 is for what must not go on. */
-int files_restore(struct target *target, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct avc_error *notes,
-		  struct avc_error *err) warn_unused;
-/* The same for a process that gets a table of its own: what is to be in it. */
+/* A table that is made anew: what is to be in it. */
 struct files_table {
 	uint32_t count;
 	struct {
@@ -625,9 +621,13 @@ struct files_table {
 		bool cloexec;
 	} *entry; /* by fd, ascending                                        */
 };
-int files_collect(struct target *target, struct generation *image, const struct avc_config *config,
-		  pid_t init, struct files_table *table, struct avc_error *notes,
-		  struct avc_error *err) warn_unused;
+/* Makes the tables of a dead app the generation's again: that of the main process, which
+ * its templates hold, at once; of the others (table[], by branch) what is to be in them.
+ * Lists what the restored processes have to do themselves.  What could not be put back is
+ * told in *notes; -1 is for what must not go on. */
+int files_restore(struct target *target, struct generation *generation,
+		  const struct avc_config *config, pid_t init, struct files_table *table,
+		  struct avc_error *notes, struct avc_error *err) warn_unused;
 void files_table_free(struct files_table *table);
 /* A duplicate of a descriptor of another process, or -1. */
 int files_borrow(int pidfd, int fd);
@@ -705,11 +705,12 @@ void branch_setup_groups(const struct branch *branch, struct setup *setup);
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
 void branch_forget(struct branch *branch);
 
-/* All processes of a generation, of which the main one is there; each is stopped. */
+/* All processes of a generation, of which the main one is there; each is stopped.
+ * `table`: of each branch. */
 struct family;
 struct family *family_new(struct target *main, struct generation *generation,
-			  const struct avc_config *config, const struct link *link,
-			  struct last_pid *helper, struct avc_error *err);
+			  struct last_pid *helper, const struct files_table *table,
+			  struct avc_error *err);
 /* The main process (a stopped tracee) brings forth the others. */
 int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		struct avc_error *err) warn_unused;

@@ -9,6 +9,7 @@
 #include <poll.h>
 #include <sched.h>
 #include <signal.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
@@ -260,16 +261,20 @@ int restore(struct target *target, struct generation *generation, const struct l
 	struct last_pid *helper = last_pid_start(link->pidns_fd, slot, err);
 	struct sandbox *sandbox = NULL;
 	struct family *family = NULL;
+	struct files_table *tables = calloc(generation->branches + 1, sizeof *tables);
 	int result, pidfd = -1;
 
 	*pid = 0;
 	*times = (struct restore_times){ 0 };
-	if (!helper)
-		return -1;
+	if (!helper || !tables) {
+		last_pid_stop(helper);
+		free(tables);
+		return fail_errno(err, 0, "restore", "calloc", "out of memory");
+	}
 	tracee_deadline_set(timer, FORK_NS);
-	result = files_restore(target, generation, config, link->init, notes, err);
+	result = files_restore(target, generation, config, link->init, tables, notes, err);
 	if (!result && generation->branches) {
-		family = family_new(target, generation, config, link, helper, err);
+		family = family_new(target, generation, helper, tables, err);
 		result = family ? 0 : -1;
 	}
 	if (!result)
@@ -279,6 +284,9 @@ int restore(struct target *target, struct generation *generation, const struct l
 		result = family_start(family, notes, err);
 	tracee_deadline_clear(timer);
 	last_pid_stop(helper);
+	for (uint32_t i = 0; i < generation->branches; i++)
+		files_table_free(&tables[i]);
+	free(tables);
 	if (!result)
 		restore_note(target, generation, *pid, notes);
 	if (!result)
