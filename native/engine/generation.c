@@ -214,6 +214,7 @@ int generation_finish(struct target *target, struct generation *generation, stru
 {
 	const struct thread *main_thread = thread_find(target, target->pid);
 	struct proc_status status = { 0 };
+	struct avc_error again = { 0 };
 	struct proc_stat stat;
 
 	if (generation->branches && (!main_thread || proc_status(target->pid, &status)))
@@ -222,18 +223,31 @@ int generation_finish(struct target *target, struct generation *generation, stru
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
+		struct avc_error failed = { 0 };
+
 		if (!branch->target)
 			continue;
 		branch->target->forebear = &main_thread->creds;
 		branch->target->forebear_groups = status.groups;
-		if (finish_branch(branch, err))
-			return -1;
+		if (finish_branch(branch, &failed)) {
+			/* What was not as it was known is known now: of all of them. */
+			if (failed.code != AVC_DEADLINE || failed.errnum != EAGAIN) {
+				*err = failed;
+				return -1;
+			}
+			again = failed;
+			continue;
+		}
 		if (branch->image->notice.code && !generation->notice.code)
 			generation->notice = branch->image->notice;
 	}
 	if (proc_stat(target->pid, &stat))
 		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
-	return finish(target, generation, NULL, &stat, err);
+	if (finish(target, generation, NULL, &stat, err))
+		return -1;
+	if (again.code)
+		*err = again;
+	return again.code ? -1 : 0;
 }
 
 void generation_close_files(struct target *target, struct generation *image)

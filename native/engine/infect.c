@@ -321,7 +321,11 @@ static int make_holder(struct target *target, pid_t holder, const struct arch_re
 		       struct avc_error *err)
 {
 	struct inj_call *own = &target->pad.control->holder;
+	const struct sched_param first = { .sched_priority = 1 };
 
+	/* It clones while all of the app stands still.  Best effort; not for its clones. */
+	if (target->descendant)
+		(void)sched_setscheduler(holder, SCHED_FIFO | SCHED_RESET_ON_FORK, &first);
 	memcpy(own->out, "avckpt-hold", 12);
 	call_begin(own, INJ_AFTER_PARK);
 	/* Out of the app's process group, or the number stays taken; and of its session,
@@ -427,8 +431,9 @@ static int clone_by(struct target *target, pid_t tid, const struct arch_regs *ba
 
 /* The holder of a process that is not the main one must not be a child of anybody in the
  * app: wait(2) would find it.  So a task in between makes it, and ends, whereupon it is
- * init's; and the one in between is waited for by its parent before that runs again.  It
- * has no exit signal, so that nobody is told.
+ * init's; and the one in between is waited for by its parent, which does so in any case
+ * before it goes home, whether we are still there or not.  It has no exit signal, so that
+ * nobody is told.
  *
  * This holder also makes the templates.  They have its signal handlers and working
  * directory, which are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
@@ -437,7 +442,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	struct inj_call *call = &target->pad.control->runner;
 	struct thread *thread = thread_find(target, target->pid);
 	struct proc_stat stat = { 0 };
-	pid_t between = 0, between_inside = 0, holder = 0;
+	pid_t between = 0, holder = 0;
 	int result;
 
 	if (!thread || !thread->stopped)
@@ -445,8 +450,10 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
 	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND, 0, 0, 0, 0);
+	call_add(call, INJ_WAIT, 0, 0, 0, 0, 0);
 	if (borrow(target, thread, err))
 		return -1;
+	target->waiting = true;
 	result = pad_run_clone(thread->tid, call, &between, err);
 	if (result) {
 		target->lost = target->lost || err->code != AVC_KERNEL;
@@ -460,8 +467,6 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
-		between_inside = proc_inside(between);
-	if (!result)
 		result = clone_by(target, between, &target->holder_base,
 				  &target->pad.control->holder,
 				  CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD,
@@ -469,26 +474,19 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	tracee_kill(between);
 	if (!result)
 		result = make_holder(target, holder, &target->holder_base, err);
-	if (!result && (proc_stat(holder, &stat) || stat.parent != init))
+	if (!result && proc_stat(holder, &stat))
+		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
+	if (!result && stat.parent != init)
 		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "make holder", "",
 			      "a process above it adopts orphans (PR_SET_CHILD_SUBREAPER)");
 	if (holder && keep_holder(target, holder, result, err))
 		result = -1;
-	/* The thread has come back from clone(2) and rests in the pad. */
-	if (tracee_settle(thread->tid, err)) {
+	if (pad_run(thread->tid, call, err)) {
 		thread->stopped = false;
 		return -1;
 	}
-	if (between_inside > 0) {
-		call_begin(call, INJ_AFTER_HOME);
-		call_add(call, SYS_wait4, (uint64_t)between_inside, 0, __WALL, 0, 0);
-		if (pad_send(&target->pad, thread->tid, &thread->regs, call, err) ||
-		    pad_run(thread->tid, call, err))
-			result = -1;
-	}
-	if (give_back(thread, err))
-		result = -1;
-	return result;
+	target->waiting = false;
+	return give_back(thread, err) || result ? -1 : 0;
 }
 
 void unhold(struct target *target)

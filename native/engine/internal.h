@@ -252,6 +252,7 @@ struct target {
 	uint64_t start;               /* when it began; tells it from one with its number */
 	uint32_t images;              /* generations that have one of it                  */
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	uint32_t forebear_groups;     /* a hash                                            */
 	bool frozen, frozen_new;      /* stopped in this freeze; and only found in it      */
@@ -410,8 +411,7 @@ int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, str
 /* Resumes it until all calls were made; it is in a plain trap stop then. */
 int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
- * not let it, fails with AVC_KERNEL, and it is in a plain trap stop.  The clone is the
- * last of the calls. */
+ * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
 int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		  struct avc_error *err) warn_unused;
 /* The same in two parts, for several at a time. */

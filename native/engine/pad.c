@@ -196,8 +196,11 @@ int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 /* It has made all its calls and not stopped: a limit of processes, or of memory. */
 static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_error *err)
 {
-	const int64_t result = call->call[(call->count - 1) % INJ_CALLS_MAX].result;
+	int64_t result = 0;
 
+	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++)
+		if (call->call[i].nr == SYS_clone)
+			result = call->call[i].result;
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
 	if (tracee_await(tid, NULL, err) != STOP_TRAP)

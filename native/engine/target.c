@@ -260,6 +260,14 @@ static bool straggle(struct target *target, struct thread *thread)
 		break;
 	}
 	if (arch_regs_get(tid, &now) == 0) {
+		/* Not before it has waited for what it brought forth for us: the app would
+		 * find that. */
+		if (target->waiting && thread->borrowed &&
+		    pad_contains(&target->pad, arch_pc(&now)) &&
+		    !__atomic_load_n(&target->pad.control->runner.done, __ATOMIC_ACQUIRE)) {
+			ptrace(PTRACE_CONT, tid, NULL, 0L);
+			return true;
+		}
 		if (thread->borrowed && pad_contains(&target->pad, arch_pc(&now))) {
 			give_back(thread, &ignored);
 		} else {

@@ -19,6 +19,7 @@
 #define SYS4(nr, a, b, c, d) \
 	raw_syscall(nr, (uint64_t)(a), (uint64_t)(b), (uint64_t)(c), (uint64_t)(d), 0, 0)
 
+#define __WALL_ 0x40000000 /* <linux/wait.h> */
 #define SPAWN_TRIES 4000
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
@@ -76,6 +77,11 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 
 		if (s->nr == INJ_LIST)
 			make_list((struct inj_syscall *)s->arg[0], s->arg[1]);
+		else if (s->nr == INJ_WAIT)
+			s->result = i && s[-1].result > 0
+					    ? raw_syscall(__NR_wait4, (uint64_t)s[-1].result, 0,
+							  __WALL_, 0, 0, 0)
+					    : 0;
 		else if (s->nr == __NR_clone)
 			s->result = inj_clone(s->arg[0], s->arg[1], s->arg[2], s->arg[3],
 					      s->arg[4]);

@@ -48,6 +48,8 @@ struct inj_syscall {
 
 /* Instead of a number of a system call: arg[1] calls, struct inj_syscall at arg[0]. */
 #define INJ_LIST (-1)
+/* wait4(2) for what the call before it has brought forth. */
+#define INJ_WAIT (-2)
 
 enum inj_after {
 	INJ_AFTER_HOME = 0, /* go back to the interrupted context (struct inj_home) */
