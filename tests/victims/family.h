@@ -168,15 +168,17 @@ static inline void check_place(void)
 	}
 }
 
-/* /proc/self/task/TID/children of every thread: exactly those that we know of.
- * The process must not fork meanwhile. */
-static inline void check_children_file(void)
+/* How many children /proc lists for all our threads; -1: it could not be read.  An
+ * open file of /proc/self is that of a dead process after a restore. */
+static inline int listed_children(void)
 {
 	DIR *tasks = opendir("/proc/self/task");
 	struct dirent *task;
+	bool failed = false;
 	int found = 0;
 
-	CHECK(tasks, "/proc/self/task: %s", strerror(errno));
+	if (!tasks)
+		return -1;
 	while ((task = readdir(tasks))) {
 		char path[300];
 		FILE *file;
@@ -192,9 +194,22 @@ static inline void check_children_file(void)
 			CHECK(is_child(pid), "%d is not my child, but %s says so", pid, path);
 			found++;
 		}
+		failed |= ferror(file) != 0;
 		fclose(file);
 	}
 	closedir(tasks);
+	return failed ? -1 : found;
+}
+
+/* /proc/self/task/TID/children of every thread: exactly those that we know of.
+ * The process must not fork meanwhile. */
+static inline void check_children_file(void)
+{
+	int tries = 0, found;
+
+	do
+		found = listed_children();
+	while (found != family.children && tries++ < 5);
 	if (found != family.children)
 		came_apart("I have %d children, but %d are listed", family.children, found);
 }

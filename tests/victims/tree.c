@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * tree WORKERS [--threads T] [--lap-us N] [--orphan]: processes that hang together.
+ * tree WORKERS [--threads T] [--lap-us N] [--orphan] [--reaper]: processes that hang together.
  *
  * The main process forks WORKERS others that live as long as it does.  Each
  * knows its place (family.h), and what it shares with the others agrees with
@@ -12,7 +12,7 @@
  *
  * What a worker is besides goes by its number: kinds[], below.  With --threads
  * each worker has T threads in all.  --orphan: one process more, whose parent has
- * ended, so that it is a child of init.
+ * ended, so that it is a child of init.  --reaper: some adopt orphans themselves.
  * Counter 0: laps of all in shared memory; 1: records received by the main process.
  */
 #include <sys/socket.h>
@@ -34,6 +34,7 @@ struct ends {
 
 static long lap_us = 1000, threads = 1;
 static int workers;
+static bool with_reapers;
 static const char *board_path;
 
 /* ---- kinds of workers --------------------------------------------------------------- */
@@ -344,7 +345,7 @@ static void start_worker(int number)
 	}
 	forget_children();
 	self.number = number;
-	self.kind = (enum kind)((number - 1) % KINDS);
+	self.kind = (enum kind)((number - 1) % (with_reapers ? KINDS : REAPER));
 	self.ends.in.fd = down[0];
 	self.ends.out.fd = up[1];
 	self.ends.get.fd = self.ends.give.fd = pair[1];
@@ -478,9 +479,10 @@ static void wait_for_workers(void)
 
 int main(int argc, char **argv)
 {
-	bool orphan = victim_flag(&argc, argv, "--orphan");
+	const bool orphan = victim_flag(&argc, argv, "--orphan");
 	int i;
 
+	with_reapers = victim_flag(&argc, argv, "--reaper");
 	watch_sigchld();
 	if (argc > 2 && !strcmp(argv[1], "--member"))
 		be_execed(argv);
@@ -492,7 +494,7 @@ int main(int argc, char **argv)
 		else if (!strcmp(argv[i], "--board"))
 			board_path = argv[i + 1];
 	}
-	victim_start(&argc, argv, 1, "WORKERS [--threads T] [--lap-us N] [--orphan]");
+	victim_start(&argc, argv, 1, "WORKERS [--threads T] [--lap-us N] [--orphan] [--reaper]");
 	workers = atoi(argv[1]);
 	must(workers <= WORKERS_MAX && (workers + 2) * threads <= SLOTS_MAX, "too many");
 	family.main = getpid();
