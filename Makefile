@@ -49,6 +49,11 @@ test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times
 	@scripts/setup-programs.sh
 	@$(VENV)/python bench/programs.py --rounds $(ROUNDS)
 
+test-trees: setup ## tests of process trees, which are off by default: more kills, 200 processes, PostgreSQL under load
+	@scripts/setup-trees.sh
+	@AVCKPT_TREES=1 AVCKPT_LONG=1 $(VENV)/python -m pytest tests/native/test_engine_trees.py $(wildcard tests/integration/test_trees_*.py) \
+		--timeout 3000 $(PYTEST_ARGS) $(if $(T),-k "$(T)")
+
 lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
 	@scripts/lint.sh
 
@@ -83,6 +88,9 @@ bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against
 	@scripts/setup-ros2.sh
 	@$(VENV)/python bench/ros2.py
 
+bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
+	@AVCKPT_TREES=1 $(VENV)/python bench/trees.py
+
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
@@ -92,5 +100,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test test-programs test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 clean clean-system
+.PHONY: help setup setup-build setup-images demo test test-programs test-trees test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
 .DEFAULT_GOAL := help

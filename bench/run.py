@@ -38,6 +38,8 @@ from bench.subjects import BenchFailed, Forker, Guarded, Idle, build  # noqa: E4
 RESULTS = ROOT / "bench" / "results" / "engine.json"
 MEGABYTES = (10, 100, 1000)
 THREADS = (1, 20, 100)
+DESCRIPTORS = (100, 50, 100)
+"""MB, threads and descriptors of one more victim: the others have next to no descriptors."""
 CYCLES = 40
 QUICK_CYCLES = 5
 WARM_UP_CYCLES = 2
@@ -54,6 +56,7 @@ class Row:
 
     mb: int
     threads: int
+    descriptors: int
     fork_ms: float
     freeze_ms: float
     reap_ms: float
@@ -98,13 +101,13 @@ class Parts:
     restore_rest_ms: float
 
 
-def measure(mb: int, threads: int, cycles: int, folder: Path) -> tuple[Row, Parts]:
+def measure(mb: int, threads: int, descriptors: int, cycles: int, folder: Path) -> tuple[Row, Parts]:
     """One victim, `cycles` times.  Raises BenchFailed, AvckptError."""
     rng = random.Random(mb * 1000 + threads)
     forks, checkpoints, recoveries = [], [], []
     with (
         Forker(mb) as forker,
-        Idle(mb, threads, beat_us=BEAT_US, folder=folder) as idle,
+        Idle(mb, threads, beat_us=BEAT_US, folder=folder, descriptors=descriptors) as idle,
         Guarded(idle) as guarded,
     ):
         app_pid = idle.app_pid
@@ -125,6 +128,7 @@ def measure(mb: int, threads: int, cycles: int, folder: Path) -> tuple[Row, Part
     row = Row(
         mb=mb,
         threads=threads,
+        descriptors=descriptors,
         fork_ms=round(median(forks), 4),
         freeze_ms=round(median(c.freeze_s * 1e3 for c in checkpoints), 4),
         reap_ms=round(median(r.reap_ms for r in recoveries), 4),
@@ -153,12 +157,13 @@ def _against(value: float, limit: float | None, fork_ms: float) -> str:
 def show(rows: Sequence[Row]) -> None:
     """The table: beside each figure its ratio to fork, and its limit."""
     table = Table(title="medians in ms (times a plain fork), beside their limits", title_justify="left")
-    for heading in ("MB", "threads", "fork", "freeze", "reap", "restore", "resume gap"):
+    for heading in ("MB", "threads", "fds", "fork", "freeze", "reap", "restore", "resume gap"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(
             str(row.mb),
             str(row.threads),
+            str(row.descriptors),
             f"{row.fork_ms:.2f}",
             _against(row.freeze_ms, row.freeze_limit_ms, row.fork_ms),
             _against(row.reap_ms, row.reap_limit_ms, 0.0),
@@ -171,7 +176,8 @@ def show(rows: Sequence[Row]) -> None:
     )
     for row in rows:
         for failure in row.failures:
-            console.print(f"[red]does not hold[/]: {row.mb} MB, {row.threads} threads: {failure}")
+            what = f"{row.mb} MB, {row.threads} threads, {row.descriptors} descriptors"
+            console.print(f"[red]does not hold[/]: {what}: {failure}")
     if not any(row.failures for row in rows):
         console.print("[green]every limit holds[/]")
 
@@ -180,10 +186,11 @@ def show_parts(rows: Sequence[Row], parts: Sequence[Parts]) -> None:
     """Where the time goes."""
     table = Table(title="parts, medians in ms", title_justify="left")
     names = list(asdict(parts[0]))
-    for heading in ("MB", "threads", *(name.removesuffix("_ms").replace("_", " ") for name in names)):
+    for heading in ("MB", "threads", "fds", *(name.removesuffix("_ms").replace("_", " ") for name in names)):
         table.add_column(heading, justify="right")
     for row, part in zip(rows, parts):
-        table.add_row(str(row.mb), str(row.threads), *(f"{value:.3f}" for value in asdict(part).values()))
+        figures = (row.mb, row.threads, row.descriptors)
+        table.add_row(*map(str, figures), *(f"{value:.3f}" for value in asdict(part).values()))
     console.print(table)
 
 
@@ -207,6 +214,7 @@ def main() -> int:
     parser.add_argument("--parts", action="store_true", help="also show where the time goes")
     parser.add_argument("--mb", type=_numbers, default=MEGABYTES, help="sizes, e.g. 10,100")
     parser.add_argument("--threads", type=_numbers, default=THREADS, help="numbers of threads, e.g. 1,20")
+    parser.add_argument("--descriptors", type=int, default=0, help="open so many more (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS, help="where the results go (%(default)s)")
     args = parser.parse_args()
     cycles = args.cycles or (QUICK_CYCLES if args.quick else CYCLES)
@@ -218,14 +226,16 @@ def main() -> int:
     try:
         build()
         with tempfile.TemporaryDirectory(prefix="avckpt-bench-") as folder:
-            for mb in args.mb:
-                for threads in args.threads:
-                    if not args.json:
-                        load = os.getloadavg()[0]
-                        console.print(f"{mb} MB, {threads} threads, {cycles} cycles (load {load:.1f}) ...", style="dim")
-                    row, part = measure(mb, threads, cycles, Path(folder))
-                    rows.append(row)
-                    parts.append(part)
+            cases = [(mb, threads, args.descriptors) for mb in args.mb for threads in args.threads]
+            if (args.mb, args.threads, args.descriptors) == (MEGABYTES, THREADS, 0):
+                cases.append(DESCRIPTORS)
+            for mb, threads, descriptors in cases:
+                if not args.json:
+                    what = f"{mb} MB, {threads} threads, {descriptors} descriptors, {cycles} cycles"
+                    console.print(f"{what} (load {os.getloadavg()[0]:.1f}) ...", style="dim")
+                row, part = measure(mb, threads, descriptors, cycles, Path(folder))
+                rows.append(row)
+                parts.append(part)
     except (BenchFailed, AvckptError) as error:
         print(f"bench: {error}", file=sys.stderr)
         return 1

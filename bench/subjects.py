@@ -92,11 +92,11 @@ class Forker:
 class Idle:
     """tests/victims/idle.c below avckpt-init, which is PID 1 of a PID namespace of its own."""
 
-    def __init__(self, mb: int, threads: int, *, beat_us: int, folder: Path) -> None:
+    def __init__(self, mb: int, threads: int, *, beat_us: int, folder: Path, descriptors: int = 0) -> None:
         self.board = Board(folder / f"idle-{mb}-{threads}-{time.monotonic_ns()}")
         command: list[str | Path] = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child=KILL", init_binary()]
         command += ["--wait-ms", "2000", "--", VICTIMS / "build" / "idle", str(mb), str(threads)]
-        command += ["--beat-us", str(beat_us), "--board", self.board.path]
+        command += ["--beat-us", str(beat_us), "--descriptors", str(descriptors), "--board", self.board.path]
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         self.init_pid = 0
 

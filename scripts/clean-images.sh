@@ -8,7 +8,8 @@
 
 have podman || exit 0
 for repository in localhost/avckpt-programs localhost/avckpt-programs-build localhost/avckpt-sidecar \
-	localhost/avckpt-sidecar-build localhost/avckpt-ros2 localhost/avckpt-base; do
+	localhost/avckpt-sidecar-build localhost/avckpt-trees \
+	localhost/avckpt-ros localhost/avckpt-ros2 localhost/avckpt-base; do
 	podman images --format '{{.Repository}}:{{.Tag}}' --filter "reference=$repository" |
 		while read -r image; do podman rmi "$image" || warn "$image is in use and stays"; done
 done

@@ -406,7 +406,9 @@ def app_pid(init_pid: int) -> int:
         with contextlib.suppress(OSError):
             stat = Path(f"/proc/{child}/stat").read_text()
             name, rest = stat[stat.index("(") + 1 :].rsplit(")", 1)
-            if not name.startswith("avckpt-") and rest.split()[0] not in "ZX":
+            state, threads = rest.split()[0], int(rest.split()[17])
+            # The main thread may have ended while others go on.
+            if not name.startswith("avckpt-") and (state not in "ZX" or threads > 1):
                 found.append(int(child))
     if len(found) != 1:
         raise LookupError(f"children of avckpt-init {init_pid} that could be the app: {found}")

@@ -12,12 +12,14 @@
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/capability.h>
 #include <linux/securebits.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
+#include <sys/ptrace.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -25,6 +27,8 @@
 
 #define IOPRIO_WHO_PROCESS 1
 #define CAPABILITY_VERSION_3 0x20080522
+#define NODE_BITS (64 * NODE_WORDS)
+#define FILTER_MAX 4096 /* instructions (linux/bpf_common.h, BPF_MAXINSNS) */
 
 struct attributes {
 	char oom_score_adj[16];
@@ -41,9 +45,12 @@ struct answers {
 	uint32_t caps[6];
 	uint32_t death_signal, subreaper;
 	uint32_t header[2];
+	int32_t memory_policy;
+	uint32_t group[GROUPS_KEPT];
+	uint64_t nodes[NODE_WORDS];
 };
 
-enum { FSUID, FSGID, SECUREBITS, NO_NEW_PRIVS, SLACK, SECCOMP, RESULTS };
+enum { FSUID, FSGID, SECUREBITS, NO_NEW_PRIVS, SLACK, SECCOMP, GROUP_COUNT, POLICY };
 
 void scheduling_read(pid_t tid, struct scheduling *s)
 {
@@ -68,6 +75,9 @@ struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote 
 	call_add(call, SYS_prctl, PR_GET_NO_NEW_PRIVS, 0, 0, 0, 0);
 	call_add(call, SYS_prctl, PR_GET_TIMERSLACK, 0, 0, 0, 0);
 	call_add(call, SYS_prctl, PR_GET_SECCOMP, 0, 0, 0, 0);
+	call_add(call, SYS_getgroups, 0, 0, 0, 0, 0);
+	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS, 0, 0);
+	call_add(call, SYS_getgroups, GROUPS_KEPT, AT(group), 0, 0, 0);
 	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8, 0, 0);
 	call_add(call, SYS_getresgid, AT(gid), AT(gid) + 4, AT(gid) + 8, 0, 0);
 	call_add(call, SYS_capget, AT(header), AT(caps), 0, 0, 0);
@@ -91,12 +101,38 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	c->securebits = (uint32_t)first[SECUREBITS].result;
 	c->no_new_privs = first[NO_NEW_PRIVS].result == 1;
 	c->seccomp = (int32_t)first[SECCOMP].result;
+	c->group_count = (int32_t)first[GROUP_COUNT].result;
+	if (c->group_count > 0 && c->group_count <= GROUPS_KEPT)
+		memcpy(c->group, a->group, (size_t)c->group_count * sizeof *c->group);
+	c->memory_policy = first[POLICY].result ? -1 : a->memory_policy;
+	if (!first[POLICY].result)
+		memcpy(c->nodes, a->nodes, sizeof c->nodes);
 	c->slack_ns = (uint64_t)first[SLACK].result;
 	c->death_signal = a->death_signal;
 	c->subreaper = a->subreaper;
 }
 
+uint64_t filters_read(pid_t tid)
+{
+	uint64_t program[FILTER_MAX], sum = 0; /* of struct sock_filter */
+
+	for (long i = 0;; i++) {
+		const long n = ptrace(PTRACE_SECCOMP_GET_FILTER, tid, i, program);
+
+		if (n <= 0)
+			return sum; /* that was the last one; or it has none */
+		for (long k = 0; k < n && k < FILTER_MAX; k++)
+			sum = (sum ^ program[k]) * UINT64_C(0x100000001b3);
+		sum = sum * 31 + (uint64_t)n;
+	}
+}
+
 /* ---- when the app runs again ------------------------------------------------------------ */
+
+static bool differ_in_groups(const struct creds *a, const struct creds *b)
+{
+	return a->group_count != b->group_count || memcmp(a->group, b->group, sizeof a->group);
+}
 
 /* A thread that has fewer rights than the main thread, or other ones.  To go on with
  * more than it had would be wrong: these must succeed. */
@@ -115,6 +151,9 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 	/* Or the capabilities would go with the user. */
 	const uint32_t keep = from->securebits | SECBIT_KEEP_CAPS;
 
+	if (differ_in_groups(from, to))
+		setup_add_thread(setup, "setgroups", SYS_setgroups, (uint64_t)to->group_count,
+				 setup_data(setup, to->group, sizeof to->group), 0, 0, 0);
 	if (memcmp(from->gid, to->gid, sizeof to->gid))
 		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
 				 to->gid[2], 0, 0);
@@ -152,28 +191,42 @@ static bool has_less(const struct creds *from, const struct creds *to)
 int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
 			    const struct thread *t, struct setup *setup, struct avc_error *err)
 {
-	const struct creds *from = &main_thread->creds, *to = &t->creds;
+	/* One that is not the main process is made from that, as are its threads. */
+	const struct creds *from = target->descendant ? target->forebear : &main_thread->creds;
+	const struct creds *to = &t->creds;
 
 	if (to->death_signal)
 		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
 				 to->death_signal, 0, 0, 0);
-	if (t == main_thread) {
-		if (to->subreaper)
-			setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl,
-					 PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+	if (t == main_thread && to->subreaper)
+		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
+				 0, 0);
+	if (t == main_thread && !target->descendant)
 		return 0;
-	}
 	if (to->slack_ns && to->slack_ns != from->slack_ns)
 		setup_add_thread(setup, "prctl(TIMERSLACK)", SYS_prctl, PR_SET_TIMERSLACK,
 				 to->slack_ns, 0, 0, 0)
 			->flags = INJ_MAY_FAIL;
-	if (to->seccomp != from->seccomp)
+	if (to->memory_policy >= 0 && (to->memory_policy != from->memory_policy ||
+				       memcmp(to->nodes, from->nodes, sizeof to->nodes)))
+		setup_add_thread(setup, "set_mempolicy", SYS_set_mempolicy,
+				 (uint64_t)to->memory_policy,
+				 setup_data(setup, to->nodes, sizeof to->nodes), NODE_BITS, 0, 0)
+			->flags = INJ_MAY_FAIL;
+	if (differ_in_groups(from, to) &&
+	    (!(from->caps[0] >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "thread %d has other supplementary groups than the main thread, which "
+			    "can not be put back",
+			    t->inside);
+	if (to->seccomp != from->seccomp || to->filters != from->filters)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 			    "its threads differ in their seccomp filters (thread %d)", t->inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "thread %d has privileges that the main thread has given up",
-			    t->inside);
+			    "%s %d has privileges that the main %s has given up",
+			    target->descendant ? "process" : "thread", t->inside,
+			    target->descendant ? "process" : "thread");
 	lower(from, to, setup);
 	return 0;
 }
@@ -195,13 +248,15 @@ int attributes_keep(const struct target *target, struct generation *generation,
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
 	if (proc_read(target->pid, "oom_score_adj", kept->oom_score_adj,
-		      sizeof kept->oom_score_adj) <= 0)
+		      sizeof kept->oom_score_adj) <= 0 &&
+	    !target->descendant) /* else it has its parent's */
 		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
 	scheduling_read(generation->template, &inherited);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		const struct thread *t = &target->threads[i];
 
-		if (t->block < 0 || same_scheduling(&t->scheduling, &inherited))
+		if (t->block < 0 ||
+		    (!target->descendant && same_scheduling(&t->scheduling, &inherited)))
 			continue;
 		kept->thread[kept->count].inside = t->inside;
 		kept->thread[kept->count++].scheduling = t->scheduling;

@@ -56,6 +56,7 @@ void files_free(struct files *files)
 
 		free(f->name);
 		free(f->watch);
+		free(f->mark);
 		free(f->lock);
 		free(f->socket);
 		free(f->content);
@@ -110,6 +111,7 @@ static enum file_kind kind_of(const struct file *f)
 		{ "anon_inode:[eventpoll]", FILE_EPOLL },
 		{ "anon_inode:inotify", FILE_INOTIFY },
 		{ "anon_inode:[inotify]", FILE_INOTIFY },
+		{ "anon_inode:[pidfd]", FILE_PIDFD },
 	};
 
 	switch (f->mode & S_IFMT) {
@@ -184,6 +186,7 @@ static struct file *take_known(const struct look *look, struct file *f)
 			const int fd = f->fd, flags = f->flags;
 
 			free(f->watch);
+			free(f->mark);
 			*f = (struct file){ .fd = fd,
 					    .shared = fd,
 					    .offset = -1,
@@ -426,6 +429,15 @@ static void check_shared(struct files *files, pid_t pid)
 	}
 }
 
+/* Has anybody in the app the other end?  Of several processes that is found out when it
+ * matters, at a restore. */
+static bool may_be_ours(const struct files *files, const struct file *f)
+{
+	if (!files->several)
+		return files_other_end(files, f);
+	return !f->outside && (f->kind == FILE_PIPE || (f->socket && f->socket->peer));
+}
+
 static void keep_contents(struct look *look)
 {
 	for (uint32_t i = 0; i < look->files->count; i++) {
@@ -435,7 +447,7 @@ static void keep_contents(struct look *look)
 		/* Once for each object, from an end that can be read. */
 		if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) ||
 		    f->shared != f->fd || (f->kind != FILE_PIPE && f->kind != FILE_SOCKET) ||
-		    !files_other_end(look->files, f))
+		    !may_be_ours(look->files, f))
 			continue;
 		fd = files_borrow(look->pidfd, f->fd);
 		if (fd < 0)
@@ -516,6 +528,21 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	return 0;
 }
 
+/* Those of the app itself, whose process will be another one with its number. */
+static void find_own_pidfds(const struct target *target, struct files *files)
+{
+	for (uint32_t i = 0; i < files->count; i++) {
+		struct file *f = &files->file[i];
+
+		if (f->kind != FILE_PIDFD)
+			continue;
+		f->pid_inside = f->pid == target->leader ? target->inside : 0;
+		for (uint32_t k = 0; !f->pid_inside && k < target->thread_count; k++)
+			if (target->threads[k].tid == f->pid)
+				f->pid_inside = target->threads[k].inside;
+	}
+}
+
 /* Only the app itself, its threads and its group can be named again. */
 static void find_owners(const struct target *target, struct files *files)
 {
@@ -526,7 +553,7 @@ static void find_owners(const struct target *target, struct files *files)
 			continue;
 		if (f->owner_type == F_OWNER_PGRP)
 			f->owner_inside = proc_inside(f->owner);
-		else if (f->owner == target->pid)
+		else if (f->owner == target->leader)
 			f->owner_inside = target->inside;
 		for (uint32_t k = 0; f->owner_type == F_OWNER_TID && k < target->thread_count; k++)
 			if (target->threads[k].tid == f->owner)
@@ -566,16 +593,19 @@ int files_prepare(struct target *target, struct avc_error *err)
 	return 0;
 }
 
-int files_capture(struct target *target, struct generation *generation, struct avc_error *err)
+int files_capture(struct target *target, struct generation *generation, bool several,
+		  struct avc_error *err)
 {
 	struct files *image = target->files_image;
 
 	target->files_image = NULL;
+	image->several = several;
 	generation->files = image;
 	if (files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
 		       target->init, err))
 		return -1;
 	find_owners(target, image);
+	find_own_pidfds(target, image);
 	return 0;
 }
 

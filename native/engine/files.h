@@ -7,7 +7,9 @@
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
  *   files_make.c    opens and makes again what is lost
  *   files_restore.c compares two tables and makes the one the other
+ *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
+ *   files_watches.c inotify
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *   files_mapped.c  the same of files that are mapped
  *   files_written.c the same of files that are not open any more
@@ -36,7 +38,8 @@ enum file_kind {
 	FILE_TIMERFD,
 	FILE_SIGNALFD,
 	FILE_EPOLL,
-	FILE_INOTIFY
+	FILE_INOTIFY,
+	FILE_PIDFD
 };
 
 struct file_lock {
@@ -49,6 +52,15 @@ struct file_watch { /* of an epoll set                                         *
 	int fd;
 	uint32_t events;
 	uint64_t data;
+};
+
+struct file_mark { /* of inotify                                               */
+	int wd;
+	uint32_t mask;
+	uint64_t dev, ino; /* as the kernel has them                           */
+	uint32_t handle_bytes;
+	int handle_type;
+	uint8_t handle[128]; /* open_by_handle_at(2)                           */
 };
 
 struct file_socket {
@@ -85,10 +97,12 @@ struct file {
 	int clock, settime_flags;
 	uint64_t ticks, deadline_ns, interval_ns;
 	uint64_t mask; /* signalfd                                                  */
-	/* inotify: how many watches, and a sum over what fdinfo says of them      */
+	/* pidfd: in our namespace; of the app itself or a thread of it, in its own      */
+	pid_t pid, pid_inside;
 	uint32_t watch_count;
-	uint64_t watch_sum;
 	struct file_watch *watch; /* epoll, allocated                              */
+	uint32_t mark_count;
+	struct file_mark *mark; /* inotify, allocated                              */
 	/* As fdinfo says it                                                      */
 	int told_flags;
 	uint64_t told_ino;
@@ -103,13 +117,15 @@ struct file {
 	/* In the middle of a message, as far as can be told (files_stream.c)      */
 	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */
-	uint8_t *content;
+	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
 	bool content_lost; /* there was something that can not be put back          */
+	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 };
 
 struct files {
 	uint32_t count, room;
+	bool several;      /* other processes may have the other ends of pipes        */
 	bool with_tcp;     /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns; /* CLOCK_REALTIME                                       */
 	struct file *file; /* by fd, ascending                                     */
@@ -126,8 +142,6 @@ struct files *files_new(uint32_t room);
 int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
 	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
 struct file *files_find(const struct files *files, int fd);
-/* A duplicate of the descriptor of a process, or -1. */
-int files_borrow(int pidfd, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
 
 /* files_info.c */
@@ -162,6 +176,11 @@ void files_find_going(struct files *files);
  * one that can be brought there is, any other is reset.  Returns NULL or what failed. */
 const char *file_put_stream(int fd, const struct file *want, const struct file *now);
 
+/* files_watches.c */
+/* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is
+ * (NULL: fresh).  Returns NULL or why not all of them. */
+const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init);
+
 /* files_make.c */
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
  * may be set on success as well: what is not as it was. */
@@ -180,6 +199,10 @@ struct files_work {
 	struct generation *generation;
 	const struct avc_config *config;
 	pid_t init;
+	/* A task that has the table as it was at the death: the template, or the holder;
+	 * 0: the table is gone. */
+	pid_t table;
+	int table_pidfd;
 	struct files *want, *now;
 	int *local;      /* of want, by group leader: a descriptor of ours, or -1  */
 	int *claimed_by; /* of now: leader (index in want) of the group that has it */
@@ -189,6 +212,17 @@ struct files_work {
 	uint32_t problems;
 	struct avc_error *notes;
 };
+
+int files_work_begin(struct files_work *work, struct avc_error *err) warn_unused;
+int files_work_gather(struct files_work *work, struct avc_error *err) warn_unused;
+int files_work_place(struct files_work *work, struct avc_error *err) warn_unused;
+void files_work_finish(struct files_work *work);
+int files_work_table(const struct files_work *work, struct files_table *table,
+		     struct avc_error *err) warn_unused;
+void files_work_end(struct files_work *work);
+/* A duplicate of what is at this place of the table now. */
+int files_borrow_placed(const struct files_work *work, const struct file *w);
+void files_note(struct files_work *work, const struct file *f, const char *problem);
 
 uint32_t files_index(const struct files *files, const struct file *file);
 /* Index of the first descriptor of the same open file description. */

@@ -108,6 +108,15 @@ static void list_owner(struct setup *setup, const struct file *w)
 		->flags = INJ_MAY_FAIL;
 }
 
+/* What was open is a dead process's. */
+static void list_pidfd(struct setup *setup, const struct file *w)
+{
+	setup_add(setup, INJ_OWNERS, "pidfd_open", INJ_PIDFD_OPEN, (uint64_t)w->fd,
+		  (uint64_t)w->pid_inside, (uint64_t)w->flags & (O_NONBLOCK | O_EXCL),
+		  w->cloexec ? O_CLOEXEC : 0, 0)
+		->flags = INJ_MAY_FAIL;
+}
+
 void files_list_calls(struct files_work *work)
 {
 	struct inj_slot *slot = pad_slot(&work->target->pad, work->generation->slot);
@@ -125,6 +134,8 @@ void files_list_calls(struct files_work *work)
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
 
+		if (w->pid_inside)
+			list_pidfd(setup, w);
 		if (files_leader(work->want, w) != i)
 			continue;
 		if (w->kind == FILE_EPOLL)

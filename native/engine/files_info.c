@@ -45,13 +45,6 @@ failed:
 	return NULL;
 }
 
-static uint64_t sum_up(uint64_t sum, const char *text, size_t bytes)
-{
-	for (size_t i = 0; i < bytes; i++)
-		sum = (sum ^ (uint8_t)text[i]) * UINT64_C(0x100000001b3);
-	return sum;
-}
-
 /* "1: POSIX  ADVISORY  WRITE 14092 fe:00:2147490 5 14" */
 static void add_lock(struct file *file, const char *line)
 {
@@ -101,6 +94,41 @@ static void add_watch(struct file *file, const char *line, uint32_t *room)
 	file->watch[file->watch_count++] = watch;
 }
 
+/* "5 ino:3f7e8 sdev:fe00000 mask:fff ignored_mask:0 fhandle-bytes:8 fhandle-type:1
+ * f_handle:e8f7030000000000"; without what begins with f for a file system without. */
+static void add_mark(struct file *file, const char *line, uint32_t *room)
+{
+	struct file_mark mark = { 0 };
+	unsigned long ino;
+	unsigned int wd, dev, type = 0;
+	int at = 0;
+
+	if (sscanf(line,
+		   "%x ino:%lx sdev:%x mask:%x ignored_mask:%*x fhandle-bytes:%x fhandle-type:%x"
+		   " f_handle:%n",
+		   &wd, &ino, &dev, &mark.mask, &mark.handle_bytes, &type, &at) < 4)
+		return;
+	mark.wd = (int)wd;
+	mark.ino = ino;
+	mark.dev = dev;
+	mark.handle_type = (int)type;
+	if (!at || mark.handle_bytes > sizeof mark.handle)
+		mark.handle_bytes = 0;
+	for (uint32_t i = 0; i < mark.handle_bytes; i++)
+		if (sscanf(line + at + 2 * i, "%2hhx", &mark.handle[i]) != 1)
+			mark.handle_bytes = 0;
+	if (file->mark_count == *room) {
+		const uint32_t wanted = *room ? 2 * *room : 8;
+		struct file_mark *more = realloc(file->mark, wanted * sizeof *more);
+
+		if (!more)
+			return;
+		file->mark = more;
+		*room = wanted;
+	}
+	file->mark[file->mark_count++] = mark;
+}
+
 static uint64_t nanoseconds(const char *value)
 {
 	unsigned long long s, ns;
@@ -148,12 +176,12 @@ static void take_line(struct file *file, const char *key, const char *value, uin
 		file->interval_ns = nanoseconds(value);
 	else if (!strcmp(key, "sigmask"))
 		file->mask = strtoull(value, NULL, 16);
+	else if (!strcmp(key, "Pid"))
+		file->pid = atoi(value);
 	else if (!strcmp(key, "tfd"))
 		add_watch(file, value, room);
-	else if (!strncmp(key, "inotify wd", 10)) {
-		file->watch_count++;
-		file->watch_sum += sum_up(1, value, strcspn(value, "\n"));
-	}
+	else if (!strcmp(key, "inotify wd"))
+		add_mark(file, value, room);
 }
 
 static const struct {
@@ -164,6 +192,7 @@ static const struct {
 	{ FILE_TIMERFD, "clockid" },
 	{ FILE_SIGNALFD, "sigmask" },
 	{ FILE_EPOLL, "tfd" },
+	{ FILE_PIDFD, "Pid" },
 };
 
 bool file_read_info(pid_t pid, struct file *file)
@@ -184,7 +213,7 @@ bool file_read_info(pid_t pid, struct file *file)
 		return false;
 	file->lock_count = 0;
 	file->watch_count = 0;
-	file->watch_sum = 0;
+	file->mark_count = 0;
 	for (line = text; *line; line = next) {
 		char *colon;
 

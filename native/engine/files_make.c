@@ -211,6 +211,23 @@ static int take_from_init(const struct file *want, pid_t init)
 	return fd;
 }
 
+/* Since Linux 6.9 the inode tells one process from another that has got its number. */
+static int make_pidfd(const struct file *want, pid_t init)
+{
+	struct stat own = { 0 };
+	int fd = proc_pidfd_open(init);
+	const bool told = fd >= 0 && fstat(fd, &own) == 0 &&
+			  (own.st_ino != want->ino || want->pid == init);
+
+	close_fd(&fd);
+	if (!told || want->pid <= 0)
+		return -1;
+	fd = (int)syscall(SYS_pidfd_open, want->pid, want->flags & (O_NONBLOCK | O_EXCL));
+	if (fd >= 0 && !is_the_one(fd, want))
+		close_fd(&fd);
+	return fd;
+}
+
 int file_make(const struct file *want, pid_t template, pid_t init, const char **why)
 {
 	const int nonblock = want->flags & O_NONBLOCK;
@@ -241,9 +258,14 @@ int file_make(const struct file *want, pid_t template, pid_t init, const char **
 	case FILE_EPOLL:
 		return epoll_create1(EPOLL_CLOEXEC);
 	case FILE_INOTIFY:
-		if (want->watch_count)
-			*why = "it was closed since the checkpoint; its watches are lost";
 		return inotify_init1(IN_CLOEXEC | (nonblock ? IN_NONBLOCK : 0));
+	case FILE_PIDFD:
+		if (want->pid_inside)
+			return open_empty(want); /* for the moment: files_calls.c */
+		fd = make_pidfd(want, init);
+		if (fd < 0)
+			*why = "it was closed since the checkpoint, and its process has ended";
+		return fd >= 0 ? fd : open_empty(want);
 	case FILE_OTHER:
 		break;
 	}

@@ -31,7 +31,7 @@ struct mail { /* in the pad: one recvmsg(2) that brings one descriptor          
 	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
 };
 
-static void note(struct files_work *work, const struct file *f, const char *problem)
+void files_note(struct files_work *work, const struct file *f, const char *problem)
 {
 	if (!problem)
 		return;
@@ -150,7 +150,7 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
 
 	if (!n)
 		return -1;
-	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->generation->template, n->fd);
+	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->table, n->fd);
 	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
 	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
 }
@@ -171,7 +171,7 @@ static void share_port(const struct files_work *work, const struct file *w)
 		if (work->now->file[k].kind != FILE_SOCKET)
 			continue;
 		/* The port is at the same place in an IPv6 address. */
-		fd = files_borrow(work->generation->pidfd, work->now->file[k].fd);
+		fd = files_borrow(work->table_pidfd, work->now->file[k].fd);
 		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
 		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
 			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
@@ -190,8 +190,8 @@ static void gather(struct files_work *work)
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
 		if (work->source[group] >= 0)
-			work->local[group] = files_borrow(work->generation->pidfd,
-							  work->now->file[work->source[group]].fd);
+			work->local[group] = files_borrow(
+				work->table_pidfd, work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
 	}
@@ -213,9 +213,9 @@ static void make_lost(struct files_work *work)
 		if (w->socket && w->socket->listening)
 			share_port(work, w);
 		work->local[group] = file_make(w, work->generation->template, work->init, &why);
-		note(work, w, why);
+		files_note(work, w, why);
 		if (work->local[group] < 0)
-			note(work, w, "it can not be made again");
+			files_note(work, w, "it can not be made again");
 	}
 }
 
@@ -329,7 +329,7 @@ static int lowest_free(const struct numbers *numbers, const struct files *avoid)
 	return -1;
 }
 
-static int send_one(int socket, int fd)
+int files_send(int socket, int fd)
 {
 	uint8_t byte = 0, control[CMSG_SPACE(sizeof fd)] __attribute__((aligned(8))) = { 0 };
 	struct iovec io = { &byte, 1 };
@@ -376,8 +376,8 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		to = lowest_free(numbers, NULL);
-		if (send_one(ours, from)) {
-			note(work, w, "it could not be handed over");
+		if (files_send(ours, from)) {
+			files_note(work, w, "it could not be handed over");
 			continue;
 		}
 		if (inject(work, err, SYS_recvmsg, (uint64_t)theirs, mail,
@@ -463,6 +463,15 @@ const struct file *files_now_of(const struct files_work *work, uint32_t i)
 	return source < 0 ? NULL : &work->now->file[source];
 }
 
+/* A duplicate of what is at this place of the table now. */
+int files_borrow_placed(const struct files_work *work, const struct file *w)
+{
+	const int local = work->local[files_leader(work->want, w)];
+
+	return local >= 0 ? fcntl(local, F_DUPFD_CLOEXEC, 0)
+			  : files_borrow(work->table_pidfd, w->fd);
+}
+
 static void put_states(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -474,40 +483,22 @@ static void put_states(struct files_work *work)
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
 		    !n->lock_count && !w->lock_count)
 			continue;
-		fd = files_borrow(work->generation->pidfd, w->fd);
+		fd = files_borrow_placed(work, w);
 		if (fd < 0) {
-			note(work, w, "it could not be put in its place");
+			files_note(work, w, "it could not be put in its place");
 			continue;
 		}
-		note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		files_note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		if (w->kind == FILE_INOTIFY)
+			files_note(work, w, file_put_marks(fd, w, n, work->init));
 		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
 		    (work->config->tcp == AVC_TCP_RESET ||
 		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
-			note(work, w, file_reset_tcp(fd));
+			files_note(work, w, file_reset_tcp(fd));
 		else if (n && n->tcp_state == 1 /* TCP_ESTABLISHED */ &&
 			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
-			note(work, w, file_put_stream(fd, w, n));
+			files_note(work, w, file_put_stream(fd, w, n));
 		close(fd);
-	}
-}
-
-static void put_contents(struct files_work *work)
-{
-	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file *w = &work->want->file[i],
-				  *other = files_other_end(work->want, w);
-		int fd, other_fd, bytes = 0;
-
-		if (!other || files_leader(work->want, w) != i)
-			continue;
-		fd = files_borrow(work->generation->pidfd, w->fd);
-		other_fd = files_borrow(work->generation->pidfd, other->fd);
-		if (fd >= 0 && other_fd >= 0 &&
-		    (w->content_bytes || w->content_lost ||
-		     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
-			note(work, w, file_put_content(fd, other_fd, w));
-		close_fd(&fd);
-		close_fd(&other_fd);
 	}
 }
 
@@ -522,68 +513,104 @@ static void *filled(uint32_t count, int value)
 	return array;
 }
 
-int files_restore(struct target *target, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct avc_error *notes,
-		  struct avc_error *err)
+int files_work_begin(struct files_work *work, struct avc_error *err)
 {
-	struct files_work work = { .target = target,
-				   .generation = generation,
-				   .config = config,
-				   .init = init,
-				   .want = generation->files,
-				   .notes = notes };
-	int result = -1;
+	work->now = files_new(work->want->count + 64);
+	work->local = filled(work->want->count, -1);
+	work->source = filled(work->want->count, -1);
+	work->lost = calloc(work->want->count + 1, sizeof *work->lost);
+	if (!work->now || !work->local || !work->source || !work->lost)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
+				      work->want, work->init, err))
+		return -1;
+	if (work->config->tcp == AVC_TCP_MESSAGES) {
+		files_find_going(work->want);
+		files_find_going(work->now);
+	}
+	work->claimed_by = filled(work->now->count, -1);
+	if (!work->claimed_by)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	find_staying(work);
+	find_moved(work);
+	break_pairs(work);
+	return 0;
+}
 
-	work.now = files_new(work.want->count + 64);
-	work.local = filled(work.want->count, -1);
-	work.source = filled(work.want->count, -1);
-	work.lost = calloc(work.want->count + 1, sizeof *work.lost);
-	if (!work.now || !work.local || !work.source || !work.lost) {
-		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
-		goto out;
-	}
-	if (files_look(work.now, generation->template, generation->pidfd, FILES_NOW, work.want,
-		       init, err))
-		goto out;
-	if (config->tcp == AVC_TCP_MESSAGES) {
-		files_find_going(work.want);
-		files_find_going(work.now);
-	}
-	work.claimed_by = filled(work.now->count, -1);
-	if (!work.claimed_by) {
-		fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
-		goto out;
-	}
-	call_begin(&pad_slot(&target->pad, generation->slot)->template_call, INJ_AFTER_PARK);
-	find_staying(&work);
-	find_moved(&work);
-	break_pairs(&work);
-	gather(&work);
-	/* What is left on the list is made just before the fork (restore.c). */
-	if (close_new(&work, err) || set_cloexec(&work, err) ||
-	    (is_urgent(&work) && flush(&work, err)))
-		goto out;
-	make_lost(&work);
-	if (put_lost(&work, err))
-		goto out;
-	put_states(&work);
-	put_contents(&work);
-	files_list_calls(&work);
-	close_list(&work);
-	if (work.problems > 1) {
+void files_work_end(struct files_work *work)
+{
+	if (work->problems > 1) {
 		char rest[32];
 
-		snprintf(rest, sizeof rest, " (and %u more)", work.problems - 1);
-		strncat(notes->detail, rest, sizeof notes->detail - strlen(notes->detail) - 1);
+		snprintf(rest, sizeof rest, " (and %u more)", work->problems - 1);
+		strncat(work->notes->detail, rest,
+			sizeof work->notes->detail - strlen(work->notes->detail) - 1);
 	}
-	result = 0;
-out:
-	for (uint32_t i = 0; work.local && i < work.want->count; i++)
-		close_fd(&work.local[i]);
-	free(work.local);
-	free(work.source);
-	free(work.lost);
-	free(work.claimed_by);
-	files_free(work.now);
-	return result;
+	for (uint32_t i = 0; work->local && i < work->want->count; i++)
+		close_fd(&work->local[i]);
+	free(work->local);
+	free(work->source);
+	free(work->lost);
+	free(work->claimed_by);
+	files_free(work->now);
+}
+
+int files_work_gather(struct files_work *work, struct avc_error *err)
+{
+	/* A table that is made anew: everything has to be put in its place. */
+	for (uint32_t i = 0; work->target->descendant && i < work->want->count; i++)
+		work->lost[i] = true;
+	gather(work);
+	if (work->target->descendant)
+		return 0;
+	call_begin(&pad_slot(&work->target->pad, work->generation->slot)->template_call,
+		   INJ_AFTER_PARK);
+	/* What is left on the list is made just before the fork (restore.c). */
+	return close_new(work, err) || set_cloexec(work, err) ||
+			       (is_urgent(work) && flush(work, err))
+		       ? -1
+		       : 0;
+}
+
+int files_work_place(struct files_work *work, struct avc_error *err)
+{
+	make_lost(work);
+	if (!work->target->descendant && put_lost(work, err))
+		return -1;
+	put_states(work);
+	return 0;
+}
+
+void files_work_finish(struct files_work *work)
+{
+	files_list_calls(work);
+	if (!work->target->descendant)
+		close_list(work);
+}
+
+int files_work_table(const struct files_work *work, struct files_table *table,
+		     struct avc_error *err)
+{
+	table->entry = calloc(work->want->count + 1, sizeof *table->entry);
+	if (!table->entry)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const int local = work->local[files_leader(work->want, w)];
+
+		if (local < 0)
+			continue; /* told already */
+		table->entry[table->count].fd = w->fd;
+		table->entry[table->count].cloexec = w->cloexec;
+		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
+	}
+	return 0;
+}
+
+void files_table_free(struct files_table *table)
+{
+	for (uint32_t i = 0; i < table->count; i++)
+		close_fd(&table->entry[i].ours);
+	free(table->entry);
+	*table = (struct files_table){ 0 };
 }

@@ -30,6 +30,7 @@
 #include "files.h"
 
 #define CONTENT_MAX (1 << 20)
+#define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
 #define STATUS_FLAGS (O_APPEND | O_NONBLOCK | O_DIRECT | O_NOATIME)
 
@@ -225,6 +226,53 @@ static void keep_pipe(int fd, struct file *file, uint32_t bytes)
 	close(copy[1]);
 }
 
+/* One look into a Unix socket, nothing taken out.  Bytes, or -1; a message is cut, and its
+ * whole length the answer. */
+static ssize_t peek(int fd, struct file *file, void *to, size_t room)
+{
+	struct iovec io = { to, room };
+	struct msghdr head = { .msg_iov = &io, .msg_iovlen = 1 };
+	const ssize_t n = recvmsg(fd, &head, MSG_PEEK | MSG_DONTWAIT | MSG_TRUNC);
+
+	/* There is no room for them: so it is said that there are some. */
+	if (n >= 0 && head.msg_flags & MSG_CTRUNC && option(fd, SOL_SOCKET, SO_PASSCRED) <= 0)
+		file->rights_lost = true;
+	return n;
+}
+
+/* Datagrams, or records: the kernel moves on with every look, if it is told where to begin. */
+static void keep_messages(int fd, struct file *file)
+{
+	const int first = 0, before = option(fd, SOL_SOCKET, SO_PEEK_OFF);
+	size_t used = 0;
+
+	if (setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &first, sizeof first)) {
+		file->content_lost = true;
+		return;
+	}
+	for (;;) {
+		uint8_t *more = realloc(file->content, used + sizeof(uint32_t) + MESSAGE_MAX);
+		uint32_t bytes;
+		ssize_t n;
+
+		if (more)
+			file->content = more;
+		n = more ? peek(fd, file, more + used + sizeof bytes, MESSAGE_MAX)
+			 : MESSAGE_MAX + 1;
+		/* An empty datagram can not be looked past; for others it is the end. */
+		file->content_lost |= n > MESSAGE_MAX ||
+				      (n > 0 && used + (size_t)n > CONTENT_MAX) ||
+				      (n == 0 && file->socket->type == SOCK_DGRAM);
+		if (n <= 0 || file->content_lost)
+			break;
+		bytes = (uint32_t)n;
+		memcpy(file->content + used, &bytes, sizeof bytes);
+		used += sizeof bytes + bytes;
+	}
+	file->content_bytes = (uint32_t)used;
+	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
+}
+
 void file_keep_content(int fd, struct file *file)
 {
 	int bytes = 0;
@@ -232,8 +280,11 @@ void file_keep_content(int fd, struct file *file)
 
 	if (ioctl(fd, FIONREAD, &bytes) || bytes <= 0)
 		return;
-	if (bytes > CONTENT_MAX ||
-	    (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM)) {
+	if (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM) {
+		keep_messages(fd, file);
+		return;
+	}
+	if (bytes > CONTENT_MAX) {
 		file->content_lost = true;
 		return;
 	}
@@ -246,7 +297,7 @@ void file_keep_content(int fd, struct file *file)
 		keep_pipe(fd, file, (uint32_t)bytes);
 		return;
 	}
-	n = recv(fd, file->content, (size_t)bytes, MSG_PEEK | MSG_DONTWAIT);
+	n = peek(fd, file, file->content, (size_t)bytes);
 	file->content_bytes = n > 0 ? (uint32_t)n : 0;
 	file->content_lost = n != bytes; /* a descriptor in flight ends what is seen */
 }
@@ -273,7 +324,8 @@ static void drain(int fd, const struct file *want)
 
 const char *file_put_content(int fd, int other_fd, const struct file *want)
 {
-	const bool pipe = want->kind == FILE_PIPE;
+	const bool pipe = want->kind == FILE_PIPE,
+		   messages = !pipe && want->socket->type != SOCK_STREAM;
 	int in = pipe ? reopen(fd, O_RDONLY) : fd,
 	    out = pipe ? reopen(other_fd, O_WRONLY) : other_fd;
 	const char *problem = NULL;
@@ -283,10 +335,16 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 		drain(in, want);
 		while (put < want->content_bytes) {
 			const uint8_t *from = want->content + put;
-			const size_t bytes = want->content_bytes - put;
-			const ssize_t n = pipe ? write(out, from, bytes)
-					       : send(out, from, bytes,
-						      MSG_DONTWAIT | MSG_NOSIGNAL);
+			uint32_t bytes = want->content_bytes - put;
+			ssize_t n;
+
+			if (messages) {
+				memcpy(&bytes, from, sizeof bytes);
+				from += sizeof bytes;
+				put += sizeof bytes;
+			}
+			n = pipe ? write(out, from, bytes)
+				 : send(out, from, bytes, MSG_DONTWAIT | MSG_NOSIGNAL);
 
 			if (n <= 0)
 				break;
@@ -295,6 +353,8 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	}
 	if (put < want->content_bytes || in < 0 || out < 0)
 		problem = "what was in it could not be put back";
+	else if (want->rights_lost)
+		problem = "descriptors that were on their way through it are lost";
 	else if (want->content_lost)
 		problem = "what was in it is lost";
 	if (pipe) {
@@ -475,11 +535,6 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 		if ((!now || now->mask != want->mask) &&
 		    syscall(SYS_signalfd4, fd, &want->mask, 8, 0) < 0)
 			problem = "its mask could not be put back";
-		break;
-	case FILE_INOTIFY:
-		if (now &&
-		    (now->watch_count != want->watch_count || now->watch_sum != want->watch_sum))
-			problem = "its watches are not those it had";
 		break;
 	default:
 		break;

@@ -1,18 +1,21 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * One checkpoint.  Every thread is stopped; then, and only then, the main thread
- * clones the process; then everything goes on.  What can wait, waits until then
- * (generation.c).
+ * One checkpoint.  Every thread of every process is stopped; then, and only then, the
+ * processes are cloned: the main one by its main thread, the others by their holders,
+ * which share their memory (infect.c).  Then everything goes on.  What can wait, waits
+ * until then (generation.c).
  */
 #include <errno.h>
 #include <sched.h>
 #include <signal.h>
 #include <stddef.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
+#include <unistd.h>
 
 #include "internal.h"
 
@@ -91,11 +94,11 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 		struct thread *t = &target->threads[i];
 
 		if (t->attached && !t->seen)
-			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
+			return fail(err, AVC_DEADLINE, EAGAIN, t->tid, "freeze", "",
 				    "it is just starting a process");
 		if (!t->stopped)
 			continue;
-		if (next >= target->pad.threads_max && t->tid != target->pid)
+		if (next >= target->pad.threads_max && t->tid != target->leader)
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "more threads than prepared for");
 		if (!arch_is_native(&t->regs))
@@ -109,7 +112,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 		if (in_old_pad(target, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old pad");
-		t->block = t->tid == target->pid ? 0 : (int)next++;
+		t->block = t->tid == target->leader ? 0 : (int)next++;
 		if (thread_read(t, err))
 			return -1;
 		if (arch_frame_read_xstate(t->tid,
@@ -120,26 +123,6 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 			return -1;
 	}
 	*threads = next;
-	return 0;
-}
-
-/* exec puts another program in its place, and the pad is gone. */
-static int check_pad(struct target *target, struct avc_error *err)
-{
-	long nonce;
-
-	errno = 0;
-	nonce = ptrace(
-		PTRACE_PEEKDATA, target->pid,
-		(void *)(target->pad.base + INJ_CODE_BYTES + offsetof(struct inj_control, nonce)),
-		NULL);
-	if (errno == ESRCH)
-		return fail_errno(err, target->pid, "freeze", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
-		return fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
-			    "it has executed another program");
-	}
 	return 0;
 }
 
@@ -168,7 +151,25 @@ static void capture_files(void *arg)
 {
 	struct capture *capture = arg;
 
-	files_capture(capture->target, capture->generation, &capture->generation->files_error);
+	files_capture(capture->target, capture->generation, capture->generation->branches > 0,
+		      &capture->generation->files_error);
+}
+
+/* Pads of guards that died, and of the process that forked this one. */
+static void drop_old_pads(struct target *target, struct generation *generation,
+			  struct inj_call *call)
+{
+	if (!target->checkpoints)
+		return;
+	for (; target->old_pads && call->count < INJ_CALLS_MAX - 2; target->old_pads--) {
+		const avc_remote base = target->old_pad[target->old_pads - 1].base;
+		const size_t bytes = target->old_pad[target->old_pads - 1].bytes;
+
+		if (anybody_uses(target, base, bytes))
+			return;
+		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
+		generation->vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
+	}
 }
 
 static int clone_app(struct target *target, struct thread *main_thread,
@@ -184,16 +185,7 @@ static int clone_app(struct target *target, struct thread *main_thread,
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(target, call);
 	memory_dofork(target->memory, call);
-	if (target->checkpoints)
-		for (; target->old_pads && call->count < INJ_CALLS_MAX - 2; target->old_pads--) {
-			const avc_remote base = target->old_pad[target->old_pads - 1].base;
-			const size_t bytes = target->old_pad[target->old_pads - 1].bytes;
-
-			if (anybody_uses(target, base, bytes))
-				break;
-			call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-			generation->vm_pages -= (long)(bytes / 4096);
-		}
+	drop_old_pads(target, generation, call);
 	/* ECHILD, if it has none: the one question that needs no look at each thread. */
 	children = call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
@@ -215,6 +207,225 @@ static int clone_app(struct target *target, struct thread *main_thread,
 	return 0;
 }
 
+/* ---- the other processes ---------------------------------------------------------- */
+
+#define LOOKS 64
+#define LOOK_US 100
+
+/* Until a look at the whole tree finds nobody who is not stopped: processes create
+ * processes while we look. */
+static int stop_tree(struct tree *tree, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->members; i++)
+		tree->member[i]->frozen = tree->member[i]->frozen_new = false;
+	if (stop_all(tree->main, err))
+		return -1;
+	/* It had no other one at the last checkpoint; whether that is still so, the clone
+	 * will tell. */
+	if (!tree->enabled || (tree->count <= 1 && tree->main->childless))
+		return 0;
+	for (int looks = 0; looks < LOOKS; looks++) {
+		uint32_t fresh = 0;
+		bool all = true;
+
+		for (uint32_t i = 1; i < tree->count; i++) {
+			struct target *t = tree->kin[i].target;
+			struct avc_error failed = { 0 };
+
+			if (!t || t->frozen)
+				continue;
+			all = false;
+			if (stop_all(t, &failed) == 0) {
+				t->frozen = true;
+			} else if (failed.code != AVC_GONE) {
+				*err = failed;
+				return -1;
+			} else {
+				usleep(LOOK_US); /* until it is a zombie, or nothing */
+			}
+		}
+		if (all && looks)
+			return 0;
+		if (tree_look(tree, &fresh, err))
+			return -1;
+		for (uint32_t i = 1; fresh && i < tree->count; i++)
+			if (tree->kin[i].target && !tree->kin[i].target->infected)
+				tree->kin[i].target->frozen_new = true;
+	}
+	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",
+		    "its processes come and go too fast");
+}
+
+/* One that was found while everything was stopped has nothing of ours yet. */
+static int prepare_stopped(struct tree *tree, struct target *target, struct avc_error *err)
+{
+	if (target->pid != target->leader)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
+			    "the main thread of process %d has ended", target->inside);
+	if (!target->infected && infect_stopped(target, tree->slots, err))
+		return -1;
+	if (!target->holder && hold_stopped(target, tree->init, err))
+		return -1;
+	return target->files_image ? 0 : files_prepare(target, err);
+}
+
+/* Of the leader of a session or group, as the app knows it; 0: it is none of the app's,
+ * or gone. */
+static pid_t number_inside(const struct tree *tree, pid_t pid)
+{
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->kin[i].pid == pid)
+			return tree->kin[i].target ? tree->kin[i].target->inside : proc_inside(pid);
+	return 0;
+}
+
+/* The kin that were there are the branches, in the same order. */
+static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	int index[PROCESSES_MAX];
+
+	index[0] = PARENT_MAIN;
+	generation->branch = calloc(tree->count, sizeof *generation->branch);
+	if (!generation->branch)
+		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+	for (uint32_t i = 1; i < tree->count; i++) {
+		const struct kin *kin = &tree->kin[i];
+		struct branch *branch = &generation->branch[generation->branches];
+
+		index[i] = (int)generation->branches;
+		if (!kin->pid)
+			continue;
+		branch->parent = kin->parent == PARENT_INIT ? PARENT_INIT : index[kin->parent];
+		branch->inside = kin->ended ? proc_inside(kin->pid) : kin->target->inside;
+		branch->target = kin->target;
+		branch->stat = kin->stat;
+		branch->session = number_inside(tree, kin->stat.session);
+		branch->group = number_inside(tree, kin->stat.group);
+		if (kin->ended) {
+			if (branch->parent == PARENT_INIT || branch->inside <= 0)
+				continue; /* init is just about to wait for it */
+			branch->status = proc_exit_status(kin->pid);
+		} else {
+			branch->image = calloc(1, sizeof *branch->image);
+			if (!branch->image)
+				return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+			branch->image->pidfd = -1;
+			branch->image->slot = generation->slot;
+			kin->target->images++;
+		}
+		generation->branches++;
+	}
+	return 0;
+}
+
+static int read_branch(struct tree *tree, struct branch *branch, bool strict, struct avc_error *err)
+{
+	struct target *target = branch->target;
+
+	if (strict)
+		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+
+	if (prepare_stopped(tree, target, err) || pad_check(target, target->pid, err))
+		return -1;
+	if (memory_prepare(target->memory, &branch->image->image, err) ||
+	    read_all(target, branch->image->slot, &branch->image->threads, err))
+		return -1;
+	branch->image->vm_pages = proc_vm_pages(target->pid);
+	memory_copy(target, branch->image->image);
+	files_mapped_copy(branch->image->mapped);
+	return 0;
+}
+
+/* Timers only the process itself can tell of. */
+static int ask_timers(struct target *target, struct avc_error *err)
+{
+	struct thread *thread = thread_find(target, target->pid);
+	struct inj_call *call = &target->pad.control->runner;
+	const uint64_t start = now_ns();
+
+	if (!thread || !thread->stopped)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
+			    "its main thread has ended");
+	call_begin(call, INJ_AFTER_HOME);
+	timers_ask(target, call);
+	if (borrow(target, thread, err) || pad_run(thread->tid, call, err)) {
+		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
+			thread->stopped = false;
+		return -1;
+	}
+	pending_read(target);
+	timers_answer(target, call, now_ns() - start);
+	return give_back(thread, err);
+}
+
+/* The holder shares the process' memory and descriptors; its clone is the template. */
+static int start_clone(struct branch *branch, struct avc_error *err)
+{
+	struct target *target = branch->target;
+	struct inj_call *call = &target->pad.control->holder;
+
+	call_begin(call, INJ_AFTER_PARK);
+	memory_dofork(target->memory, call);
+	drop_old_pads(target, branch->image, call);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	if (pad_send(&target->pad, target->holder, &target->holder_base, call, err) ||
+	    pad_start(target->holder, err))
+		return -1;
+	target->lost = true; /* until we have heard of the clone */
+	return 0;
+}
+
+static int await_clone(struct branch *branch, struct avc_error *err)
+{
+	struct target *target = branch->target;
+
+	if (pad_await_clone(target->holder, &target->pad.control->holder, &branch->image->template,
+			    err))
+		return -1;
+	target->lost = false;
+	return 0;
+}
+
+static int read_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	if (tree->count <= 1)
+		return 0;
+	if (make_branches(tree, generation, err))
+		return -1;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target &&
+		    read_branch(tree, &generation->branch[i], generation->mapped != NULL, err))
+			return -1;
+	return 0;
+}
+
+static int start_clones(struct generation *generation, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target &&
+		    (ask_timers(generation->branch[i].target, err) ||
+		     start_clone(&generation->branch[i], err)))
+			return -1;
+	return 0;
+}
+
+static int await_clones(struct generation *generation, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		if (!branch->target)
+			continue;
+		if (files_capture(branch->target, branch->image, true, err) ||
+		    await_clone(branch, err))
+			return -1;
+		branch->image->taken_ns = generation->taken_ns;
+	}
+	return 0;
+}
+
+/* ---- all of it ----------------------------------------------------------------------- */
+
 static void let_go(const struct target *target, struct thread *thread)
 {
 	if (thread->attached && thread->stopped)
@@ -222,10 +433,19 @@ static void let_go(const struct target *target, struct thread *thread)
 	thread_release(thread);
 }
 
-int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
-	   struct generation *generation, struct freeze_times *times, struct avc_error *err)
+static void let_go_all(struct target *target, const struct thread *but)
 {
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		if (&target->threads[i] != but)
+			let_go(target, &target->threads[i]);
+}
+
+int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
+	   struct freeze_times *times, struct avc_error *err)
+{
+	struct target *target = tree->main;
 	const uint64_t start = now_ns();
+	const bool was_childless = target->childless;
 	struct thread *main_thread;
 	bool cloned = false;
 	int result;
@@ -235,27 +455,35 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 	generation->pidfd = -1;
 	urgent_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	result = stop_all(target, err);
+	result = stop_tree(tree, err);
 	times->stop_ns = now_ns() - start;
 	main_thread = thread_find(target, target->pid);
 	if (!result && (!main_thread || !main_thread->stopped))
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			      "its main thread has ended");
-	if (!result)
-		result = check_pad(target, err);
+		result = fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
+			      "its main thread has just ended");
 	if (!result)
 		result = read_all(target, generation->slot, &generation->threads, err);
+	if (!result) {
+		/* The deadline is for getting things stopped; the clone of a big
+		 * process takes its time. */
+		tracee_deadline_set(timer, CLONE_NS);
+		result = read_branches(tree, generation, err);
+	}
 	if (!result) {
 		generation->vm_pages = proc_vm_pages(target->pid);
 		memory_copy(target, generation->image);
 		files_mapped_copy(generation->mapped);
 		generation->taken_ns = now_ns();
-		/* The deadline is for getting things stopped; the clone of a big
-		 * process takes its time. */
-		tracee_deadline_set(timer, CLONE_NS);
+		result = start_clones(generation, err);
+	}
+	if (!result) {
 		result = clone_app(target, main_thread, generation, times, err);
 		cloned = !result;
 	}
+	if (!result)
+		result = await_clones(generation, err);
+	if (generation->branches)
+		times->clone_ns = now_ns() - generation->taken_ns;
 	/* The image is whole.  The main thread first: it has a few steps to go before it
 	 * can be let go, and would have to share the CPUs with everybody else. */
 	if (main_thread) {
@@ -264,21 +492,23 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 			main_thread->stopped = false;
 		let_go(target, main_thread);
 	}
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (&target->threads[i] != main_thread)
-			let_go(target, &target->threads[i]);
+	let_go_all(target, main_thread);
+	for (uint32_t i = 0; i < tree->members; i++)
+		let_go_all(tree->member[i], NULL);
 	tracee_deadline_clear(timer);
 	times->freeze_ns = now_ns() - start;
 	urgent_end();
-	if (!cloned)
+	if (!cloned || result)
 		return -1;
 	target->checkpoints++;
 	if (pending_deadly(target->pending))
 		return fail(err, AVC_GONE, 0, target->pid, "freeze", "",
 			    "it is just being ended by signal %d", pending_deadly(target->pending));
-	/* What that means, support_check() says at the next attempt. */
-	if (!target->childless)
-		return fail(err, AVC_DEADLINE, ECHILD, target->pid, "freeze", "",
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target)
+			generation->branch[i].target->checkpoints++;
+	if ((was_childless || !tree->enabled) && !target->childless)
+		return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "freeze", "",
 			    "it has just started another process");
 	return 0;
 }

@@ -11,12 +11,15 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
+#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/sysmacros.h>
 #include <unistd.h>
 
 #include "internal.h"
+
+#define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
 
 /* The OOM killer is to take templates first; undone in what is restored. */
 void oom_score_adj_set(pid_t pid, const char *value)
@@ -72,9 +75,30 @@ static int quieten(struct target *target, struct generation *generation, bool se
 	return 0;
 }
 
+/* A main thread that has ended while others go on: it is there again until they are,
+ * and ends again. */
+static void fill_ended(struct target *target, struct generation *generation,
+		       const struct thread *cloned, struct setup *setup)
+{
+	struct inj_thread *block = pad_thread(&target->pad, generation->slot, 0);
+
+	*block = (struct inj_thread){
+		.stack = pad_remote(&target->pad, pad_stack(&target->pad, generation->slot, 0)) -
+			 16,
+		.tid = target->inside,
+	};
+	if (proc_read(target->leader, "comm", block->name, sizeof block->name) > 0)
+		block->name[strcspn(block->name, "\n")] = 0;
+	/* fork(2) has given it that of the thread that was cloned, who wants it back. */
+	if (cloned->rseq)
+		setup_add(setup, INJ_BEFORE, "rseq", SYS_rseq, cloned->rseq, cloned->rseq_bytes,
+			  RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
+}
+
 /* Fills the slot in from what freeze() has read: one block per thread. */
 static int fill_slot(struct target *target, struct generation *generation,
-		     const struct proc_stat *stat, pid_t group_inside, struct avc_error *err)
+		     const struct branch *branch, const struct proc_stat *stat, pid_t group_inside,
+		     struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
@@ -86,6 +110,13 @@ static int fill_slot(struct target *target, struct generation *generation,
 	if (mem_fd < 0)
 		return fail_errno(err, generation->template, "keep template", "open(mem)",
 				  "it was killed");
+	if (proc_status(target->pid, &status) &&
+	    (!branch || proc_status(generation->template, &status))) {
+		close(mem_fd);
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
+	}
+	generation->headless = target->pid != target->leader;
 	setup_begin(&setup, pad, generation->slot);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread t = target->threads[i];
@@ -98,9 +129,9 @@ static int fill_slot(struct target *target, struct generation *generation,
 		block = pad_thread(pad, generation->slot, b);
 		frame = pad_frame(pad, generation->slot, b);
 
-		/* The main thread's was seen to when it was borrowed; its own
+		/* The borrowed thread's was seen to when it was borrowed; its own
 		 * memory has been run on since. */
-		if (b)
+		if (t.tid != target->pid)
 			rseq_fixup(mem_fd, &t);
 		rewind_original(&t, &t.regs);
 		arch_rewind(&t.regs);
@@ -116,23 +147,27 @@ static int fill_slot(struct target *target, struct generation *generation,
 			.rseq_bytes = t.rseq_bytes,
 			.rseq_signature = t.rseq_signature,
 			.other_base = arch_other_base(&t.regs),
+			.large_state = arch_frame_needs_room(frame) ? pad_remote(pad, frame) : 0,
 			.tid = t.inside,
 			.affinity_bytes = t.affinity_bytes,
 		};
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		memcpy(block->name, t.name, sizeof block->name);
 		setup_thread(&setup, block);
+		if (branch && status.groups != target->forebear_groups)
+			branch_setup_groups(branch, &setup);
 		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
 					    err)) {
 			close(mem_fd);
 			return -1;
 		}
+		if (branch && !b)
+			branch_setup_dumpable(branch, &setup);
 		pending_setup_thread(target, &t, &setup);
 	}
 	close(mem_fd);
-	if (proc_status(target->pid, &status))
-		return fail_errno(err, target->pid, "keep template", "open(status)",
-				  "it has ended");
+	if (generation->headless)
+		fill_ended(target, generation, main_thread, &setup);
 	generation->sandboxed = status.seccomp == 1 ||
 				status.seccomp_filters > target->plain_filters;
 	if (memory_finish(target, generation, status.locked_kb, &setup, err))
@@ -147,43 +182,139 @@ static int fill_slot(struct target *target, struct generation *generation,
 	slot->threads = generation->threads;
 	slot->pid = target->inside;
 	slot->group = group_inside;
-	slot->session_leader = stat->session == target->pid;
+	slot->session_leader = stat->session == target->leader;
+	slot->placed = slot->fresh = target->descendant;
 	slot->tty_fd = stat->tty && stat->tty_group == stat->group ? tty_fd(target->pid, stat->tty)
 								   : -1;
 	return setup_end(&setup, target->pid, err);
 }
 
-int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+static int finish(struct target *target, struct generation *generation, struct branch *branch,
+		  const struct proc_stat *stat, struct avc_error *err)
 {
-	struct proc_stat stat = { 0 };
 	long pages;
 	pid_t group;
 
 	generation->pidfd = proc_pidfd_open(generation->template);
-	if (generation->pidfd < 0 || proc_stat(target->pid, &stat))
-		return fail_errno(err, target->pid, "keep template", "pidfd_open", "it has ended");
+	if (generation->pidfd < 0)
+		return fail_errno(err, generation->template, "keep template", "pidfd_open",
+				  "it was killed");
 	/* Nothing but the app's own group, or one whose leader is visible, can be
 	 * put back. */
-	group = stat.group == target->pid ? target->inside : proc_inside(stat.group);
+	group = stat->group == target->leader ? target->inside : proc_inside(stat->group);
 	if (group <= 0)
 		group = target->inside;
 	pages = proc_vm_pages(generation->template);
-	if (quieten(target, generation, stat.session == target->pid, err))
+	if (quieten(target, generation, branch || stat->session == target->leader, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
-	return fill_slot(target, generation, &stat, group, err);
+	if (branch && branch_learn(branch, err))
+		return -1;
+	return fill_slot(target, generation, branch, stat, group, err);
+}
+
+/* What only a process that makes another one its child has to know.  This one may have
+ * ended meanwhile: a shell's children live for milliseconds. */
+static int finish_branch(struct branch *branch, struct avc_error *err)
+{
+	struct target *target = branch->target;
+
+	/* The holder rests again. */
+	if (tracee_settle(target->holder, err) ||
+	    finish(target, branch->image, branch, &branch->stat, err))
+		return -1;
+	for (int i = 0; i < RLIM_NLIMITS && i < 16; i++) {
+		struct rlimit limit;
+
+		if (prlimit(target->pid, (enum __rlimit_resource)i, NULL, &limit) &&
+		    prlimit(branch->image->template, (enum __rlimit_resource)i, NULL, &limit))
+			return fail_errno(err, branch->image->template, "keep template", "prlimit",
+					  "it was killed");
+		branch->limit[i][0] = limit.rlim_cur;
+		branch->limit[i][1] = limit.rlim_max;
+	}
+	return 0;
+}
+
+int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	const struct thread *main_thread = thread_find(target, target->pid);
+	struct proc_status status = { 0 };
+	struct avc_error again = { 0 };
+	struct proc_stat stat;
+
+	if (generation->branches && (!main_thread || proc_status(target->pid, &status)))
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		struct avc_error failed = { 0 };
+
+		if (!branch->target)
+			continue;
+		branch->target->forebear = &main_thread->creds;
+		branch->target->forebear_groups = status.groups;
+		if (finish_branch(branch, &failed)) {
+			/* What was not as it was known is known now: of all of them. */
+			if (failed.code != AVC_DEADLINE || failed.errnum != EAGAIN) {
+				*err = failed;
+				return -1;
+			}
+			again = failed;
+			continue;
+		}
+		if (branch->image->notice.code && !generation->notice.code)
+			generation->notice = branch->image->notice;
+	}
+	if (proc_stat(target->pid, &stat))
+		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
+	if (finish(target, generation, NULL, &stat, err))
+		return -1;
+	if (again.code)
+		*err = again;
+	return again.code ? -1 : 0;
+}
+
+void generation_close_files(struct target *target, struct generation *image)
+{
+	struct inj_call *call = &pad_slot(&target->pad, image->slot)->template_call;
+	struct avc_error ignored = { 0 };
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	if (pad_send(&target->pad, image->template, &image->base, call, &ignored) ||
+	    pad_run(image->template, call, &ignored))
+		return; /* it was killed, and has nothing open any more */
+}
+
+static void image_drop(struct generation *image)
+{
+	if (image->template)
+		tracee_kill(image->template);
+	close_fd(&image->pidfd);
+	mem_image_free(image->image);
+	free(image->timers);
+	free(image->attributes);
+	files_free(image->files);
+	files_mapped_free(image->mapped);
 }
 
 void generation_drop(struct generation *generation)
 {
-	if (generation->template)
-		tracee_kill(generation->template);
-	close_fd(&generation->pidfd);
-	mem_image_free(generation->image);
-	free(generation->timers);
-	free(generation->attributes);
-	files_free(generation->files);
-	files_mapped_free(generation->mapped);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		branch_forget(branch);
+		if (!branch->image)
+			continue;
+		image_drop(branch->image);
+		free(branch->image);
+		if (branch->target)
+			branch->target->images--;
+	}
+	free(generation->branch);
+	image_drop(generation);
 	*generation = (struct generation){ .pidfd = -1 };
 }

@@ -29,7 +29,7 @@ struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind ki
 		.kind = kind,
 		.cookie = guard->cookie,
 		.at_ns = now_ns(),
-		.app_pid = guard->target.pid,
+		.app_pid = guard->target.leader,
 		.app_pid_inside = guard->target.inside,
 		.generations = guard->count,
 		.restores = guard->restores,
@@ -122,7 +122,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	kill(guard->target.pid, SIGKILL);
+	kill(guard->target.leader, SIGKILL);
 }
 
 static bool take_command(struct avc_guard *guard, struct command *command)
@@ -223,20 +223,58 @@ static void attach(struct avc_guard *guard)
 			 (now - guard->started_ns < LOOK_OFTEN_NS ? LOOK_AGAIN_NS : LOOK_SELDOM_NS);
 }
 
+static void watch(struct avc_guard *guard, nfds_t *n, int fd)
+{
+	if (*n == guard->fds_room) {
+		struct pollfd *more = realloc(guard->fds, 2 * (*n + 32) * sizeof *more);
+
+		if (!more)
+			return; /* its news will be seen with the next */
+		guard->fds = more;
+		guard->fds_room = 2 * (*n + 32);
+	}
+	guard->fds[(*n)++] = (struct pollfd){ .fd = fd, .events = POLLIN };
+}
+
+static uint32_t all_stragglers(struct avc_guard *guard)
+{
+	uint32_t left = stragglers(&guard->target);
+
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		left += stragglers(guard->tree.member[i]);
+	return left;
+}
+
+static bool any_lost(const struct avc_guard *guard)
+{
+	bool lost = guard->target.lost;
+
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		lost |= guard->tree.member[i]->lost;
+	return lost;
+}
+
 static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
-	struct pollfd fds[AVC_KEEP_MAX + 4];
 	const uint64_t now = now_ns();
 	uint64_t ns = guard->next_ns > now ? guard->next_ns - now : 0;
 	struct timespec timeout;
 	nfds_t n = 0;
 
-	fds[n++] = (struct pollfd){ .fd = guard->wake_fd, .events = POLLIN };
-	fds[n++] = (struct pollfd){ .fd = guard->link.init_pidfd, .events = POLLIN };
-	fds[n++] = (struct pollfd){ .fd = guard->link.report_fd, .events = POLLIN };
-	fds[n++] = (struct pollfd){ .fd = guard->target.holder_pidfd, .events = POLLIN };
-	for (uint32_t i = 0; i < guard->count; i++)
-		fds[n++] = (struct pollfd){ .fd = guard->generations[i].pidfd, .events = POLLIN };
+	watch(guard, &n, guard->wake_fd);
+	watch(guard, &n, guard->link.init_pidfd);
+	watch(guard, &n, guard->link.report_fd);
+	watch(guard, &n, guard->target.holder_pidfd);
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		watch(guard, &n, guard->tree.member[i]->pidfd);
+		watch(guard, &n, guard->tree.member[i]->holder_pidfd);
+	}
+	for (uint32_t i = 0; i < guard->count; i++) {
+		watch(guard, &n, guard->generations[i].pidfd);
+		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
+			if (guard->generations[i].branch[k].image)
+				watch(guard, &n, guard->generations[i].branch[k].image->pidfd);
+	}
 	if (straggling) {
 		const bool fresh = now - guard->stragglers_since_ns < NS_PER_S;
 		const uint64_t slice = fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS;
@@ -245,7 +283,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	}
 	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
 				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(fds, n, guard->next_ns == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
+	(void)ppoll(guard->fds, n, guard->next_ns == UINT64_MAX && !straggling ? NULL : &timeout,
+		    NULL);
 }
 
 static void let_go(struct avc_guard *guard)
@@ -256,9 +295,12 @@ static void let_go(struct avc_guard *guard)
 		link_arm(&guard->link, false);
 	drop_all(guard);
 	unhold(&guard->target);
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		unhold(guard->tree.member[i]);
 	/* The end of this thread detaches what is left. */
-	while (guard->target.threads && stragglers(&guard->target) && now_ns() < end)
+	while (guard->target.threads && all_stragglers(guard) && now_ns() < end)
 		usleep(200);
+	tree_free(&guard->tree);
 	target_close(&guard->target);
 	pad_close(&guard->target.pad);
 	link_close(&guard->link);
@@ -277,13 +319,13 @@ static void *guard_main(void *arg)
 		ended = true;
 	}
 	while (!ended && !must_stop(guard)) {
-		const uint32_t straggling = stragglers(&guard->target);
+		const uint32_t straggling = all_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
 		if (!straggling && !dying)
 			guard->stragglers_since_ns = now_ns();
-		if (guard->target.lost)
+		if (any_lost(guard))
 			kill_lost(guard);
 		if (dying)
 			reap_unknown(guard);
@@ -293,6 +335,7 @@ static void *guard_main(void *arg)
 			continue;
 		}
 		reap_dead(guard);
+		tend_tree(guard);
 		if (pidfd_ended(guard->link.init_pidfd)) {
 			ended = true;
 			break;
@@ -302,7 +345,7 @@ static void *guard_main(void *arg)
 			continue;
 		if (!guard->attached)
 			attach(guard);
-		else if (stragglers(&guard->target))
+		else if (all_stragglers(guard))
 			guard->next_ns = now_ns() + STRAGGLER_LONG_NS;
 		else
 			checkpoint(guard, 0);
@@ -343,16 +386,20 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	pthread_mutex_init(&guard->lock, NULL);
 	link_init(&guard->link);
 	target_init(&guard->target);
-	guard->target.threads = calloc(THREADS_MAX, sizeof *guard->target.threads);
-	guard->target.thread_room = THREADS_MAX;
-	guard->target.memory = memory_new();
-	guard->target.pending = pending_new();
-	guard->target.timers = timers_new();
+	guard->tree = (struct tree){
+		.enabled = getenv("AVCKPT_TREES") != NULL,
+		.main = &guard->target,
+		.slots = config->keep + 1,
+		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),
+		.member = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.member),
+		.is_ours = is_ours,
+		.arg = guard,
+	};
 	config_set(guard, config);
 	guard->link.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 3);
 	guard->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-	if (!guard->target.threads || !guard->target.memory || !guard->target.pending ||
-	    !guard->target.timers || guard->link.init_pidfd < 0 || guard->wake_fd < 0) {
+	if (!target_make_room(&guard->target) || !guard->tree.kin || !guard->tree.member ||
+	    guard->link.init_pidfd < 0 || guard->wake_fd < 0) {
 		fail_errno(err, 0, "start guard", "eventfd", "out of memory or descriptors");
 		goto failed;
 	}
@@ -366,10 +413,9 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 failed:
 	close_fd(&guard->link.init_pidfd);
 	close_fd(&guard->wake_fd);
-	free(guard->target.threads);
-	memory_free(guard->target.memory);
-	free(guard->target.pending);
-	free(guard->target.timers);
+	target_free_room(&guard->target);
+	tree_free(&guard->tree);
+	free(guard->fds);
 	free(guard);
 	return NULL;
 }
@@ -406,9 +452,8 @@ void avc_guard_stop(struct avc_guard *guard)
 	files_written_free(guard->written);
 	close_fd(&guard->wake_fd);
 	pthread_mutex_destroy(&guard->lock);
-	free(guard->target.threads);
-	memory_free(guard->target.memory);
-	free(guard->target.pending);
-	free(guard->target.timers);
+	target_free_room(&guard->target);
+	tree_free(&guard->tree);
+	free(guard->fds);
 	free(guard);
 }

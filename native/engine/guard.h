@@ -12,6 +12,8 @@
 #ifndef AVCKPT_GUARD_H
 #define AVCKPT_GUARD_H
 
+#include <poll.h>
+
 #include "internal.h"
 
 #define COMMANDS_MAX 64
@@ -40,7 +42,10 @@ struct avc_guard {
 	timer_t timer;
 	struct link link;
 	bool attached, unprotected;
-	struct target target;
+	struct target target; /* the app's main process                         */
+	struct tree tree;     /* and the others                                 */
+	struct pollfd *fds;   /* room for wait_for_news()                       */
+	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
 	uint32_t count;
 	uint64_t number; /* of the last generation taken             */
@@ -82,7 +87,11 @@ void drop_generation(struct avc_guard *guard, uint32_t i);
 void drop_all(struct avc_guard *guard);
 uint32_t free_slot(const struct avc_guard *guard);
 void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason, uint64_t ticket);
-int known_tracees(const struct avc_guard *guard, pid_t keep[AVC_KEEP_MAX + 2]);
+/* A template or holder; with the app's own processes. */
+bool is_ours(pid_t pid, const void *guard);
+bool is_known_process(pid_t pid, const void *guard);
+/* Processes of the app that have ended, or are another program now. */
+void tend_tree(struct avc_guard *guard);
 void kill_lost(struct avc_guard *guard);
 void reap_dead(struct avc_guard *guard);
 void reap_unknown(const struct avc_guard *guard);

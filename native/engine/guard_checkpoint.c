@@ -19,6 +19,8 @@ void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error 
 {
 	drop_all(guard);
 	unhold(&guard->target);
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		unhold(guard->tree.member[i]);
 	if (!guard->unprotected || ticket)
 		emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
 	guard->unprotected = true;
@@ -58,26 +60,40 @@ static void touch_slot(const struct pad *pad, uint32_t slot, uint32_t threads)
 	for (uint32_t i = 0; i < threads && i < pad->threads_max; i++) {
 		volatile uint8_t *frame = pad_frame(pad, slot, i);
 
-		for (size_t at = 0; at < arch_frame_bytes(); at += 4096)
+		for (size_t at = 0; at < arch_frame_bytes(); at += ARCH_PAGE_BYTES)
 			frame[at] = 0;
 		frame[arch_frame_bytes() - 1] = 0;
 		*(volatile uint64_t *)pad_thread(pad, slot, i) = 0;
 	}
 }
 
-static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err)
+/* Templates of another pad are of another program, or too small. */
+static void drop_images(struct avc_guard *guard, const struct target *target)
 {
-	struct target *target = &guard->target;
+	for (uint32_t i = guard->count; i-- > 0;)
+		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
+			if (guard->generations[i].branch[k].target == target) {
+				drop_generation(guard, i);
+				break;
+			}
+}
+
+static int prepare_process(struct avc_guard *guard, struct target *target, struct avc_error *err)
+{
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (find_app(guard, err) || support_check(target, passing, err) || take_stock(target, err))
+	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
 		return -1;
+	if (target->descendant && !infected_still(target))
+		target->infected = false;
 	if (target->infected && (target->thread_count > target->pad.threads_max ||
 				 guard->config.keep >= target->pad.slots))
 		target->infected = false;
 	if (!target->infected) {
-		/* Templates of another pad are of another program or too small. */
-		drop_all(guard);
+		if (target->descendant)
+			drop_images(guard, target);
+		else
+			drop_all(guard);
 		unhold(target);
 		for (uint32_t i = 0; i < target->thread_count; i++)
 			target->threads[i].known = false;
@@ -88,6 +104,102 @@ static int prepare(struct avc_guard *guard, bool *passing, struct avc_error *err
 		return -1;
 	if (!target->holder && hold(target, guard->timer, deadline, err))
 		return -1;
+	return 0;
+}
+
+/* Where only an app that is one process is protected. */
+static int prepare_alone(struct avc_guard *guard, struct avc_error *err)
+{
+	struct tree *tree = &guard->tree;
+
+	if (prepare_process(guard, tree->main, err))
+		return -1;
+	tree->count = 1;
+	tree->kin[0] = (struct kin){
+		.pid = tree->main->leader,
+		.parent = PARENT_INIT,
+		.target = tree->main,
+	};
+	return tree->main->childless ? 0 : tree_refuse(tree, err);
+}
+
+static int prepare(struct avc_guard *guard, struct avc_error *err)
+{
+	struct tree *tree = &guard->tree;
+	uint32_t fresh;
+
+	if (find_app(guard, err))
+		return -1;
+	tree->init = guard->link.init;
+	tree->slots = guard->config.keep + 1;
+	if (!tree->enabled)
+		return prepare_alone(guard, err);
+	if (tree_look(tree, &fresh, err))
+		return -1;
+	for (uint32_t i = 0; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+		struct avc_error failed = { 0 };
+
+		if (!target)
+			continue;
+		target->shm_bytes = guard->target.shm_bytes;
+		target->tcp_moved = guard->target.tcp_moved;
+		if (prepare_process(guard, target, &failed) == 0)
+			continue;
+		/* One that is ending is seen to by the freeze. */
+		if (i == 0 || failed.code != AVC_GONE) {
+			*err = failed;
+			return -1;
+		}
+	}
+	return 0;
+}
+
+/* What is known of the descriptors while the app runs makes the freeze shorter. */
+static int prepare_files(struct avc_guard *guard, struct avc_error *err)
+{
+	struct tree *tree = &guard->tree;
+
+	for (uint32_t i = 0; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+		struct avc_error failed = { 0 };
+
+		if (target && files_prepare(target, &failed) &&
+		    (i == 0 || failed.code != AVC_GONE)) {
+			*err = failed;
+			return -1;
+		}
+	}
+	return 0;
+}
+
+/* A checkpoint that came to nothing: holders that were cloning are not to be relied on. */
+static void abandon(struct avc_guard *guard, struct generation *fresh)
+{
+	generation_drop(fresh);
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->lost)
+			unhold(guard->tree.member[i]);
+	if (guard->tree.members)
+		kill_lost(guard);
+	tree_sweep(&guard->tree);
+}
+
+static uint32_t threads_of(const struct generation *generation)
+{
+	uint32_t threads = generation->threads;
+
+	for (uint32_t i = 0; i < generation->branches; i++)
+		threads += generation->branch[i].image ? generation->branch[i].image->threads : 0;
+	return threads;
+}
+
+static int files_errors(const struct generation *generation, struct avc_error *err)
+{
+	if (generation->files_error.code) {
+		*err = generation->files_error;
+		return -1;
+	}
 	return 0;
 }
 
@@ -110,55 +222,59 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	struct freeze_times times;
 	int result;
 
-	if (files_prepare(target, err) || memory_prepare(target->memory, &fresh.image, err)) {
+	if (prepare_files(guard, err) || memory_prepare(target->memory, &fresh.image, err)) {
 		generation_drop(&fresh);
 		return -1;
 	}
 	if (guard->config.files == AVC_FILES_STRICT)
 		watch_files(guard, &fresh);
 	touch_slot(&target->pad, fresh.slot, target->thread_count);
+	for (uint32_t i = 1; i < guard->tree.count; i++)
+		if (guard->tree.kin[i].target && guard->tree.kin[i].target->infected)
+			touch_slot(&guard->tree.kin[i].target->pad, fresh.slot,
+				   guard->tree.kin[i].target->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
 	/* What is written between here and the freeze counts as written after it. */
 	note_written(guard);
-	result = freeze(target, guard->timer, guard->config.freeze_deadline_ns, &fresh, &times,
-			err);
+	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
+			&times, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
-	event->threads = fresh.threads;
-	if (!result && fresh.files_error.code) {
-		*err = fresh.files_error;
-		result = -1;
+	event->threads = threads_of(&fresh);
+	if (!result)
+		result = files_errors(&fresh, err);
+	if (!result) {
+		tracee_deadline_set(guard->timer, NS_PER_S);
+		result = generation_finish(target, &fresh, err);
+		tracee_deadline_clear(guard->timer);
 	}
 	if (result) {
-		generation_drop(&fresh);
-		return -1;
-	}
-	tracee_deadline_set(guard->timer, NS_PER_S);
-	result = generation_finish(target, &fresh, err);
-	tracee_deadline_clear(guard->timer);
-	if (result) {
-		generation_drop(&fresh);
+		abandon(guard, &fresh);
 		return -1;
 	}
 	event->error = fresh.notice;
 	files_settle(target, &fresh);
+	for (uint32_t i = 0; i < fresh.branches; i++)
+		if (fresh.branch[i].target)
+			files_settle(fresh.branch[i].target, fresh.branch[i].image);
 	fresh.number = ++guard->number;
 	keep_generation(guard, &fresh);
 	link_arm(&guard->link, true);
 	event->generation = fresh.number;
 	event->generations = guard->count;
 	event->quiescent = fresh.quiescent;
+	tend_tree(guard);
 	return 0;
 }
 
-/* What is copied aside is known from the checkpoint before: EAGAIN means that there
- * was something new, and that it is known now. */
+/* EAGAIN means that something was not as it was known to be, and is known now: memory
+ * that has to be copied aside, or a process. */
 static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
-		if (take_once(guard, event, err) == 0)
+		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
 		if (err->code != AVC_DEADLINE || err->errnum != EAGAIN || tries == TAKE_TRIES)
 			return -1;
@@ -169,7 +285,6 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = event_new(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
-	bool passing = false;
 
 	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
 						   : UINT64_MAX;
@@ -184,11 +299,11 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 			       "memory is short, so no generation is held");
 		return;
 	}
-	if (prepare(guard, &passing, &error) == 0 && take(guard, &event, &error) == 0) {
+	if (take(guard, &event, &error) == 0) {
 		guard->misses = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
-		event.app_pid = guard->target.pid;
+		event.app_pid = guard->target.leader;
 		event.app_pid_inside = guard->target.inside;
 		emit(guard, &event);
 		return;
@@ -203,7 +318,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	/* A child process may be gone at the next look: the generations there are
 	 * stay good for a while. */
-	if (error.code == AVC_UNSUPPORTED && passing && guard->count &&
+	if (error.code == AVC_UNSUPPORTED && error.pid != guard->target.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
 		emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;

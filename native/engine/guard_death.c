@@ -4,6 +4,7 @@
  */
 #include <signal.h>
 #include <string.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -77,6 +78,41 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	target_close(&guard->target);
 }
 
+/* The other processes are those of the generation now; what they had before they died is
+ * given up, tables of descriptors that only we still hold among it. */
+static void adopt_family(struct avc_guard *guard, const struct generation *generation)
+{
+	struct tree *tree = &guard->tree;
+
+	for (uint32_t i = 0; i < tree->members; i++) {
+		struct target *target = tree->member[i];
+
+		target_close(target);
+		for (uint32_t g = 0; target->holder && g < guard->count; g++)
+			for (uint32_t k = 0; k < guard->generations[g].branches; k++)
+				if (guard->generations[g].branch[k].target == target)
+					generation_close_files(
+						target, guard->generations[g].branch[k].image);
+		unhold(target);
+	}
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct branch *branch = &generation->branch[i];
+		struct avc_error gone = { 0 };
+		struct proc_stat stat;
+
+		if (!branch->target)
+			continue;
+		/* One that has died again already is seen to by the next checkpoint. */
+		if (proc_stat(branch->pid, &stat) == 0 &&
+		    target_open(branch->target, branch->pid, branch->inside, &gone) == 0) {
+			branch->target->infected = true;
+			branch->target->start = stat.start;
+		}
+	}
+	tree->count = 0;
+	guard->target.childless = !generation->branches;
+}
+
 /* The newest generation; when restores are used up, the one before it. */
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		       enum avc_reason reason, struct avc_error *error)
@@ -118,6 +154,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		target->infected = target_open(target, pid,
 					       pad_slot(&target->pad, generation->slot)->pid,
 					       &failed) == 0;
+		adopt_family(guard, generation);
 		guard->restores++;
 		guard->lineage = generation->lineage;
 		guard->restored_from = generation->number;
@@ -152,12 +189,30 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 	return guard->count > 0;
 }
 
+/* A death in quick succession should be as cheap as the first; and of the processes that
+ * are not the main one only the holder keeps what they have open. */
+static void hold_all(struct avc_guard *guard)
+{
+	struct avc_error ignored = { 0 };
+
+	/* The next checkpoint tries again, and tells. */
+	if (hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+		guard->dying_until_ns = now_ns() + DYING_NS;
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		ignored = (struct avc_error){ 0 };
+		if (target->pid && hold(target, guard->timer, guard->config.freeze_deadline_ns,
+					&ignored))
+			guard->dying_until_ns = now_ns() + DYING_NS;
+	}
+}
+
 void died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
 	struct avc_error error = { 0 };
 	enum avc_reason reason;
-	pid_t keep[AVC_KEEP_MAX + 2];
 
 	urgent_begin();
 	event.wait_status = report->status;
@@ -183,20 +238,18 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 			goto out;
 		}
 	}
-	link_kill_leftovers(&guard->link, keep, known_tracees(guard, keep));
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->pid)
+			syscall(SYS_pidfd_send_signal, guard->tree.member[i]->pidfd, SIGKILL, NULL,
+				0);
+	link_kill_leftovers(&guard->link, is_ours, guard);
 	if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
 		give_up(guard, report, AVC_REASON_EMPTY, &error);
 	} else if (!bring_back(guard, report, reason, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (guard->target.pid) {
-		/* A death in quick succession should be as cheap as the first. */
-		struct avc_error no_holder = { 0 };
-
-		if (hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns,
-			 &no_holder))
-			/* The next checkpoint tries again, and tells. */
-			guard->dying_until_ns = now_ns() + DYING_NS;
+		hold_all(guard);
 	}
 	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
 						   : UINT64_MAX;

@@ -65,41 +65,92 @@ void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason
 	emit(guard, &event);
 }
 
-/* What we trace and know of: templates, holder, the app. */
-int known_tracees(const struct avc_guard *guard, pid_t keep[AVC_KEEP_MAX + 2])
+bool is_ours(pid_t pid, const void *arg)
 {
-	int count = 0;
+	const struct avc_guard *guard = arg;
 
-	for (uint32_t i = 0; i < guard->count; i++)
-		keep[count++] = guard->generations[i].template;
-	if (guard->target.holder)
-		keep[count++] = guard->target.holder;
-	if (guard->target.pid)
-		keep[count++] = guard->target.pid;
-	return count;
+	if (pid == guard->target.holder)
+		return true;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->holder == pid)
+			return true;
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const struct generation *generation = &guard->generations[i];
+
+		if (generation->template == pid)
+			return true;
+		for (uint32_t k = 0; k < generation->branches; k++)
+			if (generation->branch[k].image &&
+			    generation->branch[k].image->template == pid)
+				return true;
+	}
+	return false;
+}
+
+bool is_known_process(pid_t pid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	if (pid == guard->target.leader)
+		return true;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->leader == pid)
+			return true;
+	return is_ours(pid, guard);
 }
 
 void kill_lost(struct avc_guard *guard)
 {
-	pid_t keep[AVC_KEEP_MAX + 2];
-
-	link_kill_lost(&guard->link, keep, known_tracees(guard, keep));
+	link_kill_lost(&guard->link, is_known_process, guard);
 	guard->target.lost = false;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		guard->tree.member[i]->lost = false;
+}
+
+static bool has_thread(const struct target *target, pid_t tid)
+{
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		if (target->threads[i].tid == tid && target->threads[i].attached)
+			return true;
+	return false;
 }
 
 static bool is_known(pid_t tid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (tid == guard->target.holder)
+	if (is_ours(tid, guard) || has_thread(&guard->target, tid))
 		return true;
-	for (uint32_t i = 0; i < guard->count; i++)
-		if (guard->generations[i].template == tid)
-			return true;
-	for (uint32_t i = 0; i < guard->target.thread_count; i++)
-		if (guard->target.threads[i].tid == tid && guard->target.threads[i].attached)
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (has_thread(guard->tree.member[i], tid))
 			return true;
 	return false;
+}
+
+/* What it had open must not stay open by us: somebody may be reading a pipe to its end. */
+static void release(struct avc_guard *guard, struct target *target)
+{
+	for (uint32_t i = 0; i < guard->count; i++)
+		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
+			if (guard->generations[i].branch[k].target == target)
+				generation_close_files(target, guard->generations[i].branch[k].image);
+	tree_let_go(&guard->tree, target);
+}
+
+void tend_tree(struct avc_guard *guard)
+{
+	bool any = false;
+
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		any |= guard->tree.member[i]->pid &&
+		       pidfd_ended(guard->tree.member[i]->pidfd);
+	/* When the main process goes, the others go with it, and all of it comes back. */
+	if (!any || !guard->target.pid || pidfd_ended(guard->target.pidfd))
+		return;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->pid && pidfd_ended(guard->tree.member[i]->pidfd))
+			release(guard, guard->tree.member[i]);
+	tree_sweep(&guard->tree);
 }
 
 /* An app that is killed while its threads are being stopped may leave a thread that
@@ -108,6 +159,17 @@ void reap_unknown(const struct avc_guard *guard)
 {
 	while (tracee_reap_unknown(is_known, guard))
 		;
+}
+
+static bool has_ended(const struct generation *generation)
+{
+	if (pidfd_ended(generation->pidfd))
+		return true;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].image &&
+		    pidfd_ended(generation->branch[i].image->pidfd))
+			return true;
+	return false;
 }
 
 /* Templates that were killed, from inside the container or by the OOM killer. */
@@ -124,10 +186,14 @@ void reap_dead(struct avc_guard *guard)
 	 * reaped what is ours: then it is no news.  A death does not wait. */
 	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
 		for (uint32_t i = guard->count; i-- > 0;)
-			if (pidfd_ended(guard->generations[i].pidfd))
+			if (has_ended(&guard->generations[i]))
 				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
 		if (guard->target.holder && pidfd_ended(guard->target.holder_pidfd))
 			unhold(&guard->target);
+		for (uint32_t i = 0; i < guard->tree.members; i++)
+			if (guard->tree.member[i]->holder &&
+			    pidfd_ended(guard->tree.member[i]->holder_pidfd))
+				unhold(guard->tree.member[i]);
 		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
 			return;
 		if (news[1].revents)
@@ -274,6 +340,15 @@ int check_strict(struct avc_guard *guard, const struct generation *generation, p
 	if (guard->config.files != AVC_FILES_STRICT)
 		return 0;
 	note_written(guard);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct target *target = generation->branch[i].target;
+
+		/* What one that has ended before has written, note_written() knows. */
+		if (target && target->holder &&
+		    files_check_strict(generation->branch[i].image, target->holder,
+				       target->holder_pidfd, guard->link.init, target->holder, err))
+			return -1;
+	}
 	return files_check_strict(generation, pid, pidfd, guard->link.init, guard->target.holder,
 				  err);
 }

@@ -20,11 +20,19 @@
 #include <sys/ptrace.h>
 #include <sys/random.h>
 #include <sys/syscall.h>
+#include <sys/uio.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #include "internal.h"
 
+#define HOLDER_OPTIONS                                                                       \
+	(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | \
+	 PTRACE_O_TRACESYSGOOD | PTRACE_O_SUSPEND_SECCOMP)
 #define CAVE_BYTES 256
+#define PADS_START UINT64_C(0x200000000000)
+#define PADS (UINT64_C(1) << 19)
+#define PAD_DISTANCE (UINT64_C(64) << 20)
 _Static_assert(CAVE_BYTES >= ARCH_STUB_BYTES, "the stub must fit");
 
 /* True if the last bytes of the mapping are a stub that a guard which died could not
@@ -155,11 +163,19 @@ static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const u
 	return 0;
 }
 
+/* A child has its parent's pad mapped, and at a restore is there together with it for
+ * a moment: each has a place of its own, in a part of the address space that programs
+ * do not use by themselves. */
+static uint64_t where_to_map(const struct target *target)
+{
+	return target->descendant ? PADS_START + target->nonce % PADS * PAD_DISTANCE : 0;
+}
+
 static int make_pad(struct target *target, struct thread *thread, avc_remote cave, uint32_t slots,
 		    uint32_t threads_max, struct avc_error *err)
 {
 	struct pad *pad = &target->pad;
-	uint64_t arg[6] = { 0,
+	uint64_t arg[6] = { where_to_map(target),
 			    pad_layout(pad, slots, threads_max),
 			    PROT_READ | PROT_WRITE,
 			    MAP_SHARED | MAP_ANONYMOUS | MAP_NORESERVE,
@@ -213,12 +229,12 @@ static int check_task(struct target *target, const struct thread *t, struct avc_
 	return 0;
 }
 
-int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
-	   struct avc_error *err)
+static int infect_thread(struct target *target, struct thread *thread, uint32_t slots,
+			 struct avc_error *err)
 {
 	uint8_t stub[ARCH_STUB_BYTES], zero[ARCH_STUB_BYTES] = { 0 };
 	uint32_t threads_max = 32, threads = target->thread_count * 2;
-	struct thread *thread;
+	struct arch_regs home;
 	avc_remote cave;
 	size_t bytes;
 	int result;
@@ -234,35 +250,21 @@ int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadli
 	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
 	if (target->mem_fd < 0)
 		return fail_errno(err, target->pid, "infect", "open(mem)", "it has ended");
-	tracee_deadline_set(timer, deadline_ns);
-	thread = stop_main(target, err);
-	if (!thread) {
-		tracee_deadline_clear(timer);
+	if (check_task(target, thread, err) || survey(target, arch_pc(&thread->regs), &cave, err))
 		return -1;
+	rseq_fixup(target->mem_fd, thread);
+	home = thread->regs;
+	arch_resume(&home);
+	bytes = arch_stub_build(stub, &home, thread->sigmask);
+	if (pwrite(target->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
+		return fail_errno(err, target->pid, "infect", "write(mem)",
+				  "its code can not be written");
+	result = make_pad(target, thread, cave, slots, threads_max, err);
+	/* Nobody is in the stub any more: leave no trace. */
+	if (thread->stopped && (!thread->borrowed || give_back(thread, err) == 0)) {
+		if (pwrite(target->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
+			err->undo_failures++;
 	}
-	result = check_task(target, thread, err);
-	if (!result)
-		result = survey(target, arch_pc(&thread->regs), &cave, err);
-	if (!result) {
-		struct arch_regs home;
-
-		rseq_fixup(target->mem_fd, thread);
-		home = thread->regs;
-		arch_resume(&home);
-		bytes = arch_stub_build(stub, &home, thread->sigmask);
-		if (pwrite(target->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
-			result = fail_errno(err, target->pid, "infect", "write(mem)",
-					    "its code can not be written");
-		else
-			result = make_pad(target, thread, cave, slots, threads_max, err);
-		/* Nobody is in the stub any more: leave no trace. */
-		if (thread->stopped && (!thread->borrowed || give_back(thread, err) == 0)) {
-			if (pwrite(target->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
-				err->undo_failures++;
-		}
-	}
-	thread_release(thread);
-	tracee_deadline_clear(timer);
 	if (result)
 		pad_close(&target->pad);
 	target->infected = !result;
@@ -270,15 +272,108 @@ int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadli
 	return result;
 }
 
+int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+	   struct avc_error *err)
+{
+	struct thread *thread;
+	int result;
+
+	tracee_deadline_set(timer, deadline_ns);
+	thread = stop_main(target, err);
+	if (!thread) {
+		tracee_deadline_clear(timer);
+		return -1;
+	}
+	result = infect_thread(target, thread, slots, err);
+	thread_release(thread);
+	tracee_deadline_clear(timer);
+	return result;
+}
+
+int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err)
+{
+	struct thread *thread = thread_find(target, target->pid);
+
+	if (!thread || !thread->stopped)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "infect", "",
+			    "its main thread has ended");
+	if (thread_read(thread, err))
+		return -1;
+	return infect_thread(target, thread, slots, err);
+}
+
+bool infected_still(const struct target *target)
+{
+	uint64_t nonce = 0;
+	struct iovec here = { &nonce, sizeof nonce };
+	struct iovec there = { (void *)(target->pad.base + INJ_CODE_BYTES +
+					offsetof(struct inj_control, nonce)),
+			       sizeof nonce };
+
+	return target->infected &&
+	       process_vm_readv(target->pid, &here, 1, &there, 1, 0) == sizeof nonce &&
+	       nonce == target->nonce;
+}
+
+/* What makes a new task the holder: it lies still, is known as such, and has none of
+ * the app's numbers. */
+static int make_holder(struct target *target, pid_t holder, const struct arch_regs *base,
+		       struct avc_error *err)
+{
+	struct inj_call *own = &target->pad.control->holder;
+	const struct sched_param first = { .sched_priority = 1 };
+
+	/* It clones while all of the app stands still.  Best effort; not for its clones. */
+	if (target->descendant)
+		(void)sched_setscheduler(holder, SCHED_FIFO | SCHED_RESET_ON_FORK, &first);
+	memcpy(own->out, "avckpt-hold", 12);
+	call_begin(own, INJ_AFTER_PARK);
+	/* Out of the app's process group, or the number stays taken; and of its session,
+	 * which another process of the app may lead. */
+	call_add(own, target->descendant ? SYS_setsid : SYS_setpgid, 0, 0, 0, 0, 0);
+	call_add(own, SYS_prctl, PR_SET_NAME, pad_remote(&target->pad, own->out), 0, 0, 0);
+	return pad_send(&target->pad, holder, base, own, err) || pad_run(holder, own, err) ? -1 : 0;
+}
+
+static int keep_holder(struct target *target, pid_t holder, int result, struct avc_error *err)
+{
+	target->holder = holder;
+	target->holder_pidfd = proc_pidfd_open(holder);
+	if (!result && target->holder_pidfd >= 0)
+		return 0;
+	if (!err->code)
+		fail_errno(err, holder, "make holder", "pidfd_open", "it was killed");
+	unhold(target);
+	return -1;
+}
+
+static int hold_descendant(struct target *target, timer_t timer, uint64_t deadline_ns,
+			   struct avc_error *err)
+{
+	struct thread *thread;
+	int result;
+
+	urgent_begin();
+	tracee_deadline_set(timer, deadline_ns);
+	thread = stop_main(target, err);
+	result = thread ? hold_stopped(target, target->init, err) : -1;
+	if (thread)
+		thread_release(thread);
+	tracee_deadline_clear(timer);
+	urgent_end();
+	return result;
+}
+
 int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
-	struct inj_call *own = &target->pad.control->holder;
 	struct thread *thread;
 	struct arch_regs base;
 	pid_t holder = 0;
 	int result;
 
+	if (target->descendant)
+		return hold_descendant(target, timer, deadline_ns, err);
 	urgent_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	thread = stop_main(target, err);
@@ -309,30 +404,89 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACESYSGOOD | PTRACE_O_SUSPEND_SECCOMP)) ||
+	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)HOLDER_OPTIONS) ||
 	    arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
-	if (!result) {
-		memcpy(own->out, "avckpt-hold", 12);
-		call_begin(own, INJ_AFTER_PARK);
-		/* Out of the app's process group, or the number stays taken. */
-		call_add(own, SYS_setpgid, 0, 0, 0, 0, 0);
-		call_add(own, SYS_prctl, PR_SET_NAME, pad_remote(&target->pad, own->out), 0, 0, 0);
-		result = pad_send(&target->pad, holder, &base, own, err) ||
-					 pad_run(holder, own, err)
-				 ? -1
-				 : 0;
-	}
+	if (!result)
+		result = make_holder(target, holder, &base, err);
 	tracee_deadline_clear(timer);
-	target->holder = holder;
-	target->holder_pidfd = proc_pidfd_open(holder);
-	if (result || target->holder_pidfd < 0) {
-		unhold(target);
+	return keep_holder(target, holder, result, err);
+}
+
+/* A stopped task in the pad makes one clone; *child is in its first stop. */
+static int clone_by(struct target *target, pid_t tid, const struct arch_regs *base,
+		    struct inj_call *call, uint64_t flags, pid_t *child, struct avc_error *err)
+{
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_clone, flags, 0, 0, 0, 0);
+	if (pad_send(&target->pad, tid, base, call, err) || pad_run_clone(tid, call, child, err))
+		return -1;
+	if (tracee_await(*child, NULL, err) != STOP_TRAP)
+		return -1;
+	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)HOLDER_OPTIONS))
+		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
+	return 0;
+}
+
+/* The holder of a process that is not the main one must not be a child of anybody in the
+ * app: wait(2) would find it.  So a task in between makes it, and ends, whereupon it is
+ * init's; and the one in between is waited for by its parent, which does so in any case
+ * before it goes home, whether we are still there or not.  It has no exit signal, so that
+ * nobody is told.
+ *
+ * This holder also makes the templates.  They have its signal handlers and working
+ * directory, which are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
+int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->runner;
+	struct thread *thread = thread_find(target, target->pid);
+	struct proc_stat stat = { 0 };
+	pid_t between = 0, holder = 0;
+	int result;
+
+	if (!thread || !thread->stopped)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "make holder", "",
+			    "its main thread has ended");
+	call_begin(call, INJ_AFTER_HOME);
+	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND, 0, 0, 0, 0);
+	call_add(call, INJ_WAIT, 0, 0, 0, 0, 0);
+	if (borrow(target, thread, err))
+		return -1;
+	target->waiting = true;
+	result = pad_run_clone(thread->tid, call, &between, err);
+	if (result) {
+		target->lost = target->lost || err->code != AVC_KERNEL;
+		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
+			thread->stopped = false;
 		return -1;
 	}
-	return 0;
+	if (tracee_await(between, NULL, err) != STOP_TRAP ||
+	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)HOLDER_OPTIONS) ||
+	    arch_regs_get(between, &target->holder_base))
+		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
+				    "it has ended");
+	if (!result)
+		result = clone_by(target, between, &target->holder_base,
+				  &target->pad.control->holder,
+				  CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD,
+				  &holder, err);
+	tracee_kill(between);
+	if (!result)
+		result = make_holder(target, holder, &target->holder_base, err);
+	if (!result && proc_stat(holder, &stat))
+		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
+	if (!result && stat.parent != init)
+		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "make holder", "",
+			      "a process above it adopts orphans (PR_SET_CHILD_SUBREAPER)");
+	if (holder && keep_holder(target, holder, result, err))
+		result = -1;
+	if (pad_run(thread->tid, call, err)) {
+		thread->stopped = false;
+		return -1;
+	}
+	target->waiting = false;
+	return give_back(thread, err) || result ? -1 : 0;
 }
 
 void unhold(struct target *target)

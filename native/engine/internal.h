@@ -6,7 +6,10 @@
  *   guard.c      the thread: waits, obeys, tells; guard_*.c: see guard.h
  *   link.c       to avckpt-init: control page, reports, verdicts
  *   freeze.c     one checkpoint: stop everything, read it, clone it, let go
- *   restore.c    a template becomes the app again
+ *   restore.c    templates become the app again
+ *   descend.c    a restored process makes its children
+ *   remap.c      ... and their memory
+ *   tree.c       the processes of an app
  *   generation.c templates kept
  *   pending.c    signals that have not been delivered
  *   timers.c     interval timers, POSIX timers
@@ -43,6 +46,7 @@
 #define THREADS_MAX 4096
 #define OLD_PADS_MAX 128
 #define SOCKETS_MAX 64
+#define PROCESSES_MAX 512 /* of one app                                     */
 /* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13; glibc before 2.35 lacks the name. */
 #define PTRACE_GET_RSEQ 0x420f
 
@@ -65,14 +69,22 @@ struct proc_stat {
 	char state;
 	pid_t parent, group, session, tty_group;
 	uint32_t tty;
+	int threads;
 	uint64_t start; /* clock ticks after boot */
 };
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 int proc_stat(pid_t pid, struct proc_stat *stat);
+/* How a zombie has ended, as wait(2) says it; 0 if that can not be found out. */
+int proc_exit_status(pid_t pid);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
+/* A thread of the process that has not ended: the main thread, as long as it has not.
+ * 0: none. */
+pid_t proc_live_thread(pid_t pid);
+/* Until that thread has ended; a second at most. */
+void proc_await_end(pid_t tid);
 /* Children of a (single-threaded) process; returns how many (at most max), or -1. */
 int proc_children(pid_t pid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
@@ -88,7 +100,8 @@ enum mapping_flag {
 	MAPPING_WIPEONFORK = 2, /* wf */
 	MAPPING_DEVICE = 4,     /* io */
 	MAPPING_LOCKED = 8,     /* lo */
-	MAPPING_DROPPABLE = 16  /* dp */
+	MAPPING_DROPPABLE = 16, /* dp */
+	MAPPING_HUGETLB = 32    /* ht */
 };
 
 struct mapping {
@@ -109,10 +122,13 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
+	pid_t tracer;            /* a thread, in our namespace; 0: none              */
+	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t groups;         /* a hash                                           */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
+	bool shadow_stack; /* x86: CET                                        */
 };
 
 int proc_status(pid_t tid, struct proc_status *status);
@@ -146,14 +162,23 @@ struct scheduling {
 	int32_t reserved;
 };
 
+#define GROUPS_KEPT 32 /* of a thread; of one with more it is only known how many */
+#define NODE_WORDS 16  /* 1024 nodes of memory                                   */
+
 struct creds {
 	uint32_t uid[3], gid[3]; /* real, effective, saved                      */
 	uint32_t fsuid, fsgid;
 	uint32_t caps[6]; /* as capget(2) has them                            */
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
-	int32_t seccomp;   /* mode                                             */
-	uint64_t slack_ns; /* of timers                                        */
+	int32_t seccomp;  /* mode                                             */
+	uint64_t filters; /* of seccomp: a hash                               */
+	int32_t group_count;
+	uint32_t group[GROUPS_KEPT]; /* supplementary                             */
+	int32_t memory_policy;       /* set_mempolicy(2), -1: the kernel has none */
+	uint64_t nodes[NODE_WORDS];
+	uint64_t slack_ns;   /* of timers                                        */
+	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
 
 struct thread {
@@ -194,14 +219,23 @@ struct pad {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
+	int fd; /* of those pages                                              */
 };
+/* How it is mapped in two parts. */
+#define PAD_CODE_PROT (PROT_READ | PROT_EXEC)
+#define PAD_DATA_PROT (PROT_READ | PROT_WRITE)
+#define PAD_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
 
 struct files;
+struct last_pid;
 
 /* The live main process of the app. */
 struct target {
-	pid_t pid; /* 0: none                                          */
-	pid_t inside;
+	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
+	 * or, when that has ended, any other (target_follow).  0: none           */
+	pid_t pid;
+	pid_t leader; /* the process's own number                            */
+	pid_t inside; /* the same in its own namespace                       */
 	int pidfd, task_dirfd, mem_fd, timers_fd;
 	struct pad pad;
 	bool infected; /* the pad is known to be in this process           */
@@ -235,10 +269,36 @@ struct target {
 	uint32_t files_seen;
 	bool tcp_moved;    /* bytes of connections are to be counted           */
 	bool tcp_messages; /* quiescent is only who is between two messages    */
+	/* Of a process that is not the main one (tree.c). */
+	bool descendant;
+	uint64_t start;               /* when it began; tells it from one with its number */
+	uint32_t images;              /* generations that have one of it                  */
+	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	bool waiting;                 /* its main thread is to wait for a task of ours       */
+	const struct creds *forebear; /* what a process that is made from the main one has */
+	uint32_t forebear_groups;     /* a hash                                            */
+	bool frozen, frozen_new;      /* stopped in this freeze; and only found in it      */
 };
 
 #define FILES_NAME 81 /* of a file, for people                                  */
 
+/* What a generation has of a process that is not the main one. */
+struct branch {
+	struct target *target;     /* NULL: it had ended, and nobody had waited for it */
+	struct generation *image;  /* of this process alone                   */
+	int parent;                /* index of its parent's branch, or ...    */
+	pid_t inside;
+	pid_t session, group;      /* inside; 0: outside of the app           */
+	struct proc_stat stat;     /* as of the freeze                        */
+	struct manner *manner;     /* descend.c                               */
+	pid_t pid;                 /* that it was restored as last            */
+	int status;                /* of one that had ended, as from wait(2)  */
+	uint64_t limit[16][2];     /* getrlimit(2)                            */
+};
+#define PARENT_MAIN (-1)
+#define PARENT_INIT (-2)
+
+/* Also the image of one process of several: then what is of the whole is unused. */
 struct generation {
 	uint64_t number; /* 0: unused                                        */
 	pid_t template;
@@ -257,6 +317,7 @@ struct generation {
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the app when it was taken                     */
 	bool sandboxed;        /* has seccomp filters of its own                   */
+	bool headless;         /* its main thread had ended                       */
 	struct timer_image *timers;
 	struct attributes *attributes;
 	struct mem_image *image;      /* of memory that is not in the template       */
@@ -266,6 +327,33 @@ struct generation {
 	/* avckpt.files=strict */
 	struct files_mapped *mapped; /* NULL: it was not strict                         */
 	char written[FILES_NAME];    /* a file that was written since; "": none         */
+	struct branch *branch;        /* the other processes, parents first        */
+	uint32_t branches;
+};
+
+/* One process of the app, as it was found. */
+struct kin {
+	pid_t pid;
+	int parent; /* index, PARENT_INIT; the main process is 0           */
+	bool ended; /* a zombie                                         */
+	struct proc_stat stat;
+	struct target *target;
+};
+
+/* All processes of an app (tree.c). */
+struct tree {
+	bool enabled; /* or else an app has to be one process alone           */
+	struct target *main;
+	pid_t init;
+	uint32_t slots; /* of a pad                                         */
+	struct kin *kin; /* parents before children                        */
+	uint32_t count;
+	struct target **member; /* of those that are not the main process; those
+				 * that have ended as long as there are images of them */
+	uint32_t members;
+	/* Is this child of init one of our own? */
+	bool (*is_ours)(pid_t pid, const void *arg);
+	const void *arg;
 };
 
 struct link {
@@ -352,13 +440,19 @@ int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, str
 /* Resumes it until all calls were made; it is in a plain trap stop then. */
 int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
- * not let it, fails with AVC_KERNEL, and it is in a plain trap stop.  The clone is the
- * last of the calls. */
+ * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
 int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		  struct avc_error *err) warn_unused;
+/* The same in two parts, for several at a time. */
+int pad_start(pid_t tid, struct avc_error *err) warn_unused;
+int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+		    struct avc_error *err) warn_unused;
 /* The same; `meanwhile` is called once while the kernel clones. */
 int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* exec puts another program in its place, at any moment, and the pad is gone: whether it
+ * is there, in a stopped thread.  If not, the target is not infected any more. */
+int pad_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
 bool in_old_pad(const struct target *target, avc_remote address);
 /* The same for a stopped thread of the app, which gets home by itself if we die:
@@ -434,7 +528,7 @@ void timers_advance(const struct timer_image *image, uint64_t now);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 
-#define ATTRIBUTES_ASK_BYTES 96
+#define ATTRIBUTES_ASK_BYTES 368
 /* While it is stopped, from outside. */
 void scheduling_read(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
@@ -445,6 +539,8 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
+/* Of a stopped thread: its seccomp filters, whatever they say. */
+uint64_t filters_read(pid_t tid);
 int attributes_keep(const struct target *target, struct generation *generation,
 		    struct avc_error *err) warn_unused;
 /* Before the restored threads go: what can be done from outside only. */
@@ -477,25 +573,51 @@ void memory_dofork(const struct memory *memory, struct inj_call *call);
  * attempt will be better. */
 int memory_learn(struct target *target, long missing_pages, struct avc_error *err);
 /* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
+/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
+ * pages is small, and whoever writes to a shared one when it is empty is killed. */
+extern const char private_huge_pages[];
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
 /* At a restore, before anything runs. */
-int memory_put_back(const struct mem_image *image, struct avc_error *err) warn_unused;
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
 /* Brings the pad into the app, through its main thread.  The other threads run. */
 int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 	   struct avc_error *err) warn_unused;
+/* The same while everything is stopped. */
+int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err) warn_unused;
+/* The holder of one that is not the main process, by its stopped main thread. */
+int hold_stopped(struct target *target, pid_t init, struct avc_error *err) warn_unused;
 /* Makes the holder; unhold() drops it. */
 int hold(struct target *target, timer_t timer, uint64_t deadline_ns,
 	 struct avc_error *err) warn_unused;
 void unhold(struct target *target);
 
+/* ---- tree.c --------------------------------------------------------------------- */
+
+/* Looks who there is; new ones are opened, and those that are gone closed.  Sets *fresh
+ * to how many are new. */
+int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_unused;
+/* Fails if the main process has children. */
+int tree_refuse(struct tree *tree, struct avc_error *err) warn_unused;
+/* Frees those that have ended and of which there is no image. */
+void tree_sweep(struct tree *tree);
+/* It is gone, or another program: what it had open must not stay open by us. */
+void tree_let_go(struct tree *tree, struct target *target);
+void tree_free(struct tree *tree);
+
 /* ---- target.c ----------------------------------------------------------------- */
 
 void target_init(struct target *target);
+/* Room for threads and all else that a target has; false: out of memory. */
+bool target_make_room(struct target *target);
+void target_free_room(struct target *target);
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err) warn_unused;
+/* Before anything else is done with it: the main thread may have ended, and others go
+ * on (pthread_exit(3)). */
+int target_follow(struct target *target, struct avc_error *err) warn_unused;
 /* Forgets the process (the pad stays mapped here: templates live in it). */
 void target_close(struct target *target);
 /* The entry for a tid; NULL when there is no room. */
@@ -527,18 +649,34 @@ void rseq_fixup(int mem_fd, struct thread *thread);
 
 /* Before a freeze: what can be known of the app's descriptors while it runs. */
 int files_prepare(struct target *target, struct avc_error *err) warn_unused;
-/* During it: what is of this instant. */
-int files_capture(struct target *target, struct generation *generation, struct avc_error *err);
+/* During it: what is of this instant.  `several`: the app has other processes, which may
+ * have the other ends of pipes. */
+int files_capture(struct target *target, struct generation *generation, bool several,
+		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
 void files_forget(struct target *target);
 void files_free(struct files *files);
-/* Makes the table of a dead app, which its templates hold, the generation's again, and
- * lists what the restored process has to do itself.  What could not be put back is
+/* A table that is made anew: what is to be in it. */
+struct files_table {
+	uint32_t count;
+	struct {
+		int fd, ours;
+		bool cloexec;
+	} *entry; /* by fd, ascending                                        */
+};
+/* Makes the tables of a dead app the generation's again: that of the main process, which
+ * its templates hold, at once; of the others (table[], by branch) what is to be in them.
+ * Lists what the restored processes have to do themselves.  What could not be put back is
  * told in *notes; -1 is for what must not go on. */
 int files_restore(struct target *target, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct avc_error *notes,
-		  struct avc_error *err) warn_unused;
+		  const struct avc_config *config, pid_t init, struct files_table *table,
+		  struct avc_error *notes, struct avc_error *err) warn_unused;
+void files_table_free(struct files_table *table);
+/* A duplicate of a descriptor of another process, or -1. */
+int files_borrow(int pidfd, int fd);
+/* One descriptor over a socket (unix(7), SCM_RIGHTS). */
+int files_send(int socket, int fd);
 /* Whether the restored process could do it all. */
 void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struct avc_error *notes);
 /* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
@@ -573,7 +711,7 @@ struct freeze_times {
 
 /* Takes one checkpoint into *generation (slot and number given by the caller).
  * On return the app runs, whatever happened. */
-int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
+int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns,
 	   struct generation *generation, struct freeze_times *times,
 	   struct avc_error *err) warn_unused;
 
@@ -583,6 +721,8 @@ int freeze(struct target *target, timer_t timer, uint64_t deadline_ns,
 int generation_finish(struct target *target, struct generation *generation,
 		      struct avc_error *err) warn_unused;
 void generation_drop(struct generation *generation);
+/* Closes what the template of a process that has ended still has open. */
+void generation_close_files(struct target *target, struct generation *image);
 void oom_score_adj_set(pid_t pid, const char *value);
 
 /* ---- restore.c ------------------------------------------------------------------ */
@@ -601,6 +741,69 @@ int restore(struct target *target, struct generation *generation, const struct l
 	    struct restore_times *times, struct avc_error *notes,
 	    struct avc_error *err) warn_unused;
 
+/* ---- descend.c ------------------------------------------------------------------- */
+
+/* A task that a restored process has forked, and that is made what a template is. */
+struct puppet {
+	pid_t pid;
+	const struct pad *pad;   /* the one it runs in                              */
+	struct inj_call *call;
+	struct arch_regs base;
+	struct inj_syscall *list; /* in the pad: calls not made yet                  */
+	uint32_t listed, list_max;
+	int socket;               /* ours, through which it gets descriptors; -1     */
+};
+
+/* One more call; puppet_flush() makes them.  The first that fails is told. */
+void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
+		 uint64_t e, uint64_t f);
+int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err) warn_unused;
+/* It gets a descriptor: number 1, until that is closed. */
+int puppet_give(struct puppet *puppet, int fd, struct avc_error *err) warn_unused;
+
+/* After the app runs again: what only the template can tell. */
+int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
+/* To a thread's calls. */
+void branch_setup_groups(const struct branch *branch, struct setup *setup);
+void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
+void branch_forget(struct branch *branch);
+
+/* All processes of a generation, of which the main one is there; each is stopped.
+ * `table`: of each branch. */
+struct family;
+struct family *family_new(struct target *main, struct generation *generation,
+			  struct last_pid *helper, const struct files_table *table,
+			  struct avc_error *err);
+/* The main process (a stopped tracee) brings forth the others. */
+int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
+		struct avc_error *err) warn_unused;
+/* They put themselves together, one after the other, but for the main one. */
+int family_start(struct family *family, struct avc_error *notes, struct avc_error *err) warn_unused;
+void family_go(struct family *family);
+void family_kill(struct family *family);
+void family_free(struct family *family);
+/* PID of a branch's process, when all of it is there. */
+pid_t family_pid(const struct family *family, uint32_t branch);
+
+/* ---- remap.c ----------------------------------------------------------------------- */
+
+/* Makes the memory of a puppet that of `template`; it is a fork of `parent`'s and runs
+ * in the pad of `target` already. */
+int remap(struct puppet *puppet, const struct target *target, pid_t template, pid_t parent,
+	  avc_remote touched, struct avc_error *err) warn_unused;
+
+/* ---- restore.c, for one process of several ----------------------------------------- */
+
+/* Lets a stopped process that is what its template is put itself together; waits until
+ * it has; tells what of it failed; lets it go. */
+int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
+		  pid_t pid, struct avc_error *err) warn_unused;
+int restore_await(struct target *target, struct generation *image, pid_t pid,
+		  struct avc_error *err) warn_unused;
+void restore_note(struct target *target, struct generation *image, pid_t pid,
+		  struct avc_error *notes);
+void restore_go(struct target *target, struct generation *image);
+
 /* ---- urgent.c -------------------------------------------------------------------- */
 
 /* The calling thread gets a CPU before others from here to the other; best effort.
@@ -610,11 +813,12 @@ void urgent_end(void);
 
 /* ---- lastpid.c ------------------------------------------------------------------- */
 
-struct last_pid;
 /* Starts a helper task inside the PID namespace; it serves the slot's requests
  * until last_pid_stop().  last_pid_set() is the engine's own request. */
 struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
+/* From now on those of another slot. */
+void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 
 /* ---- rewind.c --------------------------------------------------------------------- */
@@ -632,8 +836,10 @@ void rewind_forget(struct target *target, struct thread *thread);
 /* ---- support.c --------------------------------------------------------------------- */
 
 /* Looks at a running app for what can not be protected.  0, or -1 with
- * AVC_UNSUPPORTED and the reason in words; *passing if that may be over soon. */
-int support_check(struct target *target, bool *passing, struct avc_error *err) warn_unused;
+ * AVC_UNSUPPORTED and the reason in words. */
+int support_check(struct target *target, struct avc_error *err) warn_unused;
+/* Is what was brought into the (running) process still there?  exec(2) takes it away. */
+bool infected_still(const struct target *target);
 /* True if this looks like a moment at which nobody is in the middle of anything. */
 bool quiescent(const struct target *target);
 
@@ -652,13 +858,15 @@ bool link_stop_asked(const struct link *link);
 int link_report(struct link *link, struct avc_report *report);
 int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind,
 		 struct avc_error *err);
-/* Kills what the dead app left behind (children of init but those in keep[]). */
-/* Kills and reaps the children of init that are tracees of ours but not in keep[]:
+/* Kills and reaps the children of init that are tracees of ours but not known:
  * clones of which we never heard, because the thread that made them was killed before
  * it could tell.  They would keep the app's number (as a process group's) and, as
  * zombies, the container from ending. */
-void link_kill_lost(const struct link *link, const pid_t *keep, int keep_count);
-void link_kill_leftovers(const struct link *link, const pid_t *keep, int keep_count);
+void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),
+		    const void *arg);
+/* Kills what the dead app left behind: children of init, but those to keep. */
+void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
+			 const void *arg);
 
 /* ---- engine.c --------------------------------------------------------------------------- */
 

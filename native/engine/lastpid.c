@@ -85,12 +85,12 @@ static int
 serve(void *arg)
 {
 	struct last_pid *helper = arg;
-	struct inj_slot *slot = helper->slot;
 	uint32_t spins = 0;
 
 	raw_syscall(SYS_prctl, PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0, 0);
 	helper->before = read_last_pid(helper->fd);
 	while (!__atomic_load_n(&helper->stop, __ATOMIC_ACQUIRE)) {
+		struct inj_slot *slot = __atomic_load_n(&helper->slot, __ATOMIC_ACQUIRE);
 		const uint32_t want = __atomic_load_n(&slot->want, __ATOMIC_ACQUIRE);
 
 		if (want != slot->have) {
@@ -183,6 +183,18 @@ int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 			err, AVC_DENIED, -helper->error, 0, "restore", "write(ns_last_pid)",
 			"the next PID can not be chosen (CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN is needed)");
 	return 0;
+}
+
+void last_pid_serve(struct last_pid *helper, struct inj_slot *slot)
+{
+	struct inj_slot *before = helper->slot;
+
+	slot->want = slot->have = 0;
+	__atomic_store_n(&helper->slot, slot, __ATOMIC_RELEASE);
+	/* It may be asleep on the other one's word.  Woken up it has nothing to write. */
+	before->last_pid = 0;
+	__atomic_add_fetch(&before->want, 1, __ATOMIC_ACQ_REL);
+	wake(&before->want);
 }
 
 void last_pid_stop(struct last_pid *helper)

@@ -17,7 +17,9 @@
 
 #include "internal.h"
 
-#define CHILDREN_MAX 1024
+#define CHILDREN_MAX 4096
+#define LEFTOVERS_NS (100 * NS_PER_MS)
+#define LEFTOVERS_US 100
 
 void link_init(struct link *link)
 {
@@ -162,7 +164,7 @@ bool link_app_started(const struct link *link, pid_t app)
 	snprintf(path, sizeof path, "/proc/%d/exe", link->init);
 	if (stat(path, &own))
 		return false;
-	snprintf(path, sizeof path, "/proc/%d/exe", app);
+	snprintf(path, sizeof path, "/proc/%d/exe", proc_live_thread(app));
 	if (stat(path, &theirs))
 		return false;
 	return own.st_dev != theirs.st_dev || own.st_ino != theirs.st_ino;
@@ -195,28 +197,24 @@ int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind, st
 	return 0;
 }
 
-static bool contains(const pid_t *list, int count, pid_t pid)
-{
-	for (int i = 0; i < count; i++)
-		if (list[i] == pid)
-			return true;
-	return false;
-}
-
-void link_kill_lost(const struct link *link, const pid_t *keep, int keep_count)
+void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),
+		    const void *arg)
 {
 	pid_t children[CHILDREN_MAX];
 	const int count = proc_children(link->init, children, CHILDREN_MAX);
 
 	for (int i = 0; i < count; i++)
-		if (!contains(keep, keep_count, children[i]) && tracee_is_ours(children[i]))
+		if (!known(children[i], arg) && tracee_is_ours(children[i]))
 			tracee_kill(children[i]);
 }
 
-void link_kill_leftovers(const struct link *link, const pid_t *keep, int keep_count)
+void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
+			 const void *arg)
 {
+	const uint64_t end = now_ns() + LEFTOVERS_NS;
+
 	/* What a killed process leaves becomes init's child in its turn. */
-	for (int round = 0; round < 8; round++) {
+	do {
 		pid_t children[CHILDREN_MAX];
 		const int count = proc_children(link->init, children, CHILDREN_MAX);
 		bool any = false;
@@ -224,15 +222,15 @@ void link_kill_leftovers(const struct link *link, const pid_t *keep, int keep_co
 		for (int i = 0; i < count; i++) {
 			struct proc_stat stat;
 
-			if (contains(keep, keep_count, children[i]) ||
-			    proc_stat(children[i], &stat) || stat.parent != link->init ||
-			    stat.state == 'Z')
+			if (keep(children[i], arg) || proc_stat(children[i], &stat) ||
+			    stat.parent != link->init)
 				continue;
-			kill(children[i], SIGKILL);
-			any = true;
+			any = true; /* its number is not free before init has waited for it */
+			if (stat.state != 'Z')
+				kill(children[i], SIGKILL);
 		}
 		if (!any)
 			return;
-		usleep(200);
-	}
+		usleep(LEFTOVERS_US);
+	} while (now_ns() < end);
 }

@@ -35,10 +35,15 @@
 #define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
 #define SMAPS_SHARE 50       /* the long file is read in at most 1/50 of the time */
 
+const char private_huge_pages[] =
+	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
+	"killed for want of another when it writes to one";
+
 struct area {
 	avc_remote start, end;
 	uint64_t offset, inode;
 	bool wiped; /* MADV_WIPEONFORK; else shared memory                     */
+	bool huge;  /* hugetlbfs, which does not know write(2)                */
 	int fd;     /* of the shared memory                                    */
 };
 
@@ -180,7 +185,7 @@ void memory_copy(const struct target *target, struct mem_image *image)
 /* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
 void memory_dofork(const struct memory *memory, struct inj_call *call)
 {
-	avc_remote at = 4096;
+	avc_remote at = ARCH_PAGE_BYTES;
 
 	if (!memory->dontfork)
 		return;
@@ -238,12 +243,13 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 			    "it uses a device's memory, which a clone does not inherit");
 	if (!memory->dontfork)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "%ld kB of its memory are not inherited by a clone", missing_pages * 4);
+			    "%ld kB of its memory are not inherited by a clone",
+			    missing_pages * ARCH_PAGE_BYTES / 1024);
 	/* Known before, it should not be missing again; but a device may have been
 	 * mapped since, at which the call stopped. */
 	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep template", "",
 		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
-		    missing_pages * 4);
+		    missing_pages * ARCH_PAGE_BYTES / 1024);
 }
 
 struct survey {
@@ -251,6 +257,7 @@ struct survey {
 	struct areas *areas;
 	uint64_t layout, shared_bytes, limit;
 	uint64_t left_bytes;
+	bool private_huge;
 };
 
 static uint64_t hash(uint64_t h, uint64_t value)
@@ -295,14 +302,16 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
+	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
 	if ((!wiped && !is_shared(m)) || is_pad(survey->target, m->start))
 		return 0;
 	if (!wiped) {
-		survey->shared_bytes += m->end - m->start;
-		if (survey->shared_bytes > survey->limit) {
+		/* One that is too large does not keep small ones from being rolled back. */
+		if (survey->shared_bytes + (m->end - m->start) > survey->limit) {
 			survey->left_bytes += m->end - m->start;
 			return 0;
 		}
+		survey->shared_bytes += m->end - m->start;
 	}
 	if (areas->count == AREAS_MAX) {
 		areas->too_many = true;
@@ -314,6 +323,7 @@ static int find_area(const struct mapping *m, void *arg)
 		.offset = m->offset,
 		.inode = m->inode,
 		.wiped = wiped,
+		.huge = m->flags & MAPPING_HUGETLB,
 		.fd = -1,
 	};
 	return 0;
@@ -410,6 +420,9 @@ static int check_areas(struct target *target, const struct generation *generatio
 	memory->read_ns = now_ns();
 	memory->cost_ns = memory->read_ns - start;
 	memory->left_bytes = survey.left_bytes;
+	if (!result && survey.private_huge)
+		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "", "%s",
+			      private_huge_pages);
 	if (!result && !same_areas(found, copied)) {
 		result = remember(target, generation->template, found, err);
 		if (!result)
@@ -515,9 +528,15 @@ static void lock_again(struct target *target, int64_t locked_kb, struct setup *s
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
+	const struct thread *main_thread = thread_find(target, target->pid);
+
 	if (check_areas(target, generation, err) || fill_wiped(target, generation, setup, err))
 		return -1;
 	lock_again(target, locked_kb, setup);
+	if (main_thread && main_thread->creds.future_lock)
+		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
+			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
 	if (target->memory->left_bytes && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
 		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
@@ -525,18 +544,23 @@ int memory_finish(struct target *target, struct generation *generation, int64_t 
 	return 0;
 }
 
-int memory_put_back(const struct mem_image *image, struct avc_error *err)
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err)
 {
 	const uint8_t *from = image ? image->data : NULL;
+	int mem_fd = -1, result = 0;
 
-	for (uint32_t i = 0; image && i < image->areas.count; i++) {
+	for (uint32_t i = 0; !result && image && i < image->areas.count; i++) {
 		const struct area *a = &image->areas.area[i];
+		const off_t at = (off_t)(a->huge ? a->start : a->offset);
 
-		if (!a->wiped &&
-		    pwrite(a->fd, from, area_bytes(a), (off_t)a->offset) != (ssize_t)area_bytes(a))
-			return fail_errno(err, 0, "restore", "pwrite",
-					  "shared memory can not be written");
+		if (a->huge && mem_fd < 0)
+			mem_fd = proc_open(pid, "mem", O_RDWR);
+		if (!a->wiped && pwrite(a->huge ? mem_fd : a->fd, from, area_bytes(a), at) !=
+					 (ssize_t)area_bytes(a))
+			result = fail_errno(err, pid, "restore", "pwrite",
+					    "shared memory can not be written");
 		from += area_bytes(a);
 	}
-	return 0;
+	close_fd(&mem_fd);
+	return result;
 }

@@ -21,15 +21,13 @@
 #define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
 #define PARKED_NS NS_PER_S
 
-#define PAGE 4096u
-
 static size_t page_up(size_t n)
 {
-	return (n + PAGE - 1) & ~(size_t)(PAGE - 1);
+	return (n + ARCH_PAGE_BYTES - 1) & ~(size_t)(ARCH_PAGE_BYTES - 1);
 }
 
 /* A block: struct inj_thread, stack (growing down), signal frame.  With AVX-512
- * it all fits one page. */
+ * it all fits one page, with AMX three. */
 static size_t block_stack_top(void)
 {
 	return 896;
@@ -62,9 +60,11 @@ int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t
 		return fail_errno(err, pid, "infect", "open(map_files)",
 				  "the pad can not be reached");
 	map = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-	close(fd);
-	if (map == MAP_FAILED)
+	if (map == MAP_FAILED) {
+		close(fd);
 		return fail_errno(err, pid, "infect", "mmap", "the pad can not be mapped");
+	}
+	pad->fd = fd;
 	pad->base = base;
 	pad->map = map;
 	pad->control = (struct inj_control *)(pad->map + INJ_CODE_BYTES);
@@ -76,8 +76,10 @@ int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t
 
 void pad_close(struct pad *pad)
 {
-	if (pad->map)
+	if (pad->map) {
 		munmap(pad->map, pad->bytes);
+		close(pad->fd);
+	}
 	*pad = (struct pad){ 0 };
 }
 
@@ -203,8 +205,11 @@ int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 /* It has made all its calls and not stopped: a limit of processes, or of memory. */
 static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_error *err)
 {
-	const int64_t result = call->call[(call->count - 1) % INJ_CALLS_MAX].result;
+	int64_t result = 0;
 
+	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++)
+		if (call->call[i].nr == SYS_clone)
+			result = call->call[i].result;
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
 	if (tracee_await(tid, NULL, err) != STOP_TRAP)
@@ -213,24 +218,18 @@ static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_erro
 		    "it may not have another process: %s", strerror((int)-result));
 }
 
-int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
+int pad_start(pid_t tid, struct avc_error *err)
 {
-	return pad_run_clone_while(tid, call, NULL, NULL, child, err);
+	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+		return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
+	return 0;
 }
 
-int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
-			void *arg, pid_t *child, struct avc_error *err)
+int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
 {
-	int signal = 0;
-
 	for (;;) {
 		struct stop stop;
 
-		if (ptrace(PTRACE_CONT, tid, NULL, (long)signal))
-			return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
-		if (meanwhile)
-			meanwhile(arg);
-		meanwhile = NULL;
 		tracee_watch(&call->done);
 		stop = tracee_wait(tid, 0);
 		tracee_watch(NULL);
@@ -249,9 +248,26 @@ int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile
 		default:
 			/* SIGSTOP, SIGCONT and job control make stops of their own
 			 * (ptrace(2), PTRACE_EVENT_STOP). */
-			signal = stop.kind == STOP_SIGNAL ? stop.signal : 0;
+			if (ptrace(PTRACE_CONT, tid, NULL,
+				   (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
+				return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
 		}
 	}
+}
+
+int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
+{
+	return pad_run_clone_while(tid, call, NULL, NULL, child, err);
+}
+
+int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			void *arg, pid_t *child, struct avc_error *err)
+{
+	if (pad_start(tid, err))
+		return -1;
+	if (meanwhile)
+		meanwhile(arg);
+	return pad_await_clone(tid, call, child, err);
 }
 
 bool in_old_pad(const struct target *target, avc_remote address)
@@ -271,12 +287,32 @@ int suspend_seccomp(const struct thread *thread, bool suspend, struct avc_error 
 	return 0;
 }
 
+int pad_check(struct target *target, pid_t tid, struct avc_error *err)
+{
+	const avc_remote at = target->pad.base + INJ_CODE_BYTES +
+			      offsetof(struct inj_control, nonce);
+	long nonce;
+
+	errno = 0;
+	nonce = ptrace(PTRACE_PEEKDATA, tid, (void *)at, NULL);
+	if (errno == ESRCH)
+		return fail_errno(err, tid, "stop", "ptrace(PEEKDATA)", "it has ended");
+	if (errno || (uint64_t)nonce != target->nonce) {
+		target->infected = false;
+		return fail(err, AVC_DEADLINE, 0, tid, "stop", "",
+			    "it has executed another program");
+	}
+	return 0;
+}
+
 int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
 	struct inj_control *control = target->pad.control;
 	struct arch_regs home;
 
+	if (pad_check(target, thread->tid, err))
+		return -1;
 	/* Homes are places of the app's, never of a pad that will be taken away. */
 	if (in_old_pad(target, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",

@@ -158,7 +158,7 @@ void pending_read(struct target *target)
 		t->signalled = false;
 		if (t->block < 0)
 			continue;
-		if (t->block == 0)
+		if (t->tid == target->pid)
 			read_queue(pending, t->tid, -1);
 		read_queue(pending, t->tid, t->block);
 	}

@@ -58,7 +58,8 @@ int avc_engine_probe(struct avc_error *err)
 			       : fail_errno(err, 0, "probe", "open(ns_last_pid)",
 					    "needs root and a writable /proc/sys (--privileged)");
 	close(fd);
-	page = mmap(NULL, 4096, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+	page = mmap(NULL, ARCH_PAGE_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1,
+		    0);
 	if (pipe2(ready, O_CLOEXEC))
 		ready[0] = ready[1] = -1;
 	child = fork();
@@ -81,7 +82,7 @@ int avc_engine_probe(struct avc_error *err)
 		char name[64];
 
 		snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)page,
-			 (unsigned long)page + 4096);
+			 (unsigned long)page + ARCH_PAGE_BYTES);
 		fd = proc_open(child, name, O_RDWR);
 		if (fd < 0)
 			result = fail_errno(err, 0, "probe", "open(map_files)",
@@ -90,6 +91,6 @@ int avc_engine_probe(struct avc_error *err)
 			close(fd);
 	}
 	tracee_kill(child);
-	munmap(page, 4096);
+	munmap(page, ARCH_PAGE_BYTES);
 	return result;
 }

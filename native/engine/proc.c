@@ -50,15 +50,25 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 	p = strrchr(buf, ')');
 	if (!p ||
 	    sscanf(p + 1,
-		   " %c %d %d %d %d %d %*u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %*d %*d %llu",
+		   " %c %d %d %d %d %d %*u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
-		   &stat->tty_group, &start) != 7) {
+		   &stat->tty_group, &stat->threads, &start) != 8) {
 		errno = EPROTO;
 		return -1;
 	}
 	stat->tty = (uint32_t)tty;
 	stat->start = start;
 	return 0;
+}
+
+int proc_exit_status(pid_t pid)
+{
+	char buf[1024], *p;
+
+	if (proc_read(pid, "stat", buf, sizeof buf) <= 0)
+		return 0;
+	p = strrchr(buf, ' '); /* the last field */
+	return p ? atoi(p + 1) : 0;
 }
 
 pid_t proc_inside(pid_t tid)
@@ -76,6 +86,52 @@ pid_t proc_inside(pid_t tid)
 		*end = 0;
 	last = strrchr(line, '\t');
 	return last ? atoi(last) : -1;
+}
+
+/* Its memory goes first, before it is a zombie. */
+static bool is_live(pid_t tid)
+{
+	char buf[64];
+	struct proc_stat stat;
+
+	return proc_stat(tid, &stat) == 0 && stat.state != 'Z' && stat.state != 'X' &&
+	       proc_read(tid, "statm", buf, sizeof buf) > 0 && atol(buf) > 0;
+}
+
+static int find_live(pid_t tid, void *arg)
+{
+	pid_t *found = arg;
+
+	if (!is_live(tid))
+		return 0;
+	*found = tid;
+	return -1;
+}
+
+pid_t proc_live_thread(pid_t pid)
+{
+	pid_t found = 0;
+	int dirfd;
+
+	if (is_live(pid))
+		return pid;
+	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	if (dirfd < 0)
+		return 0;
+	(void)proc_tasks(dirfd, find_live, &found);
+	close(dirfd);
+	return found;
+}
+
+void proc_await_end(pid_t tid)
+{
+	struct proc_stat stat;
+
+	for (int us = 0; us < 1000000; us += 50) {
+		if (proc_stat(tid, &stat) || stat.state == 'Z' || stat.state == 'X')
+			return;
+		usleep(50);
+	}
 }
 
 int proc_children(pid_t pid, pid_t *children, int max)
@@ -103,7 +159,7 @@ static const struct {
 	enum mapping_flag flag;
 } mapping_flags[] = {
 	{ "dc", MAPPING_DONTFORK }, { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
-	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },
+	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
 };
 
 static uint32_t parse_flags(const char *p)
@@ -186,6 +242,10 @@ int proc_status(pid_t tid, struct proc_status *status)
 			continue;
 		if (!strncmp(line, "NSpid:", 6))
 			status->inside = atoi(strrchr(line, '\t') + 1);
+		else if (!strncmp(line, "TracerPid:", 10))
+			status->tracer = atoi(value);
+		else if (!strncmp(line, "SigCgt:", 7))
+			status->caught = strtoull(value, NULL, 16);
 		else if (!strncmp(line, "VmLck:", 6))
 			status->locked_kb = strtoll(value, NULL, 10);
 		else if (!strncmp(line, "Uid:", 4))
@@ -197,6 +257,8 @@ int proc_status(pid_t tid, struct proc_status *status)
 				status->groups = status->groups * 31 + (unsigned char)*value;
 		else if (!strncmp(line, "NoNewPrivs:", 11))
 			status->no_new_privs = (uint32_t)atoi(value);
+		else if (!strncmp(line, "x86_Thread_features:", 20))
+			status->shadow_stack = strstr(value, "shstk") != NULL;
 		else if (!strncmp(line, "Seccomp:", 8))
 			status->seccomp = (uint32_t)atoi(value);
 		else if (!strncmp(line, "Seccomp_filters:", 16))

@@ -9,6 +9,7 @@
 #include <poll.h>
 #include <sched.h>
 #include <signal.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
@@ -52,7 +53,7 @@ static void reset(const struct pad *pad, uint32_t slot_number)
 	struct inj_slot *slot = pad_slot(pad, slot_number);
 
 	slot->state = INJ_IDLE;
-	slot->go = 0;
+	slot->go = INJ_GO_NOT;
 	slot->ready = 0;
 	slot->running = 0;
 	slot->error = 0;
@@ -63,14 +64,39 @@ static void reset(const struct pad *pad, uint32_t slot_number)
 	slot->blocks = pad_remote(pad, pad_thread(pad, slot_number, 0));
 }
 
-/* One fork of the template; the child is sent to inj_restore() and let go. */
+/* A stopped process is sent to inj_restore() and let go. */
+static int send_off(struct target *target, struct generation *generation, pid_t child,
+		    struct sandbox **sandbox, struct avc_error *err)
+{
+	const struct pad *pad = &target->pad;
+	struct arch_regs regs;
+
+	/* Its stack is the first thread's, in the slot. */
+	arch_call(&regs, &generation->base, pad->base + INJ_RESTORE_OFFSET,
+		  pad_remote(pad, pad_stack(pad, generation->slot, 0)),
+		  pad_remote(pad, pad_slot(pad, generation->slot)));
+	if (generation->sandboxed && arch_regs_set(child, &regs) == 0) {
+		*sandbox = sandbox_begin(child, err);
+		if (*sandbox)
+			return 0;
+		tracee_kill(child);
+		return -1;
+	}
+	if (arch_regs_set(child, &regs) || ptrace(PTRACE_DETACH, child, NULL, 0L)) {
+		fail_errno(err, child, "restore", "ptrace(DETACH)", "the new process was killed");
+		tracee_kill(child);
+		return -1;
+	}
+	return 0;
+}
+
+/* One fork of the template.  If it is to have children, it stays stopped. */
 static int fork_template(struct target *target, struct generation *generation, pid_t *pid,
 			 int *pidfd, bool again, struct sandbox **sandbox, struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
 	struct inj_call *call = &slot->template_call;
-	struct arch_regs regs;
 	pid_t child = 0;
 
 	/* The first time there are calls of files_restore() before it. */
@@ -82,23 +108,24 @@ static int fork_template(struct target *target, struct generation *generation, p
 		return -1;
 	if (tracee_await(child, NULL, err) != STOP_TRAP)
 		return -1;
-	/* Its stack is the first thread's, in the slot. */
-	arch_call(&regs, &generation->base, pad->base + INJ_RESTORE_OFFSET,
-		  pad_remote(pad, pad_stack(pad, generation->slot, 0)), pad_remote(pad, slot));
 	close_fd(pidfd);
 	*pidfd = proc_pidfd_open(child);
-	if (*pidfd >= 0 && generation->sandboxed && arch_regs_set(child, &regs) == 0) {
-		*sandbox = sandbox_begin(child, err);
-		if (!*sandbox) {
-			tracee_kill(child);
-			return -1;
-		}
-	} else if (*pidfd < 0 || arch_regs_set(child, &regs) ||
-		   ptrace(PTRACE_DETACH, child, NULL, 0L)) {
-		fail_errno(err, child, "restore", "ptrace(DETACH)", "the new process was killed");
+	if (*pidfd < 0) {
+		fail_errno(err, child, "restore", "pidfd_open", "the new process was killed");
 		tracee_kill(child);
 		return -1;
 	}
+	if (generation->branches) {
+		if (proc_inside(child) == slot->pid) {
+			*pid = child;
+		} else {
+			tracee_kill(child);
+			slot->state = INJ_WRONG_PID;
+		}
+		return tracee_settle(generation->template, err);
+	}
+	if (send_off(target, generation, child, sandbox, err))
+		return -1;
 	*pid = child;
 	/* The template can come to rest meanwhile. */
 	return tracee_settle(generation->template, err);
@@ -125,8 +152,8 @@ static int describe_failure(const struct pad *pad, const struct inj_slot *slot,
 /* Forks until the number that comes out is the app's; in a PID namespace that is
  * shared somebody else may fork in between. */
 static int rebuild(struct target *target, struct generation *generation, struct last_pid *helper,
-		   pid_t *pid, int *pidfd, struct sandbox **sandbox, struct restore_times *times,
-		   struct avc_error *err)
+		   struct family *family, pid_t *pid, int *pidfd, struct sandbox **sandbox,
+		   struct restore_times *times, struct avc_error *notes, struct avc_error *err)
 {
 	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
 
@@ -146,6 +173,12 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 		    fork_template(target, generation, pid, pidfd, i > 0, sandbox, err))
 			return -1;
 		times->fork_ns = now_ns() - start;
+		if (family && slot->state == INJ_IDLE) {
+			if (family_make(family, *pid, notes, err) ||
+			    send_off(target, generation, *pid, sandbox, err))
+				return -1;
+			times->fork_ns = now_ns() - start;
+		}
 		start = now_ns();
 		if (*sandbox ? !sandbox_wait(*sandbox, &slot->state, start + READY_NS)
 			     : !wait_word(&slot->state, INJ_IDLE, start + READY_NS))
@@ -164,6 +197,29 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 		    "the PID is taken by somebody else");
 }
 
+/* ---- one of several ---------------------------------------------------------------- */
+
+int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
+		  pid_t pid, struct avc_error *err)
+{
+	struct sandbox *none = NULL;
+
+	reset(&target->pad, image->slot);
+	timers_advance(image->timers, now_ns());
+	last_pid_serve(helper, pad_slot(&target->pad, image->slot));
+	return send_off(target, image, pid, &none, err);
+}
+
+int restore_await(struct target *target, struct generation *image, pid_t pid, struct avc_error *err)
+{
+	struct inj_slot *slot = pad_slot(&target->pad, image->slot);
+
+	if (!wait_word(&slot->state, INJ_IDLE, now_ns() + READY_NS))
+		return fail(err, AVC_KERNEL, ETIMEDOUT, pid, "restore", "",
+			    "the new process does not answer");
+	return slot->state == INJ_READY ? 0 : describe_failure(&target->pad, slot, err);
+}
+
 /* What was allowed to fail, and did: to be told. */
 static void note_failed(const struct pad *pad, uint32_t slot, pid_t pid, struct avc_error *notice)
 {
@@ -174,6 +230,26 @@ static void note_failed(const struct pad *pad, uint32_t slot, pid_t pid, struct 
 		     setup_name(pad, pad_remote(pad, s)), "not everything could be put back");
 }
 
+static void let_go(struct inj_slot *slot, enum inj_go stage)
+{
+	__atomic_store_n(&slot->go, stage, __ATOMIC_RELEASE);
+	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+}
+
+void restore_go(struct target *target, struct generation *image)
+{
+	let_go(pad_slot(&target->pad, image->slot), INJ_GO_ALL);
+}
+
+void restore_note(struct target *target, struct generation *image, pid_t pid,
+		  struct avc_error *notes)
+{
+	note_failed(&target->pad, image->slot, pid, notes);
+	files_check_calls(&target->pad, image->slot, pad_slot(&target->pad, image->slot)->pid,
+			  notes);
+	attributes_put_back(image->attributes, pid, notes);
+}
+
 int restore(struct target *target, struct generation *generation, const struct link *link,
 	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
 	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
@@ -182,26 +258,37 @@ int restore(struct target *target, struct generation *generation, const struct l
 	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
 	struct last_pid *helper = last_pid_start(link->pidns_fd, slot, err);
 	struct sandbox *sandbox = NULL;
+	struct family *family = NULL;
+	struct files_table *tables = calloc(generation->branches + 1, sizeof *tables);
 	int result, pidfd = -1;
 
 	*pid = 0;
 	*times = (struct restore_times){ 0 };
-	if (!helper)
-		return -1;
+	if (!helper || !tables) {
+		last_pid_stop(helper);
+		free(tables);
+		return fail_errno(err, 0, "restore", "calloc", "out of memory");
+	}
 	tracee_deadline_set(timer, FORK_NS);
-	result = files_restore(target, generation, config, link->init, notes, err);
+	result = files_restore(target, generation, config, link->init, tables, notes, err);
+	if (!result && generation->branches) {
+		family = family_new(target, generation, helper, tables, err);
+		result = family ? 0 : -1;
+	}
 	if (!result)
-		result = rebuild(target, generation, helper, pid, &pidfd, &sandbox, times, err);
+		result = rebuild(target, generation, helper, family, pid, &pidfd, &sandbox, times,
+				 notes, err);
+	if (!result && family)
+		result = family_start(family, notes, err);
 	tracee_deadline_clear(timer);
 	last_pid_stop(helper);
+	for (uint32_t i = 0; i < generation->branches; i++)
+		files_table_free(&tables[i]);
+	free(tables);
 	if (!result)
-		note_failed(&target->pad, generation->slot, *pid, notes);
+		restore_note(target, generation, *pid, notes);
 	if (!result)
-		files_check_calls(&target->pad, generation->slot, slot->pid, notes);
-	if (!result)
-		attributes_put_back(generation->attributes, *pid, notes);
-	if (!result)
-		result = memory_put_back(generation->image, err);
+		result = memory_put_back(generation->image, *pid, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {
@@ -216,13 +303,22 @@ int restore(struct target *target, struct generation *generation, const struct l
 			poll(&gone, 1, 1000);
 			close_fd(&pidfd);
 		}
+		if (family)
+			family_kill(family);
+		family_free(family);
 		*pid = 0;
 		return -1;
 	}
 	if (sandbox)
 		sandbox_go(sandbox, &target->pad, generation->slot);
-	__atomic_store_n(&slot->go, 1, __ATOMIC_RELEASE);
-	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+	/* As they knew it: ended.  (sandbox_go() has seen to it.) */
+	else if (generation->headless) {
+		let_go(slot, INJ_GO_ENDED);
+		proc_await_end(*pid);
+	}
+	let_go(slot, INJ_GO_ALL);
+	if (family)
+		family_go(family);
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 
@@ -231,6 +327,9 @@ int restore(struct target *target, struct generation *generation, const struct l
 		wait_word(&slot->running, running, now_ns() + NS_PER_MS);
 	}
 	times->restore_ns = now_ns() - died_ns;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		generation->branch[i].pid = family_pid(family, i);
+	family_free(family);
 	close_fd(&pidfd);
 	return 0;
 }

@@ -129,11 +129,13 @@ static void timespec(struct target *target, struct thread *t, int argument, uint
 {
 	const uint64_t pointer = arch_syscall_arg(&t->regs, (unsigned int)argument);
 	const bool same = same_call(t, pointer);
+	struct avc_error gone = { 0 };
 	int64_t left[2], *cell;
 	int64_t ns;
 
 	/* Without a pad, or with all cells taken, it begins again in full. */
-	if (!pointer || !target->infected || take_cell(target, t) < 0)
+	if (!pointer || !target->infected || pad_check(target, t->tid, &gone) ||
+	    take_cell(target, t) < 0)
 		return;
 	cell = target->pad.control->timeout[t->timeout_cell];
 	if (same) {
@@ -194,7 +196,7 @@ static long guess_call(const struct target *target, const struct arch_regs *regs
 {
 	const uint64_t a = arch_syscall_arg(regs, 0), b = arch_syscall_arg(regs, 1),
 		       c = arch_syscall_arg(regs, 2), d = arch_syscall_arg(regs, 3);
-	const uint64_t small = 4096;
+	const uint64_t small = ARCH_PAGE_BYTES; /* no address */
 	uint8_t code[ARCH_CODE_BYTES];
 	long nr;
 

@@ -110,6 +110,7 @@ void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot_nu
 	for (uint32_t i = 0; i < sandbox->count; i++) {
 		const pid_t tid = sandbox->tid[i];
 		struct arch_regs regs, now;
+		uint64_t frame;
 		int block;
 
 		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
@@ -118,13 +119,21 @@ void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot_nu
 		block = thread_of(pad, slot_number, tid);
 		if (block < 0)
 			continue;
-		arch_call(&regs, &now, pad->base + INJ_SIGRETURN_OFFSET, arch_sp(&now),
-			  pad_thread(pad, slot_number, (uint32_t)block)->frame);
+		frame = pad_thread(pad, slot_number, (uint32_t)block)->frame;
+		if (frame)
+			arch_call(&regs, &now, pad->base + INJ_SIGRETURN_OFFSET, arch_sp(&now),
+				  frame);
+		else
+			arch_call(&regs, &now, pad->base + INJ_END_OFFSET, arch_sp(&now), 0);
 		(void)arch_regs_set(tid, &regs); /* it was killed: no matter */
 	}
 	slot->running = slot->threads;
-	for (uint32_t i = 0; i < sandbox->count; i++)
+	for (uint32_t i = 0; i < sandbox->count; i++) {
 		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);
+		/* The others know it as ended. */
+		if (i == 0 && !pad_thread(pad, slot_number, 0)->frame)
+			proc_await_end(sandbox->pid);
+	}
 	/* One that was killed meanwhile is a tracee still, until it was waited for. */
 	for (bool ended = false; pump(sandbox, &ended);)
 		;

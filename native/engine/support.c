@@ -10,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -71,54 +72,102 @@ static int check_mappings(struct target *target, struct avc_error *err)
 	maps = fopen(path, "re");
 	if (!maps)
 		return fail_errno(err, target->pid, "check", "open(maps)", "it has ended");
-	while (!result && fgets(line, sizeof line, maps))
+	while (!result && fgets(line, sizeof line, maps)) {
 		if (strstr(line, " /[aio]"))
 			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
 				      "it uses kernel AIO");
+		/* Those of files are found in the first clone. */
+		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				      private_huge_pages);
+	}
 	fclose(maps);
 	target->surveyed_pages = result ? -1 : pages;
 	return result;
 }
 
-struct children {
-	pid_t pid;
-	int count;
-};
-
-static int count_children(pid_t tid, void *arg)
+/* Its children are made by their parents, which have to have what their children have. */
+static int check_descendant(const struct target *target, struct avc_error *err)
 {
-	struct children *children = arg;
-	char name[64], buf[256];
+	static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "user", "cgroup", "pid" };
+	struct proc_status status;
 
-	/* A child hangs on the thread that forked it. */
-	snprintf(name, sizeof name, "task/%d/children", tid);
-	if (proc_read(children->pid, name, buf, sizeof buf) > 0)
-		for (const char *p = buf; *p; p++)
-			children->count += *p == ' ';
-	return 0;
-}
+	for (size_t i = 0; i < sizeof spaces / sizeof *spaces; i++) {
+		char path[64];
+		struct stat own, inits;
 
-static int check_children(struct target *target, struct avc_error *err)
-{
-	struct children children = { .pid = target->pid };
-
-	if (proc_tasks(target->task_dirfd, count_children, &children))
-		return fail_errno(err, target->pid, "check", "getdents64", "it has ended");
-	if (children.count)
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->pid, spaces[i]);
+		if (stat(path, &own))
+			return fail_errno(err, target->pid, "check", "stat(ns)", "it has ended");
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->init, spaces[i]);
+		if (stat(path, &inits) || own.st_ino != inits.st_ino)
+			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				    "process %d has a %s namespace of its own", target->inside,
+				    spaces[i]);
+	}
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.seccomp == 1 || status.seccomp_filters > target->plain_filters)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
-			    "it has child processes (%d); only single processes are protected yet",
-			    children.count);
+			    "process %d is not the main one and has a seccomp filter of its own",
+			    target->inside);
 	return 0;
 }
 
-int support_check(struct target *target, bool *passing, struct avc_error *err)
+/* A thread's second stack would not know of what it was made to do in the pad, and return
+ * to the wrong place: so before that.  A program has it from its start, or not at all. */
+static int check_shadow_stack(struct target *target, struct avc_error *err)
 {
-	*passing = false;
-	if (check_descriptors(target, err) || check_mappings(target, err))
+	struct proc_status status;
+
+	if (target->infected)
+		return 0;
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.shadow_stack)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			    "it has shadow stacks (CET), which can not be put back; "
+			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
+	return 0;
+}
+
+/* unshare(2) and setns(2): its next child is the first process of another namespace.  A
+ * clone of ours would be that, and the namespace would end with it. */
+static int check_namespaces(struct target *target, struct avc_error *err)
+{
+	static const struct {
+		const char *own, *of_children, *reason;
+	} kinds[] = {
+		{ "ns/pid", "ns/pid_for_children",
+		  "its children get a PID namespace of their own (a container in the container)" },
+		{ "ns/time", "ns/time_for_children",
+		  "its children get a time namespace of their own" },
+	};
+
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++) {
+		char path[64], own[64] = "", theirs[64] = "";
+
+		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].own);
+		if (readlink(path, own, sizeof own - 1) < 0)
+			continue; /* the kernel has none of these; or it has ended */
+		/* Of a namespace in which there was no process yet nothing is told. */
+		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].of_children);
+		if (readlink(path, theirs, sizeof theirs - 1) < 0 && errno != ENOENT)
+			continue;
+		/* Behind the kind: "pid:[4026531836]". */
+		if (strcmp(own + strcspn(own, "["), theirs + strcspn(theirs, "[")) != 0)
+			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				    kinds[i].reason);
+	}
+	return 0;
+}
+
+int support_check(struct target *target, struct avc_error *err)
+{
+	if (check_shadow_stack(target, err) || check_namespaces(target, err) ||
+	    check_descriptors(target, err) || check_mappings(target, err))
 		return -1;
-	/* Thread by thread only when the last checkpoint did not find that it has none. */
-	*passing = !target->childless && check_children(target, err) != 0;
-	return *passing ? -1 : 0;
+	return target->descendant ? check_descendant(target, err) : 0;
 }
 
 /* By way of the process: a second entry for each thread in the kernel's memory of

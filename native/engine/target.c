@@ -15,7 +15,8 @@
 
 #include "internal.h"
 
-#define ASK_AGAIN_AFTER 8 /* checkpoints */
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h */
+#define ASK_AGAIN_AFTER 8    /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
 
 void target_init(struct target *target)
@@ -25,14 +26,65 @@ void target_init(struct target *target)
 	};
 }
 
+bool target_make_room(struct target *target)
+{
+	target->threads = calloc(THREADS_MAX, sizeof *target->threads);
+	target->thread_room = THREADS_MAX;
+	target->memory = memory_new();
+	target->pending = pending_new();
+	target->timers = timers_new();
+	return target->threads && target->memory && target->pending && target->timers;
+}
+
+void target_free_room(struct target *target)
+{
+	free(target->threads);
+	memory_free(target->memory);
+	free(target->pending);
+	free(target->timers);
+	target->threads = NULL;
+	target->memory = NULL;
+	target->pending = NULL;
+	target->timers = NULL;
+}
+
+/* A descriptor for its table of descriptors: the main thread has none any more when it
+ * has ended, and the others have pidfds of their own since Linux 6.9. */
+static int follow(struct target *target, struct avc_error *err)
+{
+	const pid_t pid = proc_live_thread(target->leader);
+
+	if (!pid)
+		return fail(err, AVC_GONE, ESRCH, target->leader, "attach", "", "it has ended");
+	close_fd(&target->pidfd);
+	target->pid = pid;
+	target->pidfd = pid == target->leader ? proc_pidfd_open(pid)
+					      : (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
+	if (target->pidfd < 0 && errno == EINVAL)
+		return fail(err, AVC_UNSUPPORTED, EINVAL, target->leader, "attach",
+			    "pidfd_open(PIDFD_THREAD)",
+			    "its main thread has ended, which needs Linux 6.9");
+	if (target->pidfd < 0)
+		return fail_errno(err, target->leader, "attach", "pidfd_open", "it has ended");
+	return 0;
+}
+
+int target_follow(struct target *target, struct avc_error *err)
+{
+	return proc_live_thread(target->pid) == target->pid ? 0 : follow(target, err);
+}
+
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err)
 {
-	target->pid = pid;
+	target->leader = pid;
 	target->inside = inside;
-	target->pidfd = proc_pidfd_open(pid);
 	target->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
-	target->mem_fd = proc_open(pid, "mem", O_RDWR);
 	target->timers_fd = proc_open(pid, "timers", O_RDONLY);
+	if (follow(target, err)) {
+		target_close(target);
+		return -1;
+	}
+	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
 	if (target->pidfd < 0 || target->task_dirfd < 0 || target->mem_fd < 0 ||
 	    target->timers_fd < 0) {
 		fail_errno(err, pid, "attach", "open(/proc)", "its /proc can not be read");
@@ -49,6 +101,7 @@ void target_close(struct target *target)
 	close_fd(&target->mem_fd);
 	close_fd(&target->timers_fd);
 	target->pid = 0;
+	target->leader = 0;
 	target->infected = false;
 	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
 	for (uint32_t i = 0; i < target->thread_count; i++) {
@@ -102,16 +155,15 @@ void threads_forget_unseen(struct target *target)
 static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 {
 	const int errnum = errno;
-	char buf[4096], *line;
+	struct proc_status status;
 
 	if (errnum == EPERM) {
-		if (proc_read(tid, "status", buf, sizeof buf) <= 0 || !strstr(buf, "\nVmSize:"))
+		if (proc_status(tid, &status) || status.locked_kb < 0)
 			return fail(err, AVC_GONE, errnum, tid, "stop", "ptrace(SEIZE)",
 				    "it has ended");
-		line = strstr(buf, "\nTracerPid:");
-		if (line && atoi(line + 11))
+		if (status.tracer)
 			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
-				    "it is being traced by process %d", atoi(line + 11));
+				    "it is being traced by process %d", status.tracer);
 	}
 	errno = errnum;
 	return fail_errno(err, tid, "stop", "ptrace(SEIZE)",
@@ -241,6 +293,14 @@ static bool straggle(struct target *target, struct thread *thread)
 		break;
 	}
 	if (arch_regs_get(tid, &now) == 0) {
+		/* Not before it has waited for what it brought forth for us: the app would
+		 * find that. */
+		if (target->waiting && thread->borrowed &&
+		    pad_contains(&target->pad, arch_pc(&now)) &&
+		    !__atomic_load_n(&target->pad.control->runner.done, __ATOMIC_ACQUIRE)) {
+			ptrace(PTRACE_CONT, tid, NULL, 0L);
+			return true;
+		}
 		if (thread->borrowed && pad_contains(&target->pad, arch_pc(&now))) {
 			give_back(thread, &ignored);
 		} else {
@@ -327,7 +387,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
 	const avc_remote out = pad_remote(&target->pad, call->out);
-	struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes;
+	struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
 
 	call_begin(call, INJ_AFTER_HOME);
 	memset(call->out, 0, sizeof call->out);
@@ -338,6 +398,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	 * (fs/proc/base.c, proc_flush_pid()). */
 	inside = call_add(call, SYS_gettid, 0, 0, 0, 0, 0);
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32, 0, 0, 0);
+	locks = thread->tid == target->pid ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
 	attributes = attributes_ask(call, call->out + 64, out + 64);
 	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
 	    pad_run(thread->tid, call, err))
@@ -360,6 +421,9 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	memcpy(thread->name, call->out + 32, sizeof thread->name);
 	thread->name[sizeof thread->name - 1] = 0;
 	attributes_answer(attributes, call->out + 64, &thread->creds);
+	if (locks && locks->result > 0)
+		thread->creds.future_lock = (int32_t)locks->result;
+	thread->creds.filters = filters_read(thread->tid);
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->known = true;
 	thread->asked = 0;

@@ -188,12 +188,9 @@ int tracee_settle(pid_t tid, struct avc_error *err)
 
 bool tracee_is_ours(pid_t tid)
 {
-	char buf[4096], *line;
+	struct proc_status status;
 
-	if (proc_read(tid, "status", buf, sizeof buf) <= 0)
-		return false;
-	line = strstr(buf, "\nTracerPid:");
-	return line && atoi(line + 11) == gettid();
+	return proc_status(tid, &status) == 0 && status.tracer == gettid();
 }
 
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg)

@@ -7,6 +7,7 @@
 
 #include <asm/unistd.h>
 #include <linux/futex.h>
+#include <linux/mman.h>
 #include <linux/prctl.h>
 #include <linux/sched.h>
 
@@ -19,6 +20,7 @@
 #define SYS4(nr, a, b, c, d) \
 	raw_syscall(nr, (uint64_t)(a), (uint64_t)(b), (uint64_t)(c), (uint64_t)(d), 0, 0)
 
+#define __WALL_ 0x40000000 /* <linux/wait.h> */
 #define SPAWN_TRIES 4000
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
@@ -69,6 +71,23 @@ static void make_list(struct inj_syscall *s, uint64_t count)
 					  s[i].arg[3], s[i].arg[4], s[i].arg[5]);
 }
 
+/* Nothing tells but new memory: what is locked can not be dropped, and is there at once
+ * if it is not to be locked on fault only. */
+static long find_future_lock(void)
+{
+	const long at = raw_syscall(__NR_mmap, 0, 4096, PROT_READ | PROT_WRITE,
+				    MAP_PRIVATE | MAP_ANONYMOUS, (uint64_t)-1, 0);
+	uint8_t present = 0;
+	long dropped;
+
+	if (at < 0 && at > -4096)
+		return at;
+	SYS3(__NR_mincore, at, 4096, &present);
+	dropped = SYS3(__NR_madvise, at, 4096, MADV_DONTNEED);
+	SYS2(__NR_munmap, at, 4096);
+	return dropped == 0 ? 0 : MCL_FUTURE | (present & 1 ? 0 : MCL_ONFAULT);
+}
+
 __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 {
 	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++) {
@@ -76,6 +95,13 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 
 		if (s->nr == INJ_LIST)
 			make_list((struct inj_syscall *)s->arg[0], s->arg[1]);
+		else if (s->nr == INJ_WAIT)
+			s->result = i && s[-1].result > 0
+					    ? raw_syscall(__NR_wait4, (uint64_t)s[-1].result, 0,
+							  __WALL_, 0, 0, 0)
+					    : 0;
+		else if (s->nr == INJ_FUTURE_LOCK)
+			s->result = find_future_lock();
 		else if (s->nr == __NR_clone)
 			s->result = inj_clone(s->arg[0], s->arg[1], s->arg[2], s->arg[3],
 					      s->arg[4]);
@@ -150,12 +176,26 @@ static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t want
 	return -17; /* EEXIST */
 }
 
+static long open_pidfd(uint64_t fd, uint64_t pid, uint64_t flags, uint64_t cloexec)
+{
+	const long opened = SYS2(__NR_pidfd_open, pid, flags);
+	long r;
+
+	if (opened < 0)
+		return opened;
+	r = SYS3(__NR_dup3, opened, fd, cloexec);
+	SYS1(__NR_close, opened);
+	return r;
+}
+
 static long make_call(const struct inj_syscall *s)
 {
 	const uint64_t *arg = s->arg;
 
 	if (s->nr == INJ_TIMER_CREATE)
 		return make_timer(arg[0], arg[1], (int32_t *)arg[2], (int32_t)arg[3]);
+	if (s->nr == INJ_PIDFD_OPEN)
+		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
 	return raw_syscall(s->nr, arg[0], arg[1], arg[2], arg[3], arg[4], arg[5]);
 }
 
@@ -205,15 +245,26 @@ static void set_up(struct inj_slot *slot, struct inj_thread *t, int first)
 			fail(slot, INJ_STEP_BASE, t->tid, r);
 	}
 #endif
+	if (t->large_state)
+		inj_make_room(t->large_state);
 	run_setup(slot, t->tid, t->setup);
+}
+
+/* Of one thread, not of its process. */
+__attribute__((section(".text.entry"))) void inj_end(void)
+{
+	for (;;)
+		SYS1(__NR_exit, 0);
 }
 
 /* Waits until the engine says that everybody goes.  An engine that died never
  * will: then init ends the container, and this process must not linger. */
-static void wait_for_go(struct inj_slot *slot)
+static void wait_for_go(struct inj_slot *slot, enum inj_go stage)
 {
-	while (!__atomic_load_n(&slot->go, __ATOMIC_ACQUIRE)) {
-		if (futex_wait(&slot->go, 0, INJ_GO_S * 1000) == -110 /* ETIMEDOUT */)
+	uint32_t go;
+
+	while ((go = __atomic_load_n(&slot->go, __ATOMIC_ACQUIRE)) < stage) {
+		if (futex_wait(&slot->go, go, INJ_GO_S * 1000) == -110 /* ETIMEDOUT */)
 			leave();
 	}
 	__atomic_add_fetch(&slot->running, 1, __ATOMIC_ACQ_REL);
@@ -226,7 +277,7 @@ void inj_thread(struct inj_slot *slot, struct inj_thread *t)
 	set_up(slot, t, 0);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) == slot->threads)
 		futex_wake(&slot->ready);
-	wait_for_go(slot);
+	wait_for_go(slot, INJ_GO_ALL);
 	inj_sigreturn(t->frame);
 }
 
@@ -286,7 +337,9 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 		say(slot, INJ_WRONG_PID);
 		leave();
 	}
-	if (slot->session_leader) {
+	if (slot->placed) {
+		/* by the engine: its children were to have them, too */
+	} else if (slot->session_leader) {
 		r = SYS0(__NR_setsid);
 		if (r < 0)
 			fail(slot, INJ_STEP_SESSION, me->tid, r);
@@ -306,7 +359,7 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_BEFORE]);
 	for (uint32_t i = 1; i < slot->threads; i++)
 		spawn(slot, thread_of(slot, i), &last);
-	set_up(slot, me, 1);
+	set_up(slot, me, !slot->fresh);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) != slot->threads) {
 		uint32_t n;
 
@@ -316,6 +369,10 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_OWNERS]);
 	run_setup(slot, me->tid, slot->setup[INJ_AFTER]);
 	say(slot, INJ_READY);
-	wait_for_go(slot);
+	if (!me->frame) {
+		wait_for_go(slot, INJ_GO_ENDED);
+		inj_end();
+	}
+	wait_for_go(slot, INJ_GO_ALL);
 	inj_sigreturn(me->frame);
 }

@@ -48,6 +48,10 @@ struct inj_syscall {
 
 /* Instead of a number of a system call: arg[1] calls, struct inj_syscall at arg[0]. */
 #define INJ_LIST (-1)
+/* wait4(2) for what the call before it has brought forth. */
+#define INJ_WAIT (-3)
+/* Likewise, with what mlockall(2) was told of memory to come for a result. */
+#define INJ_FUTURE_LOCK (-2)
 
 enum inj_after {
 	INJ_AFTER_HOME = 0, /* go back to the interrupted context (struct inj_home) */
@@ -61,7 +65,7 @@ struct inj_call {
 	uint32_t count;
 	uint32_t after; /* enum inj_after                                      */
 	struct inj_syscall call[INJ_CALLS_MAX];
-	uint8_t out[256]; /* where calls may leave results                      */
+	uint8_t out[512]; /* where calls may leave results                      */
 	uint8_t stack[INJ_STACK_BYTES] __attribute__((aligned(64)));
 };
 
@@ -93,6 +97,8 @@ struct inj_setup {
 
 /* Instead of a system call: timer_create(clock, event, &id) that gives the id arg[3]. */
 #define INJ_TIMER_CREATE (-1)
+/* Likewise: pidfd_open(arg[1], arg[2]), as the descriptor arg[0] with the flags arg[3]. */
+#define INJ_PIDFD_OPEN (-2)
 
 enum inj_setup_flag {
 	INJ_MUST = 0,
@@ -109,15 +115,17 @@ enum inj_stage {
 
 /* One thread to be restored. */
 struct inj_thread {
-	uint64_t frame; /* stack pointer for rt_sigreturn(2)                */
+	/* stack pointer for rt_sigreturn(2), 0: a main thread that ends instead  */
+	uint64_t frame;
 	uint64_t stack; /* initial stack pointer of the new thread          */
 	uint64_t tls;
 	uint64_t clear_tid; /* set_tid_address(2)                               */
 	uint64_t robust_list;
 	uint64_t robust_bytes;
-	uint64_t rseq;       /* address, 0: none registered                      */
-	uint64_t other_base; /* a second base register (x86: gs), 0: none       */
-	uint64_t setup;      /* list of struct inj_setup, by the thread itself   */
+	uint64_t rseq;        /* address, 0: none registered                      */
+	uint64_t other_base;  /* a second base register (x86: gs), 0: none       */
+	uint64_t large_state; /* registers there is no room for yet, 0: none     */
+	uint64_t setup;       /* list of struct inj_setup, by the thread itself   */
 	uint32_t rseq_bytes;
 	uint32_t rseq_signature;
 	int32_t tid; /* inside                                           */
@@ -131,6 +139,12 @@ enum inj_state {
 	INJ_WRONG_PID = 1, /* somebody else took the number: try again          */
 	INJ_FAILED = 2,    /* error, error_at, error_tid say what               */
 	INJ_READY = 3      /* all threads exist and wait for `go`               */
+};
+
+enum inj_go {
+	INJ_GO_NOT = 0,
+	INJ_GO_ENDED = 1, /* a main thread that ends (inj_thread.frame)         */
+	INJ_GO_ALL = 2    /* to the app                                      */
 };
 
 enum inj_step {
@@ -149,7 +163,7 @@ enum inj_step {
 /* One generation's restore, in the restored process. */
 struct inj_slot {
 	uint32_t state;   /* futex, enum inj_state                          */
-	uint32_t go;      /* futex, set by the engine                       */
+	uint32_t go;      /* futex, enum inj_go, set by the engine          */
 	uint32_t ready;   /* threads that have set themselves up            */
 	uint32_t running; /* threads that are about to return to the app    */
 	/* ns_last_pid, written by the engine's helper on request               */
@@ -162,6 +176,9 @@ struct inj_slot {
 	int32_t pid;   /* the app's, inside                              */
 	int32_t group; /* process group, inside                          */
 	uint32_t session_leader;
+	uint32_t placed; /* session and group are right already                */
+	uint32_t fresh;  /* it is not a fork of what it is to be: the first
+			  * thread has to register with rseq(2), too           */
 	int32_t tty_fd; /* -1, or a descriptor of the tty it was in the
 	                       * foreground of                                  */
 	uint32_t threads;
@@ -175,6 +192,7 @@ struct inj_slot {
 /* Entry points, at the addresses the linker put them (inject_blob.h). */
 void inj_run(struct inj_call *call);
 void inj_restore(struct inj_slot *slot);
+void inj_end(void) __attribute__((noreturn));
 
 /* Of arch/ARCH/inject.S. */
 void inj_go_home(void) __attribute__((noreturn));
@@ -182,6 +200,7 @@ long inj_clone(uint64_t flags, uint64_t stack, uint64_t a, uint64_t b, uint64_t 
 long inj_spawn(uint64_t flags, uint64_t stack, uint64_t tls, struct inj_thread *thread,
 	       struct inj_slot *slot, int32_t tid);
 void inj_thread(struct inj_slot *slot, struct inj_thread *thread) __attribute__((noreturn));
+void inj_make_room(uint64_t state);
 void inj_sigreturn(uint64_t frame) __attribute__((noreturn));
 
 #endif

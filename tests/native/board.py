@@ -13,6 +13,7 @@ from types import TracebackType
 MAGIC = 0x31445242544356
 LAYOUT = struct.Struct("<9Q32Q")
 GAP_OFFSET = 5 * 8
+COUNTERS_OFFSET = 9 * 8
 VIOLATION_STATUS = 99
 UNAVAILABLE_STATUS = 77
 
@@ -65,3 +66,7 @@ class Board:
     def forget_gap(self) -> None:
         """From now on gap_ns is the longest gap between beats since now."""
         struct.pack_into("<Q", self.page, GAP_OFFSET, 0)
+
+    def set_counter(self, which: int, value: int) -> None:
+        """For a victim that waits for it."""
+        struct.pack_into("<Q", self.page, COUNTERS_OFFSET + 8 * which, value)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes a thread's floating-point registers behind its back.
+"""Changes a thread's floating-point registers, or has it make system calls, behind its back.
 
 By ptrace(2) itself: gdb 13 can not write them on a CPU whose XSAVE area is larger than it knows (AMX).
 """
@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import signal
 import struct
 
+PTRACE_SINGLESTEP, PTRACE_GETREGS, PTRACE_SETREGS = 9, 12, 13
+PTRACE_SEIZE, PTRACE_INTERRUPT, PTRACE_EVENT_STOP = 0x4206, 0x4207, 128
 PTRACE_GETFPREGS, PTRACE_SETFPREGS, PTRACE_ATTACH, PTRACE_DETACH = 14, 15, 16, 17
 WALL = 0x40000000
 # Where they are in struct user_fpregs_struct (the FXSAVE area).
@@ -31,7 +34,54 @@ def set_fpu_register(tid: int, name: str, value: int) -> None:
         _ptrace(PTRACE_DETACH, tid)
 
 
-def _ptrace(request: int, tid: int, data: ctypes.Array[ctypes.c_char] | None = None) -> None:
+# Words of struct user_regs_struct.
+REGS_WORDS = 27
+RAX, RIP, ORIG_RAX = 10, 16, 15
+ARGUMENTS = (14, 13, 12, 7, 9, 8)
+"""rdi, rsi, rdx, r10, r8, r9."""
+WORD = (1 << 64) - 1
+
+
+def remote_syscall(tid: int, number: int, *args: int) -> int:
+    """Has a thread that nobody traces, and that is blocked in a system call, make another one first; its result.
+
+    Raises BlockingIOError when this is no moment for it: try again.
+    """
+    saved = ctypes.create_string_buffer(REGS_WORDS * 8)
+    signal_to_take = 0
+    _ptrace(PTRACE_SEIZE, tid)
+    try:
+        _ptrace(PTRACE_INTERRUPT, tid)
+        _, status = os.waitpid(tid, WALL)
+        if status >> 16 != PTRACE_EVENT_STOP:
+            signal_to_take = os.WSTOPSIG(status)
+            raise BlockingIOError(f"thread {tid} has a signal to take first")
+        _ptrace(PTRACE_GETREGS, tid, saved)
+        registers = list(struct.unpack(f"{REGS_WORDS}Q", saved.raw))
+        if registers[ORIG_RAX] == WORD:
+            raise BlockingIOError(f"thread {tid} is not in a system call")
+        # rip is behind the `syscall` instruction, two bytes long, that it will make again.
+        registers[RIP] -= 2
+        registers[RAX], registers[ORIG_RAX] = number, WORD
+        for register, value in zip(ARGUMENTS, args):
+            registers[register] = value & WORD
+        _ptrace(PTRACE_SETREGS, tid, ctypes.create_string_buffer(struct.pack(f"{REGS_WORDS}Q", *registers)))
+        _ptrace(PTRACE_SINGLESTEP, tid)
+        _, status = os.waitpid(tid, WALL)
+        if os.WSTOPSIG(status) != signal.SIGTRAP:
+            _ptrace(PTRACE_SETREGS, tid, saved)
+            signal_to_take = os.WSTOPSIG(status)
+            raise BlockingIOError(f"thread {tid} has a signal to take first")
+        after = ctypes.create_string_buffer(REGS_WORDS * 8)
+        _ptrace(PTRACE_GETREGS, tid, after)
+        result: int = struct.unpack_from("q", after, RAX * 8)[0]
+        _ptrace(PTRACE_SETREGS, tid, saved)
+        return result
+    finally:
+        _ptrace(PTRACE_DETACH, tid, signal_to_take)
+
+
+def _ptrace(request: int, tid: int, data: ctypes.Array[ctypes.c_char] | int | None = None) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     libc.ptrace.argtypes = (ctypes.c_long, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
     libc.ptrace.restype = ctypes.c_long

@@ -6,6 +6,7 @@ from __future__ import annotations
 import random
 import signal
 import socket
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -266,3 +267,80 @@ def test_killed_at_random_moments(scenario: str, tmp_path: Path) -> None:
         disturb(victim)
         restored(victim, guard)
         assert guard.fds() <= fds + 2  # the second generation's
+
+
+@pytest.fixture
+def other(memory: Path, tmp_path: Path) -> None:
+    """A folder on another file system, where tests/victims/inotify looks for it."""
+    (tmp_path / "other").symlink_to(memory)
+
+
+@pytest.mark.parametrize("scenario", ["changed", "closed", "reused"])
+@pytest.mark.usefixtures("other")
+def test_watches(scenario: str, tmp_path: Path) -> None:
+    """The watches of the checkpoint, under their own numbers, and no event of what was done to them."""
+    with (
+        Victim(f"inotify {scenario} {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        for _ in range(2):
+            checkpoint(guard)
+            for _kill in range(KILLS):
+                disturb(victim)
+                event = restored(victim, guard)
+                assert "error" not in event, event
+
+
+@pytest.fixture
+def overlay(memory: Path, tmp_path: Path) -> Iterator[Path]:
+    """A folder on an overlay, as a container's root is one; upper folder on a disk."""
+    for name in ("lower", "upper", "work", "merged"):
+        (tmp_path / name).mkdir()
+    layers = f"lowerdir={tmp_path}/lower,upperdir={tmp_path}/upper,workdir={tmp_path}/work"
+    subprocess.run(["mount", "-t", "overlay", "overlay", "-o", layers, tmp_path / "merged"], check=True)
+    (tmp_path / "merged/other").symlink_to(memory)
+    yield tmp_path / "merged"
+    subprocess.run(["umount", tmp_path / "merged"], check=True)
+
+
+def test_watches_on_an_overlay(overlay: Path, memory: Path) -> None:
+    """Of which no handle can be opened."""
+    with (
+        Victim(f"inotify closed {overlay}", memory) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        for _kill in range(KILLS):
+            disturb(victim)
+            event = restored(victim, guard)
+            assert "error" not in event, event
+
+
+@pytest.mark.usefixtures("other")
+def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
+    with Victim(f"inotify gone {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        assert "not all of what it watched" in restored(victim, guard)["error"]["detail"]
+
+
+@pytest.mark.parametrize("scenario", ["messages", "pidfds"])
+def test_sockets(scenario: str, tmp_path: Path) -> None:
+    """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
+    with (
+        Victim(f"sockets {scenario} {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        for _ in range(2):
+            checkpoint(guard)
+            for _kill in range(KILLS):
+                disturb(victim)
+                event = restored(victim, guard)
+                assert "error" not in event, event
+
+
+def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
+    with Victim(f"sockets rights {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        victim.kill_app()
+        assert "descriptors that were on their way" in guard.wait("restored")["error"]["detail"]

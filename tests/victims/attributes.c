@@ -7,6 +7,7 @@
  * Needs root.  With --inherited only the process is changed, and all threads are alike.
  */
 #include <linux/capability.h>
+#include <linux/mempolicy.h>
 #include <pthread.h>
 #include <sched.h>
 #include <signal.h>
@@ -83,7 +84,8 @@ static void add_prctl_to(struct look *look, const char *name, int option)
 static void look_at_me(struct look *look)
 {
 	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
-	uint32_t attr[12] = { 0 }, caps[6], id[3];
+	uint32_t attr[12] = { 0 }, caps[6], id[3], groups[8];
+	unsigned long nodes[16];
 	char path[1024];
 	int i;
 
@@ -100,6 +102,10 @@ static void look_at_me(struct look *look)
 	must(!syscall(SYS_sched_getattr, 0, attr, sizeof(attr), 0), "sched_getattr");
 	for (i = 0; i < 12; i++)
 		add(look, "sched %d: %u\n", i, attr[i]);
+	i = (int)syscall(SYS_getgroups, 8, groups);
+	add(look, "groups %d: %u %u\n", i, i > 0 ? groups[0] : 0, i > 1 ? groups[1] : 0);
+	if (!syscall(SYS_get_mempolicy, &i, nodes, 64 * 16, 0, 0))
+		add(look, "memory policy %d of %lx\n", i, nodes[0]);
 	add(look, "ioprio %ld\n", syscall(SYS_ioprio_get, 1, 0));
 	add(look, "fsuid %ld fsgid %ld\n", syscall(SYS_setfsuid, -1), syscall(SYS_setfsgid, -1));
 	add_prctl(look, "slack", PR_GET_TIMERSLACK);
@@ -205,13 +211,29 @@ static void set_death_signal(void)
 	must(!prctl(PR_SET_PDEATHSIG, SIGUSR1), "PR_SET_PDEATHSIG");
 }
 
+static void set_groups(void)
+{
+	const gid_t groups[] = { 2001, 2002 };
+
+	must(!syscall(SYS_setgroups, 2, groups), "setgroups");
+}
+
+static void set_memory_policy(void)
+{
+	const unsigned long node = 1;
+
+	if (syscall(SYS_set_mempolicy, MPOL_BIND, &node, 64))
+		must(errno == ENOSYS, "set_mempolicy");
+}
+
 static void set_nothing(void)
 {
 }
 
 static void (*const kinds[])(void) = {
-	set_nice,    set_round_robin,  set_batch,        set_io_priority,    set_slack,   set_user,
-	set_fs_user, set_no_new_privs, set_death_signal, set_user_with_caps, set_nothing,
+	set_nice,   set_round_robin,   set_batch,        set_io_priority,  set_slack,
+	set_user,   set_fs_user,       set_no_new_privs, set_death_signal, set_user_with_caps,
+	set_groups, set_memory_policy, set_nothing,
 };
 
 static void *work(void *arg)

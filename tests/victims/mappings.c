@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited]: memory of every kind a plain fork does not carry as it is,
+ * mappings [SHARED_KB] [--inherited] [--huge] [--future] [--large]: memory of every kind a plain fork does not carry as it is,
  * and kinds that are easily forgotten.  Each is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
@@ -12,10 +12,15 @@
  * - locked memory (mlock), as far as the limits allow
  * - anonymous shared memory of SHARED_KB (64; 0: none), which must be of one
  *   instant with the private memory
+ * - areas with a memory policy, and with marks (MADV_HUGEPAGE and others)
  * - mappings that come and go all the time
  *
- * With --inherited the first two are ordinary memory.
+ * With --inherited the first two are ordinary memory; with --huge the shared memory is of
+ * huge pages;
+ * with --large there are 64 MB more of shared memory, of which nothing is expected;
+ * with --future all memory that comes is locked (mlockall).
  */
+#include <linux/mempolicy.h>
 #include <setjmp.h>
 #include <signal.h>
 #include <sys/resource.h>
@@ -97,6 +102,23 @@ static void check_fault(volatile uint64_t *at, bool by_writing, const char *what
 	}
 }
 
+static bool future;
+
+/* What is new is locked.  (Not what was mapped just before a checkpoint: which areas are
+ * locked is looked at now and then only.) */
+static void check_future(void)
+{
+	bool locked = false;
+
+	for (int tries = 0; future && !locked && tries < 5; tries++) {
+		void *at = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+
+		locked = madvise(at, BYTES, MADV_DONTNEED) && errno == EINVAL;
+		munmap(at, BYTES);
+	}
+	CHECK(locked || !future, "new memory is not locked");
+}
+
 static void come_and_go(void)
 {
 	uint64_t *at = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
@@ -108,6 +130,35 @@ static void come_and_go(void)
 	CHECK(!munmap(at, BYTES), "munmap: %s", strerror(errno));
 }
 
+static uint64_t *bound; /* to a node of memory; NULL: the kernel knows none */
+
+/* Areas of which a test compares the marks. */
+static void mark_kinds(void)
+{
+	static const int kinds[] = { MADV_HUGEPAGE, MADV_NOHUGEPAGE, MADV_DONTDUMP,
+				     MADV_MERGEABLE };
+	const unsigned long node = 1;
+
+	/* A kernel may be without one or the other. */
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++)
+		must(!madvise(map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1), BYTES,
+			      kinds[i]) ||
+			     errno == EINVAL,
+		     "madvise");
+	bound = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	if (syscall(SYS_mbind, bound, BYTES, MPOL_BIND, &node, 64, 0))
+		bound = NULL;
+}
+
+static void check_bound(void)
+{
+	int policy = -1;
+
+	CHECK(!bound || (!syscall(SYS_get_mempolicy, &policy, NULL, 0, bound, MPOL_F_ADDR) &&
+			 policy == MPOL_BIND),
+	      "the policy of an area is %d", policy);
+}
+
 int main(int argc, char **argv)
 {
 	struct sigaction act = { .sa_handler = on_fault };
@@ -115,11 +166,14 @@ int main(int argc, char **argv)
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited;
+	bool inherited, huge, large;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
-	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited]");
+	huge = victim_flag(&argc, argv, "--huge");
+	future = victim_flag(&argc, argv, "--future");
+	large = victim_flag(&argc, argv, "--large");
+	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge] [--future] [--large]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -148,16 +202,22 @@ int main(int argc, char **argv)
 	regions[n++] = (struct region){ "the heap", heap, BYTES / 8 };
 	if (shared_kb) {
 		void *at = mmap(NULL, shared_kb << 10, PROT_READ | PROT_WRITE,
-				MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+				MAP_SHARED | MAP_ANONYMOUS | (huge ? MAP_HUGETLB : 0), -1, 0);
 
 		must(at != MAP_FAILED, "mmap");
 		regions[n++] = (struct region){ "shared memory", at, (shared_kb << 10) / 8 };
 	}
+	/* Below the other, so that it is found first. */
+	must(!large || mmap(NULL, 64 << 20, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1,
+			    0) != MAP_FAILED,
+	     "mmap");
+	mark_kinds();
 	read_only = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	read_only[3] = 333;
 	must(!mprotect(read_only, BYTES, PROT_READ), "mprotect");
 	none = map(PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	write_all(regions, n);
+	must(!future || !mlockall(MCL_FUTURE), "mlockall");
 	victim_ready();
 	for (lap = 0;; lap++) {
 		check_all(regions, n);
@@ -169,6 +229,8 @@ int main(int argc, char **argv)
 		CHECK(((char *)regions[2].at)[BYTES - 1] == 'f', "the file's own page is %x",
 		      ((unsigned char *)regions[2].at)[BYTES - 1]);
 		come_and_go();
+		check_future();
+		check_bound();
 		if (lap % 1024 == 0 && lap < 65536) {
 			brk_at = sbrk(4096);
 			CHECK(brk_at != (void *)-1, "sbrk: %s", strerror(errno));

@@ -2,7 +2,7 @@
  *
  * unsupported KIND [AFTER_SECONDS [FOR_SECONDS]]: a process that can not be
  * checkpointed, from AFTER_SECONDS after its start (0), for FOR_SECONDS (0: for
- * ever; not every kind can be undone).  Beats every 1 ms; counter 0 is 1 while it
+ * ever; not every kind can be undone); AFTER_SECONDS "signal": from SIGUSR1 on.  Beats every 1 ms; counter 0 is 1 while it
  * is as it says.
  *
  *   iouring   has an io_uring
@@ -12,9 +12,18 @@
  *   sysvsem   has SysV semaphores with undo
  *   shared    64 MB of anonymous shared memory
  *   userfault has a userfaultfd
+ *   huge      private memory of huge pages
+ *   nested    children would get a PID namespace of their own
+ *   filter    one thread under a seccomp filter more than the others, which have one
+ *   groups    one thread with other groups, which the main thread may not set
+ *   hugefile  the same, of a file (a memfd)
  */
 #include <linux/aio_abi.h>
+#include <linux/capability.h>
+#include <linux/filter.h>
 #include <linux/io_uring.h>
+#include <linux/seccomp.h>
+#include <pthread.h>
 #include <sched.h>
 #include <signal.h>
 #include <sys/ipc.h>
@@ -130,6 +139,97 @@ static void stop_shared(void)
 	munmap(memory, 64 << 20);
 }
 
+static bool start_huge(void)
+{
+	memory = mmap(NULL, 2 << 20, PROT_READ | PROT_WRITE,
+		      MAP_PRIVATE | MAP_ANONYMOUS | MAP_HUGETLB, -1, 0);
+	if (memory == MAP_FAILED)
+		return false;
+	memset(memory, 7, 2 << 20);
+	return true;
+}
+
+static bool start_hugefile(void)
+{
+	int file = memfd_create("huge", MFD_CLOEXEC | MFD_HUGETLB);
+
+	if (file < 0 || ftruncate(file, 2 << 20))
+		return false;
+	memory = mmap(NULL, 2 << 20, PROT_READ | PROT_WRITE, MAP_PRIVATE, file, 0);
+	close(file);
+	if (memory == MAP_FAILED)
+		return false;
+	memset(memory, 7, 2 << 20);
+	return true;
+}
+
+static void stop_huge(void)
+{
+	munmap(memory, 2 << 20);
+}
+
+static bool start_nested(void)
+{
+	return unshare(CLONE_NEWPID) == 0;
+}
+
+static bool add_filter(void)
+{
+	struct sock_filter all[] = { BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW) };
+	struct sock_fprog program = { 1, all };
+
+	return !prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) &&
+	       !syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, 0, &program);
+}
+
+static void *filtered(void *arg)
+{
+	if (!add_filter())
+		unavailable("seccomp");
+	(void)arg;
+	for (;;)
+		pause();
+	return NULL;
+}
+
+static bool start_filter(void)
+{
+	pthread_t thread;
+
+	return add_filter() && !pthread_create(&thread, NULL, filtered, NULL);
+}
+
+static void *grouped(void *arg)
+{
+	const gid_t group = 4711;
+
+	if (syscall(SYS_setgroups, 1, &group))
+		unavailable("setgroups");
+	*(volatile bool *)arg = true;
+	for (;;)
+		pause();
+	return NULL;
+}
+
+static bool start_groups(void)
+{
+	static volatile bool done;
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2] = { { 0 } };
+	pthread_t thread;
+
+	if (pthread_create(&thread, NULL, grouped, (void *)&done))
+		return false;
+	while (!done)
+		nap_us(100);
+	/* Of the main thread, which has no more than the other: but for this one, it would be
+	 * refused for that. */
+	if (syscall(SYS_capget, &header, data))
+		return false;
+	data[0].effective &= ~(1u << CAP_SETGID);
+	return !syscall(SYS_capset, &header, data);
+}
+
 static const struct kind {
 	const char *name;
 	bool (*start)(void);
@@ -138,13 +238,17 @@ static const struct kind {
 	{ "iouring", start_iouring, stop_fd },     { "aio", start_aio, stop_aio },
 	{ "traced", start_traced, NULL },          { "sysvshm", start_sysvshm, stop_sysvshm },
 	{ "sysvsem", start_sysvsem, NULL },        { "shared", start_shared, stop_shared },
-	{ "userfault", start_userfault, stop_fd },
+	{ "userfault", start_userfault, stop_fd }, { "huge", start_huge, stop_huge },
+	{ "nested", start_nested, NULL },          { "filter", start_filter, NULL },
+	{ "groups", start_groups, NULL },          { "hugefile", start_hugefile, stop_huge },
 };
 
 int main(int argc, char **argv)
 {
 	const struct kind *kind = kinds, *end = kinds + sizeof(kinds) / sizeof(kinds[0]);
 	uint64_t from_ns, to_ns = 0;
+	bool on_signal;
+	sigset_t usr1;
 
 	victim_start(&argc, argv, 1, "KIND [AFTER_SECONDS [FOR_SECONDS]]");
 	while (kind < end && strcmp(kind->name, argv[1]))
@@ -153,11 +257,16 @@ int main(int argc, char **argv)
 		fprintf(stderr, "unsupported: no kind is called %s\n", argv[1]);
 		return 2;
 	}
-	from_ns = now_ns() + (uint64_t)((argc > 2 ? atof(argv[2]) : 0) * 1e9);
-	if (argc > 3 && atof(argv[3]) > 0)
-		to_ns = from_ns + (uint64_t)(atof(argv[3]) * 1e9);
+	sigemptyset(&usr1);
+	sigaddset(&usr1, SIGUSR1);
+	sigprocmask(SIG_BLOCK, &usr1, NULL);
+	on_signal = argc > 2 && !strcmp(argv[2], "signal");
+	from_ns = on_signal ? UINT64_MAX
+			    : now_ns() + (uint64_t)((argc > 2 ? atof(argv[2]) : 0) * 1e9);
 	board->counter[0] = 0;
 	while (now_ns() < from_ns || !board->counter[0]) {
+		if (on_signal && sigtimedwait(&usr1, NULL, &(struct timespec){ 0 }) == SIGUSR1)
+			from_ns = now_ns();
 		if (now_ns() >= from_ns) {
 			if (!kind->start())
 				unavailable(kind->name);
@@ -168,6 +277,8 @@ int main(int argc, char **argv)
 		beat();
 		nap_us(1000);
 	}
+	if (argc > 3 && atof(argv[3]) > 0)
+		to_ns = from_ns + (uint64_t)(atof(argv[3]) * 1e9);
 	for (;;) {
 		if (to_ns && now_ns() >= to_ns && kind->stop) {
 			kind->stop();

@@ -211,6 +211,48 @@ size_t arch_xstate_bytes(void)
 	return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
 }
 
+/* AMX tile data (arch/x86/kernel/fpu/xstate.c, XFEATURE_MASK_USER_DYNAMIC).  Of these 8 kB
+ * a thread has nothing until it first uses them, and its signal frames are by so much
+ * smaller: in one of another size rt_sigreturn(2) finds no more than the SSE registers. */
+#define DYNAMIC (UINT64_C(1) << 18)
+#define FEATURES_OFFSET 512 /* of XSTATE_BV */
+#define LEGACY_BYTES 576    /* with the header behind it */
+
+static uint64_t enabled_features(void)
+{
+	uint32_t low, high;
+
+	__asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+	return (uint64_t)high << 32 | low;
+}
+
+/* Of a thread without. */
+static size_t plain_bytes(void)
+{
+	static size_t bytes; /* see above */
+	size_t found = LEGACY_BYTES;
+
+	if (__atomic_load_n(&bytes, __ATOMIC_RELAXED))
+		return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
+	for (unsigned int i = 2; i < 63; i++) {
+		unsigned int size, offset, c, d;
+
+		if ((enabled_features() & ~DYNAMIC) >> i & 1 &&
+		    __get_cpuid_count(0xd, i, &size, &offset, &c, &d) && offset + size > found)
+			found = offset + size;
+	}
+	__atomic_store_n(&bytes, found, __ATOMIC_RELAXED);
+	return found;
+}
+
+bool arch_frame_needs_room(const void *frame)
+{
+	uint64_t features;
+
+	memcpy(&features, (const uint8_t *)frame + FEATURES_OFFSET, sizeof features);
+	return features & DYNAMIC;
+}
+
 static size_t xstate_room(void)
 {
 	return (arch_xstate_bytes() + sizeof(uint32_t) + 63) & ~(size_t)63;
@@ -221,58 +263,23 @@ size_t arch_frame_bytes(void)
 	return xstate_room() + ((sizeof(struct frame) + 63) & ~(size_t)63);
 }
 
-/* AMX's tiles, the one state that the kernel makes room for only when a thread
- * first uses it (arch/x86/kernel/fpu/xstate.c, XFEATURE_MASK_USER_DYNAMIC).  Of a
- * thread that has not, it takes no frame that is larger than what comes before, and
- * sets it back to the legacy registers only (fpu/signal.c,
- * check_xstate_in_sigframe()). */
-#define TILE_DATA 18
-#define TILE_DATA_BIT (UINT64_C(1) << TILE_DATA)
-#define XSTATE_BV_OFFSET 512
-
-static size_t xstate_bytes_without_tiles(void)
-{
-	static size_t bytes;
-	unsigned int size, offset, c, d;
-
-	if (!__atomic_load_n(&bytes, __ATOMIC_RELAXED)) {
-		size_t found = arch_xstate_bytes();
-
-		/* Leaf 0xd, one subleaf for each state: where it begins. */
-		if (__get_cpuid_count(0xd, TILE_DATA, &size, &offset, &c, &d) && size && offset &&
-		    offset + size == found)
-			found = offset;
-		__atomic_store_n(&bytes, found, __ATOMIC_RELAXED);
-	}
-	return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
-}
-
-static bool uses_tiles(const uint8_t *xstate)
-{
-	uint64_t present;
-
-	memcpy(&present, xstate + XSTATE_BV_OFFSET, sizeof present);
-	return present & TILE_DATA_BIT;
-}
-
-static int read_xstate(pid_t tid, void *frame, size_t bytes)
-{
-	struct iovec iov = { frame, bytes };
-
-	if (ptrace(PTRACE_GETREGSET, tid, NT_X86_XSTATE, &iov) == -1)
-		return -1;
-	if (iov.iov_len != bytes) {
-		errno = EOVERFLOW;
-		return -1;
-	}
-	return 0;
-}
-
 int arch_frame_read_xstate(pid_t tid, void *frame)
 {
-	if (read_xstate(tid, frame, xstate_bytes_without_tiles()))
-		return -1;
-	return uses_tiles(frame) ? read_xstate(tid, frame, arch_xstate_bytes()) : 0;
+	size_t bytes = plain_bytes();
+
+	for (;;) {
+		struct iovec iov = { frame, bytes };
+
+		if (ptrace(PTRACE_GETREGSET, tid, NT_X86_XSTATE, &iov) == -1)
+			return -1;
+		if (iov.iov_len != bytes) {
+			errno = EOVERFLOW;
+			return -1;
+		}
+		if (bytes == arch_xstate_bytes() || !arch_frame_needs_room(frame))
+			return 0;
+		bytes = arch_xstate_bytes();
+	}
 }
 
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
@@ -280,8 +287,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 {
 	const struct user_regs_struct *r = &regs->r;
 	uint8_t *xstate = frame;
-	const bool tiles = uses_tiles(xstate);
-	const size_t bytes = tiles ? arch_xstate_bytes() : xstate_bytes_without_tiles();
+	const bool dynamic = arch_frame_needs_room(frame);
+	const size_t bytes = dynamic ? arch_xstate_bytes() : plain_bytes();
 	const uint32_t magic2 = SW_MAGIC2;
 	struct sw_bytes sw = { .magic1 = SW_MAGIC1,
 			       .extended_bytes = (uint32_t)(bytes + sizeof magic2),
@@ -290,8 +297,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 
 	/* ptrace leaves XCR0 where the signal frame wants its features. */
 	memcpy(&sw.features, xstate + SW_OFFSET, sizeof sw.features);
-	if (!tiles)
-		sw.features &= ~TILE_DATA_BIT;
+	if (!dynamic)
+		sw.features &= ~DYNAMIC;
 	memcpy(xstate + SW_OFFSET, &sw, sizeof sw);
 	memcpy(xstate + bytes, &magic2, sizeof magic2);
 

@@ -16,6 +16,7 @@
 
 #define ARCH_NAME "x86-64"
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
+#define ARCH_PAGE_BYTES 4096
 
 struct arch_regs {
 	struct user_regs_struct r;
@@ -109,6 +110,9 @@ size_t arch_xstate_bytes(void);
  * inj_sigreturn(). */
 size_t arch_frame_bytes(void);
 int arch_frame_read_xstate(pid_t tid, void *frame);
+/* Whether the frame, which was read, has state that the kernel gives a new thread no room
+ * for until it uses it (AMX tiles): inj_make_room() has to be called before. */
+bool arch_frame_needs_room(const void *frame);
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
 			    uint64_t sigmask, const uint64_t altstack[3]);
 

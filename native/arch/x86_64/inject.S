@@ -102,6 +102,15 @@ inj_spawn:
 	call	inj_thread
 	ud2
 
+/* To use AMX tiles makes the kernel give the thread room for them.  (%rdi: XSAVE image) */
+	.globl	inj_make_room
+	.type	inj_make_room, @function
+inj_make_room:
+	movl	$0x40000, %eax
+	xorl	%edx, %edx
+	xrstor64 (%rdi)
+	ret
+
 	.globl	inj_sigreturn
 	.type	inj_sigreturn, @function
 inj_sigreturn:

@@ -1,0 +1,831 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The kernel has no call that gives a process another parent, and a fork of a template is
+ * init's child.  So only the main process is forked from its template; the others are
+ * forked by their own restored parents, under their own numbers, and then made what their
+ * templates are: memory (remap.c), descriptors, signal handlers, credentials.  All of them
+ * are tracees that rest in a pad until everything is there.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <sched.h>
+#include <signal.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/resource.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define TRIES 64
+#define TRY_AGAIN_US 200
+#define SIGNALS 64
+#define AUXV_BYTES 1024
+
+/* ---- a puppet -------------------------------------------------------------------- */
+
+struct letter { /* in the pad: one recvmsg(2) that brings one descriptor           */
+	struct msghdr head;
+	struct iovec io;
+	uint8_t byte;
+	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
+};
+
+/* The list of calls is where files_restore.c has its own, which is not in use any more. */
+static void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot)
+{
+	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2 + sizeof(struct letter);
+
+	puppet->pad = pad;
+	puppet->call = &pad->control->holder;
+	puppet->list = (struct inj_syscall *)(((uintptr_t)memory + 63) & ~(uintptr_t)63);
+	puppet->list_max =
+		(INJ_FILES_BYTES / 2 - sizeof(struct letter) - 64) / sizeof *puppet->list;
+	puppet->listed = 0;
+}
+
+void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
+		 uint64_t e, uint64_t f)
+{
+	if (puppet->listed < puppet->list_max)
+		puppet->list[puppet->listed] =
+			(struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, f } };
+	puppet->listed++;
+}
+
+static int puppet_run(struct puppet *puppet, struct avc_error *err)
+{
+	const uint32_t listed = puppet->listed;
+
+	puppet->listed = 0;
+	if (!listed)
+		return 0;
+	if (listed > puppet->list_max)
+		return fail(err, AVC_UNSUPPORTED, 0, puppet->pid, "restore", "",
+			    "it has more mappings than there is room for");
+	call_begin(puppet->call, INJ_AFTER_PARK);
+	call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list), listed, 0, 0, 0);
+	return pad_send(puppet->pad, puppet->pid, &puppet->base, puppet->call, err) ||
+			       pad_run(puppet->pid, puppet->call, err)
+		       ? -1
+		       : 0;
+}
+
+int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
+{
+	const uint32_t listed = puppet->listed;
+
+	if (puppet_run(puppet, err))
+		return -1;
+	for (uint32_t i = 0; i < listed; i++) {
+		const struct inj_syscall *s = &puppet->list[i];
+
+		if (s->result < 0 && s->result > -4096)
+			return fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore", what,
+				    "call %u of %u at %lx", i + 1, listed,
+				    (unsigned long)s->arg[0]);
+	}
+	return 0;
+}
+
+/* Room for arguments, behind the list of calls. */
+static void *puppet_data(const struct puppet *puppet, avc_remote *remote)
+{
+	void *data = puppet->call->out;
+
+	*remote = pad_remote(puppet->pad, data);
+	return data;
+}
+
+static avc_remote write_letter(const struct puppet *puppet)
+{
+	avc_remote remote;
+	struct letter *letter = puppet_data(puppet, &remote);
+
+	_Static_assert(sizeof *letter <= sizeof puppet->call->out, "room for a letter");
+	*letter = (struct letter){ 0 };
+	letter->io = (struct iovec){ (void *)(remote + offsetof(struct letter, byte)), 1 };
+	letter->head = (struct msghdr){
+		.msg_iov = (void *)(remote + offsetof(struct letter, io)),
+		.msg_iovlen = 1,
+		.msg_control = (void *)(remote + offsetof(struct letter, control)),
+		.msg_controllen = sizeof letter->control,
+	};
+	return remote;
+}
+
+/* Everything its parent had open is closed; descriptor 0 is a socket of which we have the
+ * other end. */
+static int open_mail(struct puppet *puppet, struct avc_error *err)
+{
+	avc_remote out;
+	int pidfd;
+
+	(void)puppet_data(puppet, &out);
+	puppet_call(puppet, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	if (puppet_flush(puppet, "socketpair", err))
+		return -1;
+	pidfd = proc_pidfd_open(puppet->pid);
+	puppet->socket = pidfd < 0 ? -1 : files_borrow(pidfd, 1);
+	close_fd(&pidfd);
+	if (puppet->socket < 0)
+		return fail_errno(err, puppet->pid, "restore", "pidfd_getfd", "it was killed");
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	return puppet_flush(puppet, "close", err);
+}
+
+int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
+{
+	/* What is not received yet waits in the socket. */
+	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "recvmsg", err))
+		return -1;
+	if (files_send(puppet->socket, fd)) {
+		if (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
+		    files_send(puppet->socket, fd))
+			return fail_errno(err, puppet->pid, "restore", "sendmsg",
+					  "a descriptor could not be handed over");
+	}
+	puppet_call(puppet, SYS_recvmsg, 0, write_letter(puppet), MSG_CMSG_CLOEXEC | MSG_DONTWAIT,
+		    0, 0, 0);
+	return 0;
+}
+
+/* ---- what a template has besides memory and descriptors ---------------------------- */
+
+struct action { /* struct sigaction as the kernel has it                          */
+	uint64_t handler, flags, restorer, mask;
+};
+
+struct manner {
+	struct action action[SIGNALS];
+	int64_t brk, personality, dumpable;
+	uint32_t umask;
+	uint32_t group_count;
+	uint32_t group[64];
+	uint64_t mm[11]; /* of struct prctl_mm_map, but for brk                   */
+	uint32_t auxv_bytes;
+	uint8_t auxv[AUXV_BYTES];
+};
+
+enum { START_CODE, END_CODE, START_DATA, END_DATA, START_BRK, BRK, START_STACK, ARG_START, ARG_END,
+       ENV_START, ENV_END };
+
+static int read_mm(pid_t pid, struct manner *manner)
+{
+	/* Fields of /proc/PID/stat after the name, counted from `state` as 3. */
+	static const struct {
+		int field, to;
+	} fields[] = { { 26, START_CODE }, { 27, END_CODE },   { 28, START_STACK },
+		       { 45, START_DATA }, { 46, END_DATA },   { 47, START_BRK },
+		       { 48, ARG_START },  { 49, ARG_END },    { 50, ENV_START },
+		       { 51, ENV_END } };
+	char buf[1024], *p;
+	ssize_t n;
+	int fd;
+
+	if (proc_read(pid, "stat", buf, sizeof buf) <= 0 || !(p = strrchr(buf, ')')))
+		return -1;
+	p++;
+	for (int field = 3; *p; field++) {
+		char *next;
+
+		while (*p == ' ')
+			p++;
+		for (size_t i = 0; i < sizeof fields / sizeof *fields; i++)
+			if (fields[i].field == field)
+				manner->mm[fields[i].to] = strtoull(p, NULL, 10);
+		next = strchr(p, ' ');
+		if (!next)
+			break;
+		p = next;
+	}
+	fd = proc_open(pid, "auxv", O_RDONLY);
+	n = fd < 0 ? -1 : read(fd, manner->auxv, sizeof manner->auxv);
+	close_fd(&fd);
+	manner->auxv_bytes = n > 0 ? (uint32_t)n : 0;
+	return 0;
+}
+
+static int read_status(pid_t pid, struct manner *manner)
+{
+	char buf[8192], *line;
+
+	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
+		return -1;
+	line = strstr(buf, "\nUmask:");
+	manner->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
+	line = strstr(buf, "\nGroups:");
+	for (char *p = line ? line + 8 : buf + strlen(buf);
+	     manner->group_count < sizeof manner->group / sizeof *manner->group;) {
+		char *next;
+		const unsigned long group = strtoul(p, &next, 10);
+
+		if (next == p || memchr(p, '\n', (size_t)(next - p)))
+			break;
+		manner->group[manner->group_count++] = (uint32_t)group;
+		p = next;
+	}
+	return 0;
+}
+
+int branch_learn(struct branch *branch, struct avc_error *err)
+{
+	const struct pad *pad = &branch->target->pad;
+	struct generation *image = branch->image;
+	struct inj_call *call = &pad_slot(pad, image->slot)->template_call;
+	uint8_t *memory = pad_files(pad, image->slot) + INJ_FILES_BYTES / 2;
+	struct inj_syscall *list = (struct inj_syscall *)memory;
+	struct action *action = (struct action *)(list + SIGNALS + 8);
+	struct manner *manner = calloc(1, sizeof *manner);
+	uint32_t n = 0;
+
+	branch->manner = manner;
+	if (!manner)
+		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+	for (int i = 0; i < SIGNALS; i++)
+		list[n++] = (struct inj_syscall){ .nr = SYS_rt_sigaction,
+						  .arg = { (uint64_t)i + 1, 0,
+							   pad_remote(pad, &action[i]), 8 } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
+	list[n++] = (struct inj_syscall){ .nr = SYS_personality, .arg = { 0xffffffff } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_DUMPABLE } };
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
+	if (pad_send(pad, image->template, &image->base, call, err) ||
+	    pad_run(image->template, call, err))
+		return -1;
+	memcpy(manner->action, action, sizeof manner->action);
+	manner->brk = list[SIGNALS].result;
+	manner->personality = list[SIGNALS + 1].result;
+	manner->dumpable = list[SIGNALS + 2].result;
+	if (read_mm(image->template, manner) || read_status(image->template, manner))
+		return fail_errno(err, image->template, "keep template", "open(/proc)",
+				  "it was killed");
+	return 0;
+}
+
+void branch_setup_groups(const struct branch *branch, struct setup *setup)
+{
+	const struct manner *manner = branch->manner;
+	const avc_remote list = setup_data(setup, manner->group, sizeof manner->group);
+
+	setup_add_thread(setup, "setgroups", SYS_setgroups, manner->group_count, list, 0, 0, 0);
+}
+
+void branch_setup_dumpable(const struct branch *branch, struct setup *setup)
+{
+	/* A change of users takes it away. */
+	setup_add_thread(setup, "", SYS_prctl, PR_SET_DUMPABLE,
+			 (uint64_t)branch->manner->dumpable, 0, 0, 0)
+		->flags = INJ_MAY_FAIL;
+}
+
+void branch_forget(struct branch *branch)
+{
+	free(branch->manner);
+	branch->manner = NULL;
+}
+
+/* ---- the family ------------------------------------------------------------------------ */
+
+struct member {
+	pid_t pid; /* 0: not made yet                                         */
+	int pidfd;
+	bool traced, zombie;
+	struct puppet puppet;
+};
+
+struct family {
+	struct target *main;
+	struct generation *generation;
+	struct last_pid *helper;
+	const struct files_table *table; /* by branch                            */
+	bool flush;          /* some have had children that ended                  */
+	struct member first; /* the main process                              */
+	struct member *member; /* by branch                                   */
+};
+
+#define FAMILY_OPTIONS                                                                       \
+	(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | \
+	 PTRACE_O_TRACESYSGOOD | PTRACE_O_SUSPEND_SECCOMP)
+
+struct family *family_new(struct target *main, struct generation *generation,
+			  struct last_pid *helper, const struct files_table *table,
+			  struct avc_error *err)
+{
+	struct family *family = calloc(1, sizeof *family);
+
+	if (family)
+		family->member = calloc(generation->branches + 1, sizeof *family->member);
+	if (!family || !family->member) {
+		free(family);
+		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		return NULL;
+	}
+	family->main = main;
+	family->generation = generation;
+	family->helper = helper;
+	family->table = table;
+	family->first.pidfd = family->first.puppet.socket = -1;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		family->member[i].pidfd = family->member[i].puppet.socket = -1;
+	return family;
+}
+
+static struct member *member_of(struct family *family, int branch)
+{
+	return branch < 0 ? &family->first : &family->member[branch];
+}
+
+static const struct target *target_of(const struct family *family, int branch)
+{
+	return branch < 0 ? family->main : family->generation->branch[branch].target;
+}
+
+static pid_t template_of(const struct family *family, int branch)
+{
+	return branch < 0 ? family->generation->template
+			  : family->generation->branch[branch].image->template;
+}
+
+/* Who forks it: its parent; an orphan's is gone, and somebody of its session does. */
+static int host_of(const struct family *family, const struct branch *branch)
+{
+	const struct generation *generation = family->generation;
+
+	if (branch->parent != PARENT_INIT)
+		return branch->parent;
+	for (uint32_t i = 0; i < generation->branches && &generation->branch[i] != branch; i++)
+		if (generation->branch[i].target && family->member[i].pid &&
+		    generation->branch[i].session == branch->session)
+			return (int)i;
+	return PARENT_MAIN;
+}
+
+/* One clone of a stopped task that rests in the pad; *child is in its first stop. */
+static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t flags, pid_t *child,
+		      struct avc_error *err)
+{
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_clone, flags, 0, 0, 0, 0);
+	if (pad_send(puppet->pad, puppet->pid, &puppet->base, call, err) ||
+	    pad_run_clone(puppet->pid, call, child, err))
+		return -1;
+	if (tracee_await(*child, NULL, err) != STOP_TRAP || tracee_settle(puppet->pid, err))
+		return -1;
+	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)FAMILY_OPTIONS))
+		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
+	return 0;
+}
+
+/* A child of the host's that came to nothing, or was only in between. */
+static int take_back(struct puppet *host, pid_t child, pid_t inside, struct avc_error *err)
+{
+	tracee_kill(child);
+	puppet_call(host, SYS_wait4, (uint64_t)inside, 0, __WALL, 0, 0, 0);
+	return puppet_run(host, err);
+}
+
+/* Forks the host until the child has the number. */
+static int fork_host(struct family *family, struct member *host, const struct branch *branch,
+		     pid_t *child, struct avc_error *err)
+{
+	struct inj_call *runner = &host->puppet.pad->control->runner;
+
+	for (int i = 0; i < TRIES; i++) {
+		struct puppet between = host->puppet;
+		pid_t inside, between_inside = 0;
+		int result;
+
+		if (i)
+			usleep(TRY_AGAIN_US);
+		family->flush |= i > 0;
+		*child = 0;
+		/* An orphan's parent has ended: so does one that is there for that. */
+		if (branch->parent == PARENT_INIT) {
+			if (clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, &between.pid,
+				       err))
+				return -1;
+			between_inside = proc_inside(between.pid);
+		}
+		result = last_pid_set(family->helper, branch->inside - 1, err) ||
+			 clone_task(&between, runner, SIGCHLD, child, err);
+		inside = *child ? proc_inside(*child) : 0;
+		if (between_inside &&
+		    take_back(&host->puppet, between.pid, between_inside, err))
+			return -1;
+		if (result)
+			return -1;
+		if (inside == branch->inside)
+			return 0;
+		if (between_inside)
+			tracee_kill(*child); /* init's */
+		else if (take_back(&host->puppet, *child, inside, err))
+			return -1;
+	}
+	return fail(err, AVC_KERNEL, EEXIST, branch->inside, "restore", "clone",
+		    "PID %d is taken by somebody else", branch->inside);
+}
+
+/* Ended, and not waited for: it ends again, and nobody waits for it. */
+static int make_zombie(struct member *member, const struct branch *branch, struct avc_error *err)
+{
+	const int signal = WIFSIGNALED(branch->status) ? WTERMSIG(branch->status) : 0;
+	const struct rlimit none = { 0, 0 };
+	const uint64_t open_mask = 0;
+	struct puppet *puppet = &member->puppet;
+
+	member->zombie = true;
+	if (signal) {
+		avc_remote remote;
+
+		memset(puppet_data(puppet, &remote), 0, 32);
+		puppet_call(puppet, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8, 0, 0);
+		if (puppet_run(puppet, err))
+			return -1;
+		prlimit(puppet->pid, RLIMIT_CORE, &none, NULL);
+		if (ptrace(PTRACE_SETSIGMASK, puppet->pid, sizeof open_mask, &open_mask))
+			return fail_errno(err, puppet->pid, "restore", "ptrace(SETSIGMASK)",
+					  "it was killed");
+		kill(puppet->pid, signal);
+	} else {
+		puppet_call(puppet, SYS_exit_group, (uint64_t)WEXITSTATUS(branch->status), 0, 0, 0,
+			    0, 0);
+		call_begin(puppet->call, INJ_AFTER_PARK);
+		call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list),
+			 puppet->listed, 0, 0, 0);
+		puppet->listed = 0;
+		if (pad_send(puppet->pad, puppet->pid, &puppet->base, puppet->call, err))
+			return -1;
+	}
+	if (ptrace(PTRACE_CONT, puppet->pid, NULL, 0L))
+		return fail_errno(err, puppet->pid, "restore", "ptrace(CONT)", "it was killed");
+	for (;;) {
+		const struct stop stop = tracee_wait(puppet->pid, 0);
+
+		if (stop.kind == STOP_EXIT)
+			return 0;
+		if (stop.kind == STOP_DEADLINE)
+			return fail(err, AVC_DEADLINE, 0, puppet->pid, "restore", "",
+				    "it did not end again");
+		if (stop.kind != STOP_DYING)
+			ptrace(PTRACE_CONT, puppet->pid, NULL,
+			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+	}
+}
+
+/* From its parent's pad into its own. */
+static int change_pad(struct puppet *puppet, const struct target *target, uint32_t slot,
+		      struct avc_error *err)
+{
+	const struct pad *pad = &target->pad;
+
+	if (puppet_give(puppet, pad->fd, err))
+		return -1;
+	puppet_call(puppet, SYS_mmap, pad->base, INJ_CODE_BYTES, PAD_CODE_PROT, PAD_FLAGS, 1, 0);
+	puppet_call(puppet, SYS_mmap, pad->base + INJ_CODE_BYTES, pad->bytes - INJ_CODE_BYTES,
+		    PAD_DATA_PROT, PAD_FLAGS, 1, INJ_CODE_BYTES);
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (puppet_flush(puppet, "mmap", err))
+		return -1;
+	puppet_enter(puppet, pad, slot);
+	return 0;
+}
+
+static int put_mm(struct puppet *puppet, const struct manner *manner, struct avc_error *notes)
+{
+	struct {
+		uint64_t mm[11];
+		uint64_t auxv;
+		uint32_t auxv_bytes, exe_fd;
+	} map;
+	const avc_remote at = pad_remote(puppet->pad, puppet->list + puppet->list_max / 2);
+	uint8_t *here = (uint8_t *)(puppet->list + puppet->list_max / 2);
+	struct avc_error failed = { 0 };
+
+	memcpy(map.mm, manner->mm, sizeof map.mm);
+	map.mm[BRK] = (uint64_t)manner->brk;
+	map.auxv = manner->auxv_bytes ? at + sizeof map : 0;
+	map.auxv_bytes = manner->auxv_bytes;
+	map.exe_fd = ~0u;
+	memcpy(here, &map, sizeof map);
+	memcpy(here + sizeof map, manner->auxv, manner->auxv_bytes);
+	puppet_call(puppet, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP, at, sizeof map, 0, 0);
+	if (puppet_flush(puppet, "prctl(SET_MM_MAP)", &failed) == 0)
+		return 0;
+	/* Only what `ps` shows, and where its heap may grow. */
+	if (failed.code != AVC_KERNEL || !failed.errnum)
+		return -1;
+	if (!notes->code)
+		*notes = failed;
+	return 0;
+}
+
+/* In order; what is received comes to the lowest number that is free. */
+static int put_files(struct puppet *puppet, const struct files_table *table, struct avc_error *err)
+{
+	int socket = 0, lowest = 0;
+
+	/* Out of the way, between or behind those that are wanted. */
+	for (uint32_t i = 0; i < table->count; i++)
+		socket += table->entry[i].fd == socket;
+	if (socket) {
+		puppet_call(puppet, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket, 0, 0, 0);
+		puppet_call(puppet, SYS_close, 0, 0, 0, 0, 0, 0);
+	}
+	if (puppet_flush(puppet, "fcntl(DUPFD)", err))
+		return -1;
+	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
+		const int fd = table->entry[i].fd;
+
+		/* The lowest number that is free; of those that are taken `placed` is the
+		 * first that is not below it. */
+		for (;; lowest++) {
+			while (placed < i && table->entry[placed].fd < lowest)
+				placed++;
+			if (lowest != socket && !(placed < i && table->entry[placed].fd == lowest))
+				break;
+		}
+		if (files_send(puppet->socket, table->entry[i].ours) &&
+		    (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
+		     files_send(puppet->socket, table->entry[i].ours)))
+			return fail_errno(err, puppet->pid, "restore", "sendmsg",
+					  "a descriptor could not be handed over");
+		puppet_call(puppet, SYS_recvmsg, (uint64_t)socket, write_letter(puppet),
+			    MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0);
+		if (lowest != fd) {
+			puppet_call(puppet, SYS_dup3, (uint64_t)lowest, (uint64_t)fd,
+				    table->entry[i].cloexec ? O_CLOEXEC : 0, 0, 0, 0);
+			puppet_call(puppet, SYS_close, (uint64_t)lowest, 0, 0, 0, 0, 0);
+		} else if (!table->entry[i].cloexec) {
+			puppet_call(puppet, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
+		}
+		if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "dup3", err))
+			return -1;
+	}
+	puppet_call(puppet, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
+	return puppet_flush(puppet, "dup3", err);
+}
+
+static int put_manner(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
+{
+	const struct manner *manner = branch->manner;
+	struct action *actions = (struct action *)(puppet->list + puppet->list_max / 2);
+	int cwd = proc_open(branch->image->template, "cwd", O_PATH | O_DIRECTORY);
+
+	if (cwd < 0 || puppet_give(puppet, cwd, err)) {
+		close_fd(&cwd);
+		return fail_errno(err, puppet->pid, "restore", "open(cwd)",
+				  "its working directory is gone");
+	}
+	close_fd(&cwd);
+	puppet_call(puppet, SYS_fchdir, 1, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_personality, (uint64_t)manner->personality, 0, 0, 0, 0, 0);
+	memcpy(actions, manner->action, sizeof manner->action);
+	for (int i = 0; i < SIGNALS; i++)
+		if (i + 1 != SIGKILL && i + 1 != SIGSTOP)
+			puppet_call(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
+				    pad_remote(puppet->pad, &actions[i]), 0, 8, 0, 0);
+	return puppet_flush(puppet, "rt_sigaction", err);
+}
+
+static void put_limits(pid_t pid, const struct branch *branch, struct avc_error *notes)
+{
+	for (int i = 0; i < RLIM_NLIMITS && i < 16; i++) {
+		const struct rlimit limit = { branch->limit[i][0], branch->limit[i][1] };
+		struct rlimit now;
+
+		if (prlimit(pid, (enum __rlimit_resource)i, NULL, &now) == 0 &&
+		    now.rlim_cur == limit.rlim_cur && now.rlim_max == limit.rlim_max)
+			continue;
+		if (prlimit(pid, (enum __rlimit_resource)i, &limit, NULL))
+			fail_errno(notes, pid, "restore", "prlimit",
+				   "a resource limit could not be put back");
+	}
+}
+
+/* Session and group before it has children of its own.  What it has from its parent is
+ * right as a rule. */
+static int place(struct member *member, const struct branch *branch, struct avc_error *notes,
+		 struct avc_error *err)
+{
+	struct puppet *puppet = &member->puppet;
+	struct proc_stat stat;
+
+	if (proc_stat(puppet->pid, &stat))
+		return fail_errno(err, puppet->pid, "restore", "open(stat)", "it was killed");
+	if (branch->session == branch->inside) {
+		puppet_call(puppet, SYS_setsid, 0, 0, 0, 0, 0, 0);
+	} else {
+		if (branch->session > 0 && proc_inside(stat.session) != branch->session)
+			fail(notes, AVC_UNSUPPORTED, 0, branch->inside, "restore", "",
+			     "process %d is not in the session it was in, whose leader is gone",
+			     branch->inside);
+		if (branch->group == branch->inside)
+			puppet_call(puppet, SYS_setpgid, 0, 0, 0, 0, 0, 0);
+	}
+	return puppet_flush(puppet, "setsid", err);
+}
+
+/* When all are there: into groups that others lead. */
+static int join_group(struct member *member, const struct branch *branch, struct avc_error *notes,
+		      struct avc_error *err)
+{
+	struct puppet *puppet = &member->puppet;
+	struct proc_stat stat;
+
+	if (proc_stat(puppet->pid, &stat))
+		return fail_errno(err, puppet->pid, "restore", "open(stat)", "it was killed");
+	if (branch->group <= 0 || branch->group == branch->inside ||
+	    proc_inside(stat.group) == branch->group)
+		return 0;
+	puppet_call(puppet, SYS_setpgid, 0, (uint64_t)branch->group, 0, 0, 0, 0);
+	if (puppet_run(puppet, err))
+		return -1;
+	if (puppet->list[0].result)
+		fail(notes, AVC_KERNEL, (int)-puppet->list[0].result, branch->inside, "restore",
+		     "setpgid", "process %d is not in the process group it was in, whose leader is gone",
+		     branch->inside);
+	return 0;
+}
+
+static int become(struct family *family, uint32_t index, int host, struct avc_error *notes,
+		  struct avc_error *err)
+{
+	struct branch *branch = &family->generation->branch[index];
+	struct member *member = &family->member[index];
+	struct puppet *puppet = &member->puppet;
+	const struct target *parent = target_of(family, host);
+	/* The main process, a fork of its template, is registered with rseq(2); those that
+	 * are made here register last of all. */
+	const struct inj_thread *parents =
+		pad_thread(&parent->pad, family->generation->slot, 0);
+	const avc_remote rseq = host < 0 ? parents->rseq : 0;
+
+	if (open_mail(puppet, err))
+		return -1;
+	if (rseq)
+		puppet_call(puppet, SYS_rseq, rseq, parents->rseq_bytes, 1 /* UNREGISTER */,
+			    parents->rseq_signature, 0, 0);
+	if (change_pad(puppet, branch->target, branch->image->slot, err) ||
+	    remap(puppet, branch->target, branch->image->template, template_of(family, host), rseq,
+		  err) ||
+	    put_mm(puppet, branch->manner, notes) || put_manner(puppet, branch, err) ||
+	    place(member, branch, notes, err))
+		return -1;
+	put_limits(puppet->pid, branch, notes);
+	if (put_files(puppet, &family->table[index], err))
+		return -1;
+	close_fd(&puppet->socket);
+	return 0;
+}
+
+int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
+		struct avc_error *err)
+{
+	struct generation *generation = family->generation;
+	struct inj_slot *slot = pad_slot(&family->main->pad, generation->slot);
+	struct member *first = &family->first;
+
+	first->pid = first->puppet.pid = main_pid;
+	first->traced = true;
+	first->pidfd = proc_pidfd_open(main_pid);
+	puppet_enter(&first->puppet, &family->main->pad, generation->slot);
+	if (first->pidfd < 0 || ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)FAMILY_OPTIONS) ||
+	    arch_regs_get(main_pid, &first->puppet.base))
+		return fail_errno(err, main_pid, "restore", "ptrace(GETREGS)", "it was killed");
+	if (slot->session_leader)
+		puppet_call(&first->puppet, SYS_setsid, 0, 0, 0, 0, 0, 0);
+	else
+		puppet_call(&first->puppet, SYS_setpgid, 0, (uint64_t)slot->group, 0, 0, 0, 0);
+	if (puppet_flush(&first->puppet, "setsid", err))
+		return -1;
+	slot->placed = 1;
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+		const int host = host_of(family, branch);
+		struct member *member = &family->member[i], *by = member_of(family, host);
+
+		if (fork_host(family, by, branch, &member->pid, err))
+			return -1;
+		member->traced = true;
+		member->puppet = by->puppet;
+		member->puppet.pid = member->pid;
+		member->puppet.socket = -1;
+		member->pidfd = proc_pidfd_open(member->pid);
+		if (member->pidfd < 0)
+			return fail_errno(err, member->pid, "restore", "pidfd_open", "it was killed");
+		if (!branch->target) {
+			family->flush = true;
+			if (make_zombie(member, branch, err))
+				return -1;
+			member->traced = false;
+		} else if (become(family, i, host, notes, err)) {
+			return -1;
+		}
+	}
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target &&
+		    join_group(&family->member[i], &generation->branch[i], notes, err))
+			return -1;
+	/* Those that have ended again have told their parents, who know it already. */
+	for (int i = -1; family->flush && i < (int)generation->branches; i++) {
+		struct puppet *puppet = &member_of(family, i)->puppet;
+		avc_remote remote;
+		uint64_t *data;
+
+		if (i >= 0 && !generation->branch[i].target)
+			continue;
+		data = puppet_data(puppet, &remote);
+		data[0] = UINT64_C(1) << (SIGCHLD - 1);
+		data[1] = data[2] = 0;
+		puppet_call(puppet, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8, 0, 0);
+		if (puppet_run(puppet, err))
+			return -1;
+	}
+	return 0;
+}
+
+/* ---- off they go ------------------------------------------------------------------------- */
+
+int family_start(struct family *family, struct avc_error *notes, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < family->generation->branches; i++) {
+		struct branch *branch = &family->generation->branch[i];
+		struct member *member = &family->member[i];
+
+		if (!branch->target)
+			continue;
+		if (restore_start(branch->target, branch->image, family->helper, member->pid, err))
+			return -1;
+		member->traced = false;
+		if (restore_await(branch->target, branch->image, member->pid, err))
+			return -1;
+		restore_note(branch->target, branch->image, member->pid, notes);
+		if (memory_put_back(branch->image->image, member->pid, err))
+			return -1;
+	}
+	return 0;
+}
+
+void family_go(struct family *family)
+{
+	for (uint32_t i = 0; i < family->generation->branches; i++) {
+		struct branch *branch = &family->generation->branch[i];
+
+		if (branch->target)
+			restore_go(branch->target, branch->image);
+	}
+}
+
+pid_t family_pid(const struct family *family, uint32_t branch)
+{
+	return family->member[branch].pid;
+}
+
+static void kill_member(struct member *member)
+{
+	if (member->pid && member->traced)
+		tracee_kill(member->pid);
+	else if (member->pidfd >= 0)
+		syscall(SYS_pidfd_send_signal, member->pidfd, SIGKILL, NULL, 0);
+	member->traced = false;
+}
+
+void family_kill(struct family *family)
+{
+	for (uint32_t i = family->generation->branches; i-- > 0;)
+		kill_member(&family->member[i]);
+	kill_member(&family->first);
+	for (uint32_t i = 0; i < family->generation->branches; i++) {
+		struct pollfd gone = { .fd = family->member[i].pidfd, .events = POLLIN };
+
+		if (gone.fd >= 0)
+			poll(&gone, 1, 1000);
+	}
+}
+
+void family_free(struct family *family)
+{
+	if (!family)
+		return;
+	for (uint32_t i = 0; i < family->generation->branches; i++) {
+		close_fd(&family->member[i].pidfd);
+		close_fd(&family->member[i].puppet.socket);
+	}
+	close_fd(&family->first.pidfd);
+	free(family->member);
+	free(family);
+}

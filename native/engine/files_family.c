@@ -1,0 +1,230 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The tables of descriptors of all processes of an app (files.h), and what is between
+ * them: a pipe or socket pair whose ends different processes have is made again once, for
+ * all of them, and what was in it is put back once.
+ */
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <unistd.h>
+
+#include "files.h"
+
+struct tables {
+	struct files_work *work;
+	uint32_t count;
+};
+
+static bool is_pair(const struct file *f)
+{
+	return f->kind == FILE_PIPE || (f->kind == FILE_SOCKET && f->socket && f->socket->peer);
+}
+
+static bool same_end(const struct file *a, const struct file *b)
+{
+	return a->kind == b->kind && a->ino == b->ino &&
+	       (a->kind != FILE_PIPE || !((a->flags ^ b->flags) & O_ACCMODE));
+}
+
+static bool other_end(const struct file *a, const struct file *b)
+{
+	if (a->kind != b->kind)
+		return false;
+	if (a->kind == FILE_SOCKET)
+		return b->ino == a->socket->peer;
+	return a->ino == b->ino && (a->flags ^ b->flags) & O_ACCMODE;
+}
+
+/* Something like `like` that is there, of any process: its descriptor in *fd, ours. */
+static bool find_end(const struct tables *tables, const struct file *like,
+		     bool (*fits)(const struct file *a, const struct file *b), int *fd)
+{
+	for (uint32_t i = 0; i < tables->count; i++) {
+		const struct files_work *work = &tables->work[i];
+
+		for (uint32_t k = 0; k < work->want->count; k++) {
+			const struct file *w = &work->want->file[k];
+
+			if (w->kind != like->kind || !fits(like, w) ||
+			    (work->lost[k] && work->local[files_leader(work->want, w)] < 0))
+				continue;
+			*fd = files_borrow_placed(work, w);
+			if (*fd >= 0)
+				return true;
+		}
+	}
+	return false;
+}
+
+static int reopen(int fd, int flags)
+{
+	char path[40];
+	int opened;
+
+	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
+	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
+	opened = open(path, (flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
+	close(fd);
+	return opened;
+}
+
+/* Does anybody have the other end? */
+static struct files_work *who_has_other(const struct tables *tables, const struct file *w,
+					uint32_t *leader)
+{
+	for (uint32_t i = 0; i < tables->count; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++)
+			if (other_end(w, &tables->work[i].want->file[k])) {
+				*leader = files_leader(tables->work[i].want,
+						       &tables->work[i].want->file[k]);
+				return &tables->work[i];
+			}
+	return NULL;
+}
+
+static void join_lost(const struct tables *tables, struct files_work *work, const struct file *w)
+{
+	const uint32_t group = files_leader(work->want, w);
+	struct files_work *others;
+	uint32_t leader = 0;
+	int fd, ends[2];
+
+	if (find_end(tables, w, same_end, &fd)) {
+		work->local[group] = fd;
+		return;
+	}
+	if (w->kind == FILE_PIPE && find_end(tables, w, other_end, &fd)) {
+		work->local[group] = reopen(fd, w->flags);
+		return;
+	}
+	others = who_has_other(tables, w, &leader);
+	if (!others || others->local[leader] >= 0 || file_make_pair(w, ends))
+		return;
+	work->local[group] = ends[0];
+	others->local[leader] = ends[1];
+	/* An end that is still there belongs to a pair that is none any more. */
+	for (uint32_t k = 0; k < others->want->count; k++)
+		if (files_leader(others->want, &others->want->file[k]) == leader) {
+			others->source[leader] = -1;
+			others->lost[k] = true;
+		}
+}
+
+static void join(const struct tables *tables)
+{
+	for (uint32_t i = 0; i < tables->count; i++) {
+		struct files_work *work = &tables->work[i];
+
+		for (uint32_t k = 0; k < work->want->count; k++) {
+			const struct file *w = &work->want->file[k];
+
+			if (is_pair(w) && work->lost[k] &&
+			    work->local[files_leader(work->want, w)] < 0)
+				join_lost(tables, work, w);
+		}
+	}
+}
+
+/* Once, however many have an end that can be read. */
+static bool is_first(const struct tables *tables, uint32_t table, const struct file *w)
+{
+	for (uint32_t i = 0; i <= table; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++)
+			if (same_end(w, &tables->work[i].want->file[k]))
+				return &tables->work[i].want->file[k] == w;
+	return false;
+}
+
+static const struct file *content_of(const struct tables *tables, const struct file *w)
+{
+	for (uint32_t i = 0; i < tables->count; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
+			const struct file *f = &tables->work[i].want->file[k];
+
+			if (same_end(w, f) && (f->content_bytes || f->content_lost))
+				return f;
+		}
+	return w;
+}
+
+static void put_contents(const struct tables *tables)
+{
+	for (uint32_t i = 0; i < tables->count; i++) {
+		struct files_work *work = &tables->work[i];
+
+		for (uint32_t k = 0; k < work->want->count; k++) {
+			const struct file *w = &work->want->file[k], *content;
+			int fd = -1, other_fd = -1, bytes = 0;
+
+			if (!is_pair(w) ||
+			    (w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY) ||
+			    !is_first(tables, i, w) || !find_end(tables, w, same_end, &fd))
+				continue;
+			content = content_of(tables, w);
+			if (find_end(tables, w, other_end, &other_fd) &&
+			    (content->content_bytes || content->content_lost ||
+			     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
+				files_note(work, w, file_put_content(fd, other_fd, content));
+			close_fd(&fd);
+			close_fd(&other_fd);
+		}
+	}
+}
+
+int files_restore(struct target *target, struct generation *generation,
+		  const struct avc_config *config, pid_t init, struct files_table *table,
+		  struct avc_error *notes, struct avc_error *err)
+{
+	struct tables tables = { .work = calloc(generation->branches + 1, sizeof *tables.work) };
+	int result = -1;
+
+	if (!tables.work)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (int i = -1; i < (int)generation->branches; i++) {
+		const struct branch *branch = i < 0 ? NULL : &generation->branch[i];
+		struct generation *image = branch ? branch->image : generation;
+
+		if (branch && !branch->target)
+			continue;
+		tables.work[tables.count++] = (struct files_work){
+			.target = branch ? branch->target : target,
+			.generation = image,
+			.config = config,
+			.init = init,
+			/* Of one that has ended before, nobody has the table. */
+			.table = branch ? branch->target->holder : generation->template,
+			.table_pidfd = branch ? branch->target->holder_pidfd : generation->pidfd,
+			.want = image->files,
+			.notes = notes,
+		};
+		if (files_work_begin(&tables.work[tables.count - 1], err))
+			goto out;
+	}
+	for (uint32_t i = 0; i < tables.count; i++)
+		if (files_work_gather(&tables.work[i], err))
+			goto out;
+	if (tables.count > 1)
+		join(&tables);
+	for (uint32_t i = 0; i < tables.count; i++)
+		if (files_work_place(&tables.work[i], err))
+			goto out;
+	put_contents(&tables);
+	for (uint32_t i = 0, k = 0; i < tables.count; i++) {
+		files_work_finish(&tables.work[i]);
+		if (!i)
+			continue;
+		while (!generation->branch[k].target)
+			k++;
+		if (files_work_table(&tables.work[i], &table[k++], err))
+			goto out;
+	}
+	result = 0;
+out:
+	for (uint32_t i = 0; i < tables.count; i++)
+		files_work_end(&tables.work[i]);
+	free(tables.work);
+	return result;
+}

@@ -1,0 +1,292 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Watches of inotify(7) put back under their own numbers (files.h).
+ *
+ * A watch is on an inode.  fdinfo names that by file system and handle, and the container
+ * has the file system mounted somewhere: from any place on it a handle can be opened.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/openat2.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/inotify.h>
+#include <sys/ioctl.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "files.h"
+
+/* The number that the next watch gets (linux/inotify.h, since Linux 4.16). */
+#define SET_NEXT_WD _IOW('I', 0, int32_t)
+
+/* ---- where it is ---------------------------------------------------------------- */
+
+/* Of mountinfo: "\040" and the like stand for blanks. */
+static void unescape(char *path)
+{
+	char *to = path;
+	unsigned int code;
+
+	for (const char *p = path; *p;) {
+		if (*p == '\\' && sscanf(p + 1, "%3o", &code) == 1) {
+			*to++ = (char)code;
+			p += 4;
+		} else {
+			*to++ = *p++;
+		}
+	}
+	*to = 0;
+}
+
+/* A server is asked nothing while the app is dead (files.c). */
+static bool is_served(const char *type)
+{
+	static const char *const served[] = { "fuse", "nfs", "cifs", "smb", "9p", "ceph", "afs" };
+
+	for (size_t i = 0; i < sizeof served / sizeof *served; i++)
+		if (!strncmp(type, served[i], strlen(served[i])))
+			return true;
+	return false;
+}
+
+/* Not just O_PATH, for open_by_handle_at(2); but to open a device does things. */
+static int open_anchor(int at)
+{
+	char own[40];
+	struct stat st;
+
+	if (fstat(at, &st) || !(S_ISREG(st.st_mode) || S_ISDIR(st.st_mode)))
+		return -1;
+	snprintf(own, sizeof own, "/proc/thread-self/fd/%d", at);
+	return open(own, O_RDONLY | O_CLOEXEC);
+}
+
+/* Below the root of a process: init's is the container's. */
+static int open_below(pid_t pid, const char *path)
+{
+	struct open_how how = { .flags = O_PATH | O_NOFOLLOW | O_CLOEXEC,
+				.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS };
+	const int root = proc_open(pid, "root", O_PATH | O_DIRECTORY);
+	int fd;
+
+	if (root < 0)
+		return -1;
+	fd = (int)syscall(SYS_openat2, root, path, &how, sizeof how);
+	close(root);
+	return fd;
+}
+
+struct file_system {
+	uint64_t dev;
+	int anchor; /* anything that is on it, or -1                           */
+	/* The root of most containers.  Its handles can not be opened, but in them are
+	 * those of the file system below, to which the anchor belongs.           */
+	bool overlay;
+	char point[2048]; /* where it is mounted                               */
+};
+
+static void try_mount(struct file_system *fs, pid_t init, char *line)
+{
+	char *type = strstr(line, " - "), *upper;
+	struct proc_stat stat;
+	unsigned int major, minor;
+	int at = -1;
+
+	if (sscanf(line, "%*d %*d %u:%u %*s %2047s", &major, &minor, fs->point) != 3 ||
+	    ((uint64_t)major << 20 | minor) != fs->dev || !type || is_served(type + 3))
+		return;
+	unescape(fs->point);
+	fs->overlay = !strncmp(type + 3, "overlay ", 8);
+	upper = fs->overlay ? strstr(type, ",upperdir=") : NULL;
+	if (upper) {
+		upper += 10;
+		upper[strcspn(upper, ",\n")] = 0;
+		unescape(upper);
+		/* A path of the host's; init's parent is the container's monitor there. */
+		if (proc_stat(init, &stat) == 0)
+			at = open_below(stat.parent, upper);
+	} else if (!fs->overlay) {
+		at = open_below(init, fs->point);
+	}
+	if (at >= 0)
+		fs->anchor = open_anchor(at);
+	close_fd(&at);
+}
+
+static void open_file_system(struct file_system *fs, pid_t init, uint64_t dev)
+{
+	char path[48], *line = NULL;
+	size_t size = 0;
+	FILE *mounts;
+
+	close_fd(&fs->anchor);
+	fs->dev = dev;
+	snprintf(path, sizeof path, "/proc/%d/mountinfo", init);
+	mounts = fopen(path, "re");
+	while (mounts && fs->anchor < 0 && getline(&line, &size, mounts) > 0)
+		try_mount(fs, init, line);
+	free(line);
+	if (mounts)
+		fclose(mounts);
+}
+
+static int open_handle(int anchor, int type, const uint8_t *bytes, uint32_t count)
+{
+	struct {
+		struct file_handle head;
+		uint8_t bytes[sizeof((struct file_mark *)0)->handle];
+	} handle = { .head = { .handle_bytes = count, .handle_type = type } };
+
+	if (!count || count > sizeof handle.bytes) {
+		errno = EOPNOTSUPP;
+		return -1;
+	}
+	memcpy(handle.head.f_handle, bytes, count);
+	return open_by_handle_at(anchor, &handle.head, O_PATH | O_CLOEXEC);
+}
+
+/* fs/overlayfs/overlayfs.h: struct ovl_fh, behind three bytes of padding. */
+struct overlay_handle {
+	uint8_t padding[3], version, magic, bytes, flags, type, uuid[16];
+	uint8_t real[];
+};
+
+/* The file below has a path, and its end, how much of it ever, is that in the overlay. */
+static int open_overlaid(const struct file_system *fs, const struct file_mark *mark, pid_t init)
+{
+	const struct overlay_handle *handle = (const struct overlay_handle *)mark->handle;
+	char own[40], below[2048], path[sizeof below + sizeof fs->point];
+	struct stat st;
+	ssize_t n;
+	int real;
+
+	if (mark->handle_bytes <= sizeof *handle || handle->magic != 0xfb)
+		return -1;
+	real = open_handle(fs->anchor, handle->type, handle->real,
+			   mark->handle_bytes - (uint32_t)sizeof *handle);
+	if (real < 0)
+		return -1;
+	snprintf(own, sizeof own, "/proc/thread-self/fd/%d", real);
+	n = readlink(own, below, sizeof below - 1);
+	close(real);
+	below[n > 0 ? n : 0] = 0;
+	for (const char *end = below; *end; end += 1 + strcspn(end + 1, "/")) {
+		int fd;
+
+		snprintf(path, sizeof path, "%s%s", fs->point, end);
+		fd = open_below(init, path);
+		if (fd >= 0 && fstat(fd, &st) == 0 && st.st_ino == mark->ino)
+			return fd;
+		close_fd(&fd);
+	}
+	return -1;
+}
+
+static int open_marked(const struct file_system *fs, const struct file_mark *mark, pid_t init)
+{
+	if (fs->anchor < 0)
+		return -1;
+	if (fs->overlay)
+		return open_overlaid(fs, mark, init);
+	return open_handle(fs->anchor, mark->handle_type, mark->handle, mark->handle_bytes);
+}
+
+/* ---- what it is to have ----------------------------------------------------------- */
+
+static const struct file_mark *find_mark(const struct file *f, const struct file_mark *mark)
+{
+	for (uint32_t i = 0; f && i < f->mark_count; i++)
+		if (f->mark[i].wd == mark->wd && f->mark[i].dev == mark->dev &&
+		    f->mark[i].ino == mark->ino)
+			return &f->mark[i];
+	return NULL;
+}
+
+/* Reads what is in it, event by event, as long as there is one and it is without a name. */
+static void take_events(int fd, int bytes)
+{
+	struct inotify_event event;
+	int left;
+
+	for (; bytes > 0; bytes -= (int)sizeof event)
+		if (ioctl(fd, FIONREAD, &left) || left < (int)sizeof event ||
+		    read(fd, &event, sizeof event) != sizeof event)
+			return;
+}
+
+/* Those that were added since.  That is an event, IN_IGNORED, which the app would not
+ * understand; if nothing else is in the queue, it can be taken out again. */
+static void remove_new(int fd, const struct file *want, const struct file *now)
+{
+	uint32_t kept = 0;
+	int before = 0, removed = 0;
+	char buf[65536];
+
+	for (uint32_t i = 0; i < now->mark_count; i++)
+		kept += find_mark(want, &now->mark[i]) != NULL;
+	if (ioctl(fd, FIONREAD, &before))
+		before = 0;
+	for (uint32_t i = 0; i < now->mark_count; i++)
+		if (!find_mark(want, &now->mark[i]) && inotify_rm_watch(fd, now->mark[i].wd) == 0)
+			removed++;
+	if (!before)
+		take_events(fd, removed * (int)sizeof(struct inotify_event));
+	/* Nothing in it is of a watch that is known. */
+	while (before && !kept && ioctl(fd, FIONREAD, &before) == 0 && before &&
+	       read(fd, buf, sizeof buf) > 0)
+		;
+}
+
+/* Those that are missing, or have another mask. */
+static uint32_t add_missing(int fd, const struct file *want, const struct file *now, pid_t init)
+{
+	struct file_system fs = { .anchor = -1 };
+	uint32_t failed = 0;
+
+	for (uint32_t i = 0; i < want->mark_count; i++) {
+		const struct file_mark *mark = &want->mark[i], *is = find_mark(now, mark);
+		char path[40];
+		int at, wd;
+
+		if (is && is->mask == mark->mask)
+			continue;
+		if (fs.dev != mark->dev)
+			open_file_system(&fs, init, mark->dev);
+		at = open_marked(&fs, mark, init);
+		if (at < 0 || (!is && ioctl(fd, SET_NEXT_WD, mark->wd))) {
+			close_fd(&at);
+			failed++;
+			continue;
+		}
+		snprintf(path, sizeof path, "/proc/thread-self/fd/%d", at);
+		wd = inotify_add_watch(fd, path, mark->mask);
+		close(at);
+		if (wd >= 0 && wd != mark->wd)
+			inotify_rm_watch(fd, wd);
+		failed += wd != mark->wd;
+	}
+	close_fd(&fs.anchor);
+	return failed;
+}
+
+static int highest(const struct file *f, int so_far)
+{
+	for (uint32_t i = 0; f && i < f->mark_count; i++)
+		so_far = f->mark[i].wd > so_far ? f->mark[i].wd : so_far;
+	return so_far;
+}
+
+const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init)
+{
+	uint32_t failed;
+
+	if (now)
+		remove_new(fd, want, now);
+	failed = add_missing(fd, want, now, init);
+	/* As ever, a number is not given again soon. */
+	ioctl(fd, SET_NEXT_WD, highest(now, highest(want, 0)) + 1);
+	return failed ? "not all of what it watched is there any more" : NULL;
+}

@@ -1,0 +1,287 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The processes of an app: its main process and everything below it, and what has
+ * become init's because its parent is gone.
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+/* ---- who there is --------------------------------------------------------------- */
+
+struct looking {
+	struct tree *tree;
+	pid_t pid;
+	int parent;
+	struct avc_error *err;
+};
+
+static int add_kin(struct tree *tree, pid_t pid, int parent, struct avc_error *err)
+{
+	if (tree->count == PROCESSES_MAX)
+		return fail(err, AVC_UNSUPPORTED, 0, tree->main->pid, "look at processes", "",
+			    "it has more than %d processes", PROCESSES_MAX);
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->kin[i].pid == pid)
+			return 0; /* its parent has just gone: seen twice */
+	tree->kin[tree->count++] = (struct kin){ .pid = pid, .parent = parent };
+	return 0;
+}
+
+static int add_children(struct looking *look, const char *name)
+{
+	char *buf = NULL, *p;
+	size_t room = 0;
+	int result = 0;
+	FILE *file;
+	char path[64];
+
+	snprintf(path, sizeof path, "/proc/%d/%s", look->pid, name);
+	file = fopen(path, "re");
+	if (!file)
+		return 0; /* it has ended */
+	if (getdelim(&buf, &room, '\0', file) > 0)
+		for (p = buf; !result;) {
+			char *next;
+			const long child = strtol(p, &next, 10);
+
+			if (next == p)
+				break;
+			p = next;
+			if (look->parent == PARENT_INIT &&
+			    (child == look->tree->main->leader ||
+			     look->tree->is_ours((pid_t)child, look->tree->arg)))
+				continue;
+			result = add_kin(look->tree, (pid_t)child, look->parent, look->err);
+		}
+	fclose(file);
+	free(buf);
+	return result;
+}
+
+/* A child hangs on the thread that forked it. */
+static int look_at_task(pid_t tid, void *arg)
+{
+	char name[48];
+
+	snprintf(name, sizeof name, "task/%d/children", tid);
+	return add_children(arg, name);
+}
+
+static int look_below(struct looking *look)
+{
+	int dirfd = proc_open(look->pid, "task", O_RDONLY | O_DIRECTORY), result;
+
+	if (dirfd < 0)
+		return 0;
+	result = proc_tasks(dirfd, look_at_task, look);
+	close(dirfd);
+	return result && look->err->code ? -1 : 0;
+}
+
+/* Ended, and not waited for; a main thread that has gone before its threads is not. */
+static bool is_zombie(const struct proc_stat *stat)
+{
+	return (stat->state == 'Z' || stat->state == 'X') && stat->threads < 2;
+}
+
+/* ---- targets -------------------------------------------------------------------- */
+
+static struct target *target_new(const struct tree *tree)
+{
+	const struct target *main = tree->main;
+	struct target *target = malloc(sizeof *target);
+
+	if (!target)
+		return NULL;
+	target_init(target);
+	target->descendant = true;
+	target->shm_bytes = main->shm_bytes;
+	target->tcp_moved = main->tcp_moved;
+	target->plain_filters = main->plain_filters;
+	target->init = main->init;
+	if (!target_make_room(target)) {
+		target_free_room(target);
+		free(target);
+		return NULL;
+	}
+	return target;
+}
+
+static void target_free(struct target *target)
+{
+	unhold(target);
+	target_close(target);
+	pad_close(&target->pad);
+	target_free_room(target);
+	free(target);
+}
+
+static struct target *find_member(const struct tree *tree, pid_t pid, uint64_t start)
+{
+	for (uint32_t i = 0; i < tree->members; i++)
+		if (tree->member[i]->leader == pid && tree->member[i]->start == start)
+			return tree->member[i];
+	return NULL;
+}
+
+/* A thread of ours that forked while it was being stopped has brought it forth as our
+ * tracee, and it was taken for one more thread (target.c, adopt()). */
+static void forget_thread(struct target *target, pid_t tid)
+{
+	struct thread *t = thread_find(target, tid);
+
+	if (t && !t->seen) {
+		t->attached = false;
+		t->stopped = false;
+	}
+}
+
+static struct target *add_member(struct tree *tree, pid_t pid, uint64_t start,
+				 struct avc_error *err)
+{
+	struct target *target;
+
+	if (tree->members == 2 * PROCESSES_MAX) {
+		fail(err, AVC_UNSUPPORTED, 0, tree->main->pid, "look at processes", "",
+		     "it has had too many processes since the oldest generation");
+		return NULL;
+	}
+	target = target_new(tree);
+	if (!target) {
+		fail_errno(err, pid, "look at processes", "malloc", "out of memory");
+		return NULL;
+	}
+	if (target_open(target, pid, proc_inside(pid), err)) {
+		target_free(target);
+		return NULL;
+	}
+	target->start = start;
+	forget_thread(tree->main, pid);
+	for (uint32_t i = 0; i < tree->members; i++)
+		forget_thread(tree->member[i], pid);
+	tree->member[tree->members++] = target;
+	return target;
+}
+
+int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
+{
+	struct looking look = { .tree = tree, .err = err };
+
+	*fresh = 0;
+	tree->count = 0;
+	if (add_kin(tree, tree->main->leader, PARENT_INIT, err))
+		return -1;
+	tree->kin[0].target = tree->main;
+	look.pid = tree->init;
+	look.parent = PARENT_INIT;
+	if (look_below(&look))
+		return -1;
+	for (uint32_t i = 0; i < tree->count; i++) {
+		struct kin *kin = &tree->kin[i];
+		struct proc_stat stat;
+
+		look.pid = kin->pid;
+		look.parent = (int)i;
+		if (i && proc_stat(kin->pid, &stat)) {
+			kin->pid = 0; /* it was waited for just now */
+			continue;
+		}
+		if (i)
+			kin->stat = stat;
+		if (i && is_zombie(&stat)) {
+			kin->ended = true;
+			continue;
+		}
+		if (i) {
+			kin->target = find_member(tree, kin->pid, stat.start);
+			/* A clone of ours of which we never heard, and no orphan. */
+			if (!kin->target && kin->parent == PARENT_INIT && tracee_is_ours(kin->pid)) {
+				tree->main->lost = true;
+				kin->pid = 0;
+				continue;
+			}
+			if (!kin->target) {
+				struct avc_error gone = { 0 };
+
+				kin->target = add_member(tree, kin->pid, stat.start, &gone);
+				if (!kin->target && gone.code != AVC_GONE) {
+					*err = gone;
+					return -1;
+				}
+				if (!kin->target) {
+					kin->pid = 0;
+					continue;
+				}
+				++*fresh;
+			}
+		}
+		/* Thread by thread only when the last checkpoint did not find that it
+		 * has none: then the next one will find that it has. */
+		if (!(i == 0 && tree->main->childless) && look_below(&look))
+			return -1;
+	}
+	return 0;
+}
+
+int tree_refuse(struct tree *tree, struct avc_error *err)
+{
+	struct looking look = { .tree = tree, .pid = tree->main->leader, .parent = 0, .err = err };
+	uint32_t children;
+
+	if (look_below(&look))
+		return -1;
+	children = tree->count - 1;
+	tree->count = 1;
+	if (!children)
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, tree->kin[1].pid, "check", "",
+		    "it has child processes (%u); only single processes are protected yet",
+		    children);
+}
+
+/* ---- the end of one --------------------------------------------------------------- */
+
+void tree_let_go(struct tree *tree, struct target *target)
+{
+	(void)tree;
+	unhold(target);
+	target_close(target);
+}
+
+void tree_sweep(struct tree *tree)
+{
+	uint32_t kept = 0;
+
+	for (uint32_t i = 0; i < tree->members; i++) {
+		struct target *target = tree->member[i];
+
+		if (target->pid && pidfd_ended(target->pidfd))
+			tree_let_go(tree, target);
+		/* One of which a thread is still ours has to be waited for. */
+		if (!target->pid && !target->images && !target->thread_count && !target->lost)
+			target_free(target);
+		else
+			tree->member[kept++] = target;
+	}
+	tree->members = kept;
+}
+
+void tree_free(struct tree *tree)
+{
+	for (uint32_t i = 0; i < tree->members; i++)
+		target_free(tree->member[i]);
+	free(tree->member);
+	free(tree->kin);
+	tree->member = NULL;
+	tree->kin = NULL;
+	tree->members = 0;
+	tree->count = 0;
+}

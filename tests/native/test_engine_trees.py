@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Applications of several processes under a real guard: seen by nobody, and restored whole.
+
+`make test-trees` runs the long form: more kills, and as many processes as are promised.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from avckpt.events import GuardConfig
+from harness import wait_until
+from native.family import (
+    kill_main,
+    main_process,
+    members,
+    ours,
+    places,
+    progress,
+    pss_kb,
+    wait_whole,
+)
+from native.guarded import GuardProcess, Victim, config
+from native.test_engine_tracer_killed import storm
+
+LONG = os.environ.get("AVCKPT_LONG") == "1"
+KILLS = 100 if LONG else 5
+CHECKPOINTS = 1000 if LONG else 20
+STORM = 500 if LONG else 60
+
+STATIC = ["tree 1", "tree 8", "tree 16 --threads 3", "prefork 4 20", "prefork 2 1 --private 20", "terminal"]
+"""The processes stay the same."""
+CHANGING = ["churn 1", "churn 8", "churn 6 --vfork", "churn 3 --threads 4", "commands"]
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def steady(interval_s: float = 0.0, keep: int = 2) -> GuardConfig:
+    """With a second of patience for a freeze: on a busy machine the default of 50 ms would miss most of them."""
+    return config(interval_s, keep=keep, freeze_deadline_s=1.0)
+
+
+def checkpoint(guard: GuardProcess) -> None:
+    """Takes one; a missed one is tried again."""
+    for _ in range(20):
+        event = guard.command("checkpoint")
+        if event["kind"] == "checkpoint":
+            return
+        assert event["kind"] == "missed", event
+        time.sleep(0.02)
+    raise AssertionError(f"twenty missed checkpoints, the last: {event}")
+
+
+def kill_again_and_again(guard: GuardProcess, victim: Victim, kills: int, pause_s: float, orphans: int = 0) -> None:
+    """The main process dies at random moments; each time the tree is there again, and goes on."""
+    rng = random.Random(victim.command)
+    guard.wait("checkpoint")
+    changes = victim.command.split()[0] in ("churn", "commands")
+    before = places(victim)
+    for _ in range(kills):
+        time.sleep(rng.uniform(0, pause_s))
+        since = guard.mark()
+        kill_main(victim)
+        guard.wait("restored", since=since)
+        progress(victim)
+        wait_whole(victim, orphans)
+        if not changes:
+            assert places(victim) == before
+    victim.wait_beats(50)
+
+
+def wait_counter(victim: Victim, which: int, value: int) -> None:
+    """Until a counter on the board has come so far."""
+    wait_until(
+        lambda: victim.see().counter[which] >= value or victim.see().violations,
+        10,
+        f"counter {which} of {victim.command} comes to {value}",
+    )
+    victim.check()
+
+
+@pytest.mark.parametrize("command", [*STATIC, *CHANGING, "terminal --stopped", "tree 9 --orphan"])
+def test_nobody_sees_checkpoints(command: str, tmp_path: Path) -> None:
+    """Not even in the middle of fork, exec, vfork and exit; every few milliseconds."""
+    with Victim(command, tmp_path) as victim, GuardProcess(steady(0.005), [victim.pid]) as guard:
+        guard.wait("checkpoint", count=CHECKPOINTS, timeout_s=100)
+        progress(victim)
+        assert not [event for event in guard.events if event.get("kind") in ("unprotected", "died")]
+        since = guard.mark()
+        guard.stop()
+        assert not [event for event in guard.events[since:] if event.get("kind") == "gave_up"]
+        # Without it everything goes on, and nothing of it is left.
+        progress(victim)
+        wait_until(lambda: not ours(victim), 10, "no template is left")
+        wait_whole(victim, allowed=command.count("--orphan"))
+
+
+def test_an_application_that_adopts_orphans_itself_is_refused(tmp_path: Path) -> None:
+    """PR_SET_CHILD_SUBREAPER: what is made an orphan for init would become its child."""
+    with Victim("tree 8 --reaper", tmp_path) as victim, GuardProcess(steady(0.02), [victim.pid]) as guard:
+        assert "adopts orphans" in guard.wait("unprotected")["error"]["message"]
+        progress(victim)
+        assert not ours(victim)
+
+
+@pytest.mark.parametrize("command", [*STATIC, *CHANGING])
+def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
+        kill_again_and_again(guard, victim, KILLS, 0.15)
+
+
+def test_a_stopped_job_is_stopped_again(tmp_path: Path) -> None:
+    with Victim("terminal --stopped", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
+        kill_again_and_again(guard, victim, KILLS, 0.15)
+
+
+def test_a_daemon_of_the_application_goes_back_with_it(tmp_path: Path) -> None:
+    """It is init's child, because its parent has ended; it shares memory with the others."""
+    with Victim("tree 9 --orphan", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
+        kill_again_and_again(guard, victim, KILLS, 0.15, orphans=1)
+
+
+@pytest.mark.parametrize("signum", [signal.SIGSEGV, signal.SIGABRT, signal.SIGTERM])
+def test_killed_in_other_ways(signum: int, tmp_path: Path) -> None:
+    with Victim("tree 8", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
+        before = places(victim)
+        checkpoint(guard)
+        for n in range(1, 4):
+            kill_main(victim, signum)
+            assert guard.wait("restored", count=n)["wait_status"] & 0x7F == signum
+            progress(victim)
+        assert places(victim) == before
+
+
+def test_rolled_back_on_command(tmp_path: Path) -> None:
+    with Victim("tree 8", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
+        before = places(victim)
+        for _ in range(3):
+            checkpoint(guard)
+            assert guard.command("restore")["kind"] == "restored"
+            progress(victim)
+        assert places(victim) == before
+
+
+def test_started_since_is_gone_and_ended_since_is_back(tmp_path: Path) -> None:
+    """Command 1 runs at the checkpoint; at the kill it has long ended, and command 2 runs."""
+    with Victim("commands --gate", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
+        wait_until(lambda: len(members(victim)) == 2 and victim.see().counter[3] == 1, 10, "command 1")
+        time.sleep(0.1)  # for it to have executed its program
+        before = places(victim)
+        checkpoint(guard)
+        victim.board.set_counter(8, 1)
+        wait_until(lambda: victim.see().counter[3] == 2 and len(members(victim)) == 2, 10, "command 2")
+        assert places(victim) != before
+        victim.board.set_counter(8, 0)
+        for n in range(1, 4):
+            kill_main(victim)
+            guard.wait("restored", count=n)
+            wait_until(lambda: len(members(victim)) == 2, 10, "the two are there")
+            wait_whole(victim)
+            assert places(victim) == before
+        # It ends once more, is reaped, and everything takes its course.
+        victim.board.set_counter(8, 10)
+        wait_counter(victim, 3, 11)
+        assert victim.see().counter[0] == 1 + 10
+
+
+def test_a_dead_child_holds_no_pipe_open(tmp_path: Path) -> None:
+    """$(cmd) sees the end of what cmd says when it ends, and not when its template goes."""
+    with Victim("commands --gate", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
+        for n in range(1, 6):
+            wait_counter(victim, 3, n)
+            time.sleep(0.05)
+            checkpoint(guard)
+            assert victim.see().counter[0] == n - 1
+            victim.board.set_counter(8, n)
+            # No other checkpoint comes.
+            wait_counter(victim, 0, n)
+
+
+@pytest.mark.parametrize("command", ["churn 6 --life-ms 300", "churn 6 --vfork --life-ms 300"])
+def test_a_child_that_is_killed_is_the_applications_business(command: str, tmp_path: Path) -> None:
+    rng = random.Random(command)
+    with Victim(command, tmp_path) as victim, GuardProcess(steady(0.02), [victim.pid]) as guard:
+        guard.wait("checkpoint", count=3)
+        for _ in range(20):
+            main = main_process(victim)
+            children = [m.pid for m in members(victim) if m.name in ("child", "exe") and m.pid != main]
+            if children:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(rng.choice(children), signal.SIGKILL)
+            victim.wait_beats(5)
+        wait_until(lambda: victim.see().counter[3] > 0 or victim.see().violations, 10, "it has noticed")
+        guard.wait("checkpoint", since=guard.mark(), count=3)
+        progress(victim)
+        assert not [event for event in guard.events if event.get("kind") in ("died", "restored", "unprotected")]
+
+
+def test_pages_stay_shared(tmp_path: Path) -> None:
+    """Prefork workers share their data after a restore as they did before it; proportional sizes are the measure."""
+    megabytes, workers = 60, 6
+
+    def held_kb() -> int:
+        # A holder has the application's memory itself, and would count it twice.
+        return sum(map(pss_kb, [m.pid for m in members(victim)] + ours(victim, "avckpt-tmpl")))
+
+    with (
+        Victim(f"prefork {workers} {megabytes} --touch 256", tmp_path) as victim,
+        GuardProcess(steady(keep=1), [victim.pid]) as guard,
+    ):
+        alone = held_kb()
+        assert alone < (megabytes + 20) * 1024
+        for n in range(1, 4):
+            checkpoint(guard)
+            with_templates = held_kb()
+            kill_main(victim)
+            guard.wait("restored", count=n)
+            progress(victim)
+            wait_whole(victim)
+            victim.wait_beats(300)  # its workers read all of it, which must not unshare it
+            assert len(members(victim)) == workers + 1
+            assert held_kb() < with_templates + workers * 2048, (alone, with_templates)
+
+
+def test_a_template_killed_from_inside_costs_a_generation(tmp_path: Path) -> None:
+    with Victim("tree 8", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
+        checkpoint(guard)
+        templates = ours(victim, "avckpt-tmpl")
+        assert len(templates) > 8
+        os.kill(templates[-1], signal.SIGKILL)
+        guard.wait("dropped")
+        progress(victim)
+        checkpoint(guard)
+        kill_main(victim)
+        guard.wait("restored")
+        progress(victim)
+
+
+def test_it_ends_as_its_main_process_does(tmp_path: Path) -> None:
+    """A clean end of the main process ends the container, and everybody in it."""
+    with Victim("tree 8 --seconds 1.5", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
+        guard.wait("checkpoint", count=3)
+        assert guard.wait("gave_up")["reason"] == "clean_exit"
+        assert victim.end(10) == 0
+        guard.wait("ended")
+        assert victim.see().violations == 0
+
+
+def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
+    """The guard dies before, in and after checkpoints; no process is harmed or left stopped, no template ever runs."""
+    with contextlib.ExitStack() as stack:
+        commands = ("tree 8 --threads 2", "churn 4", "churn 3 --vfork", "terminal")
+        victims = [stack.enter_context(Victim(command, tmp_path)) for command in commands]
+        before = [places(victim) for victim in victims]
+        said = storm(config(0.002), STORM, 60, 1, *victims)
+        assert said["left"] == []
+        assert said["unprotected"] == 0
+        for victim in victims:
+            progress(victim)
+            wait_whole(victim)
+        for n in (0, 3):
+            assert places(victims[n]) == before[n]
+        # And the next guard protects as if nothing had been.
+        with GuardProcess(steady(0.05), [victim.pid for victim in victims]) as guard:
+            for cookie, victim in enumerate(victims, 1):
+                guard.wait("checkpoint", cookie=cookie, count=3)
+                since = guard.mark()
+                kill_main(victim)
+                guard.wait("restored", since=since, cookie=cookie)
+                progress(victim)
+
+
+def test_the_tracer_is_killed_after_restores(tmp_path: Path) -> None:
+    """What was restored is the application itself, and lives on without whoever restored it."""
+    with Victim("tree 8", tmp_path) as victim:
+        before = places(victim)
+        for _ in range(KILLS):
+            with GuardProcess(steady(0.02), [victim.pid]) as guard:
+                guard.wait("checkpoint")
+                kill_main(victim)
+                guard.wait("restored")
+                guard.kill()
+            progress(victim)
+            wait_whole(victim)
+            assert places(victim) == before
+
+
+@pytest.mark.skipif(not LONG, reason="long: `make test-trees`")
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("command", ["tree 125 --threads 7 --lap-us 200000", "tree 120 --lap-us 100000"])
+def test_many(command: str, tmp_path: Path) -> None:
+    """Two hundred processes, a thousand threads."""
+    again = steady(2.0)
+    with Victim(command, tmp_path) as victim, GuardProcess(again, [victim.pid]) as guard:
+        kill_again_and_again(guard, victim, 10, 3.0)

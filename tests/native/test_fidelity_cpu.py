@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registers that not every CPU has."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from native.board import UNAVAILABLE_STATUS
+from native.guarded import BUILD, GuardProcess, Victim, config, kill_at_random
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def skip_without(program: str) -> None:
+    """Skips with what the victim says is missing."""
+    done = subprocess.run([BUILD / program, "1", "--seconds", "0.05"], capture_output=True, text=True, check=False)
+    if done.returncode == UNAVAILABLE_STATUS:
+        pytest.skip(done.stderr.strip())
+
+
+def test_tiles(tmp_path: Path) -> None:
+    """AMX: a restored thread has to be given room for its tiles before it can have them."""
+    skip_without("tiles")
+    with Victim("tiles 3", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 40, (0.01, 0.12))
+        assert not victim.see().violations
+
+
+def test_protection_keys(tmp_path: Path) -> None:
+    """Each thread has the rights that it had, and the keys are allocated."""
+    skip_without("pkeys")
+    with Victim("pkeys 3", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 30, (0.01, 0.12))
+
+
+def test_shadow_stacks_are_refused(tmp_path: Path) -> None:
+    """A kernel that has them says so of each thread; a program compiled for them has one."""
+    if "x86_Thread_features:" not in Path("/proc/self/status").read_text():
+        pytest.skip("this kernel has no shadow stacks for programs (CONFIG_X86_USER_SHADOW_STACK)")
+    tunables = "/usr/bin/env GLIBC_TUNABLES=glibc.cpu.x86_shstk=on"
+    with Victim(f"{tunables} {BUILD / 'idle'} 0 1", tmp_path) as victim:
+        if (
+            "shstk"
+            not in Path(f"/proc/{victim.app}/status").read_text().split("x86_Thread_features:")[1].split("\n")[0]
+        ):
+            pytest.skip("this CPU or C library gives a program no shadow stack")
+        with GuardProcess(config(0.03), [victim.pid]) as guard:
+            assert "shadow stacks" in guard.wait("unprotected")["error"]["message"]
+            victim.wait_beats(20)

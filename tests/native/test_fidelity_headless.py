@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process whose main thread has ended while others go on."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from native.guarded import GuardProcess, Victim, config, kill_at_random, state_of, threads
+
+pytestmark = pytest.mark.skipif(
+    tuple(int(part) for part in os.uname().release.split(".")[:2]) < (6, 9), reason="pidfds of threads: Linux 6.9"
+)
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def test_it_is_restored_without_its_main_thread(tmp_path: Path) -> None:
+    """The others are who they were; the main thread has ended, as it had before."""
+    with Victim("headless 5", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        before = threads(victim.app)
+        kill_at_random(guard, victim, 40, (0.01, 0.12))
+        assert state_of(victim.app) == "Z"
+        assert threads(victim.app) == before
+
+
+def test_the_end_of_the_last_thread(tmp_path: Path) -> None:
+    """Is the process's."""
+    plain = config(restore_on_exit=False)
+    with Victim("headless 3", tmp_path) as victim, GuardProcess(plain, [victim.pid]) as guard:
+        guard.wait("attached")
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        victim.kill_app()
+        guard.wait("restored")
+        victim.wait_beats()
+        victim.kill_app(signal.SIGUSR1)
+        assert victim.end(5) == 7
+
+
+def test_a_guard_that_comes_later(tmp_path: Path) -> None:
+    """Takes it for the application that it is."""
+    with Victim("headless 2", tmp_path) as victim:
+        with GuardProcess(config(0.03), [victim.pid]) as guard:
+            guard.wait("checkpoint", count=3)
+        with GuardProcess(config(0.03), [victim.pid]) as guard:
+            kill_at_random(guard, victim, 3, (0.05, 0.1))

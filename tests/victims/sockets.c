@@ -1,0 +1,154 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Sockets with messages in them, and what else holds on to others.
+ *
+ *   sockets SCENARIO FOLDER     see scenario.h
+ */
+#include <poll.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+
+#include "scenario.h"
+
+/* ---- messages ------------------------------------------------------------------ */
+
+static void say(int f, const char *text)
+{
+	must(send(f, text, strlen(text), MSG_NOSIGNAL) == (ssize_t)strlen(text), "send");
+}
+
+static void say_all(void)
+{
+	say(fd[0], "one");
+	say(fd[0], "and two");
+	say(fd[2], "a record");
+	say(fd[2], "another");
+	say(fd[4], "of a closed pair");
+}
+
+static void messages_setup(void)
+{
+	must(socketpair(AF_UNIX, SOCK_DGRAM, 0, fd) == 0 &&
+		     socketpair(AF_UNIX, SOCK_SEQPACKET, 0, fd + 2) == 0 &&
+		     socketpair(AF_UNIX, SOCK_DGRAM, 0, fd + 4) == 0 &&
+		     socketpair(AF_UNIX, SOCK_SEQPACKET, 0, fd + 6) == 0,
+	     "socketpair");
+	say_all();
+}
+
+static void messages_disturb(void)
+{
+	must(read(fd[1], scratch, 100) == 3, "read");
+	say(fd[1], "an answer");
+	must(read(fd[3], scratch, 100) == 8 && read(fd[3], scratch, 100) == 7, "read");
+	close(fd[5]);
+	say(fd[7], "new");
+}
+
+static void expect_none(int f)
+{
+	CHECK(recv(f, scratch, 10, MSG_DONTWAIT) < 0 && errno == EAGAIN,
+	      "a message that was not there");
+}
+
+static void messages_verify(void)
+{
+	int offset = 0;
+	socklen_t bytes = sizeof offset;
+
+	expect_text(fd[1], "one", "a datagram");
+	expect_text(fd[1], "and two", "the second datagram");
+	expect_text(fd[3], "a record", "a record");
+	expect_text(fd[3], "another", "the second record");
+	expect_text(fd[5], "of a closed pair", "a pair that was closed");
+	for (int i = 0; i < 8; i++)
+		expect_none(fd[i]);
+	CHECK(getsockopt(fd[1], SOL_SOCKET, SO_PEEK_OFF, &offset, &bytes) == 0 && offset == -1,
+	      "SO_PEEK_OFF is %d", offset);
+	say_all();
+}
+
+/* ---- descriptors in flight: lost, and told ----------------------------------------- */
+
+static void rights_setup(void)
+{
+	char byte = 'x', control[CMSG_SPACE(sizeof(int))] = { 0 };
+	struct iovec io = { &byte, 1 };
+	struct msghdr head = { .msg_iov = &io,
+			       .msg_iovlen = 1,
+			       .msg_control = control,
+			       .msg_controllen = sizeof control };
+	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
+
+	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd) == 0, "socketpair");
+	c->cmsg_level = SOL_SOCKET;
+	c->cmsg_type = SCM_RIGHTS;
+	c->cmsg_len = CMSG_LEN(sizeof(int));
+	memcpy(CMSG_DATA(c), &fd[0], sizeof(int));
+	must(sendmsg(fd[0], &head, 0) == 1, "sendmsg");
+}
+
+/* ---- pidfds ----------------------------------------------------------------------------- */
+
+static int pidfd_of(pid_t pid, unsigned int flags)
+{
+	return (int)syscall(SYS_pidfd_open, pid, flags);
+}
+
+static void pidfds_setup(void)
+{
+	fd[0] = pidfd_of(getppid(), 0);
+	fd[1] = pidfd_of(getpid(), 0);
+	fd[2] = pidfd_of(getpid(), O_NONBLOCK);
+	fd[3] = dup(fd[1]);
+	must(fd[0] >= 0 && fd[1] >= 0 && fd[2] >= 0 && fd[3] >= 0, "pidfd_open");
+}
+
+static void pidfds_disturb(void)
+{
+	close(fd[0]);
+	close(fd[2]);
+}
+
+static void expect_process(int f, pid_t pid)
+{
+	struct pollfd p = { .fd = f, .events = POLLIN };
+	char path[48], text[512], *line;
+	ssize_t n;
+	int info;
+
+	CHECK(poll(&p, 1, 0) == 0, "the process of pidfd %d has ended", f);
+	CHECK(!syscall(SYS_pidfd_send_signal, f, 0, NULL, 0), "pidfd %d: %s", f, strerror(errno));
+	snprintf(path, sizeof path, "/proc/self/fdinfo/%d", f);
+	info = open(path, O_RDONLY);
+	n = read(info, text, sizeof text - 1);
+	close(info);
+	text[n > 0 ? n : 0] = 0;
+	line = strstr(text, "\nPid:");
+	CHECK(line && atoi(line + 5) == pid, "pidfd %d is not of %d: %s", f, pid, text);
+}
+
+static void pidfds_verify(void)
+{
+	expect_process(fd[0], getppid());
+	for (int i = 1; i <= 3; i++)
+		expect_process(fd[i], getpid());
+	CHECK(fcntl(fd[2], F_GETFL) & O_NONBLOCK && fcntl(fd[2], F_GETFD) == FD_CLOEXEC &&
+		      !fcntl(fd[3], F_GETFD),
+	      "the flags of a pidfd");
+}
+
+static void nothing(void)
+{
+}
+
+static const struct scenario scenarios[] = {
+	{ "messages", messages_setup, messages_disturb, messages_verify },
+	{ "pidfds", pidfds_setup, pidfds_disturb, pidfds_verify },
+	{ "rights", rights_setup, nothing, nothing },
+};
+
+int main(int argc, char **argv)
+{
+	play(argc, argv, scenarios, sizeof scenarios / sizeof *scenarios);
+}
