@@ -232,7 +232,9 @@ def test_containers_of_another_store(podman: Podman, hooked: Podman, receiver: R
         podman.run("image", "unmount", base_image)
         subprocess.run(["umount", f"{store}/root/overlay"], check=False, stderr=subprocess.DEVNULL)
         shutil.rmtree(store)
-    assert (status, err) == (0, "")
+    # In a store that it has never seen, Podman 4 looks at CNI's files, and may find the plugins missing.
+    said = [line for line in err.splitlines() if "Error validating CNI config file" not in line]
+    assert (status, said) == (0, [])
     assert out.startswith(INIT)
 
 
