@@ -152,8 +152,18 @@ static int check_namespaces(struct target *target, struct avc_error *err)
 			continue; /* the kernel has none of these; or it has ended */
 		/* Of a namespace in which there was no process yet nothing is told. */
 		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].of_children);
-		if (readlink(path, theirs, sizeof theirs - 1) < 0 && errno != ENOENT)
-			continue;
+		if (readlink(path, theirs, sizeof theirs - 1) < 0) {
+			char other[64];
+
+			if (errno != ENOENT)
+				continue;
+			/* Nor of any of one that is just ending (kernel/exit.c,
+			 * exit_task_namespaces()). */
+			snprintf(path, sizeof path, "/proc/%d/ns/uts", target->pid);
+			if (readlink(path, other, sizeof other) < 0)
+				return fail(err, AVC_GONE, ESRCH, target->pid, "check", "readlink",
+					    "it has ended");
+		}
 		/* Behind the kind: "pid:[4026531836]". */
 		if (strcmp(own + strcspn(own, "["), theirs + strcspn(theirs, "[")) != 0)
 			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",

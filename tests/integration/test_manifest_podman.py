@@ -200,7 +200,9 @@ def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Pr
         done = project.avckpt("up", "--json")
         assert "starting the container avckpt-sidecar" in done.stderr
         assert states(done)["by-map"]
-        entries = {entry["name"].split("_")[1]: entry for entry in sidecar.ps()}
+        # There may be others on this machine.
+        ours = [entry for entry in sidecar.ps() if entry["name"].startswith(project.name)]
+        entries = {entry["name"].split("_")[1]: entry for entry in ours}
         assert entries["by-map"]["interval_s"] == 0.3
         assert entries["by-list"]["interval_s"] == 0.15  # its label wins
         assert entries["by-list"]["keep"] == 3

@@ -23,11 +23,16 @@ static char main_state(void)
 	int fd;
 
 	snprintf(path, sizeof path, "/proc/%d/stat", getpid());
-	fd = open(path, O_RDONLY | O_CLOEXEC);
-	n = fd < 0 ? -1 : read(fd, text, sizeof text - 1);
+	/* An open file of /proc does not survive a restore: then once more. */
+	for (int tries = 0; tries < 5; tries++) {
+		fd = open(path, O_RDONLY | O_CLOEXEC);
+		n = fd < 0 ? -1 : read(fd, text, sizeof text - 1);
+		close(fd);
+		if (n > 0)
+			break;
+	}
 	CHECK(n > 0, "%s: %s", path, strerror(errno));
-	close(fd);
-	text[n] = 0;
+	text[n > 0 ? n : 0] = 0;
 	p = strrchr(text, ')');
 	return p ? p[2] : '?';
 }
