@@ -33,23 +33,16 @@
 
 /* ---- a puppet -------------------------------------------------------------------- */
 
-struct letter { /* in the pad: one recvmsg(2) that brings one descriptor           */
-	struct msghdr head;
-	struct iovec io;
-	uint8_t byte;
-	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
-};
-
 /* The list of calls is where files_restore.c has its own, which is not in use any more. */
 static void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot)
 {
-	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2 + sizeof(struct letter);
+	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2 + sizeof(struct files_letter);
 
 	puppet->pad = pad;
 	puppet->call = &pad->control->holder;
 	puppet->list = (struct inj_syscall *)(((uintptr_t)memory + 63) & ~(uintptr_t)63);
-	puppet->list_max =
-		(INJ_FILES_BYTES / 2 - sizeof(struct letter) - 64) / sizeof *puppet->list;
+	puppet->list_max = (INJ_FILES_BYTES / 2 - sizeof(struct files_letter) - 64) /
+			   sizeof *puppet->list;
 	puppet->listed = 0;
 }
 
@@ -57,8 +50,8 @@ void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_
 		 uint64_t e, uint64_t f)
 {
 	if (puppet->listed < puppet->list_max)
-		puppet->list[puppet->listed] =
-			(struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, f } };
+		puppet->list[puppet->listed] = (struct inj_syscall){ .nr = nr,
+								     .arg = { a, b, c, d, e, f } };
 	puppet->listed++;
 }
 
@@ -109,17 +102,10 @@ static void *puppet_data(const struct puppet *puppet, avc_remote *remote)
 static avc_remote write_letter(const struct puppet *puppet)
 {
 	avc_remote remote;
-	struct letter *letter = puppet_data(puppet, &remote);
+	struct files_letter *letter = puppet_data(puppet, &remote);
 
 	_Static_assert(sizeof *letter <= sizeof puppet->call->out, "room for a letter");
-	*letter = (struct letter){ 0 };
-	letter->io = (struct iovec){ (void *)(remote + offsetof(struct letter, byte)), 1 };
-	letter->head = (struct msghdr){
-		.msg_iov = (void *)(remote + offsetof(struct letter, io)),
-		.msg_iovlen = 1,
-		.msg_control = (void *)(remote + offsetof(struct letter, control)),
-		.msg_controllen = sizeof letter->control,
-	};
+	files_letter_write(letter, remote);
 	return remote;
 }
 
@@ -177,17 +163,28 @@ struct manner {
 	uint8_t auxv[AUXV_BYTES];
 };
 
-enum { START_CODE, END_CODE, START_DATA, END_DATA, START_BRK, BRK, START_STACK, ARG_START, ARG_END,
-       ENV_START, ENV_END };
+enum {
+	START_CODE,
+	END_CODE,
+	START_DATA,
+	END_DATA,
+	START_BRK,
+	BRK,
+	START_STACK,
+	ARG_START,
+	ARG_END,
+	ENV_START,
+	ENV_END
+};
 
 static int read_mm(pid_t pid, struct manner *manner)
 {
 	/* Fields of /proc/PID/stat after the name, counted from `state` as 3. */
 	static const struct {
 		int field, to;
-	} fields[] = { { 26, START_CODE }, { 27, END_CODE },   { 28, START_STACK },
-		       { 45, START_DATA }, { 46, END_DATA },   { 47, START_BRK },
-		       { 48, ARG_START },  { 49, ARG_END },    { 50, ENV_START },
+	} fields[] = { { 26, START_CODE }, { 27, END_CODE }, { 28, START_STACK },
+		       { 45, START_DATA }, { 46, END_DATA }, { 47, START_BRK },
+		       { 48, ARG_START },  { 49, ARG_END },  { 50, ENV_START },
 		       { 51, ENV_END } };
 	char buf[1024], *p;
 	ssize_t n;
@@ -285,8 +282,8 @@ void branch_setup_groups(const struct branch *branch, struct setup *setup)
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup)
 {
 	/* A change of users takes it away. */
-	setup_add_thread(setup, "", SYS_prctl, PR_SET_DUMPABLE,
-			 (uint64_t)branch->manner->dumpable, 0, 0, 0)
+	setup_add_thread(setup, "", SYS_prctl, PR_SET_DUMPABLE, (uint64_t)branch->manner->dumpable,
+			 0, 0, 0)
 		->flags = INJ_MAY_FAIL;
 }
 
@@ -301,7 +298,7 @@ void branch_forget(struct branch *branch)
 struct member {
 	pid_t pid; /* 0: not made yet                                         */
 	int pidfd;
-	bool traced, zombie;
+	bool traced;
 	struct puppet puppet;
 };
 
@@ -310,14 +307,10 @@ struct family {
 	struct generation *generation;
 	struct last_pid *helper;
 	const struct files_table *table; /* by branch                            */
-	bool flush;          /* some have had children that ended                  */
-	struct member first; /* the main process                              */
-	struct member *member; /* by branch                                   */
+	bool flush;                      /* some have had children that ended                  */
+	struct member first;             /* the main process                              */
+	struct member *member;           /* by branch                                   */
 };
-
-#define FAMILY_OPTIONS                                                                       \
-	(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | \
-	 PTRACE_O_TRACESYSGOOD | PTRACE_O_SUSPEND_SECCOMP)
 
 struct family *family_new(struct target *main, struct generation *generation,
 			  struct last_pid *helper, const struct files_table *table,
@@ -383,7 +376,7 @@ static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t fla
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP || tracee_settle(puppet->pid, err))
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)FAMILY_OPTIONS))
+	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
 		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
 	return 0;
 }
@@ -421,8 +414,7 @@ static int fork_host(struct family *family, struct member *host, const struct br
 		result = last_pid_set(family->helper, branch->inside - 1, err) ||
 			 clone_task(&between, runner, SIGCHLD, child, err);
 		inside = *child ? proc_inside(*child) : 0;
-		if (between_inside &&
-		    take_back(&host->puppet, between.pid, between_inside, err))
+		if (between_inside && take_back(&host->puppet, between.pid, between_inside, err))
 			return -1;
 		if (result)
 			return -1;
@@ -445,7 +437,6 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 	const uint64_t open_mask = 0;
 	struct puppet *puppet = &member->puppet;
 
-	member->zombie = true;
 	if (signal) {
 		avc_remote remote;
 
@@ -656,7 +647,8 @@ static int join_group(struct member *member, const struct branch *branch, struct
 		return -1;
 	if (puppet->list[0].result)
 		fail(notes, AVC_KERNEL, (int)-puppet->list[0].result, branch->inside, "restore",
-		     "setpgid", "process %d is not in the process group it was in, whose leader is gone",
+		     "setpgid",
+		     "process %d is not in the process group it was in, whose leader is gone",
 		     branch->inside);
 	return 0;
 }
@@ -670,8 +662,7 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 	const struct target *parent = target_of(family, host);
 	/* The main process, a fork of its template, is registered with rseq(2); those that
 	 * are made here register last of all. */
-	const struct inj_thread *parents =
-		pad_thread(&parent->pad, family->generation->slot, 0);
+	const struct inj_thread *parents = pad_thread(&parent->pad, family->generation->slot, 0);
 	const avc_remote rseq = host < 0 ? parents->rseq : 0;
 
 	if (open_mail(puppet, err))
@@ -703,7 +694,8 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	first->traced = true;
 	first->pidfd = proc_pidfd_open(main_pid);
 	puppet_enter(&first->puppet, &family->main->pad, generation->slot);
-	if (first->pidfd < 0 || ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)FAMILY_OPTIONS) ||
+	if (first->pidfd < 0 ||
+	    ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)TRACE_OPTIONS_OURS) ||
 	    arch_regs_get(main_pid, &first->puppet.base))
 		return fail_errno(err, main_pid, "restore", "ptrace(GETREGS)", "it was killed");
 	if (slot->session_leader)
@@ -726,7 +718,8 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		member->puppet.socket = -1;
 		member->pidfd = proc_pidfd_open(member->pid);
 		if (member->pidfd < 0)
-			return fail_errno(err, member->pid, "restore", "pidfd_open", "it was killed");
+			return fail_errno(err, member->pid, "restore", "pidfd_open",
+					  "it was killed");
 		if (!branch->target) {
 			family->flush = true;
 			if (make_zombie(member, branch, err))

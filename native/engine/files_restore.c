@@ -24,13 +24,6 @@
 
 #define NAME_SHOWN 48
 
-struct mail { /* in the pad: one recvmsg(2) that brings one descriptor          */
-	struct msghdr head;
-	struct iovec io;
-	uint8_t byte;
-	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
-};
-
 void files_note(struct files_work *work, const struct file *f, const char *problem)
 {
 	if (!problem)
@@ -190,8 +183,8 @@ static void gather(struct files_work *work)
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
 		if (work->source[group] >= 0)
-			work->local[group] = files_borrow(
-				work->table_pidfd, work->now->file[work->source[group]].fd);
+			work->local[group] = files_borrow(work->table_pidfd,
+							  work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
 	}
@@ -232,10 +225,10 @@ static bool is_urgent(const struct files_work *work)
 /* ---- in the template ------------------------------------------------------------- */
 
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
-static struct mail *mail_of(const struct files_work *work)
+static struct files_letter *mail_of(const struct files_work *work)
 {
-	return (struct mail *)(pad_files(&work->target->pad, work->generation->slot) +
-			       INJ_FILES_BYTES / 2);
+	return (struct files_letter *)(pad_files(&work->target->pad, work->generation->slot) +
+				       INJ_FILES_BYTES / 2);
 }
 
 static struct inj_syscall *list_of(const struct files_work *work)
@@ -243,7 +236,8 @@ static struct inj_syscall *list_of(const struct files_work *work)
 	return (struct inj_syscall *)(mail_of(work) + 1);
 }
 
-#define LISTED_MAX ((INJ_FILES_BYTES / 2 - sizeof(struct mail)) / sizeof(struct inj_syscall))
+#define LISTED_MAX \
+	((INJ_FILES_BYTES / 2 - sizeof(struct files_letter)) / sizeof(struct inj_syscall))
 
 /* What was listed becomes the template's next call. */
 static void close_list(struct files_work *work)
@@ -346,20 +340,25 @@ int files_send(int socket, int fd)
 	return sendmsg(socket, &head, MSG_DONTWAIT | MSG_NOSIGNAL) == 1 ? 0 : -1;
 }
 
+void files_letter_write(struct files_letter *letter, avc_remote remote)
+{
+	*letter = (struct files_letter){ 0 };
+	letter->io = (struct iovec){ (void *)(remote + offsetof(struct files_letter, byte)), 1 };
+	letter->head = (struct msghdr){
+		.msg_iov = (void *)(remote + offsetof(struct files_letter, io)),
+		.msg_iovlen = 1,
+		.msg_control = (void *)(remote + offsetof(struct files_letter, control)),
+		.msg_controllen = sizeof letter->control,
+	};
+}
+
 static avc_remote lay_out_mail(const struct files_work *work)
 {
-	const struct pad *pad = &work->target->pad;
-	struct mail *mail = mail_of(work);
+	struct files_letter *letter = mail_of(work);
+	const avc_remote remote = pad_remote(&work->target->pad, letter);
 
-	*mail = (struct mail){ 0 };
-	mail->io = (struct iovec){ (void *)pad_remote(pad, &mail->byte), 1 };
-	mail->head = (struct msghdr){
-		.msg_iov = (void *)pad_remote(pad, &mail->io),
-		.msg_iovlen = 1,
-		.msg_control = (void *)pad_remote(pad, mail->control),
-		.msg_controllen = sizeof mail->control,
-	};
-	return pad_remote(pad, &mail->head);
+	files_letter_write(letter, remote);
+	return remote;
 }
 
 /* One letter for all: recvmsg(2) leaves the header as it was, for it is just as long. */
@@ -488,7 +487,8 @@ static void put_states(struct files_work *work)
 			files_note(work, w, "it could not be put in its place");
 			continue;
 		}
-		files_note(work, w, file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		files_note(work, w,
+			   file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
 		if (w->kind == FILE_INOTIFY)
 			files_note(work, w, file_put_marks(fd, w, n, work->init));
 		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&

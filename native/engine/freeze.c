@@ -217,7 +217,7 @@ static int clone_app(struct target *target, struct thread *main_thread,
 static int stop_tree(struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->members; i++)
-		tree->member[i]->frozen = tree->member[i]->frozen_new = false;
+		tree->member[i]->frozen = false;
 	if (stop_all(tree->main, err))
 		return -1;
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
@@ -248,9 +248,6 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 			return 0;
 		if (tree_look(tree, &fresh, err))
 			return -1;
-		for (uint32_t i = 1; fresh && i < tree->count; i++)
-			if (tree->kin[i].target && !tree->kin[i].target->infected)
-				tree->kin[i].target->frozen_new = true;
 	}
 	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",
 		    "its processes come and go too fast");

@@ -133,8 +133,9 @@ static void release(struct avc_guard *guard, struct target *target)
 	for (uint32_t i = 0; i < guard->count; i++)
 		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
 			if (guard->generations[i].branch[k].target == target)
-				generation_close_files(target, guard->generations[i].branch[k].image);
-	tree_let_go(&guard->tree, target);
+				generation_close_files(target,
+						       guard->generations[i].branch[k].image);
+	tree_let_go(target);
 }
 
 void tend_tree(struct avc_guard *guard)
@@ -142,8 +143,7 @@ void tend_tree(struct avc_guard *guard)
 	bool any = false;
 
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		any |= guard->tree.member[i]->pid &&
-		       pidfd_ended(guard->tree.member[i]->pidfd);
+		any |= guard->tree.member[i]->pid && pidfd_ended(guard->tree.member[i]->pidfd);
 	/* When the main process goes, the others go with it, and all of it comes back. */
 	if (!any || !guard->target.pid || pidfd_ended(guard->target.pidfd))
 		return;
@@ -166,8 +166,7 @@ static bool has_ended(const struct generation *generation)
 	if (pidfd_ended(generation->pidfd))
 		return true;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].image &&
-		    pidfd_ended(generation->branch[i].image->pidfd))
+		if (generation->branch[i].image && pidfd_ended(generation->branch[i].image->pidfd))
 			return true;
 	return false;
 }

@@ -26,9 +26,6 @@
 
 #include "internal.h"
 
-#define HOLDER_OPTIONS                                                                       \
-	(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | \
-	 PTRACE_O_TRACESYSGOOD | PTRACE_O_SUSPEND_SECCOMP)
 #define CAVE_BYTES 256
 #define PADS_START UINT64_C(0x200000000000)
 #define PADS (UINT64_C(1) << 19)
@@ -175,12 +172,9 @@ static int make_pad(struct target *target, struct thread *thread, avc_remote cav
 		    uint32_t threads_max, struct avc_error *err)
 {
 	struct pad *pad = &target->pad;
-	uint64_t arg[6] = { where_to_map(target),
-			    pad_layout(pad, slots, threads_max),
-			    PROT_READ | PROT_WRITE,
-			    MAP_SHARED | MAP_ANONYMOUS | MAP_NORESERVE,
-			    (uint64_t)-1,
-			    0 };
+	uint64_t arg[6] = { where_to_map(target),   pad_layout(pad, slots, threads_max),
+			    PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS | MAP_NORESERVE,
+			    (uint64_t)-1,           0 };
 	long base, result;
 
 	if (stub_syscall(thread, cave, SYS_mmap, arg, &base, err))
@@ -404,7 +398,7 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)HOLDER_OPTIONS) ||
+	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)TRACE_OPTIONS_OURS) ||
 	    arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
@@ -424,7 +418,7 @@ static int clone_by(struct target *target, pid_t tid, const struct arch_regs *ba
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)HOLDER_OPTIONS))
+	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
 		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -462,7 +456,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||
-	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)HOLDER_OPTIONS) ||
+	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)TRACE_OPTIONS_OURS) ||
 	    arch_regs_get(between, &target->holder_base))
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");

@@ -34,6 +34,7 @@
 #include <pthread.h>
 #include <stdbool.h>
 #include <stdint.h>
+#include <sys/socket.h>
 #include <sys/types.h>
 
 #include "arch.h"
@@ -277,23 +278,23 @@ struct target {
 	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	uint32_t forebear_groups;     /* a hash                                            */
-	bool frozen, frozen_new;      /* stopped in this freeze; and only found in it      */
+	bool frozen;                  /* stopped in this freeze                            */
 };
 
 #define FILES_NAME 81 /* of a file, for people                                  */
 
 /* What a generation has of a process that is not the main one. */
 struct branch {
-	struct target *target;     /* NULL: it had ended, and nobody had waited for it */
-	struct generation *image;  /* of this process alone                   */
-	int parent;                /* index of its parent's branch, or ...    */
+	struct target *target;    /* NULL: it had ended, and nobody had waited for it */
+	struct generation *image; /* of this process alone                   */
+	int parent;               /* index of its parent's branch, or ...    */
 	pid_t inside;
-	pid_t session, group;      /* inside; 0: outside of the app           */
-	struct proc_stat stat;     /* as of the freeze                        */
-	struct manner *manner;     /* descend.c                               */
-	pid_t pid;                 /* that it was restored as last            */
-	int status;                /* of one that had ended, as from wait(2)  */
-	uint64_t limit[16][2];     /* getrlimit(2)                            */
+	pid_t session, group;  /* inside; 0: outside of the app           */
+	struct proc_stat stat; /* as of the freeze                        */
+	struct manner *manner; /* descend.c                               */
+	pid_t pid;             /* that it was restored as last            */
+	int status;            /* of one that had ended, as from wait(2)  */
+	uint64_t limit[16][2]; /* getrlimit(2)                            */
 };
 #define PARENT_MAIN (-1)
 #define PARENT_INIT (-2)
@@ -327,7 +328,7 @@ struct generation {
 	/* avckpt.files=strict */
 	struct files_mapped *mapped; /* NULL: it was not strict                         */
 	char written[FILES_NAME];    /* a file that was written since; "": none         */
-	struct branch *branch;        /* the other processes, parents first        */
+	struct branch *branch;       /* the other processes, parents first        */
 	uint32_t branches;
 };
 
@@ -345,7 +346,7 @@ struct tree {
 	bool enabled; /* or else an app has to be one process alone           */
 	struct target *main;
 	pid_t init;
-	uint32_t slots; /* of a pad                                         */
+	uint32_t slots;  /* of a pad                                         */
 	struct kin *kin; /* parents before children                        */
 	uint32_t count;
 	struct target **member; /* of those that are not the main process; those
@@ -408,6 +409,8 @@ bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *
 void tracee_kill(pid_t pid);
 /* Is this thread the one that traces it? */
 bool tracee_is_ours(pid_t tid);
+/* Holders, and processes that are being made: never to run on without us. */
+#define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | PTRACE_O_SUSPEND_SECCOMP | TRACE_OPTIONS_APP)
 #define TRACE_OPTIONS_APP \
 	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
 
@@ -605,7 +608,7 @@ int tree_refuse(struct tree *tree, struct avc_error *err) warn_unused;
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);
 /* It is gone, or another program: what it had open must not stay open by us. */
-void tree_let_go(struct tree *tree, struct target *target);
+void tree_let_go(struct target *target);
 void tree_free(struct tree *tree);
 
 /* ---- target.c ----------------------------------------------------------------- */
@@ -663,7 +666,7 @@ struct files_table {
 	struct {
 		int fd, ours;
 		bool cloexec;
-	} *entry; /* by fd, ascending                                        */
+	} * entry; /* by fd, ascending                                        */
 };
 /* Makes the tables of a dead app the generation's again: that of the main process, which
  * its templates hold, at once; of the others (table[], by branch) what is to be in them.
@@ -675,6 +678,14 @@ int files_restore(struct target *target, struct generation *generation,
 void files_table_free(struct files_table *table);
 /* A duplicate of a descriptor of another process, or -1. */
 int files_borrow(int pidfd, int fd);
+/* In a pad: what recvmsg(2) needs for one descriptor, `remote` there; the header is first. */
+struct files_letter {
+	struct msghdr head;
+	struct iovec io;
+	uint8_t byte;
+	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
+};
+void files_letter_write(struct files_letter *letter, avc_remote remote);
 /* One descriptor over a socket (unix(7), SCM_RIGHTS). */
 int files_send(int socket, int fd);
 /* Whether the restored process could do it all. */
@@ -711,9 +722,8 @@ struct freeze_times {
 
 /* Takes one checkpoint into *generation (slot and number given by the caller).
  * On return the app runs, whatever happened. */
-int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns,
-	   struct generation *generation, struct freeze_times *times,
-	   struct avc_error *err) warn_unused;
+int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
+	   struct freeze_times *times, struct avc_error *err) warn_unused;
 
 /* ---- generation.c -------------------------------------------------------------- */
 
@@ -746,12 +756,12 @@ int restore(struct target *target, struct generation *generation, const struct l
 /* A task that a restored process has forked, and that is made what a template is. */
 struct puppet {
 	pid_t pid;
-	const struct pad *pad;   /* the one it runs in                              */
+	const struct pad *pad; /* the one it runs in                              */
 	struct inj_call *call;
 	struct arch_regs base;
 	struct inj_syscall *list; /* in the pad: calls not made yet                  */
 	uint32_t listed, list_max;
-	int socket;               /* ours, through which it gets descriptors; -1     */
+	int socket; /* ours, through which it gets descriptors; -1     */
 };
 
 /* One more call; puppet_flush() makes them.  The first that fails is told. */

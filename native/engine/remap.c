@@ -20,7 +20,7 @@
 
 #include "internal.h"
 
-#define PAGE UINT64_C(4096)
+#define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 #define COPY_BYTES (512u << 10)
 #define MAP_PAGES 16384u /* of pagemap, read at a time                        */
 
@@ -94,8 +94,8 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 {
 	return a->shared == b->shared && is_stack(a) == is_stack(b) && a->inode == b->inode &&
 	       is_special(a) == is_special(b) &&
-	       (!is_file(a) || (a->offset - a->start == b->offset - b->start &&
-				!strcmp(a->name, b->name)));
+	       (!is_file(a) ||
+		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
 }
 
 /* What is of ours in either, or stays where it is whatever happens. */
@@ -338,15 +338,15 @@ static int fill_piece(struct remap *r, const struct piece *piece)
 					  "its pages can not be compared");
 		for (size_t i = 0; i <= count; i++) {
 			const enum page now =
-				i == count ? PAGE_SAME
-					   : compare(r->frame[i],
-						     piece->kept ? r->parent_frame[i] : 0,
-						     piece->kept);
+				i == count
+					? PAGE_SAME
+					: compare(r->frame[i], piece->kept ? r->parent_frame[i] : 0,
+						  piece->kept);
 
 			if (now == run && i < count)
 				continue;
-			if (run != PAGE_SAME && apply(r, piece, run, from + begin * PAGE,
-						      from + i * PAGE))
+			if (run != PAGE_SAME &&
+			    apply(r, piece, run, from + begin * PAGE, from + i * PAGE))
 				return -1;
 			run = now;
 			begin = i;
@@ -400,7 +400,8 @@ int remap(struct puppet *puppet, const struct target *target, pid_t template, pi
 
 	if (r.want_mem < 0 || r.is_mem < 0 || r.want_pages < 0 || r.parent_pages < 0 || !r.buffer ||
 	    !r.frame || !r.parent_frame)
-		fail_errno(err, puppet->pid, "restore memory", "open(mem)", "it can not be reached");
+		fail_errno(err, puppet->pid, "restore memory", "open(mem)",
+			   "it can not be reached");
 	else if (proc_mappings(puppet->pid, "maps", add_mapping, &r.is) ||
 		 proc_mappings(template, "maps", add_mapping, &r.want))
 		fail_errno(err, puppet->pid, "restore memory", "read(maps)", "it was killed");

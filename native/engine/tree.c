@@ -203,7 +203,8 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 		if (i) {
 			kin->target = find_member(tree, kin->pid, stat.start);
 			/* A clone of ours of which we never heard, and no orphan. */
-			if (!kin->target && kin->parent == PARENT_INIT && tracee_is_ours(kin->pid)) {
+			if (!kin->target && kin->parent == PARENT_INIT &&
+			    tracee_is_ours(kin->pid)) {
 				tree->main->lost = true;
 				kin->pid = 0;
 				continue;
@@ -249,9 +250,8 @@ int tree_refuse(struct tree *tree, struct avc_error *err)
 
 /* ---- the end of one --------------------------------------------------------------- */
 
-void tree_let_go(struct tree *tree, struct target *target)
+void tree_let_go(struct target *target)
 {
-	(void)tree;
 	unhold(target);
 	target_close(target);
 }
@@ -264,7 +264,7 @@ void tree_sweep(struct tree *tree)
 		struct target *target = tree->member[i];
 
 		if (target->pid && pidfd_ended(target->pidfd))
-			tree_let_go(tree, target);
+			tree_let_go(target);
 		/* One of which a thread is still ours has to be waited for. */
 		if (!target->pid && !target->images && !target->thread_count && !target->lost)
 			target_free(target);
