@@ -436,11 +436,13 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 	const struct rlimit none = { 0, 0 };
 	const uint64_t open_mask = 0;
 	struct puppet *puppet = &member->puppet;
+	avc_remote remote;
+	uint8_t *data = puppet_data(puppet, &remote);
 
+	memset(data, 0, 64);
+	memcpy(data + 32, branch->name, sizeof branch->name);
+	puppet_call(puppet, SYS_prctl, PR_SET_NAME, remote + 32, 0, 0, 0, 0);
 	if (signal) {
-		avc_remote remote;
-
-		memset(puppet_data(puppet, &remote), 0, 32);
 		puppet_call(puppet, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8, 0, 0);
 		if (puppet_run(puppet, err))
 			return -1;

@@ -302,6 +302,8 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 			if (branch->parent == PARENT_INIT || branch->inside <= 0)
 				continue; /* init is just about to wait for it */
 			branch->status = proc_exit_status(kin->pid);
+			if (proc_read(kin->pid, "comm", branch->name, sizeof branch->name) > 0)
+				branch->name[strcspn(branch->name, "\n")] = 0;
 		} else {
 			branch->image = calloc(1, sizeof *branch->image);
 			if (!branch->image)

@@ -294,6 +294,7 @@ struct branch {
 	struct manner *manner; /* descend.c                               */
 	pid_t pid;             /* that it was restored as last            */
 	int status;            /* of one that had ended, as from wait(2)  */
+	char name[16];         /* the same                                */
 	uint64_t limit[16][2]; /* getrlimit(2)                            */
 };
 #define PARENT_MAIN (-1)
