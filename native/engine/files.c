@@ -438,21 +438,31 @@ static bool may_be_ours(const struct files *files, const struct file *f)
 	return !f->outside && (f->kind == FILE_PIPE || (f->socket && f->socket->peer));
 }
 
+static bool is_channel(const struct file *f)
+{
+	return f->kind == FILE_PIPE ||
+	       (f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
+		!f->socket->listening);
+}
+
 static void keep_contents(struct look *look)
 {
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
+		bool ours;
 		int fd;
 
 		/* Once for each object, from an end that can be read. */
 		if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) ||
-		    f->shared != f->fd || (f->kind != FILE_PIPE && f->kind != FILE_SOCKET) ||
-		    !may_be_ours(look->files, f))
+		    f->shared != f->fd || f->outside || !is_channel(f))
 			continue;
+		ours = may_be_ours(look->files, f);
 		fd = files_borrow(look->pidfd, f->fd);
 		if (fd < 0)
 			continue;
-		file_keep_content(fd, f);
+		f->ended = !files_other_end(look->files, f) && file_has_ended(fd);
+		if (ours || f->ended)
+			file_keep_content(fd, f);
 		close(fd);
 	}
 }

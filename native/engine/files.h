@@ -120,6 +120,7 @@ struct file {
 	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
 	bool content_lost; /* there was something that can not be put back          */
+	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 };
 
@@ -159,6 +160,8 @@ void file_keep_content(int fd, struct file *file);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
+/* Whether nobody has the other end. */
+bool file_has_ended(int fd);
 /* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
  * open file description; `now` is what it is (NULL: fresh). Returns NULL or why not. */
 const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind);
@@ -189,7 +192,7 @@ int file_open_path(const struct file *want, pid_t init);
 int file_make(const struct file *want, pid_t template, pid_t init, const char **why);
 /* Both ends of a pipe or socket pair. */
 int file_make_pair(const struct file *want, int ends[2]);
-/* A socket or pipe that reads as closed by the other side. */
+/* A socket or pipe that reads as closed by the other side, after what was in it. */
 int file_make_dead(const struct file *want, pid_t template);
 
 /* files_restore.c and files_calls.c */

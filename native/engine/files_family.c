@@ -150,6 +150,16 @@ static const struct file *content_of(const struct tables *tables, const struct f
 	return w;
 }
 
+/* Whoever had the other end of this pipe had ended already, and left it what is in it. */
+static bool has_ended(const struct tables *tables, const struct file *w)
+{
+	for (uint32_t i = 0; i < tables->count; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++)
+			if (other_end(w, &tables->work[i].want->file[k]))
+				return false;
+	return w->ended || (tables->work[0].want->several && !w->outside);
+}
+
 static void put_contents(const struct tables *tables)
 {
 	for (uint32_t i = 0; i < tables->count; i++) {
@@ -158,15 +168,20 @@ static void put_contents(const struct tables *tables)
 		for (uint32_t k = 0; k < work->want->count; k++) {
 			const struct file *w = &work->want->file[k], *content;
 			int fd = -1, other_fd = -1, bytes = 0;
+			bool found;
 
-			if (!is_pair(w) ||
+			if (!(is_pair(w) || (w->kind == FILE_PIPE && w->ended)) ||
 			    (w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY) ||
 			    !is_first(tables, i, w) || !find_end(tables, w, same_end, &fd))
 				continue;
 			content = content_of(tables, w);
-			if (find_end(tables, w, other_end, &other_fd) &&
-			    (content->content_bytes || content->content_lost ||
-			     (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
+			found = find_end(tables, w, other_end, &other_fd);
+			if (!found && w->kind == FILE_PIPE && has_ended(tables, w)) {
+				other_fd = fcntl(fd, F_DUPFD_CLOEXEC, 0);
+				found = true;
+			}
+			if (found && (content->content_bytes || content->content_lost ||
+				      (ioctl(fd, FIONREAD, &bytes) == 0 && bytes)))
 				files_note(work, w, file_put_content(fd, other_fd, content));
 			close_fd(&fd);
 			close_fd(&other_fd);

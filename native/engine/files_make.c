@@ -138,6 +138,13 @@ static int socket_of(pid_t template, int domain, int type, int protocol)
 	return fd;
 }
 
+/* What the other side had sent before it was gone. */
+static void leave_content(int fd, int other_fd, const struct file *want)
+{
+	if (want->ended && want->content)
+		(void)file_put_content(fd, other_fd, want);
+}
+
 int file_make_dead(const struct file *want, pid_t template)
 {
 	const struct file_socket *s = want->socket;
@@ -148,6 +155,8 @@ int file_make_dead(const struct file *want, pid_t template)
 
 		if (pipe2(ends, O_CLOEXEC))
 			return -1;
+		if (mine == 0)
+			leave_content(ends[0], ends[1], want);
 		close(ends[!mine]);
 		return ends[mine];
 	}
@@ -163,6 +172,7 @@ int file_make_dead(const struct file *want, pid_t template)
 			       SOCK_CLOEXEC,
 		       0, ends))
 		return -1;
+	leave_content(ends[0], ends[1], want);
 	close(ends[1]);
 	return ends[0];
 }

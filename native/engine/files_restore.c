@@ -91,6 +91,22 @@ static void break_pairs(struct files_work *work)
 			work->lost[i] = true;
 }
 
+/* Nobody can send again what was read since from a socket that has no other end. */
+static void give_up_read(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		int fd, bytes = 0;
+
+		if (w->kind != FILE_SOCKET || !w->ended || !w->content || work->source[i] < 0)
+			continue;
+		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
+		if (fd < 0 || ioctl(fd, FIONREAD, &bytes) || (uint32_t)bytes != w->content_bytes)
+			work->source[i] = -1;
+		close_fd(&fd);
+	}
+}
+
 /* Somewhere else in the table, perhaps: the app may have moved it. */
 static void find_moved(struct files_work *work)
 {
@@ -533,6 +549,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_staying(work);
 	find_moved(work);
+	give_up_read(work);
 	break_pairs(work);
 	return 0;
 }

@@ -11,6 +11,7 @@
 #include <linux/unix_diag.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
+#include <poll.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -271,6 +272,13 @@ static void keep_messages(int fd, struct file *file)
 	}
 	file->content_bytes = (uint32_t)used;
 	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
+}
+
+bool file_has_ended(int fd)
+{
+	struct pollfd end = { .fd = fd };
+
+	return poll(&end, 1, 0) == 1 && end.revents & POLLHUP;
 }
 
 void file_keep_content(int fd, struct file *file)

@@ -232,6 +232,10 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 			struct target *t = tree->kin[i].target;
 			struct avc_error failed = { 0 };
 
+			if (tree->kin[i].ending) {
+				all = false;
+				usleep(LOOK_US);
+			}
 			if (!t || t->frozen)
 				continue;
 			all = false;

@@ -338,6 +338,7 @@ struct kin {
 	pid_t pid;
 	int parent; /* index, PARENT_INIT; the main process is 0           */
 	bool ended; /* a zombie                                         */
+	bool ending; /* neither a process any more nor a zombie yet      */
 	struct proc_stat stat;
 	struct target *target;
 };

@@ -218,7 +218,7 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 					return -1;
 				}
 				if (!kin->target) {
-					kin->pid = 0;
+					kin->ending = true;
 					continue;
 				}
 				++*fresh;
