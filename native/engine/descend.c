@@ -669,7 +669,8 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 
 	if (open_mail(puppet, err))
 		return -1;
-	if (rseq)
+	/* An orphan comes from one in between that has none (kernel/rseq.c, CLONE_VM). */
+	if (rseq && branch->parent != PARENT_INIT)
 		puppet_call(puppet, SYS_rseq, rseq, parents->rseq_bytes, 1 /* UNREGISTER */,
 			    parents->rseq_signature, 0, 0);
 	if (change_pad(puppet, branch->target, branch->image->slot, err) ||

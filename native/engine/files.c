@@ -359,37 +359,40 @@ static int compare_keys(const struct file *a, const struct file *b)
 
 static int by_key(const void *a, const void *b)
 {
-	const struct file *x = *(struct file *const *)a, *y = *(struct file *const *)b;
-	const int order = compare_keys(x, y);
+	const struct files_held *x = a, *y = b;
+	const int order = compare_keys(x->file, y->file);
 
-	return order ? order : x->fd - y->fd;
+	return order ? order : (x->number > y->number) - (x->number < y->number);
 }
 
-/* Which descriptors are of the same open file description.  Only those of the same
- * file can be, and kcmp(2) gives an order, so that it takes few calls. */
-static void find_shared(struct files *files, pid_t pid)
+/* Only those of the same file can be of the same description, and kcmp(2) gives an order,
+ * so that it takes few calls. */
+void files_group(struct files_held *held, uint32_t count)
 {
-	struct file **sorted = calloc(files->count + 1, sizeof *sorted);
-	struct file **kinds = calloc(files->count + 1, sizeof *kinds);
+	struct files_held **kinds = calloc(count + 1, sizeof *kinds);
 
-	for (uint32_t i = 0; sorted && kinds && i < files->count; i++)
-		sorted[i] = &files->file[i];
-	if (sorted && kinds)
-		qsort(sorted, files->count, sizeof *sorted, by_key);
-	for (uint32_t i = 0, kind_count = 0; sorted && kinds && i < files->count; i++) {
+	for (uint32_t i = 0; i < count; i++) {
+		held[i].number = i;
+		held[i].first = held[i].file;
+	}
+	if (!kinds)
+		return;
+	qsort(held, count, sizeof *held, by_key);
+	for (uint32_t i = 0, kind_count = 0; i < count; i++) {
 		uint32_t low = 0, high;
 		bool found = false;
 
-		if (i && compare_keys(sorted[i], sorted[i - 1]))
+		if (i && compare_keys(held[i].file, held[i - 1].file))
 			kind_count = 0;
 		high = kind_count;
 		while (low < high && !found) {
 			const uint32_t middle = (low + high) / 2;
-			const long order = syscall(SYS_kcmp, pid, pid, KCMP_FILE, sorted[i]->fd,
-						   kinds[middle]->fd);
+			const long order = syscall(SYS_kcmp, held[i].pid, kinds[middle]->pid,
+						   KCMP_FILE, held[i].file->fd,
+						   kinds[middle]->file->fd);
 
 			if (order == 0) {
-				sorted[i]->shared = kinds[middle]->fd;
+				held[i].first = kinds[middle]->file;
 				found = true;
 			} else if (order == 1) {
 				high = middle;
@@ -399,12 +402,26 @@ static void find_shared(struct files *files, pid_t pid)
 		}
 		if (!found) {
 			memmove(&kinds[low + 1], &kinds[low], (kind_count - low) * sizeof *kinds);
-			kinds[low] = sorted[i];
+			kinds[low] = &held[i];
 			kind_count++;
 		}
 	}
-	free(sorted);
 	free(kinds);
+}
+
+/* Which descriptors are of the same open file description. */
+static void find_shared(struct files *files, pid_t pid)
+{
+	struct files_held *held = calloc(files->count + 1, sizeof *held);
+
+	if (!held)
+		return;
+	for (uint32_t i = 0; i < files->count; i++)
+		held[i] = (struct files_held){ .file = &files->file[i], .pid = pid };
+	files_group(held, files->count);
+	for (uint32_t i = 0; i < files->count; i++)
+		held[i].file->shared = held[i].first->fd;
+	free(held);
 }
 
 /* The same during a freeze: what was found before it is only checked. */

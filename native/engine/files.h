@@ -82,6 +82,8 @@ struct file {
 	bool cloexec;
 	bool outside; /* its open file description is also init's                  */
 	int shared;   /* lowest fd with the same open file description             */
+	/* The first one, of all processes, that has it; NULL: only this process      */
+	const struct file *family;
 	bool known;   /* the same object as in `known` of files_look(); at a restore
 		       * the name and what does not change is left to that   */
 	char *name;   /* as readlink(2) says, allocated                            */
@@ -144,6 +146,15 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
 struct file *files_find(const struct files *files, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
+/* Finds out which of them are of the same open file description: `first` is the first of
+ * those.  They are sorted anew. */
+struct files_held {
+	struct file *file;
+	pid_t pid; /* who has it                                               */
+	uint32_t number;
+	struct file *first;
+};
+void files_group(struct files_held *held, uint32_t count);
 
 /* files_info.c */
 /* fdinfo of a descriptor: O_CLOEXEC, locks, and what is in anonymous inodes.  True if

@@ -13,6 +13,51 @@
 
 #include "files.h"
 
+/* ---- after a checkpoint ---------------------------------------------------------- */
+
+static uint32_t list_held(struct files_held *held, const struct generation *image)
+{
+	uint32_t count = 0;
+
+	for (uint32_t i = 0; image->files && i < image->files->count; i++) {
+		struct file *f = &image->files->file[i];
+
+		if (f->shared != f->fd || f->outside)
+			continue;
+		if (held)
+			held[count] = (struct files_held){ .file = f, .pid = image->template };
+		count++;
+	}
+	return count;
+}
+
+/* By the templates, which have the tables as the processes have them.  What a process has
+ * put in a place since is found to be shared with nobody. */
+void files_settle_family(struct generation *generation)
+{
+	struct files_held *held = NULL;
+	uint32_t count;
+
+	for (int pass = 0; pass < 2; pass++) {
+		count = list_held(held, generation);
+		for (uint32_t i = 0; i < generation->branches; i++)
+			if (generation->branch[i].image)
+				count += list_held(held ? held + count : NULL,
+						   generation->branch[i].image);
+		if (!held)
+			held = calloc(count + 1, sizeof *held);
+		if (!held)
+			return;
+	}
+	files_group(held, count);
+	for (uint32_t i = 0; i < count; i++)
+		if (held[i].first != held[i].file)
+			held[i].file->family = held[i].first->family = held[i].first;
+	free(held);
+}
+
+/* ---- a restore -------------------------------------------------------------------- */
+
 struct tables {
 	struct files_work *work;
 	uint32_t count;
@@ -85,6 +130,24 @@ static struct files_work *who_has_other(const struct tables *tables, const struc
 	return NULL;
 }
 
+static bool same_family(const struct file *a, const struct file *b)
+{
+	return a->family && a->family == b->family;
+}
+
+/* What another process has still, or again, this one has as well. */
+static void join_family(const struct tables *tables, struct files_work *work)
+{
+	for (uint32_t k = 0; k < work->want->count; k++) {
+		const struct file *w = &work->want->file[k];
+		int fd;
+
+		if (work->lost[k] && w->family && work->local[k] < 0 &&
+		    find_end(tables, w, same_family, &fd))
+			work->local[k] = fd;
+	}
+}
+
 static void join_lost(const struct tables *tables, struct files_work *work, const struct file *w)
 {
 	const uint32_t group = files_leader(work->want, w);
@@ -118,6 +181,7 @@ static void join(const struct tables *tables)
 	for (uint32_t i = 0; i < tables->count; i++) {
 		struct files_work *work = &tables->work[i];
 
+		join_family(tables, work);
 		for (uint32_t k = 0; k < work->want->count; k++) {
 			const struct file *w = &work->want->file[k];
 
@@ -223,9 +287,12 @@ int files_restore(struct target *target, struct generation *generation,
 			goto out;
 	if (tables.count > 1)
 		join(&tables);
-	for (uint32_t i = 0; i < tables.count; i++)
+	for (uint32_t i = 0; i < tables.count; i++) {
+		if (i)
+			join_family(&tables, &tables.work[i]);
 		if (files_work_place(&tables.work[i], err))
 			goto out;
+	}
 	put_contents(&tables);
 	for (uint32_t i = 0, k = 0; i < tables.count; i++) {
 		files_work_finish(&tables.work[i]);

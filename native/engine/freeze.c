@@ -393,6 +393,12 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 {
 	if (tree->count <= 1)
 		return 0;
+	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
+	for (uint32_t i = 1; i < tree->count; i++)
+		if (tree->kin[i].target && !tree->kin[i].target->infected &&
+		    tree_shares_memory(tree, i))
+			return fail(err, AVC_UNSUPPORTED, 0, tree->kin[i].pid, "check", "",
+				    "a child process has its parent's memory (CLONE_VM)");
 	if (make_branches(tree, generation, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)

@@ -257,7 +257,9 @@ static bool any_lost(const struct avc_guard *guard)
 static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	const uint64_t now = now_ns();
-	uint64_t ns = guard->next_ns > now ? guard->next_ns - now : 0;
+	const uint64_t check_ns = exec_check_due(guard);
+	const uint64_t due = guard->next_ns < check_ns ? guard->next_ns : check_ns;
+	uint64_t ns = due > now ? due - now : 0;
 	struct timespec timeout;
 	nfds_t n = 0;
 
@@ -283,7 +285,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	}
 	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
 				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(guard->fds, n, guard->next_ns == UINT64_MAX && !straggling ? NULL : &timeout,
+	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout,
 		    NULL);
 }
 

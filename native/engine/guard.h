@@ -92,6 +92,10 @@ bool is_ours(pid_t pid, const void *guard);
 bool is_known_process(pid_t pid, const void *guard);
 /* Processes of the app that have ended, or are another program now. */
 void tend_tree(struct avc_guard *guard);
+/* Gives up what was brought into processes that have executed another program since;
+ * `all`: whether or not it is time to look.  When it is: CLOCK_MONOTONIC, UINT64_MAX: never. */
+void let_executed_go(struct avc_guard *guard, bool all);
+uint64_t exec_check_due(const struct avc_guard *guard);
 void kill_lost(struct avc_guard *guard);
 void reap_dead(struct avc_guard *guard);
 void reap_unknown(const struct avc_guard *guard);

@@ -84,8 +84,6 @@ static int prepare_process(struct avc_guard *guard, struct target *target, struc
 
 	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
 		return -1;
-	if (target->descendant && !infected_still(target))
-		target->infected = false;
 	if (target->infected && (target->thread_count > target->pad.threads_max ||
 				 guard->config.keep >= target->pad.slots))
 		target->infected = false;
@@ -132,6 +130,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		return -1;
 	tree->init = guard->link.init;
 	tree->slots = guard->config.keep + 1;
+	let_executed_go(guard, true);
 	if (!tree->enabled)
 		return prepare_alone(guard, err);
 	if (tree_look(tree, &fresh, err))
@@ -140,7 +139,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		struct target *target = tree->kin[i].target;
 		struct avc_error failed = { 0 };
 
-		if (!target)
+		if (!target || (!target->infected && tree_shares_memory(tree, i)))
 			continue;
 		target->shm_bytes = guard->target.shm_bytes;
 		target->tcp_moved = guard->target.tcp_moved;
@@ -258,6 +257,8 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	for (uint32_t i = 0; i < fresh.branches; i++)
 		if (fresh.branch[i].target)
 			files_settle(fresh.branch[i].target, fresh.branch[i].image);
+	if (fresh.branches)
+		files_settle_family(&fresh);
 	fresh.number = ++guard->number;
 	keep_generation(guard, &fresh);
 	link_arm(&guard->link, true);

@@ -138,9 +138,60 @@ static void release(struct avc_guard *guard, struct target *target)
 	tree_let_go(target);
 }
 
+#define EXEC_CHECK_NS (1 * NS_PER_MS)
+#define EXEC_CHECK_LONG_NS (200 * NS_PER_MS)
+
+static bool found_executed(struct target *target, uint64_t now)
+{
+	uint64_t pause = (now - target->held_ns) / 8;
+
+	if (pause < EXEC_CHECK_NS)
+		pause = EXEC_CHECK_NS;
+	if (pause > EXEC_CHECK_LONG_NS)
+		pause = EXEC_CHECK_LONG_NS;
+	target->exec_check_ns = now + pause;
+	return has_executed(target);
+}
+
+/* One that executes another program closes what it has marked for that (O_CLOEXEC), and
+ * somebody may be waiting for just that.  The kernel does not tell, so it is looked at: often
+ * at first, for most do it at once if they do it at all. */
+void let_executed_go(struct avc_guard *guard, bool all)
+{
+	struct target *main = &guard->target;
+	const uint64_t now = now_ns();
+
+	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
+		drop_all(guard);
+		unhold(main);
+	}
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		if (target->pid && target->infected && (all || now >= target->exec_check_ns) &&
+		    found_executed(target, now))
+			release(guard, target);
+	}
+}
+
+uint64_t exec_check_due(const struct avc_guard *guard)
+{
+	uint64_t due = guard->target.holder ? guard->target.exec_check_ns : UINT64_MAX;
+
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		const struct target *target = guard->tree.member[i];
+
+		if (target->pid && target->infected && target->exec_check_ns < due)
+			due = target->exec_check_ns;
+	}
+	return due;
+}
+
 void tend_tree(struct avc_guard *guard)
 {
 	bool any = false;
+
+	let_executed_go(guard, false);
 
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		any |= guard->tree.member[i]->pid && pidfd_ended(guard->tree.member[i]->pidfd);

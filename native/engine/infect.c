@@ -296,17 +296,17 @@ int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err)
 	return infect_thread(target, thread, slots, err);
 }
 
-bool infected_still(const struct target *target)
+/* ESRCH is of one that is ending: exec(2) has memory, but not this. */
+bool has_executed(const struct target *target)
 {
 	uint64_t nonce = 0;
 	struct iovec here = { &nonce, sizeof nonce };
 	struct iovec there = { (void *)(target->pad.base + INJ_CODE_BYTES +
 					offsetof(struct inj_control, nonce)),
 			       sizeof nonce };
+	const ssize_t n = process_vm_readv(target->pid, &here, 1, &there, 1, 0);
 
-	return target->infected &&
-	       process_vm_readv(target->pid, &here, 1, &there, 1, 0) == sizeof nonce &&
-	       nonce == target->nonce;
+	return n == sizeof nonce ? nonce != target->nonce : errno == EFAULT;
 }
 
 /* What makes a new task the holder: it lies still, is known as such, and has none of
@@ -332,6 +332,8 @@ static int make_holder(struct target *target, pid_t holder, const struct arch_re
 static int keep_holder(struct target *target, pid_t holder, int result, struct avc_error *err)
 {
 	target->holder = holder;
+	target->held_ns = now_ns();
+	target->exec_check_ns = 0;
 	target->holder_pidfd = proc_pidfd_open(holder);
 	if (!result && target->holder_pidfd >= 0)
 		return 0;

@@ -279,6 +279,8 @@ struct target {
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	uint32_t forebear_groups;     /* a hash                                            */
 	bool frozen;                  /* stopped in this freeze                            */
+	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
+					  * executed another program                       */
 };
 
 #define FILES_NAME 81 /* of a file, for people                                  */
@@ -605,6 +607,9 @@ void unhold(struct target *target);
 /* Looks who there is; new ones are opened, and those that are gone closed.  Sets *fresh
  * to how many are new. */
 int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_unused;
+/* Whether kin[i] has its parent's memory, and not its own: after vfork(2) until it has
+ * executed a program. */
+bool tree_shares_memory(const struct tree *tree, uint32_t i);
 /* Fails if the main process has children. */
 int tree_refuse(struct tree *tree, struct avc_error *err) warn_unused;
 /* Frees those that have ended and of which there is no image. */
@@ -660,6 +665,8 @@ int files_capture(struct target *target, struct generation *generation, bool sev
 		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
+/* The same for all processes: what they share of open files. */
+void files_settle_family(struct generation *generation);
 void files_forget(struct target *target);
 void files_free(struct files *files);
 /* A table that is made anew: what is to be in it. */
@@ -850,8 +857,9 @@ void rewind_forget(struct target *target, struct thread *thread);
 /* Looks at a running app for what can not be protected.  0, or -1 with
  * AVC_UNSUPPORTED and the reason in words. */
 int support_check(struct target *target, struct avc_error *err) warn_unused;
-/* Is what was brought into the (running) process still there?  exec(2) takes it away. */
-bool infected_still(const struct target *target);
+/* Whether the (running, infected) process has another program: what was brought into it
+ * is gone. */
+bool has_executed(const struct target *target);
 /* True if this looks like a moment at which nobody is in the middle of anything. */
 bool quiescent(const struct target *target);
 

@@ -6,6 +6,7 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/kcmp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -230,6 +231,14 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 			return -1;
 	}
 	return 0;
+}
+
+bool tree_shares_memory(const struct tree *tree, uint32_t i)
+{
+	const int parent = tree->kin[i].parent;
+
+	return parent >= 0 && tree->kin[parent].target &&
+	       syscall(SYS_kcmp, tree->kin[i].pid, tree->kin[parent].pid, KCMP_VM, 0, 0) == 0;
 }
 
 int tree_refuse(struct tree *tree, struct avc_error *err)
