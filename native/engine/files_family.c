@@ -153,7 +153,7 @@ static void join_lost(const struct tables *tables, struct files_work *work, cons
 	const uint32_t group = files_leader(work->want, w);
 	struct files_work *others;
 	uint32_t leader = 0;
-	int fd, ends[2];
+	int fd, ends[2], writer;
 
 	if (find_end(tables, w, same_end, &fd)) {
 		work->local[group] = fd;
@@ -166,8 +166,10 @@ static void join_lost(const struct tables *tables, struct files_work *work, cons
 	others = who_has_other(tables, w, &leader);
 	if (!others || others->local[leader] >= 0 || file_make_pair(w, ends))
 		return;
-	work->local[group] = ends[0];
-	others->local[leader] = ends[1];
+	/* pipe(2): the first is the one to read from. */
+	writer = w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY;
+	work->local[group] = ends[writer];
+	others->local[leader] = ends[!writer];
 	/* An end that is still there belongs to a pair that is none any more. */
 	for (uint32_t k = 0; k < others->want->count; k++)
 		if (files_leader(others->want, &others->want->file[k]) == leader) {
