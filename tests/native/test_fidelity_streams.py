@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -122,8 +123,17 @@ def test_a_message_cut_by_the_checkpoint_ends_the_connection(tmp_path: Path) -> 
             whole, read = victim.see().counter[0], victim.see().counter[4]
             client.sendall(struct.pack("<I", len(LONG)) + LONG[:30_000])
             more_than(victim, 4, read + 20_000)
-            guard.command("checkpoint")
-            client.sendall(LONG[30_000:])
+            # The rest keeps coming, however long the checkpoint takes: or it would be a pause.
+            with ThreadPoolExecutor(1) as pool:
+                checkpoint = pool.submit(guard.command, "checkpoint")
+                rest = memoryview(LONG)[30_000:]
+                while not checkpoint.done():
+                    assert len(rest) > 10, "the checkpoint takes for ever"
+                    client.sendall(rest[:10])
+                    rest = rest[10:]
+                    time.sleep(0.001)
+                assert checkpoint.result()["kind"] == "checkpoint"
+            client.sendall(rest)
             more_than(victim, 0, whole)
             time.sleep(SILENT_S)
             victim.kill_app()
