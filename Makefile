@@ -49,9 +49,9 @@ test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times
 	@scripts/setup-programs.sh
 	@$(VENV)/python bench/programs.py --rounds $(ROUNDS)
 
-test-trees: setup ## tests of process trees, which are off by default: more kills, 200 processes, PostgreSQL under load
+test-trees: setup ## the tests of process trees at length: more kills, 200 processes, PostgreSQL under load
 	@scripts/setup-trees.sh
-	@AVCKPT_TREES=1 AVCKPT_LONG=1 $(VENV)/python -m pytest tests/native/test_engine_trees.py $(wildcard tests/integration/test_trees_*.py) \
+	@AVCKPT_LONG=1 $(VENV)/python -m pytest tests/native/test_engine_trees.py $(wildcard tests/integration/test_trees_*.py) \
 		--timeout 3000 $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
@@ -89,7 +89,7 @@ bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against
 	@$(VENV)/python bench/ros2.py
 
 bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
-	@AVCKPT_TREES=1 $(VENV)/python bench/trees.py
+	@$(VENV)/python bench/trees.py
 
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache

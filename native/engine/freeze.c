@@ -222,7 +222,7 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 		return -1;
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */
-	if (!tree->enabled || (tree->count <= 1 && tree->main->childless))
+	if (tree->count <= 1 && tree->main->childless)
 		return 0;
 	for (int looks = 0; looks < LOOKS; looks++) {
 		uint32_t fresh = 0;
@@ -516,7 +516,7 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target)
 			generation->branch[i].target->checkpoints++;
-	if ((was_childless || !tree->enabled) && !target->childless)
+	if (was_childless && !target->childless)
 		return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "freeze", "",
 			    "it has just started another process");
 	return 0;

@@ -389,7 +389,6 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	link_init(&guard->link);
 	target_init(&guard->target);
 	guard->tree = (struct tree){
-		.enabled = getenv("AVCKPT_TREES") != NULL,
 		.main = &guard->target,
 		.slots = config->keep + 1,
 		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),

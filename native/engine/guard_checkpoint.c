@@ -105,22 +105,6 @@ static int prepare_process(struct avc_guard *guard, struct target *target, struc
 	return 0;
 }
 
-/* Where only an app that is one process is protected. */
-static int prepare_alone(struct avc_guard *guard, struct avc_error *err)
-{
-	struct tree *tree = &guard->tree;
-
-	if (prepare_process(guard, tree->main, err))
-		return -1;
-	tree->count = 1;
-	tree->kin[0] = (struct kin){
-		.pid = tree->main->leader,
-		.parent = PARENT_INIT,
-		.target = tree->main,
-	};
-	return tree->main->childless ? 0 : tree_refuse(tree, err);
-}
-
 static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
@@ -131,8 +115,6 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 	tree->init = guard->link.init;
 	tree->slots = guard->config.keep + 1;
 	let_executed_go(guard, true);
-	if (!tree->enabled)
-		return prepare_alone(guard, err);
 	if (tree_look(tree, &fresh, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {

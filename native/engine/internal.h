@@ -347,7 +347,6 @@ struct kin {
 
 /* All processes of an app (tree.c). */
 struct tree {
-	bool enabled; /* or else an app has to be one process alone           */
 	struct target *main;
 	pid_t init;
 	uint32_t slots;  /* of a pad                                         */
@@ -610,8 +609,6 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_un
 /* Whether kin[i] has its parent's memory, and not its own: after vfork(2) until it has
  * executed a program. */
 bool tree_shares_memory(const struct tree *tree, uint32_t i);
-/* Fails if the main process has children. */
-int tree_refuse(struct tree *tree, struct avc_error *err) warn_unused;
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);
 /* It is gone, or another program: what it had open must not stay open by us. */

@@ -241,22 +241,6 @@ bool tree_shares_memory(const struct tree *tree, uint32_t i)
 	       syscall(SYS_kcmp, tree->kin[i].pid, tree->kin[parent].pid, KCMP_VM, 0, 0) == 0;
 }
 
-int tree_refuse(struct tree *tree, struct avc_error *err)
-{
-	struct looking look = { .tree = tree, .pid = tree->main->leader, .parent = 0, .err = err };
-	uint32_t children;
-
-	if (look_below(&look))
-		return -1;
-	children = tree->count - 1;
-	tree->count = 1;
-	if (!children)
-		return 0;
-	return fail(err, AVC_UNSUPPORTED, 0, tree->kin[1].pid, "check", "",
-		    "it has child processes (%u); only single processes are protected yet",
-		    children);
-}
-
 /* ---- the end of one --------------------------------------------------------------- */
 
 void tree_let_go(struct target *target)
