@@ -61,10 +61,10 @@ void scheduling_read(pid_t tid, struct scheduling *s)
 }
 
 /* `out`, `remote`: room for ATTRIBUTES_ASK_BYTES. */
-struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote)
+const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote)
 {
 	struct answers *a = out;
-	struct inj_syscall *first;
+	const struct inj_syscall *first;
 
 	a->header[0] = CAPABILITY_VERSION_3;
 	a->header[1] = 0;

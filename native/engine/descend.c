@@ -159,6 +159,7 @@ struct manner {
 	uint32_t group_count;
 	uint32_t group[64];
 	uint64_t mm[11]; /* of struct prctl_mm_map, but for brk                   */
+	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
 	uint32_t auxv_bytes;
 	uint8_t auxv[AUXV_BYTES];
 };
@@ -265,7 +266,10 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	manner->brk = list[SIGNALS].result;
 	manner->personality = list[SIGNALS + 1].result;
 	manner->dumpable = list[SIGNALS + 2].result;
-	if (read_mm(image->template, manner) || read_status(image->template, manner))
+	/* The template has limits and groups of the time when the holder was made. */
+	if (read_mm(image->template, manner) || read_status(image->template, manner) ||
+	    (proc_limits(branch->target->pid, manner->limit) &&
+	     proc_limits(image->template, manner->limit)))
 		return fail_errno(err, image->template, "keep template", "open(/proc)",
 				  "it was killed");
 	return 0;
@@ -594,19 +598,22 @@ static int put_manner(struct puppet *puppet, const struct branch *branch, struct
 	return puppet_flush(puppet, "rt_sigaction", err);
 }
 
-static void put_limits(pid_t pid, const struct branch *branch, struct avc_error *notes)
+static int put_limits(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
+		      struct avc_error *err)
 {
-	for (int i = 0; i < RLIM_NLIMITS && i < 16; i++) {
-		const struct rlimit limit = { branch->limit[i][0], branch->limit[i][1] };
-		struct rlimit now;
+	uint64_t(*limit)[2] = (uint64_t(*)[2])(puppet->list + puppet->list_max / 2);
 
-		if (prlimit(pid, (enum __rlimit_resource)i, NULL, &now) == 0 &&
-		    now.rlim_cur == limit.rlim_cur && now.rlim_max == limit.rlim_max)
-			continue;
-		if (prlimit(pid, (enum __rlimit_resource)i, &limit, NULL))
-			fail_errno(notes, pid, "restore", "prlimit",
-				   "a resource limit could not be put back");
-	}
+	memcpy(limit, branch->manner->limit, sizeof branch->manner->limit);
+	for (uint64_t i = 0; i < LIMITS; i++)
+		puppet_call(puppet, SYS_prlimit64, 0, i, pad_remote(puppet->pad, &limit[i]), 0, 0,
+			    0);
+	if (puppet_run(puppet, err))
+		return -1;
+	for (int i = 0; i < LIMITS; i++)
+		if (puppet->list[i].result)
+			fail(notes, AVC_KERNEL, (int)-puppet->list[i].result, branch->inside,
+			     "restore", "prlimit", "a resource limit could not be put back");
+	return 0;
 }
 
 /* Session and group before it has children of its own.  What it has from its parent is
@@ -677,9 +684,8 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 	    remap(puppet, branch->target, branch->image->template, template_of(family, host), rseq,
 		  err) ||
 	    put_mm(puppet, branch->manner, notes) || put_manner(puppet, branch, err) ||
-	    place(member, branch, notes, err))
+	    place(member, branch, notes, err) || put_limits(puppet, branch, notes, err))
 		return -1;
-	put_limits(puppet->pid, branch, notes);
 	if (put_files(puppet, &family->table[index], err))
 		return -1;
 	close_fd(&puppet->socket);

@@ -339,18 +339,21 @@ static int read_branch(struct tree *tree, struct branch *branch, bool strict, st
 	return 0;
 }
 
-/* Timers only the process itself can tell of. */
-static int ask_timers(struct target *target, struct avc_error *err)
+/* Timers only the process itself can tell of.  And young processes change what they are
+ * all the time: a name, a user. */
+static int ask_process(struct target *target, struct avc_error *err)
 {
 	struct thread *thread = thread_find(target, target->pid);
 	struct inj_call *call = &target->pad.control->runner;
 	const uint64_t start = now_ns();
+	struct questions questions;
 
 	if (!thread || !thread->stopped)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(target, call);
+	ask_add(target, thread, call, &questions);
 	if (borrow(target, thread, err) || pad_run(thread->tid, call, err)) {
 		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
 			thread->stopped = false;
@@ -358,7 +361,7 @@ static int ask_timers(struct target *target, struct avc_error *err)
 	}
 	pending_read(target);
 	timers_answer(target, call, now_ns() - start);
-	return give_back(thread, err);
+	return give_back(thread, err) ? -1 : ask_answer(thread, call, &questions, err);
 }
 
 /* The holder shares the process' memory and descriptors; its clone is the template. */
@@ -412,7 +415,7 @@ static int start_clones(struct generation *generation, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
-		    (ask_timers(generation->branch[i].target, err) ||
+		    (ask_process(generation->branch[i].target, err) ||
 		     start_clone(&generation->branch[i], err)))
 			return -1;
 	return 0;

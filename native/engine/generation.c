@@ -11,7 +11,6 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
-#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/sysmacros.h>
@@ -19,6 +18,7 @@
 
 #include "internal.h"
 
+#define TEMPLATE_NAME 16 /* in template_call.out: what it had got by fork(2) */
 #define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
 
 /* The OOM killer is to take templates first; undone in what is restored. */
@@ -68,6 +68,8 @@ static int quieten(struct target *target, struct generation *generation, bool se
 		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
 	else
 		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_NAME, pad_remote(&target->pad, call->out + TEMPLATE_NAME),
+		 0, 0, 0);
 	call_add(call, SYS_prctl, PR_SET_NAME, pad_remote(&target->pad, call->out), 0, 0, 0);
 	if (pad_send(&target->pad, pid, &generation->base, call, err) || pad_run(pid, call, err))
 		return -1;
@@ -152,7 +154,11 @@ static int fill_slot(struct target *target, struct generation *generation,
 			.affinity_bytes = t.affinity_bytes,
 		};
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
-		memcpy(block->name, t.name, sizeof block->name);
+		/* Of the one that was cloned, as it was then. */
+		memcpy(block->name,
+		       !branch && t.tid == target->pid ? (char *)slot->template_call.out + TEMPLATE_NAME
+						       : t.name,
+		       sizeof block->name);
 		setup_thread(&setup, block);
 		if (branch && status.groups != target->forebear_groups)
 			branch_setup_groups(branch, &setup);
@@ -221,20 +227,10 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 	struct target *target = branch->target;
 
 	/* The holder rests again. */
-	if (tracee_settle(target->holder, err) ||
-	    finish(target, branch->image, branch, &branch->stat, err))
-		return -1;
-	for (int i = 0; i < RLIM_NLIMITS && i < 16; i++) {
-		struct rlimit limit;
-
-		if (prlimit(target->pid, (enum __rlimit_resource)i, NULL, &limit) &&
-		    prlimit(branch->image->template, (enum __rlimit_resource)i, NULL, &limit))
-			return fail_errno(err, branch->image->template, "keep template", "prlimit",
-					  "it was killed");
-		branch->limit[i][0] = limit.rlim_cur;
-		branch->limit[i][1] = limit.rlim_max;
-	}
-	return 0;
+	return tracee_settle(target->holder, err) ||
+			       finish(target, branch->image, branch, &branch->stat, err)
+		       ? -1
+		       : 0;
 }
 
 int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)

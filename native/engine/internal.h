@@ -119,6 +119,10 @@ struct mapping {
 int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
 		  void *arg);
 
+/* /proc/PID/limits, as getrlimit(2) numbers them; ~0: no limit.  0 or -1. */
+#define LIMITS 16
+int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
+
 /* What is of interest in /proc/PID/status. */
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
@@ -297,7 +301,6 @@ struct branch {
 	pid_t pid;             /* that it was restored as last            */
 	int status;            /* of one that had ended, as from wait(2)  */
 	char name[16];         /* the same                                */
-	uint64_t limit[16][2]; /* getrlimit(2)                            */
 };
 #define PARENT_MAIN (-1)
 #define PARENT_INIT (-2)
@@ -539,7 +542,7 @@ void timers_advance(const struct timer_image *image, uint64_t now);
 void scheduling_read(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
  * leave them.  Returns the first of the calls. */
-struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
+const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
 void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *creds);
 /* When the app runs again: each thread, after setup_thread(); the process. */
 int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
@@ -642,7 +645,16 @@ void thread_release(struct thread *thread);
 uint32_t stragglers(struct target *target);
 /* What ptrace can read of a stopped thread: mask, robust list, rseq. */
 int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
-/* Asks a stopped thread what only it can tell (clear_child_tid, sigaltstack). */
+/* What only a thread itself can tell (clear_child_tid, sigaltstack, credentials): added to
+ * calls that it makes anyway, and what came of it. */
+struct questions {
+	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
+};
+void ask_add(const struct target *target, const struct thread *thread, struct inj_call *call,
+	     struct questions *questions);
+int ask_answer(struct thread *thread, const struct inj_call *call,
+	       const struct questions *questions, struct avc_error *err) warn_unused;
+/* Asks a stopped thread just that. */
 int ask(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 /* The threads there are now; those that ended are forgotten. */
 int take_stock(struct target *target, struct avc_error *err) warn_unused;

@@ -226,6 +226,9 @@ static void parse_ids(const char *p, uint32_t id[4])
 	sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]);
 }
 
+#define LIMIT_NAME 26 /* columns: fs/proc/base.c, proc_pid_limits() */
+#define LIMIT_VALUE 21
+
 int proc_status(pid_t tid, struct proc_status *status)
 {
 	static const char *const caps[5] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
@@ -267,6 +270,26 @@ int proc_status(pid_t tid, struct proc_status *status)
 			for (int i = 0; i < 5; i++)
 				if (!strncmp(line, caps[i], 7))
 					status->caps[i] = strtoull(value, NULL, 16);
+	}
+	return 0;
+}
+
+int proc_limits(pid_t pid, uint64_t limit[LIMITS][2])
+{
+	char buf[4096], *line;
+
+	if (proc_read(pid, "limits", buf, sizeof buf) <= 0)
+		return -1;
+	line = buf;
+	for (int i = 0; i < LIMITS; i++) {
+		line = strchr(line, '\n');
+		if (!line || strlen(++line) < LIMIT_NAME)
+			return -1;
+		for (int k = 0; k < 2; k++) {
+			char *value = line + LIMIT_NAME + k * LIMIT_VALUE;
+
+			limit[i][k] = *value == 'u' ? ~UINT64_C(0) : strtoull(value, NULL, 10);
+		}
 	}
 	return 0;
 }

@@ -75,6 +75,9 @@ static int send_off(struct target *target, struct generation *generation, pid_t 
 	arch_call(&regs, &generation->base, pad->base + INJ_RESTORE_OFFSET,
 		  pad_remote(pad, pad_stack(pad, generation->slot, 0)),
 		  pad_remote(pad, pad_slot(pad, generation->slot)));
+	/* A holder, of which the template is a clone, has that of the time when it was made. */
+	if (!generation->headless)
+		arch_tls_set(&regs, pad_thread(pad, generation->slot, 0)->tls);
 	if (generation->sandboxed && arch_regs_set(child, &regs) == 0) {
 		*sandbox = sandbox_begin(child, err);
 		if (*sandbox)

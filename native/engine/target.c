@@ -383,13 +383,12 @@ int thread_read(struct thread *thread, struct avc_error *err)
 	return 0;
 }
 
-int ask(struct target *target, struct thread *thread, struct avc_error *err)
+void ask_add(const struct target *target, const struct thread *thread, struct inj_call *call,
+	     struct questions *questions)
 {
-	struct inj_call *call = &target->pad.control->runner;
 	const avc_remote out = pad_remote(&target->pad, call->out);
-	struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
+	const struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
 
-	call_begin(call, INJ_AFTER_HOME);
 	memset(call->out, 0, sizeof call->out);
 	tid_address = call_add(call, SYS_prctl, PR_GET_TID_ADDRESS, out, 0, 0, 0);
 	altstack = call_add(call, SYS_sigaltstack, 0, out + 8, 0, 0, 0);
@@ -400,13 +399,30 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32, 0, 0, 0);
 	locks = thread->tid == target->pid ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
 	attributes = attributes_ask(call, call->out + 64, out + 64);
+	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
+}
+
+int ask(struct target *target, struct thread *thread, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->runner;
+	struct questions questions;
+
+	call_begin(call, INJ_AFTER_HOME);
+	ask_add(target, thread, call, &questions);
 	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
 	    pad_run(thread->tid, call, err))
 		return -1;
-	if (give_back(thread, err))
-		return -1;
-	if (tid_address->result)
-		return fail(err, AVC_UNSUPPORTED, (int)-tid_address->result, thread->tid,
+	return give_back(thread, err) ? -1 : ask_answer(thread, call, &questions, err);
+}
+
+int ask_answer(struct thread *thread, const struct inj_call *call,
+	       const struct questions *questions, struct avc_error *err)
+{
+	const struct inj_syscall *altstack = questions->altstack, *inside = questions->inside,
+				 *name = questions->name, *locks = questions->locks;
+
+	if (questions->tid_address->result)
+		return fail(err, AVC_UNSUPPORTED, (int)-questions->tid_address->result, thread->tid,
 			    "read state", "prctl(PR_GET_TID_ADDRESS)",
 			    "the kernel lacks CONFIG_CHECKPOINT_RESTORE");
 	if (altstack->result)
@@ -420,7 +436,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	thread->inside = (pid_t)inside->result;
 	memcpy(thread->name, call->out + 32, sizeof thread->name);
 	thread->name[sizeof thread->name - 1] = 0;
-	attributes_answer(attributes, call->out + 64, &thread->creds);
+	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
 	thread->creds.filters = filters_read(thread->tid);

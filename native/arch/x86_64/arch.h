@@ -62,6 +62,11 @@ static inline avc_remote arch_tls(const struct arch_regs *regs)
 {
 	return regs->r.fs_base;
 }
+
+static inline void arch_tls_set(struct arch_regs *regs, avc_remote tls)
+{
+	regs->r.fs_base = tls;
+}
 static inline uint64_t arch_other_base(const struct arch_regs *regs)
 {
 	return regs->r.gs_base;
