@@ -15,6 +15,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/ioctl.h>
 #include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
@@ -639,6 +640,38 @@ static int place(struct member *member, const struct branch *branch, struct avc_
 	return puppet_flush(puppet, "setsid", err);
 }
 
+/* The leader of a session gets its terminal before it has children, who inherit it. */
+static int take_terminal(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
+			 struct avc_error *err)
+{
+	const int fd = files_find_device(branch->image->files, branch->image->tty);
+
+	if (!branch->image->tty || branch->session != branch->inside)
+		return 0;
+	puppet_call(puppet, SYS_ioctl, (uint64_t)fd, TIOCSCTTY, 0, 0, 0, 0);
+	if (puppet_run(puppet, err))
+		return -1;
+	if (puppet->list[0].result)
+		fail(notes, AVC_KERNEL, (int)-puppet->list[0].result, branch->inside, "restore",
+		     "ioctl(TIOCSCTTY)", "session %d has lost its terminal", branch->inside);
+	return 0;
+}
+
+/* Whoever was in the foreground is there again; asked for by anybody in the session. */
+static int put_foreground(struct puppet *puppet, const struct generation *image,
+			  struct avc_error *err)
+{
+	const int fd = files_find_device(image->files, image->tty);
+	avc_remote remote;
+	pid_t *group = puppet_data(puppet, &remote);
+
+	if (!image->tty || image->tty_group <= 0 || fd < 0)
+		return 0;
+	*group = image->tty_group;
+	puppet_call(puppet, SYS_ioctl, (uint64_t)fd, TIOCSPGRP, remote, 0, 0, 0);
+	return puppet_run(puppet, err);
+}
+
 /* When all are there: into groups that others lead. */
 static int join_group(struct member *member, const struct branch *branch, struct avc_error *notes,
 		      struct avc_error *err)
@@ -686,7 +719,8 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 	    put_mm(puppet, branch->manner, notes) || put_manner(puppet, branch, err) ||
 	    place(member, branch, notes, err) || put_limits(puppet, branch, notes, err))
 		return -1;
-	if (put_files(puppet, &family->table[index], err))
+	if (put_files(puppet, &family->table[index], err) ||
+	    take_terminal(puppet, branch, notes, err))
 		return -1;
 	close_fd(&puppet->socket);
 	return 0;
@@ -741,6 +775,12 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
 		    join_group(&family->member[i], &generation->branch[i], notes, err))
+			return -1;
+	for (int i = -1; i < (int)generation->branches; i++)
+		if ((i < 0 || (generation->branch[i].target &&
+			       generation->branch[i].session == generation->branch[i].inside)) &&
+		    put_foreground(&member_of(family, i)->puppet,
+				   i < 0 ? generation : generation->branch[i].image, err))
 			return -1;
 	/* Those that have ended again have told their parents, who know it already. */
 	for (int i = -1; family->flush && i < (int)generation->branches; i++) {

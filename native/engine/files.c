@@ -339,6 +339,15 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	return 0;
 }
 
+int files_find_device(const struct files *files, uint32_t rdev)
+{
+	for (uint32_t i = 0; files && i < files->count; i++)
+		if (files->file[i].kind == FILE_DEVICE && files->file[i].rdev == rdev &&
+		    !(files->file[i].flags & O_PATH))
+			return files->file[i].fd;
+	return -1;
+}
+
 static int by_fd(const void *a, const void *b)
 {
 	return ((const struct file *)a)->fd - ((const struct file *)b)->fd;

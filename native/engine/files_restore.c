@@ -18,11 +18,14 @@
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/sysmacros.h>
+#include <termios.h>
 #include <unistd.h>
 
 #include "files.h"
 
 #define NAME_SHOWN 48
+#define TTY_SLAVES 136 /* eight major numbers: pts(4), linux/major.h */
 
 void files_note(struct files_work *work, const struct file *f, const char *problem)
 {
@@ -89,6 +92,25 @@ static void break_pairs(struct files_work *work)
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->source[files_leader(work->want, &work->want->file[i])] < 0)
 			work->lost[i] = true;
+}
+
+/* A terminal whose session's leader has died is hung up: what was open of it stays dead
+ * (drivers/tty/tty_io.c, __tty_hangup()), and has to be opened again. */
+static void give_up_hung_up(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		struct termios settings;
+		int fd;
+
+		if (w->kind != FILE_DEVICE || major(w->rdev) < TTY_SLAVES ||
+		    major(w->rdev) >= TTY_SLAVES + 8 || work->source[i] < 0)
+			continue;
+		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
+		if (fd >= 0 && tcgetattr(fd, &settings) && errno == EIO)
+			work->source[i] = -1;
+		close_fd(&fd);
+	}
 }
 
 /* Nobody can send again what was read since from a socket that has no other end. */
@@ -549,6 +571,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_staying(work);
 	find_moved(work);
+	give_up_hung_up(work);
 	give_up_read(work);
 	break_pairs(work);
 	return 0;

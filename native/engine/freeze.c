@@ -321,7 +321,8 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
-static int read_branch(struct tree *tree, struct branch *branch, bool strict, struct avc_error *err)
+static int read_branch(struct tree *tree, struct branch *branch, bool strict, struct mem_seen *seen,
+		       struct avc_error *err)
 {
 	struct target *target = branch->target;
 
@@ -330,7 +331,7 @@ static int read_branch(struct tree *tree, struct branch *branch, bool strict, st
 
 	if (prepare_stopped(tree, target, err) || pad_check(target, target->pid, err))
 		return -1;
-	if (memory_prepare(target->memory, &branch->image->image, err) ||
+	if (memory_prepare(target->memory, &branch->image->image, seen, err) ||
 	    read_all(target, branch->image->slot, &branch->image->threads, err))
 		return -1;
 	branch->image->vm_pages = proc_vm_pages(target->pid);
@@ -392,7 +393,8 @@ static int await_clone(struct branch *branch, struct avc_error *err)
 	return 0;
 }
 
-static int read_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
+static int read_branches(struct tree *tree, struct generation *generation, struct mem_seen *seen,
+			 struct avc_error *err)
 {
 	if (tree->count <= 1)
 		return 0;
@@ -406,7 +408,8 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
-		    read_branch(tree, &generation->branch[i], generation->mapped != NULL, err))
+		    read_branch(tree, &generation->branch[i], generation->mapped != NULL, seen,
+				err))
 			return -1;
 	return 0;
 }
@@ -453,7 +456,7 @@ static void let_go_all(struct target *target, const struct thread *but)
 }
 
 int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
-	   struct freeze_times *times, struct avc_error *err)
+	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err)
 {
 	struct target *target = tree->main;
 	const uint64_t start = now_ns();
@@ -479,7 +482,7 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 		/* The deadline is for getting things stopped; the clone of a big
 		 * process takes its time. */
 		tracee_deadline_set(timer, CLONE_NS);
-		result = read_branches(tree, generation, err);
+		result = read_branches(tree, generation, seen, err);
 	}
 	if (!result) {
 		generation->vm_pages = proc_vm_pages(target->pid);

@@ -11,9 +11,7 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
-#include <sys/stat.h>
 #include <sys/syscall.h>
-#include <sys/sysmacros.h>
 #include <unistd.h>
 
 #include "internal.h"
@@ -31,20 +29,6 @@ void oom_score_adj_set(pid_t pid, const char *value)
 	if (write(fd, value, strlen(value)) < 0)
 		errno = 0; /* best effort */
 	close(fd);
-}
-
-/* A descriptor of the app's that is its controlling terminal, or -1. */
-static int tty_fd(pid_t pid, uint32_t tty)
-{
-	for (int fd = 0; fd < 3; fd++) {
-		char path[64];
-		struct stat st;
-
-		snprintf(path, sizeof path, "/proc/%d/fd/%d", pid, fd);
-		if (stat(path, &st) == 0 && S_ISCHR(st.st_mode) && st.st_rdev == tty)
-			return fd;
-	}
-	return -1;
 }
 
 static int quieten(struct target *target, struct generation *generation, bool session_leader,
@@ -190,8 +174,12 @@ static int fill_slot(struct target *target, struct generation *generation,
 	slot->group = group_inside;
 	slot->session_leader = stat->session == target->leader;
 	slot->placed = slot->fresh = target->descendant;
-	slot->tty_fd = stat->tty && stat->tty_group == stat->group ? tty_fd(target->pid, stat->tty)
-								   : -1;
+	generation->tty = stat->tty;
+	generation->tty_group = stat->tty && stat->tty_group > 0 ? proc_inside(stat->tty_group) : 0;
+	/* Of several processes: descend.c. */
+	slot->tty_fd = !branch && stat->tty && stat->tty_group == stat->group
+			       ? files_find_device(generation->files, stat->tty)
+			       : -1;
 	return setup_end(&setup, target->pid, err);
 }
 

@@ -200,10 +200,11 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 {
 	struct target *target = &guard->target;
 	struct generation fresh = { .pidfd = -1, .slot = free_slot(guard) };
+	struct mem_seen seen = { 0 };
 	struct freeze_times times;
 	int result;
 
-	if (prepare_files(guard, err) || memory_prepare(target->memory, &fresh.image, err)) {
+	if (prepare_files(guard, err) || memory_prepare(target->memory, &fresh.image, &seen, err)) {
 		generation_drop(&fresh);
 		return -1;
 	}
@@ -218,7 +219,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	/* What is written between here and the freeze counts as written after it. */
 	note_written(guard);
 	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
-			&times, err);
+			&seen, &times, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;

@@ -95,6 +95,8 @@ long proc_vm_pages(pid_t pid);
 /* The PID a pidfd stands for, in our namespace, or -1. */
 pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
+/* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
+int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
 	MAPPING_DONTFORK = 1,   /* dc */
@@ -107,7 +109,7 @@ enum mapping_flag {
 
 struct mapping {
 	avc_remote start, end;
-	uint64_t offset, inode;
+	uint64_t offset, inode, device;
 	char mode[5]; /* "rwxp"                                           */
 	bool shared;
 	uint32_t flags; /* enum mapping_flag; of "smaps" only               */
@@ -325,6 +327,8 @@ struct generation {
 	long vm_pages;         /* of the app when it was taken                     */
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
+	uint32_t tty;          /* its controlling terminal, 0: none               */
+	pid_t tty_group;       /* in the foreground there, inside; 0: none of the app's */
 	struct timer_image *timers;
 	struct attributes *attributes;
 	struct mem_image *image;      /* of memory that is not in the template       */
@@ -568,11 +572,19 @@ void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot);
 
 /* ---- memory.c ------------------------------------------------------------------ */
 
+/* Shared memory that an image of the same checkpoint has: one is enough. */
+struct mem_seen {
+	uint32_t count;
+	struct {
+		uint64_t device, inode, offset, bytes;
+	} area[256];
+};
+
 struct memory *memory_new(void);
 void memory_forget(struct memory *memory); /* it is another program         */
 void memory_free(struct memory *memory);
 /* Room for what is to be copied in the freeze; *image NULL: nothing. */
-int memory_prepare(const struct memory *memory, struct mem_image **image,
+int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
 void mem_image_free(struct mem_image *image);
 /* While everything is stopped: copies; and what to call before the clone. */
@@ -694,6 +706,8 @@ int files_restore(struct target *target, struct generation *generation,
 		  const struct avc_config *config, pid_t init, struct files_table *table,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
 void files_table_free(struct files_table *table);
+/* A descriptor of that device, as stat(2) numbers it; -1: there is none. */
+int files_find_device(const struct files *files, uint32_t rdev);
 /* A duplicate of a descriptor of another process, or -1. */
 int files_borrow(int pidfd, int fd);
 /* In a pad: what recvmsg(2) needs for one descriptor, `remote` there; the header is first. */
@@ -738,10 +752,11 @@ struct freeze_times {
 	uint64_t freeze_ns, stop_ns, clone_ns;
 };
 
-/* Takes one checkpoint into *generation (slot and number given by the caller).
+/* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
+ * shared memory that is prepared for already.
  * On return the app runs, whatever happened. */
 int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
-	   struct freeze_times *times, struct avc_error *err) warn_unused;
+	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err) warn_unused;
 
 /* ---- generation.c -------------------------------------------------------------- */
 

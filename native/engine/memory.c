@@ -11,13 +11,16 @@
  *   the app is stopped and written into the template, which gets the flag off, and the
  *   restored process on again.
  * - Shared memory that is nobody else's: is not copied by a clone.  Read while the app
- *   is stopped, up to a limit, and written back at a restore.
+ *   is stopped, up to a limit, and written back at a restore; once for all processes of
+ *   the app.  With a name (shm_open(3), memfd_create(2)) it may be somebody else's as
+ *   well, who would not go back with the app: then it is left alone, and that is told.
  * - Locked memory: a clone's is not.
  *
  * What areas there are of these kinds is known from the template before; whether
  * that was right is seen in the new template, when the app runs again.  If not, the
  * checkpoint is taken once more.
  */
+#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
@@ -33,6 +36,7 @@
 #define AREAS_MAX 64
 #define HOLES_MAX 8
 #define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
+#define OTHERS_NS (10 * NS_PER_S)
 #define SMAPS_SHARE 50       /* the long file is read in at most 1/50 of the time */
 
 const char private_huge_pages[] =
@@ -41,10 +45,18 @@ const char private_huge_pages[] =
 
 struct area {
 	avc_remote start, end;
-	uint64_t offset, inode;
-	bool wiped; /* MADV_WIPEONFORK; else shared memory                     */
-	bool huge;  /* hugetlbfs, which does not know write(2)                */
-	int fd;     /* of the shared memory                                    */
+	uint64_t offset, inode, device;
+	bool wiped;  /* MADV_WIPEONFORK; else shared memory                     */
+	bool huge;   /* hugetlbfs, which does not know write(2)                */
+	bool again;  /* another process of the app has it, too, and its image keeps it */
+	int fd;      /* of the shared memory                                    */
+	size_t kept; /* bytes that are in the image: less where the file ends earlier */
+};
+
+/* Memory with a name, and whether processes that are not the app's have it. */
+struct named {
+	uint64_t device, inode, checked_ns;
+	bool others;
 };
 
 struct areas {
@@ -72,6 +84,10 @@ struct memory {
 	uint64_t layout; /* a hash of the mappings when the areas were read */
 	uint64_t read_ns, cost_ns;
 	uint64_t left_bytes; /* shared memory beyond the limit                  */
+	uint64_t others_bytes; /* and that of others, too                        */
+	uint32_t named_count;
+	struct named named[AREAS_MAX];
+	uint64_t look_ns; /* what the last look at all processes took          */
 	struct locked locked;
 	int64_t locked_kb;
 	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
@@ -87,6 +103,12 @@ struct mem_image {
 static size_t area_bytes(const struct area *a)
 {
 	return a->end - a->start;
+}
+
+/* In an image. */
+static size_t area_room(const struct area *a)
+{
+	return a->again ? 0 : area_bytes(a);
 }
 
 static void areas_close(struct areas *areas)
@@ -124,15 +146,36 @@ void mem_image_free(struct mem_image *image)
 
 /* ---- before and during a freeze ------------------------------------------------ */
 
-int memory_prepare(const struct memory *memory, struct mem_image **image, struct avc_error *err)
+/* True if it was seen before. */
+static bool see(struct mem_seen *seen, const struct area *a)
+{
+	for (uint32_t i = 0; i < seen->count; i++)
+		if (seen->area[i].device == a->device && seen->area[i].inode == a->inode &&
+		    seen->area[i].offset == a->offset && seen->area[i].bytes == area_bytes(a))
+			return true;
+	if (seen->count < sizeof seen->area / sizeof *seen->area) {
+		seen->area[seen->count].device = a->device;
+		seen->area[seen->count].inode = a->inode;
+		seen->area[seen->count].offset = a->offset;
+		seen->area[seen->count++].bytes = area_bytes(a);
+	}
+	return false;
+}
+
+int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_seen *seen,
+		   struct avc_error *err)
 {
 	size_t bytes = 0;
 
 	*image = NULL;
-	for (uint32_t i = 0; i < memory->areas.count; i++)
-		bytes += area_bytes(&memory->areas.area[i]);
-	if (!bytes)
+	if (!memory->areas.count)
 		return 0;
+	for (uint32_t i = 0; i < memory->areas.count; i++) {
+		struct area *a = &memory->areas.area[i];
+
+		a->again = !a->wiped && see(seen, a);
+		bytes += area_room(a);
+	}
 	*image = malloc(sizeof **image + bytes);
 	if (!*image)
 		return fail_errno(err, 0, "keep memory", "malloc", "out of memory");
@@ -153,18 +196,21 @@ int memory_prepare(const struct memory *memory, struct mem_image **image, struct
 	return 0;
 }
 
-static bool read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
+/* As much of it as there is; -1: it can not be read. */
+static ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
 {
-	while (bytes) {
-		const ssize_t n = pread(fd, to, bytes, at);
+	size_t done = 0;
 
-		if (n <= 0)
-			return false;
-		to += n;
-		at += n;
-		bytes -= (size_t)n;
+	while (done < bytes) {
+		const ssize_t n = pread(fd, to + done, bytes - done, at + (off_t)done);
+
+		if (n < 0)
+			return -1;
+		if (n == 0)
+			break;
+		done += (size_t)n;
 	}
-	return true;
+	return (ssize_t)done;
 }
 
 void memory_copy(const struct target *target, struct mem_image *image)
@@ -172,13 +218,17 @@ void memory_copy(const struct target *target, struct mem_image *image)
 	uint8_t *to = image ? image->data : NULL;
 
 	for (uint32_t i = 0; image && i < image->areas.count; i++) {
-		const struct area *a = &image->areas.area[i];
-		const bool done = a->wiped ? read_whole(target->mem_fd, to, area_bytes(a),
-							(off_t)a->start)
-					   : read_whole(a->fd, to, area_bytes(a), (off_t)a->offset);
+		struct area *a = &image->areas.area[i];
+		const ssize_t n = a->again   ? 0
+				  : a->wiped ? read_whole(target->mem_fd, to, area_bytes(a),
+							  (off_t)a->start)
+					     : read_whole(a->fd, to, area_bytes(a),
+							  (off_t)a->offset);
 
-		image->whole = image->whole && done;
-		to += area_bytes(a);
+		a->kept = n > 0 ? (size_t)n : 0;
+		image->whole = image->whole && n >= 0 &&
+			       (!a->wiped || a->kept == area_bytes(a));
+		to += area_room(a);
 	}
 }
 
@@ -254,9 +304,10 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 
 struct survey {
 	const struct target *target;
+	struct memory *memory;
 	struct areas *areas;
 	uint64_t layout, shared_bytes, limit;
-	uint64_t left_bytes;
+	uint64_t left_bytes, others_bytes;
 	bool private_huge;
 };
 
@@ -276,11 +327,72 @@ static bool is_pad(const struct target *target, avc_remote at)
 	return false;
 }
 
-/* Anonymous memory can be shared with descendants only, and there are none. */
+/* Only its descendants can have it, too. */
 static bool is_shared(const struct mapping *m)
 {
 	return m->shared && (!strcmp(m->name, "/dev/zero (deleted)") ||
 			     !strcmp(m->name, "/anon_hugepage (deleted)"));
+}
+
+static bool has_name(const struct mapping *m)
+{
+	return m->shared && m->inode &&
+	       (!strncmp(m->name, "/dev/shm/", 9) || !strncmp(m->name, "/memfd:", 7));
+}
+
+static int is_it(const struct mapping *m, void *arg)
+{
+	const struct mapping *wanted = arg;
+
+	return m->inode == wanted->inode && m->device == wanted->device ? -1 : 0;
+}
+
+/* Does a process outside of the app's PID namespace map it?  Those inside are the app, and
+ * whoever was sent in to look after it. */
+static bool look_for_others(const struct target *target, struct mapping *m)
+{
+	char inside[64] = "", its[64];
+	DIR *proc = opendir("/proc");
+	struct dirent *entry;
+	bool others = false;
+
+	(void)proc_link(target->init, "ns/pid", inside, sizeof inside);
+	while (proc && !others && (entry = readdir(proc))) {
+		const pid_t pid = (pid_t)atoi(entry->d_name);
+
+		if (pid <= 0 || pid == getpid() || proc_link(pid, "ns/pid", its, sizeof its) < 0 ||
+		    !strcmp(its, inside))
+			continue;
+		errno = 0;
+		others = proc_mappings(pid, "maps", is_it, m) < 0 && errno == 0;
+	}
+	if (proc)
+		closedir(proc);
+	return others;
+}
+
+static bool is_others(struct memory *memory, const struct target *target, struct mapping *m)
+{
+	struct named *named = NULL;
+	uint64_t now = now_ns();
+
+	for (uint32_t i = 0; i < memory->named_count && !named; i++)
+		if (memory->named[i].inode == m->inode && memory->named[i].device == m->device)
+			named = &memory->named[i];
+	if (named && now - named->checked_ns < OTHERS_NS + memory->look_ns * SMAPS_SHARE)
+		return named->others;
+	if (!named && memory->named_count == AREAS_MAX)
+		return true;
+	if (!named)
+		named = &memory->named[memory->named_count++];
+	*named = (struct named){
+		.device = m->device,
+		.inode = m->inode,
+		.others = look_for_others(target, m),
+	};
+	named->checked_ns = now_ns();
+	memory->look_ns = named->checked_ns - now;
+	return named->others;
 }
 
 static int hash_mapping(const struct mapping *m, void *arg)
@@ -303,13 +415,21 @@ static int find_area(const struct mapping *m, void *arg)
 
 	hash_mapping(m, arg);
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
-	if ((!wiped && !is_shared(m)) || is_pad(survey->target, m->start))
+	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->target, m->start))
 		return 0;
 	if (!wiped) {
 		/* One that is too large does not keep small ones from being rolled back. */
 		if (survey->shared_bytes + (m->end - m->start) > survey->limit) {
 			survey->left_bytes += m->end - m->start;
 			return 0;
+		}
+		if (has_name(m)) {
+			struct mapping named = *m;
+
+			if (is_others(survey->memory, survey->target, &named)) {
+				survey->others_bytes += m->end - m->start;
+				return 0;
+			}
 		}
 		survey->shared_bytes += m->end - m->start;
 	}
@@ -322,6 +442,7 @@ static int find_area(const struct mapping *m, void *arg)
 		.end = m->end,
 		.offset = m->offset,
 		.inode = m->inode,
+		.device = m->device,
 		.wiped = wiped,
 		.huge = m->flags & MAPPING_HUGETLB,
 		.fd = -1,
@@ -413,13 +534,19 @@ static int check_areas(struct target *target, const struct generation *generatio
 	if (!found)
 		return fail_errno(err, 0, "keep memory", "calloc", "out of memory");
 	start = now_ns();
-	survey = (struct survey){ .target = target, .limit = target->shm_bytes, .areas = found };
+	survey = (struct survey){
+		.target = target,
+		.memory = memory,
+		.limit = target->shm_bytes,
+		.areas = found,
+	};
 	if (proc_mappings(generation->template, "smaps", find_area, &survey))
 		result = fail_errno(err, generation->template, "keep memory", "read(smaps)",
 				    "it was killed");
 	memory->read_ns = now_ns();
 	memory->cost_ns = memory->read_ns - start;
 	memory->left_bytes = survey.left_bytes;
+	memory->others_bytes = survey.others_bytes;
 	if (!result && survey.private_huge)
 		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "", "%s",
 			      private_huge_pages);
@@ -471,7 +598,7 @@ static int fill_wiped(struct target *target, struct generation *generation, stru
 				result = -1;
 			call_begin(call, INJ_AFTER_PARK);
 		}
-		from += area_bytes(a);
+		from += area_room(a);
 	}
 	close_fd(&mem_fd);
 	return result;
@@ -541,6 +668,10 @@ int memory_finish(struct target *target, struct generation *generation, int64_t 
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
 		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
 		     (unsigned long long)target->memory->left_bytes / 1024);
+	if (target->memory->others_bytes && !setup->notice.code)
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		     "%llu kB of shared memory are also others', outside of the container, and are not rolled back",
+		     (unsigned long long)target->memory->others_bytes / 1024);
 	return 0;
 }
 
@@ -555,11 +686,11 @@ int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *
 
 		if (a->huge && mem_fd < 0)
 			mem_fd = proc_open(pid, "mem", O_RDWR);
-		if (!a->wiped && pwrite(a->huge ? mem_fd : a->fd, from, area_bytes(a), at) !=
-					 (ssize_t)area_bytes(a))
+		if (!a->wiped && a->kept &&
+		    pwrite(a->huge ? mem_fd : a->fd, from, a->kept, at) != (ssize_t)a->kept)
 			result = fail_errno(err, pid, "restore", "pwrite",
 					    "shared memory can not be written");
-		from += area_bytes(a);
+		from += area_room(a);
 	}
 	close_fd(&mem_fd);
 	return result;

@@ -38,6 +38,19 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size)
 	return n;
 }
 
+int proc_link(pid_t pid, const char *name, char *buf, size_t size)
+{
+	char path[64];
+	ssize_t n;
+
+	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
+	n = readlink(path, buf, size - 1);
+	if (n < 0)
+		return -1;
+	buf[n] = 0;
+	return 0;
+}
+
 int proc_stat(pid_t pid, struct proc_stat *stat)
 {
 	char buf[1024], *p;
@@ -176,12 +189,14 @@ static uint32_t parse_flags(const char *p)
 static bool parse_mapping(const char *line, struct mapping *m)
 {
 	unsigned long start, end, offset, inode;
+	unsigned int major, minor;
 	int name = 0;
 
 	*m = (struct mapping){ 0 };
-	if (sscanf(line, "%lx-%lx %4s %lx %*x:%*x %lu %n", &start, &end, m->mode, &offset, &inode,
-		   &name) < 5)
+	if (sscanf(line, "%lx-%lx %4s %lx %x:%x %lu %n", &start, &end, m->mode, &offset, &major,
+		   &minor, &inode, &name) < 7)
 		return false;
+	m->device = (uint64_t)major << 32 | minor;
 	m->start = start;
 	m->end = end;
 	m->offset = offset;

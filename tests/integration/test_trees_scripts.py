@@ -56,7 +56,6 @@ slots = multiprocessing.Array("q", 64, lock=False)
 block = multiprocessing.shared_memory.SharedMemory(create=True, size=64)
 
 if __name__ == "__main__":
-    multiprocessing.set_start_method("fork")
     with multiprocessing.Pool(4) as pool:
         lap = 0
         while True:
