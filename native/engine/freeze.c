@@ -355,7 +355,9 @@ static int ask_process(struct target *target, struct avc_error *err)
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(target, call);
 	ask_add(target, thread, call, &questions);
-	if (borrow(target, thread, err) || pad_run(thread->tid, call, err)) {
+	if (borrow(target, thread, err))
+		return -1;
+	if (pad_run(thread->tid, call, err)) {
 		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
 			thread->stopped = false;
 		return -1;

@@ -387,7 +387,7 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
-	else if (err->code == AVC_DEADLINE)
+	else if (err->code == AVC_DEADLINE && thread->borrowed)
 		thread->stopped = false; /* on its way through the pad, and home */
 	if (!result)
 		result = give_back(thread, err);

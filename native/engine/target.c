@@ -265,6 +265,14 @@ static bool straggle(struct target *target, struct thread *thread)
 	struct stop stop = tracee_wait(tid, WNOHANG);
 	struct arch_regs now;
 
+	/* Registers can be read of what is stopped only.  If that is no news, somebody has
+	 * heard of it already, and it would stay so for ever. */
+	if (stop.kind == STOP_NONE && arch_regs_get(tid, &now) == 0) {
+		stop = tracee_wait(tid, WNOHANG);
+		if (stop.kind == STOP_NONE)
+			stop.kind = STOP_TRAP;
+	}
+
 	switch (stop.kind) {
 	case STOP_NONE:
 	case STOP_DYING:
