@@ -305,6 +305,7 @@ struct member {
 	int pidfd;
 	bool traced;
 	struct puppet puppet;
+	struct sandbox *sandbox; /* NULL: it is on its own, and waits to go        */
 };
 
 struct family {
@@ -810,10 +811,11 @@ int family_start(struct family *family, struct avc_error *notes, struct avc_erro
 
 		if (!branch->target)
 			continue;
-		if (restore_start(branch->target, branch->image, family->helper, member->pid, err))
+		if (restore_start(branch->target, branch->image, family->helper, member->pid,
+				  &member->sandbox, err))
 			return -1;
 		member->traced = false;
-		if (restore_await(branch->target, branch->image, member->pid, err))
+		if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
 			return -1;
 		restore_note(branch->target, branch->image, member->pid, notes);
 		if (memory_put_back(branch->image->image, member->pid, err))
@@ -824,12 +826,15 @@ int family_start(struct family *family, struct avc_error *notes, struct avc_erro
 
 void family_go(struct family *family)
 {
-	for (uint32_t i = 0; i < family->generation->branches; i++) {
-		struct branch *branch = &family->generation->branch[i];
+	/* First those that are stopped: their parents know it. */
+	for (int stopped = 1; stopped >= 0; stopped--)
+		for (uint32_t i = 0; i < family->generation->branches; i++) {
+			struct branch *branch = &family->generation->branch[i];
 
-		if (branch->target)
-			restore_go(branch->target, branch->image);
-	}
+			if (branch->target && !branch->image->stop_signal == !stopped)
+				restore_go(branch->target, branch->image,
+					   family->member[i].sandbox);
+		}
 }
 
 pid_t family_pid(const struct family *family, uint32_t branch)
@@ -839,10 +844,13 @@ pid_t family_pid(const struct family *family, uint32_t branch)
 
 static void kill_member(struct member *member)
 {
-	if (member->pid && member->traced)
+	if (member->sandbox)
+		sandbox_end(member->sandbox);
+	else if (member->pid && member->traced)
 		tracee_kill(member->pid);
 	else if (member->pidfd >= 0)
 		syscall(SYS_pidfd_send_signal, member->pidfd, SIGKILL, NULL, 0);
+	member->sandbox = NULL;
 	member->traced = false;
 }
 

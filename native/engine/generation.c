@@ -103,6 +103,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 				  "it has ended");
 	}
 	generation->headless = target->pid != target->leader;
+	generation->stop_signal = main_thread->stop_signal;
 	setup_begin(&setup, pad, generation->slot);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		struct thread t = target->threads[i];

@@ -192,6 +192,7 @@ struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
 	bool attached, stopped;
+	int stop_signal;       /* the process is stopped by job control           */
 	int block;             /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;         /* sent into the pad; regs and sigmask are its own  */
 	struct arch_regs regs; /* as of the stop, EINTR already mended          */
@@ -235,6 +236,7 @@ struct pad {
 
 struct files;
 struct last_pid;
+struct sandbox;
 
 /* The live main process of the app. */
 struct target {
@@ -327,6 +329,7 @@ struct generation {
 	long vm_pages;         /* of the app when it was taken                     */
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
+	int stop_signal;       /* stopped by that (job control), 0: it was not     */
 	uint32_t tty;          /* its controlling terminal, 0: none               */
 	pid_t tty_group;       /* in the foreground there, inside; 0: none of the app's */
 	struct timer_image *timers;
@@ -407,8 +410,10 @@ struct stop tracee_wait(pid_t tid, int options);
 /* For a running tracee that was interrupted (or is new): waits until it is in a
  * plain trap stop (STOP_TRAP); signals that come in between are delivered.  A new
  * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
- * STOP_TRAP is an error; after STOP_GROUP it is stopped nevertheless. */
+ * STOP_TRAP is an error. */
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
+/* The signal by which the one awaited last is stopped (job control); 0: it is not. */
+int tracee_group_signal(void);
 /* From a stop of another kind to a plain trap stop, on the kernel's way back to
  * the app, where it sees to interrupted calls and signals. */
 int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
@@ -561,14 +566,14 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
-struct sandbox;
 /* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
 struct sandbox *sandbox_begin(pid_t child, struct avc_error *err);
 /* Waits while *state is INJ_IDLE; false when it ended or was too late. */
 bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
-/* The end of it: killed, or let go to where the threads of the slot were. */
+/* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where
+ * they stop (job control), 0: go on. */
 void sandbox_end(struct sandbox *sandbox);
-void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot);
+void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot, int stop_signal);
 
 /* ---- memory.c ------------------------------------------------------------------ */
 
@@ -840,12 +845,12 @@ int remap(struct puppet *puppet, const struct target *target, pid_t template, pi
 /* Lets a stopped process that is what its template is put itself together; waits until
  * it has; tells what of it failed; lets it go. */
 int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
-		  pid_t pid, struct avc_error *err) warn_unused;
+		  pid_t pid, struct sandbox **sandbox, struct avc_error *err) warn_unused;
 int restore_await(struct target *target, struct generation *image, pid_t pid,
-		  struct avc_error *err) warn_unused;
+		  struct sandbox *sandbox, struct avc_error *err) warn_unused;
 void restore_note(struct target *target, struct generation *image, pid_t pid,
 		  struct avc_error *notes);
-void restore_go(struct target *target, struct generation *image);
+void restore_go(struct target *target, struct generation *image, struct sandbox *sandbox);
 
 /* ---- urgent.c -------------------------------------------------------------------- */
 

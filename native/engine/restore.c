@@ -48,6 +48,15 @@ static bool wait_word(uint32_t *word, uint32_t value, uint64_t end)
 	return true;
 }
 
+/* Until the new process has put itself together, or has failed to. */
+static bool await_state(struct inj_slot *slot, struct sandbox *sandbox)
+{
+	const uint64_t end = now_ns() + READY_NS;
+
+	return sandbox ? sandbox_wait(sandbox, &slot->state, end)
+		       : wait_word(&slot->state, INJ_IDLE, end);
+}
+
 static void reset(const struct pad *pad, uint32_t slot_number)
 {
 	struct inj_slot *slot = pad_slot(pad, slot_number);
@@ -78,7 +87,8 @@ static int send_off(struct target *target, struct generation *generation, pid_t 
 	/* A holder, of which the template is a clone, has that of the time when it was made. */
 	if (!generation->headless)
 		arch_tls_set(&regs, pad_thread(pad, generation->slot, 0)->tls);
-	if (generation->sandboxed && arch_regs_set(child, &regs) == 0) {
+	if ((generation->sandboxed || generation->stop_signal) &&
+	    arch_regs_set(child, &regs) == 0) {
 		*sandbox = sandbox_begin(child, err);
 		if (*sandbox)
 			return 0;
@@ -183,8 +193,7 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 			times->fork_ns = now_ns() - start;
 		}
 		start = now_ns();
-		if (*sandbox ? !sandbox_wait(*sandbox, &slot->state, start + READY_NS)
-			     : !wait_word(&slot->state, INJ_IDLE, start + READY_NS))
+		if (!await_state(slot, *sandbox))
 			return fail(err, AVC_KERNEL, ETIMEDOUT, *pid, "restore", "",
 				    "the new process does not answer");
 		times->threads_ns = now_ns() - start;
@@ -203,21 +212,20 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 /* ---- one of several ---------------------------------------------------------------- */
 
 int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
-		  pid_t pid, struct avc_error *err)
+		  pid_t pid, struct sandbox **sandbox, struct avc_error *err)
 {
-	struct sandbox *none = NULL;
-
 	reset(&target->pad, image->slot);
 	timers_advance(image->timers, now_ns());
 	last_pid_serve(helper, pad_slot(&target->pad, image->slot));
-	return send_off(target, image, pid, &none, err);
+	return send_off(target, image, pid, sandbox, err);
 }
 
-int restore_await(struct target *target, struct generation *image, pid_t pid, struct avc_error *err)
+int restore_await(struct target *target, struct generation *image, pid_t pid,
+		  struct sandbox *sandbox, struct avc_error *err)
 {
 	struct inj_slot *slot = pad_slot(&target->pad, image->slot);
 
-	if (!wait_word(&slot->state, INJ_IDLE, now_ns() + READY_NS))
+	if (!await_state(slot, sandbox))
 		return fail(err, AVC_KERNEL, ETIMEDOUT, pid, "restore", "",
 			    "the new process does not answer");
 	return slot->state == INJ_READY ? 0 : describe_failure(&target->pad, slot, err);
@@ -239,9 +247,14 @@ static void let_go(struct inj_slot *slot, enum inj_go stage)
 	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
-void restore_go(struct target *target, struct generation *image)
+/* As the others knew it: its main thread has ended, it is stopped. */
+void restore_go(struct target *target, struct generation *image, struct sandbox *sandbox)
 {
-	let_go(pad_slot(&target->pad, image->slot), INJ_GO_ALL);
+	struct inj_slot *slot = pad_slot(&target->pad, image->slot);
+
+	if (sandbox)
+		sandbox_go(sandbox, &target->pad, image->slot, image->stop_signal);
+	let_go(slot, INJ_GO_ALL);
 }
 
 void restore_note(struct target *target, struct generation *image, pid_t pid,
@@ -312,16 +325,13 @@ int restore(struct target *target, struct generation *generation, const struct l
 		*pid = 0;
 		return -1;
 	}
-	if (sandbox)
-		sandbox_go(sandbox, &target->pad, generation->slot);
-	/* As they knew it: ended.  (sandbox_go() has seen to it.) */
-	else if (generation->headless) {
+	if (family)
+		family_go(family);
+	if (!sandbox && generation->headless) {
 		let_go(slot, INJ_GO_ENDED);
 		proc_await_end(*pid);
 	}
-	let_go(slot, INJ_GO_ALL);
-	if (family)
-		family_go(family);
+	restore_go(target, generation, sandbox);
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 

@@ -101,8 +101,24 @@ static int thread_of(const struct pad *pad, uint32_t slot, pid_t tid)
 	return -1;
 }
 
+/* Lets it make the call that takes it home, and no step more. */
+static void bring_home(pid_t tid)
+{
+	for (int stops = 0; stops < 2;) {
+		struct stop stop;
+
+		if (ptrace(PTRACE_SYSCALL, tid, NULL, 0L))
+			return;
+		stop = tracee_wait(tid, 0);
+		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+			return;
+		stops += stop.kind == STOP_SYSCALL;
+	}
+}
+
 /* Each is stopped where it waits for `go`, and goes home from there. */
-void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot_number)
+void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot_number,
+		int stop_signal)
 {
 	struct inj_slot *slot = pad_slot(pad, slot_number);
 	struct avc_error ignored = { 0 };
@@ -126,13 +142,25 @@ void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot_nu
 		else
 			arch_call(&regs, &now, pad->base + INJ_END_OFFSET, arch_sp(&now), 0);
 		(void)arch_regs_set(tid, &regs); /* it was killed: no matter */
+		if (frame && stop_signal)
+			bring_home(tid);
 	}
+	if (stop_signal)
+		kill(sandbox->pid, stop_signal);
 	slot->running = slot->threads;
 	for (uint32_t i = 0; i < sandbox->count; i++) {
 		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);
 		/* The others know it as ended. */
 		if (i == 0 && !pad_thread(pad, slot_number, 0)->frame)
 			proc_await_end(sandbox->pid);
+	}
+	/* Its parent may look at once. */
+	for (uint64_t end = now_ns() + END_NS; stop_signal && now_ns() < end;) {
+		struct proc_stat stat;
+
+		if (proc_stat(sandbox->pid, &stat) || stat.state == 'T')
+			break;
+		usleep(LOOK_US);
 	}
 	/* One that was killed meanwhile is a tracee still, until it was waited for. */
 	for (bool ended = false; pump(sandbox, &ended);)

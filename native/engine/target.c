@@ -222,9 +222,6 @@ int thread_await(struct target *target, struct thread *thread, struct avc_error 
 	switch (kind) {
 	case STOP_TRAP:
 		break;
-	case STOP_GROUP:
-		thread->stopped = true;
-		return -1;
 	case STOP_EXIT:
 		thread->attached = false; /* reaped */
 		return -1;
@@ -232,6 +229,7 @@ int thread_await(struct target *target, struct thread *thread, struct avc_error 
 		return -1;
 	}
 	thread->stopped = true;
+	thread->stop_signal = tracee_group_signal();
 	if (arch_regs_get(thread->tid, &thread->regs)) {
 		thread->stopped = false;
 		return fail_errno(err, thread->tid, "stop", "ptrace(GETREGS)", "it has ended");

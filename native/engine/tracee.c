@@ -137,6 +137,13 @@ struct stop tracee_wait(pid_t tid, int options)
 	return stop;
 }
 
+static __thread int group_signal;
+
+int tracee_group_signal(void)
+{
+	return group_signal;
+}
+
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 {
 	for (;;) {
@@ -145,7 +152,13 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 
 		switch (stop.kind) {
 		case STOP_TRAP:
-			return stop.kind;
+			group_signal = 0;
+			return STOP_TRAP;
+		case STOP_GROUP:
+			/* Stopped by job control, and stays so when it is let go: what it is
+			 * made to do meanwhile is no concern of its parent's. */
+			group_signal = stop.signal;
+			return STOP_TRAP;
 		case STOP_FORK:
 			if (child)
 				*child = stop.message;
@@ -157,10 +170,6 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 		case STOP_NONE:
 		case STOP_OTHER:
 			break;
-		case STOP_GROUP:
-			fail(err, AVC_DEADLINE, 0, tid, "stop", "",
-			     "it is stopped by a signal (job control)");
-			return stop.kind;
 		case STOP_EXIT:
 		case STOP_DYING:
 			fail(err, AVC_GONE, 0, tid, "stop", "", "it has ended");
