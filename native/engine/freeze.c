@@ -265,8 +265,6 @@ static int prepare_stopped(struct tree *tree, struct target *target, struct avc_
 			    "the main thread of process %d has ended", target->inside);
 	if (!target->infected && infect_stopped(target, tree->slots, err))
 		return -1;
-	if (!target->holder && hold_stopped(target, tree->init, err))
-		return -1;
 	return target->files_image ? 0 : files_prepare(target, err);
 }
 
@@ -416,12 +414,47 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
+/* What a process above it adopts would be a child that it never had. */
+static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *err)
+{
+	for (int k = (int)i; k >= 0; k = tree->kin[k].parent) {
+		struct target *above = tree->kin[k].target;
+		struct thread *thread = above ? thread_find(above, above->pid) : NULL;
+
+		if (!thread)
+			continue;
+		if (!above->paused && !above->descendant && ask(above, thread, err))
+			return -1; /* the others were asked just now */
+		if (thread->creds.subreaper && adopt_no_more(above, err))
+			return -1;
+	}
+	return hold_stopped(tree->kin[i].target, tree->init, err);
+}
+
+/* Parents come before their children. */
+static int ask_and_hold(struct tree *tree, struct avc_error *err)
+{
+	struct avc_error failed = { 0 };
+	int result = 0;
+
+	for (uint32_t i = 1; !result && i < tree->count; i++)
+		if (tree->kin[i].target)
+			result = ask_process(tree->kin[i].target, err);
+	for (uint32_t i = 1; !result && i < tree->count; i++)
+		if (tree->kin[i].target && !tree->kin[i].target->holder)
+			result = make_holder_missing(tree, i, err);
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->kin[i].target && adopt_again(tree->kin[i].target, &failed) && !result) {
+			*err = failed;
+			result = -1;
+		}
+	return result;
+}
+
 static int start_clones(struct generation *generation, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target &&
-		    (ask_process(generation->branch[i].target, err) ||
-		     start_clone(&generation->branch[i], err)))
+		if (generation->branch[i].target && start_clone(&generation->branch[i], err))
 			return -1;
 	return 0;
 }
@@ -490,6 +523,10 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 		generation->vm_pages = proc_vm_pages(target->pid);
 		memory_copy(target, generation->image);
 		files_mapped_copy(generation->mapped);
+		generation->taken_ns = now_ns();
+		result = ask_and_hold(tree, err);
+	}
+	if (!result) {
 		generation->taken_ns = now_ns();
 		result = start_clones(generation, err);
 	}

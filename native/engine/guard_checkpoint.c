@@ -78,8 +78,9 @@ static void drop_images(struct avc_guard *guard, const struct target *target)
 			}
 }
 
-static int prepare_process(struct avc_guard *guard, struct target *target, struct avc_error *err)
+static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_error *err)
 {
+	struct target *target = guard->tree.kin[kin].target;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
 	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
@@ -100,7 +101,9 @@ static int prepare_process(struct avc_guard *guard, struct target *target, struc
 	}
 	if (acquaint(target, guard->timer, deadline, err))
 		return -1;
-	if (!target->holder && hold(target, guard->timer, deadline, err))
+	target->adopts = target->descendant && tree_has_reaper(&guard->tree, kin);
+	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
+	if (!target->holder && !target->adopts && hold(target, guard->timer, deadline, err))
 		return -1;
 	return 0;
 }
@@ -125,7 +128,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 			continue;
 		target->shm_bytes = guard->target.shm_bytes;
 		target->tcp_moved = guard->target.tcp_moved;
-		if (prepare_process(guard, target, &failed) == 0)
+		if (prepare_process(guard, i, &failed) == 0)
 			continue;
 		/* One that is ending is seen to by the freeze. */
 		if (i == 0 || failed.code != AVC_GONE) {

@@ -202,8 +202,8 @@ static void hold_all(struct avc_guard *guard)
 		struct target *target = guard->tree.member[i];
 
 		ignored = (struct avc_error){ 0 };
-		if (target->pid && hold(target, guard->timer, guard->config.freeze_deadline_ns,
-					&ignored))
+		if (target->pid && !target->adopts &&
+		    hold(target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;
 	}
 }

@@ -329,6 +329,42 @@ static int make_holder(struct target *target, pid_t holder, const struct arch_re
 	return pad_send(&target->pad, holder, base, own, err) || pad_run(holder, own, err) ? -1 : 0;
 }
 
+int adopt_no_more(struct target *target, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->runner;
+	struct thread *thread = thread_find(target, target->pid);
+
+	if (target->paused)
+		return 0;
+	call_begin(call, INJ_AFTER_HOME);
+	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0);
+	call_add(call, INJ_PAUSE, 0, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+	if (borrow(target, thread, err))
+		return -1;
+	target->paused = true;
+	if (pad_run_to_pause(thread->tid, call, err)) {
+		thread->stopped = false; /* on its way through the pad, and home */
+		target->paused = false;
+		return -1;
+	}
+	return 0;
+}
+
+int adopt_again(struct target *target, struct avc_error *err)
+{
+	struct thread *thread = thread_find(target, target->pid);
+
+	if (!target->paused)
+		return 0;
+	target->paused = false;
+	if (pad_run_on(thread->tid, &target->pad.control->runner, err)) {
+		thread->stopped = false;
+		return -1;
+	}
+	return give_back(thread, err);
+}
+
 static int keep_holder(struct target *target, pid_t holder, int result, struct avc_error *err)
 {
 	target->holder = holder;
@@ -473,8 +509,8 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	if (!result && proc_stat(holder, &stat))
 		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
 	if (!result && stat.parent != init)
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "make holder", "",
-			      "a process above it adopts orphans (PR_SET_CHILD_SUBREAPER)");
+		result = fail(err, AVC_DEADLINE, EAGAIN, target->pid, "make holder", "",
+			      "a process above it adopts orphans now (PR_SET_CHILD_SUBREAPER)");
 	if (holder && keep_holder(target, holder, result, err))
 		result = -1;
 	if (pad_run(thread->tid, call, err)) {

@@ -287,6 +287,8 @@ struct target {
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	uint32_t forebear_groups;     /* a hash                                            */
 	bool frozen;                  /* stopped in this freeze                            */
+	bool adopts;                  /* it or one above it adopts orphans                 */
+	bool paused;                  /* between adopt_no_more() and adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */
 };
@@ -457,6 +459,9 @@ int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, str
 	     struct avc_error *err) warn_unused;
 /* Resumes it until all calls were made; it is in a plain trap stop then. */
 int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+/* Resumes it until it pauses (INJ_PAUSE), and from there. */
+int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int pad_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
  * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
 int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
@@ -616,6 +621,10 @@ int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadli
 int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err) warn_unused;
 /* The holder of one that is not the main process, by its stopped main thread. */
 int hold_stopped(struct target *target, pid_t init, struct avc_error *err) warn_unused;
+/* A stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) does not for a while: they
+ * are init's.  If we die meanwhile it does again all by itself. */
+int adopt_no_more(struct target *target, struct avc_error *err) warn_unused;
+int adopt_again(struct target *target, struct avc_error *err) warn_unused;
 /* Makes the holder; unhold() drops it. */
 int hold(struct target *target, timer_t timer, uint64_t deadline_ns,
 	 struct avc_error *err) warn_unused;
@@ -626,6 +635,8 @@ void unhold(struct target *target);
 /* Looks who there is; new ones are opened, and those that are gone closed.  Sets *fresh
  * to how many are new. */
 int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_unused;
+/* Whether kin[i] or a process above it adopts orphans, as far as is known. */
+bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether kin[i] has its parent's memory, and not its own: after vfork(2) until it has
  * executed a program. */
 bool tree_shares_memory(const struct tree *tree, uint32_t i);

@@ -131,6 +131,7 @@ void *pad_frame(const struct pad *pad, uint32_t slot, uint32_t i)
 void call_begin(struct inj_call *call, enum inj_after after)
 {
 	call->done = 0;
+	call->pause = INJ_PAUSE_NONE;
 	call->count = 0;
 	call->after = after;
 }
@@ -150,16 +151,16 @@ struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_
  *
  * A task that is killed never gets done: to be noticed at once, for its process
  * can not be reaped before we have. */
-static int wait_done(struct inj_call *call, pid_t tid, struct avc_error *err)
+static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct avc_error *err)
 {
 	const struct timespec slice = { .tv_nsec = 500000 };
 	const uint64_t end = now_ns() + (call->after == INJ_AFTER_PARK ? PARKED_NS : HOMEWARD_NS);
 
-	while (!__atomic_load_n(&call->done, __ATOMIC_ACQUIRE)) {
+	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
 		struct stop stop;
 
-		syscall(SYS_futex, &call->done, FUTEX_WAIT, 0, &slice, NULL, 0);
-		if (__atomic_load_n(&call->done, __ATOMIC_ACQUIRE))
+		syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
+		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
 			break;
 		stop = tracee_wait(tid, WNOHANG);
 		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
@@ -186,11 +187,16 @@ int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, str
 	return 0;
 }
 
-int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
+int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
-	if (wait_done(call, tid, err)) {
+	return wait_word(call, &call->pause, tid, err);
+}
+
+static int run_to_end(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	if (wait_word(call, &call->done, tid, err)) {
 		/* Without a stop of its own it would go home and stay a tracee for ever;
 		 * now it stops as soon as it gets to run, and straggle() sends it home. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
@@ -200,6 +206,20 @@ int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 		return fail_errno(err, tid, "run injected code", "ptrace(INTERRUPT)",
 				  "it has gone");
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
+int pad_run_on(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	__atomic_store_n(&call->pause, INJ_PAUSE_OVER, __ATOMIC_RELEASE);
+	syscall(SYS_futex, &call->pause, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+	return run_to_end(tid, call, err);
+}
+
+int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
+	return run_to_end(tid, call, err);
 }
 
 /* It has made all its calls and not stopped: a limit of processes, or of memory. */

@@ -233,6 +233,22 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 	return 0;
 }
 
+static bool is_reaper(const struct target *target)
+{
+	const struct thread *thread = target ? thread_find((struct target *)target, target->pid)
+					     : NULL;
+
+	return thread && thread->creds.subreaper;
+}
+
+bool tree_has_reaper(const struct tree *tree, uint32_t i)
+{
+	for (int k = (int)i; k >= 0; k = tree->kin[k].parent)
+		if (is_reaper(tree->kin[k].target))
+			return true;
+	return false;
+}
+
 bool tree_shares_memory(const struct tree *tree, uint32_t i)
 {
 	const int parent = tree->kin[i].parent;

@@ -88,6 +88,16 @@ static long find_future_lock(void)
 	return dropped == 0 ? 0 : MCL_FUTURE | (present & 1 ? 0 : MCL_ONFAULT);
 }
 
+/* Nobody interrupts it meanwhile: see park(). */
+static void make_pause(struct inj_call *call)
+{
+	__atomic_store_n(&call->pause, INJ_PAUSED, __ATOMIC_RELEASE);
+	futex_wake(&call->pause);
+	while (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) == INJ_PAUSED)
+		if (futex_wait(&call->pause, INJ_PAUSED, INJ_PARK_MS) == -110 /* ETIMEDOUT */)
+			return;
+}
+
 __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 {
 	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++) {
@@ -100,6 +110,8 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 					    ? raw_syscall(__NR_wait4, (uint64_t)s[-1].result, 0,
 							  __WALL_, 0, 0, 0)
 					    : 0;
+		else if (s->nr == INJ_PAUSE)
+			make_pause(call);
 		else if (s->nr == INJ_FUTURE_LOCK)
 			s->result = find_future_lock();
 		else if (s->nr == __NR_clone)

@@ -50,6 +50,8 @@ struct inj_syscall {
 #define INJ_LIST (-1)
 /* wait4(2) for what the call before it has brought forth. */
 #define INJ_WAIT (-3)
+/* Waits until the tracer says so (inj_call.pause), INJ_PARK_MS at most. */
+#define INJ_PAUSE (-4)
 /* Likewise, with what mlockall(2) was told of memory to come for a result. */
 #define INJ_FUTURE_LOCK (-2)
 
@@ -58,10 +60,12 @@ enum inj_after {
 	INJ_AFTER_PARK = 1  /* wait for ever: templates and holders                */
 };
 
+enum inj_pause { INJ_PAUSE_NONE = 0, INJ_PAUSED = 1, INJ_PAUSE_OVER = 2 };
+
 /* A list of system calls for one task, and the stack to make them on. */
 struct inj_call {
 	uint32_t done; /* futex: 1 when all calls were made                    */
-	uint32_t reserved;
+	uint32_t pause; /* futex: enum inj_pause                                */
 	uint32_t count;
 	uint32_t after; /* enum inj_after                                      */
 	struct inj_syscall call[INJ_CALLS_MAX];

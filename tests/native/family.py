@@ -105,8 +105,16 @@ def kill_main(victim: Victim, signum: int = signal.SIGKILL) -> None:
 
 
 def places(victim: Victim) -> list[tuple[int, int, int, int, str, bool]]:
-    """Who is where; for a tree that does not change, to be compared with another moment's."""
-    return sorted(member.place for member in members(victim))
+    """Who is where; for a tree that does not change, to be compared with another moment's.
+
+    A template has its name only some moments after it was cloned: a look during a checkpoint is no look.
+    """
+
+    def look_again() -> list[Member]:
+        seen = members(victim)
+        return [] if any(member.state == "t" for member in seen) else seen
+
+    return sorted(member.place for member in wait_until(look_again, PATIENCE_S, f"{victim.command} is left alone"))
 
 
 def strangers(victim: Victim, allowed: int = 0) -> list[Member]:
