@@ -56,7 +56,7 @@ static int stop_task(pid_t tid, void *arg)
 
 /* Until a walk finds nobody new, for threads create threads while we walk.  Once
  * all known ones are stopped and none is new, there is no one left to create. */
-static int stop_all(struct target *target, struct avc_error *err)
+int stop_process(struct target *target, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		target->threads[i].seen = false;
@@ -218,7 +218,7 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->members; i++)
 		tree->member[i]->frozen = false;
-	if (stop_all(tree->main, err))
+	if (stop_process(tree->main, err))
 		return -1;
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */
@@ -239,7 +239,7 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 			if (!t || t->frozen)
 				continue;
 			all = false;
-			if (stop_all(t, &failed) == 0) {
+			if (stop_process(t, &failed) == 0) {
 				t->frozen = true;
 			} else if (failed.code != AVC_GONE) {
 				*err = failed;
@@ -483,7 +483,7 @@ static void let_go(const struct target *target, struct thread *thread)
 	thread_release(thread);
 }
 
-static void let_go_all(struct target *target, const struct thread *but)
+void let_go_process(struct target *target, const struct thread *but)
 {
 	for (uint32_t i = 0; i < target->thread_count; i++)
 		if (&target->threads[i] != but)
@@ -546,9 +546,9 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 			main_thread->stopped = false;
 		let_go(target, main_thread);
 	}
-	let_go_all(target, main_thread);
+	let_go_process(target, main_thread);
 	for (uint32_t i = 0; i < tree->members; i++)
-		let_go_all(tree->member[i], NULL);
+		let_go_process(tree->member[i], NULL);
 	tracee_deadline_clear(timer);
 	times->freeze_ns = now_ns() - start;
 	urgent_end();

@@ -387,10 +387,15 @@ static int hold_descendant(struct target *target, timer_t timer, uint64_t deadli
 
 	urgent_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	thread = stop_main(target, err);
-	result = thread ? hold_stopped(target, target->init, err) : -1;
-	if (thread)
-		thread_release(thread);
+	/* All of it: another thread may be waiting for children, of any kind (__WALL). */
+	result = stop_process(target, err);
+	thread = thread_find(target, target->pid);
+	if (!result && (!thread || !thread->stopped))
+		result = fail(err, AVC_GONE, 0, target->pid, "make holder", "", "it has ended");
+	if (!result)
+		result = thread_read(thread, err) ||
+			 hold_stopped(target, target->init, err);
+	let_go_process(target, NULL);
 	tracee_deadline_clear(timer);
 	urgent_end();
 	return result;

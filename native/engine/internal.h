@@ -768,6 +768,9 @@ struct freeze_times {
 	uint64_t freeze_ns, stop_ns, clone_ns;
 };
 
+/* Every thread of one process is stopped; all go on, but one (NULL: none). */
+int stop_process(struct target *target, struct avc_error *err) warn_unused;
+void let_go_process(struct target *target, const struct thread *but);
 /* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
  * shared memory that is prepared for already.
  * On return the app runs, whatever happened. */

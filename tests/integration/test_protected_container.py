@@ -162,7 +162,7 @@ def test_podman_kill_is_no_crash(sidecar: Sidecar, container: ContainerFactory, 
     assert made.wait() == status
 
 
-@pytest.mark.parametrize(("command", "why"), [("forker", "child processes"), ("unsupported aio", "AIO")])
+@pytest.mark.parametrize(("command", "why"), [("unsupported iouring", "io_uring"), ("unsupported aio", "AIO")])
 def test_what_can_not_be_protected_runs_and_is_told(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, command: str, why: str
 ) -> None:

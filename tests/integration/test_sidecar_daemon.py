@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import avckpt_command, run, wait_until
+from harness import ROOT, avckpt_command, run, wait_until
 from local_sidecar import ON_COMMAND, QUICK, LocalSidecar, children, ended, local_sidecar
 
 SLEEPER = ["sleep", "1000"]
@@ -167,9 +167,10 @@ def test_what_is_no_avckpt_init_is_waited_for_and_left_alone(local: LocalSidecar
 
 
 def test_what_can_not_be_protected_runs_unprotected_and_says_so(local: LocalSidecar) -> None:
-    web = local.protected("web", ["sh", "-c", "sleep 1000; true"])
+    run(["make", "-s", "-C", str(ROOT / "tests/victims")])
+    web = local.protected("web", [str(ROOT / "tests/victims/build/unsupported"), "aio"])
     row = local.wait_for(web, state="unprotected")
-    assert "child process" in row["reason"]
+    assert "AIO" in row["reason"]
     refused = local.avckpt("checkpoint", "web", check=False)
     assert refused.status == 5
     assert refused.stderr.startswith("avckpt: web runs unprotected: ")
