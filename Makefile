@@ -43,6 +43,7 @@ demo: setup ## kill a protected container's application twice and watch it go on
 	@$(VENV)/python scripts/demo.py
 
 test: setup ## every test (T=expression selects, TESTS=folder narrows)
+	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
 test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp

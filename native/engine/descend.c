@@ -74,21 +74,26 @@ static int puppet_run(struct puppet *puppet, struct avc_error *err)
 		       : 0;
 }
 
-int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
+/* Only the first `count` have to succeed. */
+static int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
+			     struct avc_error *err)
 {
-	const uint32_t listed = puppet->listed;
-
 	if (puppet_run(puppet, err))
 		return -1;
-	for (uint32_t i = 0; i < listed; i++) {
+	for (uint32_t i = 0; i < count; i++) {
 		const struct inj_syscall *s = &puppet->list[i];
 
 		if (s->result < 0 && s->result > -4096)
 			return fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore", what,
-				    "call %u of %u at %lx", i + 1, listed,
+				    "call %u of %u at %lx", i + 1, count,
 				    (unsigned long)s->arg[0]);
 	}
 	return 0;
+}
+
+int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
+{
+	return puppet_flush_some(puppet, puppet->listed, what, err);
 }
 
 /* Room for arguments, behind the list of calls. */
@@ -128,7 +133,7 @@ static int open_mail(struct puppet *puppet, struct avc_error *err)
 	if (puppet->socket < 0)
 		return fail_errno(err, puppet->pid, "restore", "pidfd_getfd", "it was killed");
 	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	return puppet_flush(puppet, "close", err);
+	return 0;
 }
 
 int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
@@ -542,8 +547,6 @@ static int put_files(struct puppet *puppet, const struct files_table *table, str
 		puppet_call(puppet, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket, 0, 0, 0);
 		puppet_call(puppet, SYS_close, 0, 0, 0, 0, 0, 0);
 	}
-	if (puppet_flush(puppet, "fcntl(DUPFD)", err))
-		return -1;
 	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
 		const int fd = table->entry[i].fd;
 
@@ -576,7 +579,28 @@ static int put_files(struct puppet *puppet, const struct files_table *table, str
 	return puppet_flush(puppet, "dup3", err);
 }
 
-static int put_manner(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
+/* With what is listed already; a limit that may not be raised is told. */
+static int put_limits(struct puppet *puppet, const struct branch *branch, uint64_t limit[][2],
+		      struct avc_error *notes, struct avc_error *err)
+{
+	const uint32_t first = puppet->listed;
+
+	memcpy(limit, branch->manner->limit, sizeof branch->manner->limit);
+	for (uint64_t i = 0; i < LIMITS; i++)
+		puppet_call(puppet, SYS_prlimit64, 0, i, pad_remote(puppet->pad, &limit[i]), 0, 0,
+			    0);
+	if (puppet_flush_some(puppet, first, "rt_sigaction", err))
+		return -1;
+	for (int i = 0; i < LIMITS; i++)
+		if (puppet->list[first + (uint32_t)i].result)
+			fail(notes, AVC_KERNEL, (int)-puppet->list[first + (uint32_t)i].result,
+			     branch->inside, "restore", "prlimit",
+			     "a resource limit could not be put back");
+	return 0;
+}
+
+static int put_manner(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
+		      struct avc_error *err)
 {
 	const struct manner *manner = branch->manner;
 	struct action *actions = (struct action *)(puppet->list + puppet->list_max / 2);
@@ -597,25 +621,7 @@ static int put_manner(struct puppet *puppet, const struct branch *branch, struct
 		if (i + 1 != SIGKILL && i + 1 != SIGSTOP)
 			puppet_call(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
 				    pad_remote(puppet->pad, &actions[i]), 0, 8, 0, 0);
-	return puppet_flush(puppet, "rt_sigaction", err);
-}
-
-static int put_limits(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
-		      struct avc_error *err)
-{
-	uint64_t(*limit)[2] = (uint64_t(*)[2])(puppet->list + puppet->list_max / 2);
-
-	memcpy(limit, branch->manner->limit, sizeof branch->manner->limit);
-	for (uint64_t i = 0; i < LIMITS; i++)
-		puppet_call(puppet, SYS_prlimit64, 0, i, pad_remote(puppet->pad, &limit[i]), 0, 0,
-			    0);
-	if (puppet_run(puppet, err))
-		return -1;
-	for (int i = 0; i < LIMITS; i++)
-		if (puppet->list[i].result)
-			fail(notes, AVC_KERNEL, (int)-puppet->list[i].result, branch->inside,
-			     "restore", "prlimit", "a resource limit could not be put back");
-	return 0;
+	return put_limits(puppet, branch, (uint64_t(*)[2])(actions + SIGNALS), notes, err);
 }
 
 /* Session and group before it has children of its own.  What it has from its parent is
@@ -717,8 +723,8 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 	if (change_pad(puppet, branch->target, branch->image->slot, err) ||
 	    remap(puppet, branch->target, branch->image->template, template_of(family, host), rseq,
 		  err) ||
-	    put_mm(puppet, branch->manner, notes) || put_manner(puppet, branch, err) ||
-	    place(member, branch, notes, err) || put_limits(puppet, branch, notes, err))
+	    put_manner(puppet, branch, notes, err) || put_mm(puppet, branch->manner, notes) ||
+	    place(member, branch, notes, err))
 		return -1;
 	if (put_files(puppet, &family->table[index], err) ||
 	    take_terminal(puppet, branch, notes, err))

@@ -54,6 +54,16 @@ static int stop_task(pid_t tid, void *arg)
 	return 0;
 }
 
+static int interrupt_task(pid_t tid, void *arg)
+{
+	struct target *target = arg;
+	struct thread *t = thread_find(target, tid);
+	struct avc_error ignored = { 0 };
+
+	/* What fails is seen when it is waited for. */
+	return t && !t->attached && thread_stop(target, t, &ignored) ? 1 : 0;
+}
+
 /* Until a walk finds nobody new, for threads create threads while we walk.  Once
  * all known ones are stopped and none is new, there is no one left to create. */
 int stop_process(struct target *target, struct avc_error *err)
@@ -218,6 +228,12 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->members; i++)
 		tree->member[i]->frozen = false;
+	/* So that they stop at the same time, and not one after the other.  A child that has
+	 * nothing of ours may have to execute a program before its parent can be stopped. */
+	for (uint32_t i = 0; tree->count > 1 && i < tree->count; i++)
+		if (tree->kin[i].target && tree->kin[i].target->infected)
+			(void)proc_tasks(tree->kin[i].target->task_dirfd, interrupt_task,
+					 tree->kin[i].target);
 	if (stop_process(tree->main, err))
 		return -1;
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
@@ -339,30 +355,75 @@ static int read_branch(struct tree *tree, struct branch *branch, bool strict, st
 }
 
 /* Timers only the process itself can tell of.  And young processes change what they are
- * all the time: a name, a user. */
-static int ask_process(struct target *target, struct avc_error *err)
-{
-	struct thread *thread = thread_find(target, target->pid);
-	struct inj_call *call = &target->pad.control->runner;
-	const uint64_t start = now_ns();
+ * all the time: a name, a user.  All are asked at the same time. */
+struct asking {
+	struct target *target;
+	struct thread *thread;
 	struct questions questions;
+	uint64_t start;
+	bool asked;
+};
 
-	if (!thread || !thread->stopped)
+static int ask_begin(struct asking *asking, struct avc_error *err)
+{
+	struct target *target = asking->target;
+	struct inj_call *call = &target->pad.control->runner;
+
+	asking->thread = thread_find(target, target->pid);
+	asking->start = now_ns();
+	if (!asking->thread || !asking->thread->stopped)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(target, call);
-	ask_add(target, thread, call, &questions);
-	if (borrow(target, thread, err))
+	ask_add(target, asking->thread, call, &asking->questions);
+	if (borrow(target, asking->thread, err) || pad_start(asking->thread->tid, err))
 		return -1;
-	if (pad_run(thread->tid, call, err)) {
+	asking->asked = true;
+	return 0;
+}
+
+static int ask_end(struct asking *asking, struct avc_error *err)
+{
+	struct target *target = asking->target;
+	struct inj_call *call = &target->pad.control->runner;
+
+	if (pad_finish(asking->thread->tid, call, err)) {
 		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
-			thread->stopped = false;
+			asking->thread->stopped = false;
 		return -1;
 	}
 	pending_read(target);
-	timers_answer(target, call, now_ns() - start);
-	return give_back(thread, err) ? -1 : ask_answer(thread, call, &questions, err);
+	timers_answer(target, call, now_ns() - asking->start);
+	return give_back(asking->thread, err) ||
+			       ask_answer(asking->thread, call, &asking->questions, err)
+		       ? -1
+		       : 0;
+}
+
+static int ask_processes(struct tree *tree, struct avc_error *err)
+{
+	struct asking *asking = calloc(tree->count, sizeof *asking);
+	int result = 0;
+
+	if (!asking)
+		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+	for (uint32_t i = 1; !result && i < tree->count; i++) {
+		asking[i].target = tree->kin[i].target;
+		if (asking[i].target)
+			result = ask_begin(&asking[i], err);
+	}
+	/* Also of those that were asked before one failed. */
+	for (uint32_t i = 1; i < tree->count; i++) {
+		struct avc_error failed = { 0 };
+
+		if (asking[i].asked && ask_end(&asking[i], &failed) && !result) {
+			*err = failed;
+			result = -1;
+		}
+	}
+	free(asking);
+	return result;
 }
 
 /* The holder shares the process' memory and descriptors; its clone is the template. */
@@ -435,11 +496,8 @@ static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *
 static int ask_and_hold(struct tree *tree, struct avc_error *err)
 {
 	struct avc_error failed = { 0 };
-	int result = 0;
+	int result = tree->count > 1 ? ask_processes(tree, err) : 0;
 
-	for (uint32_t i = 1; !result && i < tree->count; i++)
-		if (tree->kin[i].target)
-			result = ask_process(tree->kin[i].target, err);
 	for (uint32_t i = 1; !result && i < tree->count; i++)
 		if (tree->kin[i].target && !tree->kin[i].target->holder)
 			result = make_holder_missing(tree, i, err);

@@ -236,7 +236,7 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 	guard->fds[(*n)++] = (struct pollfd){ .fd = fd, .events = POLLIN };
 }
 
-static uint32_t all_stragglers(struct avc_guard *guard)
+uint32_t all_stragglers(struct avc_guard *guard)
 {
 	uint32_t left = stragglers(&guard->target);
 

@@ -75,6 +75,9 @@ void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t tick
 		const struct avc_error *error);
 void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
 
+/* Looks after the threads that are on their way back; how many are left. */
+uint32_t all_stragglers(struct avc_guard *guard);
+
 /* ---- guard_configure.c ----------------------------------------------------- */
 
 int config_check(const struct avc_config *config, struct avc_error *err);

@@ -208,6 +208,16 @@ static void hold_all(struct avc_guard *guard)
 	}
 }
 
+/* Killed in the middle of a checkpoint: init can not wait for a process before we have waited
+ * for those of its threads that are our tracees. */
+static void reap_tracees(void *arg)
+{
+	struct avc_guard *guard = arg;
+
+	(void)all_stragglers(guard);
+	reap_unknown(guard);
+}
+
 void died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
@@ -242,7 +252,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 		if (guard->tree.member[i]->pid)
 			syscall(SYS_pidfd_send_signal, guard->tree.member[i]->pidfd, SIGKILL, NULL,
 				0);
-	link_kill_leftovers(&guard->link, is_ours, guard);
+	link_kill_leftovers(&guard->link, is_ours, reap_tracees, guard);
 	if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
 		give_up(guard, report, AVC_REASON_EMPTY, &error);

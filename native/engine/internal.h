@@ -468,6 +468,7 @@ int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		  struct avc_error *err) warn_unused;
 /* The same in two parts, for several at a time. */
 int pad_start(pid_t tid, struct avc_error *err) warn_unused;
+int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		    struct avc_error *err) warn_unused;
 /* The same; `meanwhile` is called once while the kernel clones. */
@@ -927,9 +928,10 @@ int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind,
  * zombies, the container from ending. */
 void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),
 		    const void *arg);
-/* Kills what the dead app left behind: children of init, but those to keep. */
+/* Kills what the dead app left behind: children of init, but those to keep.  tend() is called
+ * while it waits for their end. */
 void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
-			 const void *arg);
+			 void (*tend)(void *arg), void *arg);
 
 /* ---- engine.c --------------------------------------------------------------------------- */
 

@@ -209,7 +209,7 @@ void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void
 }
 
 void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
-			 const void *arg)
+			 void (*tend)(void *arg), void *arg)
 {
 	const uint64_t end = now_ns() + LEFTOVERS_NS;
 
@@ -231,6 +231,7 @@ void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const 
 		}
 		if (!any)
 			return;
+		tend(arg);
 		usleep(LEFTOVERS_US);
 	} while (now_ns() < end);
 }

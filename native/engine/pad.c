@@ -194,7 +194,7 @@ int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err)
 	return wait_word(call, &call->pause, tid, err);
 }
 
-static int run_to_end(pid_t tid, struct inj_call *call, struct avc_error *err)
+int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (wait_word(call, &call->done, tid, err)) {
 		/* Without a stop of its own it would go home and stay a tracee for ever;
@@ -212,14 +212,14 @@ int pad_run_on(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	__atomic_store_n(&call->pause, INJ_PAUSE_OVER, __ATOMIC_RELEASE);
 	syscall(SYS_futex, &call->pause, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
-	return run_to_end(tid, call, err);
+	return pad_finish(tid, call, err);
 }
 
 int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
-	return run_to_end(tid, call, err);
+	return pad_finish(tid, call, err);
 }
 
 /* It has made all its calls and not stopped: a limit of processes, or of memory. */

@@ -158,7 +158,7 @@ static int protection(const struct mapping *m)
 	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
 }
 
-static int unmap(struct remap *r)
+static void unmap(struct remap *r)
 {
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const uint32_t first = i;
@@ -171,7 +171,6 @@ static int unmap(struct remap *r)
 		puppet_call(r->puppet, SYS_munmap, r->piece[first].start,
 			    r->piece[i].end - r->piece[first].start, 0, 0, 0, 0);
 	}
-	return puppet_flush(r->puppet, "munmap", r->err);
 }
 
 static const struct mapping *find_special(const struct maps *maps, const char *name)
@@ -210,7 +209,7 @@ static int move_special(struct remap *r)
 			if (i + 1 == sizeof names / sizeof *names)
 				between = r->target->pad.base + r->target->pad.bytes + PAGE;
 		}
-	return puppet_flush(r->puppet, "mremap", r->err);
+	return 0;
 }
 
 static int open_mapped(const struct remap *r, const struct mapping *m)
@@ -374,7 +373,7 @@ static int fill(struct remap *r, avc_remote touched)
 				return -1;
 		}
 	}
-	return puppet_flush(r->puppet, "madvise", r->err);
+	return 0; /* the last calls are made with what comes next */
 }
 
 /* ---- all of it ----------------------------------------------------------------------- */
@@ -405,9 +404,11 @@ int remap(struct puppet *puppet, const struct target *target, pid_t template, pi
 	else if (proc_mappings(puppet->pid, "maps", add_mapping, &r.is) ||
 		 proc_mappings(template, "maps", add_mapping, &r.want))
 		fail_errno(err, puppet->pid, "restore memory", "read(maps)", "it was killed");
-	else if (cut(&r) == 0 && unmap(&r) == 0 && move_special(&r) == 0 && map_new(&r) == 0 &&
-		 fill(&r, touched) == 0)
-		result = 0;
+	else if (cut(&r) == 0) {
+		unmap(&r);
+		if (move_special(&r) == 0 && map_new(&r) == 0)
+			result = fill(&r, touched);
+	}
 	close_fd(&r.want_mem);
 	close_fd(&r.is_mem);
 	close_fd(&r.want_pages);
