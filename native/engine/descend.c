@@ -85,8 +85,7 @@ static int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *
 
 		if (s->result < 0 && s->result > -4096)
 			return fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore", what,
-				    "call %u of %u at %lx", i + 1, count,
-				    (unsigned long)s->arg[0]);
+				    "call %u of %u at %lx", i + 1, count, (unsigned long)s->arg[0]);
 	}
 	return 0;
 }
@@ -164,7 +163,7 @@ struct manner {
 	uint32_t umask;
 	uint32_t group_count;
 	uint32_t group[64];
-	uint64_t mm[11]; /* of struct prctl_mm_map, but for brk                   */
+	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
 	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
 	uint32_t auxv_bytes;
 	uint8_t auxv[AUXV_BYTES];
@@ -648,8 +647,8 @@ static int place(struct member *member, const struct branch *branch, struct avc_
 }
 
 /* The leader of a session gets its terminal before it has children, who inherit it. */
-static int take_terminal(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
-			 struct avc_error *err)
+static int take_terminal(struct puppet *puppet, const struct branch *branch,
+			 struct avc_error *notes, struct avc_error *err)
 {
 	const int fd = files_find_device(branch->image->files, branch->image->tty);
 

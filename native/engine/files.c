@@ -466,9 +466,8 @@ static bool may_be_ours(const struct files *files, const struct file *f)
 
 static bool is_channel(const struct file *f)
 {
-	return f->kind == FILE_PIPE ||
-	       (f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
-		!f->socket->listening);
+	return f->kind == FILE_PIPE || (f->kind == FILE_SOCKET && f->socket &&
+					f->socket->domain == AF_UNIX && !f->socket->listening);
 }
 
 static void keep_contents(struct look *look)

@@ -84,9 +84,9 @@ struct file {
 	int shared;   /* lowest fd with the same open file description             */
 	/* The first one, of all processes, that has it; NULL: only this process      */
 	const struct file *family;
-	bool known;   /* the same object as in `known` of files_look(); at a restore
+	bool known; /* the same object as in `known` of files_look(); at a restore
 		       * the name and what does not change is left to that   */
-	char *name;   /* as readlink(2) says, allocated                            */
+	char *name; /* as readlink(2) says, allocated                            */
 	/* F_GETOWN_EX: in our namespace, and in its own (0: not the app's); F_GETSIG */
 	int owner_type, owner, owner_inside, owner_signal;
 	int64_t offset; /* -1: it has none                                          */

@@ -16,7 +16,7 @@
 
 #include "internal.h"
 
-#define TEMPLATE_NAME 16 /* in template_call.out: what it had got by fork(2) */
+#define TEMPLATE_NAME 16        /* in template_call.out: what it had got by fork(2) */
 #define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
 
 /* The OOM killer is to take templates first; undone in what is restored. */
@@ -141,8 +141,9 @@ static int fill_slot(struct target *target, struct generation *generation,
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		/* Of the one that was cloned, as it was then. */
 		memcpy(block->name,
-		       !branch && t.tid == target->pid ? (char *)slot->template_call.out + TEMPLATE_NAME
-						       : t.name,
+		       !branch && t.tid == target->pid
+			       ? (char *)slot->template_call.out + TEMPLATE_NAME
+			       : t.name,
 		       sizeof block->name);
 		setup_thread(&setup, block);
 		if (branch && status.groups != target->forebear_groups)

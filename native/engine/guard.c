@@ -285,8 +285,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	}
 	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
 				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout,
-		    NULL);
+	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
 }
 
 static void let_go(struct avc_guard *guard)

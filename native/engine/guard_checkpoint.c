@@ -221,8 +221,8 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	wait_quiescent(guard, &fresh.quiescent);
 	/* What is written between here and the freeze counts as written after it. */
 	note_written(guard);
-	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
-			&seen, &times, err);
+	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh, &seen,
+			&times, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;

@@ -280,15 +280,15 @@ struct target {
 	bool tcp_messages; /* quiescent is only who is between two messages    */
 	/* Of a process that is not the main one (tree.c). */
 	bool descendant;
-	uint64_t start;               /* when it began; tells it from one with its number */
-	uint32_t images;              /* generations that have one of it                  */
-	struct arch_regs holder_base; /* a user context of the holder, which clones       */
-	bool waiting;                 /* its main thread is to wait for a task of ours       */
-	const struct creds *forebear; /* what a process that is made from the main one has */
-	uint32_t forebear_groups;     /* a hash                                            */
-	bool frozen;                  /* stopped in this freeze                            */
-	bool adopts;                  /* it or one above it adopts orphans                 */
-	bool paused;                  /* between adopt_no_more() and adopt_again()         */
+	uint64_t start;                  /* when it began; tells it from one with its number */
+	uint32_t images;                 /* generations that have one of it                  */
+	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
+	bool waiting;                    /* its main thread is to wait for a task of ours       */
+	const struct creds *forebear;    /* what a process that is made from the main one has */
+	uint32_t forebear_groups;        /* a hash                                            */
+	bool frozen;                     /* stopped in this freeze                            */
+	bool adopts;                     /* it or one above it adopts orphans                 */
+	bool paused;                     /* between adopt_no_more() and adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */
 };
@@ -350,8 +350,8 @@ struct generation {
 /* One process of the app, as it was found. */
 struct kin {
 	pid_t pid;
-	int parent; /* index, PARENT_INIT; the main process is 0           */
-	bool ended; /* a zombie                                         */
+	int parent;  /* index, PARENT_INIT; the main process is 0           */
+	bool ended;  /* a zombie                                         */
 	bool ending; /* neither a process any more nor a zombie yet      */
 	struct proc_stat stat;
 	struct target *target;

@@ -37,7 +37,7 @@
 #define HOLES_MAX 8
 #define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
 #define OTHERS_NS (10 * NS_PER_S)
-#define SMAPS_SHARE 50       /* the long file is read in at most 1/50 of the time */
+#define SMAPS_SHARE 50 /* the long file is read in at most 1/50 of the time */
 
 const char private_huge_pages[] =
 	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
@@ -83,7 +83,7 @@ struct memory {
 	struct areas areas;
 	uint64_t layout; /* a hash of the mappings when the areas were read */
 	uint64_t read_ns, cost_ns;
-	uint64_t left_bytes; /* shared memory beyond the limit                  */
+	uint64_t left_bytes;   /* shared memory beyond the limit                  */
 	uint64_t others_bytes; /* and that of others, too                        */
 	uint32_t named_count;
 	struct named named[AREAS_MAX];
@@ -219,15 +219,13 @@ void memory_copy(const struct target *target, struct mem_image *image)
 
 	for (uint32_t i = 0; image && i < image->areas.count; i++) {
 		struct area *a = &image->areas.area[i];
-		const ssize_t n = a->again   ? 0
-				  : a->wiped ? read_whole(target->mem_fd, to, area_bytes(a),
-							  (off_t)a->start)
-					     : read_whole(a->fd, to, area_bytes(a),
-							  (off_t)a->offset);
+		const ssize_t n =
+			a->again   ? 0
+			: a->wiped ? read_whole(target->mem_fd, to, area_bytes(a), (off_t)a->start)
+				   : read_whole(a->fd, to, area_bytes(a), (off_t)a->offset);
 
 		a->kept = n > 0 ? (size_t)n : 0;
-		image->whole = image->whole && n >= 0 &&
-			       (!a->wiped || a->kept == area_bytes(a));
+		image->whole = image->whole && n >= 0 && (!a->wiped || a->kept == area_bytes(a));
 		to += area_room(a);
 	}
 }

@@ -64,7 +64,7 @@ enum inj_pause { INJ_PAUSE_NONE = 0, INJ_PAUSED = 1, INJ_PAUSE_OVER = 2 };
 
 /* A list of system calls for one task, and the stack to make them on. */
 struct inj_call {
-	uint32_t done; /* futex: 1 when all calls were made                    */
+	uint32_t done;  /* futex: 1 when all calls were made                    */
 	uint32_t pause; /* futex: enum inj_pause                                */
 	uint32_t count;
 	uint32_t after; /* enum inj_after                                      */
@@ -183,7 +183,7 @@ struct inj_slot {
 	uint32_t placed; /* session and group are right already                */
 	uint32_t fresh;  /* it is not a fork of what it is to be: the first
 			  * thread has to register with rseq(2), too           */
-	int32_t tty_fd; /* -1, or a descriptor of the tty it was in the
+	int32_t tty_fd;  /* -1, or a descriptor of the tty it was in the
 	                       * foreground of                                  */
 	uint32_t threads;
 	uint32_t block_bytes;       /* of one thread's block                          */
