@@ -22,11 +22,15 @@ struct Pose {
 };
 
 // The middle of the road: a rectangle with round corners, once around.
-class Circuit {
-public:
+class Circuit
+{
+      public:
 	static constexpr double kWidth = 70, kDepth = 60, kCorner = 22;
 
-	double length() const { return 2 * (kWidth + kDepth - 4 * kCorner) + 2 * M_PI * kCorner; }
+	double length() const
+	{
+		return 2 * (kWidth + kDepth - 4 * kCorner) + 2 * M_PI * kCorner;
+	}
 
 	// Where one is after so many metres, driving counter-clockwise.
 	Pose at(double way) const
@@ -78,7 +82,8 @@ inline std::vector<Box> make_city()
 			const int across = street % 2; // the street runs along the other axis
 			const double sign = street < 2 ? -1 : 1;
 			const double along_half = half[1 - across] + (out > 0 ? 40 : -9);
-			auto put = [&](double a0, double a1, double b0, double b1, double z0, double z1) {
+			auto put = [&](double a0, double a1, double b0, double b1, double z0,
+				       double z1) {
 				// a along the street, b metres away from its middle.
 				const double middle = sign * half[across];
 				const double n = sign * out;

@@ -27,8 +27,9 @@ inline void crash(const std::string &kind)
 	_exit(3);
 }
 
-class Faults {
-public:
+class Faults
+{
+      public:
 	explicit Faults(const std::string &node)
 	{
 		const char *folder = std::getenv("FAULTS");
@@ -47,12 +48,13 @@ public:
 		close(fd);
 		const std::string order(text, bytes > 0 ? static_cast<size_t>(bytes) : 0);
 		const size_t space = order.find(' ');
-		if (space == std::string::npos || order.compare(space + 1, std::strlen(place), place) != 0)
+		if (space == std::string::npos ||
+		    order.compare(space + 1, std::strlen(place), place) != 0)
 			return;
 		unlink(path_.c_str());
 		crash(order.substr(0, space));
 	}
 
-private:
+      private:
 	std::string path_;
 };
