@@ -3,306 +3,24 @@
  * The kernel has no call that gives a process another parent, and a fork of a template is
  * init's child.  So only the main process is forked from its template; the others are
  * forked by their own restored parents, under their own numbers, and then made what their
- * templates are: memory (remap.c), descriptors, signal handlers, credentials.  All of them
+ * templates are (become()): memory (remap.c), descriptors, signal handlers, credentials.  All of them
  * are tracees that rest in a pad until everything is there.
  */
 #include <errno.h>
-#include <fcntl.h>
 #include <poll.h>
-#include <sched.h>
-#include <signal.h>
-#include <stddef.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
-#include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
 #include <sys/resource.h>
-#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
-#include <unistd.h>
 
 #include "internal.h"
 
 #define TRIES 64
 #define TRY_AGAIN_US 200
-#define SIGNALS 64
-#define AUXV_BYTES 1024
-
-/* ---- a puppet -------------------------------------------------------------------- */
-
-/* The list of calls is where files_restore.c has its own, which is not in use any more. */
-static void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot)
-{
-	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2 + sizeof(struct files_letter);
-
-	puppet->pad = pad;
-	puppet->call = &pad->control->holder;
-	puppet->list = (struct inj_syscall *)(((uintptr_t)memory + 63) & ~(uintptr_t)63);
-	puppet->list_max = (INJ_FILES_BYTES / 2 - sizeof(struct files_letter) - 64) /
-			   sizeof *puppet->list;
-	puppet->listed = 0;
-}
-
-void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
-		 uint64_t e, uint64_t f)
-{
-	if (puppet->listed < puppet->list_max)
-		puppet->list[puppet->listed] = (struct inj_syscall){ .nr = nr,
-								     .arg = { a, b, c, d, e, f } };
-	puppet->listed++;
-}
-
-static int puppet_run(struct puppet *puppet, struct avc_error *err)
-{
-	const uint32_t listed = puppet->listed;
-
-	puppet->listed = 0;
-	if (!listed)
-		return 0;
-	if (listed > puppet->list_max)
-		return fail(err, AVC_UNSUPPORTED, 0, puppet->pid, "restore", "",
-			    "it has more mappings than there is room for");
-	call_begin(puppet->call, INJ_AFTER_PARK);
-	call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list), listed, 0, 0, 0);
-	return pad_send(puppet->pad, puppet->pid, &puppet->base, puppet->call, err) ||
-			       pad_run(puppet->pid, puppet->call, err)
-		       ? -1
-		       : 0;
-}
-
-/* Only the first `count` have to succeed. */
-static int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
-			     struct avc_error *err)
-{
-	if (puppet_run(puppet, err))
-		return -1;
-	for (uint32_t i = 0; i < count; i++) {
-		const struct inj_syscall *s = &puppet->list[i];
-
-		if (s->result < 0 && s->result > -4096)
-			return fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore", what,
-				    "call %u of %u at %lx", i + 1, count, (unsigned long)s->arg[0]);
-	}
-	return 0;
-}
-
-int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
-{
-	return puppet_flush_some(puppet, puppet->listed, what, err);
-}
-
-/* Room for arguments, behind the list of calls. */
-static void *puppet_data(const struct puppet *puppet, avc_remote *remote)
-{
-	void *data = puppet->call->out;
-
-	*remote = pad_remote(puppet->pad, data);
-	return data;
-}
-
-static avc_remote write_letter(const struct puppet *puppet)
-{
-	avc_remote remote;
-	struct files_letter *letter = puppet_data(puppet, &remote);
-
-	_Static_assert(sizeof *letter <= sizeof puppet->call->out, "room for a letter");
-	files_letter_write(letter, remote);
-	return remote;
-}
-
-/* Everything its parent had open is closed; descriptor 0 is a socket of which we have the
- * other end. */
-static int open_mail(struct puppet *puppet, struct avc_error *err)
-{
-	avc_remote out;
-	int pidfd;
-
-	(void)puppet_data(puppet, &out);
-	puppet_call(puppet, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
-	puppet_call(puppet, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
-	if (puppet_flush(puppet, "socketpair", err))
-		return -1;
-	pidfd = proc_pidfd_open(puppet->pid);
-	puppet->socket = pidfd < 0 ? -1 : files_borrow(pidfd, 1);
-	close_fd(&pidfd);
-	if (puppet->socket < 0)
-		return fail_errno(err, puppet->pid, "restore", "pidfd_getfd", "it was killed");
-	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	return 0;
-}
-
-int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
-{
-	/* What is not received yet waits in the socket. */
-	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "recvmsg", err))
-		return -1;
-	if (files_send(puppet->socket, fd)) {
-		if (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
-		    files_send(puppet->socket, fd))
-			return fail_errno(err, puppet->pid, "restore", "sendmsg",
-					  "a descriptor could not be handed over");
-	}
-	puppet_call(puppet, SYS_recvmsg, 0, write_letter(puppet), MSG_CMSG_CLOEXEC | MSG_DONTWAIT,
-		    0, 0, 0);
-	return 0;
-}
-
-/* ---- what a template has besides memory and descriptors ---------------------------- */
-
-struct action { /* struct sigaction as the kernel has it                          */
-	uint64_t handler, flags, restorer, mask;
-};
-
-struct manner {
-	struct action action[SIGNALS];
-	int64_t brk, personality, dumpable;
-	uint32_t umask;
-	uint32_t group_count;
-	uint32_t group[64];
-	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
-	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
-	uint32_t auxv_bytes;
-	uint8_t auxv[AUXV_BYTES];
-};
-
-enum {
-	START_CODE,
-	END_CODE,
-	START_DATA,
-	END_DATA,
-	START_BRK,
-	BRK,
-	START_STACK,
-	ARG_START,
-	ARG_END,
-	ENV_START,
-	ENV_END
-};
-
-static int read_mm(pid_t pid, struct manner *manner)
-{
-	/* Fields of /proc/PID/stat after the name, counted from `state` as 3. */
-	static const struct {
-		int field, to;
-	} fields[] = { { 26, START_CODE }, { 27, END_CODE }, { 28, START_STACK },
-		       { 45, START_DATA }, { 46, END_DATA }, { 47, START_BRK },
-		       { 48, ARG_START },  { 49, ARG_END },  { 50, ENV_START },
-		       { 51, ENV_END } };
-	char buf[1024], *p;
-	ssize_t n;
-	int fd;
-
-	if (proc_read(pid, "stat", buf, sizeof buf) <= 0 || !(p = strrchr(buf, ')')))
-		return -1;
-	p++;
-	for (int field = 3; *p; field++) {
-		char *next;
-
-		while (*p == ' ')
-			p++;
-		for (size_t i = 0; i < sizeof fields / sizeof *fields; i++)
-			if (fields[i].field == field)
-				manner->mm[fields[i].to] = strtoull(p, NULL, 10);
-		next = strchr(p, ' ');
-		if (!next)
-			break;
-		p = next;
-	}
-	fd = proc_open(pid, "auxv", O_RDONLY);
-	n = fd < 0 ? -1 : read(fd, manner->auxv, sizeof manner->auxv);
-	close_fd(&fd);
-	manner->auxv_bytes = n > 0 ? (uint32_t)n : 0;
-	return 0;
-}
-
-static int read_status(pid_t pid, struct manner *manner)
-{
-	char buf[8192], *line;
-
-	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
-		return -1;
-	line = strstr(buf, "\nUmask:");
-	manner->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
-	line = strstr(buf, "\nGroups:");
-	for (char *p = line ? line + 8 : buf + strlen(buf);
-	     manner->group_count < sizeof manner->group / sizeof *manner->group;) {
-		char *next;
-		const unsigned long group = strtoul(p, &next, 10);
-
-		if (next == p || memchr(p, '\n', (size_t)(next - p)))
-			break;
-		manner->group[manner->group_count++] = (uint32_t)group;
-		p = next;
-	}
-	return 0;
-}
-
-int branch_learn(struct branch *branch, struct avc_error *err)
-{
-	const struct pad *pad = &branch->target->pad;
-	struct generation *image = branch->image;
-	struct inj_call *call = &pad_slot(pad, image->slot)->template_call;
-	uint8_t *memory = pad_files(pad, image->slot) + INJ_FILES_BYTES / 2;
-	struct inj_syscall *list = (struct inj_syscall *)memory;
-	struct action *action = (struct action *)(list + SIGNALS + 8);
-	struct manner *manner = calloc(1, sizeof *manner);
-	uint32_t n = 0;
-
-	branch->manner = manner;
-	if (!manner)
-		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
-	for (int i = 0; i < SIGNALS; i++)
-		list[n++] = (struct inj_syscall){ .nr = SYS_rt_sigaction,
-						  .arg = { (uint64_t)i + 1, 0,
-							   pad_remote(pad, &action[i]), 8 } };
-	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
-	list[n++] = (struct inj_syscall){ .nr = SYS_personality, .arg = { 0xffffffff } };
-	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_DUMPABLE } };
-	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
-	if (pad_send(pad, image->template, &image->base, call, err) ||
-	    pad_run(image->template, call, err))
-		return -1;
-	memcpy(manner->action, action, sizeof manner->action);
-	manner->brk = list[SIGNALS].result;
-	manner->personality = list[SIGNALS + 1].result;
-	manner->dumpable = list[SIGNALS + 2].result;
-	/* The template has limits and groups of the time when the holder was made. */
-	if (read_mm(image->template, manner) || read_status(image->template, manner) ||
-	    (proc_limits(branch->target->pid, manner->limit) &&
-	     proc_limits(image->template, manner->limit)))
-		return fail_errno(err, image->template, "keep template", "open(/proc)",
-				  "it was killed");
-	return 0;
-}
-
-void branch_setup_groups(const struct branch *branch, struct setup *setup)
-{
-	const struct manner *manner = branch->manner;
-	const avc_remote list = setup_data(setup, manner->group, sizeof manner->group);
-
-	setup_add_thread(setup, "setgroups", SYS_setgroups, manner->group_count, list, 0, 0, 0);
-}
-
-void branch_setup_dumpable(const struct branch *branch, struct setup *setup)
-{
-	/* A change of users takes it away. */
-	setup_add_thread(setup, "", SYS_prctl, PR_SET_DUMPABLE, (uint64_t)branch->manner->dumpable,
-			 0, 0, 0)
-		->flags = INJ_MAY_FAIL;
-}
-
-void branch_forget(struct branch *branch)
-{
-	free(branch->manner);
-	branch->manner = NULL;
-}
-
-/* ---- the family ------------------------------------------------------------------------ */
 
 struct member {
 	pid_t pid; /* 0: not made yet                                         */
@@ -487,142 +205,6 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 	}
 }
 
-/* From its parent's pad into its own. */
-static int change_pad(struct puppet *puppet, const struct target *target, uint32_t slot,
-		      struct avc_error *err)
-{
-	const struct pad *pad = &target->pad;
-
-	if (puppet_give(puppet, pad->fd, err))
-		return -1;
-	puppet_call(puppet, SYS_mmap, pad->base, INJ_CODE_BYTES, PAD_CODE_PROT, PAD_FLAGS, 1, 0);
-	puppet_call(puppet, SYS_mmap, pad->base + INJ_CODE_BYTES, pad->bytes - INJ_CODE_BYTES,
-		    PAD_DATA_PROT, PAD_FLAGS, 1, INJ_CODE_BYTES);
-	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	if (puppet_flush(puppet, "mmap", err))
-		return -1;
-	puppet_enter(puppet, pad, slot);
-	return 0;
-}
-
-static int put_mm(struct puppet *puppet, const struct manner *manner, struct avc_error *notes)
-{
-	struct {
-		uint64_t mm[11];
-		uint64_t auxv;
-		uint32_t auxv_bytes, exe_fd;
-	} map;
-	const avc_remote at = pad_remote(puppet->pad, puppet->list + puppet->list_max / 2);
-	uint8_t *here = (uint8_t *)(puppet->list + puppet->list_max / 2);
-	struct avc_error failed = { 0 };
-
-	memcpy(map.mm, manner->mm, sizeof map.mm);
-	map.mm[BRK] = (uint64_t)manner->brk;
-	map.auxv = manner->auxv_bytes ? at + sizeof map : 0;
-	map.auxv_bytes = manner->auxv_bytes;
-	map.exe_fd = ~0u;
-	memcpy(here, &map, sizeof map);
-	memcpy(here + sizeof map, manner->auxv, manner->auxv_bytes);
-	puppet_call(puppet, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP, at, sizeof map, 0, 0);
-	if (puppet_flush(puppet, "prctl(SET_MM_MAP)", &failed) == 0)
-		return 0;
-	/* Only what `ps` shows, and where its heap may grow. */
-	if (failed.code != AVC_KERNEL || !failed.errnum)
-		return -1;
-	if (!notes->code)
-		*notes = failed;
-	return 0;
-}
-
-/* In order; what is received comes to the lowest number that is free. */
-static int put_files(struct puppet *puppet, const struct files_table *table, struct avc_error *err)
-{
-	int socket = 0, lowest = 0;
-
-	/* Out of the way, between or behind those that are wanted. */
-	for (uint32_t i = 0; i < table->count; i++)
-		socket += table->entry[i].fd == socket;
-	if (socket) {
-		puppet_call(puppet, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket, 0, 0, 0);
-		puppet_call(puppet, SYS_close, 0, 0, 0, 0, 0, 0);
-	}
-	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
-		const int fd = table->entry[i].fd;
-
-		/* The lowest number that is free; of those that are taken `placed` is the
-		 * first that is not below it. */
-		for (;; lowest++) {
-			while (placed < i && table->entry[placed].fd < lowest)
-				placed++;
-			if (lowest != socket && !(placed < i && table->entry[placed].fd == lowest))
-				break;
-		}
-		if (files_send(puppet->socket, table->entry[i].ours) &&
-		    (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
-		     files_send(puppet->socket, table->entry[i].ours)))
-			return fail_errno(err, puppet->pid, "restore", "sendmsg",
-					  "a descriptor could not be handed over");
-		puppet_call(puppet, SYS_recvmsg, (uint64_t)socket, write_letter(puppet),
-			    MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0);
-		if (lowest != fd) {
-			puppet_call(puppet, SYS_dup3, (uint64_t)lowest, (uint64_t)fd,
-				    table->entry[i].cloexec ? O_CLOEXEC : 0, 0, 0, 0);
-			puppet_call(puppet, SYS_close, (uint64_t)lowest, 0, 0, 0, 0, 0);
-		} else if (!table->entry[i].cloexec) {
-			puppet_call(puppet, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
-		}
-		if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "dup3", err))
-			return -1;
-	}
-	puppet_call(puppet, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
-	return puppet_flush(puppet, "dup3", err);
-}
-
-/* With what is listed already; a limit that may not be raised is told. */
-static int put_limits(struct puppet *puppet, const struct branch *branch, uint64_t limit[][2],
-		      struct avc_error *notes, struct avc_error *err)
-{
-	const uint32_t first = puppet->listed;
-
-	memcpy(limit, branch->manner->limit, sizeof branch->manner->limit);
-	for (uint64_t i = 0; i < LIMITS; i++)
-		puppet_call(puppet, SYS_prlimit64, 0, i, pad_remote(puppet->pad, &limit[i]), 0, 0,
-			    0);
-	if (puppet_flush_some(puppet, first, "rt_sigaction", err))
-		return -1;
-	for (int i = 0; i < LIMITS; i++)
-		if (puppet->list[first + (uint32_t)i].result)
-			fail(notes, AVC_KERNEL, (int)-puppet->list[first + (uint32_t)i].result,
-			     branch->inside, "restore", "prlimit",
-			     "a resource limit could not be put back");
-	return 0;
-}
-
-static int put_manner(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
-		      struct avc_error *err)
-{
-	const struct manner *manner = branch->manner;
-	struct action *actions = (struct action *)(puppet->list + puppet->list_max / 2);
-	int cwd = proc_open(branch->image->template, "cwd", O_PATH | O_DIRECTORY);
-
-	if (cwd < 0 || puppet_give(puppet, cwd, err)) {
-		close_fd(&cwd);
-		return fail_errno(err, puppet->pid, "restore", "open(cwd)",
-				  "its working directory is gone");
-	}
-	close_fd(&cwd);
-	puppet_call(puppet, SYS_fchdir, 1, 0, 0, 0, 0, 0);
-	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
-	puppet_call(puppet, SYS_personality, (uint64_t)manner->personality, 0, 0, 0, 0, 0);
-	memcpy(actions, manner->action, sizeof manner->action);
-	for (int i = 0; i < SIGNALS; i++)
-		if (i + 1 != SIGKILL && i + 1 != SIGSTOP)
-			puppet_call(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
-				    pad_remote(puppet->pad, &actions[i]), 0, 8, 0, 0);
-	return put_limits(puppet, branch, (uint64_t(*)[2])(actions + SIGNALS), notes, err);
-}
-
 /* Session and group before it has children of its own.  What it has from its parent is
  * right as a rule. */
 static int place(struct member *member, const struct branch *branch, struct avc_error *notes,
@@ -713,19 +295,19 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 	const struct inj_thread *parents = pad_thread(&parent->pad, family->generation->slot, 0);
 	const avc_remote rseq = host < 0 ? parents->rseq : 0;
 
-	if (open_mail(puppet, err))
+	if (puppet_open_mail(puppet, err))
 		return -1;
 	/* An orphan comes from one in between that has none (kernel/rseq.c, CLONE_VM). */
 	if (rseq && branch->parent != PARENT_INIT)
 		puppet_call(puppet, SYS_rseq, rseq, parents->rseq_bytes, 1 /* UNREGISTER */,
 			    parents->rseq_signature, 0, 0);
-	if (change_pad(puppet, branch->target, branch->image->slot, err) ||
+	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
 	    remap(puppet, branch->target, branch->image->template, template_of(family, host), rseq,
 		  err) ||
-	    put_manner(puppet, branch, notes, err) || put_mm(puppet, branch->manner, notes) ||
+	    manner_put(puppet, branch, notes, err) || manner_put_mm(puppet, branch, notes) ||
 	    place(member, branch, notes, err))
 		return -1;
-	if (put_files(puppet, &family->table[index], err) ||
+	if (puppet_put_files(puppet, &family->table[index], err) ||
 	    take_terminal(puppet, branch, notes, err))
 		return -1;
 	close_fd(&puppet->socket);

@@ -9,6 +9,8 @@
  *   restore.c    templates become the app again
  *   descend.c    a restored process makes its children
  *   remap.c      ... and their memory
+ *   manner.c     ... and what else they have
+ *   puppet.c     a process that is being made
  *   tree.c       the processes of an app
  *   generation.c templates kept
  *   pending.c    signals that have not been delivered
@@ -303,7 +305,7 @@ struct branch {
 	pid_t inside;
 	pid_t session, group;  /* inside; 0: outside of the app           */
 	struct proc_stat stat; /* as of the freeze                        */
-	struct manner *manner; /* descend.c                               */
+	struct manner *manner; /* manner.c                                */
 	pid_t pid;             /* that it was restored as last            */
 	int status;            /* of one that had ended, as from wait(2)  */
 	char name[16];         /* the same                                */
@@ -804,7 +806,7 @@ int restore(struct target *target, struct generation *generation, const struct l
 	    struct restore_times *times, struct avc_error *notes,
 	    struct avc_error *err) warn_unused;
 
-/* ---- descend.c ------------------------------------------------------------------- */
+/* ---- puppet.c ----------------------------------------------------------------------- */
 
 /* A task that a restored process has forked, and that is made what a template is. */
 struct puppet {
@@ -817,12 +819,31 @@ struct puppet {
 	int socket; /* ours, through which it gets descriptors; -1     */
 };
 
-/* One more call; puppet_flush() makes them.  The first that fails is told. */
+/* From now on it runs in that pad. */
+void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot);
+/* One more call.  The calls listed are made by puppet_run(), which leaves the results in
+ * puppet->list; puppet_flush() also tells the first that failed, puppet_flush_some() of the
+ * first `count` ones. */
 void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
 		 uint64_t e, uint64_t f);
+int puppet_run(struct puppet *puppet, struct avc_error *err) warn_unused;
 int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err) warn_unused;
-/* It gets a descriptor: number 1, until that is closed. */
+int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
+		      struct avc_error *err) warn_unused;
+/* Room for arguments of calls. */
+void *puppet_data(const struct puppet *puppet, avc_remote *remote);
+/* Closes what it has from its parent; from here on it can be given descriptors, each to be
+ * number 1 until that is closed. */
+int puppet_open_mail(struct puppet *puppet, struct avc_error *err) warn_unused;
 int puppet_give(struct puppet *puppet, int fd, struct avc_error *err) warn_unused;
+/* From its parent's pad into its own. */
+int puppet_change_pad(struct puppet *puppet, const struct target *target, uint32_t slot,
+		      struct avc_error *err) warn_unused;
+/* Its descriptors; it gets no more after that. */
+int puppet_put_files(struct puppet *puppet, const struct files_table *table,
+		     struct avc_error *err) warn_unused;
+
+/* ---- manner.c ------------------------------------------------------------------------ */
 
 /* After the app runs again: what only the template can tell. */
 int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
@@ -830,6 +851,13 @@ int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
 void branch_setup_groups(const struct branch *branch, struct setup *setup);
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
 void branch_forget(struct branch *branch);
+/* A restored process gets it; what is allowed to fail is told in *notes. */
+int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
+	       struct avc_error *err) warn_unused;
+int manner_put_mm(struct puppet *puppet, const struct branch *branch,
+		  struct avc_error *notes) warn_unused;
+
+/* ---- descend.c ------------------------------------------------------------------------- */
 
 /* All processes of a generation, of which the main one is there; each is stopped.
  * `table`: of each branch. */

@@ -1,0 +1,244 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What a process that is not the main one has besides memory and descriptors: signal
+ * handlers, working directory, limits, groups, and what the kernel knows of its layout.
+ */
+#include <fcntl.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/syscall.h>
+
+#include "internal.h"
+
+#define SIGNALS 64
+#define AUXV_BYTES 1024
+
+/* ---- after a checkpoint ------------------------------------------------------------ */
+
+struct action { /* struct sigaction as the kernel has it                          */
+	uint64_t handler, flags, restorer, mask;
+};
+
+struct manner {
+	struct action action[SIGNALS];
+	int64_t brk, personality, dumpable;
+	uint32_t umask;
+	uint32_t group_count;
+	uint32_t group[64];
+	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
+	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
+	uint32_t auxv_bytes;
+	uint8_t auxv[AUXV_BYTES];
+};
+
+enum {
+	START_CODE,
+	END_CODE,
+	START_DATA,
+	END_DATA,
+	START_BRK,
+	BRK,
+	START_STACK,
+	ARG_START,
+	ARG_END,
+	ENV_START,
+	ENV_END
+};
+
+static int read_mm(pid_t pid, struct manner *manner)
+{
+	/* Fields of /proc/PID/stat after the name, counted from `state` as 3. */
+	static const struct {
+		int field, to;
+	} fields[] = { { 26, START_CODE }, { 27, END_CODE }, { 28, START_STACK },
+		       { 45, START_DATA }, { 46, END_DATA }, { 47, START_BRK },
+		       { 48, ARG_START },  { 49, ARG_END },  { 50, ENV_START },
+		       { 51, ENV_END } };
+	char buf[1024], *p;
+	ssize_t n;
+	int fd;
+
+	if (proc_read(pid, "stat", buf, sizeof buf) <= 0 || !(p = strrchr(buf, ')')))
+		return -1;
+	p++;
+	for (int field = 3; *p; field++) {
+		char *next;
+
+		while (*p == ' ')
+			p++;
+		for (size_t i = 0; i < sizeof fields / sizeof *fields; i++)
+			if (fields[i].field == field)
+				manner->mm[fields[i].to] = strtoull(p, NULL, 10);
+		next = strchr(p, ' ');
+		if (!next)
+			break;
+		p = next;
+	}
+	fd = proc_open(pid, "auxv", O_RDONLY);
+	n = fd < 0 ? -1 : read(fd, manner->auxv, sizeof manner->auxv);
+	close_fd(&fd);
+	manner->auxv_bytes = n > 0 ? (uint32_t)n : 0;
+	return 0;
+}
+
+static int read_status(pid_t pid, struct manner *manner)
+{
+	char buf[8192], *line;
+
+	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
+		return -1;
+	line = strstr(buf, "\nUmask:");
+	manner->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
+	line = strstr(buf, "\nGroups:");
+	for (char *p = line ? line + 8 : buf + strlen(buf);
+	     manner->group_count < sizeof manner->group / sizeof *manner->group;) {
+		char *next;
+		const unsigned long group = strtoul(p, &next, 10);
+
+		if (next == p || memchr(p, '\n', (size_t)(next - p)))
+			break;
+		manner->group[manner->group_count++] = (uint32_t)group;
+		p = next;
+	}
+	return 0;
+}
+
+int branch_learn(struct branch *branch, struct avc_error *err)
+{
+	const struct pad *pad = &branch->target->pad;
+	struct generation *image = branch->image;
+	struct inj_call *call = &pad_slot(pad, image->slot)->template_call;
+	uint8_t *memory = pad_files(pad, image->slot) + INJ_FILES_BYTES / 2;
+	struct inj_syscall *list = (struct inj_syscall *)memory;
+	struct action *action = (struct action *)(list + SIGNALS + 8);
+	struct manner *manner = calloc(1, sizeof *manner);
+	uint32_t n = 0;
+
+	branch->manner = manner;
+	if (!manner)
+		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+	for (int i = 0; i < SIGNALS; i++)
+		list[n++] = (struct inj_syscall){ .nr = SYS_rt_sigaction,
+						  .arg = { (uint64_t)i + 1, 0,
+							   pad_remote(pad, &action[i]), 8 } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
+	list[n++] = (struct inj_syscall){ .nr = SYS_personality, .arg = { 0xffffffff } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_DUMPABLE } };
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
+	if (pad_send(pad, image->template, &image->base, call, err) ||
+	    pad_run(image->template, call, err))
+		return -1;
+	memcpy(manner->action, action, sizeof manner->action);
+	manner->brk = list[SIGNALS].result;
+	manner->personality = list[SIGNALS + 1].result;
+	manner->dumpable = list[SIGNALS + 2].result;
+	/* The template has limits and groups of the time when the holder was made. */
+	if (read_mm(image->template, manner) || read_status(image->template, manner) ||
+	    (proc_limits(branch->target->pid, manner->limit) &&
+	     proc_limits(image->template, manner->limit)))
+		return fail_errno(err, image->template, "keep template", "open(/proc)",
+				  "it was killed");
+	return 0;
+}
+
+void branch_setup_groups(const struct branch *branch, struct setup *setup)
+{
+	const struct manner *manner = branch->manner;
+	const avc_remote list = setup_data(setup, manner->group, sizeof manner->group);
+
+	setup_add_thread(setup, "setgroups", SYS_setgroups, manner->group_count, list, 0, 0, 0);
+}
+
+void branch_setup_dumpable(const struct branch *branch, struct setup *setup)
+{
+	/* A change of users takes it away. */
+	setup_add_thread(setup, "", SYS_prctl, PR_SET_DUMPABLE, (uint64_t)branch->manner->dumpable,
+			 0, 0, 0)
+		->flags = INJ_MAY_FAIL;
+}
+
+void branch_forget(struct branch *branch)
+{
+	free(branch->manner);
+	branch->manner = NULL;
+}
+
+/* ---- a restore ------------------------------------------------------------------------ */
+
+int manner_put_mm(struct puppet *puppet, const struct branch *branch, struct avc_error *notes)
+{
+	const struct manner *manner = branch->manner;
+	struct {
+		uint64_t mm[11];
+		uint64_t auxv;
+		uint32_t auxv_bytes, exe_fd;
+	} map;
+	const avc_remote at = pad_remote(puppet->pad, puppet->list + puppet->list_max / 2);
+	uint8_t *here = (uint8_t *)(puppet->list + puppet->list_max / 2);
+	struct avc_error failed = { 0 };
+
+	memcpy(map.mm, manner->mm, sizeof map.mm);
+	map.mm[BRK] = (uint64_t)manner->brk;
+	map.auxv = manner->auxv_bytes ? at + sizeof map : 0;
+	map.auxv_bytes = manner->auxv_bytes;
+	map.exe_fd = ~0u;
+	memcpy(here, &map, sizeof map);
+	memcpy(here + sizeof map, manner->auxv, manner->auxv_bytes);
+	puppet_call(puppet, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP, at, sizeof map, 0, 0);
+	if (puppet_flush(puppet, "prctl(SET_MM_MAP)", &failed) == 0)
+		return 0;
+	/* Only what `ps` shows, and where its heap may grow. */
+	if (failed.code != AVC_KERNEL || !failed.errnum)
+		return -1;
+	if (!notes->code)
+		*notes = failed;
+	return 0;
+}
+
+/* With what is listed already; a limit that may not be raised is told. */
+static int put_limits(struct puppet *puppet, const struct branch *branch, uint64_t limit[][2],
+		      struct avc_error *notes, struct avc_error *err)
+{
+	const uint32_t first = puppet->listed;
+
+	memcpy(limit, branch->manner->limit, sizeof branch->manner->limit);
+	for (uint64_t i = 0; i < LIMITS; i++)
+		puppet_call(puppet, SYS_prlimit64, 0, i, pad_remote(puppet->pad, &limit[i]), 0, 0,
+			    0);
+	if (puppet_flush_some(puppet, first, "rt_sigaction", err))
+		return -1;
+	for (int i = 0; i < LIMITS; i++)
+		if (puppet->list[first + (uint32_t)i].result)
+			fail(notes, AVC_KERNEL, (int)-puppet->list[first + (uint32_t)i].result,
+			     branch->inside, "restore", "prlimit",
+			     "a resource limit could not be put back");
+	return 0;
+}
+
+int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
+	       struct avc_error *err)
+{
+	const struct manner *manner = branch->manner;
+	struct action *actions = (struct action *)(puppet->list + puppet->list_max / 2);
+	int cwd = proc_open(branch->image->template, "cwd", O_PATH | O_DIRECTORY);
+
+	if (cwd < 0 || puppet_give(puppet, cwd, err)) {
+		close_fd(&cwd);
+		return fail_errno(err, puppet->pid, "restore", "open(cwd)",
+				  "its working directory is gone");
+	}
+	close_fd(&cwd);
+	puppet_call(puppet, SYS_fchdir, 1, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_personality, (uint64_t)manner->personality, 0, 0, 0, 0, 0);
+	memcpy(actions, manner->action, sizeof manner->action);
+	for (int i = 0; i < SIGNALS; i++)
+		if (i + 1 != SIGKILL && i + 1 != SIGSTOP)
+			puppet_call(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
+				    pad_remote(puppet->pad, &actions[i]), 0, 8, 0, 0);
+	return put_limits(puppet, branch, (uint64_t(*)[2])(actions + SIGNALS), notes, err);
+}

@@ -1,0 +1,190 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A task that a restored process has forked, at rest in a pad: it makes the system calls
+ * that it is given, a list at a time, and gets descriptors over a socket.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/syscall.h>
+
+#include "internal.h"
+
+/* The list of calls is where files_restore.c has its own, which is not in use any more. */
+void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot)
+{
+	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2 + sizeof(struct files_letter);
+
+	puppet->pad = pad;
+	puppet->call = &pad->control->holder;
+	puppet->list = (struct inj_syscall *)(((uintptr_t)memory + 63) & ~(uintptr_t)63);
+	puppet->list_max = (INJ_FILES_BYTES / 2 - sizeof(struct files_letter) - 64) /
+			   sizeof *puppet->list;
+	puppet->listed = 0;
+}
+
+void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
+		 uint64_t e, uint64_t f)
+{
+	if (puppet->listed < puppet->list_max)
+		puppet->list[puppet->listed] = (struct inj_syscall){ .nr = nr,
+								     .arg = { a, b, c, d, e, f } };
+	puppet->listed++;
+}
+
+int puppet_run(struct puppet *puppet, struct avc_error *err)
+{
+	const uint32_t listed = puppet->listed;
+
+	puppet->listed = 0;
+	if (!listed)
+		return 0;
+	if (listed > puppet->list_max)
+		return fail(err, AVC_UNSUPPORTED, 0, puppet->pid, "restore", "",
+			    "it has more mappings than there is room for");
+	call_begin(puppet->call, INJ_AFTER_PARK);
+	call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list), listed, 0, 0, 0);
+	return pad_send(puppet->pad, puppet->pid, &puppet->base, puppet->call, err) ||
+			       pad_run(puppet->pid, puppet->call, err)
+		       ? -1
+		       : 0;
+}
+
+/* Only the first `count` have to succeed. */
+int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
+		      struct avc_error *err)
+{
+	if (puppet_run(puppet, err))
+		return -1;
+	for (uint32_t i = 0; i < count; i++) {
+		const struct inj_syscall *s = &puppet->list[i];
+
+		if (s->result < 0 && s->result > -4096)
+			return fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore", what,
+				    "call %u of %u at %lx", i + 1, count, (unsigned long)s->arg[0]);
+	}
+	return 0;
+}
+
+int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
+{
+	return puppet_flush_some(puppet, puppet->listed, what, err);
+}
+
+/* Room for arguments, behind the list of calls. */
+void *puppet_data(const struct puppet *puppet, avc_remote *remote)
+{
+	void *data = puppet->call->out;
+
+	*remote = pad_remote(puppet->pad, data);
+	return data;
+}
+
+static avc_remote write_letter(const struct puppet *puppet)
+{
+	avc_remote remote;
+	struct files_letter *letter = puppet_data(puppet, &remote);
+
+	_Static_assert(sizeof *letter <= sizeof puppet->call->out, "room for a letter");
+	files_letter_write(letter, remote);
+	return remote;
+}
+
+/* Everything its parent had open is closed; descriptor 0 is a socket of which we have the
+ * other end. */
+int puppet_open_mail(struct puppet *puppet, struct avc_error *err)
+{
+	avc_remote out;
+	int pidfd;
+
+	(void)puppet_data(puppet, &out);
+	puppet_call(puppet, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	if (puppet_flush(puppet, "socketpair", err))
+		return -1;
+	pidfd = proc_pidfd_open(puppet->pid);
+	puppet->socket = pidfd < 0 ? -1 : files_borrow(pidfd, 1);
+	close_fd(&pidfd);
+	if (puppet->socket < 0)
+		return fail_errno(err, puppet->pid, "restore", "pidfd_getfd", "it was killed");
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	return 0;
+}
+
+int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
+{
+	/* What is not received yet waits in the socket. */
+	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "recvmsg", err))
+		return -1;
+	if (files_send(puppet->socket, fd)) {
+		if (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
+		    files_send(puppet->socket, fd))
+			return fail_errno(err, puppet->pid, "restore", "sendmsg",
+					  "a descriptor could not be handed over");
+	}
+	puppet_call(puppet, SYS_recvmsg, 0, write_letter(puppet), MSG_CMSG_CLOEXEC | MSG_DONTWAIT,
+		    0, 0, 0);
+	return 0;
+}
+
+/* From its parent's pad into its own. */
+int puppet_change_pad(struct puppet *puppet, const struct target *target, uint32_t slot,
+		      struct avc_error *err)
+{
+	const struct pad *pad = &target->pad;
+
+	if (puppet_give(puppet, pad->fd, err))
+		return -1;
+	puppet_call(puppet, SYS_mmap, pad->base, INJ_CODE_BYTES, PAD_CODE_PROT, PAD_FLAGS, 1, 0);
+	puppet_call(puppet, SYS_mmap, pad->base + INJ_CODE_BYTES, pad->bytes - INJ_CODE_BYTES,
+		    PAD_DATA_PROT, PAD_FLAGS, 1, INJ_CODE_BYTES);
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (puppet_flush(puppet, "mmap", err))
+		return -1;
+	puppet_enter(puppet, pad, slot);
+	return 0;
+}
+
+/* In order; what is received comes to the lowest number that is free. */
+int puppet_put_files(struct puppet *puppet, const struct files_table *table, struct avc_error *err)
+{
+	int socket = 0, lowest = 0;
+
+	/* Out of the way, between or behind those that are wanted. */
+	for (uint32_t i = 0; i < table->count; i++)
+		socket += table->entry[i].fd == socket;
+	if (socket) {
+		puppet_call(puppet, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket, 0, 0, 0);
+		puppet_call(puppet, SYS_close, 0, 0, 0, 0, 0, 0);
+	}
+	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
+		const int fd = table->entry[i].fd;
+
+		/* The lowest number that is free; of those that are taken `placed` is the
+		 * first that is not below it. */
+		for (;; lowest++) {
+			while (placed < i && table->entry[placed].fd < lowest)
+				placed++;
+			if (lowest != socket && !(placed < i && table->entry[placed].fd == lowest))
+				break;
+		}
+		if (files_send(puppet->socket, table->entry[i].ours) &&
+		    (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
+		     files_send(puppet->socket, table->entry[i].ours)))
+			return fail_errno(err, puppet->pid, "restore", "sendmsg",
+					  "a descriptor could not be handed over");
+		puppet_call(puppet, SYS_recvmsg, (uint64_t)socket, write_letter(puppet),
+			    MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0);
+		if (lowest != fd) {
+			puppet_call(puppet, SYS_dup3, (uint64_t)lowest, (uint64_t)fd,
+				    table->entry[i].cloexec ? O_CLOEXEC : 0, 0, 0, 0);
+			puppet_call(puppet, SYS_close, (uint64_t)lowest, 0, 0, 0, 0, 0);
+		} else if (!table->entry[i].cloexec) {
+			puppet_call(puppet, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
+		}
+		if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "dup3", err))
+			return -1;
+	}
+	puppet_call(puppet, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
+	return puppet_flush(puppet, "dup3", err);
+}
