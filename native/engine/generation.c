@@ -304,3 +304,12 @@ void generation_drop(struct generation *generation)
 	image_drop(generation);
 	*generation = (struct generation){ .pidfd = -1 };
 }
+
+uint32_t generation_threads(const struct generation *generation)
+{
+	uint32_t threads = generation->threads;
+
+	for (uint32_t i = 0; i < generation->branches; i++)
+		threads += generation->branch[i].image ? generation->branch[i].image->threads : 0;
+	return threads;
+}

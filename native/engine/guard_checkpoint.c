@@ -169,15 +169,6 @@ static void abandon(struct avc_guard *guard, struct generation *fresh)
 	tree_sweep(&guard->tree);
 }
 
-static uint32_t threads_of(const struct generation *generation)
-{
-	uint32_t threads = generation->threads;
-
-	for (uint32_t i = 0; i < generation->branches; i++)
-		threads += generation->branch[i].image ? generation->branch[i].image->threads : 0;
-	return threads;
-}
-
 static int files_errors(const struct generation *generation, struct avc_error *err)
 {
 	if (generation->files_error.code) {
@@ -226,7 +217,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
-	event->threads = threads_of(&fresh);
+	event->threads = generation_threads(&fresh);
 	if (!result)
 		result = files_errors(&fresh, err);
 	if (!result) {

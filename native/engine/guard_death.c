@@ -172,7 +172,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		event.restore_ns = times.restore_ns;
 		event.fork_ns = times.fork_ns;
 		event.threads_ns = times.threads_ns;
-		event.threads = generation->threads;
+		event.threads = generation_threads(generation);
 		event.generation = generation->number;
 		event.generations = guard->count;
 		event.attempt = attempt;

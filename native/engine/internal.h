@@ -786,6 +786,8 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 int generation_finish(struct target *target, struct generation *generation,
 		      struct avc_error *err) warn_unused;
 void generation_drop(struct generation *generation);
+/* Of all its processes. */
+uint32_t generation_threads(const struct generation *generation);
 /* Closes what the template of a process that has ended still has open. */
 void generation_close_files(struct target *target, struct generation *image);
 void oom_score_adj_set(pid_t pid, const char *value);
