@@ -18,9 +18,9 @@
  *      kept_count(&kept);
  *      send(message);
  *
- * It works because a memfd that is mapped shared is left alone by a restore
- * (docs/fidelity.md), while everything else goes back.  It needs nothing from
- * avckpt, and does nothing without it.  C and C++; one writer, one thread.
+ * It works because shared memory whose name begins with "avckpt-kept" is left
+ * alone by a restore (docs/fidelity.md), while everything else goes back.  It needs
+ * nothing from avckpt, and does nothing without it.  C and C++; one writer, one thread.
  */
 #ifndef KEPT_H
 #define KEPT_H
@@ -37,7 +37,7 @@ struct kept {
 /* 0, or -1 and errno: memfd_create(2), ftruncate(2), mmap(2). */
 static inline int kept_open(struct kept *kept)
 {
-	const int fd = memfd_create("kept", MFD_CLOEXEC);
+	const int fd = memfd_create("avckpt-kept", MFD_CLOEXEC);
 	void *page = MAP_FAILED;
 
 	if (fd < 0)

@@ -12,9 +12,9 @@ class Kept:
     """How many messages this process has sent, also those that it does not remember."""
 
     def __init__(self) -> None:
-        fd = os.memfd_create("kept")
+        fd = os.memfd_create("avckpt-kept")
         os.ftruncate(fd, mmap.PAGESIZE)
-        self._page = mmap.mmap(fd, mmap.PAGESIZE)  # shared: a restore leaves it alone
+        self._page = mmap.mmap(fd, mmap.PAGESIZE)  # by its name: a restore leaves it alone
         os.close(fd)
         self._remembered = 0
 

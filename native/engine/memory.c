@@ -332,10 +332,16 @@ static bool is_shared(const struct mapping *m)
 			     !strcmp(m->name, "/anon_hugepage (deleted)"));
 }
 
+/* By its name the app may say that it is to stay as it is. */
 static bool has_name(const struct mapping *m)
 {
-	return m->shared && m->inode &&
-	       (!strncmp(m->name, "/dev/shm/", 9) || !strncmp(m->name, "/memfd:", 7));
+	const char *name = NULL;
+
+	if (!strncmp(m->name, "/dev/shm/", 9))
+		name = m->name + 9;
+	else if (!strncmp(m->name, "/memfd:", 7))
+		name = m->name + 7;
+	return m->shared && m->inode && name && strncmp(name, "avckpt-kept", 11) != 0;
 }
 
 static int is_it(const struct mapping *m, void *arg)
