@@ -221,6 +221,7 @@ struct files_work {
 	int *local;      /* of want, by group leader: a descriptor of ours, or -1  */
 	int *claimed_by; /* of now: leader (index in want) of the group that has it */
 	int *source;     /* of want, by group leader: index in now, or -1          */
+	bool *closed;    /* of now: by us                                          */
 	bool *lost;      /* of want: has to be put in place                        */
 	uint32_t listed; /* calls for the template that were not made yet          */
 	uint32_t problems;

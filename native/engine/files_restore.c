@@ -190,9 +190,12 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
  * SO_REUSEADDR (socket(7)) to themselves. */
 static void share_port(const struct files_work *work, const struct file *w)
 {
-	const struct sockaddr_in *wanted = (const struct sockaddr_in *)&w->socket->local;
+	const struct sockaddr_in *wanted;
 	const int yes = 1;
 
+	if (!w->socket || !w->socket->listening || w->socket->domain == AF_UNIX)
+		return;
+	wanted = (const struct sockaddr_in *)&w->socket->local;
 	for (uint32_t k = 0; k < work->now->count; k++) {
 		struct sockaddr_storage address = { 0 };
 		const struct sockaddr_in *is = (const struct sockaddr_in *)&address;
@@ -225,6 +228,8 @@ static void gather(struct files_work *work)
 							  work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
+		if (work->local[group] < 0)
+			share_port(work, w);
 	}
 }
 
@@ -241,8 +246,6 @@ static void make_lost(struct files_work *work)
 
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
-		if (w->socket && w->socket->listening)
-			share_port(work, w);
 		work->local[group] = file_make(w, work->generation->template, work->init, &why);
 		files_note(work, w, why);
 		if (work->local[group] < 0)
@@ -313,6 +316,14 @@ static int inject(struct files_work *work, struct avc_error *err, long nr, uint6
 	return 0;
 }
 
+/* Nothing, or something else, was there at the checkpoint. */
+static bool is_new(const struct files_work *work, const struct file *n)
+{
+	const struct file *w = files_find(work->want, n->fd);
+
+	return !w || work->lost[files_index(work->want, w)];
+}
+
 /* In ranges: a program may have opened thousands since. */
 static int close_new(struct files_work *work, struct avc_error *err)
 {
@@ -321,11 +332,12 @@ static int close_new(struct files_work *work, struct avc_error *err)
 	for (uint32_t i = 0; i < now->count; i++) {
 		const uint32_t first = i;
 
-		if (files_find(work->want, now->file[i].fd))
+		if (!is_new(work, &now->file[i]))
 			continue;
+		work->closed[i] = true;
 		while (i + 1 < now->count && now->file[i + 1].fd == now->file[i].fd + 1 &&
-		       !files_find(work->want, now->file[i + 1].fd))
-			i++;
+		       is_new(work, &now->file[i + 1]))
+			work->closed[++i] = true;
 		if (inject(work, err, SYS_close_range, (uint64_t)now->file[first].fd,
 			   (uint64_t)now->file[i].fd, 0))
 			return -1;
@@ -452,7 +464,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	if (!numbers.taken)
 		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
 	for (uint32_t i = 0; i < work->now->count; i++)
-		if (files_find(work->want, work->now->file[i].fd))
+		if (!work->closed[i])
 			numbers.taken[work->now->file[i].fd] = 1;
 	if (flush(work, err))
 		goto out;
@@ -567,7 +579,8 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		files_find_going(work->now);
 	}
 	work->claimed_by = filled(work->now->count, -1);
-	if (!work->claimed_by)
+	work->closed = calloc(work->now->count + 1, sizeof *work->closed);
+	if (!work->claimed_by || !work->closed)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_staying(work);
 	find_moved(work);
@@ -592,6 +605,7 @@ void files_work_end(struct files_work *work)
 	free(work->source);
 	free(work->lost);
 	free(work->claimed_by);
+	free(work->closed);
 	files_free(work->now);
 }
 
