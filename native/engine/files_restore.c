@@ -129,6 +129,22 @@ static void give_up_read(struct files_work *work)
 	}
 }
 
+/* Nobody finds a Unix socket any more whose file was deleted since: made again, it has one. */
+static void give_up_deleted(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		int fd;
+
+		if (!w->socket || !w->socket->node || work->source[i] < 0)
+			continue;
+		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
+		if (fd >= 0 && file_unix_is_deleted(fd, w->socket))
+			work->source[i] = -1;
+		close_fd(&fd);
+	}
+}
+
 /* Somewhere else in the table, perhaps: the app may have moved it. */
 static void find_moved(struct files_work *work)
 {
@@ -586,6 +602,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	find_moved(work);
 	give_up_hung_up(work);
 	give_up_read(work);
+	give_up_deleted(work);
 	break_pairs(work);
 	return 0;
 }
@@ -635,8 +652,27 @@ int files_work_place(struct files_work *work, struct avc_error *err)
 	return 0;
 }
 
+/* What was made again is what the generation has from now on: the next restore finds it,
+ * also where other processes share it. */
+static void remember_made(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		struct file *w = &work->want->file[i];
+		const int fd = work->local[files_leader(work->want, w)];
+		struct stat st;
+
+		/* And not what stands for it, because its name was taken. */
+		if (fd >= 0 && !files_now_of(work, i) && w->socket &&
+		    file_socket_is_alone(w->socket) && file_socket_has_name(fd, w->socket) &&
+		    fstat(fd, &st) == 0)
+			w->ino = st.st_ino;
+	}
+}
+
 void files_work_finish(struct files_work *work)
 {
+	files_connect_again(work);
+	remember_made(work);
 	files_list_calls(work);
 	if (!work->target->descendant)
 		close_list(work);
