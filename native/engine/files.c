@@ -58,7 +58,7 @@ void files_free(struct files *files)
 		free(f->watch);
 		free(f->mark);
 		free(f->lock);
-		free(f->socket);
+		file_socket_free(f->socket);
 		free(f->content);
 	}
 	free(files->file);
@@ -321,6 +321,9 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		look_at_owner(fd, f);
 		if (f->kind == FILE_SOCKET)
 			file_look_at_socket(fd, f);
+		/* What was opened since is not made again. */
+		if (f->socket && look->depth != FILES_NOW)
+			file_look_at_manner(fd, f->socket, look->init);
 	}
 	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
 	    !(f->flags & O_PATH))

@@ -5,6 +5,8 @@
  *   files.c         looks at a table
  *   files_info.c    what /proc/PID/fdinfo says
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
+ *   files_options.c options of sockets, and whether one can be made again
+ *   files_unix.c    names of Unix sockets
  *   files_make.c    opens and makes again what is lost
  *   files_restore.c compares two tables and makes the one the other
  *   files_family.c  all tables of an app: what is between its processes
@@ -66,7 +68,12 @@ struct file_mark { /* of inotify                                               *
 struct file_socket {
 	int domain, type, protocol;
 	bool listening, connected;
-	int backlog;
+	int backlog; /* -1: not asked yet                                         */
+	/* Of those that can be made again: file_socket_is_alone()                 */
+	uint32_t uid, gid;
+	uint32_t option_count;
+	struct file_option *option; /* files_options.c, allocated               */
+	struct file_node *node;     /* files_unix.c, allocated, NULL: none or not known */
 	uint64_t peer; /* inode of the other end of a Unix socket, 0: not known    */
 	socklen_t local_bytes, remote_bytes;
 	struct sockaddr_storage local, remote;
@@ -134,6 +141,8 @@ struct files {
 	struct file *file; /* by fd, ascending                                     */
 };
 
+struct files_work;
+
 enum files_depth {
 	FILES_BEFORE, /* everything about what stays the same; the app runs         */
 	FILES_FROZEN, /* what is of this instant; the rest from `known`             */
@@ -180,6 +189,31 @@ const char *file_put_content(int fd, int other_fd, const struct file *want);
 bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
 
+/* files_options.c */
+void file_socket_free(struct file_socket *socket);
+/* Whether it can be made again: it needs nobody at the other end. */
+bool file_socket_is_alone(const struct file_socket *socket);
+/* What only matters if it has to be made again: options, user, the file of its name. */
+void file_look_at_manner(int fd, struct file_socket *socket, pid_t init);
+/* Whether getsockname(2) says the same of `fd`. */
+bool file_socket_has_name(int fd, const struct file_socket *socket);
+/* Those that are not so yet.  Returns NULL or what failed. */
+const char *file_put_options(int fd, const struct file_socket *socket);
+
+/* files_unix.c */
+bool file_unix_is_alone(const struct file_socket *socket);
+/* Where the file of its name is, and whose. */
+void file_look_at_node(int fd, struct file_socket *socket, pid_t init);
+/* Whether that file was deleted since. */
+bool file_unix_is_deleted(int fd, const struct file_socket *socket);
+/* `template` looks names up as the app did.  0, or -1 and *why; *why may be set on success
+ * as well: what is not as it was. */
+int file_bind_unix(int fd, const struct file_socket *socket, pid_t template, pid_t init,
+		   const char **why) warn_unused;
+/* When all have their names: sockets for datagrams that were made again, or are connected
+ * to one that was. */
+void files_connect_again(struct files_work *work);
+
 /* files_stream.c */
 /* Whether bytes are just coming in; whether some that were to go out did not fit. */
 bool file_is_coming(int fd);
@@ -221,6 +255,7 @@ struct files_work {
 	int *local;      /* of want, by group leader: a descriptor of ours, or -1  */
 	int *claimed_by; /* of now: leader (index in want) of the group that has it */
 	int *source;     /* of want, by group leader: index in now, or -1          */
+	bool *closed;    /* of now: by us                                          */
 	bool *lost;      /* of want: has to be put in place                        */
 	uint32_t listed; /* calls for the template that were not made yet          */
 	uint32_t problems;

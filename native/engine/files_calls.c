@@ -117,6 +117,19 @@ static void list_pidfd(struct setup *setup, const struct file *w)
 		->flags = INJ_MAY_FAIL;
 }
 
+/* Made again, and bound (files_make.c). */
+static void list_listen(const struct files_work *work, struct setup *setup, const struct file *w,
+			const struct file *n)
+{
+	const struct file_socket *s = w->socket;
+
+	if (!n && s && s->domain == AF_UNIX && s->listening && (!w->family || w->family == w) &&
+	    work->lost[files_index(work->want, w)])
+		setup_add(setup, INJ_DESCRIPTORS, "listen", SYS_listen, (uint64_t)w->fd,
+			  (uint64_t)s->backlog, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
+}
+
 void files_list_calls(struct files_work *work)
 {
 	struct inj_slot *slot = pad_slot(&work->target->pad, work->generation->slot);
@@ -138,6 +151,7 @@ void files_list_calls(struct files_work *work)
 			list_pidfd(setup, w);
 		if (files_leader(work->want, w) != i)
 			continue;
+		list_listen(work, setup, w, n);
 		if (w->kind == FILE_EPOLL)
 			list_epoll(work, setup, w, n);
 		if (w->kind == FILE_REGULAR && (w->lock_count || (n && n->lock_count)))

@@ -177,32 +177,50 @@ int file_make_dead(const struct file *want, pid_t template)
 	return ends[0];
 }
 
-/* Those that need nobody at the other end. */
-static int make_socket(const struct file *want, pid_t template, const char **why)
+static int bind_inet(int fd, const struct file_socket *s, const char **why)
+{
+	const int yes = 1;
+
+	/* Connections that it had accepted have its port, still. */
+	if (s->type == SOCK_STREAM)
+		setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
+	/* One without a port must not get any. */
+	if ((file_socket_has_name(fd, s) ||
+	     bind(fd, (const struct sockaddr *)&s->local, s->local_bytes) == 0) &&
+	    (!s->listening || listen(fd, s->backlog) == 0) &&
+	    (!s->connected ||
+	     connect(fd, (const struct sockaddr *)&s->remote, s->remote_bytes) == 0))
+		return 0;
+	*why = s->listening ? "it was closed since the checkpoint and its port is taken now"
+			    : "it was closed since the checkpoint and its address is taken now";
+	return -1;
+}
+
+/* Those that need nobody at the other end.  That a Unix socket listens is left to the
+ * restored process, which its clients take for the server (unix(7), SO_PEERCRED); that it is
+ * connected, to when all have their names (files_restore.c). */
+static int make_socket(const struct file *want, pid_t template, pid_t init, const char **why)
 {
 	const struct file_socket *s = want->socket;
-	const struct sockaddr *local, *remote;
-	const int yes = 1;
+	const char *problem;
 	int fd;
 
-	if (!s || (s->domain != AF_INET && s->domain != AF_INET6 && s->domain != AF_NETLINK) ||
-	    (s->type == SOCK_STREAM && !s->listening))
+	if (!s || !file_socket_is_alone(s))
 		return file_make_dead(want, template);
-	local = (const struct sockaddr *)&s->local;
-	remote = (const struct sockaddr *)&s->remote;
 	fd = socket_of(template, s->domain, s->type, s->protocol);
 	if (fd < 0)
 		return file_make_dead(want, template);
-	if (s->type == SOCK_STREAM)
-		setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
-	if (bind(fd, local, s->local_bytes) || (s->listening && listen(fd, s->backlog)) ||
-	    (s->connected && connect(fd, remote, s->remote_bytes))) {
-		*why = s->listening
-			       ? "it was closed since the checkpoint and its port is taken now"
-			       : "it was closed since the checkpoint and its address is taken now";
+	/* Only one user's share a port (socket(7), SO_REUSEPORT). */
+	if (fchown(fd, s->uid, s->gid))
+		*why = "it does not belong to its user any more";
+	file_put_options(fd, s);
+	if (s->domain == AF_UNIX ? file_bind_unix(fd, s, template, init, why)
+				 : bind_inet(fd, s, why)) {
 		close(fd);
 		return file_make_dead(want, template);
 	}
+	problem = file_put_options(fd, s); /* one was in the way of bind(2) */
+	*why = *why ? *why : problem;
 	return fd;
 }
 
@@ -256,7 +274,7 @@ int file_make(const struct file *want, pid_t template, pid_t init, const char **
 		return fd >= 0 ? fd : file_make_dead(want, template);
 	case FILE_SOCKET:
 		fd = take_from_init(want, init);
-		return fd >= 0 ? fd : make_socket(want, template, why);
+		return fd >= 0 ? fd : make_socket(want, template, init, why);
 	case FILE_EVENTFD:
 		return eventfd(0, EFD_CLOEXEC | (nonblock ? EFD_NONBLOCK : 0) |
 					  (want->semaphore ? EFD_SEMAPHORE : 0));

@@ -129,6 +129,22 @@ static void give_up_read(struct files_work *work)
 	}
 }
 
+/* Nobody finds a Unix socket any more whose file was deleted since: made again, it has one. */
+static void give_up_deleted(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		int fd;
+
+		if (!w->socket || !w->socket->node || work->source[i] < 0)
+			continue;
+		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
+		if (fd >= 0 && file_unix_is_deleted(fd, w->socket))
+			work->source[i] = -1;
+		close_fd(&fd);
+	}
+}
+
 /* Somewhere else in the table, perhaps: the app may have moved it. */
 static void find_moved(struct files_work *work)
 {
@@ -190,9 +206,12 @@ static int reopen_pipe(const struct files_work *work, const struct file *w)
  * SO_REUSEADDR (socket(7)) to themselves. */
 static void share_port(const struct files_work *work, const struct file *w)
 {
-	const struct sockaddr_in *wanted = (const struct sockaddr_in *)&w->socket->local;
+	const struct sockaddr_in *wanted;
 	const int yes = 1;
 
+	if (!w->socket || !w->socket->listening || w->socket->domain == AF_UNIX)
+		return;
+	wanted = (const struct sockaddr_in *)&w->socket->local;
 	for (uint32_t k = 0; k < work->now->count; k++) {
 		struct sockaddr_storage address = { 0 };
 		const struct sockaddr_in *is = (const struct sockaddr_in *)&address;
@@ -225,6 +244,8 @@ static void gather(struct files_work *work)
 							  work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
+		if (work->local[group] < 0)
+			share_port(work, w);
 	}
 }
 
@@ -241,8 +262,6 @@ static void make_lost(struct files_work *work)
 
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
-		if (w->socket && w->socket->listening)
-			share_port(work, w);
 		work->local[group] = file_make(w, work->generation->template, work->init, &why);
 		files_note(work, w, why);
 		if (work->local[group] < 0)
@@ -313,6 +332,14 @@ static int inject(struct files_work *work, struct avc_error *err, long nr, uint6
 	return 0;
 }
 
+/* Nothing, or something else, was there at the checkpoint. */
+static bool is_new(const struct files_work *work, const struct file *n)
+{
+	const struct file *w = files_find(work->want, n->fd);
+
+	return !w || work->lost[files_index(work->want, w)];
+}
+
 /* In ranges: a program may have opened thousands since. */
 static int close_new(struct files_work *work, struct avc_error *err)
 {
@@ -321,11 +348,12 @@ static int close_new(struct files_work *work, struct avc_error *err)
 	for (uint32_t i = 0; i < now->count; i++) {
 		const uint32_t first = i;
 
-		if (files_find(work->want, now->file[i].fd))
+		if (!is_new(work, &now->file[i]))
 			continue;
+		work->closed[i] = true;
 		while (i + 1 < now->count && now->file[i + 1].fd == now->file[i].fd + 1 &&
-		       !files_find(work->want, now->file[i + 1].fd))
-			i++;
+		       is_new(work, &now->file[i + 1]))
+			work->closed[++i] = true;
 		if (inject(work, err, SYS_close_range, (uint64_t)now->file[first].fd,
 			   (uint64_t)now->file[i].fd, 0))
 			return -1;
@@ -452,7 +480,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	if (!numbers.taken)
 		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
 	for (uint32_t i = 0; i < work->now->count; i++)
-		if (files_find(work->want, work->now->file[i].fd))
+		if (!work->closed[i])
 			numbers.taken[work->now->file[i].fd] = 1;
 	if (flush(work, err))
 		goto out;
@@ -567,12 +595,14 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		files_find_going(work->now);
 	}
 	work->claimed_by = filled(work->now->count, -1);
-	if (!work->claimed_by)
+	work->closed = calloc(work->now->count + 1, sizeof *work->closed);
+	if (!work->claimed_by || !work->closed)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_staying(work);
 	find_moved(work);
 	give_up_hung_up(work);
 	give_up_read(work);
+	give_up_deleted(work);
 	break_pairs(work);
 	return 0;
 }
@@ -592,6 +622,7 @@ void files_work_end(struct files_work *work)
 	free(work->source);
 	free(work->lost);
 	free(work->claimed_by);
+	free(work->closed);
 	files_free(work->now);
 }
 
@@ -621,8 +652,27 @@ int files_work_place(struct files_work *work, struct avc_error *err)
 	return 0;
 }
 
+/* What was made again is what the generation has from now on: the next restore finds it,
+ * also where other processes share it. */
+static void remember_made(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		struct file *w = &work->want->file[i];
+		const int fd = work->local[files_leader(work->want, w)];
+		struct stat st;
+
+		/* And not what stands for it, because its name was taken. */
+		if (fd >= 0 && !files_now_of(work, i) && w->socket &&
+		    file_socket_is_alone(w->socket) && file_socket_has_name(fd, w->socket) &&
+		    fstat(fd, &st) == 0)
+			w->ino = st.st_ino;
+	}
+}
+
 void files_work_finish(struct files_work *work)
 {
+	files_connect_again(work);
+	remember_made(work);
 	files_list_calls(work);
 	if (!work->target->descendant)
 		close_list(work);

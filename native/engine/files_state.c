@@ -68,7 +68,9 @@ void file_look_at_socket(int fd, struct file *file)
 		if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) == 0)
 			s->backlog = (int)info.tcpi_sacked;
 	}
-	free(file->socket);
+	if (s->listening && s->domain == AF_UNIX)
+		s->backlog = -1;
+	file_socket_free(file->socket);
 	file->socket = s;
 }
 
@@ -98,8 +100,9 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	file->tcp_going = file_is_going(fd);
 }
 
-/* Asks sock_diag(7) for the other end of a Unix socket. */
-static uint64_t ask_peer(int diag, uint64_t ino)
+/* Asks sock_diag(7) for the other end of a Unix socket, and how many may wait for one that
+ * listens (unix_diag_rqlen). */
+static void ask_diag(int diag, uint64_t ino, struct file_socket *s)
 {
 	struct {
 		struct nlmsghdr head;
@@ -111,7 +114,7 @@ static uint64_t ask_peer(int diag, uint64_t ino)
 		.ask = { .sdiag_family = AF_UNIX,
 			 .udiag_states = ~0u,
 			 .udiag_ino = (uint32_t)ino,
-			 .udiag_show = UDIAG_SHOW_PEER,
+			 .udiag_show = UDIAG_SHOW_PEER | UDIAG_SHOW_RQLEN,
 			 .udiag_cookie = { ~0u, ~0u } },
 	};
 	char answer[512] __attribute__((aligned(8)));
@@ -119,24 +122,30 @@ static uint64_t ask_peer(int diag, uint64_t ino)
 	const struct unix_diag_msg *message = (const struct unix_diag_msg *)(head + 1);
 	ssize_t n, at = (ssize_t)(sizeof *head + sizeof *message);
 
+	if (s->listening)
+		s->backlog = SOMAXCONN;
 	if (send(diag, &request, sizeof request, 0) < 0)
-		return 0;
+		return;
 	n = recv(diag, answer, sizeof answer, MSG_DONTWAIT);
 	if (n < at || head->nlmsg_type != SOCK_DIAG_BY_FAMILY)
-		return 0;
+		return;
 	while (at + 4 <= n) {
 		const struct nlattr *attribute = (const struct nlattr *)(answer + at);
+		struct unix_diag_rqlen queue;
 		uint32_t peer;
 
 		if (attribute->nla_len < sizeof *attribute)
 			break;
 		if (attribute->nla_type == UNIX_DIAG_PEER) {
 			memcpy(&peer, attribute + 1, sizeof peer);
-			return peer;
+			s->peer = peer;
+		}
+		if (attribute->nla_type == UNIX_DIAG_RQLEN && s->listening) {
+			memcpy(&queue, attribute + 1, sizeof queue);
+			s->backlog = (int)queue.udiag_wqueue;
 		}
 		at += (ssize_t)((attribute->nla_len + 3u) & ~3u);
 	}
-	return 0;
 }
 
 /* A socket of the network namespace of the process. */
@@ -170,13 +179,14 @@ void files_find_peers(struct files *files, pid_t pid)
 	for (uint32_t i = 0; i < files->count; i++) {
 		struct file *f = &files->file[i];
 
-		if (!maybe_pair(f) || f->socket->peer)
+		if (!(maybe_pair(f) && !f->socket->peer) &&
+		    !(f->kind == FILE_SOCKET && f->socket && f->socket->backlog < 0))
 			continue;
 		if (diag < 0)
 			diag = diag_open(pid);
 		if (diag < 0)
 			return;
-		f->socket->peer = ask_peer(diag, f->ino);
+		ask_diag(diag, f->ino, f->socket);
 	}
 	close_fd(&diag);
 }

@@ -344,3 +344,32 @@ def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
         checkpoint(guard)
         victim.kill_app()
         assert "descriptors that were on their way" in guard.wait("restored")["error"]["detail"]
+
+
+@pytest.mark.parametrize("scenario", ["unix", "datagrams", "rebound", "options", "dropped", "family"])
+def test_sockets_made_again(scenario: str, tmp_path: Path) -> None:
+    """Under their names, with their options; also those that the restore before had made."""
+    with (
+        Victim(f"listeners {scenario} {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        for _ in range(2):
+            checkpoint(guard)
+            for _kill in range(KILLS):
+                disturb(victim)
+                for _again in range(2):
+                    event = restored(victim, guard)
+                    assert "error" not in event, event
+
+
+def test_a_name_that_somebody_else_has_is_told(tmp_path: Path) -> None:
+    """It stays theirs."""
+    with Victim(f"listeners taken {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+            other.bind(str(tmp_path / "server"))
+            other.listen()
+            assert "its address is taken now" in restored(victim, guard)["error"]["detail"]
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+                client.connect(str(tmp_path / "server"))
