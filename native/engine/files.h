@@ -74,7 +74,7 @@ struct file_socket {
 	uint32_t option_count;
 	struct file_option *option; /* files_options.c, allocated               */
 	struct file_node *node;     /* files_unix.c, allocated, NULL: none or not known */
-	uint64_t peer; /* inode of the other end of a Unix socket, 0: not known    */
+	uint64_t peer;              /* inode of the other end of a Unix socket, 0: not known    */
 	socklen_t local_bytes, remote_bytes;
 	struct sockaddr_storage local, remote;
 };
