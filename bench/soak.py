@@ -47,6 +47,7 @@ PAUSE_S = (2.0, 5.0)
 AGAIN = 0.1
 """How often a death is followed by another one at once."""
 WARM_UP = 1 / 2
+MOMENTS = 9
 """Of the whole time: so long it takes until the sidecar's history is full and old events go."""
 MEMORY_ALLOWED_KB = 512.0
 
@@ -233,11 +234,13 @@ def main() -> int:
 
 def judge(result: dict[str, Any], path: Path) -> int:
     """Says what leaks, draws and writes; the exit status."""
+    if result["failure"]:
+        console.print(f"ended early: {result['failure']}", markup=False, style="red")
     picture = path.with_suffix(".png")
     series = result["series"]
     rows = [{name: series[name][i] for name in series} for i in range(len(series["at_s"]))]
     warm = [row for row in rows if row["at_s"] >= result["seconds"] * WARM_UP]
-    moved = growths(warm, MEMORY_ALLOWED_KB)
+    moved = growths(warm, MEMORY_ALLOWED_KB) if len(warm) >= MOMENTS else []
     leaks = [growth.name for growth in moved if growth.is_leak]
     write({**result, "leaks": leaks, "moved": {growth.name: [growth.first, growth.last] for growth in moved}}, path)
     show(moved, MEMORY_ALLOWED_KB)
@@ -246,8 +249,6 @@ def judge(result: dict[str, Any], path: Path) -> int:
     console.print(f"written to {path}" + (f" and {picture}" if plot(result, picture) else "; no matplotlib"))
     for name in leaks:
         console.print(f"[red]leaks[/]: {name}")
-    if result["failure"]:
-        console.print(f"[red]ended early[/]: {result['failure']}")
     return 1 if leaks or result["failure"] else 0
 
 
