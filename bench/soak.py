@@ -47,8 +47,9 @@ PAUSE_S = (2.0, 5.0)
 AGAIN = 0.1
 """How often a death is followed by another one at once."""
 WARM_UP = 1 / 2
-MOMENTS = 9
 """Of the whole time: so long it takes until the sidecar's history is full and old events go."""
+MOMENTS = 9
+"""With fewer, nothing can be said of growth."""
 MEMORY_ALLOWED_KB = 512.0
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
