@@ -50,6 +50,16 @@ def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json
     return event
 
 
+def disturb_and_restore(victim: Victim, guard: GuardProcess) -> None:
+    """Again and again from each of two checkpoints: everything is put back, with nothing to be told."""
+    for _ in range(2):
+        checkpoint(guard)
+        for _kill in range(KILLS):
+            disturb(victim)
+            event = restored(victim, guard)
+            assert "error" not in event, event
+
+
 @pytest.mark.parametrize(
     "scenario",
     [
@@ -283,12 +293,7 @@ def test_watches(scenario: str, tmp_path: Path) -> None:
         Victim(f"inotify {scenario} {tmp_path}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        for _ in range(2):
-            checkpoint(guard)
-            for _kill in range(KILLS):
-                disturb(victim)
-                event = restored(victim, guard)
-                assert "error" not in event, event
+        disturb_and_restore(victim, guard)
 
 
 @pytest.fixture
@@ -331,12 +336,7 @@ def test_sockets(scenario: str, tmp_path: Path) -> None:
         Victim(f"sockets {scenario} {tmp_path}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        for _ in range(2):
-            checkpoint(guard)
-            for _kill in range(KILLS):
-                disturb(victim)
-                event = restored(victim, guard)
-                assert "error" not in event, event
+        disturb_and_restore(victim, guard)
 
 
 def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
