@@ -71,3 +71,19 @@ void close_fd(int *fd)
 		close(*fd);
 	*fd = -1;
 }
+
+ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
+{
+	size_t done = 0;
+
+	while (done < bytes) {
+		const ssize_t n = pread(fd, to + done, bytes - done, at + (off_t)done);
+
+		if (n < 0)
+			return -1;
+		if (n == 0)
+			break;
+		done += (size_t)n;
+	}
+	return (ssize_t)done;
+}

@@ -39,22 +39,6 @@ static bool is_data(const struct mapping *m)
 	       strncmp(m->name, "/run/", 5);
 }
 
-static ssize_t read_at(int fd, uint8_t *to, size_t bytes, uint64_t at)
-{
-	size_t done = 0;
-
-	while (done < bytes) {
-		const ssize_t n = pread(fd, to + done, bytes - done, (off_t)(at + done));
-
-		if (n < 0)
-			return -1;
-		if (n == 0)
-			break;
-		done += (size_t)n;
-	}
-	return (ssize_t)done;
-}
-
 struct look {
 	pid_t pid;
 	struct files_mapped *mapped;
@@ -85,7 +69,7 @@ static int take_area(const struct mapping *m, void *arg)
 	/* A file server is asked nothing while the app stands still: it may be the app. */
 	a->content = file_is_remote(a->fd) ? NULL : malloc(bytes);
 	/* Page faults and disk reads now, not in the freeze. */
-	if (!a->content || read_at(a->fd, a->content, bytes, a->offset) < 0) {
+	if (!a->content || read_whole(a->fd, a->content, bytes, (off_t)a->offset) < 0) {
 		free(a->content);
 		close_fd(&a->fd);
 		return 0;
@@ -114,7 +98,7 @@ void files_mapped_copy(struct files_mapped *mapped)
 	for (uint32_t i = 0; mapped && i < mapped->count; i++) {
 		struct mapped_area *a = &mapped->area[i];
 
-		a->bytes = read_at(a->fd, a->content, a->end - a->start, a->offset);
+		a->bytes = read_whole(a->fd, a->content, a->end - a->start, (off_t)a->offset);
 	}
 }
 
@@ -133,7 +117,8 @@ static bool is_unchanged(const struct mapped_area *a)
 	uint8_t *now = malloc(bytes);
 	bool same;
 
-	same = now && a->bytes >= 0 && read_at(a->fd, now, bytes, a->offset) == a->bytes &&
+	same = now && a->bytes >= 0 &&
+	       read_whole(a->fd, now, bytes, (off_t)a->offset) == a->bytes &&
 	       !memcmp(now, a->content, (size_t)a->bytes);
 	free(now);
 	return same;

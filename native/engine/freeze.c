@@ -241,7 +241,6 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 	if (tree->count <= 1 && tree->main->childless)
 		return 0;
 	for (int looks = 0; looks < LOOKS; looks++) {
-		uint32_t fresh = 0;
 		bool all = true;
 
 		for (uint32_t i = 1; i < tree->count; i++) {
@@ -266,7 +265,7 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 		}
 		if (all && looks)
 			return 0;
-		if (tree_look(tree, &fresh, err))
+		if (tree_look(tree, err))
 			return -1;
 	}
 	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",

@@ -146,8 +146,6 @@ static int fill_slot(struct target *target, struct generation *generation,
 			       : t.name,
 		       sizeof block->name);
 		setup_thread(&setup, block);
-		if (branch && status.groups != target->forebear_groups)
-			branch_setup_groups(branch, &setup);
 		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
 					    err)) {
 			close(mem_fd);
@@ -226,22 +224,18 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
 {
 	const struct thread *main_thread = thread_find(target, target->pid);
-	struct proc_status status = { 0 };
 	struct avc_error again = { 0 };
 	struct proc_stat stat;
 
-	if (generation->branches && (!main_thread || proc_status(target->pid, &status)))
-		return fail_errno(err, target->pid, "keep template", "open(status)",
-				  "it has ended");
+	if (generation->branches && !main_thread)
+		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
-
 		struct avc_error failed = { 0 };
 
 		if (!branch->target)
 			continue;
 		branch->target->forebear = &main_thread->creds;
-		branch->target->forebear_groups = status.groups;
 		if (finish_branch(branch, &failed)) {
 			/* What was not as it was known is known now: of all of them. */
 			if (failed.code != AVC_DEADLINE || failed.errnum != EAGAIN) {

@@ -93,6 +93,9 @@ void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason
 /* A template or holder; with the app's own processes. */
 bool is_ours(pid_t pid, const void *guard);
 bool is_known_process(pid_t pid, const void *guard);
+/* Gives up a process that is gone.  What it had open must not stay open by us: somebody may
+ * be reading a pipe to its end. */
+void release(struct avc_guard *guard, struct target *target);
 /* Processes of the app that have ended, or are another program now. */
 void tend_tree(struct avc_guard *guard);
 /* Gives up what was brought into processes that have executed another program since;

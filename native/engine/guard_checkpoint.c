@@ -111,14 +111,13 @@ static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_err
 static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
-	uint32_t fresh;
 
 	if (find_app(guard, err))
 		return -1;
 	tree->init = guard->link.init;
 	tree->slots = guard->config.keep + 1;
 	let_executed_go(guard, true);
-	if (tree_look(tree, &fresh, err))
+	if (tree_look(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct target *target = tree->kin[i].target;

@@ -87,13 +87,10 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 	for (uint32_t i = 0; i < tree->members; i++) {
 		struct target *target = tree->member[i];
 
-		target_close(target);
-		for (uint32_t g = 0; target->holder && g < guard->count; g++)
-			for (uint32_t k = 0; k < guard->generations[g].branches; k++)
-				if (guard->generations[g].branch[k].target == target)
-					generation_close_files(
-						target, guard->generations[g].branch[k].image);
-		unhold(target);
+		if (target->holder)
+			release(guard, target);
+		else
+			tree_let_go(target); /* its tables are closed already */
 	}
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		const struct branch *branch = &generation->branch[i];

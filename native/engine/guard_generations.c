@@ -127,8 +127,7 @@ static bool is_known(pid_t tid, const void *arg)
 	return false;
 }
 
-/* What it had open must not stay open by us: somebody may be reading a pipe to its end. */
-static void release(struct avc_guard *guard, struct target *target)
+void release(struct avc_guard *guard, struct target *target)
 {
 	for (uint32_t i = 0; i < guard->count; i++)
 		for (uint32_t k = 0; k < guard->generations[i].branches; k++)

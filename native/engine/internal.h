@@ -65,6 +65,8 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 	       const char *detail, ...) __attribute__((format(printf, 5, 6)));
 uint64_t now_ns(void);
 void close_fd(int *fd);
+/* As much of it as there is; -1: it can not be read. */
+ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 
 /* ---- proc.c ---------------------------------------------------------------- */
 
@@ -135,7 +137,6 @@ struct proc_status {
 	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
-	uint32_t groups;         /* a hash                                           */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };
@@ -287,7 +288,6 @@ struct target {
 	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
 	bool waiting;                    /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear;    /* what a process that is made from the main one has */
-	uint32_t forebear_groups;        /* a hash                                            */
 	bool frozen;                     /* stopped in this freeze                            */
 	bool adopts;                     /* it or one above it adopts orphans                 */
 	bool paused;                     /* between adopt_no_more() and adopt_again()         */
@@ -635,9 +635,8 @@ void unhold(struct target *target);
 
 /* ---- tree.c --------------------------------------------------------------------- */
 
-/* Looks who there is; new ones are opened, and those that are gone closed.  Sets *fresh
- * to how many are new. */
-int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err) warn_unused;
+/* Looks who there is; new ones are opened. */
+int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
 /* Whether kin[i] or a process above it adopts orphans, as far as is known. */
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether kin[i] has its parent's memory, and not its own: after vfork(2) until it has
@@ -850,7 +849,6 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table,
 /* After the app runs again: what only the template can tell. */
 int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
 /* To a thread's calls. */
-void branch_setup_groups(const struct branch *branch, struct setup *setup);
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
 void branch_forget(struct branch *branch);
 /* A restored process gets it; what is allowed to fail is told in *notes. */

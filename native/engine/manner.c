@@ -25,8 +25,6 @@ struct manner {
 	struct action action[SIGNALS];
 	int64_t brk, personality, dumpable;
 	uint32_t umask;
-	uint32_t group_count;
-	uint32_t group[64];
 	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
 	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
 	uint32_t auxv_bytes;
@@ -91,17 +89,6 @@ static int read_status(pid_t pid, struct manner *manner)
 		return -1;
 	line = strstr(buf, "\nUmask:");
 	manner->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
-	line = strstr(buf, "\nGroups:");
-	for (char *p = line ? line + 8 : buf + strlen(buf);
-	     manner->group_count < sizeof manner->group / sizeof *manner->group;) {
-		char *next;
-		const unsigned long group = strtoul(p, &next, 10);
-
-		if (next == p || memchr(p, '\n', (size_t)(next - p)))
-			break;
-		manner->group[manner->group_count++] = (uint32_t)group;
-		p = next;
-	}
 	return 0;
 }
 
@@ -135,21 +122,13 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	manner->brk = list[SIGNALS].result;
 	manner->personality = list[SIGNALS + 1].result;
 	manner->dumpable = list[SIGNALS + 2].result;
-	/* The template has limits and groups of the time when the holder was made. */
+	/* The template has limits of the time when the holder was made. */
 	if (read_mm(image->template, manner) || read_status(image->template, manner) ||
 	    (proc_limits(branch->target->pid, manner->limit) &&
 	     proc_limits(image->template, manner->limit)))
 		return fail_errno(err, image->template, "keep template", "open(/proc)",
 				  "it was killed");
 	return 0;
-}
-
-void branch_setup_groups(const struct branch *branch, struct setup *setup)
-{
-	const struct manner *manner = branch->manner;
-	const avc_remote list = setup_data(setup, manner->group, sizeof manner->group);
-
-	setup_add_thread(setup, "setgroups", SYS_setgroups, manner->group_count, list, 0, 0, 0);
 }
 
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup)

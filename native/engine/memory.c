@@ -196,23 +196,6 @@ int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_s
 	return 0;
 }
 
-/* As much of it as there is; -1: it can not be read. */
-static ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
-{
-	size_t done = 0;
-
-	while (done < bytes) {
-		const ssize_t n = pread(fd, to + done, bytes - done, at + (off_t)done);
-
-		if (n < 0)
-			return -1;
-		if (n == 0)
-			break;
-		done += (size_t)n;
-	}
-	return (ssize_t)done;
-}
-
 void memory_copy(const struct target *target, struct mem_image *image)
 {
 	uint8_t *to = image ? image->data : NULL;
@@ -353,8 +336,9 @@ static int is_it(const struct mapping *m, void *arg)
 
 /* Does a process outside of the app's PID namespace map it?  Those inside are the app, and
  * whoever was sent in to look after it. */
-static bool look_for_others(const struct target *target, struct mapping *m)
+static bool look_for_others(const struct target *target, const struct mapping *m)
 {
+	struct mapping wanted = *m;
 	char inside[64] = "", its[64];
 	DIR *proc = opendir("/proc");
 	struct dirent *entry;
@@ -368,14 +352,14 @@ static bool look_for_others(const struct target *target, struct mapping *m)
 		    !strcmp(its, inside))
 			continue;
 		errno = 0;
-		others = proc_mappings(pid, "maps", is_it, m) < 0 && errno == 0;
+		others = proc_mappings(pid, "maps", is_it, &wanted) < 0 && errno == 0;
 	}
 	if (proc)
 		closedir(proc);
 	return others;
 }
 
-static bool is_others(struct memory *memory, const struct target *target, struct mapping *m)
+static bool is_others(struct memory *memory, const struct target *target, const struct mapping *m)
 {
 	struct named *named = NULL;
 	uint64_t now = now_ns();
@@ -427,13 +411,9 @@ static int find_area(const struct mapping *m, void *arg)
 			survey->left_bytes += m->end - m->start;
 			return 0;
 		}
-		if (has_name(m)) {
-			struct mapping named = *m;
-
-			if (is_others(survey->memory, survey->target, &named)) {
-				survey->others_bytes += m->end - m->start;
-				return 0;
-			}
+		if (has_name(m) && is_others(survey->memory, survey->target, m)) {
+			survey->others_bytes += m->end - m->start;
+			return 0;
 		}
 		survey->shared_bytes += m->end - m->start;
 	}

@@ -187,11 +187,16 @@ int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, str
 	return 0;
 }
 
-int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err)
+int pad_start(pid_t tid, struct avc_error *err)
 {
 	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
-	return wait_word(call, &call->pause, tid, err);
+	return 0;
+}
+
+int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	return pad_start(tid, err) ? -1 : wait_word(call, &call->pause, tid, err);
 }
 
 int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
@@ -217,9 +222,7 @@ int pad_run_on(pid_t tid, struct inj_call *call, struct avc_error *err)
 
 int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
-	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
-		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
-	return pad_finish(tid, call, err);
+	return pad_start(tid, err) ? -1 : pad_finish(tid, call, err);
 }
 
 /* It has made all its calls and not stopped: a limit of processes, or of memory. */
@@ -236,13 +239,6 @@ static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_erro
 		return -1;
 	return fail(err, AVC_KERNEL, (int)-result, tid, "clone", "clone",
 		    "it may not have another process: %s", strerror((int)-result));
-}
-
-int pad_start(pid_t tid, struct avc_error *err)
-{
-	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
-		return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
-	return 0;
 }
 
 int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)

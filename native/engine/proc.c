@@ -270,9 +270,6 @@ int proc_status(pid_t tid, struct proc_status *status)
 			parse_ids(value, status->uid);
 		else if (!strncmp(line, "Gid:", 4))
 			parse_ids(value, status->gid);
-		else if (!strncmp(line, "Groups:", 7))
-			for (; *value; value++)
-				status->groups = status->groups * 31 + (unsigned char)*value;
 		else if (!strncmp(line, "NoNewPrivs:", 11))
 			status->no_new_privs = (uint32_t)atoi(value);
 		else if (!strncmp(line, "x86_Thread_features:", 20))

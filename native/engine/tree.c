@@ -172,11 +172,10 @@ static struct target *add_member(struct tree *tree, pid_t pid, uint64_t start,
 	return target;
 }
 
-int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
+int tree_look(struct tree *tree, struct avc_error *err)
 {
 	struct looking look = { .tree = tree, .err = err };
 
-	*fresh = 0;
 	tree->count = 0;
 	if (add_kin(tree, tree->main->leader, PARENT_INIT, err))
 		return -1;
@@ -222,7 +221,6 @@ int tree_look(struct tree *tree, uint32_t *fresh, struct avc_error *err)
 					kin->ending = true;
 					continue;
 				}
-				++*fresh;
 			}
 		}
 		/* Thread by thread only when the last checkpoint did not find that it
