@@ -26,8 +26,11 @@ struct member {
 	pid_t pid; /* 0: not made yet                                         */
 	int pidfd;
 	bool traced;
+	int host; /* whose fork it is, a branch                               */
 	struct puppet puppet;
-	struct sandbox *sandbox; /* NULL: it is on its own, and waits to go        */
+	struct sandbox *sandbox;   /* NULL: it is on its own, and waits to go        */
+	struct snapshot *snapshot; /* of its template; NULL: nobody has asked yet     */
+	struct remap *plan;
 };
 
 struct family {
@@ -68,11 +71,6 @@ static struct member *member_of(struct family *family, int branch)
 	return branch < 0 ? &family->first : &family->member[branch];
 }
 
-static const struct target *target_of(const struct family *family, int branch)
-{
-	return branch < 0 ? family->main : family->generation->branch[branch].target;
-}
-
 static pid_t template_of(const struct family *family, int branch)
 {
 	return branch < 0 ? family->generation->template
@@ -93,14 +91,27 @@ static int host_of(const struct family *family, const struct branch *branch)
 	return PARENT_MAIN;
 }
 
+/* What is done while a process forks, which takes its time if it is big: how the child
+ * will differ from it is found out, and its last child is made what it is to be. */
+struct chores {
+	struct family *family;
+	int child, host; /* child -1: one that will be a zombie                  */
+	int last;        /* -1: none                                             */
+	struct avc_error *notes, error;
+	int result;
+	bool done;
+};
+
+static void do_chores(void *arg);
+
 /* One clone of a stopped task that rests in the pad; *child is in its first stop. */
-static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t flags, pid_t *child,
-		      struct avc_error *err)
+static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t flags,
+		      struct chores *chores, pid_t *child, struct avc_error *err)
 {
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, flags, 0, 0, 0, 0);
 	if (pad_send(puppet->pad, puppet->pid, &puppet->base, call, err) ||
-	    pad_run_clone(puppet->pid, call, child, err))
+	    pad_run_clone_while(puppet->pid, call, chores ? do_chores : NULL, chores, child, err))
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP || tracee_settle(puppet->pid, err))
 		return -1;
@@ -119,7 +130,7 @@ static int take_back(struct puppet *host, pid_t child, pid_t inside, struct avc_
 
 /* Forks the host until the child has the number. */
 static int fork_host(struct family *family, struct member *host, const struct branch *branch,
-		     pid_t *child, struct avc_error *err)
+		     struct chores *chores, pid_t *child, struct avc_error *err)
 {
 	struct inj_call *runner = &host->puppet.pad->control->runner;
 
@@ -134,13 +145,13 @@ static int fork_host(struct family *family, struct member *host, const struct br
 		*child = 0;
 		/* An orphan's parent has ended: so does one that is there for that. */
 		if (branch->parent == PARENT_INIT) {
-			if (clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, &between.pid,
-				       err))
+			if (clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL,
+				       &between.pid, err))
 				return -1;
 			between_inside = proc_inside(between.pid);
 		}
 		result = last_pid_set(family->helper, branch->inside - 1, err) ||
-			 clone_task(&between, runner, SIGCHLD, child, err);
+			 clone_task(&between, runner, SIGCHLD, chores, child, err);
 		inside = *child ? proc_inside(*child) : 0;
 		if (between_inside && take_back(&host->puppet, between.pid, between_inside, err))
 			return -1;
@@ -283,34 +294,139 @@ static int join_group(struct member *member, const struct branch *branch, struct
 	return 0;
 }
 
+static struct snapshot *snapshot_of(struct family *family, int branch, struct avc_error *err)
+{
+	struct member *member = member_of(family, branch);
+
+	if (!member->snapshot)
+		member->snapshot = snapshot_new(template_of(family, branch), err);
+	return member->snapshot;
+}
+
+/* The main process, a fork of its template, is registered with rseq(2); those that are made
+ * here register last of all. */
+static const struct inj_thread *registered(const struct family *family, int host)
+{
+	return host < 0 ? pad_thread(&family->main->pad, family->generation->slot, 0) : NULL;
+}
+
+static int plan_memory(struct family *family, uint32_t index, int host, struct avc_error *err)
+{
+	const struct inj_thread *thread = registered(family, host);
+	struct snapshot *want = snapshot_of(family, (int)index, err);
+	struct snapshot *is = want ? snapshot_of(family, host, err) : NULL;
+	struct member *member = &family->member[index];
+
+	if (!is)
+		return -1;
+	member->plan = remap_plan(family->generation->branch[index].target, want, is,
+				  thread ? thread->rseq : 0, err);
+	return member->plan ? 0 : -1;
+}
+
+static bool has_children(const struct family *family, uint32_t index)
+{
+	for (uint32_t i = index + 1; i < family->generation->branches; i++)
+		if (family->generation->branch[i].parent == (int)index)
+			return true;
+	return false;
+}
+
+static void forget_plan(const struct family *family, uint32_t index)
+{
+	struct member *member = &family->member[index];
+
+	remap_free(member->plan);
+	member->plan = NULL;
+	if (has_children(family, index))
+		return;
+	snapshot_free(member->snapshot);
+	member->snapshot = NULL;
+}
+
 static int become(struct family *family, uint32_t index, int host, struct avc_error *notes,
 		  struct avc_error *err)
 {
 	struct branch *branch = &family->generation->branch[index];
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
-	const struct target *parent = target_of(family, host);
-	/* The main process, a fork of its template, is registered with rseq(2); those that
-	 * are made here register last of all. */
-	const struct inj_thread *parents = pad_thread(&parent->pad, family->generation->slot, 0);
-	const avc_remote rseq = host < 0 ? parents->rseq : 0;
+	const struct inj_thread *thread = registered(family, host);
 
 	if (puppet_open_mail(puppet, err))
 		return -1;
 	/* An orphan comes from one in between that has none (kernel/rseq.c, CLONE_VM). */
-	if (rseq && branch->parent != PARENT_INIT)
-		puppet_call(puppet, SYS_rseq, rseq, parents->rseq_bytes, 1 /* UNREGISTER */,
-			    parents->rseq_signature, 0, 0);
+	if (thread && thread->rseq && branch->parent != PARENT_INIT)
+		puppet_call(puppet, SYS_rseq, thread->rseq, thread->rseq_bytes, 1 /* UNREGISTER */,
+			    thread->rseq_signature, 0, 0);
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
-	    remap(puppet, branch->target, branch->image->template, template_of(family, host), rseq,
-		  err) ||
-	    manner_put(puppet, branch, notes, err) || manner_put_mm(puppet, branch, notes) ||
-	    place(member, branch, notes, err))
+	    remap(member->plan, puppet, err) || manner_put(puppet, branch, notes, err) ||
+	    manner_put_mm(puppet, branch, notes) || place(member, branch, notes, err))
 		return -1;
 	if (puppet_put_files(puppet, &family->table[index], err) ||
 	    take_terminal(puppet, branch, notes, err))
 		return -1;
 	close_fd(&puppet->socket);
+	forget_plan(family, index);
+	return 0;
+}
+
+static void do_chores(void *arg)
+{
+	struct chores *chores = arg;
+	struct family *family = chores->family;
+
+	if (chores->done)
+		return; /* the number was not the right one */
+	chores->done = true;
+	if (chores->child >= 0 &&
+	    plan_memory(family, (uint32_t)chores->child, chores->host, &chores->error))
+		chores->result = -1;
+	else if (chores->last >= 0)
+		chores->result = become(family, (uint32_t)chores->last,
+					family->member[chores->last].host, chores->notes,
+					&chores->error);
+}
+
+/* `last` is the one that was forked last and is not yet what it is to be; -1: none. */
+static int make_member(struct family *family, uint32_t index, int *last, struct avc_error *notes,
+		       struct avc_error *err)
+{
+	const struct branch *branch = &family->generation->branch[index];
+	const int host = host_of(family, branch);
+	struct member *member = &family->member[index], *by = member_of(family, host);
+	struct chores chores = { .family = family, .host = host, .notes = notes };
+
+	/* It has to be itself before it has children. */
+	if (*last >= 0 && host == *last) {
+		if (become(family, (uint32_t)*last, family->member[*last].host, notes, err))
+			return -1;
+		*last = -1;
+	}
+	chores.child = branch->target ? (int)index : -1;
+	chores.last = *last;
+	*last = -1;
+	if (fork_host(family, by, branch, &chores, &member->pid, err))
+		return -1;
+	member->traced = true;
+	member->host = host;
+	member->puppet = by->puppet;
+	member->puppet.pid = member->pid;
+	member->puppet.socket = -1;
+	member->pidfd = proc_pidfd_open(member->pid);
+	if (member->pidfd < 0)
+		return fail_errno(err, member->pid, "restore", "pidfd_open", "it was killed");
+	if (chores.result) {
+		*err = chores.error;
+		return -1;
+	}
+	if (branch->target) {
+		*last = (int)index;
+		return 0;
+	}
+	family->flush = true;
+	if (make_zombie(member, branch, err))
+		return -1;
+	member->traced = false;
 	return 0;
 }
 
@@ -320,6 +436,7 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	struct generation *generation = family->generation;
 	struct inj_slot *slot = pad_slot(&family->main->pad, generation->slot);
 	struct member *first = &family->first;
+	int last = -1;
 
 	first->pid = first->puppet.pid = main_pid;
 	first->traced = true;
@@ -336,30 +453,11 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	if (puppet_flush(&first->puppet, "setsid", err))
 		return -1;
 	slot->placed = 1;
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
-		const int host = host_of(family, branch);
-		struct member *member = &family->member[i], *by = member_of(family, host);
-
-		if (fork_host(family, by, branch, &member->pid, err))
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (make_member(family, i, &last, notes, err))
 			return -1;
-		member->traced = true;
-		member->puppet = by->puppet;
-		member->puppet.pid = member->pid;
-		member->puppet.socket = -1;
-		member->pidfd = proc_pidfd_open(member->pid);
-		if (member->pidfd < 0)
-			return fail_errno(err, member->pid, "restore", "pidfd_open",
-					  "it was killed");
-		if (!branch->target) {
-			family->flush = true;
-			if (make_zombie(member, branch, err))
-				return -1;
-			member->traced = false;
-		} else if (become(family, i, host, notes, err)) {
-			return -1;
-		}
-	}
+	if (last >= 0 && become(family, (uint32_t)last, family->member[last].host, notes, err))
+		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
 		    join_group(&family->member[i], &generation->branch[i], notes, err))
@@ -390,24 +488,50 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 
 /* ---- off they go ------------------------------------------------------------------------- */
 
+static int start_member(struct family *family, uint32_t index, struct avc_error *err)
+{
+	struct branch *branch = &family->generation->branch[index];
+	struct member *member = &family->member[index];
+
+	if (restore_start(branch->target, branch->image, family->helper, member->pid,
+			  &member->sandbox, err))
+		return -1;
+	member->traced = false;
+	return 0;
+}
+
+static int await_member(struct family *family, uint32_t index, struct avc_error *notes,
+			struct avc_error *err)
+{
+	struct branch *branch = &family->generation->branch[index];
+	struct member *member = &family->member[index];
+
+	if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
+		return -1;
+	restore_note(branch->target, branch->image, member->pid, notes);
+	return memory_put_back(branch->image->image, member->pid, err);
+}
+
+/* It asks nothing of us while it puts itself together: no numbers for threads, no
+ * permission for calls. */
+static bool is_on_its_own(const struct generation *image)
+{
+	return image->threads == 1 && !image->sandboxed && !image->stop_signal;
+}
+
 int family_start(struct family *family, struct avc_error *notes, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < family->generation->branches; i++) {
-		struct branch *branch = &family->generation->branch[i];
-		struct member *member = &family->member[i];
+	const struct generation *generation = family->generation;
 
-		if (!branch->target)
-			continue;
-		if (restore_start(branch->target, branch->image, family->helper, member->pid,
-				  &member->sandbox, err))
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target && is_on_its_own(generation->branch[i].image) &&
+		    start_member(family, i, err))
 			return -1;
-		member->traced = false;
-		if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target && ((!is_on_its_own(generation->branch[i].image) &&
+						      start_member(family, i, err)) ||
+						     await_member(family, i, notes, err)))
 			return -1;
-		restore_note(branch->target, branch->image, member->pid, notes);
-		if (memory_put_back(branch->image->image, member->pid, err))
-			return -1;
-	}
 	return 0;
 }
 
@@ -461,7 +585,10 @@ void family_free(struct family *family)
 	for (uint32_t i = 0; i < family->generation->branches; i++) {
 		close_fd(&family->member[i].pidfd);
 		close_fd(&family->member[i].puppet.socket);
+		remap_free(family->member[i].plan);
+		snapshot_free(family->member[i].snapshot);
 	}
+	snapshot_free(family->first.snapshot);
 	close_fd(&family->first.pidfd);
 	free(family->member);
 	free(family);

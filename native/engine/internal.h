@@ -9,6 +9,7 @@
  *   restore.c    templates become the app again
  *   descend.c    a restored process makes its children
  *   remap.c      ... and their memory
+ *   snapshot.c   mappings and pages of a template
  *   manner.c     ... and what else they have
  *   puppet.c     a process that is being made
  *   tree.c       the processes of an app
@@ -827,6 +828,9 @@ void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot);
  * first `count` ones. */
 void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
 		 uint64_t e, uint64_t f);
+/* The same, for any number: those before it are made when there is no more room. */
+int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
+	       uint64_t e, struct avc_error *err) warn_unused;
 int puppet_run(struct puppet *puppet, struct avc_error *err) warn_unused;
 int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err) warn_unused;
 int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
@@ -868,7 +872,7 @@ struct family *family_new(struct target *main, struct generation *generation,
 /* The main process (a stopped tracee) brings forth the others. */
 int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		struct avc_error *err) warn_unused;
-/* They put themselves together, one after the other, but for the main one. */
+/* They put themselves together, but for the main one. */
 int family_start(struct family *family, struct avc_error *notes, struct avc_error *err) warn_unused;
 void family_go(struct family *family);
 void family_kill(struct family *family);
@@ -876,12 +880,53 @@ void family_free(struct family *family);
 /* PID of a branch's process, when all of it is there. */
 pid_t family_pid(const struct family *family, uint32_t branch);
 
+/* ---- snapshot.c --------------------------------------------------------------------- */
+
+struct mappings {
+	struct mapping *map;
+	uint32_t count, room;
+};
+
+/* A stretch of a mapping, and what pagemap says of each page. */
+struct extent {
+	avc_remote start, end;
+	uint64_t *frame;
+};
+
+struct pages {
+	bool known;
+	uint32_t count, room;
+	struct extent *extent; /* in order                                           */
+};
+
+struct snapshot {
+	pid_t template;
+	int pagemap;
+	struct mappings maps;
+	struct pages *pages; /* by mapping, of those that were asked for              */
+};
+
+struct snapshot *snapshot_new(pid_t template, struct avc_error *err);
+void snapshot_free(struct snapshot *snapshot);
+/* Of one of its mappings, a private one.  NULL on error. */
+const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mapping *mapping,
+				   struct avc_error *err);
+/* From `address` on; NULL where there is nothing.  `*end` is lowered to where that changes;
+ * `*next`, 0 at first, is where the search for a higher address begins. */
+const uint64_t *pages_frames(const struct pages *pages, uint32_t *next, avc_remote address,
+			     avc_remote *end);
+
 /* ---- remap.c ----------------------------------------------------------------------- */
 
-/* Makes the memory of a puppet that of `template`; it is a fork of `parent`'s and runs
- * in the pad of `target` already. */
-int remap(struct puppet *puppet, const struct target *target, pid_t template, pid_t parent,
-	  avc_remote touched, struct avc_error *err) warn_unused;
+struct remap;
+
+/* What makes the memory of a fork of `is` that of `want`.  Both snapshots have to stay.
+ * `touched`: an address at which the kernel has written since.  NULL on error. */
+struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
+			 avc_remote touched, struct avc_error *err);
+/* Does it, with a puppet that is in the pad of the plan's target already. */
+int remap(const struct remap *plan, struct puppet *puppet, struct avc_error *err) warn_unused;
+void remap_free(struct remap *plan);
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 

@@ -5,7 +5,8 @@
  *
  * Where both have the same mapped at the same place it stays, and with it the pages that
  * they share: of equal page frames (pagemap, Documentation/admin-guide/mm/pagemap.rst)
- * there is nothing to do.  Everything else is unmapped, mapped, and copied.
+ * there is nothing to do.  Everything else is unmapped, mapped, and copied.  What that is
+ * is found out by the templates of both, before there is a process that it is for.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -15,24 +16,12 @@
 #include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/syscall.h>
-#include <sys/uio.h>
 #include <unistd.h>
 
 #include "internal.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 #define COPY_BYTES (512u << 10)
-#define MAP_PAGES 16384u /* of pagemap, read at a time                        */
-
-#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
-#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
-#define PAGEMAP_FILE (UINT64_C(1) << 61)
-#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
-
-struct maps {
-	struct mapping *map;
-	uint32_t count, room;
-};
 
 /* A stretch that is in one mapping of both at most. */
 struct piece {
@@ -41,17 +30,20 @@ struct piece {
 	bool kept;
 };
 
+enum page { PAGE_SAME, PAGE_COPY, PAGE_DROP };
+
+struct run {
+	avc_remote start, end;
+	enum page what;
+};
+
 struct remap {
-	struct puppet *puppet;
 	const struct target *target;
-	pid_t template, parent;
-	struct maps is, want;
+	struct snapshot *is, *want;
 	struct piece *piece;
 	uint32_t pieces;
-	int want_mem, is_mem, want_pages, parent_pages;
-	uint8_t *buffer;
-	uint64_t *frame, *parent_frame;
-	struct avc_error *err;
+	struct run *run;
+	uint32_t runs, room;
 };
 
 /* ---- mappings ------------------------------------------------------------------- */
@@ -71,25 +63,6 @@ static bool is_file(const struct mapping *m)
 	return m->inode != 0;
 }
 
-static int add_mapping(const struct mapping *m, void *arg)
-{
-	struct maps *maps = arg;
-
-	if (m->start >= ARCH_USER_END)
-		return 0;
-	if (maps->count == maps->room) {
-		const uint32_t room = maps->room ? 2 * maps->room : 256;
-		struct mapping *more = realloc(maps->map, room * sizeof *more);
-
-		if (!more)
-			return -1;
-		maps->map = more;
-		maps->room = room;
-	}
-	maps->map[maps->count++] = *m;
-	return 0;
-}
-
 static bool same_backing(const struct mapping *a, const struct mapping *b)
 {
 	return a->shared == b->shared && is_stack(a) == is_stack(b) && a->inode == b->inode &&
@@ -98,20 +71,20 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
 }
 
-/* What is of ours in either, or stays where it is whatever happens. */
-static bool is_fixed(const struct remap *r, const struct mapping *m)
+/* What stays where it is whatever happens; where our pad is nothing else is touched. */
+static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
 {
-	return is_special(m) || pad_contains(&r->target->pad, m->start);
+	return is_special(m) || pad_contains(&r->target->pad, address);
 }
 
-static const struct mapping *at(const struct maps *maps, uint32_t *next, avc_remote address)
+static const struct mapping *at(const struct mappings *maps, uint32_t *next, avc_remote address)
 {
 	while (*next < maps->count && maps->map[*next].end <= address)
 		++*next;
 	return *next < maps->count && maps->map[*next].start <= address ? &maps->map[*next] : NULL;
 }
 
-static avc_remote boundary(const struct maps *maps, uint32_t next, avc_remote address)
+static avc_remote boundary(const struct mappings *maps, uint32_t next, avc_remote address)
 {
 	if (next == maps->count)
 		return UINT64_MAX;
@@ -119,27 +92,28 @@ static avc_remote boundary(const struct maps *maps, uint32_t next, avc_remote ad
 }
 
 /* Both lists side by side. */
-static int cut(struct remap *r)
+static int cut(struct remap *r, struct avc_error *err)
 {
+	const struct mappings *is_maps = &r->is->maps, *want_maps = &r->want->maps;
 	avc_remote address = 0;
 	uint32_t is = 0, want = 0;
 
-	r->piece = calloc(2 * (r->is.count + r->want.count) + 2, sizeof *r->piece);
+	r->piece = calloc(2 * (is_maps->count + want_maps->count) + 2, sizeof *r->piece);
 	if (!r->piece)
-		return fail_errno(r->err, 0, "restore memory", "calloc", "out of memory");
+		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
 	for (;;) {
-		const struct mapping *a = at(&r->is, &is, address);
-		const struct mapping *b = at(&r->want, &want, address);
-		const avc_remote x = boundary(&r->is, is, address);
-		const avc_remote y = boundary(&r->want, want, address);
+		const struct mapping *a = at(is_maps, &is, address);
+		const struct mapping *b = at(want_maps, &want, address);
+		const avc_remote x = boundary(is_maps, is, address);
+		const avc_remote y = boundary(want_maps, want, address);
 		const avc_remote end = x < y ? x : y;
 
 		if (end == UINT64_MAX)
 			return 0;
-		if (a && is_fixed(r, a))
+		if (a && is_fixed(r, a, address))
 			a = b = NULL;
-		if (b && is_fixed(r, b))
-			b = NULL;
+		if (b && is_fixed(r, b, address))
+			a = b = NULL;
 		if (a || b)
 			r->piece[r->pieces++] = (struct piece){
 				.start = address,
@@ -158,7 +132,7 @@ static int protection(const struct mapping *m)
 	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
 }
 
-static void unmap(struct remap *r)
+static int unmap(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const uint32_t first = i;
@@ -168,12 +142,14 @@ static void unmap(struct remap *r)
 		while (i + 1 < r->pieces && r->piece[i + 1].start == r->piece[i].end &&
 		       r->piece[i + 1].is && !r->piece[i + 1].kept)
 			i++;
-		puppet_call(r->puppet, SYS_munmap, r->piece[first].start,
-			    r->piece[i].end - r->piece[first].start, 0, 0, 0, 0);
+		if (puppet_ask(puppet, SYS_munmap, r->piece[first].start,
+			       r->piece[i].end - r->piece[first].start, 0, 0, 0, err))
+			return -1;
 	}
+	return 0;
 }
 
-static const struct mapping *find_special(const struct maps *maps, const char *name)
+static const struct mapping *find_special(const struct mappings *maps, const char *name)
 {
 	for (uint32_t i = 0; i < maps->count; i++)
 		if (!strcmp(maps->map[i].name, name))
@@ -183,27 +159,27 @@ static const struct mapping *find_special(const struct maps *maps, const char *n
 
 /* Of a program that was executed anew the vDSO is somewhere else.  By way of a place that
  * neither has anything at: behind the pad. */
-static int move_special(struct remap *r)
+static int move_special(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
 	static const char *const names[] = { "[vvar]", "[vvar_vclock]", "[vdso]" };
 	avc_remote between = r->target->pad.base + r->target->pad.bytes + PAGE;
 
 	for (int away = 1; away >= 0; away--)
 		for (size_t i = 0; i < sizeof names / sizeof *names; i++) {
-			const struct mapping *a = find_special(&r->is, names[i]);
-			const struct mapping *b = find_special(&r->want, names[i]);
+			const struct mapping *a = find_special(&r->is->maps, names[i]);
+			const struct mapping *b = find_special(&r->want->maps, names[i]);
 			const uint64_t bytes = a ? a->end - a->start : 0;
 
 			if (!a || !b || a->start == b->start)
 				continue;
 			if (b->end - b->start != bytes)
-				return fail(r->err, AVC_UNSUPPORTED, 0, r->puppet->pid,
-					    "restore memory", "", "its vDSO is of another size");
+				return fail(err, AVC_UNSUPPORTED, 0, puppet->pid, "restore memory",
+					    "", "its vDSO is of another size");
 			if (away)
-				puppet_call(r->puppet, SYS_mremap, a->start, bytes, bytes,
+				puppet_call(puppet, SYS_mremap, a->start, bytes, bytes,
 					    MREMAP_MAYMOVE | MREMAP_FIXED, between, 0);
 			else
-				puppet_call(r->puppet, SYS_mremap, between, bytes, bytes,
+				puppet_call(puppet, SYS_mremap, between, bytes, bytes,
 					    MREMAP_MAYMOVE | MREMAP_FIXED, b->start, 0);
 			between += bytes;
 			if (i + 1 == sizeof names / sizeof *names)
@@ -212,7 +188,7 @@ static int move_special(struct remap *r)
 	return 0;
 }
 
-static int open_mapped(const struct remap *r, const struct mapping *m)
+static int open_mapped(pid_t template, const struct mapping *m)
 {
 	char name[64];
 	int fd = -1;
@@ -220,204 +196,212 @@ static int open_mapped(const struct remap *r, const struct mapping *m)
 	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)m->start,
 		 (unsigned long)m->end);
 	if (m->shared)
-		fd = proc_open(r->template, name, O_RDWR);
-	return fd >= 0 ? fd : proc_open(r->template, name, O_RDONLY);
+		fd = proc_open(template, name, O_RDWR);
+	return fd >= 0 ? fd : proc_open(template, name, O_RDONLY);
 }
 
-static int map_piece(struct remap *r, const struct piece *piece)
+static int map_piece(const struct remap *r, struct puppet *puppet, const struct piece *piece,
+		     struct avc_error *err)
 {
 	const struct mapping *m = piece->want;
 	int flags = MAP_FIXED | (m->shared ? MAP_SHARED : MAP_PRIVATE | MAP_NORESERVE), fd;
 
 	if (!is_file(m)) {
 		flags |= MAP_ANONYMOUS | (is_stack(m) ? MAP_GROWSDOWN | MAP_STACK : 0);
-		puppet_call(r->puppet, SYS_mmap, piece->start, piece->end - piece->start,
-			    (uint64_t)protection(m), (uint64_t)flags, (uint64_t)-1, 0);
-		return 0;
+		return puppet_ask(puppet, SYS_mmap, piece->start, piece->end - piece->start,
+				  (uint64_t)protection(m), (uint64_t)flags, (uint64_t)-1, err);
 	}
-	fd = open_mapped(r, m);
+	fd = open_mapped(r->want->template, m);
 	if (fd < 0)
-		return fail_errno(r->err, r->puppet->pid, "restore memory", "open(map_files)",
+		return fail_errno(err, puppet->pid, "restore memory", "open(map_files)",
 				  "%s can not be opened", m->name);
-	if (puppet_give(r->puppet, fd, r->err)) {
+	if (puppet_give(puppet, fd, err)) {
 		close(fd);
 		return -1;
 	}
 	close(fd);
-	puppet_call(r->puppet, SYS_mmap, piece->start, piece->end - piece->start,
+	puppet_call(puppet, SYS_mmap, piece->start, piece->end - piece->start,
 		    (uint64_t)protection(m), (uint64_t)flags, 1,
 		    m->offset + (piece->start - m->start));
-	puppet_call(r->puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
 	return 0;
 }
 
-static int map_new(struct remap *r)
+static int map_new(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (piece->want && !piece->kept && map_piece(r, piece))
+		if (piece->want && !piece->kept && map_piece(r, puppet, piece, err))
 			return -1;
-		if (piece->kept && protection(piece->is) != protection(piece->want))
-			puppet_call(r->puppet, SYS_mprotect, piece->start,
-				    piece->end - piece->start, (uint64_t)protection(piece->want), 0,
-				    0, 0);
+		if (piece->kept && protection(piece->is) != protection(piece->want) &&
+		    puppet_ask(puppet, SYS_mprotect, piece->start, piece->end - piece->start,
+			       (uint64_t)protection(piece->want), 0, 0, err))
+			return -1;
 	}
-	return puppet_flush(r->puppet, "mmap", r->err);
+	return puppet_flush(puppet, "mmap", err);
 }
 
 /* ---- pages -------------------------------------------------------------------------- */
 
-static int copy_pages(struct remap *r, const struct mapping *m, avc_remote start, avc_remote end)
-{
-	while (start < end) {
-		const size_t bytes = end - start < COPY_BYTES ? end - start : COPY_BYTES;
-		struct iovec here = { r->buffer, bytes }, there = { (void *)start, bytes };
+#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
+#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
+#define PAGEMAP_FILE (UINT64_C(1) << 61)
+#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
 
-		if ((m->mode[0] != 'r' ||
-		     process_vm_readv(r->template, &here, 1, &there, 1, 0) != (ssize_t)bytes) &&
-		    pread(r->want_mem, r->buffer, bytes, (off_t)start) != (ssize_t)bytes)
-			return fail_errno(r->err, r->template, "restore memory", "read(mem)",
-					  "it can not be read at %lx", (unsigned long)start);
-		if ((m->mode[1] != 'w' ||
-		     process_vm_writev(r->puppet->pid, &here, 1, &there, 1, 0) != (ssize_t)bytes) &&
-		    pwrite(r->is_mem, r->buffer, bytes, (off_t)start) != (ssize_t)bytes)
-			return fail_errno(r->err, r->puppet->pid, "restore memory", "write(mem)",
-					  "it can not be written at %lx", (unsigned long)start);
-		start += bytes;
-	}
-	return 0;
+static bool is_own(uint64_t frame)
+{
+	return frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(frame & PAGEMAP_FILE);
 }
 
-enum page { PAGE_SAME, PAGE_COPY, PAGE_DROP };
-
 /* Of a private mapping.  What is of a file is there by itself. */
-static enum page compare(uint64_t want, uint64_t is, bool kept)
+static enum page compare(uint64_t want, uint64_t is)
 {
-	const bool own = want & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(want & PAGEMAP_FILE);
-	const bool parents = kept && is & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) &&
-			     !(is & PAGEMAP_FILE);
-
-	if (!own)
-		return parents ? PAGE_DROP : PAGE_SAME;
-	if (parents && want & PAGEMAP_FRAME &&
+	if (!is_own(want))
+		return is_own(is) ? PAGE_DROP : PAGE_SAME;
+	if (is_own(is) && want & PAGEMAP_FRAME &&
 	    !((want ^ is) & (PAGEMAP_FRAME | PAGEMAP_PRESENT | PAGEMAP_SWAPPED)))
 		return PAGE_SAME;
 	return PAGE_COPY;
 }
 
-static int apply(struct remap *r, const struct piece *piece, enum page what, avc_remote start,
-		 avc_remote end)
+static int add_run(struct remap *r, enum page what, avc_remote start, avc_remote end,
+		   struct avc_error *err)
 {
-	if (what == PAGE_COPY)
-		return copy_pages(r, piece->want, start, end);
-	if (what == PAGE_DROP)
-		puppet_call(r->puppet, SYS_madvise, start, end - start, MADV_DONTNEED, 0, 0, 0);
-	return 0;
-}
+	struct run *last = r->runs ? &r->run[r->runs - 1] : NULL;
 
-static int read_frames(int fd, avc_remote at_address, uint64_t *frames, size_t count)
-{
-	const size_t bytes = count * sizeof *frames;
-
-	return pread(fd, frames, bytes, (off_t)(at_address / PAGE * 8)) == (ssize_t)bytes ? 0 : -1;
-}
-
-static int fill_piece(struct remap *r, const struct piece *piece)
-{
-	for (avc_remote from = piece->start; from < piece->end; from += MAP_PAGES * PAGE) {
-		const avc_remote left = (piece->end - from) / PAGE;
-		const size_t count = left < MAP_PAGES ? left : MAP_PAGES;
-		enum page run = PAGE_SAME;
-		size_t begin = 0;
-
-		if (read_frames(r->want_pages, from, r->frame, count) ||
-		    (piece->kept && read_frames(r->parent_pages, from, r->parent_frame, count)))
-			return fail_errno(r->err, r->template, "restore memory", "read(pagemap)",
-					  "its pages can not be compared");
-		for (size_t i = 0; i <= count; i++) {
-			const enum page now =
-				i == count
-					? PAGE_SAME
-					: compare(r->frame[i], piece->kept ? r->parent_frame[i] : 0,
-						  piece->kept);
-
-			if (now == run && i < count)
-				continue;
-			if (run != PAGE_SAME &&
-			    apply(r, piece, run, from + begin * PAGE, from + i * PAGE))
-				return -1;
-			run = now;
-			begin = i;
-		}
+	if (last && last->what == what && last->end == start) {
+		last->end = end;
+		return 0;
 	}
+	if (r->runs == r->room) {
+		const uint32_t room = r->room ? 2 * r->room : 64;
+		struct run *more = realloc(r->run, room * sizeof *more);
+
+		if (!more)
+			return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
+		r->run = more;
+		r->room = room;
+	}
+	r->run[r->runs++] = (struct run){ start, end, what };
 	return 0;
 }
 
-static int fill(struct remap *r, avc_remote touched)
+static int compare_piece(struct remap *r, const struct piece *piece, avc_remote touched,
+			 struct avc_error *err)
 {
-	for (uint32_t i = 0; i < r->pieces; i++) {
-		const struct piece *piece = &r->piece[i];
+	static const struct pages nothing;
+	const struct pages *wanted = snapshot_pages(r->want, piece->want, err);
+	const struct pages *had = piece->kept ? snapshot_pages(r->is, piece->is, err) : &nothing;
+	uint32_t next_wanted = 0, next_had = 0;
 
-		if (!piece->want || piece->want->shared)
+	if (!wanted || !had)
+		return -1;
+	for (avc_remote start = piece->start, end; start < piece->end; start = end) {
+		const uint64_t *want, *is;
+
+		end = piece->end;
+		want = pages_frames(wanted, &next_wanted, start, &end);
+		is = pages_frames(had, &next_had, start, &end);
+		if (!want && !is)
 			continue;
-		if (fill_piece(r, piece))
-			return -1;
-		/* The kernel has written to it since (rseq(2)). */
-		if (touched >= piece->start && touched < piece->end) {
-			const avc_remote page = touched & ~(PAGE - 1);
+		for (size_t i = 0, count = (end - start) / PAGE; i < count; i++) {
+			const avc_remote page = start + i * PAGE;
+			enum page what = compare(want ? want[i] : 0, is ? is[i] : 0);
 
-			if (read_frames(r->want_pages, page, r->frame, 1) == 0 &&
-			    compare(r->frame[0], 0, false) == PAGE_COPY &&
-			    copy_pages(r, piece->want, page, page + PAGE))
+			/* The kernel has written to it since (rseq(2)). */
+			if (touched - page < PAGE && want && is_own(want[i]))
+				what = PAGE_COPY;
+			if (what != PAGE_SAME && add_run(r, what, page, page + PAGE, err))
 				return -1;
 		}
 	}
-	return 0; /* the last calls are made with what comes next */
+	return 0;
+}
+
+/* pread(2) of /proc/PID/mem, and not process_vm_readv(2): that pins pages, and a page that
+ * is shared is copied for whoever is to have it pinned (mm/gup.c, gup_must_unshare()). */
+static int copy_run(const struct remap *r, const struct puppet *puppet, int from, int to,
+		    uint8_t *buffer, const struct run *run, struct avc_error *err)
+{
+	for (avc_remote at = run->start; at < run->end;) {
+		const size_t bytes = run->end - at < COPY_BYTES ? run->end - at : COPY_BYTES;
+
+		if (pread(from, buffer, bytes, (off_t)at) != (ssize_t)bytes)
+			return fail_errno(err, r->want->template, "restore memory", "read(mem)",
+					  "it can not be read at %lx", (unsigned long)at);
+		if (pwrite(to, buffer, bytes, (off_t)at) != (ssize_t)bytes)
+			return fail_errno(err, puppet->pid, "restore memory", "write(mem)",
+					  "it can not be written at %lx", (unsigned long)at);
+		at += bytes;
+	}
+	return 0;
+}
+
+static int fill(const struct remap *r, struct puppet *puppet, struct avc_error *err)
+{
+	int from = proc_open(r->want->template, "mem", O_RDONLY);
+	int to = proc_open(puppet->pid, "mem", O_RDWR);
+	uint8_t *buffer = malloc(COPY_BYTES);
+	int result = 0;
+
+	if (from < 0 || to < 0 || !buffer)
+		result = fail_errno(err, puppet->pid, "restore memory", "open(mem)",
+				    "it can not be reached");
+	for (uint32_t i = 0; !result && i < r->runs; i++) {
+		const struct run *run = &r->run[i];
+
+		if (run->what == PAGE_COPY)
+			result = copy_run(r, puppet, from, to, buffer, run, err);
+		else /* the last of them are made with what comes next */
+			result = puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
+					    MADV_DONTNEED, 0, 0, err);
+	}
+	close_fd(&from);
+	close_fd(&to);
+	free(buffer);
+	return result;
 }
 
 /* ---- all of it ----------------------------------------------------------------------- */
 
-int remap(struct puppet *puppet, const struct target *target, pid_t template, pid_t parent,
-	  avc_remote touched, struct avc_error *err)
+struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
+			 avc_remote touched, struct avc_error *err)
 {
-	struct remap r = {
-		.puppet = puppet,
-		.target = target,
-		.template = template,
-		.parent = parent,
-		.want_mem = proc_open(template, "mem", O_RDONLY),
-		.is_mem = proc_open(puppet->pid, "mem", O_RDWR),
-		.want_pages = proc_open(template, "pagemap", O_RDONLY),
-		.parent_pages = proc_open(parent, "pagemap", O_RDONLY),
-		.buffer = malloc(COPY_BYTES),
-		.frame = malloc(MAP_PAGES * sizeof *r.frame),
-		.parent_frame = malloc(MAP_PAGES * sizeof *r.parent_frame),
-		.err = err,
-	};
-	int result = -1;
+	struct remap *r = calloc(1, sizeof *r);
 
-	if (r.want_mem < 0 || r.is_mem < 0 || r.want_pages < 0 || r.parent_pages < 0 || !r.buffer ||
-	    !r.frame || !r.parent_frame)
-		fail_errno(err, puppet->pid, "restore memory", "open(mem)",
-			   "it can not be reached");
-	else if (proc_mappings(puppet->pid, "maps", add_mapping, &r.is) ||
-		 proc_mappings(template, "maps", add_mapping, &r.want))
-		fail_errno(err, puppet->pid, "restore memory", "read(maps)", "it was killed");
-	else if (cut(&r) == 0) {
-		unmap(&r);
-		if (move_special(&r) == 0 && map_new(&r) == 0)
-			result = fill(&r, touched);
+	if (!r) {
+		fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+		return NULL;
 	}
-	close_fd(&r.want_mem);
-	close_fd(&r.is_mem);
-	close_fd(&r.want_pages);
-	close_fd(&r.parent_pages);
-	free(r.buffer);
-	free(r.frame);
-	free(r.parent_frame);
-	free(r.is.map);
-	free(r.want.map);
-	free(r.piece);
-	return result;
+	*r = (struct remap){ .target = target, .want = want, .is = is };
+	if (cut(r, err))
+		goto failed;
+	for (uint32_t i = 0; i < r->pieces; i++) {
+		const struct piece *piece = &r->piece[i];
+
+		if (piece->want && !piece->want->shared && compare_piece(r, piece, touched, err))
+			goto failed;
+	}
+	return r;
+failed:
+	remap_free(r);
+	return NULL;
+}
+
+int remap(const struct remap *r, struct puppet *puppet, struct avc_error *err)
+{
+	return unmap(r, puppet, err) || move_special(r, puppet, err) || map_new(r, puppet, err) ||
+			       fill(r, puppet, err)
+		       ? -1
+		       : 0;
+}
+
+void remap_free(struct remap *r)
+{
+	if (!r)
+		return;
+	free(r->piece);
+	free(r->run);
+	free(r);
 }

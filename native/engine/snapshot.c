@@ -1,0 +1,194 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What a template has in memory: its mappings, and of the private ones the frames of the
+ * pages that are its own.  Templates do not run, so that it can be read at any time.
+ *
+ * A page that two templates share stays shared, and one that they do not share stays so,
+ * whatever the kernel does with its frame meanwhile.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define PAGE ((avc_remote)ARCH_PAGE_BYTES)
+/* Runtimes reserve terabytes of which they use little: those are not read page by page. */
+#define SPARSE_BYTES (UINT64_C(256) << 20)
+#define REGIONS 64
+
+/* Linux 6.7, Documentation/admin-guide/mm/pagemap.rst; the headers may be older. */
+struct scan_region {
+	uint64_t start, end, categories;
+};
+
+struct scan {
+	uint64_t size, flags, start, end, walk_end, vec, vec_len, max_pages;
+	uint64_t category_inverted, category_mask, category_anyof_mask, return_mask;
+};
+
+#define SCAN _IOWR('f', 16, struct scan)
+#define SCAN_FILE (1u << 2)
+#define SCAN_PRESENT (1u << 3)
+#define SCAN_SWAPPED (1u << 4)
+
+static int add_mapping(const struct mapping *m, void *arg)
+{
+	struct mappings *maps = arg;
+
+	if (m->start >= ARCH_USER_END)
+		return 0;
+	if (maps->count == maps->room) {
+		const uint32_t room = maps->room ? 2 * maps->room : 256;
+		struct mapping *more = realloc(maps->map, room * sizeof *more);
+
+		if (!more)
+			return -1;
+		maps->map = more;
+		maps->room = room;
+	}
+	maps->map[maps->count++] = *m;
+	return 0;
+}
+
+struct snapshot *snapshot_new(pid_t template, struct avc_error *err)
+{
+	struct snapshot *snapshot = calloc(1, sizeof *snapshot);
+
+	if (!snapshot) {
+		fail_errno(err, template, "restore memory", "calloc", "out of memory");
+		return NULL;
+	}
+	snapshot->template = template;
+	snapshot->pagemap = proc_open(template, "pagemap", O_RDONLY);
+	if (snapshot->pagemap < 0 ||
+	    proc_mappings(template, "maps", add_mapping, &snapshot->maps)) {
+		fail_errno(err, template, "restore memory", "read(maps)", "it was killed");
+		snapshot_free(snapshot);
+		return NULL;
+	}
+	snapshot->pages = calloc(snapshot->maps.count + 1, sizeof *snapshot->pages);
+	if (!snapshot->pages) {
+		fail_errno(err, template, "restore memory", "calloc", "out of memory");
+		snapshot_free(snapshot);
+		return NULL;
+	}
+	return snapshot;
+}
+
+void snapshot_free(struct snapshot *snapshot)
+{
+	if (!snapshot)
+		return;
+	for (uint32_t i = 0; snapshot->pages && i < snapshot->maps.count; i++) {
+		for (uint32_t k = 0; k < snapshot->pages[i].count; k++)
+			free(snapshot->pages[i].extent[k].frame);
+		free(snapshot->pages[i].extent);
+	}
+	close_fd(&snapshot->pagemap);
+	free(snapshot->pages);
+	free(snapshot->maps.map);
+	free(snapshot);
+}
+
+static int read_extent(struct snapshot *snapshot, struct pages *pages, avc_remote start,
+		       avc_remote end)
+{
+	const size_t bytes = (end - start) / PAGE * sizeof(uint64_t);
+	struct extent *extent;
+
+	if (pages->count == pages->room) {
+		const uint32_t room = pages->room ? 2 * pages->room : 4;
+		struct extent *more = realloc(pages->extent, room * sizeof *more);
+
+		if (!more)
+			return -1;
+		pages->extent = more;
+		pages->room = room;
+	}
+	extent = &pages->extent[pages->count];
+	*extent = (struct extent){ .start = start, .end = end, .frame = malloc(bytes) };
+	if (!extent->frame)
+		return -1;
+	pages->count++;
+	return pread(snapshot->pagemap, extent->frame, bytes,
+		     (off_t)(start / PAGE * sizeof(uint64_t))) == (ssize_t)bytes
+		       ? 0
+		       : -1;
+}
+
+/* Only where there is something; 1 if the kernel can not tell. */
+static int read_sparse(struct snapshot *snapshot, struct pages *pages, const struct mapping *m)
+{
+	struct scan_region region[REGIONS];
+	avc_remote start = m->start;
+
+	while (start < m->end) {
+		struct scan scan = {
+			.size = sizeof scan,
+			.start = start,
+			.end = m->end,
+			.vec = (uint64_t)(uintptr_t)region,
+			.vec_len = REGIONS,
+			.category_inverted = SCAN_FILE,
+			.category_mask = SCAN_FILE,
+			.category_anyof_mask = SCAN_PRESENT | SCAN_SWAPPED,
+		};
+		const int found = ioctl(snapshot->pagemap, SCAN, &scan);
+
+		if (found < 0)
+			return errno == ENOTTY || errno == EINVAL ? 1 : -1;
+		for (int i = 0; i < found; i++)
+			if (read_extent(snapshot, pages, region[i].start, region[i].end))
+				return -1;
+		start = scan.walk_end;
+	}
+	return 0;
+}
+
+/* Of a private mapping of the snapshot's. */
+const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mapping *m,
+				   struct avc_error *err)
+{
+	struct pages *pages = &snapshot->pages[m - snapshot->maps.map];
+	int result = 1;
+
+	if (pages->known)
+		return pages;
+	if (m->end - m->start >= SPARSE_BYTES)
+		result = read_sparse(snapshot, pages, m);
+	if (result == 1)
+		result = read_extent(snapshot, pages, m->start, m->end);
+	if (result) {
+		fail_errno(err, snapshot->template, "restore memory", "read(pagemap)",
+			   "its pages can not be compared");
+		return NULL;
+	}
+	pages->known = true;
+	return pages;
+}
+
+/* From `address` on; NULL where there is nothing.  `end` comes down to where that changes,
+ * `next` is where the search goes on. */
+const uint64_t *pages_frames(const struct pages *pages, uint32_t *next, avc_remote address,
+			     avc_remote *end)
+{
+	const struct extent *extent;
+
+	while (*next < pages->count && pages->extent[*next].end <= address)
+		++*next;
+	if (*next == pages->count)
+		return NULL;
+	extent = &pages->extent[*next];
+	if (extent->start > address) {
+		if (extent->start < *end)
+			*end = extent->start;
+		return NULL;
+	}
+	if (extent->end < *end)
+		*end = extent->end;
+	return extent->frame + (address - extent->start) / PAGE;
+}
