@@ -116,18 +116,45 @@ static int reopen(int fd, int flags)
 	return opened;
 }
 
-/* Does anybody have the other end? */
-static struct files_work *who_has_other(const struct tables *tables, const struct file *w,
-					uint32_t *leader)
+/* Whoever has the other end, and whether it came of what is still there. */
+static const struct file *find_other(const struct tables *tables, const struct file *w,
+				     bool *made_already)
 {
 	for (uint32_t i = 0; i < tables->count; i++)
-		for (uint32_t k = 0; k < tables->work[i].want->count; k++)
-			if (other_end(w, &tables->work[i].want->file[k])) {
-				*leader = files_leader(tables->work[i].want,
-						       &tables->work[i].want->file[k]);
-				return &tables->work[i];
-			}
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
+			const struct files_work *work = &tables->work[i];
+			const struct file *other = &work->want->file[k];
+			const uint32_t leader = files_leader(work->want, other);
+
+			if (!other_end(w, other))
+				continue;
+			*made_already = work->local[leader] >= 0 && work->source[leader] < 0;
+			return other;
+		}
 	return NULL;
+}
+
+/* To everybody who has had it.  An end that is still there belongs to a pair that is none
+ * any more. */
+static void give_end(const struct tables *tables, const struct file *w, int end)
+{
+	for (uint32_t i = 0; i < tables->count; i++) {
+		struct files_work *work = &tables->work[i];
+
+		for (uint32_t k = 0; k < work->want->count; k++) {
+			const uint32_t leader = files_leader(work->want, &work->want->file[k]);
+
+			if (!same_end(w, &work->want->file[k]))
+				continue;
+			work->lost[k] = true;
+			if (leader != k)
+				continue;
+			work->source[k] = -1;
+			close_fd(&work->local[k]);
+			work->local[k] = fcntl(end, F_DUPFD_CLOEXEC, 0);
+		}
+	}
+	close(end);
 }
 
 static bool same_family(const struct file *a, const struct file *b)
@@ -151,8 +178,8 @@ static void join_family(const struct tables *tables, struct files_work *work)
 static void join_lost(const struct tables *tables, struct files_work *work, const struct file *w)
 {
 	const uint32_t group = files_leader(work->want, w);
-	struct files_work *others;
-	uint32_t leader = 0;
+	const struct file *other;
+	bool made_already;
 	int fd, ends[2], writer;
 
 	if (find_end(tables, w, same_end, &fd)) {
@@ -163,19 +190,13 @@ static void join_lost(const struct tables *tables, struct files_work *work, cons
 		work->local[group] = reopen(fd, w->flags);
 		return;
 	}
-	others = who_has_other(tables, w, &leader);
-	if (!others || others->local[leader] >= 0 || file_make_pair(w, ends))
+	other = find_other(tables, w, &made_already);
+	if (!other || made_already || file_make_pair(w, ends))
 		return;
 	/* pipe(2): the first is the one to read from. */
 	writer = w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY;
-	work->local[group] = ends[writer];
-	others->local[leader] = ends[!writer];
-	/* An end that is still there belongs to a pair that is none any more. */
-	for (uint32_t k = 0; k < others->want->count; k++)
-		if (files_leader(others->want, &others->want->file[k]) == leader) {
-			others->source[leader] = -1;
-			others->lost[k] = true;
-		}
+	give_end(tables, w, ends[writer]);
+	give_end(tables, other, ends[!writer]);
 }
 
 static void join(const struct tables *tables)

@@ -129,6 +129,23 @@ def test_a_daemon_of_the_application_goes_back_with_it(tmp_path: Path) -> None:
         kill_again_and_again(guard, victim, KILLS, 0.15, orphans=1)
 
 
+@pytest.mark.parametrize("command", ["tree 8", "tree 9 --orphan"])
+def test_dies_again_at_once(command: str, tmp_path: Path) -> None:
+    """Some have a holder again, which has what they had open, and some have none yet: one end of a pair is there."""
+    rng = random.Random(command)
+    with Victim(command, tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
+        before = places(victim)
+        for _ in range(KILLS):
+            checkpoint(guard)
+            for _ in range(3):
+                since = guard.mark()
+                kill_main(victim)
+                guard.wait("restored", since=since)
+                time.sleep(rng.uniform(0, 0.02))
+            progress(victim)
+            assert places(victim) == before
+
+
 @pytest.mark.parametrize("signum", [signal.SIGSEGV, signal.SIGABRT, signal.SIGTERM])
 def test_killed_in_other_ways(signum: int, tmp_path: Path) -> None:
     with Victim("tree 8", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
