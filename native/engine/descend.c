@@ -38,9 +38,10 @@ struct family {
 	struct generation *generation;
 	struct last_pid *helper;
 	const struct files_table *table; /* by branch                            */
-	bool flush;                      /* some have had children that ended                  */
-	struct member first;             /* the main process                              */
-	struct member *member;           /* by branch                                   */
+	struct copier *copier;
+	bool flush;            /* some have had children that ended                  */
+	struct member first;   /* the main process                              */
+	struct member *member; /* by branch                                   */
 };
 
 struct family *family_new(struct target *main, struct generation *generation,
@@ -50,8 +51,12 @@ struct family *family_new(struct target *main, struct generation *generation,
 	struct family *family = calloc(1, sizeof *family);
 
 	if (family)
+		family->copier = copier_new(err);
+	if (family && family->copier)
 		family->member = calloc(generation->branches + 1, sizeof *family->member);
 	if (!family || !family->member) {
+		if (family)
+			copier_free(family->copier);
 		free(family);
 		fail_errno(err, 0, "restore", "calloc", "out of memory");
 		return NULL;
@@ -359,8 +364,9 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 		puppet_call(puppet, SYS_rseq, thread->rseq, thread->rseq_bytes, 1 /* UNREGISTER */,
 			    thread->rseq_signature, 0, 0);
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
-	    remap(member->plan, puppet, err) || manner_put(puppet, branch, notes, err) ||
-	    manner_put_mm(puppet, branch, notes) || place(member, branch, notes, err))
+	    remap(member->plan, puppet, family->copier, err) ||
+	    manner_put(puppet, branch, notes, err) || manner_put_mm(puppet, branch, notes) ||
+	    place(member, branch, notes, err))
 		return -1;
 	if (puppet_put_files(puppet, &family->table[index], err) ||
 	    take_terminal(puppet, branch, notes, err))
@@ -402,6 +408,9 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 			return -1;
 		*last = -1;
 	}
+	/* ... and have all its memory. */
+	if (host >= 0 && copier_finish(family->copier, err))
+		return -1;
 	chores.child = branch->target ? (int)index : -1;
 	chores.last = *last;
 	*last = -1;
@@ -483,7 +492,7 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		if (puppet_run(puppet, err))
 			return -1;
 	}
-	return 0;
+	return copier_finish(family->copier, err);
 }
 
 /* ---- off they go ------------------------------------------------------------------------- */
@@ -588,6 +597,7 @@ void family_free(struct family *family)
 		remap_free(family->member[i].plan);
 		snapshot_free(family->member[i].snapshot);
 	}
+	copier_free(family->copier);
 	snapshot_free(family->first.snapshot);
 	close_fd(&family->first.pidfd);
 	free(family->member);

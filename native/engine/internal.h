@@ -9,6 +9,7 @@
  *   restore.c    templates become the app again
  *   descend.c    a restored process makes its children
  *   remap.c      ... and their memory
+ *   copier.c     ... which a second thread helps to copy
  *   snapshot.c   mappings and pages of a template
  *   manner.c     ... and what else they have
  *   puppet.c     a process that is being made
@@ -916,6 +917,21 @@ const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mappi
 const uint64_t *pages_frames(const struct pages *pages, uint32_t *next, avc_remote address,
 			     avc_remote *end);
 
+/* ---- copier.c ----------------------------------------------------------------------- */
+
+struct copier;
+
+struct copier *copier_new(struct avc_error *err); /* NULL on error */
+/* What is added from here on goes from `template` to `pid`. */
+int copier_open(struct copier *copier, pid_t template, pid_t pid,
+		struct avc_error *err) warn_unused;
+/* One stretch of memory.  `plain`: the mapping may be read and written. */
+int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain,
+	       struct avc_error *err) warn_unused;
+/* Returns when everything is copied. */
+int copier_finish(struct copier *copier, struct avc_error *err) warn_unused;
+void copier_free(struct copier *copier);
+
 /* ---- remap.c ----------------------------------------------------------------------- */
 
 struct remap;
@@ -924,8 +940,10 @@ struct remap;
  * `touched`: an address at which the kernel has written since.  NULL on error. */
 struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
 			 avc_remote touched, struct avc_error *err);
-/* Does it, with a puppet that is in the pad of the plan's target already. */
-int remap(const struct remap *plan, struct puppet *puppet, struct avc_error *err) warn_unused;
+/* Does it, with a puppet that is in the pad of the plan's target already; but the copier
+ * may not have finished. */
+int remap(const struct remap *plan, struct puppet *puppet, struct copier *copier,
+	  struct avc_error *err) warn_unused;
 void remap_free(struct remap *plan);
 
 /* ---- restore.c, for one process of several ----------------------------------------- */

@@ -21,7 +21,6 @@
 #include "internal.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
-#define COPY_BYTES (512u << 10)
 
 /* A stretch that is in one mapping of both at most. */
 struct piece {
@@ -35,6 +34,7 @@ enum page { PAGE_SAME, PAGE_COPY, PAGE_DROP };
 struct run {
 	avc_remote start, end;
 	enum page what;
+	bool plain; /* it may be read and written                           */
 };
 
 struct remap {
@@ -265,12 +265,13 @@ static enum page compare(uint64_t want, uint64_t is)
 	return PAGE_COPY;
 }
 
-static int add_run(struct remap *r, enum page what, avc_remote start, avc_remote end,
-		   struct avc_error *err)
+static int add_run(struct remap *r, const struct mapping *m, enum page what, avc_remote start,
+		   avc_remote end, struct avc_error *err)
 {
+	const bool plain = m->mode[0] == 'r' && m->mode[1] == 'w';
 	struct run *last = r->runs ? &r->run[r->runs - 1] : NULL;
 
-	if (last && last->what == what && last->end == start) {
+	if (last && last->what == what && last->end == start && last->plain == plain) {
 		last->end = end;
 		return 0;
 	}
@@ -283,7 +284,7 @@ static int add_run(struct remap *r, enum page what, avc_remote start, avc_remote
 		r->run = more;
 		r->room = room;
 	}
-	r->run[r->runs++] = (struct run){ start, end, what };
+	r->run[r->runs++] = (struct run){ start, end, what, plain };
 	return 0;
 }
 
@@ -312,55 +313,30 @@ static int compare_piece(struct remap *r, const struct piece *piece, avc_remote 
 			/* The kernel has written to it since (rseq(2)). */
 			if (touched - page < PAGE && want && is_own(want[i]))
 				what = PAGE_COPY;
-			if (what != PAGE_SAME && add_run(r, what, page, page + PAGE, err))
+			if (what != PAGE_SAME &&
+			    add_run(r, piece->want, what, page, page + PAGE, err))
 				return -1;
 		}
 	}
 	return 0;
 }
 
-/* pread(2) of /proc/PID/mem, and not process_vm_readv(2): that pins pages, and a page that
- * is shared is copied for whoever is to have it pinned (mm/gup.c, gup_must_unshare()). */
-static int copy_run(const struct remap *r, const struct puppet *puppet, int from, int to,
-		    uint8_t *buffer, const struct run *run, struct avc_error *err)
+static int fill(const struct remap *r, struct puppet *puppet, struct copier *copier,
+		struct avc_error *err)
 {
-	for (avc_remote at = run->start; at < run->end;) {
-		const size_t bytes = run->end - at < COPY_BYTES ? run->end - at : COPY_BYTES;
-
-		if (pread(from, buffer, bytes, (off_t)at) != (ssize_t)bytes)
-			return fail_errno(err, r->want->template, "restore memory", "read(mem)",
-					  "it can not be read at %lx", (unsigned long)at);
-		if (pwrite(to, buffer, bytes, (off_t)at) != (ssize_t)bytes)
-			return fail_errno(err, puppet->pid, "restore memory", "write(mem)",
-					  "it can not be written at %lx", (unsigned long)at);
-		at += bytes;
-	}
-	return 0;
-}
-
-static int fill(const struct remap *r, struct puppet *puppet, struct avc_error *err)
-{
-	int from = proc_open(r->want->template, "mem", O_RDONLY);
-	int to = proc_open(puppet->pid, "mem", O_RDWR);
-	uint8_t *buffer = malloc(COPY_BYTES);
-	int result = 0;
-
-	if (from < 0 || to < 0 || !buffer)
-		result = fail_errno(err, puppet->pid, "restore memory", "open(mem)",
-				    "it can not be reached");
-	for (uint32_t i = 0; !result && i < r->runs; i++) {
+	if (copier_open(copier, r->want->template, puppet->pid, err))
+		return -1;
+	for (uint32_t i = 0; i < r->runs; i++) {
 		const struct run *run = &r->run[i];
 
-		if (run->what == PAGE_COPY)
-			result = copy_run(r, puppet, from, to, buffer, run, err);
-		else /* the last of them are made with what comes next */
-			result = puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
-					    MADV_DONTNEED, 0, 0, err);
+		/* The last of the calls are made with what comes next. */
+		if (run->what == PAGE_COPY
+			    ? copier_add(copier, run->start, run->end, run->plain, err)
+			    : puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
+					 MADV_DONTNEED, 0, 0, err))
+			return -1;
 	}
-	close_fd(&from);
-	close_fd(&to);
-	free(buffer);
-	return result;
+	return 0;
 }
 
 /* ---- all of it ----------------------------------------------------------------------- */
@@ -389,10 +365,11 @@ failed:
 	return NULL;
 }
 
-int remap(const struct remap *r, struct puppet *puppet, struct avc_error *err)
+int remap(const struct remap *r, struct puppet *puppet, struct copier *copier,
+	  struct avc_error *err)
 {
 	return unmap(r, puppet, err) || move_special(r, puppet, err) || map_new(r, puppet, err) ||
-			       fill(r, puppet, err)
+			       fill(r, puppet, copier, err)
 		       ? -1
 		       : 0;
 }

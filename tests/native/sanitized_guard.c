@@ -29,6 +29,7 @@ static const char *const names[] = { "?",           "attached", "checkpoint", "m
 int main(int argc, char **argv)
 {
 	struct avc_config config = { .keep = 3,
+				     .shm_bytes = 4 << 20,
 				     .restore_on_signal = 1,
 				     .restore_on_exit = 1,
 				     .restore_max = 64,

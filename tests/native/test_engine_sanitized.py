@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from harness import wait_until
+from native.family import kill_main
 from native.guarded import Victim
 from native.init_peer import ROOT
 
@@ -84,7 +85,7 @@ def guarding(program: Path, victim: Victim, interval_ms: int, commands: int, out
     assert status == 0, guard.said
 
 
-@pytest.mark.parametrize("command", ["threads 8 4", "crash", "busy 4"])
+@pytest.mark.parametrize("command", ["threads 8 4", "crash", "busy 4", "tree 8", "prefork 2 1 --private 20"])
 def test_kills_and_restores(command: str, guard_program: Path, tmp_path: Path) -> None:
     rng = random.Random(command)
     with Victim(command, tmp_path) as victim:
@@ -92,7 +93,7 @@ def test_kills_and_restores(command: str, guard_program: Path, tmp_path: Path) -
             guard.wait("checkpoint", 4)
             for n in range(1, 9):
                 time.sleep(rng.uniform(0.01, 0.2))
-                victim.kill_app()
+                kill_main(victim)
                 guard.wait("restored", n)
                 victim.wait_beats(3)
         # The guard has gone in good order: the victim runs on, without it.

@@ -1,0 +1,240 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Copies memory from templates into new processes on a second CPU, while the guard goes
+ * on with everything else that they need, and on both when nothing else is left to do.
+ *
+ * pread(2) and pwrite(2) of /proc/PID/mem, and not process_vm_readv(2): that pins pages,
+ * and a page that is shared is copied for whoever is to have it pinned (mm/gup.c,
+ * gup_must_unshare()).
+ */
+#include <fcntl.h>
+#include <pthread.h>
+#include <stdlib.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define BUFFER_BYTES (256u << 10)
+/* What one of the two takes at a time. */
+#define CHUNK_BYTES (UINT64_C(2) << 20)
+/* Less than this is copied before a thread has been started. */
+#define WORTH_BYTES (UINT64_C(1) << 20)
+
+struct chunk {
+	uint32_t from; /* of the copier's sources                             */
+	avc_remote start, end;
+};
+
+struct source {
+	int from, to;
+	pid_t template, pid;
+};
+
+struct copier {
+	pthread_t thread;
+	bool started, stop;
+	pthread_mutex_t lock;
+	pthread_cond_t changed;
+	struct source *source;
+	uint32_t sources, sources_room;
+	struct chunk *chunk;
+	uint32_t chunks, chunks_room, next, busy;
+	uint8_t *buffer[2]; /* the guard's, the thread's                           */
+	struct avc_error error;
+};
+
+struct copier *copier_new(struct avc_error *err)
+{
+	struct copier *copier = calloc(1, sizeof *copier);
+
+	if (copier)
+		copier->buffer[0] = malloc(BUFFER_BYTES);
+	if (!copier || !copier->buffer[0]) {
+		free(copier);
+		fail_errno(err, 0, "restore memory", "malloc", "out of memory");
+		return NULL;
+	}
+	pthread_mutex_init(&copier->lock, NULL);
+	pthread_cond_init(&copier->changed, NULL);
+	return copier;
+}
+
+static int copy(const struct source *source, uint8_t *buffer, avc_remote start, avc_remote end,
+		struct avc_error *err)
+{
+	for (avc_remote at = start; at < end;) {
+		const size_t bytes = end - at < BUFFER_BYTES ? end - at : BUFFER_BYTES;
+
+		if (pread(source->from, buffer, bytes, (off_t)at) != (ssize_t)bytes)
+			return fail_errno(err, source->template, "restore memory", "read(mem)",
+					  "it can not be read at %lx", (unsigned long)at);
+		if (pwrite(source->to, buffer, bytes, (off_t)at) != (ssize_t)bytes)
+			return fail_errno(err, source->pid, "restore memory", "write(mem)",
+					  "it can not be written at %lx", (unsigned long)at);
+		at += bytes;
+	}
+	return 0;
+}
+
+/* With the lock held, which is let go while it copies. */
+static void take_chunk(struct copier *copier, uint8_t *buffer)
+{
+	const struct chunk chunk = copier->chunk[copier->next++];
+	const struct source source = copier->source[chunk.from];
+	struct avc_error failed = { 0 };
+	int result;
+
+	copier->busy++;
+	pthread_mutex_unlock(&copier->lock);
+	result = copy(&source, buffer, chunk.start, chunk.end, &failed);
+	pthread_mutex_lock(&copier->lock);
+	copier->busy--;
+	if (result && !copier->error.code)
+		copier->error = failed;
+	pthread_cond_broadcast(&copier->changed);
+}
+
+static void *work(void *arg)
+{
+	struct copier *copier = arg;
+
+	pthread_mutex_lock(&copier->lock);
+	while (!copier->stop) {
+		if (copier->next < copier->chunks)
+			take_chunk(copier, copier->buffer[1]);
+		else
+			pthread_cond_wait(&copier->changed, &copier->lock);
+	}
+	pthread_mutex_unlock(&copier->lock);
+	return NULL;
+}
+
+int copier_open(struct copier *copier, pid_t template, pid_t pid, struct avc_error *err)
+{
+	struct source source = {
+		.from = proc_open(template, "mem", O_RDONLY),
+		.to = proc_open(pid, "mem", O_RDWR),
+		.template = template,
+		.pid = pid,
+	};
+	int result = 0;
+
+	if (source.from < 0 || source.to < 0)
+		result = fail_errno(err, pid, "restore memory", "open(mem)",
+				    "it can not be reached");
+	pthread_mutex_lock(&copier->lock);
+	if (!result && copier->sources == copier->sources_room) {
+		const uint32_t room = copier->sources_room ? 2 * copier->sources_room : 8;
+		struct source *more = realloc(copier->source, room * sizeof *more);
+
+		if (more) {
+			copier->source = more;
+			copier->sources_room = room;
+		} else {
+			result = fail_errno(err, 0, "restore memory", "realloc", "out of memory");
+		}
+	}
+	if (!result)
+		copier->source[copier->sources++] = source;
+	pthread_mutex_unlock(&copier->lock);
+	if (result) {
+		close_fd(&source.from);
+		close_fd(&source.to);
+	}
+	return result;
+}
+
+/* With the lock held. */
+static int add_chunks(struct copier *copier, avc_remote start, avc_remote end,
+		      struct avc_error *err)
+{
+	while (start < end) {
+		const avc_remote up_to = end - start > CHUNK_BYTES ? start + CHUNK_BYTES : end;
+
+		if (copier->chunks == copier->chunks_room) {
+			const uint32_t room = copier->chunks_room ? 2 * copier->chunks_room : 64;
+			struct chunk *more = realloc(copier->chunk, room * sizeof *more);
+
+			if (!more)
+				return fail_errno(err, 0, "restore memory", "realloc",
+						  "out of memory");
+			copier->chunk = more;
+			copier->chunks_room = room;
+		}
+		copier->chunk[copier->chunks++] = (struct chunk){ copier->sources - 1, start,
+								  up_to };
+		start = up_to;
+	}
+	return 0;
+}
+
+/* Best effort: without a second thread everything is copied by the first. */
+static void start(struct copier *copier)
+{
+	copier->buffer[1] = malloc(BUFFER_BYTES);
+	copier->started = copier->buffer[1] &&
+			  pthread_create(&copier->thread, NULL, work, copier) == 0;
+}
+
+int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain,
+	       struct avc_error *err)
+{
+	int result;
+
+	/* What its owner may not read or write only its tracer may
+	 * (fs/proc/base.c, proc_mem_foll_force()). */
+	if (!plain || to - from < WORTH_BYTES)
+		return copy(&copier->source[copier->sources - 1], copier->buffer[0], from, to, err);
+	if (!copier->started)
+		start(copier);
+	pthread_mutex_lock(&copier->lock);
+	result = add_chunks(copier, from, to, err);
+	pthread_cond_broadcast(&copier->changed);
+	pthread_mutex_unlock(&copier->lock);
+	return result;
+}
+
+static void close_sources(struct copier *copier)
+{
+	for (; copier->sources; copier->sources--) {
+		close_fd(&copier->source[copier->sources - 1].from);
+		close_fd(&copier->source[copier->sources - 1].to);
+	}
+}
+
+int copier_finish(struct copier *copier, struct avc_error *err)
+{
+	pthread_mutex_lock(&copier->lock);
+	while (copier->next < copier->chunks || copier->busy)
+		if (copier->next < copier->chunks)
+			take_chunk(copier, copier->buffer[0]);
+		else
+			pthread_cond_wait(&copier->changed, &copier->lock);
+	if (copier->error.code)
+		*err = copier->error;
+	close_sources(copier);
+	copier->chunks = copier->next = 0;
+	pthread_mutex_unlock(&copier->lock);
+	return copier->error.code ? -1 : 0;
+}
+
+void copier_free(struct copier *copier)
+{
+	if (!copier)
+		return;
+	pthread_mutex_lock(&copier->lock);
+	copier->next = copier->chunks; /* what is not begun is not wanted any more */
+	copier->stop = true;
+	pthread_cond_broadcast(&copier->changed);
+	pthread_mutex_unlock(&copier->lock);
+	if (copier->started)
+		pthread_join(copier->thread, NULL);
+	close_sources(copier);
+	pthread_mutex_destroy(&copier->lock);
+	pthread_cond_destroy(&copier->changed);
+	free(copier->buffer[0]);
+	free(copier->buffer[1]);
+	free(copier->source);
+	free(copier->chunk);
+	free(copier);
+}
