@@ -831,7 +831,7 @@ void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_
 		 uint64_t e, uint64_t f);
 /* The same, for any number: those before it are made when there is no more room. */
 int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
-	       uint64_t e, struct avc_error *err) warn_unused;
+	       uint64_t e, uint64_t f, struct avc_error *err) warn_unused;
 int puppet_run(struct puppet *puppet, struct avc_error *err) warn_unused;
 int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err) warn_unused;
 int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,

@@ -73,11 +73,11 @@ int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
 
 /* One of any number; those before it are made when there is no more room. */
 int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
-	       uint64_t e, struct avc_error *err)
+	       uint64_t e, uint64_t f, struct avc_error *err)
 {
 	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "mmap", err))
 		return -1;
-	puppet_call(puppet, nr, a, b, c, d, e, 0);
+	puppet_call(puppet, nr, a, b, c, d, e, f);
 	return 0;
 }
 

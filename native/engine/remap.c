@@ -143,7 +143,7 @@ static int unmap(const struct remap *r, struct puppet *puppet, struct avc_error 
 		       r->piece[i + 1].is && !r->piece[i + 1].kept)
 			i++;
 		if (puppet_ask(puppet, SYS_munmap, r->piece[first].start,
-			       r->piece[i].end - r->piece[first].start, 0, 0, 0, err))
+			       r->piece[i].end - r->piece[first].start, 0, 0, 0, 0, err))
 			return -1;
 	}
 	return 0;
@@ -200,46 +200,64 @@ static int open_mapped(pid_t template, const struct mapping *m)
 	return fd >= 0 ? fd : proc_open(template, name, O_RDONLY);
 }
 
-static int map_piece(const struct remap *r, struct puppet *puppet, const struct piece *piece,
-		     struct avc_error *err)
+/* Libraries are mapped in several pieces, one after the other: opened once. */
+static int give_file(const struct remap *r, struct puppet *puppet, const struct mapping *m,
+		     const struct mapping **given, struct avc_error *err)
 {
-	const struct mapping *m = piece->want;
-	int flags = MAP_FIXED | (m->shared ? MAP_SHARED : MAP_PRIVATE | MAP_NORESERVE), fd;
+	int fd, result;
 
-	if (!is_file(m)) {
-		flags |= MAP_ANONYMOUS | (is_stack(m) ? MAP_GROWSDOWN | MAP_STACK : 0);
-		return puppet_ask(puppet, SYS_mmap, piece->start, piece->end - piece->start,
-				  (uint64_t)protection(m), (uint64_t)flags, (uint64_t)-1, err);
-	}
+	if (m && *given && m->device == (*given)->device && m->inode == (*given)->inode &&
+	    m->shared == (*given)->shared)
+		return 0;
+	if (*given && puppet_ask(puppet, SYS_close, 1, 0, 0, 0, 0, 0, err))
+		return -1;
+	*given = m;
+	if (!m)
+		return 0;
 	fd = open_mapped(r->want->template, m);
 	if (fd < 0)
 		return fail_errno(err, puppet->pid, "restore memory", "open(map_files)",
 				  "%s can not be opened", m->name);
-	if (puppet_give(puppet, fd, err)) {
-		close(fd);
-		return -1;
-	}
+	result = puppet_give(puppet, fd, err);
 	close(fd);
-	puppet_call(puppet, SYS_mmap, piece->start, piece->end - piece->start,
-		    (uint64_t)protection(m), (uint64_t)flags, 1,
-		    m->offset + (piece->start - m->start));
-	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	return 0;
+	return result;
+}
+
+static int map_piece(const struct remap *r, struct puppet *puppet, const struct piece *piece,
+		     const struct mapping **given, struct avc_error *err)
+{
+	const struct mapping *m = piece->want;
+	const uint64_t bytes = piece->end - piece->start, prot = (uint64_t)protection(m);
+	const int stack = is_stack(m) ? MAP_GROWSDOWN | MAP_STACK : 0;
+	const int flags = MAP_FIXED | (m->shared ? MAP_SHARED : MAP_PRIVATE | MAP_NORESERVE);
+
+	if (!is_file(m))
+		return puppet_ask(puppet, SYS_mmap, piece->start, bytes, prot,
+				  (uint64_t)(flags | MAP_ANONYMOUS | stack), (uint64_t)-1, 0, err);
+	return give_file(r, puppet, m, given, err) ||
+			       puppet_ask(puppet, SYS_mmap, piece->start, bytes, prot,
+					  (uint64_t)flags, 1, m->offset + (piece->start - m->start),
+					  err)
+		       ? -1
+		       : 0;
 }
 
 static int map_new(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
+	const struct mapping *given = NULL;
+
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (piece->want && !piece->kept && map_piece(r, puppet, piece, err))
+		if (piece->want && !piece->kept && map_piece(r, puppet, piece, &given, err))
 			return -1;
 		if (piece->kept && protection(piece->is) != protection(piece->want) &&
 		    puppet_ask(puppet, SYS_mprotect, piece->start, piece->end - piece->start,
-			       (uint64_t)protection(piece->want), 0, 0, err))
+			       (uint64_t)protection(piece->want), 0, 0, 0, err))
 			return -1;
 	}
-	return puppet_flush(puppet, "mmap", err);
+	return give_file(r, puppet, NULL, &given, err) || puppet_flush(puppet, "mmap", err) ? -1
+											    : 0;
 }
 
 /* ---- pages -------------------------------------------------------------------------- */
@@ -333,7 +351,7 @@ static int fill(const struct remap *r, struct puppet *puppet, struct copier *cop
 		if (run->what == PAGE_COPY
 			    ? copier_add(copier, run->start, run->end, run->plain, err)
 			    : puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
-					 MADV_DONTNEED, 0, 0, err))
+					 MADV_DONTNEED, 0, 0, 0, err))
 			return -1;
 	}
 	return 0;
