@@ -102,7 +102,7 @@ struct chores {
 	struct family *family;
 	int child, host; /* child -1: one that will be a zombie                  */
 	int last;        /* -1: none                                             */
-	struct avc_error *notes, error;
+	struct avc_error error;
 	int result;
 	bool done;
 };
@@ -130,7 +130,8 @@ static int take_back(struct puppet *host, pid_t child, pid_t inside, struct avc_
 {
 	tracee_kill(child);
 	puppet_call(host, SYS_wait4, (uint64_t)inside, 0, __WALL, 0, 0, 0);
-	return puppet_run(host, err);
+	puppet_soften(host, NULL);
+	return puppet_flush(host, err);
 }
 
 /* Forks the host until the child has the number. */
@@ -188,7 +189,8 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 	puppet_call(puppet, SYS_prctl, PR_SET_NAME, remote + 32, 0, 0, 0, 0);
 	if (signal) {
 		puppet_call(puppet, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8, 0, 0);
-		if (puppet_run(puppet, err))
+		puppet_soften(puppet, NULL); /* nobody may change that of SIGKILL */
+		if (puppet_flush(puppet, err))
 			return -1;
 		prlimit(puppet->pid, RLIMIT_CORE, &none, NULL);
 		if (ptrace(PTRACE_SETSIGMASK, puppet->pid, sizeof open_mask, &open_mask))
@@ -223,8 +225,7 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 
 /* Session and group before it has children of its own.  What it has from its parent is
  * right as a rule. */
-static int place(struct member *member, const struct branch *branch, struct avc_error *notes,
-		 struct avc_error *err)
+static int place(struct member *member, const struct branch *branch, struct avc_error *err)
 {
 	struct puppet *puppet = &member->puppet;
 	struct proc_stat stat;
@@ -235,30 +236,24 @@ static int place(struct member *member, const struct branch *branch, struct avc_
 		puppet_call(puppet, SYS_setsid, 0, 0, 0, 0, 0, 0);
 	} else {
 		if (branch->session > 0 && proc_inside(stat.session) != branch->session)
-			fail(notes, AVC_UNSUPPORTED, 0, branch->inside, "restore", "",
+			fail(puppet->notes, AVC_UNSUPPORTED, 0, branch->inside, "restore", "",
 			     "process %d is not in the session it was in, whose leader is gone",
 			     branch->inside);
 		if (branch->group == branch->inside)
 			puppet_call(puppet, SYS_setpgid, 0, 0, 0, 0, 0, 0);
 	}
-	return puppet_flush(puppet, "setsid", err);
+	return 0;
 }
 
 /* The leader of a session gets its terminal before it has children, who inherit it. */
-static int take_terminal(struct puppet *puppet, const struct branch *branch,
-			 struct avc_error *notes, struct avc_error *err)
+static void take_terminal(struct puppet *puppet, const struct branch *branch)
 {
 	const int fd = files_find_device(branch->image->files, branch->image->tty);
 
 	if (!branch->image->tty || branch->session != branch->inside)
-		return 0;
+		return;
 	puppet_call(puppet, SYS_ioctl, (uint64_t)fd, TIOCSCTTY, 0, 0, 0, 0);
-	if (puppet_run(puppet, err))
-		return -1;
-	if (puppet->list[0].result)
-		fail(notes, AVC_KERNEL, (int)-puppet->list[0].result, branch->inside, "restore",
-		     "ioctl(TIOCSCTTY)", "session %d has lost its terminal", branch->inside);
-	return 0;
+	puppet_soften(puppet, "the session that it leads has lost its terminal");
 }
 
 /* Whoever was in the foreground is there again; asked for by anybody in the session. */
@@ -273,12 +268,12 @@ static int put_foreground(struct puppet *puppet, const struct generation *image,
 		return 0;
 	*group = image->tty_group;
 	puppet_call(puppet, SYS_ioctl, (uint64_t)fd, TIOCSPGRP, remote, 0, 0, 0);
-	return puppet_run(puppet, err);
+	puppet_soften(puppet, NULL);
+	return puppet_flush(puppet, err);
 }
 
 /* When all are there: into groups that others lead. */
-static int join_group(struct member *member, const struct branch *branch, struct avc_error *notes,
-		      struct avc_error *err)
+static int join_group(struct member *member, const struct branch *branch, struct avc_error *err)
 {
 	struct puppet *puppet = &member->puppet;
 	struct proc_stat stat;
@@ -289,14 +284,8 @@ static int join_group(struct member *member, const struct branch *branch, struct
 	    proc_inside(stat.group) == branch->group)
 		return 0;
 	puppet_call(puppet, SYS_setpgid, 0, (uint64_t)branch->group, 0, 0, 0, 0);
-	if (puppet_run(puppet, err))
-		return -1;
-	if (puppet->list[0].result)
-		fail(notes, AVC_KERNEL, (int)-puppet->list[0].result, branch->inside, "restore",
-		     "setpgid",
-		     "process %d is not in the process group it was in, whose leader is gone",
-		     branch->inside);
-	return 0;
+	puppet_soften(puppet, "it is not in the process group it was in, whose leader is gone");
+	return puppet_flush(puppet, err);
 }
 
 static struct snapshot *snapshot_of(struct family *family, int branch, struct avc_error *err)
@@ -349,13 +338,12 @@ static void forget_plan(const struct family *family, uint32_t index)
 	member->snapshot = NULL;
 }
 
-static int become(struct family *family, uint32_t index, int host, struct avc_error *notes,
-		  struct avc_error *err)
+static int become(struct family *family, uint32_t index, struct avc_error *err)
 {
 	struct branch *branch = &family->generation->branch[index];
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
-	const struct inj_thread *thread = registered(family, host);
+	const struct inj_thread *thread = registered(family, member->host);
 
 	if (puppet_open_mail(puppet, err))
 		return -1;
@@ -364,12 +352,12 @@ static int become(struct family *family, uint32_t index, int host, struct avc_er
 		puppet_call(puppet, SYS_rseq, thread->rseq, thread->rseq_bytes, 1 /* UNREGISTER */,
 			    thread->rseq_signature, 0, 0);
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
-	    remap(member->plan, puppet, family->copier, err) ||
-	    manner_put(puppet, branch, notes, err) || manner_put_mm(puppet, branch, notes) ||
-	    place(member, branch, notes, err))
+	    remap(member->plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
+	    place(member, branch, err) || puppet_put_files(puppet, &family->table[index], err))
 		return -1;
-	if (puppet_put_files(puppet, &family->table[index], err) ||
-	    take_terminal(puppet, branch, notes, err))
+	take_terminal(puppet, branch);
+	manner_put_limits(puppet, branch); /* it may have more open than it may open now */
+	if (puppet_flush(puppet, err))
 		return -1;
 	close_fd(&puppet->socket);
 	forget_plan(family, index);
@@ -388,23 +376,20 @@ static void do_chores(void *arg)
 	    plan_memory(family, (uint32_t)chores->child, chores->host, &chores->error))
 		chores->result = -1;
 	else if (chores->last >= 0)
-		chores->result = become(family, (uint32_t)chores->last,
-					family->member[chores->last].host, chores->notes,
-					&chores->error);
+		chores->result = become(family, (uint32_t)chores->last, &chores->error);
 }
 
 /* `last` is the one that was forked last and is not yet what it is to be; -1: none. */
-static int make_member(struct family *family, uint32_t index, int *last, struct avc_error *notes,
-		       struct avc_error *err)
+static int make_member(struct family *family, uint32_t index, int *last, struct avc_error *err)
 {
 	const struct branch *branch = &family->generation->branch[index];
 	const int host = host_of(family, branch);
 	struct member *member = &family->member[index], *by = member_of(family, host);
-	struct chores chores = { .family = family, .host = host, .notes = notes };
+	struct chores chores = { .family = family, .host = host };
 
 	/* It has to be itself before it has children. */
 	if (*last >= 0 && host == *last) {
-		if (become(family, (uint32_t)*last, family->member[*last].host, notes, err))
+		if (become(family, (uint32_t)*last, err))
 			return -1;
 		*last = -1;
 	}
@@ -420,6 +405,7 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 	member->host = host;
 	member->puppet = by->puppet;
 	member->puppet.pid = member->pid;
+	member->puppet.inside = branch->inside;
 	member->puppet.socket = -1;
 	member->pidfd = proc_pidfd_open(member->pid);
 	if (member->pidfd < 0)
@@ -450,6 +436,8 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	first->pid = first->puppet.pid = main_pid;
 	first->traced = true;
 	first->pidfd = proc_pidfd_open(main_pid);
+	first->puppet.inside = slot->pid;
+	first->puppet.notes = notes;
 	puppet_enter(&first->puppet, &family->main->pad, generation->slot);
 	if (first->pidfd < 0 ||
 	    ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)TRACE_OPTIONS_OURS) ||
@@ -459,17 +447,17 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		puppet_call(&first->puppet, SYS_setsid, 0, 0, 0, 0, 0, 0);
 	else
 		puppet_call(&first->puppet, SYS_setpgid, 0, (uint64_t)slot->group, 0, 0, 0, 0);
-	if (puppet_flush(&first->puppet, "setsid", err))
+	if (puppet_flush(&first->puppet, err))
 		return -1;
 	slot->placed = 1;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (make_member(family, i, &last, notes, err))
+		if (make_member(family, i, &last, err))
 			return -1;
-	if (last >= 0 && become(family, (uint32_t)last, family->member[last].host, notes, err))
+	if (last >= 0 && become(family, (uint32_t)last, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
-		    join_group(&family->member[i], &generation->branch[i], notes, err))
+		    join_group(&family->member[i], &generation->branch[i], err))
 			return -1;
 	for (int i = -1; i < (int)generation->branches; i++)
 		if ((i < 0 || (generation->branch[i].target &&
@@ -489,7 +477,8 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		data[0] = UINT64_C(1) << (SIGCHLD - 1);
 		data[1] = data[2] = 0;
 		puppet_call(puppet, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8, 0, 0);
-		if (puppet_run(puppet, err))
+		puppet_soften(puppet, NULL);
+		if (puppet_flush(puppet, err))
 			return -1;
 	}
 	return copier_finish(family->copier, err);

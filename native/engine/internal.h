@@ -812,6 +812,8 @@ int restore(struct target *target, struct generation *generation, const struct l
 /* ---- puppet.c ----------------------------------------------------------------------- */
 
 /* A task that a restored process has forked, and that is made what a template is. */
+#define PUPPET_SOFTS 24
+
 struct puppet {
 	pid_t pid;
 	const struct pad *pad; /* the one it runs in                              */
@@ -819,24 +821,29 @@ struct puppet {
 	struct arch_regs base;
 	struct inj_syscall *list; /* in the pad: calls not made yet                  */
 	uint32_t listed, list_max;
+	uint8_t *data; /* in the pad: for what the calls refer to             */
+	struct soft {
+		uint32_t index;
+		const char *problem;
+	} soft[PUPPET_SOFTS]; /* of the calls, those that may fail                  */
+	uint32_t softs;
+	pid_t inside; /* for notes: what did fail                            */
+	struct avc_error *notes;
 	int socket; /* ours, through which it gets descriptors; -1     */
 };
 
 /* From now on it runs in that pad. */
 void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot);
-/* One more call.  The calls listed are made by puppet_run(), which leaves the results in
- * puppet->list; puppet_flush() also tells the first that failed, puppet_flush_some() of the
- * first `count` ones. */
+/* One more call.  All of them are made by puppet_flush(), which leaves the results in
+ * puppet->list and tells the first that failed. */
 void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
 		 uint64_t e, uint64_t f);
 /* The same, for any number: those before it are made when there is no more room. */
 int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
 	       uint64_t e, uint64_t f, struct avc_error *err) warn_unused;
-int puppet_run(struct puppet *puppet, struct avc_error *err) warn_unused;
-int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err) warn_unused;
-int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
-		      struct avc_error *err) warn_unused;
-/* Room for arguments of calls. */
+/* The last one may fail: then `problem`, if any, is noted. */
+void puppet_soften(struct puppet *puppet, const char *problem);
+int puppet_flush(struct puppet *puppet, struct avc_error *err) warn_unused;
 void *puppet_data(const struct puppet *puppet, avc_remote *remote);
 /* Closes what it has from its parent; from here on it can be given descriptors, each to be
  * number 1 until that is closed. */
@@ -857,10 +864,10 @@ int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
 void branch_forget(struct branch *branch);
 /* A restored process gets it; what is allowed to fail is told in *notes. */
-int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
+int manner_put(struct puppet *puppet, const struct branch *branch,
 	       struct avc_error *err) warn_unused;
-int manner_put_mm(struct puppet *puppet, const struct branch *branch,
-		  struct avc_error *notes) warn_unused;
+/* When it has everything open: there may be more of it than may be opened. */
+void manner_put_limits(struct puppet *puppet, const struct branch *branch);
 
 /* ---- descend.c ------------------------------------------------------------------------- */
 

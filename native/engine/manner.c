@@ -147,61 +147,55 @@ void branch_forget(struct branch *branch)
 
 /* ---- a restore ------------------------------------------------------------------------ */
 
-int manner_put_mm(struct puppet *puppet, const struct branch *branch, struct avc_error *notes)
-{
-	const struct manner *manner = branch->manner;
-	struct {
+/* What the calls refer to, in the puppet's memory. */
+struct arguments {
+	struct action action[SIGNALS];
+	uint64_t limit[LIMITS][2];
+	struct { /* struct prctl_mm_map                                     */
 		uint64_t mm[11];
 		uint64_t auxv;
 		uint32_t auxv_bytes, exe_fd;
 	} map;
-	const avc_remote at = pad_remote(puppet->pad, puppet->list + puppet->list_max / 2);
-	uint8_t *here = (uint8_t *)(puppet->list + puppet->list_max / 2);
-	struct avc_error failed = { 0 };
+	uint8_t auxv[AUXV_BYTES];
+};
 
-	memcpy(map.mm, manner->mm, sizeof map.mm);
-	map.mm[BRK] = (uint64_t)manner->brk;
-	map.auxv = manner->auxv_bytes ? at + sizeof map : 0;
-	map.auxv_bytes = manner->auxv_bytes;
-	map.exe_fd = ~0u;
-	memcpy(here, &map, sizeof map);
-	memcpy(here + sizeof map, manner->auxv, manner->auxv_bytes);
-	puppet_call(puppet, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP, at, sizeof map, 0, 0);
-	if (puppet_flush(puppet, "prctl(SET_MM_MAP)", &failed) == 0)
-		return 0;
-	/* Only what `ps` shows, and where its heap may grow. */
-	if (failed.code != AVC_KERNEL || !failed.errnum)
-		return -1;
-	if (!notes->code)
-		*notes = failed;
-	return 0;
-}
-
-/* With what is listed already; a limit that may not be raised is told. */
-static int put_limits(struct puppet *puppet, const struct branch *branch, uint64_t limit[][2],
-		      struct avc_error *notes, struct avc_error *err)
+static struct arguments *arguments_of(const struct puppet *puppet)
 {
-	const uint32_t first = puppet->listed;
-
-	memcpy(limit, branch->manner->limit, sizeof branch->manner->limit);
-	for (uint64_t i = 0; i < LIMITS; i++)
-		puppet_call(puppet, SYS_prlimit64, 0, i, pad_remote(puppet->pad, &limit[i]), 0, 0,
-			    0);
-	if (puppet_flush_some(puppet, first, "rt_sigaction", err))
-		return -1;
-	for (int i = 0; i < LIMITS; i++)
-		if (puppet->list[first + (uint32_t)i].result)
-			fail(notes, AVC_KERNEL, (int)-puppet->list[first + (uint32_t)i].result,
-			     branch->inside, "restore", "prlimit",
-			     "a resource limit could not be put back");
-	return 0;
+	return (struct arguments *)puppet->data;
 }
 
-int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *notes,
-	       struct avc_error *err)
+/* Only what `ps` shows, and where its heap may grow. */
+static void put_mm(struct puppet *puppet, const struct manner *manner)
+{
+	struct arguments *arguments = arguments_of(puppet);
+
+	memcpy(arguments->map.mm, manner->mm, sizeof manner->mm);
+	memcpy(arguments->auxv, manner->auxv, manner->auxv_bytes);
+	arguments->map.mm[BRK] = (uint64_t)manner->brk;
+	arguments->map.auxv = manner->auxv_bytes ? pad_remote(puppet->pad, arguments->auxv) : 0;
+	arguments->map.auxv_bytes = manner->auxv_bytes;
+	arguments->map.exe_fd = ~0u;
+	puppet_call(puppet, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP,
+		    pad_remote(puppet->pad, &arguments->map), sizeof arguments->map, 0, 0);
+	puppet_soften(puppet, "what it knows of its heap and arguments could not be put back");
+}
+
+void manner_put_limits(struct puppet *puppet, const struct branch *branch)
+{
+	struct arguments *arguments = arguments_of(puppet);
+
+	memcpy(arguments->limit, branch->manner->limit, sizeof arguments->limit);
+	for (uint64_t i = 0; i < LIMITS; i++) {
+		puppet_call(puppet, SYS_prlimit64, 0, i,
+			    pad_remote(puppet->pad, &arguments->limit[i]), 0, 0, 0);
+		puppet_soften(puppet, "a resource limit could not be put back");
+	}
+}
+
+int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
 {
 	const struct manner *manner = branch->manner;
-	struct action *actions = (struct action *)(puppet->list + puppet->list_max / 2);
+	struct arguments *arguments = arguments_of(puppet);
 	int cwd = proc_open(branch->image->template, "cwd", O_PATH | O_DIRECTORY);
 
 	if (cwd < 0 || puppet_give(puppet, cwd, err)) {
@@ -214,10 +208,12 @@ int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_er
 	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
 	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
 	puppet_call(puppet, SYS_personality, (uint64_t)manner->personality, 0, 0, 0, 0, 0);
-	memcpy(actions, manner->action, sizeof manner->action);
+	memcpy(arguments->action, manner->action, sizeof arguments->action);
 	for (int i = 0; i < SIGNALS; i++)
-		if (i + 1 != SIGKILL && i + 1 != SIGSTOP)
-			puppet_call(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
-				    pad_remote(puppet->pad, &actions[i]), 0, 8, 0, 0);
-	return put_limits(puppet, branch, (uint64_t(*)[2])(actions + SIGNALS), notes, err);
+		if (i + 1 != SIGKILL && i + 1 != SIGSTOP &&
+		    puppet_ask(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
+			       pad_remote(puppet->pad, &arguments->action[i]), 0, 8, 0, 0, err))
+			return -1;
+	put_mm(puppet, manner);
+	return 0;
 }

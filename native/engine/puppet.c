@@ -10,17 +10,18 @@
 
 #include "internal.h"
 
-/* The list of calls is where files_restore.c has its own, which is not in use any more. */
+/* The list of calls is where files_restore.c has its own, which is not in use any more;
+ * what they refer to is behind it. */
 void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot)
 {
-	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2 + sizeof(struct files_letter);
+	uint8_t *memory = pad_files(pad, slot) + INJ_FILES_BYTES / 2;
 
 	puppet->pad = pad;
 	puppet->call = &pad->control->holder;
-	puppet->list = (struct inj_syscall *)(((uintptr_t)memory + 63) & ~(uintptr_t)63);
-	puppet->list_max = (INJ_FILES_BYTES / 2 - sizeof(struct files_letter) - 64) /
-			   sizeof *puppet->list;
-	puppet->listed = 0;
+	puppet->list = (struct inj_syscall *)memory;
+	puppet->list_max = INJ_FILES_BYTES / 4 / sizeof *puppet->list;
+	puppet->data = memory + INJ_FILES_BYTES / 4;
+	puppet->listed = puppet->softs = 0;
 }
 
 void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
@@ -32,7 +33,13 @@ void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_
 	puppet->listed++;
 }
 
-int puppet_run(struct puppet *puppet, struct avc_error *err)
+void puppet_soften(struct puppet *puppet, const char *problem)
+{
+	if (puppet->softs < PUPPET_SOFTS)
+		puppet->soft[puppet->softs++] = (struct soft){ puppet->listed - 1, problem };
+}
+
+static int run(struct puppet *puppet, struct avc_error *err)
 {
 	const uint32_t listed = puppet->listed;
 
@@ -41,7 +48,7 @@ int puppet_run(struct puppet *puppet, struct avc_error *err)
 		return 0;
 	if (listed > puppet->list_max)
 		return fail(err, AVC_UNSUPPORTED, 0, puppet->pid, "restore", "",
-			    "it has more mappings than there is room for");
+			    "there is no room for so many system calls");
 	call_begin(puppet->call, INJ_AFTER_PARK);
 	call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list), listed, 0, 0, 0);
 	return pad_send(puppet->pad, puppet->pid, &puppet->base, puppet->call, err) ||
@@ -50,38 +57,71 @@ int puppet_run(struct puppet *puppet, struct avc_error *err)
 		       : 0;
 }
 
-/* Only the first `count` have to succeed. */
-int puppet_flush_some(struct puppet *puppet, uint32_t count, const char *what,
-		      struct avc_error *err)
+static const char *name_of(long nr)
 {
-	if (puppet_run(puppet, err))
-		return -1;
-	for (uint32_t i = 0; i < count; i++) {
-		const struct inj_syscall *s = &puppet->list[i];
+	static const struct {
+		long nr;
+		const char *name;
+	} names[] = {
+		{ SYS_mmap, "mmap" },         { SYS_munmap, "munmap" },
+		{ SYS_mprotect, "mprotect" }, { SYS_mremap, "mremap" },
+		{ SYS_madvise, "madvise" },   { SYS_recvmsg, "recvmsg" },
+		{ SYS_dup3, "dup3" },         { SYS_fcntl, "fcntl" },
+		{ SYS_fchdir, "fchdir" },     { SYS_rt_sigaction, "rt_sigaction" },
+		{ SYS_prlimit64, "prlimit" }, { SYS_prctl, "prctl" },
+		{ SYS_setsid, "setsid" },     { SYS_setpgid, "setpgid" },
+		{ SYS_ioctl, "ioctl" },       { SYS_socketpair, "socketpair" },
+	};
 
-		if (s->result < 0 && s->result > -4096)
-			return fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore", what,
-				    "call %u of %u at %lx", i + 1, count, (unsigned long)s->arg[0]);
-	}
-	return 0;
+	for (size_t i = 0; i < sizeof names / sizeof *names; i++)
+		if (names[i].nr == nr)
+			return names[i].name;
+	return "";
 }
 
-int puppet_flush(struct puppet *puppet, const char *what, struct avc_error *err)
+static const struct soft *soft_of(const struct puppet *puppet, uint32_t index)
 {
-	return puppet_flush_some(puppet, puppet->listed, what, err);
+	for (uint32_t i = 0; i < puppet->softs; i++)
+		if (puppet->soft[i].index == index)
+			return &puppet->soft[i];
+	return NULL;
+}
+
+int puppet_flush(struct puppet *puppet, struct avc_error *err)
+{
+	const uint32_t listed = puppet->listed;
+	int result = run(puppet, err);
+
+	for (uint32_t i = 0; !result && i < listed; i++) {
+		const struct inj_syscall *s = &puppet->list[i];
+		const struct soft *soft;
+
+		if (s->result >= 0 || s->result <= -4096)
+			continue;
+		soft = soft_of(puppet, i);
+		if (!soft)
+			result = fail(err, AVC_KERNEL, (int)-s->result, puppet->pid, "restore",
+				      name_of(s->nr), "call %u of %u at %lx", i + 1, listed,
+				      (unsigned long)s->arg[0]);
+		else if (soft->problem)
+			fail(puppet->notes, AVC_KERNEL, (int)-s->result, puppet->inside, "restore",
+			     name_of(s->nr), "%s", soft->problem);
+	}
+	puppet->softs = 0;
+	return result;
 }
 
 /* One of any number; those before it are made when there is no more room. */
 int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
 	       uint64_t e, uint64_t f, struct avc_error *err)
 {
-	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "mmap", err))
+	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, err))
 		return -1;
 	puppet_call(puppet, nr, a, b, c, d, e, f);
 	return 0;
 }
 
-/* Room for arguments, behind the list of calls. */
+/* A little room for arguments, until the next flush. */
 void *puppet_data(const struct puppet *puppet, avc_remote *remote)
 {
 	void *data = puppet->call->out;
@@ -110,7 +150,7 @@ int puppet_open_mail(struct puppet *puppet, struct avc_error *err)
 	(void)puppet_data(puppet, &out);
 	puppet_call(puppet, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
 	puppet_call(puppet, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
-	if (puppet_flush(puppet, "socketpair", err))
+	if (puppet_flush(puppet, err))
 		return -1;
 	pidfd = proc_pidfd_open(puppet->pid);
 	puppet->socket = pidfd < 0 ? -1 : files_borrow(pidfd, 1);
@@ -124,11 +164,10 @@ int puppet_open_mail(struct puppet *puppet, struct avc_error *err)
 int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
 {
 	/* What is not received yet waits in the socket. */
-	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "recvmsg", err))
+	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, err))
 		return -1;
 	if (files_send(puppet->socket, fd)) {
-		if (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
-		    files_send(puppet->socket, fd))
+		if (errno != EAGAIN || puppet_flush(puppet, err) || files_send(puppet->socket, fd))
 			return fail_errno(err, puppet->pid, "restore", "sendmsg",
 					  "a descriptor could not be handed over");
 	}
@@ -149,13 +188,14 @@ int puppet_change_pad(struct puppet *puppet, const struct target *target, uint32
 	puppet_call(puppet, SYS_mmap, pad->base + INJ_CODE_BYTES, pad->bytes - INJ_CODE_BYTES,
 		    PAD_DATA_PROT, PAD_FLAGS, 1, INJ_CODE_BYTES);
 	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	if (puppet_flush(puppet, "mmap", err))
+	if (puppet_flush(puppet, err))
 		return -1;
 	puppet_enter(puppet, pad, slot);
 	return 0;
 }
 
-/* In order; what is received comes to the lowest number that is free. */
+/* In order; what is received comes to the lowest number that is free.  The last of the calls
+ * are made with what comes next. */
 int puppet_put_files(struct puppet *puppet, const struct files_table *table, struct avc_error *err)
 {
 	int socket = 0, lowest = 0;
@@ -179,7 +219,7 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table, str
 				break;
 		}
 		if (files_send(puppet->socket, table->entry[i].ours) &&
-		    (errno != EAGAIN || puppet_flush(puppet, "recvmsg", err) ||
+		    (errno != EAGAIN || puppet_flush(puppet, err) ||
 		     files_send(puppet->socket, table->entry[i].ours)))
 			return fail_errno(err, puppet->pid, "restore", "sendmsg",
 					  "a descriptor could not be handed over");
@@ -192,9 +232,9 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table, str
 		} else if (!table->entry[i].cloexec) {
 			puppet_call(puppet, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
 		}
-		if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, "dup3", err))
+		if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, err))
 			return -1;
 	}
 	puppet_call(puppet, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
-	return puppet_flush(puppet, "dup3", err);
+	return 0;
 }

@@ -256,8 +256,7 @@ static int map_new(const struct remap *r, struct puppet *puppet, struct avc_erro
 			       (uint64_t)protection(piece->want), 0, 0, 0, err))
 			return -1;
 	}
-	return give_file(r, puppet, NULL, &given, err) || puppet_flush(puppet, "mmap", err) ? -1
-											    : 0;
+	return give_file(r, puppet, NULL, &given, err) || puppet_flush(puppet, err) ? -1 : 0;
 }
 
 /* ---- pages -------------------------------------------------------------------------- */

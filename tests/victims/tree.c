@@ -15,6 +15,7 @@
  * ended, so that it is a child of init.  --reaper: some adopt orphans themselves.
  * Counter 0: laps of all in shared memory; 1: records received by the main process.
  */
+#include <sys/resource.h>
 #include <sys/socket.h>
 
 #include "channel.h"
@@ -144,6 +145,26 @@ struct worker {
 
 static struct worker self;
 
+/* More is open than may be opened now. */
+enum { HIGH_FD = 300, FEW_FDS = 250 };
+
+static void lower_limit(void)
+{
+	const struct rlimit few = { FEW_FDS, FEW_FDS };
+
+	must(dup2(self.ends.in.fd, HIGH_FD) == HIGH_FD, "dup2");
+	must(setrlimit(RLIMIT_NOFILE, &few) == 0, "setrlimit");
+}
+
+static void check_limit(void)
+{
+	struct rlimit is = { 0, 0 };
+
+	CHECK(fcntl(HIGH_FD, F_GETFD) == 0, "descriptor %d: %s", HIGH_FD, strerror(errno));
+	CHECK(getrlimit(RLIMIT_NOFILE, &is) == 0 && is.rlim_cur == FEW_FDS, "RLIMIT_NOFILE is %ld",
+	      (long)is.rlim_cur);
+}
+
 static void *listen_down(void *unused)
 {
 	(void)unused;
@@ -213,6 +234,8 @@ static _Noreturn void work(void)
 		send_some(&self.ring_out, &me.random);
 		if (next_random(&me.random) % 8 == 0)
 			check_children_file();
+		if (self.kind == MEMBER)
+			check_limit();
 		if (self.kind == ZOMBIES)
 			check_zombies();
 		else if (self.kind != WAITER)
@@ -290,6 +313,7 @@ static _Noreturn void be_worker(void)
 		while (!shared->leader[self.number - 1])
 			nap(500);
 		must(setpgid(0, shared->leader[self.number - 1]) == 0, "setpgid");
+		lower_limit();
 	}
 	shared->leader[self.number] = getpid();
 	if (self.kind == GROUP || self.kind == WAITER)
