@@ -41,6 +41,7 @@ STATIC = [
     "tree 8 --reaper",
     "prefork 4 20",
     "prefork 2 1 --private 20",
+    "prefork 2 100 --sparse",
     "terminal",
 ]
 """The processes stay the same."""

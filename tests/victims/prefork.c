@@ -1,11 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * prefork WORKERS MB [--touch KB] [--private MB]: a server that loads its data and
+ * prefork WORKERS MB [--touch KB] [--private MB] [--sparse]: a server that loads its data and
  * then forks its workers, which share it.
  *
  * Each worker has changed the first KB kilobytes (64) of the data for itself, and
  * goes on reading all of it.  With --private MB the workers execute the program
- * anew and have MB of memory of their own instead.
+ * anew and have MB of memory of their own instead.  With --sparse they have
+ * given back every other page.
  * Counter 0: pages read by workers; 7 + i: laps of worker i (the first 24).
  */
 #include "family.h"
@@ -14,6 +15,7 @@ enum { PAGE_WORDS = 512 };
 
 static uint64_t *memory;
 static size_t pages, touched;
+static bool sparse;
 static const char *board_path;
 
 static void fill(size_t mb)
@@ -30,6 +32,8 @@ static void fill(size_t mb)
 
 static uint64_t belongs(size_t page, int worker)
 {
+	if (sparse && worker && page % 2)
+		return 0;
 	return mix(page, page < touched && worker ? (uint64_t)worker + 1 : 1);
 }
 
@@ -38,7 +42,9 @@ static _Noreturn void work(int number)
 	uint64_t random = (uint64_t)number + 1, laps;
 	size_t page;
 
-	for (page = 0; page < touched && page < pages; page++)
+	for (page = 1; sparse && page < pages; page += 2)
+		must(madvise(memory + page * PAGE_WORDS, 4096, MADV_DONTNEED) == 0, "madvise");
+	for (page = 0; page < touched && page < pages; page += sparse ? 2 : 1)
 		memory[page * PAGE_WORDS] = belongs(page, number);
 	for (laps = 1;; laps++) {
 		int i;
@@ -99,6 +105,7 @@ int main(int argc, char **argv)
 
 	if (argc > 4 && !strcmp(argv[1], "--worker"))
 		work_execed(argv);
+	sparse = victim_flag(&argc, argv, "--sparse");
 	touched = 16;
 	for (i = 1; i + 1 < argc; i++) {
 		if (!strcmp(argv[i], "--touch"))
@@ -108,7 +115,7 @@ int main(int argc, char **argv)
 		else if (!strcmp(argv[i], "--board"))
 			board_path = argv[i + 1];
 	}
-	victim_start(&argc, argv, 2, "WORKERS MB [--touch KB] [--private MB]");
+	victim_start(&argc, argv, 2, "WORKERS MB [--touch KB] [--private MB] [--sparse]");
 	workers = atoi(argv[1]);
 	family.main = getpid();
 	know_family("prefork");
