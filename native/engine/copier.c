@@ -202,14 +202,25 @@ static void close_sources(struct copier *copier)
 	}
 }
 
+bool copier_help(struct copier *copier)
+{
+	bool more;
+
+	pthread_mutex_lock(&copier->lock);
+	if (copier->next < copier->chunks)
+		take_chunk(copier, copier->buffer[0]);
+	else if (copier->busy)
+		pthread_cond_wait(&copier->changed, &copier->lock);
+	more = copier->next < copier->chunks || copier->busy;
+	pthread_mutex_unlock(&copier->lock);
+	return more;
+}
+
 int copier_finish(struct copier *copier, struct avc_error *err)
 {
+	while (copier_help(copier))
+		;
 	pthread_mutex_lock(&copier->lock);
-	while (copier->next < copier->chunks || copier->busy)
-		if (copier->next < copier->chunks)
-			take_chunk(copier, copier->buffer[0]);
-		else
-			pthread_cond_wait(&copier->changed, &copier->lock);
 	if (copier->error.code)
 		*err = copier->error;
 	close_sources(copier);

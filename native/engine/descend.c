@@ -21,6 +21,7 @@
 
 #define TRIES 64
 #define TRY_AGAIN_US 200
+#define STEP_NS (5 * NS_PER_S)
 
 struct member {
 	pid_t pid; /* 0: not made yet                                         */
@@ -37,6 +38,8 @@ struct family {
 	struct target *main;
 	struct generation *generation;
 	struct last_pid *helper;
+	struct link *link;
+	timer_t timer;
 	const struct files_table *table; /* by branch                            */
 	struct copier *copier;
 	bool flush;            /* some have had children that ended                  */
@@ -45,8 +48,8 @@ struct family {
 };
 
 struct family *family_new(struct target *main, struct generation *generation,
-			  struct last_pid *helper, const struct files_table *table,
-			  struct avc_error *err)
+			  struct last_pid *helper, struct link *link, timer_t timer,
+			  const struct files_table *table, struct avc_error *err)
 {
 	struct family *family = calloc(1, sizeof *family);
 
@@ -64,6 +67,8 @@ struct family *family_new(struct target *main, struct generation *generation,
 	family->main = main;
 	family->generation = generation;
 	family->helper = helper;
+	family->link = link;
+	family->timer = timer;
 	family->table = table;
 	family->first.pidfd = family->first.puppet.socket = -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
@@ -379,6 +384,20 @@ static void do_chores(void *arg)
 		chores->result = become(family, (uint32_t)chores->last, &chores->error);
 }
 
+/* How long all of it takes depends on how much there is: deadlines are for each step. */
+static void go_on(struct family *family)
+{
+	tracee_deadline_set(family->timer, STEP_NS);
+	link_working(family->link);
+}
+
+static int finish_copies(struct family *family, struct avc_error *err)
+{
+	while (copier_help(family->copier))
+		go_on(family);
+	return copier_finish(family->copier, err);
+}
+
 /* `last` is the one that was forked last and is not yet what it is to be; -1: none. */
 static int make_member(struct family *family, uint32_t index, int *last, struct avc_error *err)
 {
@@ -387,6 +406,7 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 	struct member *member = &family->member[index], *by = member_of(family, host);
 	struct chores chores = { .family = family, .host = host };
 
+	go_on(family);
 	/* It has to be itself before it has children. */
 	if (*last >= 0 && host == *last) {
 		if (become(family, (uint32_t)*last, err))
@@ -394,7 +414,7 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 		*last = -1;
 	}
 	/* ... and have all its memory. */
-	if (host >= 0 && copier_finish(family->copier, err))
+	if (host >= 0 && finish_copies(family, err))
 		return -1;
 	chores.child = branch->target ? (int)index : -1;
 	chores.last = *last;
@@ -455,6 +475,8 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 			return -1;
 	if (last >= 0 && become(family, (uint32_t)last, err))
 		return -1;
+	if (finish_copies(family, err))
+		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
 		    join_group(&family->member[i], &generation->branch[i], err))
@@ -481,7 +503,7 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		if (puppet_flush(puppet, err))
 			return -1;
 	}
-	return copier_finish(family->copier, err);
+	return 0;
 }
 
 /* ---- off they go ------------------------------------------------------------------------- */

@@ -63,7 +63,6 @@ struct avc_guard {
 	bool vouching;                 /* somebody says when the app is healthy    */
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
-	uint32_t verdict_seq;
 	struct files_written *written; /* avckpt.files=strict; NULL: not yet        */
 };
 

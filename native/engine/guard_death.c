@@ -16,7 +16,7 @@ static int say_restored(void *arg, struct avc_error *err)
 {
 	struct avc_guard *guard = arg;
 
-	return link_verdict(&guard->link, guard->verdict_seq, AVC_VERDICT_RESTORED, err);
+	return link_verdict(&guard->link, AVC_VERDICT_RESTORED, err);
 }
 
 static uint32_t restores_within(const struct avc_guard *guard, uint64_t now)
@@ -66,7 +66,7 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	struct avc_event event = event_new(guard, AVC_EVENT_GAVE_UP);
 	struct avc_error ignored = { 0 };
 
-	(void)link_verdict(&guard->link, report->seq, AVC_VERDICT_GIVE_UP, &ignored);
+	(void)link_verdict(&guard->link, AVC_VERDICT_GIVE_UP, &ignored);
 	event.reason = reason;
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
@@ -137,7 +137,6 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			drop_all(guard);
 			break;
 		}
-		guard->verdict_seq = report->seq;
 		if (restore(target, generation, &guard->link, config, guard->timer,
 			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
 			    &failed)) {
@@ -222,6 +221,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	enum avc_reason reason;
 
 	urgent_begin();
+	guard->link.death = report->seq;
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
 	emit(guard, &event);

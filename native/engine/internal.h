@@ -380,7 +380,9 @@ struct link {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
-	int pidns_fd; /* of the container                                 */
+	int pidns_fd;        /* of the container                                 */
+	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
+	uint64_t working_ns; /* when it was last told that it takes longer          */
 };
 
 /* ---- tracee.c ---------------------------------------------------------------- */
@@ -803,7 +805,7 @@ struct restore_times {
 /* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
  * there, before anything runs: it sends the verdict.  On success *pid is the new
  * main process. */
-int restore(struct target *target, struct generation *generation, const struct link *link,
+int restore(struct target *target, struct generation *generation, struct link *link,
 	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
 	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
 	    struct restore_times *times, struct avc_error *notes,
@@ -875,8 +877,8 @@ void manner_put_limits(struct puppet *puppet, const struct branch *branch);
  * `table`: of each branch. */
 struct family;
 struct family *family_new(struct target *main, struct generation *generation,
-			  struct last_pid *helper, const struct files_table *table,
-			  struct avc_error *err);
+			  struct last_pid *helper, struct link *link, timer_t timer,
+			  const struct files_table *table, struct avc_error *err);
 /* The main process (a stopped tracee) brings forth the others. */
 int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		struct avc_error *err) warn_unused;
@@ -935,6 +937,8 @@ int copier_open(struct copier *copier, pid_t template, pid_t pid,
 /* One stretch of memory.  `plain`: the mapping may be read and written. */
 int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain,
 	       struct avc_error *err) warn_unused;
+/* Lends a hand; false when nothing is left. */
+bool copier_help(struct copier *copier);
 /* Returns when everything is copied. */
 int copier_finish(struct copier *copier, struct avc_error *err) warn_unused;
 void copier_free(struct copier *copier);
@@ -1018,8 +1022,10 @@ pid_t link_app(const struct link *link);
 void link_arm(struct link *link, bool armed);
 bool link_stop_asked(const struct link *link);
 int link_report(struct link *link, struct avc_report *report);
-int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind,
-		 struct avc_error *err);
+/* Of the last death.  init waits for only so long, and anew from each link_working() on,
+ * which may be called as often as there is progress. */
+int link_verdict(const struct link *link, enum avc_verdict_kind kind, struct avc_error *err);
+void link_working(struct link *link);
 /* Kills and reaps the children of init that are tracees of ours but not known:
  * clones of which we never heard, because the thread that made them was killed before
  * it could tell.  They would keep the app's number (as a process group's) and, as

@@ -20,6 +20,7 @@
 #define CHILDREN_MAX 4096
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 #define LEFTOVERS_US 100
+#define WORKING_NS (100 * NS_PER_MS)
 
 void link_init(struct link *link)
 {
@@ -187,14 +188,25 @@ int link_report(struct link *link, struct avc_report *report)
 	return read(link->report_fd, report, sizeof *report) == sizeof *report ? 1 : 0;
 }
 
-int link_verdict(struct link *link, uint32_t seq, enum avc_verdict_kind kind, struct avc_error *err)
+int link_verdict(const struct link *link, enum avc_verdict_kind kind, struct avc_error *err)
 {
-	const struct avc_verdict verdict = { .seq = seq, .kind = kind };
+	const struct avc_verdict verdict = { .seq = link->death, .kind = kind };
 
 	/* A reader that is gone raises SIGPIPE, which this thread has blocked. */
 	if (write(link->verdict_fd, &verdict, sizeof verdict) != sizeof verdict)
 		return fail_errno(err, link->init, "tell init", "write", "init does not listen");
 	return 0;
+}
+
+void link_working(struct link *link)
+{
+	const uint64_t now = now_ns();
+	struct avc_error ignored = { 0 };
+
+	if (now - link->working_ns < WORKING_NS)
+		return;
+	link->working_ns = now;
+	(void)link_verdict(link, AVC_VERDICT_WORKING, &ignored);
 }
 
 void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),

@@ -266,7 +266,7 @@ void restore_note(struct target *target, struct generation *image, pid_t pid,
 	attributes_put_back(image->attributes, pid, notes);
 }
 
-int restore(struct target *target, struct generation *generation, const struct link *link,
+int restore(struct target *target, struct generation *generation, struct link *link,
 	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
 	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
 	    struct restore_times *times, struct avc_error *notes, struct avc_error *err)
@@ -288,9 +288,10 @@ int restore(struct target *target, struct generation *generation, const struct l
 	tracee_deadline_set(timer, FORK_NS);
 	result = files_restore(target, generation, config, link->init, tables, notes, err);
 	if (!result && generation->branches) {
-		family = family_new(target, generation, helper, tables, err);
+		family = family_new(target, generation, helper, link, timer, tables, err);
 		result = family ? 0 : -1;
 	}
+	link_working(link);
 	if (!result)
 		result = rebuild(target, generation, helper, family, pid, &pidfd, &sandbox, times,
 				 notes, err);

@@ -501,6 +501,8 @@ static void take_verdict(void)
 		}
 		if (verdict.kind == AVC_VERDICT_GIVE_UP)
 			finish_unrestored("the guard gave up");
+		if (verdict.kind == AVC_VERDICT_WORKING)
+			self.deadline_ns = now_ns() + self.wait_ms * NS_PER_MS;
 	}
 }
 

@@ -43,6 +43,7 @@ PageT = TypeVar("PageT", bound="Page")
 class Verdict(enum.IntEnum):
     RESTORED = 1
     GIVE_UP = 2
+    WORKING = 3
 
 
 @dataclass(frozen=True)

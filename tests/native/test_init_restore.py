@@ -281,6 +281,26 @@ def test_silent_guard_is_waited_for_only_so_long() -> None:
         assert "the guard did not answer in time" in init.error_text()
 
 
+def test_guard_that_says_it_is_at_work_is_waited_for() -> None:
+    with Phoenix(options=["--wait-ms", "400"]) as init, Guard(init) as guard:
+        pid = init.app_pid()
+        init.app.say("exit 3")
+        guard.report()
+        for _ in range(5):
+            assert still_waits(init, 0.2)
+            guard.answer(1, Verdict.WORKING)
+        guard.answer(0, Verdict.WORKING)
+        init.spawn(pid)
+        guard.answer(1, Verdict.RESTORED)
+        init.go()
+        assert init.app_pid() == pid
+        init.app.say("exit 4")
+        report = guard.report()
+        guard.answer(1, Verdict.WORKING)  # of the death before this one
+        assert init.end() == 4
+        assert (time.monotonic_ns() - report.reaped_ns) / 1e9 > 0.39
+
+
 def test_default_wait() -> None:
     with Phoenix() as init, Guard(init) as guard:
         assert guard.ctl().wait_ms == 2000

@@ -39,7 +39,7 @@ struct avc_ctl {
 	int32_t app_pid;    /* the app's main process; 0 until it was started    */
 	int32_t report_fd;  /* init's number of the report pipe's read end       */
 	int32_t verdict_fd; /* init's number of the verdict pipe's read end      */
-	uint32_t wait_ms;   /* how long init waits for a verdict                 */
+	uint32_t wait_ms;   /* how long init waits to hear of a verdict          */
 	/* Written by the guard: 1 while at least one generation is held.  With 0
 	 * init does not ask, it ends with the app's status.                     */
 	uint32_t armed;
@@ -72,7 +72,8 @@ struct avc_report {
 enum avc_verdict_kind {
 	AVC_VERDICT_RESTORED = 1, /* the app is there again under the same PID;
 	                           * written before it starts to run             */
-	AVC_VERDICT_GIVE_UP = 2   /* end with the app's status                   */
+	AVC_VERDICT_GIVE_UP = 2,  /* end with the app's status                   */
+	AVC_VERDICT_WORKING = 3   /* none yet: wait for wait_ms from now on       */
 };
 
 struct avc_verdict {
