@@ -123,17 +123,9 @@ int copier_open(struct copier *copier, pid_t template, pid_t pid, struct avc_err
 		result = fail_errno(err, pid, "restore memory", "open(mem)",
 				    "it can not be reached");
 	pthread_mutex_lock(&copier->lock);
-	if (!result && copier->sources == copier->sources_room) {
-		const uint32_t room = copier->sources_room ? 2 * copier->sources_room : 8;
-		struct source *more = realloc(copier->source, room * sizeof *more);
-
-		if (more) {
-			copier->source = more;
-			copier->sources_room = room;
-		} else {
-			result = fail_errno(err, 0, "restore memory", "realloc", "out of memory");
-		}
-	}
+	if (!result && !make_room(&copier->source, copier->sources, &copier->sources_room,
+				  sizeof *copier->source))
+		result = fail_errno(err, 0, "restore memory", "realloc", "out of memory");
 	if (!result)
 		copier->source[copier->sources++] = source;
 	pthread_mutex_unlock(&copier->lock);
@@ -151,16 +143,9 @@ static int add_chunks(struct copier *copier, avc_remote start, avc_remote end,
 	while (start < end) {
 		const avc_remote up_to = end - start > CHUNK_BYTES ? start + CHUNK_BYTES : end;
 
-		if (copier->chunks == copier->chunks_room) {
-			const uint32_t room = copier->chunks_room ? 2 * copier->chunks_room : 64;
-			struct chunk *more = realloc(copier->chunk, room * sizeof *more);
-
-			if (!more)
-				return fail_errno(err, 0, "restore memory", "realloc",
-						  "out of memory");
-			copier->chunk = more;
-			copier->chunks_room = room;
-		}
+		if (!make_room(&copier->chunk, copier->chunks, &copier->chunks_room,
+			       sizeof *copier->chunk))
+			return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
 		copier->chunk[copier->chunks++] = (struct chunk){ copier->sources - 1, start,
 								  up_to };
 		start = up_to;

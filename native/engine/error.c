@@ -2,6 +2,7 @@
 #include <errno.h>
 #include <stdarg.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <time.h>
 #include <unistd.h>
@@ -86,4 +87,20 @@ ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
 		done += (size_t)n;
 	}
 	return (ssize_t)done;
+}
+
+bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes)
+{
+	void *before, *more;
+	const uint32_t wanted = *room ? 2 * *room : 16;
+
+	if (count < *room)
+		return true;
+	memcpy(&before, array, sizeof before);
+	more = realloc(before, wanted * bytes);
+	if (!more)
+		return false;
+	memcpy(array, &more, sizeof more);
+	*room = wanted;
+	return true;
 }

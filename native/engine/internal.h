@@ -69,6 +69,9 @@ uint64_t now_ns(void);
 void close_fd(int *fd);
 /* As much of it as there is; -1: it can not be read. */
 ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
+/* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
+ * and nothing has changed. */
+bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 
 /* ---- proc.c ---------------------------------------------------------------- */
 

@@ -292,15 +292,8 @@ static int add_run(struct remap *r, const struct mapping *m, enum page what, avc
 		last->end = end;
 		return 0;
 	}
-	if (r->runs == r->room) {
-		const uint32_t room = r->room ? 2 * r->room : 64;
-		struct run *more = realloc(r->run, room * sizeof *more);
-
-		if (!more)
-			return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
-		r->run = more;
-		r->room = room;
-	}
+	if (!make_room(&r->run, r->runs, &r->room, sizeof *r->run))
+		return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
 	r->run[r->runs++] = (struct run){ start, end, what, plain };
 	return 0;
 }

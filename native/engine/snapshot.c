@@ -41,15 +41,8 @@ static int add_mapping(const struct mapping *m, void *arg)
 
 	if (m->start >= ARCH_USER_END)
 		return 0;
-	if (maps->count == maps->room) {
-		const uint32_t room = maps->room ? 2 * maps->room : 256;
-		struct mapping *more = realloc(maps->map, room * sizeof *more);
-
-		if (!more)
-			return -1;
-		maps->map = more;
-		maps->room = room;
-	}
+	if (!make_room(&maps->map, maps->count, &maps->room, sizeof *maps->map))
+		return -1;
 	maps->map[maps->count++] = *m;
 	return 0;
 }
@@ -100,15 +93,8 @@ static int read_extent(struct snapshot *snapshot, struct pages *pages, avc_remot
 	const size_t bytes = (end - start) / PAGE * sizeof(uint64_t);
 	struct extent *extent;
 
-	if (pages->count == pages->room) {
-		const uint32_t room = pages->room ? 2 * pages->room : 4;
-		struct extent *more = realloc(pages->extent, room * sizeof *more);
-
-		if (!more)
-			return -1;
-		pages->extent = more;
-		pages->room = room;
-	}
+	if (!make_room(&pages->extent, pages->count, &pages->room, sizeof *pages->extent))
+		return -1;
 	extent = &pages->extent[pages->count];
 	*extent = (struct extent){ .start = start, .end = end, .frame = malloc(bytes) };
 	if (!extent->frame)
