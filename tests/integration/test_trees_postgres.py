@@ -28,9 +28,13 @@ data=/var/lib/postgresql/data
 if [ ! -s $data/PG_VERSION ]; then
     {BIN}/initdb --pgdata=$data --auth=trust --no-sync >/dev/null
 fi
-exec {BIN}/postgres -D $data -c port=$1 -c listen_addresses=127.0.0.1 -c unix_socket_directories=/tmp \\
-    -c shared_buffers=16MB -c max_connections=40 -c logging_collector=off
+port=$1
+shift
+exec {BIN}/postgres -D $data -c port=$port -c listen_addresses=127.0.0.1 -c unix_socket_directories=/tmp \\
+    -c shared_buffers=16MB -c max_connections=40 -c logging_collector=off "$@"
 """
+SILENT = ("-c", "wal_level=minimal", "-c", "max_wal_senders=0", "-c", "autovacuum=off")
+"""Idle it writes nothing.  As it is otherwise, it notes every now and then what it is about, and `strict` sees it."""
 
 
 class Session:
@@ -77,14 +81,14 @@ class Session:
 class Database:
     """A protected PostgreSQL, and a container of the same image, not protected, for its clients."""
 
-    def __init__(self, sidecar: Sidecar, factory: ContainerFactory, folder: Path, port: int) -> None:
+    def __init__(self, sidecar: Sidecar, factory: ContainerFactory, folder: Path, port: int, *options: str) -> None:
         write_files(folder, {"start.sh": START})
         image = trees_image(factory.podman)
         self.sidecar = sidecar
         self.port = port
         self.clients = factory("sleep", "infinity", image=image, options=["--network=host"])
         self.server = factory.protected(
-            *("/files/start.sh", str(port)),
+            *("/files/start.sh", str(port), *options),
             labels={"interval": "500ms", "files": "strict", "shm": "64MB", "restore.max": "64/1s"},
             options=[
                 *("--network=host", "--user", "postgres", "--restart=on-failure:1000"),
@@ -133,17 +137,23 @@ class Database:
 
 
 @pytest.fixture
-def database(
+def start(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, free_port: Callable[[], int]
-) -> Iterator[Database]:
-    made = Database(sidecar, container, tmp_path, free_port())
-    yield made
-    made.close()
+) -> Iterator[Callable[..., Database]]:
+    with contextlib.ExitStack() as stack:
+
+        def make(*options: str) -> Database:
+            made = Database(sidecar, container, tmp_path, free_port(), *options)
+            stack.callback(made.close)
+            return made
+
+        yield make
 
 
 @pytest.mark.timeout(900)
-def test_idle_it_is_restored_whole_with_its_connections(database: Database) -> None:
+def test_idle_it_is_restored_whole_with_its_connections(start: Callable[..., Database]) -> None:
     """Backends, their sessions' state and locks, and whoever works in the background."""
+    database = start(*SILENT)
     database.run("pgbench", "-i", "-q", "-s", "1", "postgres")
     database.query("checkpoint")
     sessions = [database.session() for _ in range(SESSIONS)]
@@ -213,9 +223,10 @@ class Ledger:
 
 
 @pytest.mark.timeout(3000)
-def test_under_write_load_it_starts_cold_and_loses_nothing(database: Database) -> None:
+def test_under_write_load_it_starts_cold_and_loses_nothing(start: Callable[..., Database]) -> None:
     """What was written since the checkpoint forbids a restore; PostgreSQL's own recovery does the rest."""
     rng = random.Random(5)
+    database = start()
     database.run("pgbench", "-i", "-q", "-s", "2", "postgres")
     database.query("create table ledger (id bigint primary key)")
     ledger = Ledger(database)
