@@ -222,6 +222,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 
 	urgent_begin();
 	guard->link.death = report->seq;
+	guard->link.working_ns = now_ns();
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
 	emit(guard, &event);

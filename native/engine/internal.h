@@ -385,7 +385,7 @@ struct link {
 	struct avc_ctl *ctl;
 	int pidns_fd;        /* of the container                                 */
 	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
-	uint64_t working_ns; /* when it was last told that it takes longer          */
+	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
 };
 
 /* ---- tracee.c ---------------------------------------------------------------- */

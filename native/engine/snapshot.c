@@ -17,7 +17,7 @@
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 /* Runtimes reserve terabytes of which they use little: those are not read page by page. */
-#define SPARSE_BYTES (UINT64_C(256) << 20)
+#define SPARSE_BYTES (UINT64_C(4) << 30)
 #define REGIONS 64
 
 /* Linux 6.7, Documentation/admin-guide/mm/pagemap.rst; the headers may be older. */
