@@ -96,6 +96,7 @@ bool is_known_process(pid_t pid, const void *guard);
  * be reading a pipe to its end. */
 void release(struct avc_guard *guard, struct target *target);
 /* Processes of the app that have ended, or are another program now. */
+void let_ended_go(struct avc_guard *guard);
 void tend_tree(struct avc_guard *guard);
 /* Gives up what was brought into processes that have executed another program since;
  * `all`: whether or not it is time to look.  When it is: CLOCK_MONOTONIC, UINT64_MAX: never. */

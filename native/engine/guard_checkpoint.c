@@ -108,11 +108,26 @@ static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_err
 	return 0;
 }
 
+static int renew_holders(struct avc_guard *guard, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		if (!target->doubtful)
+			continue;
+		if (proc_is_exiting(guard->target.pid))
+			return fail(err, AVC_GONE, 0, guard->target.pid, "attach", "",
+				    "it has ended");
+		unhold(target);
+	}
+	return 0;
+}
+
 static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
 
-	if (find_app(guard, err))
+	if (find_app(guard, err) || renew_holders(guard, err))
 		return -1;
 	tree->init = guard->link.init;
 	tree->slots = guard->config.keep + 1;
@@ -156,16 +171,16 @@ static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 	return 0;
 }
 
-/* A checkpoint that came to nothing: holders that were cloning are not to be relied on. */
+/* A checkpoint that came to nothing: holders that were cloning are not to be relied on for
+ * another one.  But if it was because the app died, they have what its processes had open. */
 static void abandon(struct avc_guard *guard, struct generation *fresh)
 {
 	generation_drop(fresh);
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->lost)
-			unhold(guard->tree.member[i]);
+		guard->tree.member[i]->doubtful |= guard->tree.member[i]->lost;
 	if (guard->tree.members)
 		kill_lost(guard);
-	tree_sweep(&guard->tree);
+	let_ended_go(guard);
 }
 
 static int files_errors(const struct generation *generation, struct avc_error *err)

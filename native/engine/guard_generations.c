@@ -186,21 +186,30 @@ uint64_t exec_check_due(const struct avc_guard *guard)
 	return due;
 }
 
-void tend_tree(struct avc_guard *guard)
+/* When the main process goes, the others go with it, and all of it comes back with what
+ * the holders have.  Some end by themselves, as soon as it has closed what it has open:
+ * before its own end can be seen.  So that is looked for last. */
+void let_ended_go(struct avc_guard *guard)
 {
-	bool any = false;
+	const struct target *main = &guard->target;
 
-	let_executed_go(guard, false);
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		any |= guard->tree.member[i]->pid && pidfd_ended(guard->tree.member[i]->pidfd);
-	/* When the main process goes, the others go with it, and all of it comes back. */
-	if (!any || !guard->target.pid || pidfd_ended(guard->target.pidfd))
+		target->ended = target->pid && pidfd_ended(target->pidfd);
+	}
+	if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
 		return;
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->pid && pidfd_ended(guard->tree.member[i]->pidfd))
+		if (guard->tree.member[i]->ended)
 			release(guard, guard->tree.member[i]);
 	tree_sweep(&guard->tree);
+}
+
+void tend_tree(struct avc_guard *guard)
+{
+	let_executed_go(guard, false);
+	let_ended_go(guard);
 }
 
 /* An app that is killed while its threads are being stopped may leave a thread that

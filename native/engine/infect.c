@@ -527,6 +527,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 
 void unhold(struct target *target)
 {
+	target->doubtful = false;
 	if (!target->holder)
 		return;
 	tracee_kill(target->holder);

@@ -106,6 +106,8 @@ pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
 /* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
 int proc_link(pid_t pid, const char *name, char *buf, size_t size);
+/* It is just ending, and may have closed already what it had open. */
+bool proc_is_exiting(pid_t tid);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
 	MAPPING_DONTFORK = 1,   /* dc */
@@ -248,6 +250,8 @@ struct sandbox;
 
 /* The live main process of the app. */
 struct target {
+	bool ended;    /* when it was last looked at                               */
+	bool doubtful; /* its holder was cloning when a checkpoint came to nothing  */
 	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
 	 * or, when that has ended, any other (target_follow).  0: none           */
 	pid_t pid;

@@ -362,6 +362,19 @@ int proc_pidfd_open(pid_t pid)
 	return (int)syscall(SYS_pidfd_open, pid, 0);
 }
 
+/* PF_EXITING (include/linux/sched.h) among the flags of proc(5), which a task gets before it
+ * closes anything (kernel/exit.c, do_exit()). */
+bool proc_is_exiting(pid_t tid)
+{
+	char buf[1024], *p;
+	unsigned int flags;
+
+	if (proc_read(tid, "stat", buf, sizeof buf) <= 0)
+		return true;
+	p = strrchr(buf, ')');
+	return p && sscanf(p + 1, " %*c %*d %*d %*d %*d %*d %u", &flags) == 1 && flags & 4;
+}
+
 bool pidfd_ended(int pidfd)
 {
 	struct pollfd p = { .fd = pidfd, .events = POLLIN };

@@ -270,8 +270,6 @@ void tree_sweep(struct tree *tree)
 	for (uint32_t i = 0; i < tree->members; i++) {
 		struct target *target = tree->member[i];
 
-		if (target->pid && pidfd_ended(target->pidfd))
-			tree_let_go(target);
 		/* One of which a thread is still ours has to be waited for. */
 		if (!target->pid && !target->images && !target->thread_count && !target->lost)
 			target_free(target);
