@@ -276,7 +276,8 @@ def test_killed_at_random_moments(scenario: str, tmp_path: Path) -> None:
             assert "error" not in event, event
         disturb(victim)
         restored(victim, guard)
-        assert guard.fds() <= fds + 2  # the second generation's
+        # The second generation's; and what is open for a moment, while the next holder is made.
+        wait_until(lambda: guard.fds() <= fds + 2, 5, "no descriptor is left open")
 
 
 @pytest.fixture
