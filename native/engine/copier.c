@@ -203,8 +203,6 @@ bool copier_help(struct copier *copier)
 
 int copier_finish(struct copier *copier, struct avc_error *err)
 {
-	while (copier_help(copier))
-		;
 	pthread_mutex_lock(&copier->lock);
 	if (copier->error.code)
 		*err = copier->error;

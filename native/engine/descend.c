@@ -361,8 +361,8 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	    place(member, branch, err) || puppet_put_files(puppet, &family->table[index], err))
 		return -1;
 	take_terminal(puppet, branch);
-	manner_put_limits(puppet, branch); /* it may have more open than it may open now */
-	if (puppet_flush(puppet, err))
+	/* It may have more open than it may open now. */
+	if (manner_put_limits(puppet, branch, err) || puppet_flush(puppet, err))
 		return -1;
 	close_fd(&puppet->socket);
 	forget_plan(family, index);

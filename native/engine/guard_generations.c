@@ -196,13 +196,12 @@ void let_ended_go(struct avc_guard *guard)
 	for (uint32_t i = 0; i < guard->tree.members; i++) {
 		struct target *target = guard->tree.member[i];
 
-		target->ended = target->pid && pidfd_ended(target->pidfd);
+		if (!target->pid || !pidfd_ended(target->pidfd))
+			continue;
+		if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
+			return;
+		release(guard, target);
 	}
-	if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
-		return;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->ended)
-			release(guard, guard->tree.member[i]);
 	tree_sweep(&guard->tree);
 }
 

@@ -78,7 +78,7 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 struct proc_stat {
 	char state;
 	pid_t parent, group, session, tty_group;
-	uint32_t tty;
+	uint32_t tty, flags; /* PF_*                                            */
 	int threads;
 	uint64_t start; /* clock ticks after boot */
 };
@@ -250,8 +250,6 @@ struct sandbox;
 
 /* The live main process of the app. */
 struct target {
-	bool ended;    /* when it was last looked at                               */
-	bool doubtful; /* its holder was cloning when a checkpoint came to nothing  */
 	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
 	 * or, when that has ended, any other (target_follow).  0: none           */
 	pid_t pid;
@@ -295,6 +293,7 @@ struct target {
 	uint64_t start;                  /* when it began; tells it from one with its number */
 	uint32_t images;                 /* generations that have one of it                  */
 	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
+	bool doubtful;                   /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                    /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear;    /* what a process that is made from the main one has */
 	bool frozen;                     /* stopped in this freeze                            */
@@ -820,9 +819,9 @@ int restore(struct target *target, struct generation *generation, struct link *l
 
 /* ---- puppet.c ----------------------------------------------------------------------- */
 
-/* A task that a restored process has forked, and that is made what a template is. */
 #define PUPPET_SOFTS 24
 
+/* A task that a restored process has forked, and that is made what a template is. */
 struct puppet {
 	pid_t pid;
 	const struct pad *pad; /* the one it runs in                              */
@@ -872,11 +871,12 @@ int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
 /* To a thread's calls. */
 void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
 void branch_forget(struct branch *branch);
-/* A restored process gets it; what is allowed to fail is told in *notes. */
+/* A restored process gets it, with the puppet's next flush. */
 int manner_put(struct puppet *puppet, const struct branch *branch,
 	       struct avc_error *err) warn_unused;
 /* When it has everything open: there may be more of it than may be opened. */
-void manner_put_limits(struct puppet *puppet, const struct branch *branch);
+int manner_put_limits(struct puppet *puppet, const struct branch *branch,
+		      struct avc_error *err) warn_unused;
 
 /* ---- descend.c ------------------------------------------------------------------------- */
 
@@ -944,9 +944,8 @@ int copier_open(struct copier *copier, pid_t template, pid_t pid,
 /* One stretch of memory.  `plain`: the mapping may be read and written. */
 int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain,
 	       struct avc_error *err) warn_unused;
-/* Lends a hand; false when nothing is left. */
+/* Lends a hand; false when nothing is left, and then it can be finished. */
 bool copier_help(struct copier *copier);
-/* Returns when everything is copied. */
 int copier_finish(struct copier *copier, struct avc_error *err) warn_unused;
 void copier_free(struct copier *copier);
 

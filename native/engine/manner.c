@@ -180,16 +180,18 @@ static void put_mm(struct puppet *puppet, const struct manner *manner)
 	puppet_soften(puppet, "what it knows of its heap and arguments could not be put back");
 }
 
-void manner_put_limits(struct puppet *puppet, const struct branch *branch)
+int manner_put_limits(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
 {
 	struct arguments *arguments = arguments_of(puppet);
 
 	memcpy(arguments->limit, branch->manner->limit, sizeof arguments->limit);
 	for (uint64_t i = 0; i < LIMITS; i++) {
-		puppet_call(puppet, SYS_prlimit64, 0, i,
-			    pad_remote(puppet->pad, &arguments->limit[i]), 0, 0, 0);
+		if (puppet_ask(puppet, SYS_prlimit64, 0, i,
+			       pad_remote(puppet->pad, &arguments->limit[i]), 0, 0, 0, err))
+			return -1;
 		puppet_soften(puppet, "a resource limit could not be put back");
 	}
+	return 0;
 }
 
 int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *err)

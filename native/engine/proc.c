@@ -14,6 +14,8 @@
 
 #include "internal.h"
 
+#define PF_EXITING 4 /* include/linux/sched.h; not for user space otherwise */
+
 int proc_open(pid_t pid, const char *name, int flags)
 {
 	char path[96];
@@ -63,9 +65,9 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 	p = strrchr(buf, ')');
 	if (!p ||
 	    sscanf(p + 1,
-		   " %c %d %d %d %d %d %*u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu",
+		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
-		   &stat->tty_group, &stat->threads, &start) != 8) {
+		   &stat->tty_group, &stat->flags, &stat->threads, &start) != 9) {
 		errno = EPROTO;
 		return -1;
 	}
@@ -362,17 +364,12 @@ int proc_pidfd_open(pid_t pid)
 	return (int)syscall(SYS_pidfd_open, pid, 0);
 }
 
-/* PF_EXITING (include/linux/sched.h) among the flags of proc(5), which a task gets before it
- * closes anything (kernel/exit.c, do_exit()). */
+/* A task gets the flag before it closes anything (kernel/exit.c, do_exit()). */
 bool proc_is_exiting(pid_t tid)
 {
-	char buf[1024], *p;
-	unsigned int flags;
+	struct proc_stat stat;
 
-	if (proc_read(tid, "stat", buf, sizeof buf) <= 0)
-		return true;
-	p = strrchr(buf, ')');
-	return p && sscanf(p + 1, " %*c %*d %*d %*d %*d %*d %u", &flags) == 1 && flags & 4;
+	return proc_stat(tid, &stat) || stat.flags & PF_EXITING;
 }
 
 bool pidfd_ended(int pidfd)

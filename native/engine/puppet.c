@@ -10,6 +10,8 @@
 
 #include "internal.h"
 
+#define SPARE 8 /* puppet_call() is used for so many in a row at most, puppet_ask() for more */
+
 /* The list of calls is where files_restore.c has its own, which is not in use any more;
  * what they refer to is behind it. */
 void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot)
@@ -115,7 +117,7 @@ int puppet_flush(struct puppet *puppet, struct avc_error *err)
 int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
 	       uint64_t e, uint64_t f, struct avc_error *err)
 {
-	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, err))
+	if (puppet->listed + SPARE > puppet->list_max && puppet_flush(puppet, err))
 		return -1;
 	puppet_call(puppet, nr, a, b, c, d, e, f);
 	return 0;
@@ -161,19 +163,21 @@ int puppet_open_mail(struct puppet *puppet, struct avc_error *err)
 	return 0;
 }
 
-int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
+/* It comes to the lowest number that is free, by the socket that has number `socket` there. */
+static int hand_over(struct puppet *puppet, int socket, int fd, struct avc_error *err)
 {
 	/* What is not received yet waits in the socket. */
-	if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, err))
-		return -1;
-	if (files_send(puppet->socket, fd)) {
-		if (errno != EAGAIN || puppet_flush(puppet, err) || files_send(puppet->socket, fd))
-			return fail_errno(err, puppet->pid, "restore", "sendmsg",
-					  "a descriptor could not be handed over");
-	}
-	puppet_call(puppet, SYS_recvmsg, 0, write_letter(puppet), MSG_CMSG_CLOEXEC | MSG_DONTWAIT,
-		    0, 0, 0);
-	return 0;
+	if (files_send(puppet->socket, fd) &&
+	    (errno != EAGAIN || puppet_flush(puppet, err) || files_send(puppet->socket, fd)))
+		return fail_errno(err, puppet->pid, "restore", "sendmsg",
+				  "a descriptor could not be handed over");
+	return puppet_ask(puppet, SYS_recvmsg, (uint64_t)socket, write_letter(puppet),
+			  MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0, err);
+}
+
+int puppet_give(struct puppet *puppet, int fd, struct avc_error *err)
+{
+	return hand_over(puppet, 0, fd, err);
 }
 
 /* From its parent's pad into its own. */
@@ -218,13 +222,8 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table, str
 			if (lowest != socket && !(placed < i && table->entry[placed].fd == lowest))
 				break;
 		}
-		if (files_send(puppet->socket, table->entry[i].ours) &&
-		    (errno != EAGAIN || puppet_flush(puppet, err) ||
-		     files_send(puppet->socket, table->entry[i].ours)))
-			return fail_errno(err, puppet->pid, "restore", "sendmsg",
-					  "a descriptor could not be handed over");
-		puppet_call(puppet, SYS_recvmsg, (uint64_t)socket, write_letter(puppet),
-			    MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0);
+		if (hand_over(puppet, socket, table->entry[i].ours, err))
+			return -1;
 		if (lowest != fd) {
 			puppet_call(puppet, SYS_dup3, (uint64_t)lowest, (uint64_t)fd,
 				    table->entry[i].cloexec ? O_CLOEXEC : 0, 0, 0, 0);
@@ -232,8 +231,6 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table, str
 		} else if (!table->entry[i].cloexec) {
 			puppet_call(puppet, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
 		}
-		if (puppet->listed + 8 > puppet->list_max && puppet_flush(puppet, err))
-			return -1;
 	}
 	puppet_call(puppet, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
 	return 0;

@@ -8,13 +8,11 @@
  * there is nothing to do.  Everything else is unmapped, mapped, and copied.  What that is
  * is found out by the templates of both, before there is a process that it is for.
  */
-#include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
-#include <sys/prctl.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -110,9 +108,7 @@ static int cut(struct remap *r, struct avc_error *err)
 
 		if (end == UINT64_MAX)
 			return 0;
-		if (a && is_fixed(r, a, address))
-			a = b = NULL;
-		if (b && is_fixed(r, b, address))
+		if ((a && is_fixed(r, a, address)) || (b && is_fixed(r, b, address)))
 			a = b = NULL;
 		if (a || b)
 			r->piece[r->pieces++] = (struct piece){
