@@ -54,33 +54,33 @@ static int stop_task(pid_t tid, void *arg)
 	return 0;
 }
 
+/* What fails is seen when it is waited for. */
 static int interrupt_task(pid_t tid, void *arg)
 {
 	struct target *target = arg;
 	struct thread *t = thread_find(target, tid);
 	struct avc_error ignored = { 0 };
 
-	/* What fails is seen when it is waited for. */
-	return t && !t->attached && thread_stop(target, t, &ignored) ? 1 : 0;
+	if (t && !t->attached)
+		t->seen = thread_stop(target, t, &ignored) == 0;
+	return 0;
 }
 
-/* Until a walk finds nobody new, for threads create threads while we walk.  Once
- * all known ones are stopped and none is new, there is no one left to create. */
-int stop_process(struct target *target, struct avc_error *err)
+static void stop_begin(struct target *target)
 {
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		target->threads[i].seen = false;
 		target->threads[i].block = -1;
 	}
+}
+
+/* Until a walk finds nobody new, for threads create threads while we walk.  Once
+ * all known ones are stopped and none is new, there is no one left to create. */
+static int stop_all(struct target *target, struct avc_error *err)
+{
 	for (;;) {
 		struct walk walk = { .target = target, .err = err };
 
-		if (proc_tasks(target->task_dirfd, stop_task, &walk))
-			return err->code ? -1
-					 : fail_errno(err, target->pid, "freeze", "getdents64",
-						      "it has ended");
-		if (!walk.fresh)
-			return 0;
 		for (uint32_t i = 0; i < target->thread_count; i++) {
 			struct thread *t = &target->threads[i];
 			struct avc_error gone = { 0 };
@@ -93,7 +93,19 @@ int stop_process(struct target *target, struct avc_error *err)
 				*err = gone;
 			return -1;
 		}
+		if (proc_tasks(target->task_dirfd, stop_task, &walk))
+			return err->code ? -1
+					 : fail_errno(err, target->pid, "freeze", "getdents64",
+						      "it has ended");
+		if (!walk.fresh)
+			return 0;
 	}
+}
+
+int stop_process(struct target *target, struct avc_error *err)
+{
+	stop_begin(target);
+	return stop_all(target, err);
 }
 
 static int read_all(struct target *target, uint32_t slot, uint32_t *threads, struct avc_error *err)
@@ -156,13 +168,26 @@ struct capture {
 	struct generation *generation;
 };
 
-/* The table does not change while the kernel clones: nobody runs. */
+static void capture_main_files(struct target *target, struct generation *generation)
+{
+	files_capture(target, generation, generation->branches > 0, &generation->files_error);
+}
+
+/* The tables do not change while the kernel clones: nobody runs. */
 static void capture_files(void *arg)
 {
-	struct capture *capture = arg;
+	const struct capture *capture = arg;
+	struct generation *generation = capture->generation;
 
-	files_capture(capture->target, capture->generation, capture->generation->branches > 0,
-		      &capture->generation->files_error);
+	if (!generation->files)
+		capture_main_files(capture->target, generation);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		if (branch->target)
+			files_capture(branch->target, branch->image, true,
+				      &branch->image->files_error);
+	}
 }
 
 /* Pads of guards that died, and of the process that forked this one. */
@@ -226,15 +251,18 @@ static int clone_app(struct target *target, struct thread *main_thread,
  * processes while we look. */
 static int stop_tree(struct tree *tree, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < tree->members; i++)
+	stop_begin(tree->main);
+	for (uint32_t i = 0; i < tree->members; i++) {
 		tree->member[i]->frozen = false;
+		stop_begin(tree->member[i]);
+	}
 	/* So that they stop at the same time, and not one after the other.  A child that has
 	 * nothing of ours may have to execute a program before its parent can be stopped. */
 	for (uint32_t i = 0; tree->count > 1 && i < tree->count; i++)
 		if (tree->kin[i].target && tree->kin[i].target->infected)
 			(void)proc_tasks(tree->kin[i].target->task_dirfd, interrupt_task,
 					 tree->kin[i].target);
-	if (stop_process(tree->main, err))
+	if (stop_all(tree->main, err))
 		return -1;
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */
@@ -254,7 +282,7 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 			if (!t || t->frozen)
 				continue;
 			all = false;
-			if (stop_process(t, &failed) == 0) {
+			if (stop_all(t, &failed) == 0) {
 				t->frozen = true;
 			} else if (failed.code != AVC_GONE) {
 				*err = failed;
@@ -334,7 +362,7 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
-static int read_branch(struct tree *tree, struct branch *branch, bool strict, struct mem_seen *seen,
+static int read_branch(struct branch *branch, bool strict, struct mem_seen *seen,
 		       struct avc_error *err)
 {
 	struct target *target = branch->target;
@@ -342,9 +370,8 @@ static int read_branch(struct tree *tree, struct branch *branch, bool strict, st
 	if (strict)
 		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
 
-	if (prepare_stopped(tree, target, err) || pad_check(target, target->pid, err))
-		return -1;
-	if (memory_prepare(target->memory, &branch->image->image, seen, err) ||
+	if (pad_check(target, target->pid, err) ||
+	    memory_prepare(target->memory, &branch->image->image, seen, err) ||
 	    read_all(target, branch->image->slot, &branch->image->threads, err))
 		return -1;
 	branch->image->vm_pages = proc_vm_pages(target->pid);
@@ -382,12 +409,23 @@ static int ask_begin(struct asking *asking, struct avc_error *err)
 	return 0;
 }
 
+/* All are interrupted before the first is waited for: it takes each some time to get there. */
+static int ask_halt(struct asking *asking, struct avc_error *err)
+{
+	if (pad_halt(asking->thread->tid, &asking->target->pad.control->runner, err) == 0)
+		return 0;
+	asking->asked = false;
+	if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
+		asking->thread->stopped = false;
+	return -1;
+}
+
 static int ask_end(struct asking *asking, struct avc_error *err)
 {
 	struct target *target = asking->target;
 	struct inj_call *call = &target->pad.control->runner;
 
-	if (pad_finish(asking->thread->tid, call, err)) {
+	if (tracee_await(asking->thread->tid, NULL, err) != STOP_TRAP) {
 		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
 			asking->thread->stopped = false;
 		return -1;
@@ -400,28 +438,21 @@ static int ask_end(struct asking *asking, struct avc_error *err)
 		       : 0;
 }
 
-static int ask_processes(struct tree *tree, struct avc_error *err)
+/* Also of those that were asked before one failed. */
+static int hear_all(struct asking *asking, uint32_t count, struct avc_error *err)
 {
-	struct asking *asking = calloc(tree->count, sizeof *asking);
+	int (*const step[])(struct asking *, struct avc_error *) = { ask_halt, ask_end };
 	int result = 0;
 
-	if (!asking)
-		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
-	for (uint32_t i = 1; !result && i < tree->count; i++) {
-		asking[i].target = tree->kin[i].target;
-		if (asking[i].target)
-			result = ask_begin(&asking[i], err);
-	}
-	/* Also of those that were asked before one failed. */
-	for (uint32_t i = 1; i < tree->count; i++) {
-		struct avc_error failed = { 0 };
+	for (size_t k = 0; k < sizeof step / sizeof *step; k++)
+		for (uint32_t i = 0; i < count; i++) {
+			struct avc_error failed = { 0 };
 
-		if (asking[i].asked && ask_end(&asking[i], &failed) && !result) {
-			*err = failed;
-			result = -1;
+			if (asking[i].asked && step[k](&asking[i], &failed) && !result) {
+				*err = failed;
+				result = -1;
+			}
 		}
-	}
-	free(asking);
 	return result;
 }
 
@@ -453,9 +484,28 @@ static int await_clone(struct branch *branch, struct avc_error *err)
 	return 0;
 }
 
+/* Each is asked as soon as it has been read, and answers while the next one is read. */
+static int read_and_ask(struct generation *generation, struct mem_seen *seen, struct asking *asking,
+			struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		asking[i].target = branch->target;
+		if (branch->target && (read_branch(branch, generation->mapped != NULL, seen, err) ||
+				       ask_begin(&asking[i], err)))
+			return -1;
+	}
+	return 0;
+}
+
 static int read_branches(struct tree *tree, struct generation *generation, struct mem_seen *seen,
 			 struct avc_error *err)
 {
+	struct avc_error failed = { 0 };
+	struct asking *asking;
+	int result = 0;
+
 	if (tree->count <= 1)
 		return 0;
 	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
@@ -466,12 +516,21 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 				    "a child process has its parent's memory (CLONE_VM)");
 	if (make_branches(tree, generation, err))
 		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target &&
-		    read_branch(tree, &generation->branch[i], generation->mapped != NULL, seen,
-				err))
-			return -1;
-	return 0;
+	asking = calloc(generation->branches + 1, sizeof *asking);
+	if (!asking)
+		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+	for (uint32_t i = 0; !result && i < generation->branches; i++)
+		if (generation->branch[i].target)
+			result = prepare_stopped(tree, generation->branch[i].target, err);
+	if (!result)
+		result = read_and_ask(generation, seen, asking, err);
+	/* They answer meanwhile. */
+	if (!result)
+		capture_main_files(tree->main, generation);
+	if (hear_all(asking, generation->branches, result ? &failed : err) && !result)
+		result = -1;
+	free(asking);
+	return result;
 }
 
 /* What a process above it adopts would be a child that it never had. */
@@ -492,10 +551,10 @@ static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *
 }
 
 /* Parents come before their children. */
-static int ask_and_hold(struct tree *tree, struct avc_error *err)
+static int make_holders_missing(struct tree *tree, struct avc_error *err)
 {
 	struct avc_error failed = { 0 };
-	int result = tree->count > 1 ? ask_processes(tree, err) : 0;
+	int result = 0;
 
 	for (uint32_t i = 1; !result && i < tree->count; i++)
 		if (tree->kin[i].target && !tree->kin[i].target->holder)
@@ -523,8 +582,7 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 
 		if (!branch->target)
 			continue;
-		if (files_capture(branch->target, branch->image, true, err) ||
-		    await_clone(branch, err))
+		if (await_clone(branch, err))
 			return -1;
 		branch->image->taken_ns = generation->taken_ns;
 	}
@@ -574,15 +632,13 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 		/* The deadline is for getting things stopped; the clone of a big
 		 * process takes its time. */
 		tracee_deadline_set(timer, CLONE_NS);
-		result = read_branches(tree, generation, seen, err);
-	}
-	if (!result) {
 		generation->vm_pages = proc_vm_pages(target->pid);
 		memory_copy(target, generation->image);
 		files_mapped_copy(generation->mapped);
-		generation->taken_ns = now_ns();
-		result = ask_and_hold(tree, err);
+		result = read_branches(tree, generation, seen, err);
 	}
+	if (!result)
+		result = make_holders_missing(tree, err);
 	if (!result) {
 		generation->taken_ns = now_ns();
 		result = start_clones(generation, err);

@@ -189,6 +189,9 @@ static int files_errors(const struct generation *generation, struct avc_error *e
 		*err = generation->files_error;
 		return -1;
 	}
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target && files_errors(generation->branch[i].image, err))
+			return -1;
 	return 0;
 }
 

@@ -52,6 +52,7 @@
 #define OLD_PADS_MAX 128
 #define SOCKETS_MAX 64
 #define PROCESSES_MAX 512 /* of one app                                     */
+#define CHILDREN_MAX 4096 /* of init: orphans, holders and templates, too   */
 /* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13; glibc before 2.35 lacks the name. */
 #define PTRACE_GET_RSEQ 0x420f
 
@@ -97,6 +98,8 @@ pid_t proc_live_thread(pid_t pid);
 void proc_await_end(pid_t tid);
 /* Children of a (single-threaded) process; returns how many (at most max), or -1. */
 int proc_children(pid_t pid, pid_t *children, int max);
+/* The same of one thread, by the open /proc/PID/task of its process. */
+int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
 int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
 /* Size of the address space in pages (statm), or -1. */
@@ -478,8 +481,10 @@ int pad_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unu
  * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
 int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		  struct avc_error *err) warn_unused;
-/* The same in two parts, for several at a time. */
+/* The same in parts, for several at a time.  pad_halt() waits until it is done and
+ * interrupts it; its stop is still to come, for which pad_finish() waits, too. */
 int pad_start(pid_t tid, struct avc_error *err) warn_unused;
+int pad_halt(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		    struct avc_error *err) warn_unused;

@@ -17,7 +17,6 @@
 
 #include "internal.h"
 
-#define CHILDREN_MAX 4096
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 #define LEFTOVERS_US 100
 #define WORKING_NS (100 * NS_PER_MS)

@@ -199,7 +199,7 @@ int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err)
 	return pad_start(tid, err) ? -1 : wait_word(call, &call->pause, tid, err);
 }
 
-int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
+int pad_halt(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (wait_word(call, &call->done, tid, err)) {
 		/* Without a stop of its own it would go home and stay a tracee for ever;
@@ -210,6 +210,13 @@ int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "run injected code", "ptrace(INTERRUPT)",
 				  "it has gone");
+	return 0;
+}
+
+int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	if (pad_halt(tid, call, err))
+		return -1;
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
 

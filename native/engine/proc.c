@@ -149,14 +149,22 @@ void proc_await_end(pid_t tid)
 	}
 }
 
-int proc_children(pid_t pid, pid_t *children, int max)
+int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
 {
-	char name[48], buf[8192], *p = buf;
-	int count = 0;
+	char name[32], buf[CHILDREN_MAX * sizeof "4194304"], *p = buf;
+	int count = 0, fd;
+	ssize_t n;
 
-	snprintf(name, sizeof name, "task/%d/children", pid);
-	if (proc_read(pid, name, buf, sizeof buf) < 0)
+	snprintf(name, sizeof name, "%d/children", tid);
+	fd = openat(task_dirfd, name, O_RDONLY | O_CLOEXEC);
+	if (fd < 0)
 		return -1;
+	/* One read(2) of many is a page at most. */
+	n = read_whole(fd, (uint8_t *)buf, sizeof buf - 1, 0);
+	close(fd);
+	if (n < 0)
+		return -1;
+	buf[n] = 0;
 	while (count < max) {
 		char *next;
 		long child = strtol(p, &next, 10);
@@ -166,6 +174,18 @@ int proc_children(pid_t pid, pid_t *children, int max)
 		children[count++] = (pid_t)child;
 		p = next;
 	}
+	return count;
+}
+
+int proc_children(pid_t pid, pid_t *children, int max)
+{
+	const int task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	int count;
+
+	if (task_dirfd < 0)
+		return -1;
+	count = proc_children_of(task_dirfd, pid, children, max);
+	close(task_dirfd);
 	return count;
 }
 

@@ -19,7 +19,7 @@
 
 struct looking {
 	struct tree *tree;
-	pid_t pid;
+	int task_dirfd;
 	int parent;
 	struct avc_error *err;
 };
@@ -36,55 +36,41 @@ static int add_kin(struct tree *tree, pid_t pid, int parent, struct avc_error *e
 	return 0;
 }
 
-static int add_children(struct looking *look, const char *name)
-{
-	char *buf = NULL, *p;
-	size_t room = 0;
-	int result = 0;
-	FILE *file;
-	char path[64];
-
-	snprintf(path, sizeof path, "/proc/%d/%s", look->pid, name);
-	file = fopen(path, "re");
-	if (!file)
-		return 0; /* it has ended */
-	if (getdelim(&buf, &room, '\0', file) > 0)
-		for (p = buf; !result;) {
-			char *next;
-			const long child = strtol(p, &next, 10);
-
-			if (next == p)
-				break;
-			p = next;
-			if (look->parent == PARENT_INIT &&
-			    (child == look->tree->main->leader ||
-			     look->tree->is_ours((pid_t)child, look->tree->arg)))
-				continue;
-			result = add_kin(look->tree, (pid_t)child, look->parent, look->err);
-		}
-	fclose(file);
-	free(buf);
-	return result;
-}
-
 /* A child hangs on the thread that forked it. */
 static int look_at_task(pid_t tid, void *arg)
 {
-	char name[48];
+	const struct looking *look = arg;
+	struct tree *tree = look->tree;
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children_of(look->task_dirfd, tid, children, CHILDREN_MAX);
 
-	snprintf(name, sizeof name, "task/%d/children", tid);
-	return add_children(arg, name);
+	for (int i = 0; i < count; i++) {
+		if (look->parent == PARENT_INIT &&
+		    (children[i] == tree->main->leader || tree->is_ours(children[i], tree->arg)))
+			continue;
+		if (add_kin(tree, children[i], look->parent, look->err))
+			return -1;
+	}
+	return 0;
 }
 
-static int look_below(struct looking *look)
+/* Of one that has ended there is nothing to be seen. */
+static int look_below(struct tree *tree, int task_dirfd, int parent, struct avc_error *err)
 {
-	int dirfd = proc_open(look->pid, "task", O_RDONLY | O_DIRECTORY), result;
+	struct looking look = { tree, task_dirfd, parent, err };
 
-	if (dirfd < 0)
+	return proc_tasks(task_dirfd, look_at_task, &look) && err->code ? -1 : 0;
+}
+
+static int look_below_init(struct tree *tree, struct avc_error *err)
+{
+	int task_dirfd = proc_open(tree->init, "task", O_RDONLY | O_DIRECTORY), result;
+
+	if (task_dirfd < 0)
 		return 0;
-	result = proc_tasks(dirfd, look_at_task, look);
-	close(dirfd);
-	return result && look->err->code ? -1 : 0;
+	result = look_below(tree, task_dirfd, PARENT_INIT, err);
+	close(task_dirfd);
+	return result;
 }
 
 /* Ended, and not waited for; a main thread that has gone before its threads is not. */
@@ -174,22 +160,16 @@ static struct target *add_member(struct tree *tree, pid_t pid, uint64_t start,
 
 int tree_look(struct tree *tree, struct avc_error *err)
 {
-	struct looking look = { .tree = tree, .err = err };
-
 	tree->count = 0;
 	if (add_kin(tree, tree->main->leader, PARENT_INIT, err))
 		return -1;
 	tree->kin[0].target = tree->main;
-	look.pid = tree->init;
-	look.parent = PARENT_INIT;
-	if (look_below(&look))
+	if (look_below_init(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct kin *kin = &tree->kin[i];
 		struct proc_stat stat;
 
-		look.pid = kin->pid;
-		look.parent = (int)i;
 		if (i && proc_stat(kin->pid, &stat)) {
 			kin->pid = 0; /* it was waited for just now */
 			continue;
@@ -225,7 +205,8 @@ int tree_look(struct tree *tree, struct avc_error *err)
 		}
 		/* Thread by thread only when the last checkpoint did not find that it
 		 * has none: then the next one will find that it has. */
-		if (!(i == 0 && tree->main->childless) && look_below(&look))
+		if (!(i == 0 && tree->main->childless) &&
+		    look_below(tree, kin->target->task_dirfd, (int)i, err))
 			return -1;
 	}
 	return 0;

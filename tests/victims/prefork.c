@@ -7,7 +7,8 @@
  * goes on reading all of it.  With --private MB the workers execute the program
  * anew and have MB of memory of their own instead.  With --sparse they have
  * given back every other page.
- * Counter 0: pages read by workers; 7 + i: laps of worker i (the first 24).
+ * Counter 0: pages read by workers; 2, 3: forks (family.h); 7 + i: laps of worker i (the
+ * first 24).
  */
 #include "family.h"
 
@@ -46,6 +47,7 @@ static _Noreturn void work(int number)
 		must(madvise(memory + page * PAGE_WORDS, 4096, MADV_DONTNEED) == 0, "madvise");
 	for (page = 0; page < touched && page < pages; page += sparse ? 2 : 1)
 		memory[page * PAGE_WORDS] = belongs(page, number);
+	time_forks();
 	for (laps = 1;; laps++) {
 		int i;
 
@@ -126,6 +128,7 @@ int main(int argc, char **argv)
 	for (i = 1; i <= workers && i <= 24; i++)
 		while (!__atomic_load_n(&board->counter[7 + i], __ATOMIC_RELAXED) && board_path)
 			nap(1000);
+	time_forks();
 	victim_ready();
 	for (;; page = page + 1 < pages ? page + 1 : 0) {
 		check_place();

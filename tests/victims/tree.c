@@ -13,7 +13,8 @@
  * What a worker is besides goes by its number: kinds[], below.  With --threads
  * each worker has T threads in all.  --orphan: one process more, whose parent has
  * ended, so that it is a child of init.  --reaper: some adopt orphans themselves.
- * Counter 0: laps of all in shared memory; 1: records received by the main process.
+ * Counter 0: laps of all in shared memory; 1: records received by the main process; 2, 3:
+ * forks (family.h).
  */
 #include <sys/resource.h>
 #include <sys/socket.h>
@@ -44,6 +45,7 @@ static _Noreturn void stay(const char *name)
 {
 	forget_children();
 	know_family(name);
+	time_forks();
 	for (;;) {
 		check_place();
 		check_nothing_to_wait_for();
@@ -213,6 +215,7 @@ static _Noreturn void work(void)
 	pthread_t thread;
 	long i;
 
+	time_forks();
 	pthread_attr_init(&attr);
 	pthread_attr_setstacksize(&attr, 64 << 10);
 	/* One that is blocked in a read, the others meet. */
@@ -401,6 +404,7 @@ static void start_orphan(void)
 		while (getppid() == parent)
 			nap(1000);
 		know_family("orphan");
+		time_forks();
 		for (;;) {
 			check_place();
 			check_nothing_to_wait_for();
@@ -460,6 +464,7 @@ static _Noreturn void be_main(void)
 	uint64_t laps;
 	int i;
 
+	time_forks();
 	for (laps = 0;; laps++) {
 		uint64_t received = 0;
 
