@@ -31,6 +31,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from unittest import mock
 
 from rich.console import Console
 from rich.table import Table
@@ -42,7 +43,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from native.family import kill_main, members  # noqa: E402
 from native.guarded import GuardProcess, Victim, config  # noqa: E402
 
-from bench.subjects import BenchFailed, Forker, build  # noqa: E402
+from bench.subjects import BenchFailed, build  # noqa: E402
 
 RESULTS = ROOT / "bench" / "results" / "trees.json"
 WARM_UP_CYCLES = 2
@@ -108,11 +109,6 @@ class Subject:
         return sum(len(os.listdir(f"/proc/{pid}/task")) for pid in self.pids())
 
 
-def rss_mb(pid: int) -> float:
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
-
-
 def cycles_of(subject: Subject, cycles: int, take: Callable[[], float]) -> float:
     """Median of `cycles`, after a few that do not count."""
     rng = random.Random(subject.command)
@@ -125,26 +121,27 @@ def cycles_of(subject: Subject, cycles: int, take: Callable[[], float]) -> float
     return statistics.median(taken)
 
 
-def fork_ms(mb: float, cycles: int) -> float:
-    """Of a process that has touched so much."""
-    with Forker(max(1, round(mb))) as forker:
-        return statistics.median(forker.fork_ms() for _ in range(cycles))
+def forks_ms(command: str, folder: Path) -> tuple[float, int]:
+    """What plain forks of all its processes take, one after the other, each by itself; and how many there are."""
+    with mock.patch.dict(os.environ, VICTIM_TIME_FORKS="1"), Victim(command, folder) as victim:
+        pids = {member.pid for member in members(victim) if not member.is_zombie}
+        give_up = time.monotonic() + PATIENCE_S
+        while victim.see().counter[3] < len(pids):
+            if victim.see().violations or time.monotonic() > give_up:
+                raise BenchFailed(f"the forks of `{command}` could not be measured: {victim.said}")
+            time.sleep(0.01)
+            pids = {member.pid for member in members(victim) if not member.is_zombie}
+        return victim.see().counter[2] / 1e6, len(pids)
 
 
 def measure_freeze(cycles: int, folder: Path) -> list[Figure]:
     found = []
     for command in TREES:
+        forks, processes = forks_ms(command, folder)
         with Subject(command, folder) as subject:
             threads = subject.threads()
-            sizes = [rss_mb(pid) for pid in subject.pids()]
             took = cycles_of(subject, cycles, subject.checkpoint_ms)
-        known: dict[int, float] = {}
-        for size in sizes:
-            known.setdefault(round(size), 0.0)
-        for size_mb in known:
-            known[size_mb] = fork_ms(size_mb, cycles)
-        forks = sum(known[round(size)] for size in sizes)
-        how = f"1.5 x {forks:.2f} (forks of {len(sizes)} processes, {sum(sizes):.0f} MB) + 0.03 x {threads} threads"
+        how = f"1.5 x {forks:.2f} (plain forks of its {processes} processes) + 0.03 x {threads} threads"
         found.append(Figure(f"freeze of `{command}`", took, 1.5 * forks + 0.03 * threads, how))
     return found
 
