@@ -475,6 +475,8 @@ static bool is_channel(const struct file *f)
 
 static void keep_contents(struct look *look)
 {
+	struct scratch scratch = { -1, -1, 0 };
+
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
 		bool ours;
@@ -490,9 +492,10 @@ static void keep_contents(struct look *look)
 			continue;
 		f->ended = !files_other_end(look->files, f) && file_has_ended(fd);
 		if (ours || f->ended)
-			file_keep_content(fd, f);
+			file_keep_content(fd, f, &scratch);
 		close(fd);
 	}
+	scratch_close(&scratch);
 }
 
 struct linux_dirent64 {

@@ -176,7 +176,12 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socke
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(const struct files *files, const struct file *file);
-void file_keep_content(int fd, struct file *file);
+/* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
+struct scratch {
+	int in, out, bytes;
+};
+void scratch_close(struct scratch *scratch);
+void file_keep_content(int fd, struct file *file, struct scratch *scratch);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);

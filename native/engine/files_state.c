@@ -210,31 +210,46 @@ const struct file *files_other_end(const struct files *files, const struct file 
 	return NULL;
 }
 
-/* Reads without taking anything out: tee(2) shares the pages with a pipe of ours. */
-static void keep_pipe(int fd, struct file *file, uint32_t bytes)
+static bool scratch_open(struct scratch *scratch, int bytes)
 {
-	int copy[2];
-	uint32_t got = 0;
+	int ends[2];
 
-	if (pipe2(copy, O_CLOEXEC | O_NONBLOCK)) {
+	if (scratch->in < 0) {
+		if (pipe2(ends, O_CLOEXEC | O_NONBLOCK))
+			return false;
+		scratch->in = ends[0];
+		scratch->out = ends[1];
+		scratch->bytes = fcntl(scratch->out, F_GETPIPE_SZ);
+	}
+	if (bytes > scratch->bytes && fcntl(scratch->out, F_SETPIPE_SZ, bytes) > 0)
+		scratch->bytes = bytes;
+	return true;
+}
+
+void scratch_close(struct scratch *scratch)
+{
+	close_fd(&scratch->in);
+	close_fd(&scratch->out);
+}
+
+/* Reads without taking anything out: tee(2) shares the pages with a pipe of ours. */
+static void keep_pipe(int fd, struct file *file, uint32_t bytes, struct scratch *scratch)
+{
+	uint32_t got = 0;
+	ssize_t n;
+
+	if (!scratch_open(scratch, fcntl(fd, F_GETPIPE_SZ))) {
 		file->content_lost = true;
 		return;
 	}
-	fcntl(copy[1], F_SETPIPE_SZ, fcntl(fd, F_GETPIPE_SZ));
-	while (got < bytes) {
-		ssize_t n = tee(fd, copy[1], bytes - got, SPLICE_F_NONBLOCK);
-
-		/* It always begins at the front: once is all. */
-		if (n < (ssize_t)bytes)
-			break;
-		while (got < bytes && (n = read(copy[0], file->content + got, bytes - got)) > 0)
+	/* It always begins at the front: once is all. */
+	if (tee(fd, scratch->out, bytes, SPLICE_F_NONBLOCK) == (ssize_t)bytes)
+		while (got < bytes && (n = read(scratch->in, file->content + got, bytes - got)) > 0)
 			got += (uint32_t)n;
-		break;
-	}
 	file->content_bytes = got;
 	file->content_lost = got != bytes;
-	close(copy[0]);
-	close(copy[1]);
+	if (file->content_lost)
+		scratch_close(scratch); /* with what is left in it */
 }
 
 /* One look into a Unix socket, nothing taken out.  Bytes, or -1; a message is cut, and its
@@ -291,7 +306,7 @@ bool file_has_ended(int fd)
 	return poll(&end, 1, 0) == 1 && end.revents & POLLHUP;
 }
 
-void file_keep_content(int fd, struct file *file)
+void file_keep_content(int fd, struct file *file, struct scratch *scratch)
 {
 	int bytes = 0;
 	ssize_t n;
@@ -312,7 +327,7 @@ void file_keep_content(int fd, struct file *file)
 		return;
 	}
 	if (file->kind == FILE_PIPE) {
-		keep_pipe(fd, file, (uint32_t)bytes);
+		keep_pipe(fd, file, (uint32_t)bytes, scratch);
 		return;
 	}
 	n = peek(fd, file, file->content, (size_t)bytes);
