@@ -57,7 +57,9 @@ ESTABLISHED = "--tcp-established"
 CLOSED = "--tcp-close"
 """After a crash CRIU gets no connection back: the dead process' sockets have said goodbye to their peers, and
 linger in the way of new ones (with --tcp-established: "Can't connect inet socket back: Cannot assign requested
-address").  So they are restored as closed ones where that can be said; Podman 5.4 has no option for it."""
+address").  So they are restored as closed ones."""
+IN_FLIGHT = "--skip-in-flight"
+"""A connection that nobody has accepted yet does not keep CRIU from dumping."""
 NO_CHECKPOINTS = "24h"
 """An interval that does not come up: checkpoints are taken by command."""
 
@@ -454,7 +456,7 @@ class CriuBare(InWorld):
         self._world.run("mkdir", self._images)
         # -v1: the log costs time.
         done = self._world.run(
-            *("criu", "dump", "-t", inner, "-D", self._images, "--tcp-established", "-o", "dump.log", "-v1", *more),
+            *("criu", "dump", "-t", inner, "-D", self._images, ESTABLISHED, IN_FLIGHT, "-o", "dump.log", "-v1", *more),
             check=False,
         )
         if done.status != 0:
@@ -515,6 +517,7 @@ class CriuPodman(InWorld):
         self._world.import_image()
         self._name = f"server-{uuid.uuid4().hex[:8]}"
         self._undo.callback(self._podman, "rm", "--force", "--ignore", "--time", "0", self._name)
+        self._undo.callback(self._tell_criu)
         mounts = ["-v", f"{PROGRAMS_INSIDE}:{PROGRAMS_INSIDE}:ro", "-v", f"{BOARDS_INSIDE}:{BOARDS_INSIDE}"]
         self._podman(
             *("run", "--detach", "--pull=never", "--name", self._name, "--network=host"),
@@ -526,9 +529,14 @@ class CriuPodman(InWorld):
     def _podman(self, *args: str, check: bool = True) -> Completed:
         return self._world.run("podman", "--runtime", self.runtime, *args, check=check)
 
+    def _tell_criu(self, *options: str) -> None:
+        """What Podman has no options for: CRIU reads this file, whoever calls it (criu(8), configuration files)."""
+        script = 'mkdir -p /etc/criu && printf "%s\\n" "$@" >/etc/criu/default.conf'
+        self._world.run("sh", "-c", script, "sh", *(option.removeprefix("--") for option in options))
+
     def _checkpoint(self, *more: str) -> tuple[float, dict[str, int]]:
         done = self._podman(
-            *("container", "checkpoint", "--keep", "--tcp-established", "--print-stats", *more, self._name), check=False
+            *("container", "checkpoint", "--keep", ESTABLISHED, "--print-stats", *more, self._name), check=False
         )
         if done.status != 0:
             log = self._world.run("cat", f"{self._static_dir}/dump.log", check=False).stdout
@@ -540,6 +548,7 @@ class CriuPodman(InWorld):
         return done.took_s * 1e3, told
 
     def checkpoint(self) -> Taken:
+        self._tell_criu(IN_FLIGHT)
         took_ms, told = self._checkpoint("--leave-running")
         size = self._world.run("du", "-sk", f"{self._static_dir}/checkpoint").stdout.split()[0]
         freeze = (told["freezing_time"] + told["frozen_time"]) / 1e3 if told else None
@@ -561,10 +570,12 @@ class CriuPodman(InWorld):
             self.refused.append(str(error))
 
     def crash(self) -> Recovered:
+        self._tell_criu(CLOSED)
         self.kill()
         return Recovered(self._restore())
 
     def stop_and_restore(self) -> None:
+        self._tell_criu(IN_FLIGHT)
         self._checkpoint()
         self._restore()
 
