@@ -71,7 +71,9 @@ bench: setup ## measure freeze, reap and restore beside a plain fork()
 bench-peers: setup ## measure avckpt beside CRIU (bare, and through Podman), cold start and a plain fork()
 	@scripts/setup-plots.sh
 	@scripts/setup-peers.sh
+	@scripts/setup-ros.sh
 	@$(VENV)/python bench/peers.py
+	@$(VENV)/python bench/ros_peers.py
 
 bench-cost: setup-build ## measure what checkpoints cost a request/reply server over time
 	@scripts/setup-plots.sh

@@ -367,7 +367,10 @@ def main() -> int:
     except (BenchFailed, AvckptError) as error:
         print(f"bench: {error}", file=sys.stderr)
         status = 1
-    cost_show.show(merge(args.output, cells, memory), args.output)
+    finally:
+        # What was measured is not lost with what could not be.
+        results = merge(args.output, cells, memory)
+    cost_show.show(results, args.output)
     return status
 
 

@@ -507,58 +507,60 @@ class CriuBare(InWorld):
         return done.stdout
 
 
-class CriuPodman(InWorld):
-    """CRIU through Podman: `podman container checkpoint` and `restore`."""
+class CriuContainer:
+    """A container in the peers' world, for `podman container checkpoint` and `restore`."""
 
-    runtime = "crun"
-    name = "CRIU, Podman, crun"
+    def __init__(self, world: World, runtime: str, name: str) -> None:
+        self.name = name
+        self.refused: list[str] = []
+        """Restores that did not work at the first try, in CRIU's own words."""
+        self._world = world
+        self._runtime = runtime
+        self._static_dir = ""
 
-    def start(self) -> None:
-        self._world.import_image()
-        self._name = f"server-{uuid.uuid4().hex[:8]}"
-        self._undo.callback(self._podman, "rm", "--force", "--ignore", "--time", "0", self._name)
-        self._undo.callback(self._tell_criu)
-        mounts = ["-v", f"{PROGRAMS_INSIDE}:{PROGRAMS_INSIDE}:ro", "-v", f"{BOARDS_INSIDE}:{BOARDS_INSIDE}"]
-        self._podman(
-            *("run", "--detach", "--pull=never", "--name", self._name, "--network=host"),
-            *(*self.container_options, *mounts),
-            *(IMAGE, *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE)),
-        )
-        self._static_dir = self._podman("inspect", "--format", "{{.StaticDir}}", self._name).stdout.strip()
+    def podman(self, *args: str, check: bool = True) -> Completed:
+        return self._world.run("podman", "--runtime", self._runtime, *args, check=check)
 
-    def _podman(self, *args: str, check: bool = True) -> Completed:
-        return self._world.run("podman", "--runtime", self.runtime, *args, check=check)
+    def run(self, *args: str) -> None:
+        """On the world's own network.  `args`: options, image, command."""
+        self.podman("run", "--detach", "--pull=never", "--name", self.name, "--network=host", *args)
+        self._static_dir = self.inspect("{{.StaticDir}}")
 
-    def _tell_criu(self, *options: str) -> None:
+    def inspect(self, format: str) -> str:
+        return self.podman("inspect", "--format", format, self.name).stdout.strip()
+
+    def remove(self) -> None:
+        self.podman("rm", "--force", "--ignore", "--time", "0", self.name)
+        self.tell_criu()
+
+    def tell_criu(self, *options: str) -> None:
         """What Podman has no options for: CRIU reads this file, whoever calls it (criu(8), configuration files)."""
         script = 'mkdir -p /etc/criu && printf "%s\\n" "$@" >/etc/criu/default.conf'
         self._world.run("sh", "-c", script, "sh", *(option.removeprefix("--") for option in options))
 
-    def _checkpoint(self, *more: str) -> tuple[float, dict[str, int]]:
-        done = self._podman(
-            *("container", "checkpoint", "--keep", ESTABLISHED, "--print-stats", *more, self._name), check=False
+    def checkpoint(self, *more: str, told: Sequence[str] = (IN_FLIGHT,)) -> Taken:
+        """Raises CriuFailed."""
+        self.tell_criu(*told)
+        done = self.podman(
+            *("container", "checkpoint", "--keep", ESTABLISHED, "--print-stats", *more, self.name), check=False
         )
         if done.status != 0:
             log = self._world.run("cat", f"{self._static_dir}/dump.log", check=False).stdout
             raise _criu_failed("podman container checkpoint", done, log)
         try:
-            told: dict[str, int] = json.loads(done.stdout)["container_statistics"][0]["criu_statistics"]
+            stats: dict[str, int] = json.loads(done.stdout)["container_statistics"][0]["criu_statistics"]
         except (ValueError, KeyError, IndexError, TypeError):
-            told = {}
-        return done.took_s * 1e3, told
-
-    def checkpoint(self) -> Taken:
-        self._tell_criu(IN_FLIGHT)
-        took_ms, told = self._checkpoint("--leave-running")
+            stats = {}
         size = self._world.run("du", "-sk", f"{self._static_dir}/checkpoint").stdout.split()[0]
-        freeze = (told["freezing_time"] + told["frozen_time"]) / 1e3 if told else None
-        return Taken(took_ms, freeze, int(size) / 1024)
+        freeze = (stats["freezing_time"] + stats["frozen_time"]) / 1e3 if stats else None
+        return Taken(done.took_s * 1e3, freeze, int(size) / 1024)
 
-    def _restore(self) -> float:
-        until = time.monotonic() + PATIENCE_S
+    def restore(self, patience_s: float = PATIENCE_S) -> float:
+        """What the command took that did it, ms.  Raises CriuFailed."""
+        until = time.monotonic() + patience_s
         # Podman hears of the death from conmon; until then it does not restore ("is running or paused").
         while True:
-            done = self._podman("container", "restore", "--keep", ESTABLISHED, self._name, check=False)
+            done = self.podman("container", "restore", "--keep", ESTABLISHED, self.name, check=False)
             if done.status == 0:
                 return done.took_s * 1e3
             if "is running or paused" in done.stderr and time.monotonic() < until:
@@ -569,20 +571,36 @@ class CriuPodman(InWorld):
                 raise error
             self.refused.append(str(error))
 
+
+class CriuPodman(InWorld):
+    """CRIU through Podman: `podman container checkpoint` and `restore`."""
+
+    runtime = "crun"
+    name = "CRIU, Podman, crun"
+
+    def start(self) -> None:
+        self._world.import_image()
+        self._container = CriuContainer(self._world, self.runtime, f"server-{uuid.uuid4().hex[:8]}")
+        self._container.refused = self.refused
+        self._undo.callback(self._container.remove)
+        mounts = ["-v", f"{PROGRAMS_INSIDE}:{PROGRAMS_INSIDE}:ro", "-v", f"{BOARDS_INSIDE}:{BOARDS_INSIDE}"]
+        self._container.run(*self.container_options, *mounts, IMAGE, *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE))
+
+    def checkpoint(self) -> Taken:
+        return self._container.checkpoint("--leave-running")
+
     def crash(self) -> Recovered:
-        self._tell_criu(CLOSED)
+        self._container.tell_criu(CLOSED)
         self.kill()
-        return Recovered(self._restore())
+        return Recovered(self._container.restore())
 
     def stop_and_restore(self) -> None:
-        self._tell_criu(IN_FLIGHT)
-        self._checkpoint()
-        self._restore()
+        self._container.checkpoint()
+        self._container.restore()
 
     def _ask_conmon(self) -> int:
         # The world has PIDs of its own, which all of its processes see in NSpid.
-        inside = self._podman("inspect", "--format", "{{.State.ConmonPid}}", self._name).stdout.strip()
-        return self._world.outside(int(inside))
+        return self._world.outside(int(self._container.inspect("{{.State.ConmonPid}}")))
 
 
 class CriuPodmanRunc(CriuPodman):
@@ -593,6 +611,7 @@ class CriuPodmanRunc(CriuPodman):
 
 
 __all__ = [
+    "CLOSED",
     "AvckptEngine",
     "AvckptPodman",
     "Below",
@@ -600,6 +619,7 @@ __all__ = [
     "ColdStart",
     "CommandFailed",
     "CriuBare",
+    "CriuContainer",
     "CriuFailed",
     "CriuPodman",
     "CriuPodmanRunc",

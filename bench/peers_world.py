@@ -51,7 +51,7 @@ class World:
         command += ["--fork", "--kill-child", "sh", str(ROOT / "bench" / "peers_world.sh")]
         command += [str(path) for path in (tarball, self._mountpoint, PROGRAMS, boards, CACHE)]
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
-        self._has_image = False
+        self._has_image = self._uses_podman = False
         self._first = 0
         self.enter: list[str] = []
         """The command in front of a program that shall run in it."""
@@ -73,7 +73,7 @@ class World:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._has_image:
+        if self._uses_podman:
             # So that no cgroups are left on the host.
             self.run("podman", "rm", "--all", "--force", "--time", "0", check=False)
         self._process.kill()
@@ -101,14 +101,19 @@ class World:
         raise BenchFailed(f"no process {pid} in the peers' world")
 
     def _is_inside(self, pid: str) -> bool:
-        mine, theirs = (os.readlink(f"/proc/{each}/ns/pid") for each in (self._first, pid))
+        mine, theirs = (os.readlink(f"/proc/{each}/ns/net") for each in (self._first, pid))
         return mine == theirs
 
     def import_image(self) -> None:
         """The same base image that the host's containers start from."""
         if not self._has_image:
-            self._has_image = True
+            self._has_image = self._uses_podman = True
             self.run("podman", "import", "--quiet", f"/cache/{self._base.name}", IMAGE)
+
+    def load_image(self, archive: Path) -> None:
+        """Of `podman save`, by its path inside."""
+        self._uses_podman = True
+        self.run("podman", "load", "--quiet", "--input", str(archive))
 
     def versions(self) -> dict[str, str]:
         """Of what is compared with."""

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ROS node beside CRIU: the pipeline of examples/ros in the peers' world, its voxel filter brought back by Podman.
+
+    .venv/bin/python bench/ros_peers.py [--runs 2] [--runtimes crun,runc]
+
+Each run takes one checkpoint of the filter, kills it three seconds later with SIGKILL, and calls `podman container
+restore` in that moment.  What a crash does to the chain is measured as in bench/ros.py, whose results for avckpt and
+for a cold start stand beside it.  Writes bench/results/ros_peers.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(ROOT / "tests"))
+
+from harness import CommandFailed, wait_until  # noqa: E402
+
+from bench.peers_subjects import CLOSED, IN_FLIGHT, CriuContainer, CriuFailed  # noqa: E402
+from bench.peers_world import BOARDS_INSIDE, World  # noqa: E402
+from bench.ros import BEFORE_S, SETTLE_S, machine, say  # noqa: E402
+from bench.ros_pipeline import LOST_M, MANIFEST, PERIOD_S, START_S, Log, PipelineFailed  # noqa: E402
+from bench.ros_show import spread  # noqa: E402
+from bench.subjects import BenchFailed  # noqa: E402
+
+RESULTS = ROOT / "bench" / "results" / "ros_peers.json"
+BESIDE = ROOT / "bench" / "results" / "ros.json"
+IMAGE = "localhost/avckpt-ros:latest"
+NODE = "voxel"
+SERVICES = ("roscore", "monitor", "ndt", NODE, "player")
+RESTORE_S = 65.0
+"""How long a restore is tried: longer than a port stays taken by connections that have ended (TIME_WAIT)."""
+CHAIN_S = 30.0
+"""How long the chain is then waited for."""
+AROUND_S = 0.3
+"""Scans published so shortly before and after a checkpoint count as its own."""
+
+Json = dict[str, Any]
+
+
+def commands() -> dict[str, list[str]]:
+    """Of the manifest's services, with its defaults."""
+    text = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", MANIFEST.read_text())
+    services = yaml.safe_load(text)["services"]
+    return {name: services[name]["command"] for name in SERVICES}
+
+
+class Chain:
+    """The pipeline's containers in a world of their own."""
+
+    def __init__(self, world: World, runtime: str, results: Path) -> None:
+        self._results = results
+        self._world = world
+        self.log = Log(results / "monitor.log")
+        self.containers = {name: CriuContainer(world, runtime, f"ros-{name}") for name in SERVICES}
+        self.node = self.containers[NODE]
+        self._options = ["--env", "ROS_MASTER_URI=http://127.0.0.1:11311", "--env", "ROS_IP=127.0.0.1"]
+        self._options += ["--volume", "/cache/ros-drive:/drive:ro"]
+        self._options += ["--volume", f"{BOARDS_INSIDE}/{results.name}:/results"]
+
+    def __enter__(self) -> Chain:
+        (self._results / "faults").mkdir(parents=True)
+        for name in SERVICES:
+            self._start(name)
+        self.wait_delivers(time.time(), START_S, frames=20)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for container in reversed(self.containers.values()):
+            container.remove()
+
+    def _start(self, name: str) -> None:
+        self.containers[name].run(*self._options, IMAGE, *commands()[name])
+
+    def start_node_anew(self) -> None:
+        self.node.remove()
+        self._start(NODE)
+        self.wait_delivers(time.time(), START_S, frames=20)
+
+    def wait_delivers(self, since: float, timeout_s: float, frames: int) -> None:
+        """Raises PipelineFailed."""
+        try:
+            wait_until(lambda: self.log.delivers(since, frames), timeout_s, "", every_s=0.05)
+        except TimeoutError:
+            raise PipelineFailed(f"the chain does not deliver within {timeout_s:.0f} s") from None
+
+    def kill_node(self) -> float:
+        """When."""
+        pidfd = os.pidfd_open(self._world.outside(int(self.node.inspect("{{.State.Pid}}"))))
+        try:
+            at = time.time()
+            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+            return at
+        finally:
+            os.close(pidfd)
+
+
+def one_run(chain: Chain, variant: str, rng: random.Random) -> Json:
+    """A checkpoint, a crash, a restore.  Raises CriuFailed, PipelineFailed when there is no checkpoint."""
+    time.sleep(BEFORE_S + rng.uniform(0, 1.0))
+    chain.wait_delivers(time.time() - 0.5, SETTLE_S, frames=10)
+    began = time.time()
+    taken = chain.node.checkpoint("--leave-running", told=(IN_FLIGHT, CLOSED))
+    ended = time.time()
+    time.sleep(BEFORE_S + rng.uniform(0, 0.1))
+    around = chain.log.frames(began - AROUND_S, ended + AROUND_S)
+    run = {
+        "variant": variant,
+        "checkpoint_ms": taken.took_ms,
+        "freeze_ms": taken.tool_freeze_ms,
+        "checkpoint_mb": taken.memory_mb,
+        "lost_at_checkpoint": sum(frame.pose is None for frame in around),
+    }
+    chain.node.tell_criu(CLOSED)
+    at = chain.kill_node()
+    try:
+        run["command_ms"] = chain.node.restore(RESTORE_S)
+        chain.wait_delivers(at + 0.001, CHAIN_S, frames=15)
+    except (CriuFailed, PipelineFailed) as error:
+        return run | {"failed": str(error)}
+    frames = chain.log.frames(at - PERIOD_S)
+    clouds = [frame.filtered for frame in frames if frame.filtered is not None and frame.stamp > at]
+    poses = [frame.pose for frame in frames if frame.pose is not None and frame.stamp > at and frame.error_m < LOST_M]
+    return run | {
+        "to_next_cloud_ms": 1e3 * (min(clouds) - at),
+        "to_next_pose_ms": 1e3 * (min(poses) - at),
+        "lost": sum(frame.pose is None for frame in frames if frame.stamp < min(poses)),
+    }
+
+
+def runs_of(runtime: str, runs: int, rng: random.Random) -> Generator[Json, None, None]:
+    variant = f"CRIU, Podman, {runtime}"
+    with tempfile.TemporaryDirectory(prefix="avckpt-ros-", dir="/dev/shm") as folder, World(Path(folder)) as world:
+        archive = Path(folder) / "ros.tar"
+        subprocess.run(["podman", "save", "--quiet", "--output", str(archive), IMAGE], check=True)
+        world.load_image(BOARDS_INSIDE / archive.name)
+        archive.unlink()
+        with Chain(world, runtime, Path(folder) / "results") as chain:
+            for _ in range(runs):
+                before = len(chain.node.refused)
+                run = one_run(chain, variant, rng)
+                yield run | {"refused": len(chain.node.refused) - before}
+                if "failed" in run:
+                    chain.start_node_anew()
+
+
+def row(name: str, key: str, digits: int, columns: Sequence[Sequence[Json]]) -> str:
+    cells = [spread([run[key] for run in column if run.get(key) is not None], digits) for column in columns]
+    return f"| {name} | " + " | ".join(cells) + " |"
+
+
+def table(runs: Sequence[Json]) -> str:
+    """Mean and standard deviation; avckpt and cold start as bench/ros.py has measured them."""
+    beside = json.loads(BESIDE.read_text())["latency"] if BESIDE.exists() else []
+    every = [*beside, *runs]
+    variants = list(dict.fromkeys(run["variant"] for run in every))
+    columns = [[run for run in every if run["variant"] == variant] for variant in variants]
+    failed = [sum(run["variant"] == variant and "failed" in run for run in every) for variant in variants]
+    lines = ["| | " + " | ".join(variants) + " |", "|---|" + "---:|" * len(variants)]
+    lines.append("| runs | " + " | ".join(str(len(column)) for column in columns) + " |")
+    lines.append("| of these did not recover | " + " | ".join(map(str, failed)) + " |")
+    for name, key, digits in (
+        ("freeze by a checkpoint, by the tool's own account, ms", "freeze_ms", 0),
+        ("scans lost at a checkpoint", "lost_at_checkpoint", 2),
+        ("a checkpoint holds, MB", "checkpoint_mb", 0),
+        ("crash to next filtered cloud, ms", "to_next_cloud_ms", 0),
+        ("crash to next pose, ms", "to_next_pose_ms", 0),
+        ("scans lost", "lost", 2),
+    ):
+        lines.append(row(name, key, digits, columns))
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="The ROS node beside CRIU through Podman.")
+    parser.add_argument("--runs", type=int, default=2, help="of each runtime (%(default)s)")
+    parser.add_argument("--runtimes", default="crun,runc", help="(%(default)s)")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="where the results go (%(default)s)")
+    parser.add_argument("--show", action="store_true", help="measure nothing, make the table of what is there")
+    args = parser.parse_args()
+    runs: list[Json] = json.loads(args.output.read_text())["runs"] if args.show else []
+    if os.geteuid() != 0:
+        print("ros_peers: it takes root: CRIU restores other processes", file=sys.stderr)
+        return 1
+    try:
+        for runtime in [] if args.show else args.runtimes.split(","):
+            with contextlib.closing(runs_of(runtime, args.runs, random.Random(runtime))) as found:
+                for run in found:
+                    runs.append(run)
+                    told = run.get("failed") or f"next pose after {run['to_next_pose_ms']:.0f} ms"
+                    say(f"{run['variant']}: {told}")
+    except (BenchFailed, CommandFailed, PipelineFailed, subprocess.CalledProcessError) as error:
+        print(f"ros_peers: {error}", file=sys.stderr)
+        return 1
+    if not args.show:
+        args.output.write_text(json.dumps({"runs": runs, "machine": machine()}, indent=1) + "\n")
+    args.output.with_suffix(".md").write_text(table(runs) + "\n")
+    print(table(runs))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
