@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 sys.path.insert(0, str(ROOT / "tests"))
 
-from harness import CommandFailed, wait_until  # noqa: E402
+from harness import CommandFailed  # noqa: E402
 
 from bench.peers_subjects import CLOSED, IN_FLIGHT, CriuContainer, CriuFailed  # noqa: E402
 from bench.peers_world import BOARDS_INSIDE, World  # noqa: E402
@@ -71,6 +71,7 @@ class Chain:
         self.log = Log(results / "monitor.log")
         self.containers = {name: CriuContainer(world, runtime, f"ros-{name}") for name in SERVICES}
         self.node = self.containers[NODE]
+        self._commands = commands()
         self._options = ["--env", "ROS_MASTER_URI=http://127.0.0.1:11311", "--env", "ROS_IP=127.0.0.1"]
         self._options += ["--volume", "/cache/ros-drive:/drive:ro"]
         self._options += ["--volume", f"{BOARDS_INSIDE}/{results.name}:/results"]
@@ -79,7 +80,7 @@ class Chain:
         (self._results / "faults").mkdir(parents=True)
         for name in SERVICES:
             self._start(name)
-        self.wait_delivers(time.time(), START_S, frames=20)
+        self.log.wait_delivers(time.time(), START_S, frames=20)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -87,19 +88,12 @@ class Chain:
             container.remove()
 
     def _start(self, name: str) -> None:
-        self.containers[name].run(*self._options, IMAGE, *commands()[name])
+        self.containers[name].run(*self._options, IMAGE, *self._commands[name])
 
     def start_node_anew(self) -> None:
         self.node.remove()
         self._start(NODE)
-        self.wait_delivers(time.time(), START_S, frames=20)
-
-    def wait_delivers(self, since: float, timeout_s: float, frames: int) -> None:
-        """Raises PipelineFailed."""
-        try:
-            wait_until(lambda: self.log.delivers(since, frames), timeout_s, "", every_s=0.05)
-        except TimeoutError:
-            raise PipelineFailed(f"the chain does not deliver within {timeout_s:.0f} s") from None
+        self.log.wait_delivers(time.time(), START_S, frames=20)
 
     def kill_node(self) -> float:
         """When."""
@@ -115,7 +109,7 @@ class Chain:
 def one_run(chain: Chain, variant: str, rng: random.Random) -> Json:
     """A checkpoint, a crash, a restore.  Raises CriuFailed, PipelineFailed when there is no checkpoint."""
     time.sleep(BEFORE_S + rng.uniform(0, 1.0))
-    chain.wait_delivers(time.time() - 0.5, SETTLE_S, frames=10)
+    chain.log.wait_delivers(time.time() - 0.5, SETTLE_S, frames=10)
     began = time.time()
     taken = chain.node.checkpoint("--leave-running", told=(IN_FLIGHT, CLOSED))
     ended = time.time()
@@ -132,7 +126,7 @@ def one_run(chain: Chain, variant: str, rng: random.Random) -> Json:
     at = chain.kill_node()
     try:
         run["command_ms"] = chain.node.restore(RESTORE_S)
-        chain.wait_delivers(at + 0.001, CHAIN_S, frames=15)
+        chain.log.wait_delivers(at + 0.001, CHAIN_S, frames=15)
     except (CriuFailed, PipelineFailed) as error:
         return run | {"failed": str(error)}
     frames = chain.log.frames(at - PERIOD_S)
@@ -211,8 +205,9 @@ def main() -> int:
         return 1
     if not args.show:
         args.output.write_text(json.dumps({"runs": runs, "machine": machine()}, indent=1) + "\n")
-    args.output.with_suffix(".md").write_text(table(runs) + "\n")
-    print(table(runs))
+    text = table(runs)
+    args.output.with_suffix(".md").write_text(text + "\n")
+    print(text)
     return 0
 
 

@@ -113,6 +113,18 @@ class Log:
         good = [frame for frame in self.frames(since) if frame.pose is not None and frame.error_m < LOST_M]
         return len(good) >= frames
 
+    def wait_delivers(self, since: float, timeout_s: float, frames: int = 20) -> None:
+        """Raises PipelineFailed when the chain has not delivered so many frames by then."""
+        try:
+            wait_until(lambda: self.delivers(since, frames), timeout_s, "", every_s=0.05)
+        except TimeoutError:
+            seen = self.frames(since)
+            poses = [frame for frame in seen if frame.pose is not None]
+            raise PipelineFailed(
+                f"the chain does not deliver: of {len(seen)} scans {len(poses)} became poses, "
+                f"{sum(frame.error_m > LOST_M for frame in poses)} of them wrong"
+            ) from None
+
 
 @dataclass(frozen=True)
 class Crash:
@@ -159,15 +171,7 @@ class Pipeline:
 
     def wait_delivers(self, since: float, timeout_s: float, frames: int = 20) -> None:
         """Raises PipelineFailed when the chain has not delivered so many frames by then."""
-        try:
-            wait_until(lambda: self.log.delivers(since, frames), timeout_s, "", every_s=0.05)
-        except TimeoutError:
-            seen = self.log.frames(since)
-            poses = [frame for frame in seen if frame.pose is not None]
-            raise PipelineFailed(
-                f"the chain does not deliver: of {len(seen)} scans {len(poses)} became poses, "
-                f"{sum(frame.error_m > LOST_M for frame in poses)} of them wrong"
-            ) from None
+        self.log.wait_delivers(since, timeout_s, frames)
 
     def pid(self, node: str) -> int:
         """The node's process.  Raises LookupError while there is none."""

@@ -103,10 +103,8 @@ class Idle:
     def __enter__(self) -> Idle:
         try:
             eventually(self._has_started, "the victim has touched its memory")
-            # The list may be short of one at the moment when another child ends (proc(5), children).
-            eventually(
-                lambda: len(children(self._process.pid)) == 1 or self._process.poll() is not None, "init is there"
-            )
+            # It may have ended meanwhile, which check() tells.
+            eventually(lambda: self._process.poll() is not None or bool(children(self._process.pid)), "init is there")
             self.check()
             (self.init_pid,) = children(self._process.pid)
         except BaseException:

@@ -69,6 +69,11 @@ class Figure:
         return self.measured_ms <= self.limit_ms
 
 
+def living(victim: Victim) -> list[int]:
+    """Its processes, zombies left out."""
+    return [member.pid for member in members(victim) if not member.is_zombie]
+
+
 class Subject:
     """A victim of several processes with a guard that takes checkpoints on command."""
 
@@ -103,7 +108,7 @@ class Subject:
         return float(event["restore_s"]) * 1e3
 
     def pids(self) -> list[int]:
-        return [member.pid for member in members(self.victim) if not member.is_zombie]
+        return living(self.victim)
 
     def threads(self) -> int:
         return sum(len(os.listdir(f"/proc/{pid}/task")) for pid in self.pids())
@@ -124,14 +129,12 @@ def cycles_of(subject: Subject, cycles: int, take: Callable[[], float]) -> float
 def forks_ms(command: str, folder: Path) -> tuple[float, int]:
     """What plain forks of all its processes take, one after the other, each by itself; and how many there are."""
     with mock.patch.dict(os.environ, VICTIM_TIME_FORKS="1"), Victim(command, folder) as victim:
-        pids = {member.pid for member in members(victim) if not member.is_zombie}
         give_up = time.monotonic() + PATIENCE_S
-        while victim.see().counter[3] < len(pids):
+        while victim.see().counter[3] < (processes := len(living(victim))):
             if victim.see().violations or time.monotonic() > give_up:
                 raise BenchFailed(f"the forks of `{command}` could not be measured: {victim.said}")
             time.sleep(0.01)
-            pids = {member.pid for member in members(victim) if not member.is_zombie}
-        return victim.see().counter[2] / 1e6, len(pids)
+        return victim.see().counter[2] / 1e6, processes
 
 
 def measure_freeze(cycles: int, folder: Path) -> list[Figure]:

@@ -229,8 +229,7 @@ static int clone_app(struct target *target, struct thread *main_thread,
 		return -1;
 	if (pad_run_clone_while(main_thread->tid, call, capture_files, &capture, &template, err)) {
 		target->lost = err->code != AVC_KERNEL;
-		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
-			main_thread->stopped = false;
+		thread_runs_on(main_thread, err);
 		return -1;
 	}
 	times->clone_ns = now_ns() - start;
@@ -415,8 +414,7 @@ static int ask_halt(struct asking *asking, struct avc_error *err)
 	if (pad_halt(asking->thread->tid, &asking->target->pad.control->runner, err) == 0)
 		return 0;
 	asking->asked = false;
-	if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
-		asking->thread->stopped = false;
+	thread_runs_on(asking->thread, err);
 	return -1;
 }
 
@@ -426,8 +424,7 @@ static int ask_end(struct asking *asking, struct avc_error *err)
 	struct inj_call *call = &target->pad.control->runner;
 
 	if (tracee_await(asking->thread->tid, NULL, err) != STOP_TRAP) {
-		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
-			asking->thread->stopped = false;
+		thread_runs_on(asking->thread, err);
 		return -1;
 	}
 	pending_read(target);

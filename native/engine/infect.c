@@ -493,8 +493,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	result = pad_run_clone(thread->tid, call, &between, err);
 	if (result) {
 		target->lost = target->lost || err->code != AVC_KERNEL;
-		if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
-			thread->stopped = false;
+		thread_runs_on(thread, err);
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||

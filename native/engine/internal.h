@@ -683,6 +683,8 @@ void threads_forget_unseen(struct target *target);
  * registers and mends the interrupted call. */
 int thread_stop(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 int thread_await(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+/* After injected code in it has failed: what did not come back in time is still on its way. */
+void thread_runs_on(struct thread *thread, const struct avc_error *err);
 /* Lets it go on as if nothing had been.  A thread that could not be stopped stays
  * attached: a straggler. */
 void thread_release(struct thread *thread);

@@ -238,6 +238,12 @@ int thread_await(struct target *target, struct thread *thread, struct avc_error 
 	return 0;
 }
 
+void thread_runs_on(struct thread *thread, const struct avc_error *err)
+{
+	if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
+		thread->stopped = false;
+}
+
 void thread_release(struct thread *thread)
 {
 	struct avc_error ignored = { 0 };
