@@ -284,5 +284,7 @@ uint32_t files_leader(const struct files *files, const struct file *file);
 /* What is `want`'s i-th already, or NULL if it is made anew. */
 const struct file *files_now_of(const struct files_work *work, uint32_t i);
 void files_list_calls(struct files_work *work);
+/* What the set watches under this number, or NULL; `epoll` may be NULL. */
+const struct file_watch *files_find_watch(const struct file *epoll, int fd);
 
 #endif

@@ -11,10 +11,10 @@
 
 #include "files.h"
 
-static const struct file_watch *find_watch(const struct file *epoll, const struct file_watch *watch)
+const struct file_watch *files_find_watch(const struct file *epoll, int fd)
 {
 	for (uint32_t i = 0; epoll && i < epoll->watch_count; i++)
-		if (epoll->watch[i].fd == watch->fd)
+		if (epoll->watch[i].fd == fd)
 			return &epoll->watch[i];
 	return NULL;
 }
@@ -25,32 +25,31 @@ static bool renew(const struct files_work *work, const struct file *n,
 		  const struct file_watch *watch)
 {
 	const struct file *of = files_find(work->want, watch->fd);
-	const struct file_watch *is = find_watch(n, watch);
+	const struct file_watch *is = files_find_watch(n, watch->fd);
 
 	return !is || is->events != watch->events || is->data != watch->data ||
 	       work->lost[files_index(work->want, of)] || of->kind == FILE_SIGNALFD ||
 	       of->kind == FILE_EPOLL || watch->events & (EPOLLET | EPOLLONESHOT);
 }
 
+/* What it watches since has been forgotten (files_restore.c). */
 static void list_epoll(const struct files_work *work, struct setup *setup, const struct file *w,
 		       const struct file *n)
 {
-	for (uint32_t i = 0; n && i < n->watch_count; i++)
-		if (!find_watch(w, &n->watch[i]))
-			setup_add(setup, INJ_DESCRIPTORS, "", SYS_epoll_ctl, (uint64_t)w->fd,
-				  EPOLL_CTL_DEL, (uint64_t)n->watch[i].fd, 0, 0)
-				->flags = INJ_MAY_FAIL;
 	for (uint32_t i = 0; i < w->watch_count; i++) {
 		const struct file_watch *watch = &w->watch[i];
+		const struct file *of = files_find(work->want, watch->fd);
 		struct epoll_event event = { .events = watch->events };
+		enum inj_stage stage;
 
-		if (!files_find(work->want, watch->fd) || !renew(work, n, watch))
+		if (!of || !renew(work, n, watch))
 			continue;
 		event.data.u64 = watch->data;
-		setup_add(setup, INJ_DESCRIPTORS, "", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_DEL,
+		stage = of->pid_inside ? INJ_OWNERS : INJ_DESCRIPTORS; /* when it is there */
+		setup_add(setup, stage, "", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_DEL,
 			  (uint64_t)watch->fd, 0, 0)
 			->flags = INJ_MAY_FAIL;
-		setup_add(setup, INJ_DESCRIPTORS, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd,
+		setup_add(setup, stage, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd,
 			  EPOLL_CTL_ADD, (uint64_t)watch->fd,
 			  setup_data(setup, &event, sizeof event), 0)
 			->flags = INJ_MAY_FAIL;
@@ -117,7 +116,8 @@ static void list_pidfd(struct setup *setup, const struct file *w)
 		->flags = INJ_MAY_FAIL;
 }
 
-/* Made again, and bound (files_make.c). */
+/* Made again, and bound (files_make.c).  Whoever connects is told who listens (unix(7),
+ * SO_PEERCRED), so the process must have its own user by then. */
 static void list_listen(const struct files_work *work, struct setup *setup, const struct file *w,
 			const struct file *n)
 {
@@ -125,7 +125,7 @@ static void list_listen(const struct files_work *work, struct setup *setup, cons
 
 	if (!n && s && s->domain == AF_UNIX && s->listening && (!w->family || w->family == w) &&
 	    work->lost[files_index(work->want, w)])
-		setup_add(setup, INJ_DESCRIPTORS, "listen", SYS_listen, (uint64_t)w->fd,
+		setup_add(setup, INJ_OWNERS, "listen", SYS_listen, (uint64_t)w->fd,
 			  (uint64_t)s->backlog, 0, 0, 0)
 			->flags = INJ_MAY_FAIL;
 }
@@ -144,11 +144,12 @@ void files_list_calls(struct files_work *work)
 	};
 	slot->setup[INJ_DESCRIPTORS] = 0;
 	slot->setup[INJ_OWNERS] = 0;
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->want->file[i].pid_inside)
+			list_pidfd(setup, &work->want->file[i]);
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
 
-		if (w->pid_inside)
-			list_pidfd(setup, w);
 		if (files_leader(work->want, w) != i)
 			continue;
 		list_listen(work, setup, w, n);

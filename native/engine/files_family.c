@@ -31,13 +31,41 @@ static uint32_t list_held(struct files_held *held, const struct generation *imag
 	return count;
 }
 
+static pid_t inside_of(const struct target *main, const struct generation *generation, pid_t pid)
+{
+	if (pid == main->leader)
+		return main->inside;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].pid == pid)
+			return generation->branch[i].inside;
+	return 0;
+}
+
+/* Pidfds and owners: what the process itself is called is known already (files.c). */
+static void name_others(const struct target *main, const struct generation *generation,
+			struct files *files)
+{
+	for (uint32_t i = 0; files && i < files->count; i++) {
+		struct file *f = &files->file[i];
+
+		if (f->kind == FILE_PIDFD && !f->pid_inside)
+			f->pid_inside = inside_of(main, generation, f->pid);
+		if (f->owner && !f->owner_inside && f->owner_type == F_OWNER_PID)
+			f->owner_inside = inside_of(main, generation, f->owner);
+	}
+}
+
 /* By the templates, which have the tables as the processes have them.  What a process has
  * put in a place since is found to be shared with nobody. */
-void files_settle_family(struct generation *generation)
+void files_settle_family(const struct target *main, struct generation *generation)
 {
 	struct files_held *held = NULL;
 	uint32_t count;
 
+	name_others(main, generation, generation->files);
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].image)
+			name_others(main, generation, generation->branch[i].image->files);
 	for (int pass = 0; pass < 2; pass++) {
 		count = list_held(held, generation);
 		for (uint32_t i = 0; i < generation->branches; i++)

@@ -2,11 +2,15 @@
  *
  * Makes the table of descriptors the checkpoint's again (files.h).
  *
- * The dead app's table lives on in its templates.  The engine gets or makes what is
- * missing, and the template, by injected calls, takes it over a socket and puts it in
- * its place: nobody else runs with this table meanwhile.  What depends on the process
+ * The dead app's table lives on in its template and its holder.  The engine gets or makes
+ * what is missing, and the template, by injected calls, takes it over a socket and puts it
+ * in its place: nobody else runs with this table meanwhile.  What depends on the process
  * (epoll and signalfd, owners, POSIX locks) is left to the restored process itself, as a
  * list of calls in its slot.
+ *
+ * Only the main process gets this table.  The others are forked by their parents and get
+ * theirs anew, out of what is gathered here (files_work_table()): of the old one, which the
+ * holder has, only that is closed which is new, until they are all there.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -14,6 +18,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
@@ -126,6 +131,19 @@ static void give_up_read(struct files_work *work)
 		if (fd < 0 || ioctl(fd, FIONREAD, &bytes) || (uint32_t)bytes != w->content_bytes)
 			work->source[i] = -1;
 		close_fd(&fd);
+	}
+}
+
+/* Of a process of the app's, it is of a dead one. */
+static void give_up_pidfds(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (!w->pid_inside)
+			continue;
+		work->source[files_leader(work->want, w)] = -1;
+		work->lost[i] = true;
 	}
 }
 
@@ -279,7 +297,7 @@ static bool is_urgent(const struct files_work *work)
 	return false;
 }
 
-/* ---- in the template ------------------------------------------------------------- */
+/* ---- in the table ------------------------------------------------------------------ */
 
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
 static struct files_letter *mail_of(const struct files_work *work)
@@ -296,29 +314,36 @@ static struct inj_syscall *list_of(const struct files_work *work)
 #define LISTED_MAX \
 	((INJ_FILES_BYTES / 2 - sizeof(struct files_letter)) / sizeof(struct inj_syscall))
 
-/* What was listed becomes the template's next call. */
+/* Of the task that has the table. */
+static struct inj_call *call_of(const struct files_work *work)
+{
+	return work->target->descendant
+		       ? &work->target->pad.control->holder
+		       : &pad_slot(&work->target->pad, work->generation->slot)->template_call;
+}
+
+/* What was listed becomes the task's next call. */
 static void close_list(struct files_work *work)
 {
-	struct inj_call *call =
-		&pad_slot(&work->target->pad, work->generation->slot)->template_call;
-
 	if (work->listed)
-		call_add(call, INJ_LIST, pad_remote(&work->target->pad, list_of(work)),
+		call_add(call_of(work), INJ_LIST, pad_remote(&work->target->pad, list_of(work)),
 			 work->listed, 0, 0, 0);
 	work->listed = 0;
 }
 
 static int flush(struct files_work *work, struct avc_error *err)
 {
-	struct generation *generation = work->generation;
-	struct inj_call *call = &pad_slot(&work->target->pad, generation->slot)->template_call;
+	const struct target *target = work->target;
+	struct inj_call *call = call_of(work);
 	int result = 0;
 
 	close_list(work);
 	if (call->count)
-		result = pad_send(&work->target->pad, generation->template, &generation->base, call,
-				  err) ||
-			 pad_run(generation->template, call, err);
+		result = pad_send(&target->pad, work->table,
+				  target->descendant ? &target->holder_base
+						     : &work->generation->base,
+				  call, err) ||
+			 pad_run(work->table, call, err);
 	call_begin(call, INJ_AFTER_PARK);
 	return result ? -1 : 0;
 }
@@ -329,6 +354,51 @@ static int inject(struct files_work *work, struct avc_error *err, long nr, uint6
 	if (work->listed == LISTED_MAX && flush(work, err))
 		return -1;
 	list_of(work)[work->listed++] = (struct inj_syscall){ .nr = nr, .arg = { a, b, c } };
+	return 0;
+}
+
+/* Has somebody watched by this epoll set what is not watched by it in the checkpoint? */
+static bool is_watched_since(const struct files_work *work, const struct file *want,
+			     const struct file_watch *watch)
+{
+	const struct file *w = files_find(work->want, watch->fd);
+
+	return !files_find_watch(want, watch->fd) || !w || work->lost[files_index(work->want, w)];
+}
+
+/* A set watches a number and an open file description, and lets go of them when nobody has
+ * the description open any more (epoll(7), Questions and answers): a process outside of the
+ * app may have it still, and of a table that is made anew the old one stays for a while.  Under
+ * the same number something else is watched then as well.  Only in the table where the two
+ * belong together can they be forgotten. */
+static int forget_watches(struct files_work *work, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const struct file *n = w->kind == FILE_EPOLL ? files_now_of(work, i) : NULL;
+
+		if (!n || files_leader(work->want, w) != i)
+			continue;
+		for (uint32_t k = 0; k < n->watch_count; k++)
+			if (is_watched_since(work, w, &n->watch[k]) &&
+			    inject(work, err, SYS_epoll_ctl, (uint64_t)n->fd, EPOLL_CTL_DEL,
+				   (uint64_t)n->watch[k].fd))
+				return -1;
+	}
+	return 0;
+}
+
+/* POSIX locks are the table's (fcntl(2)), and the one that is made anew has to get them. */
+static int unlock_all(struct files_work *work, struct avc_error *err)
+{
+	struct flock *all = (struct flock *)mail_of(work);
+
+	*all = (struct flock){ .l_type = F_UNLCK, .l_whence = SEEK_SET };
+	for (uint32_t i = 0; i < work->now->count; i++)
+		if (work->now->file[i].lock_count &&
+		    inject(work, err, SYS_fcntl, (uint64_t)work->now->file[i].fd, F_SETLK,
+			   pad_remote(&work->target->pad, all)))
+			return -1;
 	return 0;
 }
 
@@ -464,7 +534,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 static int put_lost(struct files_work *work, struct avc_error *err)
 {
 	const struct pad *pad = &work->target->pad;
-	struct inj_call *call = &pad_slot(pad, work->generation->slot)->template_call;
+	struct inj_call *call = call_of(work);
 	struct numbers numbers = { .room = 16 };
 	int32_t ends[2];
 	int ours, theirs, result = -1;
@@ -587,6 +657,10 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	work->lost = calloc(work->want->count + 1, sizeof *work->lost);
 	if (!work->now || !work->local || !work->source || !work->lost)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	/* The app died while it was cloning (guard_checkpoint.c, abandon()). */
+	if (work->table && work->target->descendant && work->target->doubtful &&
+	    tracee_halt(work->table, err))
+		return -1;
 	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
 				      work->want, work->init, err))
 		return -1;
@@ -602,6 +676,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	find_moved(work);
 	give_up_hung_up(work);
 	give_up_read(work);
+	give_up_pidfds(work);
 	give_up_deleted(work);
 	break_pairs(work);
 	return 0;
@@ -626,21 +701,27 @@ void files_work_end(struct files_work *work)
 	files_free(work->now);
 }
 
-int files_work_gather(struct files_work *work, struct avc_error *err)
+/* All other processes have a table that is made anew. */
+static int gather_anew(struct files_work *work, struct avc_error *err)
 {
-	/* A table that is made anew: everything has to be put in its place. */
-	for (uint32_t i = 0; work->target->descendant && i < work->want->count; i++)
+	if (unlock_all(work, err) || flush(work, err))
+		return -1;
+	for (uint32_t i = 0; i < work->want->count; i++)
 		work->lost[i] = true;
 	gather(work);
+	return 0;
+}
+
+int files_work_gather(struct files_work *work, struct avc_error *err)
+{
+	gather(work);
+	call_begin(call_of(work), INJ_AFTER_PARK);
+	if (forget_watches(work, err) || close_new(work, err))
+		return -1;
 	if (work->target->descendant)
-		return 0;
-	call_begin(&pad_slot(&work->target->pad, work->generation->slot)->template_call,
-		   INJ_AFTER_PARK);
+		return gather_anew(work, err);
 	/* What is left on the list is made just before the fork (restore.c). */
-	return close_new(work, err) || set_cloexec(work, err) ||
-			       (is_urgent(work) && flush(work, err))
-		       ? -1
-		       : 0;
+	return set_cloexec(work, err) || (is_urgent(work) && flush(work, err)) ? -1 : 0;
 }
 
 int files_work_place(struct files_work *work, struct avc_error *err)

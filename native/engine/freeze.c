@@ -337,6 +337,7 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 		if (!kin->pid)
 			continue;
 		branch->parent = kin->parent == PARENT_INIT ? PARENT_INIT : index[kin->parent];
+		branch->pid = kin->pid;
 		branch->inside = kin->ended ? proc_inside(kin->pid) : kin->target->inside;
 		branch->target = kin->target;
 		branch->stat = kin->stat;

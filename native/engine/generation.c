@@ -269,6 +269,35 @@ void generation_close_files(struct target *target, struct generation *image)
 		return; /* it was killed, and has nothing open any more */
 }
 
+static bool start_closing(struct target *target)
+{
+	struct inj_call *call = &target->pad.control->holder;
+	struct avc_error gone = { 0 };
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	return pad_send(&target->pad, target->holder, &target->holder_base, call, &gone) == 0 &&
+	       pad_start(target->holder, &gone) == 0;
+}
+
+void generation_close_tables(const struct generation *generation)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct target *target = generation->branch[i].target;
+
+		if (target)
+			target->closing = target->holder && start_closing(target);
+	}
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct target *target = generation->branch[i].target;
+		struct avc_error gone = { 0 };
+
+		if (target && target->closing &&
+		    pad_finish(target->holder, &target->pad.control->holder, &gone))
+			continue; /* it was killed, and has nothing open any more */
+	}
+}
+
 static void image_drop(struct generation *image)
 {
 	if (image->template)

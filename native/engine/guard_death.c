@@ -78,20 +78,30 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	target_close(&guard->target);
 }
 
-/* The other processes are those of the generation now; what they had before they died is
- * given up, tables of descriptors that only we still hold among it. */
+static bool is_of(const struct generation *generation, const struct target *target)
+{
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target == target)
+			return true;
+	return false;
+}
+
+/* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
+static void release_new(struct avc_guard *guard, const struct generation *generation)
+{
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->holder && !is_of(generation, guard->tree.member[i]))
+			release(guard, guard->tree.member[i]);
+}
+
+/* The other processes are those of the generation now; of what they had before they died
+ * nothing is open any more (generation_close_tables()). */
 static void adopt_family(struct avc_guard *guard, const struct generation *generation)
 {
 	struct tree *tree = &guard->tree;
 
-	for (uint32_t i = 0; i < tree->members; i++) {
-		struct target *target = tree->member[i];
-
-		if (target->holder)
-			release(guard, target);
-		else
-			tree_let_go(target); /* its tables are closed already */
-	}
+	for (uint32_t i = 0; i < tree->members; i++)
+		tree_let_go(tree->member[i]);
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		const struct branch *branch = &generation->branch[i];
 		struct avc_error gone = { 0 };
@@ -137,6 +147,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			drop_all(guard);
 			break;
 		}
+		release_new(guard, generation);
 		if (restore(target, generation, &guard->link, config, guard->timer,
 			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
 			    &failed)) {

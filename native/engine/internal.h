@@ -296,6 +296,7 @@ struct target {
 	uint64_t start;                  /* when it began; tells it from one with its number */
 	uint32_t images;                 /* generations that have one of it                  */
 	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
+	bool closing;                    /* by its holder: generation_close_tables()      */
 	bool doubtful;                   /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                    /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear;    /* what a process that is made from the main one has */
@@ -317,7 +318,7 @@ struct branch {
 	pid_t session, group;  /* inside; 0: outside of the app           */
 	struct proc_stat stat; /* as of the freeze                        */
 	struct manner *manner; /* manner.c                                */
-	pid_t pid;             /* that it was restored as last            */
+	pid_t pid;             /* as of the freeze; then as restored last */
 	int status;            /* of one that had ended, as from wait(2)  */
 	char name[16];         /* the same                                */
 };
@@ -434,6 +435,8 @@ int tracee_group_signal(void);
 /* From a stop of another kind to a plain trap stop, on the kernel's way back to
  * the app, where it sees to interrupted calls and signals. */
 int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
+/* The same of a task of ours of which it is not known whether it runs. */
+int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
 /* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
  * that a thread has brought forth when it was killed is a tracee nobody heard of. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
@@ -721,8 +724,8 @@ int files_capture(struct target *target, struct generation *generation, bool sev
 		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
-/* The same for all processes: what they share of open files. */
-void files_settle_family(struct generation *generation);
+/* The same for all processes: what they share of open files, and who of them is named. */
+void files_settle_family(const struct target *main, struct generation *generation);
 void files_forget(struct target *target);
 void files_free(struct files *files);
 /* A table that is made anew: what is to be in it. */
@@ -806,6 +809,9 @@ void generation_drop(struct generation *generation);
 uint32_t generation_threads(const struct generation *generation);
 /* Closes what the template of a process that has ended still has open. */
 void generation_close_files(struct target *target, struct generation *image);
+/* The same of all processes but the main one, once they are restored and have tables of
+ * their own: before they go on, for what they close is to be closed. */
+void generation_close_tables(const struct generation *generation);
 void oom_score_adj_set(pid_t pid, const char *value);
 
 /* ---- restore.c ------------------------------------------------------------------ */

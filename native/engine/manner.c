@@ -1,14 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * What a process that is not the main one has besides memory and descriptors: signal
- * handlers, working directory, limits, groups, and what the kernel knows of its layout.
+ * handlers, root and working directory, limits, groups, and what the kernel knows of its layout.
  */
 #include <fcntl.h>
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
+#include <unistd.h>
 
 #include "internal.h"
 
@@ -157,6 +159,7 @@ struct arguments {
 		uint32_t auxv_bytes, exe_fd;
 	} map;
 	uint8_t auxv[AUXV_BYTES];
+	char here[8];
 };
 
 static struct arguments *arguments_of(const struct puppet *puppet)
@@ -194,20 +197,62 @@ int manner_put_limits(struct puppet *puppet, const struct branch *branch, struct
 	return 0;
 }
 
+static bool same_folder(pid_t a, pid_t b, const char *name)
+{
+	const int fd_a = proc_open(a, name, O_PATH | O_DIRECTORY);
+	const int fd_b = proc_open(b, name, O_PATH | O_DIRECTORY);
+	struct stat is, other;
+	const bool same = fd_a >= 0 && fd_b >= 0 && fstat(fd_a, &is) == 0 &&
+			  fstat(fd_b, &other) == 0 && is.st_dev == other.st_dev &&
+			  is.st_ino == other.st_ino;
+
+	if (fd_a >= 0)
+		close(fd_a);
+	if (fd_b >= 0)
+		close(fd_b);
+	return same;
+}
+
+/* Goes into a folder of the template's. */
+static int enter(struct puppet *puppet, pid_t template, const char *name, struct avc_error *err)
+{
+	int folder = proc_open(template, name, O_PATH | O_DIRECTORY);
+
+	if (folder < 0)
+		return fail_errno(err, puppet->pid, "restore", "open", "its %s directory is gone",
+				  name);
+	if (puppet_give(puppet, folder, err)) {
+		close(folder);
+		return -1;
+	}
+	close(folder);
+	puppet_call(puppet, SYS_fchdir, 1, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	return 0;
+}
+
+/* It has its parent's, and the right to have another one only if that still has it. */
+static int put_folders(struct puppet *puppet, pid_t template, struct avc_error *err)
+{
+	struct arguments *arguments = arguments_of(puppet);
+
+	if (!same_folder(template, puppet->pid, "root")) {
+		if (enter(puppet, template, "root", err))
+			return -1;
+		strcpy(arguments->here, ".");
+		puppet_call(puppet, SYS_chroot, pad_remote(puppet->pad, arguments->here), 0, 0, 0,
+			    0, 0);
+	}
+	return enter(puppet, template, "cwd", err);
+}
+
 int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
 {
 	const struct manner *manner = branch->manner;
 	struct arguments *arguments = arguments_of(puppet);
-	int cwd = proc_open(branch->image->template, "cwd", O_PATH | O_DIRECTORY);
 
-	if (cwd < 0 || puppet_give(puppet, cwd, err)) {
-		close_fd(&cwd);
-		return fail_errno(err, puppet->pid, "restore", "open(cwd)",
-				  "its working directory is gone");
-	}
-	close_fd(&cwd);
-	puppet_call(puppet, SYS_fchdir, 1, 0, 0, 0, 0, 0);
-	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (put_folders(puppet, branch->image->template, err))
+		return -1;
 	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
 	puppet_call(puppet, SYS_personality, (uint64_t)manner->personality, 0, 0, 0, 0, 0);
 	memcpy(arguments->action, manner->action, sizeof arguments->action);

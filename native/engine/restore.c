@@ -297,6 +297,8 @@ int restore(struct target *target, struct generation *generation, struct link *l
 				 notes, err);
 	if (!result && family)
 		result = family_start(family, notes, err);
+	if (!result)
+		generation_close_tables(generation);
 	tracee_deadline_clear(timer);
 	last_pid_stop(helper);
 	for (uint32_t i = 0; i < generation->branches; i++)

@@ -195,6 +195,14 @@ int tracee_settle(pid_t tid, struct avc_error *err)
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
 
+int tracee_halt(pid_t tid, struct avc_error *err)
+{
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+		return fail_errno(err, tid, "stop", "ptrace(INTERRUPT)", "it has gone");
+	(void)ptrace(PTRACE_CONT, tid, NULL, 0L); /* refused if it runs */
+	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
 bool tracee_is_ours(pid_t tid)
 {
 	struct proc_status status;

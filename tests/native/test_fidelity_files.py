@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import random
 import signal
 import socket
@@ -15,9 +17,12 @@ from pathlib import Path
 import pytest
 from avckpt.events import Files, Tcp
 from harness import wait_until
+from native.family import descendants
 from native.guarded import GuardProcess, Json, Victim, config
 
 KILLS = 6
+WHERE = ("", "--in-child")
+"""Of the victim: its main process, or a child that does everything."""
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +34,15 @@ def checkpoint(guard: GuardProcess) -> Json:
     """Takes one, once the guard has found the victim."""
     guard.wait("attached")
     return guard.command("checkpoint")
+
+
+def borrow(pid: int, fd: int) -> int:
+    """A descriptor of ours for what another process has open: pidfd_getfd(2)."""
+    pidfd = os.pidfd_open(pid)
+    ours = ctypes.CDLL(None, use_errno=True).syscall(438, pidfd, fd, 0)
+    os.close(pidfd)
+    assert ours >= 0, os.strerror(ctypes.get_errno())
+    return int(ours)
 
 
 def disturb(victim: Victim) -> None:
@@ -60,17 +74,18 @@ def disturb_and_restore(victim: Victim, guard: GuardProcess) -> None:
             assert "error" not in event, event
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize(
     "scenario",
     [
         *("opened", "closed", "replaced", "deleted", "offset", "lost"),
-        *("content", "events", "timer", "epoll", "flags", "locks"),
+        *("content", "events", "timer", "epoll", "watched", "flags", "locks"),
     ],
 )
-def test_as_at_the_checkpoint(scenario: str, tmp_path: Path) -> None:
+def test_as_at_the_checkpoint(scenario: str, where: str, tmp_path: Path) -> None:
     """From one generation many times, then from a later one: each time nothing is missing, and nothing is left."""
     with (
-        Victim(f"descriptors {scenario} {tmp_path}", tmp_path) as victim,
+        Victim(f"descriptors {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         for _ in range(2):
@@ -83,6 +98,23 @@ def test_as_at_the_checkpoint(scenario: str, tmp_path: Path) -> None:
             victim.wait_beats()
             if scenario == "timer":
                 break  # it goes off once
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_what_was_watched_since_is_forgotten_though_others_have_it(where: str, tmp_path: Path) -> None:
+    """An epoll set lets go of a description when nobody has it open any more; here we have."""
+    with (
+        Victim(f"descriptors watched {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        for _kill in range(KILLS):
+            disturb(victim)
+            app = [victim.app, *descendants(victim.app)][-1]
+            ours = borrow(app, victim.see().counter[3])
+            event = restored(victim, guard)
+            os.close(ours)
+            assert "error" not in event, event
 
 
 def test_a_file_that_is_gone_reads_as_empty_and_is_told(tmp_path: Path) -> None:
@@ -254,12 +286,13 @@ def test_connections_go_on_by_default(tmp_path: Path) -> None:
         assert client.ask("c") == "2 c"
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["opened", "closed", "replaced", "content", "events", "epoll", "flags", "locks"])
-def test_killed_at_random_moments(scenario: str, tmp_path: Path) -> None:
+def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> None:
     """Before, while and after it changes things, and while it looks at them; the guard keeps nothing of the app's."""
     rng = random.Random(scenario)
     with (
-        Victim(f"descriptors {scenario} {tmp_path}", tmp_path) as victim,
+        Victim(f"descriptors {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         checkpoint(guard)
@@ -276,8 +309,9 @@ def test_killed_at_random_moments(scenario: str, tmp_path: Path) -> None:
             assert "error" not in event, event
         disturb(victim)
         restored(victim, guard)
-        # The second generation's; and what is open for a moment, while the next holder is made.
-        wait_until(lambda: guard.fds() <= fds + 2, 5, "no descriptor is left open")
+        # The second generation's, of each process; and what is open for a moment, while the next holder is made.
+        processes = 1 + len(descendants(victim.app))
+        wait_until(lambda: guard.fds() <= fds + 2 * processes, 5, "no descriptor is left open")
 
 
 @pytest.fixture
@@ -286,12 +320,13 @@ def other(memory: Path, tmp_path: Path) -> None:
     (tmp_path / "other").symlink_to(memory)
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["changed", "closed", "reused"])
 @pytest.mark.usefixtures("other")
-def test_watches(scenario: str, tmp_path: Path) -> None:
+def test_watches(scenario: str, where: str, tmp_path: Path) -> None:
     """The watches of the checkpoint, under their own numbers, and no event of what was done to them."""
     with (
-        Victim(f"inotify {scenario} {tmp_path}", tmp_path) as victim,
+        Victim(f"inotify {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         disturb_and_restore(victim, guard)
@@ -330,11 +365,12 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
         assert "not all of what it watched" in restored(victim, guard)["error"]["detail"]
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["messages", "pidfds"])
-def test_sockets(scenario: str, tmp_path: Path) -> None:
+def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
     """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
     with (
-        Victim(f"sockets {scenario} {tmp_path}", tmp_path) as victim,
+        Victim(f"sockets {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         disturb_and_restore(victim, guard)
@@ -347,11 +383,12 @@ def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
         assert "descriptors that were on their way" in guard.wait("restored")["error"]["detail"]
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["unix", "datagrams", "rebound", "options", "dropped", "family"])
-def test_sockets_made_again(scenario: str, tmp_path: Path) -> None:
+def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
     """Under their names, with their options; also those that the restore before had made."""
     with (
-        Victim(f"listeners {scenario} {tmp_path}", tmp_path) as victim,
+        Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         for _ in range(2):

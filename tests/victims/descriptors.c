@@ -573,6 +573,43 @@ static void epoll_verify(void)
 	}
 }
 
+/* Under a watched number something else is watched, of which somebody else (the test: the
+ * number is counter 3) may have a descriptor as well. */
+static void watched_setup(void)
+{
+	fd[0] = epoll_create1(EPOLL_CLOEXEC);
+	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd + 1) == 0, "socketpair");
+	epoll_add(fd[0], fd[1], EPOLLIN, 1);
+	board->counter[3] = (uint64_t)fd[1];
+}
+
+static void watched_disturb(void)
+{
+	const int was = fd[1];
+	int also;
+
+	must(close(fd[1]) == 0 && close(fd[2]) == 0, "close");
+	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd + 1) == 0 && fd[1] == was, "socketpair");
+	epoll_add(fd[0], fd[1], EPOLLIN, 1);
+	also = dup(fd[1]);
+	must(also >= 0, "dup");
+	epoll_add(fd[0], also, EPOLLIN, 2);
+	must(write(fd[2], "x", 1) == 1, "write");
+}
+
+static void watched_verify(void)
+{
+	struct epoll_event event[16];
+	int n = epoll_wait(fd[0], event, 16, 0);
+
+	CHECK(n == 0, "%d event(s), of %lu first, of what was watched since the checkpoint", n,
+	      event[0].data.u64);
+	must(write(fd[2], "x", 1) == 1, "write");
+	n = epoll_wait(fd[0], event, 16, 200);
+	CHECK(n == 1 && event[0].data.u64 == 1, "%d events, not the one that came", n);
+	must(read(fd[1], scratch, 2) == 1, "read");
+}
+
 /* ---- flags and owners ---------------------------------------------------------------------------- */
 
 static pid_t owner_tid;
@@ -741,6 +778,7 @@ static const struct scenario scenarios[] = {
 	{ "events", events_setup, events_disturb, events_verify },
 	{ "timer", timer_setup, timer_disturb, timer_verify },
 	{ "epoll", epoll_setup, epoll_disturb, epoll_verify },
+	{ "watched", watched_setup, watched_disturb, watched_verify },
 	{ "flags", flags_setup, flags_disturb, flags_verify },
 	{ "locks", locks_setup, locks_disturb, locks_verify },
 	{ "strict", strict_setup, strict_disturb, nothing },
