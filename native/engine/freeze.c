@@ -531,10 +531,11 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 	return result;
 }
 
-/* What a process above it adopts would be a child that it never had. */
+/* What a process above it adopts would be a child that it never had; it itself sees to that
+ * (hold_stopped()). */
 static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *err)
 {
-	for (int k = (int)i; k >= 0; k = tree->kin[k].parent) {
+	for (int k = tree->kin[i].parent; k >= 0; k = tree->kin[k].parent) {
 		struct target *above = tree->kin[k].target;
 		struct thread *thread = above ? thread_find(above, above->pid) : NULL;
 

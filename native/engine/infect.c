@@ -485,8 +485,12 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "make holder", "",
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
+	if (thread->creds.subreaper)
+		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0);
 	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND, 0, 0, 0, 0);
 	call_add(call, INJ_WAIT, 0, 0, 0, 0, 0);
+	if (thread->creds.subreaper)
+		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
 	if (borrow(target, thread, err))
 		return -1;
 	target->waiting = true;

@@ -118,7 +118,11 @@ enum mapping_flag {
 	MAPPING_DEVICE = 4,     /* io */
 	MAPPING_LOCKED = 8,     /* lo */
 	MAPPING_DROPPABLE = 16, /* dp */
-	MAPPING_HUGETLB = 32    /* ht */
+	MAPPING_HUGETLB = 32,   /* ht */
+	MAPPING_HUGE = 64,      /* hg: transparent huge pages               */
+	MAPPING_SMALL = 128,    /* nh */
+	MAPPING_DONTDUMP = 256, /* dd */
+	MAPPING_MERGEABLE = 512 /* mg */
 };
 
 struct mapping {

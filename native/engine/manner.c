@@ -5,6 +5,7 @@
  */
 #include <fcntl.h>
 #include <signal.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
@@ -16,6 +17,10 @@
 
 #define SIGNALS 64
 #define AUXV_BYTES 1024
+#ifndef PR_SET_MEMORY_MERGE
+#define PR_SET_MEMORY_MERGE 67 /* since Linux 6.4 */
+#define PR_GET_MEMORY_MERGE 68
+#endif
 
 /* ---- after a checkpoint ------------------------------------------------------------ */
 
@@ -26,7 +31,10 @@ struct action { /* struct sigaction as the kernel has it                        
 struct manner {
 	struct action action[SIGNALS];
 	int64_t brk, personality, dumpable;
+	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
+	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
 	uint32_t umask;
+	int64_t dumped; /* core(5), coredump_filter; -1: the kernel does not dump  */
 	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
 	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
 	uint32_t auxv_bytes;
@@ -91,6 +99,9 @@ static int read_status(pid_t pid, struct manner *manner)
 		return -1;
 	line = strstr(buf, "\nUmask:");
 	manner->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
+	manner->dumped = proc_read(pid, "coredump_filter", buf, sizeof buf) > 0
+				 ? (int64_t)strtoul(buf, NULL, 16)
+				 : -1;
 	return 0;
 }
 
@@ -102,6 +113,7 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	uint8_t *memory = pad_files(pad, image->slot) + INJ_FILES_BYTES / 2;
 	struct inj_syscall *list = (struct inj_syscall *)memory;
 	struct action *action = (struct action *)(list + SIGNALS + 8);
+	uint64_t *permitted = (uint64_t *)(action + SIGNALS);
 	struct manner *manner = calloc(1, sizeof *manner);
 	uint32_t n = 0;
 
@@ -115,6 +127,12 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
 	list[n++] = (struct inj_syscall){ .nr = SYS_personality, .arg = { 0xffffffff } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_DUMPABLE } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_THP_DISABLE } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_MEMORY_MERGE } };
+	*permitted = 0;
+	list[n++] = (struct inj_syscall){ .nr = ARCH_STATE_CALL,
+					  .arg = { ARCH_STATE_PERMITTED,
+						   pad_remote(pad, permitted) } };
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
 	if (pad_send(pad, image->template, &image->base, call, err) ||
@@ -124,6 +142,9 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	manner->brk = list[SIGNALS].result;
 	manner->personality = list[SIGNALS + 1].result;
 	manner->dumpable = list[SIGNALS + 2].result;
+	manner->no_huge_pages = list[SIGNALS + 3].result;
+	manner->merging = list[SIGNALS + 4].result;
+	manner->state_permitted = *permitted;
 	/* The template has limits of the time when the holder was made. */
 	if (read_mm(image->template, manner) || read_status(image->template, manner) ||
 	    (proc_limits(branch->target->pid, manner->limit) &&
@@ -246,6 +267,16 @@ static int put_folders(struct puppet *puppet, pid_t template, struct avc_error *
 	return enter(puppet, template, "cwd", err);
 }
 
+static void put_dumped(struct puppet *puppet, int64_t dumped)
+{
+	int fd = dumped < 0 ? -1 : proc_open(puppet->pid, "coredump_filter", O_WRONLY);
+
+	if (dumped >= 0 && (fd < 0 || dprintf(fd, "0x%x", (unsigned int)dumped) < 0))
+		fail_errno(puppet->notes, puppet->inside, "restore", "write(coredump_filter)",
+			   "what of it is dumped could not be put back");
+	close_fd(&fd);
+}
+
 int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
 {
 	const struct manner *manner = branch->manner;
@@ -262,5 +293,18 @@ int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_er
 			       pad_remote(puppet->pad, &arguments->action[i]), 0, 8, 0, 0, err))
 			return -1;
 	put_mm(puppet, manner);
+	put_dumped(puppet, manner->dumped);
+	if (manner->state_permitted >> ARCH_STATE_NUMBER & 1)
+		puppet_call(puppet, ARCH_STATE_CALL, ARCH_STATE_ASK, ARCH_STATE_NUMBER, 0, 0, 0, 0);
+	/* Since Linux 6.18 what is answered has the flags in it, which are asked for apart. */
+	if (manner->no_huge_pages >= 0)
+		puppet_call(puppet, SYS_prctl, PR_SET_THP_DISABLE,
+			    (uint64_t)manner->no_huge_pages & 1,
+			    (uint64_t)manner->no_huge_pages & ~UINT64_C(1), 0, 0, 0);
+	if (manner->merging >= 0) {
+		puppet_call(puppet, SYS_prctl, PR_SET_MEMORY_MERGE, (uint64_t)manner->merging, 0, 0,
+			    0, 0);
+		puppet_soften(puppet, "what it says of pages to be merged could not be put back");
+	}
 	return 0;
 }

@@ -65,6 +65,15 @@ struct areas {
 	struct area area[AREAS_MAX];
 };
 
+/* What madvise(2) was told of private memory, in a process whose restore maps it anew. */
+struct advised {
+	uint32_t count;
+	struct {
+		avc_remote start, end;
+		uint32_t flags;
+	} area[AREAS_MAX];
+};
+
 struct locked {
 	uint32_t count;
 	struct {
@@ -88,6 +97,7 @@ struct memory {
 	uint32_t named_count;
 	struct named named[AREAS_MAX];
 	uint64_t look_ns; /* what the last look at all processes took          */
+	struct advised advised;
 	struct locked locked;
 	int64_t locked_kb;
 	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
@@ -392,6 +402,46 @@ static int hash_mapping(const struct mapping *m, void *arg)
 	return 0;
 }
 
+static const struct {
+	uint32_t flag;
+	int advice;
+} advices[] = {
+	{ MAPPING_HUGE, MADV_HUGEPAGE },
+	{ MAPPING_SMALL, MADV_NOHUGEPAGE },
+	{ MAPPING_DONTDUMP, MADV_DONTDUMP },
+	{ MAPPING_MERGEABLE, MADV_MERGEABLE },
+};
+
+static uint32_t advice_of(const struct mapping *m)
+{
+	uint32_t flags = 0;
+
+	/* The kernel itself has marked those. */
+	if (m->flags & (MAPPING_DEVICE | MAPPING_DROPPABLE))
+		return 0;
+	for (size_t i = 0; i < sizeof advices / sizeof *advices; i++)
+		flags |= m->flags & advices[i].flag;
+	return flags;
+}
+
+static void find_advised(struct advised *advised, const struct mapping *m)
+{
+	const uint32_t flags = advice_of(m);
+
+	if (!flags || m->start >= ARCH_USER_END)
+		return;
+	if (advised->count && advised->area[advised->count - 1].end == m->start &&
+	    advised->area[advised->count - 1].flags == flags) {
+		advised->area[advised->count - 1].end = m->end;
+		return;
+	}
+	if (advised->count == AREAS_MAX)
+		return; /* advice is no more than that */
+	advised->area[advised->count].start = m->start;
+	advised->area[advised->count].end = m->end;
+	advised->area[advised->count++].flags = flags;
+}
+
 static int find_area(const struct mapping *m, void *arg)
 {
 	struct survey *survey = arg;
@@ -402,6 +452,8 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
+	if (survey->target->descendant && !is_pad(survey->target, m->start))
+		find_advised(&survey->memory->advised, m);
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
 	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->target, m->start))
 		return 0;
@@ -524,6 +576,7 @@ static int check_areas(struct target *target, const struct generation *generatio
 		.limit = target->shm_bytes,
 		.areas = found,
 	};
+	memory->advised.count = 0;
 	if (proc_mappings(generation->template, "smaps", find_area, &survey))
 		result = fail_errno(err, generation->template, "keep memory", "read(smaps)",
 				    "it was killed");
@@ -636,6 +689,19 @@ static void lock_again(struct target *target, int64_t locked_kb, struct setup *s
 			->flags = INJ_MAY_FAIL;
 }
 
+static void advise_again(const struct memory *memory, struct setup *setup)
+{
+	for (uint32_t i = 0; i < memory->advised.count; i++)
+		for (size_t k = 0; k < sizeof advices / sizeof *advices; k++)
+			if (memory->advised.area[i].flags & advices[k].flag)
+				setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise,
+					  memory->advised.area[i].start,
+					  memory->advised.area[i].end -
+						  memory->advised.area[i].start,
+					  (uint64_t)advices[k].advice, 0, 0)
+					->flags = INJ_MAY_FAIL;
+}
+
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
@@ -644,6 +710,7 @@ int memory_finish(struct target *target, struct generation *generation, int64_t 
 	if (check_areas(target, generation, err) || fill_wiped(target, generation, setup, err))
 		return -1;
 	lock_again(target, locked_kb, setup);
+	advise_again(target->memory, setup);
 	if (main_thread && main_thread->creds.future_lock)
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
 			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)

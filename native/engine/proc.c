@@ -195,6 +195,8 @@ static const struct {
 } mapping_flags[] = {
 	{ "dc", MAPPING_DONTFORK }, { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
 	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
+	{ "hg", MAPPING_HUGE },     { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
+	{ "mg", MAPPING_MERGEABLE },
 };
 
 static uint32_t parse_flags(const char *p)

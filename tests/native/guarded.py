@@ -204,6 +204,12 @@ class Victim(Init):
         return self.board.see()
 
     @property
+    def player(self) -> int:
+        """The process that does everything: with --in-child a child of the victim's."""
+        app = self.app
+        return children_of(app)[0] if "--in-child" in self.command else app
+
+    @property
     def app(self) -> int:
         """The victim's PID in our namespace; waits while it is being restored."""
 
@@ -267,7 +273,7 @@ def kill_at_random(
     """Kills the victim again and again, and sees each time that it goes on."""
     rng = random.Random(seed)
     guard.wait("checkpoint", cookie=cookie)
-    pid = inside(victim.app)
+    pid, acting = inside(victim.app), victim.see().pid
     for _ in range(kills):
         time.sleep(rng.uniform(*pause_s))
         since = guard.mark()
@@ -275,11 +281,15 @@ def kill_at_random(
         guard.wait("restored", since=since, cookie=cookie)
         victim.wait_beats(3)
         assert inside(victim.app) == pid
-        assert victim.see().pid == pid
+        assert victim.see().pid == acting
 
+
+WHERE = ("", "--in-child")
+"""What a test of a victim is done with: the main process does everything, or a child of it."""
 
 __all__ = [
     "BUILD",
+    "WHERE",
     "GuardProcess",
     "Victim",
     "children_of",

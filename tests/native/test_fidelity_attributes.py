@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from native.guarded import BUILD, GuardProcess, Victim, config, kill_at_random
+from native.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 
 
 @pytest.fixture(autouse=True)
@@ -16,10 +16,11 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("command", ["attributes --inherited", "attributes"])
-def test_attributes(command: str, tmp_path: Path) -> None:
+def test_attributes(command: str, where: str, tmp_path: Path) -> None:
     """Scheduling, I/O priority, credentials, prctl settings; limits, umask, directories."""
-    with Victim(command, tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+    with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 40, (0.01, 0.12))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from native.board import UNAVAILABLE_STATUS
-from native.guarded import BUILD, GuardProcess, Victim, config, kill_at_random
+from native.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 
 
 @pytest.fixture(autouse=True)
@@ -23,18 +23,20 @@ def skip_without(program: str) -> None:
         pytest.skip(done.stderr.strip())
 
 
-def test_tiles(tmp_path: Path) -> None:
+@pytest.mark.parametrize("where", WHERE)
+def test_tiles(where: str, tmp_path: Path) -> None:
     """AMX: a restored thread has to be given room for its tiles before it can have them."""
     skip_without("tiles")
-    with Victim("tiles 3", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+    with Victim(f"tiles 3 {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 40, (0.01, 0.12))
         assert not victim.see().violations
 
 
-def test_protection_keys(tmp_path: Path) -> None:
+@pytest.mark.parametrize("where", WHERE)
+def test_protection_keys(where: str, tmp_path: Path) -> None:
     """Each thread has the rights that it had, and the keys are allocated."""
     skip_without("pkeys")
-    with Victim("pkeys 3", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+    with Victim(f"pkeys 3 {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 30, (0.01, 0.12))
 
 

@@ -18,11 +18,9 @@ import pytest
 from avckpt.events import Files, Tcp
 from harness import wait_until
 from native.family import descendants
-from native.guarded import GuardProcess, Json, Victim, config
+from native.guarded import WHERE, GuardProcess, Json, Victim, config
 
 KILLS = 6
-WHERE = ("", "--in-child")
-"""Of the victim: its main process, or a child that does everything."""
 
 
 @pytest.fixture(autouse=True)
@@ -366,7 +364,7 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["messages", "pidfds"])
+@pytest.mark.parametrize("scenario", ["messages", "pidfds", "child"])
 def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
     """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
     with (

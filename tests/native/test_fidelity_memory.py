@@ -30,28 +30,35 @@ def flagged(pid: int, flag: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("command", ["mappings", "mappings 0", "mappings 3000", "mappings 64 --future"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("mappings", "mappings 0", "mappings 3000", "mappings 64 --future"),
+        *("mappings --unbound --in-child", "mappings 3000 --unbound --in-child"),
+        "mappings 64 --future --unbound --in-child",
+    ],
+)
 def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
     """The victim compares all of it with one version number all the time."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
-        wiped, locked = flagged(victim.app, "wf"), flagged(victim.app, "lo")
-        marks = {flag: flagged(victim.app, flag) for flag in ("hg", "nh", "dd", "mg")}
+        wiped, locked = flagged(victim.player, "wf"), flagged(victim.player, "lo")
+        marks = {flag: flagged(victim.player, flag) for flag in ("hg", "nh", "dd", "mg")}
         assert wiped
         assert any(marks.values())
         kill_at_random(guard, victim, 30, (0.01, 0.15))
         # Its own forks are to find it wiped, now as before.
-        assert flagged(victim.app, "wf") == wiped
-        assert {flag: flagged(victim.app, flag) for flag in marks} == marks
-        assert set(locked) <= set(flagged(victim.app, "lo"))
+        assert flagged(victim.player, "wf") == wiped
+        assert {flag: flagged(victim.player, flag) for flag in marks} == marks
+        assert set(locked) <= set(flagged(victim.player, "lo"))
 
 
 def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:
     """A random number generator relies on it: it must hold at every moment."""
     with Victim("mappings", tmp_path) as victim, GuardProcess(config(0.01), [victim.pid]) as guard:
-        wiped = flagged(victim.app, "wf")
+        wiped = flagged(victim.player, "wf")
         guard.wait("checkpoint", count=3)
         for _ in range(200):
-            assert flagged(victim.app, "wf") == wiped
+            assert flagged(victim.player, "wf") == wiped
 
 
 def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) -> None:
@@ -150,5 +157,5 @@ def test_node(tmp_path: Path) -> None:
     script.write_text(NODE)
     command = f"{shutil.which('node')} {script}"
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.1), [victim.pid]) as guard:
-        assert flagged(victim.app, "dc")
+        assert flagged(victim.player, "dc")
         kill_at_random(guard, victim, 30, (0.05, 0.4))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from native.guarded import GuardProcess, Victim, config, kill_at_random
+from native.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
 
 
 @pytest.fixture(autouse=True)
@@ -14,7 +14,8 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
+@pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("command", ["timers", "alarm 20", "alarm 150"])
-def test_timers(command: str, tmp_path: Path) -> None:
-    with Victim(command, tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+def test_timers(command: str, where: str, tmp_path: Path) -> None:
+    with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 60, (0.005, 0.1))

@@ -1,7 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * mappings [SHARED_KB] [--inherited] [--huge] [--future] [--large]: memory of every kind a plain fork does not carry as it is,
- * and kinds that are easily forgotten.  Each is written and read all the time.
+ * mappings [SHARED_KB] [--inherited] [--huge] [--future] [--large] [--unbound]: memory of
+ * every kind a plain fork does not carry as it is, and kinds that are easily forgotten.  Each
+ * is written and read all the time.
  *
  * - anonymous, MADV_DONTFORK: not in a fork at all (V8 marks its heap so)
  * - anonymous, MADV_WIPEONFORK: zeroes in a fork
@@ -16,9 +17,9 @@
  * - mappings that come and go all the time
  *
  * With --inherited the first two are ordinary memory; with --huge the shared memory is of
- * huge pages;
- * with --large there are 64 MB more of shared memory, of which nothing is expected;
- * with --future all memory that comes is locked (mlockall).
+ * huge pages; with --large there are 64 MB more of shared memory, of which nothing is
+ * expected; with --future all memory that comes is locked (mlockall); with --unbound no area
+ * has a policy.
  */
 #include <linux/mempolicy.h>
 #include <setjmp.h>
@@ -133,7 +134,7 @@ static void come_and_go(void)
 static uint64_t *bound; /* to a node of memory; NULL: the kernel knows none */
 
 /* Areas of which a test compares the marks. */
-static void mark_kinds(void)
+static void mark_kinds(bool unbound)
 {
 	static const int kinds[] = { MADV_HUGEPAGE, MADV_NOHUGEPAGE, MADV_DONTDUMP,
 				     MADV_MERGEABLE };
@@ -146,7 +147,7 @@ static void mark_kinds(void)
 			     errno == EINVAL,
 		     "madvise");
 	bound = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
-	if (syscall(SYS_mbind, bound, BYTES, MPOL_BIND, &node, 64, 0))
+	if (unbound || syscall(SYS_mbind, bound, BYTES, MPOL_BIND, &node, 64, 0))
 		bound = NULL;
 }
 
@@ -166,14 +167,16 @@ int main(int argc, char **argv)
 	size_t shared_kb, lap;
 	uint64_t *read_only, *none, *heap;
 	char *brk_at;
-	bool inherited, huge, large;
+	bool inherited, huge, large, unbound;
 	int n = 0, fd;
 
 	inherited = victim_flag(&argc, argv, "--inherited");
 	huge = victim_flag(&argc, argv, "--huge");
 	future = victim_flag(&argc, argv, "--future");
 	large = victim_flag(&argc, argv, "--large");
-	victim_start(&argc, argv, 0, "[SHARED_KB] [--inherited] [--huge] [--future] [--large]");
+	unbound = victim_flag(&argc, argv, "--unbound");
+	victim_start(&argc, argv, 0,
+		     "[SHARED_KB] [--inherited] [--huge] [--future] [--large] [--unbound]");
 	shared_kb = argc > 1 ? (size_t)atol(argv[1]) : 64;
 	sigaction(SIGSEGV, &act, NULL);
 
@@ -211,7 +214,7 @@ int main(int argc, char **argv)
 	must(!large || mmap(NULL, 64 << 20, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1,
 			    0) != MAP_FAILED,
 	     "mmap");
-	mark_kinds();
+	mark_kinds(unbound);
 	read_only = map(PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
 	read_only[3] = 333;
 	must(!mprotect(read_only, BYTES, PROT_READ), "mprotect");

@@ -2,21 +2,17 @@
  *
  * Scenarios: state of a kind, disturbed after a checkpoint and looked at after a restore.
  *
- *   PROGRAM SCENARIO FOLDER [--in-child]
+ *   PROGRAM SCENARIO FOLDER
  *
  * SIGUSR1 disturbs, as told by the scenario; the board counts it (counter 0 before, counter 2
  * when it is done), but the process's own memory forgets it with a restore.  A process that
  * finds the board ahead of its memory was restored: it verifies that everything is as it was
  * set up, counts that (counter 1), and goes on.  Files are made in FOLDER.
- *
- * With --in-child all of this is done by a child of the process, which only passes the signal
- * on and ends as its child does.
  */
 #ifndef SCENARIO_H
 #define SCENARIO_H
 
 #include <signal.h>
-#include <sys/wait.h>
 
 #include "victim.h"
 
@@ -72,39 +68,14 @@ static inline void on_signal(int signal)
 	asked = 1;
 }
 
-static pid_t player;
-
-static inline void pass_on(int signal)
-{
-	if (player)
-		kill(player, signal);
-}
-
-static inline void play_in_child(void)
-{
-	const struct sigaction passing = { .sa_handler = pass_on, .sa_flags = SA_RESTART };
-	int status;
-
-	sigaction(SIGUSR1, &passing, NULL);
-	player = fork();
-	must(player >= 0, "fork");
-	if (!player)
-		return;
-	must(waitpid(player, &status, 0) == player, "waitpid");
-	_exit(WIFEXITED(status) ? WEXITSTATUS(status) : 128 + WTERMSIG(status));
-}
-
 /* The whole of main(). */
 static inline _Noreturn void play(int argc, char **argv, const struct scenario *scenarios, size_t n)
 {
 	const struct scenario *scenario = NULL;
-	const bool in_child = victim_flag(&argc, argv, "--in-child");
 	uint64_t disturbed = 0;
 
-	victim_start(&argc, argv, 2, "SCENARIO FOLDER [--in-child]");
+	victim_start(&argc, argv, 2, "SCENARIO FOLDER");
 	folder = argv[2];
-	if (in_child)
-		play_in_child();
 	for (size_t i = 0; i < n; i++)
 		if (!strcmp(argv[1], scenarios[i].name))
 			scenario = &scenarios[i];

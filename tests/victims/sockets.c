@@ -5,6 +5,7 @@
  *   sockets SCENARIO FOLDER     see scenario.h
  */
 #include <poll.h>
+#include <sys/epoll.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
 
@@ -142,8 +143,60 @@ static void nothing(void)
 {
 }
 
+/* ---- a child that is watched, as event loops do ------------------------------------------- */
+
+static pid_t watched;
+
+static void watch_child(void)
+{
+	struct epoll_event event = { .events = EPOLLIN, .data.u64 = 7 };
+
+	watched = fork();
+	must(watched >= 0, "fork");
+	while (!watched)
+		pause();
+	fd[1] = pidfd_of(watched, 0);
+	must(fd[1] >= 0 && epoll_ctl(fd[0], EPOLL_CTL_ADD, fd[1], &event) == 0, "epoll_ctl");
+}
+
+static void child_setup(void)
+{
+	fd[0] = epoll_create1(EPOLL_CLOEXEC);
+	watch_child();
+}
+
+static void end_child(void)
+{
+	struct epoll_event event = { 0 };
+	int n;
+
+	must(kill(watched, SIGKILL) == 0, "kill");
+	n = epoll_wait(fd[0], &event, 1, 2000);
+	CHECK(n == 1 && event.data.u64 == 7, "the end of a child was not told");
+	CHECK(waitpid(watched, NULL, 0) == watched, "waitpid: %s", strerror(errno));
+	close(fd[1]);
+}
+
+/* Another one in its place. */
+static void child_disturb(void)
+{
+	end_child();
+	watch_child();
+}
+
+static void child_verify(void)
+{
+	struct epoll_event event;
+
+	CHECK(epoll_wait(fd[0], &event, 1, 0) == 0, "a child that is there was said to have ended");
+	expect_process(fd[1], watched);
+	end_child();
+	watch_child();
+}
+
 static const struct scenario scenarios[] = {
 	{ "messages", messages_setup, messages_disturb, messages_verify },
+	{ "child", child_setup, child_disturb, child_verify },
 	{ "pidfds", pidfds_setup, pidfds_disturb, pidfds_verify },
 	{ "rights", rights_setup, nothing, nothing },
 };

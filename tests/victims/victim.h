@@ -11,13 +11,16 @@
  * asking the process for anything.  Without --board it is private.
  *
  * Common options, anywhere on the command line: --board FILE; --seconds N (ends
- * with status 0 after N seconds).  Once set up, a victim prints "ready".
+ * with status 0 after N seconds); --in-child (all of it is done by a child of the
+ * process, which passes SIGUSR1 and SIGUSR2 on and ends as its child does).  Once set up,
+ * a victim prints "ready".
  */
 #ifndef VICTIM_H
 #define VICTIM_H
 
 #include <errno.h>
 #include <fcntl.h>
+#include <signal.h>
 #include <stdarg.h>
 #include <stdbool.h>
 #include <stdint.h>
@@ -26,6 +29,7 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/syscall.h>
+#include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -137,33 +141,6 @@ static inline void board_open(const char *path)
 	close(fd);
 }
 
-/* Takes the common options out of argv and opens the board.  Needs `least`
- * arguments after the program's name, or shows `usage`. */
-static inline void victim_start(int *argc, char **argv, int least, const char *usage)
-{
-	int kept = 1, i;
-
-	for (i = 1; i < *argc; i++) {
-		if (!strcmp(argv[i], "--board") && i + 1 < *argc)
-			board_open(argv[++i]);
-		else if (!strcmp(argv[i], "--seconds") && i + 1 < *argc)
-			victim_end_ns = now_ns() + (uint64_t)(atof(argv[++i]) * 1e9);
-		else
-			argv[kept++] = argv[i];
-	}
-	argv[kept] = NULL;
-	*argc = kept;
-	if (kept - 1 < least) {
-		fprintf(stderr, "usage: %s %s [--board FILE] [--seconds N]\n", argv[0], usage);
-		_exit(2);
-	}
-	board->magic = BOARD_MAGIC;
-	board->pid = (uint64_t)getpid();
-	board->starts++;
-	board->ready = 0;
-	board->beat_ns = 0;
-}
-
 /* Takes "--name" out of argv: was it there? */
 static inline bool victim_flag(int *argc, char **argv, const char *name)
 {
@@ -177,6 +154,61 @@ static inline bool victim_flag(int *argc, char **argv, const char *name)
 		return true;
 	}
 	return false;
+}
+
+static pid_t victim_child;
+
+static inline void victim_pass_on(int signal)
+{
+	if (victim_child)
+		kill(victim_child, signal);
+}
+
+static inline void victim_go_on_in_child(void)
+{
+	int status;
+
+	signal(SIGUSR1, victim_pass_on);
+	signal(SIGUSR2, victim_pass_on);
+	victim_child = fork();
+	must(victim_child >= 0, "fork");
+	if (victim_child) {
+		must(waitpid(victim_child, &status, 0) == victim_child, "waitpid");
+		_exit(WIFEXITED(status) ? WEXITSTATUS(status) : 128 + WTERMSIG(status));
+	}
+	signal(SIGUSR1, SIG_DFL);
+	signal(SIGUSR2, SIG_DFL);
+}
+
+/* Takes the common options out of argv and opens the board.  Needs `least`
+ * arguments after the program's name, or shows `usage`. */
+static inline void victim_start(int *argc, char **argv, int least, const char *usage)
+{
+	const bool in_child = victim_flag(argc, argv, "--in-child");
+	int kept = 1, i;
+
+	for (i = 1; i < *argc; i++) {
+		if (!strcmp(argv[i], "--board") && i + 1 < *argc)
+			board_open(argv[++i]);
+		else if (!strcmp(argv[i], "--seconds") && i + 1 < *argc)
+			victim_end_ns = now_ns() + (uint64_t)(atof(argv[++i]) * 1e9);
+		else
+			argv[kept++] = argv[i];
+	}
+	argv[kept] = NULL;
+	*argc = kept;
+	if (kept - 1 < least) {
+		fprintf(stderr, "usage: %s %s [--board FILE] [--seconds N] [--in-child]\n",
+			argv[0], usage);
+		_exit(2);
+	}
+	if (in_child)
+		victim_go_on_in_child();
+	board->magic = BOARD_MAGIC;
+	board->pid = (uint64_t)getpid();
+	board->starts++;
+	board->ready = 0;
+	board->beat_ns = 0;
 }
 
 static inline void victim_ready(void)

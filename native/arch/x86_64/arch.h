@@ -118,6 +118,13 @@ int arch_frame_read_xstate(pid_t tid, void *frame);
 /* Whether the frame, which was read, has state that the kernel gives a new thread no room
  * for until it uses it (AMX tiles): inj_make_room() has to be called before. */
 bool arch_frame_needs_room(const void *frame);
+/* A process has to ask for the permission to have such state, once: the call, what it is
+ * asked with (what is permitted comes as 64 bits, the address is the next argument), what it
+ * asks with, for the state with this number (arch/x86/kernel/fpu/xstate.c). */
+#define ARCH_STATE_CALL SYS_arch_prctl
+#define ARCH_STATE_PERMITTED 0x1022 /* ARCH_GET_XCOMP_PERM */
+#define ARCH_STATE_ASK 0x1023       /* ARCH_REQ_XCOMP_PERM */
+#define ARCH_STATE_NUMBER 18        /* XFEATURE_XTILE_DATA */
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
 			    uint64_t sigmask, const uint64_t altstack[3]);
 
