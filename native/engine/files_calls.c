@@ -49,9 +49,8 @@ static void list_epoll(const struct files_work *work, struct setup *setup, const
 		setup_add(setup, stage, "", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_DEL,
 			  (uint64_t)watch->fd, 0, 0)
 			->flags = INJ_MAY_FAIL;
-		setup_add(setup, stage, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd,
-			  EPOLL_CTL_ADD, (uint64_t)watch->fd,
-			  setup_data(setup, &event, sizeof event), 0)
+		setup_add(setup, stage, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_ADD,
+			  (uint64_t)watch->fd, setup_data(setup, &event, sizeof event), 0)
 			->flags = INJ_MAY_FAIL;
 	}
 }

@@ -34,7 +34,7 @@ struct manner {
 	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
 	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
 	uint32_t umask;
-	int64_t dumped; /* core(5), coredump_filter; -1: the kernel does not dump  */
+	int64_t dumped;            /* core(5), coredump_filter; -1: the kernel does not dump  */
 	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
 	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
 	uint32_t auxv_bytes;
@@ -130,9 +130,9 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_THP_DISABLE } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_MEMORY_MERGE } };
 	*permitted = 0;
-	list[n++] = (struct inj_syscall){ .nr = ARCH_STATE_CALL,
-					  .arg = { ARCH_STATE_PERMITTED,
-						   pad_remote(pad, permitted) } };
+	list[n++] = (struct inj_syscall){
+		.nr = ARCH_STATE_CALL, .arg = { ARCH_STATE_PERMITTED, pad_remote(pad, permitted) }
+	};
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
 	if (pad_send(pad, image->template, &image->base, call, err) ||

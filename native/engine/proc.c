@@ -193,9 +193,9 @@ static const struct {
 	char name[3];
 	enum mapping_flag flag;
 } mapping_flags[] = {
-	{ "dc", MAPPING_DONTFORK }, { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
-	{ "lo", MAPPING_LOCKED },   { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
-	{ "hg", MAPPING_HUGE },     { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
+	{ "dc", MAPPING_DONTFORK },  { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
+	{ "lo", MAPPING_LOCKED },    { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
+	{ "hg", MAPPING_HUGE },      { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
 	{ "mg", MAPPING_MERGEABLE },
 };
 

@@ -30,6 +30,12 @@ def flagged(pid: int, flag: str) -> list[str]:
     return found
 
 
+def pages(mappings: list[str]) -> set[int]:
+    """Neighbours may have become one mapping, the heap may have grown."""
+    bounds = ([int(bound, 16) for bound in mapping.split("-")] for mapping in mappings)
+    return {page for start, end in bounds for page in range(start, end, 4096)}
+
+
 @pytest.mark.parametrize(
     "command",
     [
@@ -49,7 +55,7 @@ def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
         # Its own forks are to find it wiped, now as before.
         assert flagged(victim.player, "wf") == wiped
         assert {flag: flagged(victim.player, flag) for flag in marks} == marks
-        assert set(locked) <= set(flagged(victim.player, "lo"))
+        assert pages(locked) <= pages(flagged(victim.player, "lo"))
 
 
 def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:

@@ -198,8 +198,8 @@ static inline void victim_start(int *argc, char **argv, int least, const char *u
 	argv[kept] = NULL;
 	*argc = kept;
 	if (kept - 1 < least) {
-		fprintf(stderr, "usage: %s %s [--board FILE] [--seconds N] [--in-child]\n",
-			argv[0], usage);
+		fprintf(stderr, "usage: %s %s [--board FILE] [--seconds N] [--in-child]\n", argv[0],
+			usage);
 		_exit(2);
 	}
 	if (in_child)
