@@ -377,6 +377,52 @@ static int by_key(const void *a, const void *b)
 	return order ? order : (x->number > y->number) - (x->number < y->number);
 }
 
+/* kcmp(2)'s order; -1: one of them has been closed since. */
+static long compare_held(const struct files_held *a, const struct files_held *b)
+{
+	/* A socket can not be opened twice, its file (O_PATH) can. */
+	if (a->file->kind == FILE_SOCKET && !((a->file->flags | b->file->flags) & O_PATH))
+		return 0;
+	return syscall(SYS_kcmp, a->pid, b->pid, KCMP_FILE, a->file->fd, b->file->fd);
+}
+
+static bool is_closed(const struct files_held *held)
+{
+	return syscall(SYS_kcmp, held->pid, held->pid, KCMP_FILE, held->file->fd, held->file->fd);
+}
+
+/* Among `kinds`, which are in order, of what `held` is: its index, or -1 with *at where it
+ * would be.  Those that have been closed since have no place in the order, and are taken out. */
+static int find_kind(struct files_held **kinds, uint32_t *count, const struct files_held *held,
+		     uint32_t *at)
+{
+	uint32_t low = 0, high = *count;
+
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+		const long order = compare_held(held, kinds[middle]);
+
+		if (order == 0)
+			return (int)middle;
+		if (order < 0 && is_closed(held)) {
+			*at = *count;
+			return -1;
+		}
+		if (order < 0) {
+			memmove(&kinds[middle], &kinds[middle + 1],
+				(*count - middle - 1) * sizeof *kinds);
+			--*count;
+			high--;
+		} else if (order == 1) {
+			high = middle;
+		} else {
+			low = middle + 1;
+		}
+	}
+	*at = low;
+	return -1;
+}
+
 /* Only those of the same file can be of the same description, and kcmp(2) gives an order,
  * so that it takes few calls. */
 void files_group(struct files_held *held, uint32_t count)
@@ -391,32 +437,19 @@ void files_group(struct files_held *held, uint32_t count)
 		return;
 	qsort(held, count, sizeof *held, by_key);
 	for (uint32_t i = 0, kind_count = 0; i < count; i++) {
-		uint32_t low = 0, high;
-		bool found = false;
+		uint32_t at = 0;
+		int found;
 
 		if (i && compare_keys(held[i].file, held[i - 1].file))
 			kind_count = 0;
-		high = kind_count;
-		while (low < high && !found) {
-			const uint32_t middle = (low + high) / 2;
-			const long order = syscall(SYS_kcmp, held[i].pid, kinds[middle]->pid,
-						   KCMP_FILE, held[i].file->fd,
-						   kinds[middle]->file->fd);
-
-			if (order == 0) {
-				held[i].first = kinds[middle]->file;
-				found = true;
-			} else if (order == 1) {
-				high = middle;
-			} else {
-				low = middle + 1;
-			}
+		found = find_kind(kinds, &kind_count, &held[i], &at);
+		if (found >= 0) {
+			held[i].first = kinds[found]->file;
+			continue;
 		}
-		if (!found) {
-			memmove(&kinds[low + 1], &kinds[low], (kind_count - low) * sizeof *kinds);
-			kinds[low] = &held[i];
-			kind_count++;
-		}
+		memmove(&kinds[at + 1], &kinds[at], (kind_count - at) * sizeof *kinds);
+		kinds[at] = &held[i];
+		kind_count++;
 	}
 	free(kinds);
 }

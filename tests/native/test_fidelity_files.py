@@ -18,7 +18,7 @@ import pytest
 from avckpt.events import Files, Tcp
 from harness import wait_until
 from native.family import descendants
-from native.guarded import WHERE, GuardProcess, Json, Victim, config
+from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
 
 KILLS = 6
 
@@ -396,6 +396,16 @@ def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
                 for _again in range(2):
                     event = restored(victim, guard)
                     assert "error" not in event, event
+
+
+def test_closed_by_workers_while_a_checkpoint_is_looked_through(tmp_path: Path) -> None:
+    """The main process dies right after a freeze, its workers see it and close what they shared with it."""
+    with (
+        Victim(f"listeners deserted {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(0.005), [victim.pid]) as guard,
+    ):
+        kill_at_random(guard, victim, 100, (0.0, 0.02))
+        victim.check()
 
 
 def test_a_name_that_somebody_else_has_is_told(tmp_path: Path) -> None:

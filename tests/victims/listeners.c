@@ -299,6 +299,39 @@ static void family_verify(void)
 	close(client);
 }
 
+/* ---- shared with workers that give up as soon as their parent has died ------------------- */
+
+static _Noreturn void work(pid_t parent)
+{
+	for (;;) {
+		const bool deserted = getppid() != parent;
+
+		if (deserted)
+			close(fd[0]);
+		else
+			CHECK(accept(fd[0], NULL, NULL) < 0 && errno == EAGAIN,
+			      "a listening socket does not listen: %s", strerror(errno));
+		nap_us(deserted ? 1000000 : 50);
+	}
+}
+
+static void deserted_setup(void)
+{
+	const struct sockaddr_in any = { .sin_family = AF_INET };
+	const pid_t parent = getpid();
+
+	fd[0] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
+	must(bind(fd[0], (const struct sockaddr *)&any, sizeof any) == 0 && listen(fd[0], 3) == 0,
+	     "listen");
+	for (int i = 0; i < 3; i++)
+		if (!fork())
+			work(parent);
+}
+
+static void nothing(void)
+{
+}
+
 /* ---- one that somebody else has the name of ------------------------------------------ */
 
 static void taken_setup(void)
@@ -567,6 +600,7 @@ static const struct scenario scenarios[] = {
 	{ "unix", unix_setup, unix_disturb, unix_verify },
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
 	{ "family", family_setup, family_disturb, family_verify },
+	{ "deserted", deserted_setup, nothing, nothing },
 	{ "taken", taken_setup, taken_disturb, taken_verify },
 	{ "datagrams", datagrams_setup, datagrams_disturb, datagrams_verify },
 	{ "rebound", rebound_setup, rebound_disturb, rebound_verify },
