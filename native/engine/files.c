@@ -386,7 +386,7 @@ static long compare_held(const struct files_held *a, const struct files_held *b)
 	return syscall(SYS_kcmp, a->pid, b->pid, KCMP_FILE, a->file->fd, b->file->fd);
 }
 
-static bool is_closed(const struct files_held *held)
+bool files_is_closed(const struct files_held *held)
 {
 	return syscall(SYS_kcmp, held->pid, held->pid, KCMP_FILE, held->file->fd, held->file->fd);
 }
@@ -404,7 +404,7 @@ static int find_kind(struct files_held **kinds, uint32_t *count, const struct fi
 
 		if (order == 0)
 			return (int)middle;
-		if (order < 0 && is_closed(held)) {
+		if (order < 0 && files_is_closed(held)) {
 			*at = *count;
 			return -1;
 		}

@@ -159,11 +159,14 @@ bool files_same_object(const struct file *a, const struct file *b);
  * those.  They are sorted anew. */
 struct files_held {
 	struct file *file;
-	pid_t pid; /* who has it                                               */
+	const struct file *before; /* the same in the checkpoint before, or NULL       */
+	pid_t pid;                 /* who has it                                       */
 	uint32_t number;
 	struct file *first;
 };
 void files_group(struct files_held *held, uint32_t count);
+/* Since the look at it. */
+bool files_is_closed(const struct files_held *held);
 
 /* files_info.c */
 /* fdinfo of a descriptor: O_CLOEXEC, locks, and what is in anonymous inodes.  True if

@@ -15,7 +15,16 @@
 
 /* ---- after a checkpoint ---------------------------------------------------------- */
 
-static uint32_t list_held(struct files_held *held, const struct generation *image)
+/* What is of the same object as in the checkpoint before. */
+static const struct file *find_before(const struct generation *before, const struct file *f)
+{
+	const struct file *b = before && before->files ? files_find(before->files, f->fd) : NULL;
+
+	return b && files_same_object(f, b) ? b : NULL;
+}
+
+static uint32_t list_held(struct files_held *held, const struct generation *image,
+			  const struct generation *before)
 {
 	uint32_t count = 0;
 
@@ -25,10 +34,37 @@ static uint32_t list_held(struct files_held *held, const struct generation *imag
 		if (f->shared != f->fd || f->outside)
 			continue;
 		if (held)
-			held[count] = (struct files_held){ .file = f, .pid = image->template };
+			held[count] = (struct files_held){ .file = f,
+							   .before = find_before(before, f),
+							   .pid = image->template };
 		count++;
 	}
 	return count;
+}
+
+static const struct generation *image_of(const struct generation *generation,
+					 const struct target *target)
+{
+	for (uint32_t i = 0; generation && i < generation->branches; i++)
+		if (generation->branch[i].target == target)
+			return generation->branch[i].image;
+	return NULL;
+}
+
+/* What has been closed since the freeze (a worker does that when its parent has died) can not
+ * be compared any more; as a rule it was shared in the checkpoint before. */
+static void group_closed(struct files_held *held, uint32_t count)
+{
+	for (uint32_t i = 0; i < count; i++) {
+		const struct file *before = held[i].before;
+
+		if (!before || !before->family || held[i].first != held[i].file ||
+		    !files_is_closed(&held[i]))
+			continue;
+		for (uint32_t k = 0; k < count && held[i].first == held[i].file; k++)
+			if (k != i && held[k].before && held[k].before->family == before->family)
+				held[i].first = held[k].first;
+	}
 }
 
 static pid_t inside_of(const struct target *main, const struct generation *generation, pid_t pid)
@@ -57,7 +93,8 @@ static void name_others(const struct target *main, const struct generation *gene
 
 /* By the templates, which have the tables as the processes have them.  What a process has
  * put in a place since is found to be shared with nobody. */
-void files_settle_family(const struct target *main, struct generation *generation)
+void files_settle_family(const struct target *main, struct generation *generation,
+			 const struct generation *before)
 {
 	struct files_held *held = NULL;
 	uint32_t count;
@@ -67,17 +104,19 @@ void files_settle_family(const struct target *main, struct generation *generatio
 		if (generation->branch[i].image)
 			name_others(main, generation, generation->branch[i].image->files);
 	for (int pass = 0; pass < 2; pass++) {
-		count = list_held(held, generation);
+		count = list_held(held, generation, before);
 		for (uint32_t i = 0; i < generation->branches; i++)
 			if (generation->branch[i].image)
 				count += list_held(held ? held + count : NULL,
-						   generation->branch[i].image);
+						   generation->branch[i].image,
+						   image_of(before, generation->branch[i].target));
 		if (!held)
 			held = calloc(count + 1, sizeof *held);
 		if (!held)
 			return;
 	}
 	files_group(held, count);
+	group_closed(held, count);
 	for (uint32_t i = 0; i < count; i++)
 		if (held[i].first != held[i].file)
 			held[i].file->family = held[i].first->family = held[i].first;

@@ -252,7 +252,8 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		if (fresh.branch[i].target)
 			files_settle(fresh.branch[i].target, fresh.branch[i].image);
 	if (fresh.branches)
-		files_settle_family(target, &fresh);
+		files_settle_family(target, &fresh,
+				    guard->count ? &guard->generations[guard->count - 1] : NULL);
 	fresh.number = ++guard->number;
 	keep_generation(guard, &fresh);
 	link_arm(&guard->link, true);

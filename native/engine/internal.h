@@ -728,8 +728,10 @@ int files_capture(struct target *target, struct generation *generation, bool sev
 		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
-/* The same for all processes: what they share of open files, and who of them is named. */
-void files_settle_family(const struct target *main, struct generation *generation);
+/* The same for all processes: what they share of open files, and who of them is named.
+ * `before`: the checkpoint before, or NULL. */
+void files_settle_family(const struct target *main, struct generation *generation,
+			 const struct generation *before);
 void files_forget(struct target *target);
 void files_free(struct files *files);
 /* A table that is made anew: what is to be in it. */

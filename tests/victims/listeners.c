@@ -301,16 +301,24 @@ static void family_verify(void)
 
 /* ---- shared with workers that give up as soon as their parent has died ------------------- */
 
+static ino_t shared_ino;
+
 static _Noreturn void work(pid_t parent)
 {
+	struct stat st;
+
 	for (;;) {
 		const bool deserted = getppid() != parent;
 
-		if (deserted)
+		if (deserted) {
 			close(fd[0]);
-		else
+			close(fd[1]);
+		} else {
 			CHECK(accept(fd[0], NULL, NULL) < 0 && errno == EAGAIN,
 			      "a listening socket does not listen: %s", strerror(errno));
+			CHECK(fstat(fd[1], &st) == 0 && st.st_ino == shared_ino,
+			      "another file than it shared with its parent");
+		}
 		nap_us(deserted ? 1000000 : 50);
 	}
 }
@@ -319,10 +327,14 @@ static void deserted_setup(void)
 {
 	const struct sockaddr_in any = { .sin_family = AF_INET };
 	const pid_t parent = getpid();
+	struct stat st;
 
 	fd[0] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
 	must(bind(fd[0], (const struct sockaddr *)&any, sizeof any) == 0 && listen(fd[0], 3) == 0,
 	     "listen");
+	fd[1] = make_file("shared", "", O_RDWR);
+	must(unlink(path_of("shared")) == 0 && fstat(fd[1], &st) == 0, "unlink");
+	shared_ino = st.st_ino;
 	for (int i = 0; i < 3; i++)
 		if (!fork())
 			work(parent);
