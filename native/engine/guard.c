@@ -288,6 +288,21 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
 }
 
+/* Nobody is to believe that there are checkpoints when there are none. */
+static void tell_straggling(struct avc_guard *guard)
+{
+	const uint64_t now = now_ns();
+	struct avc_error error = { 0 };
+
+	guard->next_ns = now + STRAGGLER_LONG_NS;
+	if (now - guard->told_stragglers_ns < NS_PER_S)
+		return;
+	guard->told_stragglers_ns = now;
+	fail(&error, AVC_DEADLINE, 0, guard->target.pid, "stop", "",
+	     "a thread that was to stop has not done so for a second");
+	emit_error(guard, AVC_EVENT_MISSED, 0, &error);
+}
+
 static void let_go(struct avc_guard *guard)
 {
 	const uint64_t end = now_ns() + NS_PER_S;
@@ -326,6 +341,8 @@ static void *guard_main(void *arg)
 
 		if (!straggling && !dying)
 			guard->stragglers_since_ns = now_ns();
+		if (!straggling)
+			guard->told_stragglers_ns = now_ns(); /* there are none */
 		if (any_lost(guard))
 			kill_lost(guard);
 		if (dying)
@@ -347,7 +364,7 @@ static void *guard_main(void *arg)
 		if (!guard->attached)
 			attach(guard);
 		else if (all_stragglers(guard))
-			guard->next_ns = now_ns() + STRAGGLER_LONG_NS;
+			tell_straggling(guard);
 		else
 			checkpoint(guard, 0);
 	}

@@ -49,7 +49,7 @@ struct avc_guard {
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
 	uint32_t count;
 	uint64_t number; /* of the last generation taken             */
-	uint64_t started_ns, next_ns, stragglers_since_ns;
+	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* when it was found dying, some time more: see reap_unknown() */
 	uint32_t misses;         /* in a row, of one that is unsupported     */
 	uint32_t room;           /* generations that may be held now         */

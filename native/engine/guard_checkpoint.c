@@ -281,6 +281,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = event_new(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
+	bool hopeless;
 
 	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
 						   : UINT64_MAX;
@@ -314,12 +315,14 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	/* A child process may be gone at the next look: the generations there are
 	 * stay good for a while. */
-	if (error.code == AVC_UNSUPPORTED && error.pid != guard->target.pid && guard->count &&
+	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
+		   error.code == AVC_BUSY;
+	if (hopeless && error.pid != guard->target.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
 		emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
-	if (error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED || error.code == AVC_BUSY) {
+	if (hopeless) {
 		unprotect(guard, ticket, &error);
 		return;
 	}

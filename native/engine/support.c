@@ -97,8 +97,13 @@ static int check_descendant(const struct target *target, struct avc_error *err)
 		struct stat own, inits;
 
 		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->pid, spaces[i]);
+		/* Of one that is just ending they are gone, or EACCES is the answer. */
+		if (stat(path, &own) && proc_is_exiting(target->pid))
+			return fail(err, AVC_GONE, ESRCH, target->pid, "check", "stat(ns)",
+				    "it has ended");
 		if (stat(path, &own))
-			return fail_errno(err, target->pid, "check", "stat(ns)", "it has ended");
+			return fail_errno(err, target->pid, "check", "stat(ns)",
+					  "its namespaces can not be seen");
 		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->init, spaces[i]);
 		if (stat(path, &inits) || own.st_ino != inits.st_ino)
 			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",

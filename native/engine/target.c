@@ -279,6 +279,9 @@ static bool straggle(struct target *target, struct thread *thread)
 
 	switch (stop.kind) {
 	case STOP_NONE:
+		/* It may have found home by itself meanwhile, and would never stop again. */
+		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		return true;
 	case STOP_DYING:
 	case STOP_DEADLINE:
 		return true;
