@@ -137,7 +137,8 @@ def test_nothing_is_left_behind(tmp_path: Path) -> None:
 
         first = cycle(3)
         second = cycle(20)
-        assert second[:3] == first[:3], "descriptors of the guard, pads in the application, children of init"
+        more = [after > before for before, after in zip(first[:3], second[:3])]
+        assert not any(more), f"descriptors of the guard, pads in the application, children of init: {first}, {second}"
         assert second[3] <= first[3] + 2, "mappings of the guard"
         assert [state_of(pid) for pid in children_of(victim.pid)].count("Z") == 0
         guard.stop()
