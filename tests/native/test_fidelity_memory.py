@@ -47,7 +47,9 @@ def pages(mappings: list[str]) -> set[int]:
 def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
     """The victim compares all of it with one version number all the time."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
-        wiped, locked = flagged(victim.player, "wf"), flagged(victim.player, "lo")
+        wiped = flagged(victim.player, "wf")
+        # Some of it comes and goes.
+        locked = set.intersection(*(pages(flagged(victim.player, "lo")) for _ in range(10)))
         marks = {flag: flagged(victim.player, flag) for flag in ("hg", "nh", "dd", "mg")}
         assert wiped
         assert any(marks.values())
@@ -55,7 +57,7 @@ def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
         # Its own forks are to find it wiped, now as before.
         assert flagged(victim.player, "wf") == wiped
         assert {flag: flagged(victim.player, flag) for flag in marks} == marks
-        assert pages(locked) <= pages(flagged(victim.player, "lo"))
+        assert locked <= pages(flagged(victim.player, "lo"))
 
 
 def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:
