@@ -45,10 +45,9 @@ static uint32_t list_held(struct files_held *held, const struct generation *imag
 static const struct generation *image_of(const struct generation *generation,
 					 const struct target *target)
 {
-	for (uint32_t i = 0; generation && i < generation->branches; i++)
-		if (generation->branch[i].target == target)
-			return generation->branch[i].image;
-	return NULL;
+	const struct branch *branch = generation_branch(generation, target);
+
+	return branch ? branch->image : NULL;
 }
 
 /* What has been closed since the freeze (a worker does that when its parent has died) can not

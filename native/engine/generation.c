@@ -328,6 +328,14 @@ void generation_drop(struct generation *generation)
 	*generation = (struct generation){ .pidfd = -1 };
 }
 
+struct branch *generation_branch(const struct generation *generation, const struct target *target)
+{
+	for (uint32_t i = 0; generation && i < generation->branches; i++)
+		if (generation->branch[i].target == target)
+			return &generation->branch[i];
+	return NULL;
+}
+
 uint32_t generation_threads(const struct generation *generation)
 {
 	uint32_t threads = generation->threads;

@@ -71,11 +71,8 @@ static void touch_slot(const struct pad *pad, uint32_t slot, uint32_t threads)
 static void drop_images(struct avc_guard *guard, const struct target *target)
 {
 	for (uint32_t i = guard->count; i-- > 0;)
-		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
-			if (guard->generations[i].branch[k].target == target) {
-				drop_generation(guard, i);
-				break;
-			}
+		if (generation_branch(&guard->generations[i], target))
+			drop_generation(guard, i);
 }
 
 static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_error *err)

@@ -78,19 +78,12 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	target_close(&guard->target);
 }
 
-static bool is_of(const struct generation *generation, const struct target *target)
-{
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target == target)
-			return true;
-	return false;
-}
-
 /* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
 static void release_new(struct avc_guard *guard, const struct generation *generation)
 {
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->holder && !is_of(generation, guard->tree.member[i]))
+		if (guard->tree.member[i]->holder &&
+		    !generation_branch(generation, guard->tree.member[i]))
 			release(guard, guard->tree.member[i]);
 }
 

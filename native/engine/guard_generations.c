@@ -129,11 +129,12 @@ static bool is_known(pid_t tid, const void *arg)
 
 void release(struct avc_guard *guard, struct target *target)
 {
-	for (uint32_t i = 0; i < guard->count; i++)
-		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
-			if (guard->generations[i].branch[k].target == target)
-				generation_close_files(target,
-						       guard->generations[i].branch[k].image);
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const struct branch *branch = generation_branch(&guard->generations[i], target);
+
+		if (branch)
+			generation_close_files(target, branch->image);
+	}
 	tree_let_go(target);
 }
 

@@ -811,6 +811,8 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 int generation_finish(struct target *target, struct generation *generation,
 		      struct avc_error *err) warn_unused;
 void generation_drop(struct generation *generation);
+/* That of a process that is not the main one, or NULL; `generation` may be NULL. */
+struct branch *generation_branch(const struct generation *generation, const struct target *target);
 /* Of all its processes. */
 uint32_t generation_threads(const struct generation *generation);
 /* Closes what the template of a process that has ended still has open. */

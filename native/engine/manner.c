@@ -218,20 +218,15 @@ int manner_put_limits(struct puppet *puppet, const struct branch *branch, struct
 	return 0;
 }
 
-static bool same_folder(pid_t a, pid_t b, const char *name)
+static bool same_root(pid_t a, pid_t b)
 {
-	const int fd_a = proc_open(a, name, O_PATH | O_DIRECTORY);
-	const int fd_b = proc_open(b, name, O_PATH | O_DIRECTORY);
+	char path_a[32], path_b[32];
 	struct stat is, other;
-	const bool same = fd_a >= 0 && fd_b >= 0 && fstat(fd_a, &is) == 0 &&
-			  fstat(fd_b, &other) == 0 && is.st_dev == other.st_dev &&
-			  is.st_ino == other.st_ino;
 
-	if (fd_a >= 0)
-		close(fd_a);
-	if (fd_b >= 0)
-		close(fd_b);
-	return same;
+	snprintf(path_a, sizeof path_a, "/proc/%d/root", a);
+	snprintf(path_b, sizeof path_b, "/proc/%d/root", b);
+	return stat(path_a, &is) == 0 && stat(path_b, &other) == 0 && is.st_dev == other.st_dev &&
+	       is.st_ino == other.st_ino;
 }
 
 /* Goes into a folder of the template's. */
@@ -257,7 +252,7 @@ static int put_folders(struct puppet *puppet, pid_t template, struct avc_error *
 {
 	struct arguments *arguments = arguments_of(puppet);
 
-	if (!same_folder(template, puppet->pid, "root")) {
+	if (!same_root(template, puppet->pid)) {
 		if (enter(puppet, template, "root", err))
 			return -1;
 		strcpy(arguments->here, ".");
@@ -269,9 +264,12 @@ static int put_folders(struct puppet *puppet, pid_t template, struct avc_error *
 
 static void put_dumped(struct puppet *puppet, int64_t dumped)
 {
-	int fd = dumped < 0 ? -1 : proc_open(puppet->pid, "coredump_filter", O_WRONLY);
+	int fd;
 
-	if (dumped >= 0 && (fd < 0 || dprintf(fd, "0x%x", (unsigned int)dumped) < 0))
+	if (dumped < 0)
+		return;
+	fd = proc_open(puppet->pid, "coredump_filter", O_WRONLY);
+	if (fd < 0 || dprintf(fd, "0x%x", (unsigned int)dumped) < 0)
 		fail_errno(puppet->notes, puppet->inside, "restore", "write(coredump_filter)",
 			   "what of it is dumped could not be put back");
 	close_fd(&fd);

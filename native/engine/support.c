@@ -86,6 +86,17 @@ static int check_mappings(struct target *target, struct avc_error *err)
 	return result;
 }
 
+/* Of one that is just ending they are gone, or EACCES is the answer. */
+static int not_seen(pid_t pid, struct avc_error *err)
+{
+	const int errnum = errno;
+
+	if (proc_is_exiting(pid))
+		return fail(err, AVC_GONE, ESRCH, pid, "check", "stat(ns)", "it has ended");
+	errno = errnum;
+	return fail_errno(err, pid, "check", "stat(ns)", "its namespaces can not be seen");
+}
+
 /* Its children are made by their parents, which have to have what their children have. */
 static int check_descendant(const struct target *target, struct avc_error *err)
 {
@@ -97,13 +108,8 @@ static int check_descendant(const struct target *target, struct avc_error *err)
 		struct stat own, inits;
 
 		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->pid, spaces[i]);
-		/* Of one that is just ending they are gone, or EACCES is the answer. */
-		if (stat(path, &own) && proc_is_exiting(target->pid))
-			return fail(err, AVC_GONE, ESRCH, target->pid, "check", "stat(ns)",
-				    "it has ended");
 		if (stat(path, &own))
-			return fail_errno(err, target->pid, "check", "stat(ns)",
-					  "its namespaces can not be seen");
+			return not_seen(target->pid, err);
 		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->init, spaces[i]);
 		if (stat(path, &inits) || own.st_ino != inits.st_ino)
 			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",

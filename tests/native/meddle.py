@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes a thread's floating-point registers, or has it make system calls, behind its back.
+"""Changes a thread's floating-point registers, has it make system calls, or takes its descriptors, behind its back.
 
-By ptrace(2) itself: gdb 13 can not write them on a CPU whose XSAVE area is larger than it knows (AMX).
+Registers by ptrace(2) itself: gdb 13 can not write them on a CPU whose XSAVE area is larger than it knows (AMX).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ PTRACE_SINGLESTEP, PTRACE_GETREGS, PTRACE_SETREGS = 9, 12, 13
 PTRACE_SEIZE, PTRACE_INTERRUPT, PTRACE_EVENT_STOP = 0x4206, 0x4207, 128
 PTRACE_GETFPREGS, PTRACE_SETFPREGS, PTRACE_ATTACH, PTRACE_DETACH = 14, 15, 16, 17
 WALL = 0x40000000
+PIDFD_GETFD = 438  # Python has no name for it
 # Where they are in struct user_fpregs_struct (the FXSAVE area).
 FPREGS_BYTES = 512
 FPREGS = {"mxcsr": (24, "<I"), "st3": (32 + 3 * 16, "<Q"), "xmm5": (160 + 5 * 16, "<Q")}
@@ -79,6 +80,18 @@ def remote_syscall(tid: int, number: int, *args: int) -> int:
         return result
     finally:
         _ptrace(PTRACE_DETACH, tid, signal_to_take)
+
+
+def get_fd(pid: int, fd: int) -> int:
+    """A descriptor of another process, the same open file; see pidfd_getfd(2)."""
+    pidfd = os.pidfd_open(pid)
+    try:
+        got = ctypes.CDLL(None, use_errno=True).syscall(PIDFD_GETFD, pidfd, fd, 0)
+    finally:
+        os.close(pidfd)
+    if got < 0:
+        raise OSError(ctypes.get_errno(), "pidfd_getfd")
+    return int(got)
 
 
 def _ptrace(request: int, tid: int, data: ctypes.Array[ctypes.c_char] | int | None = None) -> None:

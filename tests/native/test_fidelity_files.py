@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import random
 import signal
@@ -19,6 +18,7 @@ from avckpt.events import Files, Tcp
 from harness import wait_until
 from native.family import descendants
 from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
+from native.meddle import get_fd
 
 KILLS = 6
 
@@ -32,15 +32,6 @@ def checkpoint(guard: GuardProcess) -> Json:
     """Takes one, once the guard has found the victim."""
     guard.wait("attached")
     return guard.command("checkpoint")
-
-
-def borrow(pid: int, fd: int) -> int:
-    """A descriptor of ours for what another process has open: pidfd_getfd(2)."""
-    pidfd = os.pidfd_open(pid)
-    ours = ctypes.CDLL(None, use_errno=True).syscall(438, pidfd, fd, 0)
-    os.close(pidfd)
-    assert ours >= 0, os.strerror(ctypes.get_errno())
-    return int(ours)
 
 
 def disturb(victim: Victim) -> None:
@@ -108,8 +99,7 @@ def test_what_was_watched_since_is_forgotten_though_others_have_it(where: str, t
         checkpoint(guard)
         for _kill in range(KILLS):
             disturb(victim)
-            app = [victim.app, *descendants(victim.app)][-1]
-            ours = borrow(app, victim.see().counter[3])
+            ours = get_fd(victim.player, victim.see().counter[3])
             event = restored(victim, guard)
             os.close(ours)
             assert "error" not in event, event

@@ -7,7 +7,6 @@ Below avckpt-init in a PID namespace of their own, so that none of them is left 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import re
 import signal
@@ -20,10 +19,7 @@ from harness import wait_until
 from native.board import VIOLATION_STATUS
 from native.family import Member, main_process, members
 from native.guarded import Victim
-from native.meddle import remote_syscall
-
-PIDFD_GETFD = 438
-"""The system call's number; Python has no name for it."""
+from native.meddle import get_fd, remote_syscall
 
 CONTENT = [
     "tree 0",
@@ -86,18 +82,6 @@ def test_the_tree_is_what_it_says(tmp_path: Path) -> None:
 
 
 # --- loud when something is wrong ------------------------------------------
-
-
-def get_fd(pid: int, fd: int) -> int:
-    """A descriptor of another process, the same open file; see pidfd_getfd(2)."""
-    pidfd = os.pidfd_open(pid)
-    try:
-        got = ctypes.CDLL(None, use_errno=True).syscall(PIDFD_GETFD, pidfd, fd, 0)
-    finally:
-        os.close(pidfd)
-    if got < 0:
-        raise OSError(ctypes.get_errno(), "pidfd_getfd")
-    return int(got)
 
 
 def fds(pid: int, kind: str) -> list[int]:

@@ -761,10 +761,6 @@ static void strict_disturb(void)
 	must(pwrite(fd[0], "x", 1, 3) == 1, "pwrite");
 }
 
-static void nothing(void)
-{
-}
-
 static const struct scenario scenarios[] = {
 	{ "opened", opened_setup, opened_disturb, opened_verify },
 	{ "closed", closed_setup, closed_disturb, closed_verify },

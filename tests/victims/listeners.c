@@ -340,10 +340,6 @@ static void deserted_setup(void)
 			work(parent);
 }
 
-static void nothing(void)
-{
-}
-
 /* ---- one that somebody else has the name of ------------------------------------------ */
 
 static void taken_setup(void)

@@ -62,6 +62,11 @@ static inline void expect_text(int f, const char *text, const char *what)
 	      n < 0 ? strerror(errno) : "", scratch, text);
 }
 
+/* For a scenario that does without a step. */
+static inline void nothing(void)
+{
+}
+
 static inline void on_signal(int signal)
 {
 	(void)signal;

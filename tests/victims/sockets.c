@@ -139,10 +139,6 @@ static void pidfds_verify(void)
 	      "the flags of a pidfd");
 }
 
-static void nothing(void)
-{
-}
-
 /* ---- a child that is watched, as event loops do ------------------------------------------- */
 
 static pid_t watched;
