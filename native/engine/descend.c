@@ -29,9 +29,7 @@ struct member {
 	bool traced;
 	int host; /* whose fork it is, a branch                               */
 	struct puppet puppet;
-	struct sandbox *sandbox;   /* NULL: it is on its own, and waits to go        */
-	struct snapshot *snapshot; /* of its template; NULL: nobody has asked yet     */
-	struct remap *plan;
+	struct sandbox *sandbox; /* NULL: it is on its own, and waits to go            */
 };
 
 struct family {
@@ -53,7 +51,7 @@ struct family *family_new(struct target *main, struct generation *generation,
 {
 	struct family *family = calloc(1, sizeof *family);
 
-	if (family)
+	if (family && inherit_begin(generation, 0, err) == 0)
 		family->copier = copier_new(err);
 	if (family && family->copier)
 		family->member = calloc(generation->branches + 1, sizeof *family->member);
@@ -81,32 +79,12 @@ static struct member *member_of(struct family *family, int branch)
 	return branch < 0 ? &family->first : &family->member[branch];
 }
 
-static pid_t template_of(const struct family *family, int branch)
-{
-	return branch < 0 ? family->generation->template
-			  : family->generation->branch[branch].image->template;
-}
-
-/* Who forks it: its parent; an orphan's is gone, and somebody of its session does. */
-static int host_of(const struct family *family, const struct branch *branch)
-{
-	const struct generation *generation = family->generation;
-
-	if (branch->parent != PARENT_INIT)
-		return branch->parent;
-	for (uint32_t i = 0; i < generation->branches && &generation->branch[i] != branch; i++)
-		if (generation->branch[i].target && family->member[i].pid &&
-		    generation->branch[i].session == branch->session)
-			return (int)i;
-	return PARENT_MAIN;
-}
-
 /* What is done while a process forks, which takes its time if it is big: how the child
  * will differ from it is found out, and its last child is made what it is to be. */
 struct chores {
 	struct family *family;
-	int child, host; /* child -1: one that will be a zombie                  */
-	int last;        /* -1: none                                             */
+	int child; /* -1: one that will be a zombie                            */
+	int last;  /* -1: none                                               */
 	struct avc_error error;
 	int result;
 	bool done;
@@ -293,54 +271,11 @@ static int join_group(struct member *member, const struct branch *branch, struct
 	return puppet_flush(puppet, err);
 }
 
-static struct snapshot *snapshot_of(struct family *family, int branch, struct avc_error *err)
-{
-	struct member *member = member_of(family, branch);
-
-	if (!member->snapshot)
-		member->snapshot = snapshot_new(template_of(family, branch), err);
-	return member->snapshot;
-}
-
 /* The main process, a fork of its template, is registered with rseq(2); those that are made
  * here register last of all. */
 static const struct inj_thread *registered(const struct family *family, int host)
 {
 	return host < 0 ? pad_thread(&family->main->pad, family->generation->slot, 0) : NULL;
-}
-
-static int plan_memory(struct family *family, uint32_t index, int host, struct avc_error *err)
-{
-	const struct inj_thread *thread = registered(family, host);
-	struct snapshot *want = snapshot_of(family, (int)index, err);
-	struct snapshot *is = want ? snapshot_of(family, host, err) : NULL;
-	struct member *member = &family->member[index];
-
-	if (!is)
-		return -1;
-	member->plan = remap_plan(family->generation->branch[index].target, want, is,
-				  thread ? thread->rseq : 0, err);
-	return member->plan ? 0 : -1;
-}
-
-static bool has_children(const struct family *family, uint32_t index)
-{
-	for (uint32_t i = index + 1; i < family->generation->branches; i++)
-		if (family->generation->branch[i].parent == (int)index)
-			return true;
-	return false;
-}
-
-static void forget_plan(const struct family *family, uint32_t index)
-{
-	struct member *member = &family->member[index];
-
-	remap_free(member->plan);
-	member->plan = NULL;
-	if (has_children(family, index))
-		return;
-	snapshot_free(member->snapshot);
-	member->snapshot = NULL;
 }
 
 static int become(struct family *family, uint32_t index, struct avc_error *err)
@@ -349,15 +284,16 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
 	const struct inj_thread *thread = registered(family, member->host);
+	const struct remap *plan = inherit_plan(family->main, family->generation, index, err);
 
-	if (puppet_open_mail(puppet, err))
+	if (!plan || puppet_open_mail(puppet, err))
 		return -1;
 	/* An orphan comes from one in between that has none (kernel/rseq.c, CLONE_VM). */
 	if (thread && thread->rseq && branch->parent != PARENT_INIT)
 		puppet_call(puppet, SYS_rseq, thread->rseq, thread->rseq_bytes, 1 /* UNREGISTER */,
 			    thread->rseq_signature, 0, 0);
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
-	    remap(member->plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
+	    remap(plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
 	    place(member, branch, err) || puppet_put_files(puppet, &family->table[index], err))
 		return -1;
 	take_terminal(puppet, branch);
@@ -365,7 +301,6 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	if (manner_put_limits(puppet, branch, err) || puppet_flush(puppet, err))
 		return -1;
 	close_fd(&puppet->socket);
-	forget_plan(family, index);
 	return 0;
 }
 
@@ -377,8 +312,8 @@ static void do_chores(void *arg)
 	if (chores->done)
 		return; /* the number was not the right one */
 	chores->done = true;
-	if (chores->child >= 0 &&
-	    plan_memory(family, (uint32_t)chores->child, chores->host, &chores->error))
+	if (chores->child >= 0 && !inherit_plan(family->main, family->generation,
+						(uint32_t)chores->child, &chores->error))
 		chores->result = -1;
 	else if (chores->last >= 0)
 		chores->result = become(family, (uint32_t)chores->last, &chores->error);
@@ -402,9 +337,9 @@ static int finish_copies(struct family *family, struct avc_error *err)
 static int make_member(struct family *family, uint32_t index, int *last, struct avc_error *err)
 {
 	const struct branch *branch = &family->generation->branch[index];
-	const int host = host_of(family, branch);
+	const int host = inherit_host(family->generation, index);
 	struct member *member = &family->member[index], *by = member_of(family, host);
-	struct chores chores = { .family = family, .host = host };
+	struct chores chores = { .family = family };
 
 	go_on(family);
 	/* It has to be itself before it has children. */
@@ -605,11 +540,8 @@ void family_free(struct family *family)
 	for (uint32_t i = 0; i < family->generation->branches; i++) {
 		close_fd(&family->member[i].pidfd);
 		close_fd(&family->member[i].puppet.socket);
-		remap_free(family->member[i].plan);
-		snapshot_free(family->member[i].snapshot);
 	}
 	copier_free(family->copier);
-	snapshot_free(family->first.snapshot);
 	close_fd(&family->first.pidfd);
 	free(family->member);
 	free(family);

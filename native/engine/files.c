@@ -258,6 +258,36 @@ static bool look_at_remote(const struct look *look, int number, struct file *f)
 	return true;
 }
 
+/* A child has most of what it has open from its parent: then there is nothing to look at that
+ * the look at the parent has not seen. */
+static bool look_at_inherited(const struct look *look, int number, struct file *f)
+{
+	const struct files *kin = look->files->kin;
+	const struct file *is = kin ? files_find(kin, number) : NULL;
+	const struct file *k = is ? files_find(look->known, number) : NULL;
+
+	/* Of connections, locks and anonymous inodes there is more to know. */
+	if (!k || k->remote || k->lock_count || !is->known || is_anonymous(is) || is->told_ino ||
+	    (is->kind == FILE_SOCKET && look->files->with_tcp) ||
+	    syscall(SYS_kcmp, look->pid, look->files->kin_pid, KCMP_FILE, number, number))
+		return false;
+	*f = (struct file){
+		.fd = number,
+		.shared = number,
+		.dev = is->dev,
+		.ino = is->ino,
+		.rdev = is->rdev,
+		.mode = is->mode,
+		.flags = is->flags,
+		.offset = is->offset,
+		.bytes = is->bytes,
+		.modified = is->modified,
+		.changed = is->changed,
+		.inherited = is,
+	};
+	return take_known(look, f);
+}
+
 static int look_at(struct look *look, int number, struct avc_error *err)
 {
 	struct files *files = look->files;
@@ -286,6 +316,10 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	}
 	f = &files->file[files->count];
 	if (look->depth != FILES_BEFORE && look_at_remote(look, number, f)) {
+		files->count++;
+		return 0;
+	}
+	if (look->depth == FILES_FROZEN && look_at_inherited(look, number, f)) {
 		files->count++;
 		return 0;
 	}
@@ -506,6 +540,24 @@ static bool is_channel(const struct file *f)
 					f->socket->domain == AF_UNIX && !f->socket->listening);
 }
 
+/* What its parent's look has found in it. */
+static void copy_content(const struct files *kin, struct file *f)
+{
+	const struct file *from = files_find(kin, f->inherited->shared);
+
+	f->ended = from->ended;
+	f->content_lost = from->content_lost;
+	f->rights_lost = from->rights_lost;
+	if (!from->content_bytes)
+		return;
+	f->content = malloc(from->content_bytes);
+	f->content_lost |= !f->content;
+	if (!f->content)
+		return;
+	memcpy(f->content, from->content, from->content_bytes);
+	f->content_bytes = from->content_bytes;
+}
+
 static void keep_contents(struct look *look)
 {
 	struct scratch scratch = { -1, -1, 0 };
@@ -519,6 +571,10 @@ static void keep_contents(struct look *look)
 		if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) ||
 		    f->shared != f->fd || f->outside || !is_channel(f))
 			continue;
+		if (f->inherited) {
+			copy_content(look->files->kin, f);
+			continue;
+		}
 		ours = may_be_ours(look->files, f);
 		fd = files_borrow(look->pidfd, f->fd);
 		if (fd < 0)
@@ -668,15 +724,22 @@ int files_prepare(struct target *target, struct avc_error *err)
 }
 
 int files_capture(struct target *target, struct generation *generation, bool several,
-		  struct avc_error *err)
+		  const struct files *kin, pid_t kin_pid, struct avc_error *err)
 {
 	struct files *image = target->files_image;
+	int result;
 
 	target->files_image = NULL;
 	image->several = several;
 	generation->files = image;
-	if (files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
-		       target->init, err))
+	image->kin = kin;
+	image->kin_pid = kin_pid;
+	result = files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
+			    target->init, err);
+	image->kin = NULL; /* may be gone before this one */
+	for (uint32_t i = 0; i < image->count; i++)
+		image->file[i].inherited = NULL;
+	if (result)
 		return -1;
 	find_owners(target, image);
 	find_own_pidfds(target, image);

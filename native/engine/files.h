@@ -131,6 +131,8 @@ struct file {
 	bool content_lost; /* there was something that can not be put back          */
 	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
+	/* The same open file description in `kin` of files_look(); NULL: not known to be */
+	const struct file *inherited;
 };
 
 struct files {
@@ -139,6 +141,10 @@ struct files {
 	bool with_tcp;     /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns; /* CLOCK_REALTIME                                       */
 	struct file *file; /* by fd, ascending                                     */
+	/* During a freeze: a table that has just been looked at.  What this one has in common
+	 * with it, as children have with their parents, is not looked at again. */
+	const struct files *kin;
+	pid_t kin_pid;
 };
 
 struct files_work;

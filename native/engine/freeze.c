@@ -168,24 +168,24 @@ struct capture {
 	struct generation *generation;
 };
 
-static void capture_main_files(struct target *target, struct generation *generation)
-{
-	files_capture(target, generation, generation->branches > 0, &generation->files_error);
-}
-
 /* The tables do not change while the kernel clones: nobody runs. */
 static void capture_files(void *arg)
 {
 	const struct capture *capture = arg;
 	struct generation *generation = capture->generation;
 
-	if (!generation->files)
-		capture_main_files(capture->target, generation);
+	files_capture(capture->target, generation, generation->branches > 0, NULL, 0,
+		      &generation->files_error);
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
+		const struct branch *parent = branch->parent >= 0
+						      ? &generation->branch[branch->parent]
+						      : NULL;
 
 		if (branch->target)
 			files_capture(branch->target, branch->image, true,
+				      parent ? parent->image->files : generation->files,
+				      parent ? parent->target->pid : capture->target->pid,
 				      &branch->image->files_error);
 	}
 }
@@ -374,7 +374,7 @@ static int read_branch(struct branch *branch, bool strict, struct mem_seen *seen
 	    memory_prepare(target->memory, &branch->image->image, seen, err) ||
 	    read_all(target, branch->image->slot, &branch->image->threads, err))
 		return -1;
-	branch->image->vm_pages = proc_vm_pages(target->pid);
+	branch->image->vm_pages = proc_vm_pages(target->statm_fd, NULL);
 	memory_copy(target, branch->image->image);
 	files_mapped_copy(branch->image->mapped);
 	return 0;
@@ -402,7 +402,7 @@ static int ask_begin(struct asking *asking, struct avc_error *err)
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(target, call);
-	ask_add(target, asking->thread, call, &asking->questions);
+	ask_add(target, false, call, &asking->questions);
 	if (borrow(target, asking->thread, err) || pad_start(asking->thread->tid, err))
 		return -1;
 	asking->asked = true;
@@ -424,6 +424,7 @@ static int ask_end(struct asking *asking, struct avc_error *err)
 	struct target *target = asking->target;
 	struct inj_call *call = &target->pad.control->runner;
 
+	asking->asked = false;
 	if (tracee_await(asking->thread->tid, NULL, err) != STOP_TRAP) {
 		thread_runs_on(asking->thread, err);
 		return -1;
@@ -461,6 +462,7 @@ static int start_clone(struct branch *branch, struct avc_error *err)
 	struct inj_call *call = &target->pad.control->holder;
 
 	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
 	memory_dofork(target->memory, call);
 	drop_old_pads(target, branch->image, call);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
@@ -474,36 +476,20 @@ static int start_clone(struct branch *branch, struct avc_error *err)
 static int await_clone(struct branch *branch, struct avc_error *err)
 {
 	struct target *target = branch->target;
+	const struct inj_call *call = &target->pad.control->holder;
+	struct thread *thread = thread_find(target, target->pid);
 
-	if (pad_await_clone(target->holder, &target->pad.control->holder, &branch->image->template,
-			    err))
+	if (pad_await_clone(target->holder, call, &branch->image->template, err))
 		return -1;
 	target->lost = false;
+	if (thread && call->call[0].result > 0)
+		thread->creds.future_lock = (int32_t)call->call[0].result;
 	return 0;
 }
 
-/* Each is asked as soon as it has been read, and answers while the next one is read. */
-static int read_and_ask(struct generation *generation, struct mem_seen *seen, struct asking *asking,
-			struct avc_error *err)
-{
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
-
-		asking[i].target = branch->target;
-		if (branch->target && (read_branch(branch, generation->mapped != NULL, seen, err) ||
-				       ask_begin(&asking[i], err)))
-			return -1;
-	}
-	return 0;
-}
-
-static int read_branches(struct tree *tree, struct generation *generation, struct mem_seen *seen,
+static int find_branches(struct tree *tree, struct generation *generation, struct asking **asking,
 			 struct avc_error *err)
 {
-	struct avc_error failed = { 0 };
-	struct asking *asking;
-	int result = 0;
-
 	if (tree->count <= 1)
 		return 0;
 	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
@@ -514,21 +500,40 @@ static int read_branches(struct tree *tree, struct generation *generation, struc
 				    "a child process has its parent's memory (CLONE_VM)");
 	if (make_branches(tree, generation, err))
 		return -1;
-	asking = calloc(generation->branches + 1, sizeof *asking);
-	if (!asking)
+	*asking = calloc(generation->branches + 1, sizeof **asking);
+	if (!*asking)
 		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
-	for (uint32_t i = 0; !result && i < generation->branches; i++)
-		if (generation->branch[i].target)
-			result = prepare_stopped(tree, generation->branch[i].target, err);
-	if (!result)
-		result = read_and_ask(generation, seen, asking, err);
-	/* They answer meanwhile. */
-	if (!result)
-		capture_main_files(tree->main, generation);
-	if (hear_all(asking, generation->branches, result ? &failed : err) && !result)
-		result = -1;
-	free(asking);
-	return result;
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		(*asking)[i].target = generation->branch[i].target;
+		if (generation->branch[i].target &&
+		    prepare_stopped(tree, generation->branch[i].target, err))
+			return -1;
+	}
+	return 0;
+}
+
+/* Each is asked as soon as it has been read, and answers, and is cloned, while the next one is
+ * read: what it is asked changes nothing of its memory. */
+static int read_branches(struct generation *generation, struct mem_seen *seen,
+			 struct asking *asking, bool clone, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		if (branch->target &&
+		    (read_branch(branch, generation->mapped != NULL, seen, err) ||
+		     ask_begin(&asking[i], err) || (clone && start_clone(branch, err))))
+			return -1;
+	}
+	return 0;
+}
+
+static bool has_all_holders(const struct tree *tree)
+{
+	for (uint32_t i = 1; i < tree->count; i++)
+		if (tree->kin[i].target && !tree->kin[i].target->holder)
+			return false;
+	return true;
 }
 
 /* What a process above it adopts would be a child that it never had; it itself sees to that
@@ -566,8 +571,13 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 	return result;
 }
 
-static int start_clones(struct generation *generation, struct avc_error *err)
+/* Their main threads make the holders, and have to be at rest for that. */
+static int make_and_clone(struct tree *tree, struct generation *generation, struct asking *asking,
+			  struct avc_error *err)
 {
+	if (hear_all(asking, generation->branches, err) || make_holders_missing(tree, err))
+		return -1;
+	generation->taken_ns = now_ns();
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target && start_clone(&generation->branch[i], err))
 			return -1;
@@ -610,6 +620,8 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	struct target *target = tree->main;
 	const uint64_t start = now_ns();
 	const bool was_childless = target->childless;
+	struct asking *asking = NULL;
+	struct avc_error failed = { 0 };
 	struct thread *main_thread;
 	bool cloned = false;
 	int result;
@@ -631,21 +643,27 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 		/* The deadline is for getting things stopped; the clone of a big
 		 * process takes its time. */
 		tracee_deadline_set(timer, CLONE_NS);
-		generation->vm_pages = proc_vm_pages(target->pid);
+		generation->vm_pages = proc_vm_pages(target->statm_fd, NULL);
 		memory_copy(target, generation->image);
 		files_mapped_copy(generation->mapped);
-		result = read_branches(tree, generation, seen, err);
+		result = find_branches(tree, generation, &asking, err);
 	}
-	if (!result)
-		result = make_holders_missing(tree, err);
 	if (!result) {
+		const bool at_once = has_all_holders(tree);
+
 		generation->taken_ns = now_ns();
-		result = start_clones(generation, err);
+		result = read_branches(generation, seen, asking, at_once, err);
+		if (!result && !at_once)
+			result = make_and_clone(tree, generation, asking, err);
 	}
 	if (!result) {
 		result = clone_app(target, main_thread, generation, times, err);
 		cloned = !result;
 	}
+	/* Also those that were asked before something failed. */
+	if (asking && hear_all(asking, generation->branches, result ? &failed : err))
+		result = -1;
+	free(asking);
 	if (!result)
 		result = await_clones(generation, err);
 	if (generation->branches)

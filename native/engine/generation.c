@@ -186,6 +186,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 static int finish(struct target *target, struct generation *generation, struct branch *branch,
 		  const struct proc_stat *stat, struct avc_error *err)
 {
+	int statm_fd;
 	long pages;
 	pid_t group;
 
@@ -198,7 +199,9 @@ static int finish(struct target *target, struct generation *generation, struct b
 	group = stat->group == target->leader ? target->inside : proc_inside(stat->group);
 	if (group <= 0)
 		group = target->inside;
-	pages = proc_vm_pages(generation->template);
+	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
+	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
+	close_fd(&statm_fd);
 	if (quieten(target, generation, branch || stat->session == target->leader, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
@@ -323,6 +326,7 @@ void generation_drop(struct generation *generation)
 		if (branch->target)
 			branch->target->images--;
 	}
+	inherit_free(generation->inheritance);
 	free(generation->branch);
 	image_drop(generation);
 	*generation = (struct generation){ .pidfd = -1 };

@@ -283,9 +283,12 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 
 		ns = ns < slice ? ns : slice;
 	}
+	if (guard->ahead)
+		ns = 0;
 	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
 				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
+	(void)ppoll(guard->fds, n,
+		    due == UINT64_MAX && !straggling && !guard->ahead ? NULL : &timeout, NULL);
 }
 
 /* Nobody is to believe that there are checkpoints when there are none. */
@@ -359,6 +362,10 @@ static void *guard_main(void *arg)
 			break;
 		}
 		carry_out(guard);
+		if (guard->ahead)
+			guard->ahead = guard->count &&
+				       inherit_next(&guard->target,
+						    &guard->generations[guard->count - 1]);
 		if (now_ns() < guard->next_ns)
 			continue;
 		if (!guard->attached)

@@ -52,6 +52,7 @@ struct avc_guard {
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* when it was found dying, some time more: see reap_unknown() */
 	uint32_t misses;         /* in a row, of one that is unsupported     */
+	bool ahead;              /* there may be something to inherit_next() */
 	uint32_t room;           /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;

@@ -10,6 +10,7 @@
 
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
+#define AHEAD_SHARE 100 /* of an interval at most is spent on what may come      */
 #define MISSES_UNTIL_UNPROTECTED 3
 
 /* ---- checkpoint --------------------------------------------------------------- */
@@ -204,6 +205,17 @@ static void watch_files(struct avc_guard *guard, struct generation *fresh)
 	fresh->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
 }
 
+/* What a restore can be spared of it is found out when nothing else is to be done. */
+static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
+{
+	const uint64_t interval_ns = guard->config.interval_ns;
+	struct avc_error later = { 0 };
+
+	guard->ahead = fresh->branches &&
+		       inherit_begin(fresh, interval_ns ? interval_ns / AHEAD_SHARE : UINT64_MAX,
+				     &later) == 0;
+}
+
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	struct target *target = &guard->target;
@@ -252,6 +264,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		files_settle_family(target, &fresh,
 				    guard->count ? &guard->generations[guard->count - 1] : NULL);
 	fresh.number = ++guard->number;
+	begin_ahead(guard, &fresh);
 	keep_generation(guard, &fresh);
 	link_arm(&guard->link, true);
 	event->generation = fresh.number;

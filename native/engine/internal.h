@@ -9,6 +9,7 @@
  *   restore.c    templates become the app again
  *   descend.c    a restored process makes its children
  *   remap.c      ... and their memory
+ *   inherit.c    ... of which they have some from their parents
  *   copier.c     ... which a second thread helps to copy
  *   snapshot.c   mappings and pages of a template
  *   manner.c     ... and what else they have
@@ -87,6 +88,8 @@ struct proc_stat {
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 int proc_stat(pid_t pid, struct proc_stat *stat);
+/* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
+int proc_stat_of(int stat_fd, struct proc_stat *stat);
 /* How a zombie has ended, as wait(2) says it; 0 if that can not be found out. */
 int proc_exit_status(pid_t pid);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
@@ -102,8 +105,9 @@ int proc_children(pid_t pid, pid_t *children, int max);
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
 int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
-/* Size of the address space in pages (statm), or -1. */
-long proc_vm_pages(pid_t pid);
+/* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be
+ * NULL): how many are resident and of no file. */
+long proc_vm_pages(int statm_fd, long *anonymous);
 /* The PID a pidfd stands for, in our namespace, or -1. */
 pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
@@ -262,7 +266,7 @@ struct target {
 	pid_t pid;
 	pid_t leader; /* the process's own number                            */
 	pid_t inside; /* the same in its own namespace                       */
-	int pidfd, task_dirfd, mem_fd, timers_fd;
+	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd;
 	struct pad pad;
 	bool infected; /* the pad is known to be in this process           */
 	pid_t holder;  /* 0: none                                          */
@@ -329,6 +333,8 @@ struct branch {
 #define PARENT_MAIN (-1)
 #define PARENT_INIT (-2)
 
+struct inheritance;
+
 /* Also the image of one process of several: then what is of the whole is unused. */
 struct generation {
 	uint64_t number; /* 0: unused                                        */
@@ -347,6 +353,7 @@ struct generation {
 	bool vouched;          /* the app was healthy well after it was taken      */
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the app when it was taken                     */
+	long anon_pages;       /* resident ones that are of no file                */
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
 	int stop_signal;       /* stopped by that (job control), 0: it was not     */
@@ -363,6 +370,7 @@ struct generation {
 	char written[FILES_NAME];    /* a file that was written since; "": none         */
 	struct branch *branch;       /* the other processes, parents first        */
 	uint32_t branches;
+	struct inheritance *inheritance; /* inherit.c; NULL: not begun                */
 };
 
 /* One process of the app, as it was found. */
@@ -700,11 +708,12 @@ uint32_t stragglers(struct target *target);
 /* What ptrace can read of a stopped thread: mask, robust list, rseq. */
 int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
 /* What only a thread itself can tell (clear_child_tid, sigaltstack, credentials): added to
- * calls that it makes anyway, and what came of it. */
+ * calls that it makes anyway, and what came of it.  `with_locks`: of its process, what is to
+ * be locked in memory; there is a mapping more while that is found out. */
 struct questions {
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
 };
-void ask_add(const struct target *target, const struct thread *thread, struct inj_call *call,
+void ask_add(const struct target *target, bool with_locks, struct inj_call *call,
 	     struct questions *questions);
 int ask_answer(struct thread *thread, const struct inj_call *call,
 	       const struct questions *questions, struct avc_error *err) warn_unused;
@@ -723,9 +732,10 @@ void rseq_fixup(int mem_fd, struct thread *thread);
 /* Before a freeze: what can be known of the app's descriptors while it runs. */
 int files_prepare(struct target *target, struct avc_error *err) warn_unused;
 /* During it: what is of this instant.  `several`: the app has other processes, which may
- * have the other ends of pipes. */
+ * have the other ends of pipes.  `kin`: what process `kin_pid` has, of the same freeze, or
+ * NULL. */
 int files_capture(struct target *target, struct generation *generation, bool several,
-		  struct avc_error *err);
+		  const struct files *kin, pid_t kin_pid, struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
 /* The same for all processes: what they share of open files, and who of them is named.
@@ -946,6 +956,8 @@ struct snapshot {
 
 struct snapshot *snapshot_new(pid_t template, struct avc_error *err);
 void snapshot_free(struct snapshot *snapshot);
+/* Frees what it knows of pages, until it is asked for them again; NULL: nothing to do. */
+void snapshot_rest(struct snapshot *snapshot);
 /* Of one of its mappings, a private one.  NULL on error. */
 const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mapping *mapping,
 				   struct avc_error *err);
@@ -983,6 +995,21 @@ struct remap *remap_plan(const struct target *target, struct snapshot *want, str
 int remap(const struct remap *plan, struct puppet *puppet, struct copier *copier,
 	  struct avc_error *err) warn_unused;
 void remap_free(struct remap *plan);
+
+/* ---- inherit.c --------------------------------------------------------------------- */
+
+/* Of a generation that is whole; once is enough.  `ahead_ns`: CPU time that inherit_next() may
+ * spend on it, about. */
+int inherit_begin(struct generation *generation, uint64_t ahead_ns,
+		  struct avc_error *err) warn_unused;
+/* Who is to fork a branch's process: another branch, or PARENT_MAIN. */
+int inherit_host(const struct generation *generation, uint32_t index);
+/* How it is made of that fork; NULL on error. */
+const struct remap *inherit_plan(const struct target *main, struct generation *generation,
+				 uint32_t index, struct avc_error *err);
+/* Finds out about one more of them, so that a restore need not; false: that is all. */
+bool inherit_next(const struct target *main, struct generation *generation);
+void inherit_free(struct inheritance *inheritance);
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 

@@ -53,14 +53,21 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 	return 0;
 }
 
-int proc_stat(pid_t pid, struct proc_stat *stat)
+static ssize_t read_again(int fd, char *buf, size_t size)
 {
-	char buf[1024], *p;
+	const ssize_t n = pread(fd, buf, size - 1, 0);
+
+	if (n >= 0)
+		buf[n] = 0;
+	return n;
+}
+
+static int parse_stat(const char *buf, struct proc_stat *stat)
+{
+	const char *p;
 	int tty;
 	unsigned long long start;
 
-	if (proc_read(pid, "stat", buf, sizeof buf) < 0)
-		return -1;
 	/* The name may hold anything, also ") R": the last ')' ends it. */
 	p = strrchr(buf, ')');
 	if (!p ||
@@ -74,6 +81,20 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 	stat->tty = (uint32_t)tty;
 	stat->start = start;
 	return 0;
+}
+
+int proc_stat(pid_t pid, struct proc_stat *stat)
+{
+	char buf[1024];
+
+	return proc_read(pid, "stat", buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
+}
+
+int proc_stat_of(int stat_fd, struct proc_stat *stat)
+{
+	char buf[1024];
+
+	return read_again(stat_fd, buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
 }
 
 int proc_exit_status(pid_t pid)
@@ -361,13 +382,17 @@ int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg)
 	}
 }
 
-long proc_vm_pages(pid_t pid)
+long proc_vm_pages(int statm_fd, long *anonymous)
 {
 	char buf[128];
+	long pages, resident, of_files;
 
-	if (proc_read(pid, "statm", buf, sizeof buf) <= 0)
+	if (read_again(statm_fd, buf, sizeof buf) <= 0 ||
+	    sscanf(buf, "%ld %ld %ld", &pages, &resident, &of_files) != 3)
 		return -1;
-	return atol(buf);
+	if (anonymous)
+		*anonymous = resident - of_files;
+	return pages;
 }
 
 pid_t proc_pidfd_pid(int pidfd)

@@ -55,9 +55,8 @@ struct snapshot *snapshot_new(pid_t template, struct avc_error *err)
 		return NULL;
 	}
 	snapshot->template = template;
-	snapshot->pagemap = proc_open(template, "pagemap", O_RDONLY);
-	if (snapshot->pagemap < 0 ||
-	    proc_mappings(template, "maps", add_mapping, &snapshot->maps)) {
+	snapshot->pagemap = -1;
+	if (proc_mappings(template, "maps", add_mapping, &snapshot->maps)) {
 		fail_errno(err, template, "restore memory", "read(maps)", "it was killed");
 		snapshot_free(snapshot);
 		return NULL;
@@ -71,16 +70,25 @@ struct snapshot *snapshot_new(pid_t template, struct avc_error *err)
 	return snapshot;
 }
 
+void snapshot_rest(struct snapshot *snapshot)
+{
+	for (uint32_t i = 0; snapshot && snapshot->pages && i < snapshot->maps.count; i++) {
+		struct pages *pages = &snapshot->pages[i];
+
+		for (uint32_t k = 0; k < pages->count; k++)
+			free(pages->extent[k].frame);
+		free(pages->extent);
+		*pages = (struct pages){ 0 };
+	}
+	if (snapshot)
+		close_fd(&snapshot->pagemap);
+}
+
 void snapshot_free(struct snapshot *snapshot)
 {
 	if (!snapshot)
 		return;
-	for (uint32_t i = 0; snapshot->pages && i < snapshot->maps.count; i++) {
-		for (uint32_t k = 0; k < snapshot->pages[i].count; k++)
-			free(snapshot->pages[i].extent[k].frame);
-		free(snapshot->pages[i].extent);
-	}
-	close_fd(&snapshot->pagemap);
+	snapshot_rest(snapshot);
 	free(snapshot->pages);
 	free(snapshot->maps.map);
 	free(snapshot);
@@ -143,6 +151,8 @@ const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mappi
 
 	if (pages->known)
 		return pages;
+	if (snapshot->pagemap < 0)
+		snapshot->pagemap = proc_open(snapshot->template, "pagemap", O_RDONLY);
 	if (m->end - m->start >= SPARSE_BYTES)
 		result = read_sparse(snapshot, pages, m);
 	if (result == 1)

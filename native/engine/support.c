@@ -61,7 +61,7 @@ static int check_descriptors(struct target *target, struct avc_error *err)
 /* Only when its size has changed: the file is long. */
 static int check_mappings(struct target *target, struct avc_error *err)
 {
-	const long pages = proc_vm_pages(target->pid);
+	const long pages = proc_vm_pages(target->statm_fd, NULL);
 	char path[64], line[512];
 	int result = 0;
 	FILE *maps;

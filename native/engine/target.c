@@ -21,9 +21,13 @@
 
 void target_init(struct target *target)
 {
-	*target = (struct target){
-		.pidfd = -1, .task_dirfd = -1, .mem_fd = -1, .timers_fd = -1, .holder_pidfd = -1
-	};
+	*target = (struct target){ .pidfd = -1,
+				   .task_dirfd = -1,
+				   .mem_fd = -1,
+				   .timers_fd = -1,
+				   .stat_fd = -1,
+				   .statm_fd = -1,
+				   .holder_pidfd = -1 };
 }
 
 bool target_make_room(struct target *target)
@@ -57,7 +61,9 @@ static int follow(struct target *target, struct avc_error *err)
 	if (!pid)
 		return fail(err, AVC_GONE, ESRCH, target->leader, "attach", "", "it has ended");
 	close_fd(&target->pidfd);
+	close_fd(&target->statm_fd);
 	target->pid = pid;
+	target->statm_fd = proc_open(pid, "statm", O_RDONLY);
 	target->pidfd = pid == target->leader ? proc_pidfd_open(pid)
 					      : (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
 	if (target->pidfd < 0 && errno == EINVAL)
@@ -80,13 +86,14 @@ int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error
 	target->inside = inside;
 	target->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	target->timers_fd = proc_open(pid, "timers", O_RDONLY);
+	target->stat_fd = proc_open(pid, "stat", O_RDONLY);
 	if (follow(target, err)) {
 		target_close(target);
 		return -1;
 	}
 	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
 	if (target->pidfd < 0 || target->task_dirfd < 0 || target->mem_fd < 0 ||
-	    target->timers_fd < 0) {
+	    target->timers_fd < 0 || target->stat_fd < 0 || target->statm_fd < 0) {
 		fail_errno(err, pid, "attach", "open(/proc)", "its /proc can not be read");
 		target_close(target);
 		return -1;
@@ -100,6 +107,8 @@ void target_close(struct target *target)
 	close_fd(&target->task_dirfd);
 	close_fd(&target->mem_fd);
 	close_fd(&target->timers_fd);
+	close_fd(&target->stat_fd);
+	close_fd(&target->statm_fd);
 	target->pid = 0;
 	target->leader = 0;
 	target->infected = false;
@@ -398,7 +407,7 @@ int thread_read(struct thread *thread, struct avc_error *err)
 	return 0;
 }
 
-void ask_add(const struct target *target, const struct thread *thread, struct inj_call *call,
+void ask_add(const struct target *target, bool with_locks, struct inj_call *call,
 	     struct questions *questions)
 {
 	const avc_remote out = pad_remote(&target->pad, call->out);
@@ -412,7 +421,7 @@ void ask_add(const struct target *target, const struct thread *thread, struct in
 	 * (fs/proc/base.c, proc_flush_pid()). */
 	inside = call_add(call, SYS_gettid, 0, 0, 0, 0, 0);
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32, 0, 0, 0);
-	locks = thread->tid == target->pid ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
+	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
 	attributes = attributes_ask(call, call->out + 64, out + 64);
 	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
 }
@@ -423,7 +432,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	struct questions questions;
 
 	call_begin(call, INJ_AFTER_HOME);
-	ask_add(target, thread, call, &questions);
+	ask_add(target, thread->tid == target->pid, call, &questions);
 	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
 	    pad_run(thread->tid, call, err))
 		return -1;

@@ -158,6 +158,16 @@ static struct target *add_member(struct tree *tree, pid_t pid, uint64_t start,
 	return target;
 }
 
+/* What is kept open of one that is known takes less to look at. */
+static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
+{
+	for (uint32_t i = 0; i < tree->members; i++)
+		if (tree->member[i]->leader == pid &&
+		    proc_stat_of(tree->member[i]->stat_fd, stat) == 0)
+			return 0;
+	return proc_stat(pid, stat);
+}
+
 int tree_look(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
@@ -170,7 +180,7 @@ int tree_look(struct tree *tree, struct avc_error *err)
 		struct kin *kin = &tree->kin[i];
 		struct proc_stat stat;
 
-		if (i && proc_stat(kin->pid, &stat)) {
+		if (i && look_at(tree, kin->pid, &stat)) {
 			kin->pid = 0; /* it was waited for just now */
 			continue;
 		}

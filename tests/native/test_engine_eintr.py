@@ -21,12 +21,13 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_no_eintr_over_ten_thousand_checkpoints(tmp_path: Path) -> None:
     """One process with a thread in each call: every checkpoint stops them all."""
     # Above clone's way: one generation, so that the cost is the freeze and not the bookkeeping.
     with Victim("eintr all 0", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
         # A few may miss their deadline on a busy machine.
-        done = guard.burst(CHECKPOINTS + 100)
+        done = guard.burst(CHECKPOINTS + 100, timeout_s=360)
         assert done["taken"] >= CHECKPOINTS, done
         calls = victim.see().counter[KINDS_AT : KINDS_AT + 20]
         victim.wait_beats(20)

@@ -1,0 +1,152 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the processes of a generation have in memory of those that will fork them
+ * (descend.c): who forks whom, and a plan for each (remap.c).
+ *
+ * To compare big processes takes longer than to fork them: 50 ns a page, for the kernel
+ * looks at each.  Templates do not change, so that it can be done as soon as they are there,
+ * while nobody waits for it.  What that may cost is limited; what is left is done when it
+ * is needed.
+ */
+#include <stdlib.h>
+
+#include "internal.h"
+
+/* Fewer pages are compared in no time. */
+#define WORTH_PAGES 1024
+/* About what it takes to compare a page. */
+#define PAGE_NS 60
+
+struct heir {
+	int host;                  /* a branch, or PARENT_MAIN                        */
+	struct snapshot *snapshot; /* NULL: nobody has asked yet                      */
+	struct remap *plan;        /* the same                                        */
+};
+
+struct inheritance {
+	struct snapshot *main;
+	uint64_t left_ns; /* to be spent ahead                                        */
+	uint32_t next;    /* to be looked at ahead                                    */
+	uint32_t heirs;
+	struct heir heir[]; /* by branch                                              */
+};
+
+/* Who forks it: its parent; an orphan's is gone, and somebody of its session does. */
+static int host_of(const struct generation *generation, const struct branch *branch)
+{
+	if (branch->parent != PARENT_INIT)
+		return branch->parent;
+	for (uint32_t i = 0; i < generation->branches && &generation->branch[i] != branch; i++)
+		if (generation->branch[i].target &&
+		    generation->branch[i].session == branch->session)
+			return (int)i;
+	return PARENT_MAIN;
+}
+
+int inherit_begin(struct generation *generation, uint64_t ahead_ns, struct avc_error *err)
+{
+	struct inheritance *all;
+
+	if (generation->inheritance)
+		return 0;
+	all = calloc(1, sizeof *all + generation->branches * sizeof *all->heir);
+	if (!all)
+		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+	all->left_ns = ahead_ns;
+	all->heirs = generation->branches;
+	for (uint32_t i = 0; i < all->heirs; i++)
+		all->heir[i].host = host_of(generation, &generation->branch[i]);
+	generation->inheritance = all;
+	return 0;
+}
+
+int inherit_host(const struct generation *generation, uint32_t index)
+{
+	return generation->inheritance->heir[index].host;
+}
+
+static struct snapshot *snapshot_of(struct generation *generation, int branch,
+				    struct avc_error *err)
+{
+	struct inheritance *all = generation->inheritance;
+	struct snapshot **snapshot = branch < 0 ? &all->main : &all->heir[branch].snapshot;
+
+	if (!*snapshot)
+		*snapshot = snapshot_new(branch < 0 ? generation->template
+						    : generation->branch[branch].image->template,
+					 err);
+	return *snapshot;
+}
+
+/* What nobody is to be compared with any more needs no room. */
+static void rest(const struct generation *generation, int branch)
+{
+	struct inheritance *all = generation->inheritance;
+
+	for (uint32_t i = 0; i < all->heirs; i++)
+		if (generation->branch[i].target && !all->heir[i].plan &&
+		    (all->heir[i].host == branch || (int)i == branch))
+			return;
+	snapshot_rest(branch < 0 ? all->main : all->heir[branch].snapshot);
+}
+
+/* The main process, a fork of its template, is registered with rseq(2), and the kernel has
+ * written there; the others register last of all. */
+static avc_remote touched(const struct target *main, const struct generation *generation, int host)
+{
+	return host < 0 ? pad_thread(&main->pad, generation->slot, 0)->rseq : 0;
+}
+
+const struct remap *inherit_plan(const struct target *main, struct generation *generation,
+				 uint32_t index, struct avc_error *err)
+{
+	struct heir *heir = &generation->inheritance->heir[index];
+	struct snapshot *want, *is;
+
+	if (heir->plan)
+		return heir->plan;
+	want = snapshot_of(generation, (int)index, err);
+	is = want ? snapshot_of(generation, heir->host, err) : NULL;
+	if (!is)
+		return NULL;
+	heir->plan = remap_plan(generation->branch[index].target, want, is,
+				touched(main, generation, heir->host), err);
+	rest(generation, (int)index);
+	rest(generation, heir->host);
+	return heir->plan;
+}
+
+bool inherit_next(const struct target *main, struct generation *generation)
+{
+	struct inheritance *all = generation->inheritance;
+
+	while (all && all->next < all->heirs) {
+		const uint32_t i = all->next++;
+		const struct branch *branch = &generation->branch[i];
+		const uint64_t pages = branch->image ? (uint64_t)branch->image->anon_pages : 0;
+		struct avc_error later = { 0 }; /* the restore will say it */
+
+		if (pages < WORTH_PAGES || pages * PAGE_NS > all->left_ns)
+			continue;
+		all->left_ns -= pages * PAGE_NS;
+		(void)inherit_plan(main, generation, i, &later);
+		return true;
+	}
+	if (!all)
+		return false;
+	snapshot_rest(all->main);
+	for (uint32_t i = 0; i < all->heirs; i++)
+		snapshot_rest(all->heir[i].snapshot);
+	return false;
+}
+
+void inherit_free(struct inheritance *all)
+{
+	for (uint32_t i = 0; all && i < all->heirs; i++) {
+		remap_free(all->heir[i].plan);
+		snapshot_free(all->heir[i].snapshot);
+	}
+	if (all)
+		snapshot_free(all->main);
+	free(all);
+}
