@@ -440,71 +440,79 @@ class InWorld(Subject):
             self.kill()
 
 
+class CriuImages:
+    """CRIU's own command line in the peers' world, with images on its tmpfs."""
+
+    _folder = "/tmp/images"
+
+    def __init__(self, world: World) -> None:
+        self.refused: list[str] = []
+        """Restores that did not work at the first try, in CRIU's own words."""
+        self._world = world
+
+    def dump(self, pid: int, *more: str) -> Taken:
+        """`pid`: as it is numbered inside.  Raises CriuFailed."""
+        self._world.run("rm", "-rf", self._folder)
+        self._world.run("mkdir", self._folder)
+        # -v1: the log costs time.
+        command = ["criu", "dump", "-t", str(pid), "-D", self._folder, ESTABLISHED, IN_FLIGHT, "-o", "dump.log", "-v1"]
+        done = self._world.run(*command, *more, check=False)
+        if done.status != 0:
+            raise _criu_failed("criu dump", done, self._log("dump.log"))
+        told = stats(self._bytes("stats-dump"))[1]
+        size = self._world.run("du", "-sk", self._folder).stdout.split()[0]
+        # Fields 1 and 2: time to stop everything, and time it stood still then, us.
+        return Taken(done.took_s * 1e3, (told[1] + told[2]) / 1e3, int(size) / 1024)
+
+    def restore(self, connections: str, patience_s: float = PATIENCE_S) -> float:
+        """What the command took that did it, ms.  Raises CriuFailed.
+
+        As a supervisor would: what the dead process' connections left in the kernel can be in the way.
+        """
+        until = time.monotonic() + patience_s
+        while True:
+            done = self._world.run(
+                *("criu", "restore", "-d", "-D", self._folder, connections, "-o", "restore.log", "-v1"), check=False
+            )
+            if done.status == 0:
+                return done.took_s * 1e3
+            error = _criu_failed("criu restore", done, self._log("restore.log"))
+            if time.monotonic() > until:
+                raise error
+            self.refused.append(str(error))
+
+    def _log(self, name: str) -> str:
+        return self._world.run("cat", f"{self._folder}/{name}", check=False).stdout
+
+    def _bytes(self, name: str) -> bytes:
+        command = [*self._world.enter, "cat", f"{self._folder}/{name}"]
+        return subprocess.run(command, capture_output=True, check=True, timeout=30).stdout
+
+
 class CriuBare(InWorld):
     """CRIU's own command line on a process without a container."""
 
     name = "CRIU"
-    _images = "/tmp/images"
 
     def start(self) -> None:
         self._undo.callback(self._kill_left)
+        self._criu = CriuImages(self._world)
+        self.refused = self._criu.refused
         self._world.start(*self.command(PROGRAMS_INSIDE, BOARDS_INSIDE))
 
-    def _dump(self, *more: str) -> float:
-        inner = Path(f"/proc/{self.app_pid()}/status").read_text().split("NSpid:")[1].split("\n")[0].split()[-1]
-        self._world.run("rm", "-rf", self._images)
-        self._world.run("mkdir", self._images)
-        # -v1: the log costs time.
-        done = self._world.run(
-            *("criu", "dump", "-t", inner, "-D", self._images, ESTABLISHED, IN_FLIGHT, "-o", "dump.log", "-v1", *more),
-            check=False,
-        )
-        if done.status != 0:
-            raise _criu_failed(
-                "criu dump", done, self._world.run("cat", f"{self._images}/dump.log", check=False).stdout
-            )
-        return done.took_s * 1e3
+    def _pid_inside(self) -> int:
+        return int(Path(f"/proc/{self.app_pid()}/status").read_text().split("NSpid:")[1].split("\n")[0].split()[-1])
 
     def checkpoint(self) -> Taken:
-        took_ms = self._dump("--leave-running")
-        dump = stats(self._world_bytes("stats-dump"))[1]
-        size = self._world.run("du", "-sk", self._images).stdout.split()[0]
-        # Fields 1 and 2: time to stop everything, and time it stood still then, us.
-        return Taken(took_ms, (dump[1] + dump[2]) / 1e3, int(size) / 1024)
-
-    def _restore(self, connections: str) -> float:
-        done = self._world.run(
-            *("criu", "restore", "-d", "-D", self._images, connections, "-o", "restore.log", "-v1"), check=False
-        )
-        if done.status != 0:
-            log = self._world.run("cat", f"{self._images}/restore.log", check=False).stdout
-            raise _criu_failed("criu restore", done, log)
-        return done.took_s * 1e3
+        return self._criu.dump(self._pid_inside(), "--leave-running")
 
     def crash(self) -> Recovered:
         self.kill()
-        return Recovered(self._restore_patiently(CLOSED))
+        return Recovered(self._criu.restore(CLOSED))
 
     def stop_and_restore(self) -> None:
-        self._dump()
-        self._restore_patiently(ESTABLISHED)
-
-    def _restore_patiently(self, connections: str) -> float:
-        """As a supervisor would: what the dead process' connections left in the kernel can be in the way."""
-        until = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                return self._restore(connections)
-            except CriuFailed as error:
-                if time.monotonic() > until:
-                    raise
-                self.refused.append(str(error))
-
-    def _world_bytes(self, name: str) -> bytes:
-        done = subprocess.run(
-            [*self._world.enter, "cat", f"{self._images}/{name}"], capture_output=True, check=True, timeout=30
-        )
-        return done.stdout
+        self._criu.dump(self._pid_inside())
+        self._criu.restore(ESTABLISHED)
 
 
 class CriuContainer:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS node beside CRIU: the pipeline of examples/ros in the peers' world, its voxel filter brought back by Podman.
+"""The ROS node beside CRIU: the pipeline of examples/ros in the peers' world, its voxel filter brought back by Podman,
+or, as a process without a container, by CRIU itself.
 
-    .venv/bin/python bench/ros_peers.py [--runs 2] [--runtimes crun,runc]
+    .venv/bin/python bench/ros_peers.py [--runs 2] [--ways bare,crun,runc]
 
 Each run takes one checkpoint of the filter, kills it three seconds later with SIGKILL, and calls `podman container
-restore` in that moment.  What a crash does to the chain is measured as in bench/ros.py, whose results for avckpt and
-for a cold start stand beside it.  Writes bench/results/ros_peers.json and .md.
+restore`, or `criu restore`, in that moment.  What a crash does to the chain is measured as in bench/ros.py, whose
+results for avckpt and for a cold start stand beside it.  Writes bench/results/ros_peers.json and .md.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import tempfile
 import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 
@@ -33,7 +34,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from harness import CommandFailed  # noqa: E402
 
-from bench.peers_subjects import CLOSED, IN_FLIGHT, CriuContainer, CriuFailed  # noqa: E402
+from bench.peers_subjects import CLOSED, IN_FLIGHT, CriuContainer, CriuFailed, CriuImages, Taken  # noqa: E402
 from bench.peers_world import BOARDS_INSIDE, World  # noqa: E402
 from bench.ros import BEFORE_S, SETTLE_S, machine, say  # noqa: E402
 from bench.ros_pipeline import LOST_M, MANIFEST, PERIOD_S, START_S, Log, PipelineFailed  # noqa: E402
@@ -44,6 +45,8 @@ RESULTS = ROOT / "bench" / "results" / "ros_peers.json"
 BESIDE = ROOT / "bench" / "results" / "ros.json"
 IMAGE = "localhost/avckpt-ros:latest"
 NODE = "voxel"
+BARE = "bare"
+ENVIRONMENT = ("ROS_MASTER_URI=http://127.0.0.1:11311", "ROS_IP=127.0.0.1")
 SERVICES = ("roscore", "monitor", "ndt", NODE, "player")
 RESTORE_S = 65.0
 """How long a restore is tried: longer than a port stays taken by connections that have ended (TIME_WAIT)."""
@@ -62,19 +65,97 @@ def commands() -> dict[str, list[str]]:
     return {name: services[name]["command"] for name in SERVICES}
 
 
-class Chain:
-    """The pipeline's containers in a world of their own."""
+class Service(Protocol):
+    """A node of the pipeline, with CRIU's commands for it.  Those raise CriuFailed."""
 
-    def __init__(self, world: World, runtime: str, results: Path) -> None:
+    refused: list[str]
+
+    def start(self, command: Sequence[str]) -> None: ...
+    def remove(self) -> None: ...
+    def pid(self) -> int:
+        """In the peers' world."""
+
+    def checkpoint(self) -> Taken: ...
+    def restore(self) -> float:
+        """What the command took, ms."""
+
+
+class Contained(Service):
+    """In a container, by Podman."""
+
+    def __init__(self, container: CriuContainer, options: Sequence[str]) -> None:
+        self._container = container
+        self._options = options
+        self.refused = container.refused
+
+    def start(self, command: Sequence[str]) -> None:
+        environment = [option for value in ENVIRONMENT for option in ("--env", value)]
+        self._container.run(*environment, *self._options, IMAGE, *command)
+
+    def remove(self) -> None:
+        self._container.remove()
+
+    def pid(self) -> int:
+        return int(self._container.inspect("{{.State.Pid}}"))
+
+    def checkpoint(self) -> Taken:
+        return self._container.checkpoint("--leave-running", told=(IN_FLIGHT, CLOSED))
+
+    def restore(self) -> float:
+        self._container.tell_criu(CLOSED)
+        return self._container.restore(RESTORE_S)
+
+
+class Bare(Service):
+    """A process without a container, by CRIU itself: the image's program with the image's libraries."""
+
+    _root = "/ros"
+    _pid_file = "/tmp/node.pid"
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._criu = CriuImages(world)
+        self.refused = self._criu.refused
+        unpack = f"mkdir {self._root} && podman create --name unpack {IMAGE} && "
+        unpack += f"podman export unpack | tar -C {self._root} -x && podman rm unpack"
+        world.run("sh", "-c", unpack)
+
+    def start(self, command: Sequence[str]) -> None:
+        program, *arguments = command
+        lib = f"{self._root}/usr/lib/x86_64-linux-gnu"
+        loader = [f"{self._root}/lib64/ld-linux-x86-64.so.2", "--library-path", f"{lib}:{lib}/blas:{lib}/lapack"]
+        run = ["env", *ENVIRONMENT, "ROS_HOME=/tmp/ros", *loader, f"{self._root}/opt/ros/avckpt_ros/{program}"]
+        self._world.start("sh", "-c", f'echo $$ >{self._pid_file} && exec "$@"', "sh", *run, *arguments)
+
+    def remove(self) -> None:
+        self._world.run("sh", "-c", f"[ ! -e {self._pid_file} ] || kill -KILL $(cat {self._pid_file})", check=False)
+
+    def pid(self) -> int:
+        return int(self._world.run("cat", self._pid_file).stdout)
+
+    def checkpoint(self) -> Taken:
+        return self._criu.dump(self.pid(), "--leave-running")
+
+    def restore(self) -> float:
+        return self._criu.restore(CLOSED, RESTORE_S)
+
+
+class Chain:
+    """The pipeline's containers in a world of their own; `way`: what brings the filter back."""
+
+    def __init__(self, world: World, way: str, results: Path) -> None:
         self._results = results
         self._world = world
         self.log = Log(results / "monitor.log")
-        self.containers = {name: CriuContainer(world, runtime, f"ros-{name}") for name in SERVICES}
-        self.node = self.containers[NODE]
+        runtime = "crun" if way == BARE else way
+        options = ["--volume", "/cache/ros-drive:/drive:ro", "--volume", f"{BOARDS_INSIDE}/{results.name}:/results"]
+        self.services: dict[str, Service] = {
+            name: Contained(CriuContainer(world, runtime, f"ros-{name}"), options) for name in SERVICES
+        }
+        if way == BARE:
+            self.services[NODE] = Bare(world)
+        self.node = self.services[NODE]
         self._commands = commands()
-        self._options = ["--env", "ROS_MASTER_URI=http://127.0.0.1:11311", "--env", "ROS_IP=127.0.0.1"]
-        self._options += ["--volume", "/cache/ros-drive:/drive:ro"]
-        self._options += ["--volume", f"{BOARDS_INSIDE}/{results.name}:/results"]
 
     def __enter__(self) -> Chain:
         (self._results / "faults").mkdir(parents=True)
@@ -84,11 +165,11 @@ class Chain:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for container in reversed(self.containers.values()):
-            container.remove()
+        for service in reversed(self.services.values()):
+            service.remove()
 
     def _start(self, name: str) -> None:
-        self.containers[name].run(*self._options, IMAGE, *self._commands[name])
+        self.services[name].start(self._commands[name])
 
     def start_node_anew(self) -> None:
         self.node.remove()
@@ -97,7 +178,7 @@ class Chain:
 
     def kill_node(self) -> float:
         """When."""
-        pidfd = os.pidfd_open(self._world.outside(int(self.node.inspect("{{.State.Pid}}"))))
+        pidfd = os.pidfd_open(self._world.outside(self.node.pid()))
         try:
             at = time.time()
             signal.pidfd_send_signal(pidfd, signal.SIGKILL)
@@ -111,7 +192,7 @@ def one_run(chain: Chain, variant: str, rng: random.Random) -> Json:
     time.sleep(BEFORE_S + rng.uniform(0, 1.0))
     chain.log.wait_delivers(time.time() - 0.5, SETTLE_S, frames=10)
     began = time.time()
-    taken = chain.node.checkpoint("--leave-running", told=(IN_FLIGHT, CLOSED))
+    taken = chain.node.checkpoint()
     ended = time.time()
     time.sleep(BEFORE_S + rng.uniform(0, 0.1))
     around = chain.log.frames(began - AROUND_S, ended + AROUND_S)
@@ -122,10 +203,9 @@ def one_run(chain: Chain, variant: str, rng: random.Random) -> Json:
         "checkpoint_mb": taken.memory_mb,
         "lost_at_checkpoint": sum(frame.pose is None for frame in around),
     }
-    chain.node.tell_criu(CLOSED)
     at = chain.kill_node()
     try:
-        run["command_ms"] = chain.node.restore(RESTORE_S)
+        run["command_ms"] = chain.node.restore()
         chain.log.wait_delivers(at + 0.001, CHAIN_S, frames=15)
     except (CriuFailed, PipelineFailed) as error:
         return run | {"failed": str(error)}
@@ -139,14 +219,14 @@ def one_run(chain: Chain, variant: str, rng: random.Random) -> Json:
     }
 
 
-def runs_of(runtime: str, runs: int, rng: random.Random) -> Generator[Json, None, None]:
-    variant = f"CRIU, Podman, {runtime}"
+def runs_of(way: str, runs: int, rng: random.Random) -> Generator[Json, None, None]:
+    variant = "CRIU" if way == BARE else f"CRIU, Podman, {way}"
     with tempfile.TemporaryDirectory(prefix="avckpt-ros-", dir="/dev/shm") as folder, World(Path(folder)) as world:
         archive = Path(folder) / "ros.tar"
         subprocess.run(["podman", "save", "--quiet", "--output", str(archive), IMAGE], check=True)
         world.load_image(BOARDS_INSIDE / archive.name)
         archive.unlink()
-        with Chain(world, runtime, Path(folder) / "results") as chain:
+        with Chain(world, way, Path(folder) / "results") as chain:
             for _ in range(runs):
                 before = len(chain.node.refused)
                 run = one_run(chain, variant, rng)
@@ -183,9 +263,9 @@ def table(runs: Sequence[Json]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="The ROS node beside CRIU through Podman.")
-    parser.add_argument("--runs", type=int, default=2, help="of each runtime (%(default)s)")
-    parser.add_argument("--runtimes", default="crun,runc", help="(%(default)s)")
+    parser = argparse.ArgumentParser(description="The ROS node beside CRIU, through Podman and without.")
+    parser.add_argument("--runs", type=int, default=2, help="of each way (%(default)s)")
+    parser.add_argument("--ways", default=f"{BARE},crun,runc", help="CRIU itself, Podman's runtimes (%(default)s)")
     parser.add_argument("--output", type=Path, default=RESULTS, help="where the results go (%(default)s)")
     parser.add_argument("--show", action="store_true", help="measure nothing, make the table of what is there")
     args = parser.parse_args()
@@ -194,8 +274,8 @@ def main() -> int:
         print("ros_peers: it takes root: CRIU restores other processes", file=sys.stderr)
         return 1
     try:
-        for runtime in [] if args.show else args.runtimes.split(","):
-            with contextlib.closing(runs_of(runtime, args.runs, random.Random(runtime))) as found:
+        for way in [] if args.show else args.ways.split(","):
+            with contextlib.closing(runs_of(way, args.runs, random.Random(way))) as found:
                 for run in found:
                     runs.append(run)
                     told = run.get("failed") or f"next pose after {run['to_next_pose_ms']:.0f} ms"
