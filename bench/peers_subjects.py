@@ -464,16 +464,15 @@ class CriuImages:
         # Fields 1 and 2: time to stop everything, and time it stood still then, us.
         return Taken(done.took_s * 1e3, (told[1] + told[2]) / 1e3, int(size) / 1024)
 
-    def restore(self, connections: str, patience_s: float = PATIENCE_S) -> float:
+    def restore(self, connections: str, patience_s: float = PATIENCE_S, *more: str) -> float:
         """What the command took that did it, ms.  Raises CriuFailed.
 
         As a supervisor would: what the dead process' connections left in the kernel can be in the way.
         """
         until = time.monotonic() + patience_s
         while True:
-            done = self._world.run(
-                *("criu", "restore", "-d", "-D", self._folder, connections, "-o", "restore.log", "-v1"), check=False
-            )
+            command = ["criu", "restore", "-d", "-D", self._folder, connections, "-o", "restore.log", "-v1"]
+            done = self._world.run(*command, *more, check=False)
             if done.status == 0:
                 return done.took_s * 1e3
             error = _criu_failed("criu restore", done, self._log("restore.log"))

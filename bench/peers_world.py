@@ -47,6 +47,7 @@ class World:
         self._mountpoint = Path(tempfile.mkdtemp(prefix="avckpt-peers-"))
         self._base = _newest("base-*.tar", "make setup")
         tarball = _newest("peers-*.tar", "scripts/setup-peers.sh")
+        PROGRAMS.mkdir(parents=True, exist_ok=True)
         command = ["unshare", "--mount", "--pid", "--net", "--ipc", "--uts", "--propagation", "private"]
         command += ["--fork", "--kill-child", "sh", str(ROOT / "bench" / "peers_world.sh")]
         command += [str(path) for path in (tarball, self._mountpoint, PROGRAMS, boards, CACHE)]

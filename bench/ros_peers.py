@@ -107,7 +107,7 @@ class Contained(Service):
 
 
 class Bare(Service):
-    """A process without a container, by CRIU itself: the image's program with the image's libraries."""
+    """A process without a container, by CRIU itself: with the image's files as its root, in a mount namespace."""
 
     _root = "/ros"
     _pid_file = "/tmp/node.pid"
@@ -116,16 +116,20 @@ class Bare(Service):
         self._world = world
         self._criu = CriuImages(world)
         self.refused = self._criu.refused
-        unpack = f"mkdir {self._root} && podman create --name unpack {IMAGE} && "
-        unpack += f"podman export unpack | tar -C {self._root} -x && podman rm unpack"
-        world.run("sh", "-c", unpack)
+        script = f"mkdir {self._root} && podman create --name unpack {IMAGE} && "
+        script += f"podman export unpack | tar -C {self._root} -x && podman rm unpack && "
+        script += f"mount --bind {self._root} {self._root}"
+        world.run("sh", "-c", script)
 
     def start(self, command: Sequence[str]) -> None:
-        program, *arguments = command
-        lib = f"{self._root}/usr/lib/x86_64-linux-gnu"
-        loader = [f"{self._root}/lib64/ld-linux-x86-64.so.2", "--library-path", f"{lib}:{lib}/blas:{lib}/lapack"]
-        run = ["env", *ENVIRONMENT, "ROS_HOME=/tmp/ros", *loader, f"{self._root}/opt/ros/avckpt_ros/{program}"]
-        self._world.start("sh", "-c", f'echo $$ >{self._pid_file} && exec "$@"', "sh", *run, *arguments)
+        # The image has no umount(8): the old root's, with the libraries that it needs.
+        umount = "mnt/lib64/ld-linux-x86-64.so.2 --library-path mnt/lib/x86_64-linux-gnu mnt/usr/bin/umount -l mnt"
+        script = f"echo $$ >{self._pid_file} && mount --bind {self._root} {self._root} && cd {self._root} && "
+        script += f"mount -t proc proc proc && pivot_root . mnt && {umount} && "
+        script += 'export PATH="/opt/ros/avckpt_ros:$PATH" && exec env "$@" </dev/null >/dev/null 2>&1'
+        self._world.start(
+            "unshare", "--mount", "--propagation", "private", "sh", "-c", script, "sh", *ENVIRONMENT, *command
+        )
 
     def remove(self) -> None:
         self._world.run("sh", "-c", f"[ ! -e {self._pid_file} ] || kill -KILL $(cat {self._pid_file})", check=False)
@@ -137,7 +141,7 @@ class Bare(Service):
         return self._criu.dump(self.pid(), "--leave-running")
 
     def restore(self) -> float:
-        return self._criu.restore(CLOSED, RESTORE_S)
+        return self._criu.restore(CLOSED, RESTORE_S, "--root", self._root)
 
 
 class Chain:
