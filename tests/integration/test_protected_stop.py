@@ -73,6 +73,22 @@ def test_stopped_when_there_never_was_a_sidecar(sidecar: Sidecar, container: Con
     assert made.exit_code == 128 + signal.SIGTERM
 
 
+def states(pid: int) -> set[str]:
+    """Of all its threads, as in proc(5)."""
+    stats = [entry.read_text() for entry in Path(f"/proc/{pid}/task").glob("*/stat")]
+    return {stat.rpartition(")")[2].split()[0] for stat in stats}
+
+
+def stop_between_checkpoints(daemon: int, app: int) -> None:
+    """SIGSTOP to the sidecar, at a moment in which it has not stopped the application (t)."""
+    while True:
+        os.kill(daemon, signal.SIGSTOP)
+        wait_until(lambda: states(daemon) == {"T"}, 5, "the sidecar is stopped")
+        if "t" not in states(app):
+            return
+        os.kill(daemon, signal.SIGCONT)
+
+
 @pytest.mark.parametrize("then", [signal.SIGCONT, signal.SIGKILL])
 def test_stopped_while_the_sidecar_is_stopped(
     sidecar: Sidecar, container: ContainerFactory, then: signal.Signals
@@ -86,7 +102,7 @@ def test_stopped_while_the_sidecar_is_stopped(
     sidecar.wait_generation(made, 2)
     daemon = sidecar.podman.inspect(SIDECAR_NAME)["State"]["Pid"]
     app = sidecar.app_pid(made)
-    os.kill(daemon, signal.SIGSTOP)
+    stop_between_checkpoints(daemon, app)
     with subprocess.Popen(["podman", "stop", "--time", "2", made.name], stdout=subprocess.DEVNULL) as stopping:
         try:
             # The application itself ends as it was told, by that alone.
