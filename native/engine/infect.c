@@ -55,18 +55,27 @@ static bool has_cave(int mem_fd, avc_remote end)
 	return true;
 }
 
-static void note_old_pad(struct target *target, avc_remote code, avc_remote end)
+/* True if a pad may be mapped here (where_to_map). */
+static bool is_place_of_pads(avc_remote base)
+{
+	return base >= PADS_START && base - PADS_START < PADS * PAD_DISTANCE &&
+	       base % PAD_DISTANCE == 0;
+}
+
+/* The mapping of a guard that died before it wrote anything is told by its place. */
+static void note_old_pad(struct target *target, avc_remote base, avc_remote end)
 {
 	uint64_t magic;
 
-	if (target->old_pads == OLD_PADS_MAX || code == target->pad.base ||
+	if (target->old_pads == OLD_PADS_MAX || base == target->pad.base ||
+	    end - base < INJ_CODE_BYTES + sizeof(struct inj_control) ||
 	    pread(target->mem_fd, &magic, sizeof magic,
-		  (off_t)(code + INJ_CODE_BYTES + offsetof(struct inj_control, magic))) !=
+		  (off_t)(base + INJ_CODE_BYTES + offsetof(struct inj_control, magic))) !=
 		    sizeof magic ||
-	    magic != INJ_MAGIC)
+	    (magic != INJ_MAGIC && (magic || !is_place_of_pads(base))))
 		return;
-	target->old_pad[target->old_pads].base = code;
-	target->old_pad[target->old_pads++].bytes = end - code;
+	target->old_pad[target->old_pads].base = base;
+	target->old_pad[target->old_pads++].bytes = end - base;
 }
 
 /* Finds a cave, and the pads of guards that died.  Fails if the stopped main thread
@@ -94,8 +103,9 @@ static int survey(struct target *target, avc_remote pc, avc_remote *cave, struct
 			if (!strcmp(mode, "r-xs") && end - start == INJ_CODE_BYTES) {
 				code = start;
 				code_end = end;
-			} else if (code && start == code_end) {
-				note_old_pad(target, code, end);
+			} else {
+				/* In one piece until its first pages are made executable. */
+				note_old_pad(target, code && start == code_end ? code : start, end);
 				code = 0;
 			}
 		}
@@ -162,10 +172,10 @@ static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const u
 
 /* A child has its parent's pad mapped, and at a restore is there together with it for
  * a moment: each has a place of its own, in a part of the address space that programs
- * do not use by themselves. */
+ * do not use by themselves.  The kernel takes another place if this one is taken. */
 static uint64_t where_to_map(const struct target *target)
 {
-	return target->descendant ? PADS_START + target->nonce % PADS * PAD_DISTANCE : 0;
+	return PADS_START + target->nonce % PADS * PAD_DISTANCE;
 }
 
 static int make_pad(struct target *target, struct thread *thread, avc_remote cave, uint32_t slots,

@@ -102,7 +102,8 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
     """Each guard maps pages of its own into the application; its successor takes them away."""
     with Victim("threads 4 1", tmp_path) as victim:
         storm(config(0.002), 20, 40, 3, victim)
+        storm(config(0.002), 200, 12, 3, victim)  # many of them while they map theirs
         with GuardProcess(config(0.02), [victim.pid]) as guard:
             guard.wait("checkpoint", count=6)
-            wait_until(lambda: pads(victim.app) <= 2, 5, f"old pads go; there are {pads(victim.app)}")
+            wait_until(lambda: pads(victim.app) <= 2, 5, "old pads go")
         victim.wait_beats(20)
