@@ -27,7 +27,6 @@ struct member {
 	pid_t pid; /* 0: not made yet                                         */
 	int pidfd;
 	bool traced;
-	int host; /* whose fork it is, a branch                               */
 	struct puppet puppet;
 	struct sandbox *sandbox; /* NULL: it is on its own, and waits to go            */
 };
@@ -283,7 +282,8 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	struct branch *branch = &family->generation->branch[index];
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
-	const struct inj_thread *thread = registered(family, member->host);
+	const struct inj_thread *thread = registered(family,
+						     inherit_host(family->generation, index));
 	const struct remap *plan = inherit_plan(family->main, family->generation, index, err);
 
 	if (!plan || puppet_open_mail(puppet, err))
@@ -357,7 +357,6 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 	if (fork_host(family, by, branch, &chores, &member->pid, err))
 		return -1;
 	member->traced = true;
-	member->host = host;
 	member->puppet = by->puppet;
 	member->puppet.pid = member->pid;
 	member->puppet.inside = branch->inside;

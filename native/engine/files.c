@@ -315,11 +315,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		}
 	}
 	f = &files->file[files->count];
-	if (look->depth != FILES_BEFORE && look_at_remote(look, number, f)) {
-		files->count++;
-		return 0;
-	}
-	if (look->depth == FILES_FROZEN && look_at_inherited(look, number, f)) {
+	if ((look->depth != FILES_BEFORE && look_at_remote(look, number, f)) ||
+	    (look->depth == FILES_FROZEN && look_at_inherited(look, number, f))) {
 		files->count++;
 		return 0;
 	}

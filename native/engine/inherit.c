@@ -120,7 +120,9 @@ bool inherit_next(const struct target *main, struct generation *generation)
 {
 	struct inheritance *all = generation->inheritance;
 
-	while (all && all->next < all->heirs) {
+	if (!all)
+		return false;
+	while (all->next < all->heirs) {
 		const uint32_t i = all->next++;
 		const struct branch *branch = &generation->branch[i];
 		const uint64_t pages = branch->image ? (uint64_t)branch->image->anon_pages : 0;
@@ -132,8 +134,6 @@ bool inherit_next(const struct target *main, struct generation *generation)
 		(void)inherit_plan(main, generation, i, &later);
 		return true;
 	}
-	if (!all)
-		return false;
 	snapshot_rest(all->main);
 	for (uint32_t i = 0; i < all->heirs; i++)
 		snapshot_rest(all->heir[i].snapshot);

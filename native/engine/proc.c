@@ -24,6 +24,16 @@ int proc_open(pid_t pid, const char *name, int flags)
 	return open(path, flags | O_CLOEXEC);
 }
 
+/* From the start, also of one that was read before; what is read is terminated. */
+static ssize_t read_text(int fd, char *buf, size_t size)
+{
+	const ssize_t n = pread(fd, buf, size - 1, 0);
+
+	if (n >= 0)
+		buf[n] = 0;
+	return n;
+}
+
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size)
 {
 	int fd = proc_open(pid, name, O_RDONLY), saved;
@@ -31,12 +41,10 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size)
 
 	if (fd < 0)
 		return -1;
-	n = read(fd, buf, size - 1);
+	n = read_text(fd, buf, size);
 	saved = errno;
 	close(fd);
 	errno = saved;
-	if (n >= 0)
-		buf[n] = 0;
 	return n;
 }
 
@@ -51,15 +59,6 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 		return -1;
 	buf[n] = 0;
 	return 0;
-}
-
-static ssize_t read_again(int fd, char *buf, size_t size)
-{
-	const ssize_t n = pread(fd, buf, size - 1, 0);
-
-	if (n >= 0)
-		buf[n] = 0;
-	return n;
 }
 
 static int parse_stat(const char *buf, struct proc_stat *stat)
@@ -94,7 +93,7 @@ int proc_stat_of(int stat_fd, struct proc_stat *stat)
 {
 	char buf[1024];
 
-	return read_again(stat_fd, buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
+	return read_text(stat_fd, buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
 }
 
 int proc_exit_status(pid_t pid)
@@ -387,7 +386,7 @@ long proc_vm_pages(int statm_fd, long *anonymous)
 	char buf[128];
 	long pages, resident, of_files;
 
-	if (read_again(statm_fd, buf, sizeof buf) <= 0 ||
+	if (read_text(statm_fd, buf, sizeof buf) <= 0 ||
 	    sscanf(buf, "%ld %ld %ld", &pages, &resident, &of_files) != 3)
 		return -1;
 	if (anonymous)
