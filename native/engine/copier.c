@@ -3,13 +3,15 @@
  * Copies memory from templates into new processes on a second CPU, while the guard goes
  * on with everything else that they need, and on both when nothing else is left to do.
  *
- * pread(2) and pwrite(2) of /proc/PID/mem, and not process_vm_readv(2): that pins pages,
- * and a page that is shared is copied for whoever is to have it pinned (mm/gup.c,
- * gup_must_unshare()).
+ * Read from /proc/PID/mem, and not by process_vm_readv(2): that pins pages, and a page
+ * that is shared is copied for whoever is to have it pinned (mm/gup.c,
+ * gup_must_unshare()).  Written by process_vm_writev(2): /proc/PID/mem copies each page
+ * once more on its way, and a page that is written to is its writer's own anyway.
  */
 #include <fcntl.h>
 #include <pthread.h>
 #include <stdlib.h>
+#include <sys/uio.h>
 #include <unistd.h>
 
 #include "internal.h"
@@ -59,8 +61,21 @@ struct copier *copier_new(struct avc_error *err)
 	return copier;
 }
 
+/* What its owner may not read or write only its tracer may, by /proc/PID/mem
+ * (fs/proc/base.c, proc_mem_foll_force()); a kernel can be without the other
+ * (CONFIG_CROSS_MEMORY_ATTACH). */
+static bool put(const struct source *source, uint8_t *buffer, size_t bytes, avc_remote at,
+		bool plain)
+{
+	const struct iovec here = { buffer, bytes }, there = { (void *)at, bytes };
+
+	return (plain &&
+		process_vm_writev(source->pid, &here, 1, &there, 1, 0) == (ssize_t)bytes) ||
+	       pwrite(source->to, buffer, bytes, (off_t)at) == (ssize_t)bytes;
+}
+
 static int copy(const struct source *source, uint8_t *buffer, avc_remote start, avc_remote end,
-		struct avc_error *err)
+		bool plain, struct avc_error *err)
 {
 	for (avc_remote at = start; at < end;) {
 		const size_t bytes = end - at < BUFFER_BYTES ? end - at : BUFFER_BYTES;
@@ -68,7 +83,7 @@ static int copy(const struct source *source, uint8_t *buffer, avc_remote start, 
 		if (pread(source->from, buffer, bytes, (off_t)at) != (ssize_t)bytes)
 			return fail_errno(err, source->template, "restore memory", "read(mem)",
 					  "it can not be read at %lx", (unsigned long)at);
-		if (pwrite(source->to, buffer, bytes, (off_t)at) != (ssize_t)bytes)
+		if (!put(source, buffer, bytes, at, plain))
 			return fail_errno(err, source->pid, "restore memory", "write(mem)",
 					  "it can not be written at %lx", (unsigned long)at);
 		at += bytes;
@@ -86,7 +101,7 @@ static void take_chunk(struct copier *copier, uint8_t *buffer)
 
 	copier->busy++;
 	pthread_mutex_unlock(&copier->lock);
-	result = copy(&source, buffer, chunk.start, chunk.end, &failed);
+	result = copy(&source, buffer, chunk.start, chunk.end, true, &failed);
 	pthread_mutex_lock(&copier->lock);
 	copier->busy--;
 	if (result && !copier->error.code)
@@ -166,10 +181,9 @@ int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain
 {
 	int result;
 
-	/* What its owner may not read or write only its tracer may
-	 * (fs/proc/base.c, proc_mem_foll_force()). */
 	if (!plain || to - from < WORTH_BYTES)
-		return copy(&copier->source[copier->sources - 1], copier->buffer[0], from, to, err);
+		return copy(&copier->source[copier->sources - 1], copier->buffer[0], from, to,
+			    plain, err);
 	if (!copier->started)
 		start(copier);
 	pthread_mutex_lock(&copier->lock);
