@@ -230,9 +230,9 @@ static int place(struct member *member, const struct branch *branch, struct avc_
 /* The leader of a session gets its terminal before it has children, who inherit it. */
 static void take_terminal(struct puppet *puppet, const struct branch *branch)
 {
-	const int fd = files_find_device(branch->image->files, branch->image->tty);
+	const int fd = files_find_device(branch->image->files, branch->image->stat.tty);
 
-	if (!branch->image->tty || branch->session != branch->inside)
+	if (!branch->image->stat.tty || branch->session != branch->inside)
 		return;
 	puppet_call(puppet, SYS_ioctl, (uint64_t)fd, TIOCSCTTY, 0, 0, 0, 0);
 	puppet_soften(puppet, "the session that it leads has lost its terminal");
@@ -242,11 +242,11 @@ static void take_terminal(struct puppet *puppet, const struct branch *branch)
 static int put_foreground(struct puppet *puppet, const struct generation *image,
 			  struct avc_error *err)
 {
-	const int fd = files_find_device(image->files, image->tty);
+	const int fd = files_find_device(image->files, image->stat.tty);
 	avc_remote remote;
 	pid_t *group = puppet_data(puppet, &remote);
 
-	if (!image->tty || image->tty_group <= 0 || fd < 0)
+	if (!image->stat.tty || image->tty_group <= 0 || fd < 0)
 		return 0;
 	*group = image->tty_group;
 	puppet_call(puppet, SYS_ioctl, (uint64_t)fd, TIOCSPGRP, remote, 0, 0, 0);

@@ -321,6 +321,35 @@ static pid_t number_inside(const struct tree *tree, pid_t pid)
 }
 
 /* The kin that were there are the branches, in the same order. */
+/* Of a group whose leader is outside of the app, too, if it is to be seen. */
+static pid_t group_inside(const struct tree *tree, pid_t group)
+{
+	const pid_t inside = group > 0 ? number_inside(tree, group) : 0;
+
+	return inside || group <= 0 ? inside : proc_inside(group);
+}
+
+/* Now, while all stand still: right after, it may be in another group, or who leads its
+ * group may be gone, and nobody know what number that one had inside. */
+static void keep_place(const struct tree *tree, const struct proc_stat *stat,
+		       struct generation *image)
+{
+	image->stat = *stat;
+	image->group = group_inside(tree, stat->group);
+	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
+}
+
+static int keep_place_of_main(const struct tree *tree, struct generation *generation,
+			      struct avc_error *err)
+{
+	struct proc_stat stat;
+
+	if (proc_stat_of(tree->main->stat_fd, &stat))
+		return fail_errno(err, tree->main->pid, "freeze", "read(stat)", "it has ended");
+	keep_place(tree, &stat, generation);
+	return 0;
+}
+
 static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	int index[PROCESSES_MAX];
@@ -340,7 +369,6 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 		branch->pid = kin->pid;
 		branch->inside = kin->ended ? proc_inside(kin->pid) : kin->target->inside;
 		branch->target = kin->target;
-		branch->stat = kin->stat;
 		branch->session = number_inside(tree, kin->stat.session);
 		branch->group = number_inside(tree, kin->stat.group);
 		if (kin->ended) {
@@ -355,6 +383,7 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 				return fail_errno(err, 0, "freeze", "calloc", "out of memory");
 			branch->image->pidfd = -1;
 			branch->image->slot = generation->slot;
+			keep_place(tree, &kin->stat, branch->image);
 			kin->target->images++;
 		}
 		generation->branches++;
@@ -639,6 +668,8 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 			      "its main thread has just ended");
 	if (!result)
 		result = read_all(target, generation->slot, &generation->threads, err);
+	if (!result)
+		result = keep_place_of_main(tree, generation, err);
 	if (!result) {
 		/* The deadline is for getting things stopped; the clone of a big
 		 * process takes its time. */

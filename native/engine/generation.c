@@ -83,12 +83,12 @@ static void fill_ended(struct target *target, struct generation *generation,
 
 /* Fills the slot in from what freeze() has read: one block per thread. */
 static int fill_slot(struct target *target, struct generation *generation,
-		     const struct branch *branch, const struct proc_stat *stat, pid_t group_inside,
-		     struct avc_error *err)
+		     const struct branch *branch, struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
 	const struct thread *main_thread = thread_find(target, target->pid);
+	const struct proc_stat *stat = &generation->stat;
 	struct proc_status status;
 	struct setup setup;
 	int mem_fd = proc_open(generation->template, "mem", O_RDONLY);
@@ -171,11 +171,11 @@ static int fill_slot(struct target *target, struct generation *generation,
 		generation->notice = setup.notice;
 	slot->threads = generation->threads;
 	slot->pid = target->inside;
-	slot->group = group_inside;
+	/* Nothing but the app's own group, or one whose leader is visible, can be
+	 * put back. */
+	slot->group = generation->group > 0 ? generation->group : target->inside;
 	slot->session_leader = stat->session == target->leader;
 	slot->placed = slot->fresh = target->descendant;
-	generation->tty = stat->tty;
-	generation->tty_group = stat->tty && stat->tty_group > 0 ? proc_inside(stat->tty_group) : 0;
 	/* Of several processes: descend.c. */
 	slot->tty_fd = !branch && stat->tty && stat->tty_group == stat->group
 			       ? files_find_device(generation->files, stat->tty)
@@ -184,31 +184,25 @@ static int fill_slot(struct target *target, struct generation *generation,
 }
 
 static int finish(struct target *target, struct generation *generation, struct branch *branch,
-		  const struct proc_stat *stat, struct avc_error *err)
+		  struct avc_error *err)
 {
 	int statm_fd;
 	long pages;
-	pid_t group;
 
 	generation->pidfd = proc_pidfd_open(generation->template);
 	if (generation->pidfd < 0)
 		return fail_errno(err, generation->template, "keep template", "pidfd_open",
 				  "it was killed");
-	/* Nothing but the app's own group, or one whose leader is visible, can be
-	 * put back. */
-	group = stat->group == target->leader ? target->inside : proc_inside(stat->group);
-	if (group <= 0)
-		group = target->inside;
 	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
 	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
 	close_fd(&statm_fd);
-	if (quieten(target, generation, branch || stat->session == target->leader, err))
+	if (quieten(target, generation, branch || generation->stat.session == target->leader, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
 	if (branch && branch_learn(branch, err))
 		return -1;
-	return fill_slot(target, generation, branch, stat, group, err);
+	return fill_slot(target, generation, branch, err);
 }
 
 /* What only a process that makes another one its child has to know.  This one may have
@@ -218,17 +212,14 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 	struct target *target = branch->target;
 
 	/* The holder rests again. */
-	return tracee_settle(target->holder, err) ||
-			       finish(target, branch->image, branch, &branch->stat, err)
-		       ? -1
-		       : 0;
+	return tracee_settle(target->holder, err) || finish(target, branch->image, branch, err) ? -1
+												: 0;
 }
 
 int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
 {
 	const struct thread *main_thread = thread_find(target, target->pid);
 	struct avc_error again = { 0 };
-	struct proc_stat stat;
 
 	if (generation->branches && !main_thread)
 		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
@@ -251,9 +242,7 @@ int generation_finish(struct target *target, struct generation *generation, stru
 		if (branch->image->notice.code && !generation->notice.code)
 			generation->notice = branch->image->notice;
 	}
-	if (proc_stat(target->pid, &stat))
-		return fail_errno(err, target->pid, "keep template", "open(stat)", "it has ended");
-	if (finish(target, generation, NULL, &stat, err))
+	if (finish(target, generation, NULL, err))
 		return -1;
 	if (again.code)
 		*err = again;

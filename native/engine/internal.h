@@ -324,7 +324,6 @@ struct branch {
 	int parent;               /* index of its parent's branch, or ...    */
 	pid_t inside;
 	pid_t session, group;  /* inside; 0: outside of the app           */
-	struct proc_stat stat; /* as of the freeze                        */
 	struct manner *manner; /* manner.c                                */
 	pid_t pid;             /* as of the freeze; then as restored last */
 	int status;            /* of one that had ended, as from wait(2)  */
@@ -357,8 +356,10 @@ struct generation {
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
 	int stop_signal;       /* stopped by that (job control), 0: it was not     */
-	uint32_t tty;          /* its controlling terminal, 0: none               */
-	pid_t tty_group;       /* in the foreground there, inside; 0: none of the app's */
+	struct proc_stat stat; /* as of the freeze                                */
+	/* Its group, and the one in the foreground of its terminal; inside, 0: none that
+	 * could be seen. */
+	pid_t group, tty_group;
 	struct timer_image *timers;
 	struct attributes *attributes;
 	struct mem_image *image;      /* of memory that is not in the template       */

@@ -11,7 +11,10 @@ import dataclasses
 import os
 import random
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -124,6 +127,29 @@ def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
 def test_a_stopped_job_is_stopped_again(tmp_path: Path) -> None:
     with Victim("terminal --stopped", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
         kill_again_and_again(guard, victim, KILLS, 0.15)
+
+
+@contextlib.contextmanager
+def busy_cpus() -> Iterator[None]:
+    """Somebody else wants more of them than there are; of a session of its own, which counts (sched(7), autogroups)."""
+    command = [sys.executable, "-c", "while True: pass"]
+    loops = [subprocess.Popen(command, start_new_session=True) for _ in range(len(os.sched_getaffinity(0)) + 1)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+def test_killed_before_a_checkpoint_is_complete(tmp_path: Path) -> None:
+    """Who leads a group can be gone when the freeze is over, and is in the checkpoint all the same."""
+    with (
+        busy_cpus(),
+        Victim("terminal --stopped", tmp_path) as victim,
+        GuardProcess(steady(0.05), [victim.pid]) as guard,
+    ):
+        kill_again_and_again(guard, victim, 6 * KILLS, 0.15)
 
 
 def test_a_daemon_of_the_application_goes_back_with_it(tmp_path: Path) -> None:
