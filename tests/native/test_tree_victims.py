@@ -274,6 +274,8 @@ def test_the_end_of_a_pipe_that_somebody_holds_open(tmp_path: Path) -> None:
     with Victim("commands --gate", tmp_path) as victim:
         wait_until(lambda: victim.see().counter[3] == 1, 10, "a command")
         command = wait_until(lambda: members(victim)[1:], 10, "its process")[0]
+        stdout = os.readlink(f"/proc/{victim.app}/fd/1")
+        wait_until(lambda: os.readlink(f"/proc/{command.pid}/fd/1") != stdout, 10, "the pipe in its place")
         held = os.open(f"/proc/{command.pid}/fd/1", os.O_WRONLY)
         victim.board.set_counter(8, 1)
         wait_until(lambda: not Path(f"/proc/{command.pid}/exe").exists(), 10, "its end")
