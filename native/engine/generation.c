@@ -293,8 +293,9 @@ void generation_close_tables(const struct generation *generation)
 static void image_drop(struct generation *image)
 {
 	if (image->template)
-		tracee_kill(image->template);
-	close_fd(&image->pidfd);
+		tracee_end(image->template, image->pidfd);
+	else
+		close_fd(&image->pidfd);
 	mem_image_free(image->image);
 	free(image->timers);
 	free(image->attributes);

@@ -277,6 +277,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 			if (guard->generations[i].branch[k].image)
 				watch(guard, &n, guard->generations[i].branch[k].image->pidfd);
 	}
+	for (uint32_t i = 0; tracee_ending_pidfd(i) >= 0; i++)
+		watch(guard, &n, tracee_ending_pidfd(i));
 	if (straggling) {
 		const bool fresh = now - guard->stragglers_since_ns < NS_PER_S;
 		const uint64_t slice = fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS;
@@ -317,7 +319,8 @@ static void let_go(struct avc_guard *guard)
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		unhold(guard->tree.member[i]);
 	/* The end of this thread detaches what is left. */
-	while (guard->target.threads && all_stragglers(guard) && now_ns() < end)
+	while (((guard->target.threads && all_stragglers(guard)) || tracee_reap_ending()) &&
+	       now_ns() < end)
 		usleep(200);
 	tree_free(&guard->tree);
 	target_close(&guard->target);
@@ -355,6 +358,7 @@ static void *guard_main(void *arg)
 			died(guard, &report);
 			continue;
 		}
+		(void)tracee_reap_ending();
 		reap_dead(guard);
 		tend_tree(guard);
 		if (pidfd_ended(guard->link.init_pidfd)) {

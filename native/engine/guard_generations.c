@@ -69,7 +69,7 @@ bool is_ours(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->target.holder)
+	if (pid == guard->target.holder || tracee_is_ending(pid))
 		return true;
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		if (guard->tree.member[i]->holder == pid)
@@ -216,6 +216,8 @@ void tend_tree(struct avc_guard *guard)
  * was just being made: attached to us, unheard of, and in the way of its leader's end. */
 void reap_unknown(const struct avc_guard *guard)
 {
+	/* The first that is known hides the others. */
+	(void)tracee_reap_ending();
 	while (tracee_reap_unknown(is_known, guard))
 		;
 }

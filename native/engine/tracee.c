@@ -233,3 +233,61 @@ void tracee_kill(pid_t pid)
 			return;
 	}
 }
+
+/* ---- those that are just ending ------------------------------------------------------ */
+
+/* More than one checkpoint and the end of all can leave at a time are waited for. */
+#define ENDING_MAX 64
+
+static __thread struct {
+	struct {
+		pid_t pid;
+		int pidfd;
+	} task[ENDING_MAX];
+	uint32_t count;
+} ending;
+
+void tracee_end(pid_t pid, int pidfd)
+{
+	(void)tracee_reap_ending();
+	if (pidfd < 0 || ending.count == ENDING_MAX) {
+		tracee_kill(pid);
+		close_fd(&pidfd);
+		return;
+	}
+	kill(pid, SIGKILL);
+	ending.task[ending.count].pid = pid;
+	ending.task[ending.count++].pidfd = pidfd;
+}
+
+uint32_t tracee_reap_ending(void)
+{
+	uint32_t left = 0;
+
+	for (uint32_t i = 0; i < ending.count; i++) {
+		int status;
+		const pid_t r = waitpid(ending.task[i].pid, &status,
+					__WALL | __WNOTHREAD | WNOHANG);
+
+		/* Other stops are on its way to its end. */
+		if (r == 0 || (r > 0 && WIFSTOPPED(status)))
+			ending.task[left++] = ending.task[i];
+		else
+			close_fd(&ending.task[i].pidfd);
+	}
+	ending.count = left;
+	return left;
+}
+
+bool tracee_is_ending(pid_t pid)
+{
+	for (uint32_t i = 0; i < ending.count; i++)
+		if (ending.task[i].pid == pid)
+			return true;
+	return false;
+}
+
+int tracee_ending_pidfd(uint32_t i)
+{
+	return i < ending.count ? ending.task[i].pidfd : -1;
+}

@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
+from harness import wait_until
+from native.family import children_of, look
 from native.guarded import GuardProcess, Victim, config, kill_at_random
 
 KILLS = 12
@@ -56,3 +58,16 @@ def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
         victim.end(5)
         assert guard.wait("ended")
         assert sum(event["kind"] == "restored" for event in guard.events if "kind" in event) > 20
+
+
+def templates_of(victim: Victim) -> int:
+    """Zombies count."""
+    return sum(m is not None and m.name == "avckpt-tmpl" for m in map(look, children_of(victim.pid)))
+
+
+def test_what_is_left_of_old_templates_is_reaped(tmp_path: Path) -> None:
+    """The guard does not wait for their end, which takes a while; but a zombie keeps a container from ending."""
+    with Victim("threads 4 100 --no-churn", tmp_path) as victim, GuardProcess(config(0, keep=1), [victim.pid]) as guard:
+        for _ in range(10):
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+        wait_until(lambda: templates_of(victim) == 1, 5, "old templates go")
