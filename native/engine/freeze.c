@@ -320,7 +320,6 @@ static pid_t number_inside(const struct tree *tree, pid_t pid)
 	return 0;
 }
 
-/* The kin that were there are the branches, in the same order. */
 /* Of a group whose leader is outside of the app, too, if it is to be seen. */
 static pid_t group_inside(const struct tree *tree, pid_t group)
 {
@@ -350,6 +349,7 @@ static int keep_place_of_main(const struct tree *tree, struct generation *genera
 	return 0;
 }
 
+/* The kin that were there are the branches, in the same order. */
 static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	int index[PROCESSES_MAX];

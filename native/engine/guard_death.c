@@ -120,8 +120,6 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 	struct avc_event event = event_new(guard, AVC_EVENT_RESTORED);
 	struct target *target = &guard->target;
 	const struct avc_config *config = &guard->config;
-	/* It keeps the dead app's memory: letting go of that takes its time. */
-	const pid_t old_holder = target->holder;
 	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
 
 	event.ticket = guard->restore_ticket;
@@ -184,8 +182,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		emit(guard, &event);
 		break;
 	}
-	if (old_holder)
-		unhold(target);
+	/* It has the dead app's memory, and what was open is the restored one's. */
+	unhold_soon(target);
 	return guard->count > 0;
 }
 

@@ -538,12 +538,24 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	return give_back(thread, err) || result ? -1 : 0;
 }
 
-void unhold(struct target *target)
+static void forget_holder(struct target *target)
 {
 	target->doubtful = false;
-	if (!target->holder)
-		return;
-	tracee_kill(target->holder);
-	close_fd(&target->holder_pidfd);
 	target->holder = 0;
+	target->holder_pidfd = -1;
+}
+
+void unhold(struct target *target)
+{
+	if (target->holder)
+		tracee_kill(target->holder);
+	close_fd(&target->holder_pidfd);
+	forget_holder(target);
+}
+
+void unhold_soon(struct target *target)
+{
+	if (target->holder)
+		tracee_end(target->holder, target->holder_pidfd);
+	forget_holder(target);
 }

@@ -667,10 +667,12 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err) warn_
  * are init's.  If we die meanwhile it does again all by itself. */
 int adopt_no_more(struct target *target, struct avc_error *err) warn_unused;
 int adopt_again(struct target *target, struct avc_error *err) warn_unused;
-/* Makes the holder; unhold() drops it. */
+/* Makes the holder; unhold() drops it.  unhold_soon() does not wait until what it has open is
+ * closed and its memory gone. */
 int hold(struct target *target, timer_t timer, uint64_t deadline_ns,
 	 struct avc_error *err) warn_unused;
 void unhold(struct target *target);
+void unhold_soon(struct target *target);
 
 /* ---- tree.c --------------------------------------------------------------------- */
 

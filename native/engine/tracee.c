@@ -236,7 +236,7 @@ void tracee_kill(pid_t pid)
 
 /* ---- those that are just ending ------------------------------------------------------ */
 
-/* More than one checkpoint and the end of all can leave at a time are waited for. */
+/* Those beyond that are waited for. */
 #define ENDING_MAX 64
 
 static __thread struct {
