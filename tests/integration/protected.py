@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -86,8 +87,12 @@ def start_victim(
     return victim
 
 
-def ours(container: Container) -> list[int]:
-    """Templates and holder in a container, by their PIDs on the host."""
+def ours(container: Container, name: str = "avckpt-") -> list[int]:
+    """Templates ("avckpt-tmpl") and holder ("avckpt-hold") in a container, by their PIDs on the host."""
     init = container.pid
-    children = Path(f"/proc/{init}/task/{init}/children").read_text().split()
-    return [int(pid) for pid in children if Path(f"/proc/{pid}/comm").read_text().startswith("avckpt-")]
+    found = []
+    for pid in Path(f"/proc/{init}/task/{init}/children").read_text().split():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # an old one, just ending
+            if Path(f"/proc/{pid}/comm").read_text().startswith(name):
+                found.append(int(pid))
+    return found

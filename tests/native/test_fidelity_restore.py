@@ -68,6 +68,7 @@ def test_names_in_the_process_list(tmp_path: Path) -> None:
         command_line = Path(f"/proc/{victim.app}/cmdline").read_bytes()
         for _ in range(3):
             guard.command("checkpoint")
+        wait_until(lambda: len(victim.others()) == 3, 5, "the first template has gone")
         others = [Path(f"/proc/{pid}/comm").read_text().strip() for pid in victim.others()]
         assert sorted(others) == ["avckpt-hold", "avckpt-tmpl", "avckpt-tmpl"]
         scores = [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in victim.others()]
@@ -126,7 +127,7 @@ def test_nothing_is_left_behind(tmp_path: Path) -> None:
 
         def cycle(restores: int) -> tuple[int, int, int, int]:
             guard.burst(30)
-            assert len(victim.others()) == 3, "two templates and the holder"
+            wait_until(lambda: len(victim.others()) == 3, 5, "two templates and the holder")
             for _ in range(restores):
                 since = guard.mark()
                 victim.kill_app()
