@@ -114,9 +114,8 @@ def test_podman_restart_keeps_protection(sidecar: Sidecar, container: ContainerF
 
 def test_nothing_is_left_of_a_removed_container(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
-    pids = wait_until(
-        lambda: found if len(found := ours(victim.container)) == 3 else None, 5, "two templates, one holder"
-    )
+    wait_until(lambda: len(ours(victim.container)) == 3, 5, "two templates, one holder")
+    pids = ours(victim.container)
     started = time.monotonic()
     victim.container.remove()
     assert time.monotonic() - started < 5
