@@ -334,7 +334,6 @@ static void keep_place(const struct tree *tree, const struct proc_stat *stat,
 		       struct generation *image)
 {
 	image->stat = *stat;
-	image->group = group_inside(tree, stat->group);
 	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
 }
 
@@ -346,6 +345,7 @@ static int keep_place_of_main(const struct tree *tree, struct generation *genera
 	if (proc_stat_of(tree->main->stat_fd, &stat))
 		return fail_errno(err, tree->main->pid, "freeze", "read(stat)", "it has ended");
 	keep_place(tree, &stat, generation);
+	generation->group = group_inside(tree, stat.group);
 	return 0;
 }
 

@@ -358,7 +358,6 @@ static void *guard_main(void *arg)
 			died(guard, &report);
 			continue;
 		}
-		(void)tracee_reap_ending();
 		reap_dead(guard);
 		tend_tree(guard);
 		if (pidfd_ended(guard->link.init_pidfd)) {

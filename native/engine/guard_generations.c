@@ -232,7 +232,7 @@ static bool has_ended(const struct generation *generation)
 	return false;
 }
 
-/* Templates that were killed, from inside the container or by the OOM killer. */
+/* Templates that were killed: by us, from inside the container or by the OOM killer. */
 void reap_dead(struct avc_guard *guard)
 {
 	struct avc_event events[AVC_KEEP_MAX];
@@ -245,6 +245,7 @@ void reap_dead(struct avc_guard *guard)
 	/* With its PID namespace everything dies, and init last, once we have
 	 * reaped what is ours: then it is no news.  A death does not wait. */
 	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
+		(void)tracee_reap_ending();
 		for (uint32_t i = guard->count; i-- > 0;)
 			if (has_ended(&guard->generations[i]))
 				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
@@ -256,8 +257,10 @@ void reap_dead(struct avc_guard *guard)
 				unhold(guard->tree.member[i]);
 		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
 			return;
-		if (news[1].revents)
+		if (news[1].revents & POLLIN)
 			break;
+		if (news[1].revents)
+			news[1].fd = -1; /* init is just ending */
 	}
 	for (uint32_t i = 0; i < count; i++)
 		emit(guard, &events[i]);

@@ -357,8 +357,8 @@ struct generation {
 	bool headless;         /* its main thread had ended                       */
 	int stop_signal;       /* stopped by that (job control), 0: it was not     */
 	struct proc_stat stat; /* as of the freeze                                */
-	/* Its group, and the one in the foreground of its terminal; inside, 0: none that
-	 * could be seen. */
+	/* The main process' group, and the one in the foreground of its terminal; inside,
+	 * 0: none that could be seen. */
 	pid_t group, tty_group;
 	struct timer_image *timers;
 	struct attributes *attributes;

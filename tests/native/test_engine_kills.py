@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from pathlib import Path
@@ -71,3 +72,13 @@ def test_what_is_left_of_old_templates_is_reaped(tmp_path: Path) -> None:
         for _ in range(10):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
         wait_until(lambda: templates_of(victim) == 1, 5, "old templates go")
+
+
+@pytest.mark.parametrize("command", ["threads 4 20 --no-churn", "tree 8"])
+def test_templates_that_go_with_their_container_are_no_news(command: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
+        guard.wait("checkpoint", count=4)
+        since = guard.mark()
+        os.kill(victim.pid, signal.SIGKILL)
+        guard.wait("ended", since=since)
+        assert not [event for event in guard.events[since:] if event.get("kind") == "dropped"]
