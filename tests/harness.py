@@ -78,6 +78,11 @@ class Completed:
         return f"`{' '.join(self.args)}` ended with {self.status} after {self.took_s:.2f} s: {said}"
 
 
+def take_checkpoint(avckpt: Callable[..., Completed], name: str, timeout_s: float = 20) -> None:
+    """As soon as there is something to take one of; a busy machine may be too slow for the freeze deadline."""
+    wait_until(lambda: avckpt("checkpoint", name, check=False).status == 0, timeout_s, "a checkpoint", every_s=0.2)
+
+
 class CommandFailed(AssertionError):
     """A command that had to succeed did not; `.completed` has all of it."""
 

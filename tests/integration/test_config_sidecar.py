@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import wait_until
+from harness import take_checkpoint, wait_until
 from local_sidecar import Container, LocalSidecar, local_sidecar
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
@@ -30,11 +30,6 @@ def kinds(sidecar: LocalSidecar, name: str) -> list[str]:
     """What the history says of a container."""
     lines = sidecar.avckpt("events", "--json").stdout.splitlines()
     return [event["kind"] for event in map(json.loads, lines) if event["container"] == name]
-
-
-def take(sidecar: LocalSidecar, name: str) -> None:
-    """A checkpoint, as soon as there is something to take one of."""
-    wait_until(lambda: sidecar.avckpt("checkpoint", name, check=False).status == 0, 20, "a checkpoint", every_s=0.2)
 
 
 def kill_and_wait(sidecar: LocalSidecar, container: Container, restores: int) -> dict[str, object]:
@@ -60,7 +55,7 @@ def test_a_new_one_holds_for_running_containers_and_takes_nothing_from_them(side
     plain = sidecar.protected("plain", NAP, ENABLE)
     own = sidecar.protected("own", NAP, {**ENABLE, "avckpt.interval": "30m", "avckpt.keep": "3"})
     for name in ("plain", "own"):
-        take(sidecar, name)
+        take_checkpoint(sidecar.avckpt, name)
     assert kill_and_wait(sidecar, plain, 1)["generation"] == 1
 
     sidecar.config.write_text("defaults: {interval: 100ms, keep: 2, restore.on: 'signal,3'}\n")

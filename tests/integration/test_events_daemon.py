@@ -19,7 +19,7 @@ import pytest
 from avckpt.client import Client
 from avckpt.event_record import EventRecord, Kind
 from avckpt.history import History
-from harness import avckpt_command, wait_until
+from harness import avckpt_command, take_checkpoint, wait_until
 from jsonschema import Draft202012Validator
 from local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
 from prometheus_client.parser import text_string_to_metric_families
@@ -185,7 +185,7 @@ def test_a_follower_that_does_not_read_holds_nobody_up(local: LocalSidecar) -> N
 def test_a_roll_back_is_manual_and_a_refused_command_is_told(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER, ON_COMMAND)
     local.wait_for(web, app_pid_inside=2)
-    wait_until(lambda: local.avckpt("checkpoint", "web", check=False).status == 0, 20, "a checkpoint")
+    take_checkpoint(local.avckpt, "web")
     answer = json.loads(local.avckpt("restore", "web", "--json").stdout)
     assert answer["event"]["reason"] == "manual"
     died, restored = [e for e in Client(local.run_dir).history() if e["kind"] in ("died", "restored")]
@@ -369,7 +369,7 @@ def test_memory_that_several_generations_hold_together_counts_once(local: LocalS
     web = local.protected("web", ["python3", "-c", program], ON_COMMAND)
     wait_until(lambda: "ready" in web.output.read_text(), 20, "it has its memory")
     for number in (1, 2):
-        wait_until(lambda: local.avckpt("checkpoint", "web", check=False).status == 0, 20, "a checkpoint", every_s=0.2)
+        take_checkpoint(local.avckpt, "web")
         local.wait_for(web, generations=number)
     again.touch()
     wait_until(lambda: "written" in web.output.read_text(), 20, "it has written to all of it")

@@ -9,11 +9,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from harness import ROOT, ContainerFactory, Sidecar, wait_until
+from harness import ROOT, ContainerFactory, Sidecar, take_checkpoint, wait_until
 from host_pressure import pressure
 from integration.test_policy_labels import checkpoint as checkpoint_of
 from integration.test_policy_memory import start, write
-from local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
+from local_sidecar import ON_COMMAND, local_sidecar
 from native.board import Board
 
 VICTIMS = ROOT / "tests/victims/build"
@@ -25,11 +25,11 @@ def test_the_one_that_holds_most_gives_its_oldest_up(tmp_path: Path) -> None:
     with local_sidecar(tmp_path) as sidecar:
         sidecar.start()
         little = sidecar.protected("little", [str(VICTIMS / "idle"), "1", "1"], ON_COMMAND)
-        checkpoint(sidecar, "little")
+        take_checkpoint(sidecar.avckpt, "little")
         board = Board(tmp_path / "board")
         much = sidecar.protected("much", [str(VICTIMS / "hoard"), "40", "--board", str(board.path)], ON_COMMAND)
         wait_until(lambda: board.see().ready, 10, "it is ready")
-        checkpoint(sidecar, "much")
+        take_checkpoint(sidecar.avckpt, "much")
         app = much.app_pid
         os.kill(app, signal.SIGUSR1)
         with pressure():
@@ -55,8 +55,3 @@ def test_the_sidecar_in_its_container_hears_of_it(
     victim.wait_beats()
     assert victim.app == app
     sidecar.wait_for(victim.container, lambda entry: entry["state"] == "protected", "it is protected again", 90)
-
-
-def checkpoint(sidecar: LocalSidecar, name: str) -> None:
-    """A busy machine may be too slow for the freeze deadline."""
-    wait_until(lambda: sidecar.avckpt("checkpoint", name, check=False).status == 0, 20, "a checkpoint", every_s=0.2)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, wait_until
+from harness import Container, ContainerFactory, Sidecar, take_checkpoint, wait_until
 from integration.protected import ProtectedVictim, ours, start_victim
 
 ON_COMMAND = {"interval": "1h", "restore.max": "60/60s"}
@@ -27,12 +27,7 @@ def victim(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Cal
 
 
 def checkpoint(victim: ProtectedVictim) -> None:
-    """Takes one; a busy machine may be too slow for the freeze deadline."""
-
-    def taken() -> bool:
-        return victim.sidecar.avckpt("checkpoint", victim.container.name, check=False).status == 0
-
-    wait_until(taken, 20, "a checkpoint", every_s=0.2)
+    take_checkpoint(victim.sidecar.avckpt, victim.container.name)
 
 
 def templates(victim: ProtectedVictim) -> list[int]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, free_port, wait_until
+from harness import Container, ContainerFactory, Sidecar, free_port, take_checkpoint, wait_until
 
 # Appends to a file when told "write", counts in anonymous shared memory when told "count"; answers any
 # line with the file's offset, the count, and when it was started.
@@ -80,12 +80,6 @@ def start(factory: ContainerFactory, port: int, *options: str, **labels: str) ->
     )
 
 
-def checkpoint(sidecar: Sidecar, container: Container) -> None:
-    wait_until(
-        lambda: sidecar.avckpt("checkpoint", container.name, check=False).status == 0, 20, "a checkpoint", every_s=0.2
-    )
-
-
 @pytest.mark.parametrize(
     ("labels", "offset", "count"),
     [({}, 10, 1), ({"files": "keep"}, 20, 1), ({"shm": "0"}, 10, 2)],
@@ -98,7 +92,7 @@ def test_offsets_and_shared_memory(
     with connected(port) as client:
         client.ask("write")
         started = client.ask("count")[2]
-        checkpoint(sidecar, keeper)
+        take_checkpoint(sidecar.avckpt, keeper.name)
         client.ask("write")
         assert client.ask("count") == (20, 2, started)
         os.kill(sidecar.app_pid(keeper), signal.SIGKILL)
@@ -115,7 +109,7 @@ def test_connections(sidecar: Sidecar, container: ContainerFactory, how: str, mo
     keeper = start(container, port, tcp=how)
     with connected(port) as client:
         started = client.ask("look")[2]
-        checkpoint(sidecar, keeper)
+        take_checkpoint(sidecar.avckpt, keeper.name)
         if moved:
             client.ask("look")
         os.kill(sidecar.app_pid(keeper), signal.SIGKILL)
@@ -138,7 +132,7 @@ def test_strict(sidecar: Sidecar, container: ContainerFactory, written: bool) ->
         started = client.ask("write")[2]
     # What was written right before a checkpoint counts as written since it.
     time.sleep(0.1)
-    checkpoint(sidecar, keeper)
+    take_checkpoint(sidecar.avckpt, keeper.name)
     if written:
         with connected(port) as client:
             client.ask("write")

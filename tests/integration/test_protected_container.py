@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, wait_until
+from harness import ContainerFactory, Sidecar, take_checkpoint, wait_until
 from integration.protected import QUICK, ours, start_victim
 
 OPTIONS = {
@@ -22,12 +22,6 @@ OPTIONS = {
 }
 
 
-def take_checkpoint(sidecar: Sidecar, made: Container) -> None:
-    wait_until(
-        lambda: sidecar.avckpt("checkpoint", made.name, check=False).status == 0, 20, "a checkpoint", every_s=0.2
-    )
-
-
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, options: list[str]) -> None:
     """SIGKILL, a real SIGSEGV, abort(), exit(3): to Podman and everybody inside nothing has happened."""
@@ -35,7 +29,7 @@ def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_
     labels = {**QUICK, "interval": "1h"}
     victim = start_victim(sidecar, container, tmp_path, "crash", labels=labels, options=options, generation=0)
     made = victim.container
-    take_checkpoint(sidecar, made)
+    take_checkpoint(sidecar.avckpt, made.name)
     before = made.inspect()["State"]
     inside = sidecar.wait_generation(made)["app_pid_inside"]
     deaths = {
@@ -45,7 +39,7 @@ def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_
         signal.SIGHUP: "exited with status 3",
     }
     for n, (signum, death) in enumerate(deaths.items(), 1):
-        take_checkpoint(sidecar, made)
+        take_checkpoint(sidecar.avckpt, made.name)
         entry = victim.kill(signum)
         assert (entry["state"], entry["last_death"]) == ("protected", death)
         assert (entry["restores"], entry["app_pid_inside"]) == (n, inside)

@@ -9,7 +9,7 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-from harness import CONFIG_DIR, SIDECAR_NAME, wait_until
+from harness import CONFIG_DIR, SIDECAR_NAME, take_checkpoint
 
 if TYPE_CHECKING:
     from harness import Completed, Container, ContainerFactory, Podman, Sidecar
@@ -89,7 +89,7 @@ def test_the_command_line_in_its_container(container: ContainerFactory, sidecar:
         return podman.run("exec", SIDECAR_NAME, "avckpt", *args, check=check)
 
     web = container.protected(*COUNT, labels={"interval": "1h"})
-    wait_until(lambda: inside("checkpoint", web.name, check=False).status == 0, 20, "a checkpoint", every_s=0.2)
+    take_checkpoint(inside, web.name)
     [row] = [entry for entry in json.loads(inside("ps", "--json").stdout) if entry["id"] == web.id]
     here = sidecar.find(web)
     assert here is not None
