@@ -10,6 +10,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/kcmp.h>
+#include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -22,12 +23,14 @@
 #include "files.h"
 
 #define ROOM_SPARE 64
+#define OURS_MAX 64 /* duplicates at a time                                          */
 
 struct look {
 	struct files *files, *known;
 	pid_t pid, init;
 	int pidfd, fd_dir;
 	enum files_depth depth;
+	uint32_t ours;
 	struct stat init_stdio[3];
 	bool init_known[3];
 };
@@ -288,6 +291,12 @@ static bool look_at_inherited(const struct look *look, int number, struct file *
 	return take_known(look, f);
 }
 
+static bool is_channel(const struct file *f)
+{
+	return f->kind == FILE_PIPE || (f->kind == FILE_SOCKET && f->socket &&
+					f->socket->domain == AF_UNIX && !f->socket->listening);
+}
+
 static int look_at(struct look *look, int number, struct avc_error *err)
 {
 	struct files *files = look->files;
@@ -368,7 +377,12 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	socket = known && look->depth == FILES_NOW ? known->socket : f->socket;
 	if (f->kind == FILE_SOCKET && (look->depth == FILES_NOW || look->files->with_tcp))
 		file_look_at_tcp(fd, f, socket);
-	close(fd);
+	if (look->depth == FILES_FROZEN && is_channel(f) && look->ours < OURS_MAX) {
+		f->ours = fd; /* until keep_contents() */
+		look->ours++;
+	} else {
+		close(fd);
+	}
 	files->count++;
 	return 0;
 }
@@ -531,12 +545,6 @@ static bool may_be_ours(const struct files *files, const struct file *f)
 	return !f->outside && (f->kind == FILE_PIPE || (f->socket && f->socket->peer));
 }
 
-static bool is_channel(const struct file *f)
-{
-	return f->kind == FILE_PIPE || (f->kind == FILE_SOCKET && f->socket &&
-					f->socket->domain == AF_UNIX && !f->socket->listening);
-}
-
 /* What its parent's look has found in it. */
 static void copy_content(const struct files *kin, struct file *f)
 {
@@ -555,33 +563,38 @@ static void copy_content(const struct files *kin, struct file *f)
 	f->content_bytes = from->content_bytes;
 }
 
-static void keep_contents(struct look *look)
+static void keep_content(const struct look *look, struct file *f)
 {
-	struct scratch scratch = { -1, -1, 0 };
+	struct pollfd end = { .events = POLLIN };
 
+	/* Once for each object, from an end that can be read. */
+	if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) || f->shared != f->fd ||
+	    f->outside || !is_channel(f))
+		return;
+	if (f->inherited) {
+		copy_content(look->files->kin, f);
+		return;
+	}
+	if (f->ours <= 0)
+		f->ours = files_borrow(look->pidfd, f->fd);
+	end.fd = f->ours;
+	if (f->ours < 0 || poll(&end, 1, 0) != 1)
+		return;
+	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
+	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
+		file_keep_content(f->ours, f, look->files->scratch);
+}
+
+static void keep_contents(const struct look *look)
+{
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
-		bool ours;
-		int fd;
 
-		/* Once for each object, from an end that can be read. */
-		if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) ||
-		    f->shared != f->fd || f->outside || !is_channel(f))
-			continue;
-		if (f->inherited) {
-			copy_content(look->files->kin, f);
-			continue;
-		}
-		ours = may_be_ours(look->files, f);
-		fd = files_borrow(look->pidfd, f->fd);
-		if (fd < 0)
-			continue;
-		f->ended = !files_other_end(look->files, f) && file_has_ended(fd);
-		if (ours || f->ended)
-			file_keep_content(fd, f, &scratch);
-		close(fd);
+		keep_content(look, f);
+		if (f->ours > 0)
+			close_fd(&f->ours);
+		f->ours = 0;
 	}
-	scratch_close(&scratch);
 }
 
 struct linux_dirent64 {
@@ -640,8 +653,12 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
 	result = walk(&look, err);
 	close(look.fd_dir);
-	if (result)
+	if (result) {
+		for (uint32_t i = 0; i < files->count; i++)
+			if (files->file[i].ours > 0)
+				close(files->file[i].ours);
 		return -1;
+	}
 	qsort(files->file, files->count, sizeof *files->file, by_fd);
 	if (depth == FILES_FROZEN) {
 		check_shared(files, pid);
@@ -721,7 +738,8 @@ int files_prepare(struct target *target, struct avc_error *err)
 }
 
 int files_capture(struct target *target, struct generation *generation, bool several,
-		  const struct files *kin, pid_t kin_pid, struct avc_error *err)
+		  const struct files *kin, pid_t kin_pid, struct scratch *scratch,
+		  struct avc_error *err)
 {
 	struct files *image = target->files_image;
 	int result;
@@ -731,9 +749,11 @@ int files_capture(struct target *target, struct generation *generation, bool sev
 	generation->files = image;
 	image->kin = kin;
 	image->kin_pid = kin_pid;
+	image->scratch = scratch;
 	result = files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
 			    target->init, err);
 	image->kin = NULL; /* may be gone before this one */
+	image->scratch = NULL;
 	for (uint32_t i = 0; i < image->count; i++)
 		image->file[i].inherited = NULL;
 	if (result)

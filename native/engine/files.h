@@ -87,6 +87,7 @@ struct file {
 	uint32_t mode;
 	int flags; /* F_GETFL                                                       */
 	bool cloexec;
+	int ours;     /* our duplicate, for as long as a look takes; 0: none            */
 	bool outside; /* its open file description is also init's                  */
 	int shared;   /* lowest fd with the same open file description             */
 	/* The first one, of all processes, that has it; NULL: only this process      */
@@ -145,6 +146,7 @@ struct files {
 	 * with it, as children have with their parents, is not looked at again. */
 	const struct files *kin;
 	pid_t kin_pid;
+	struct scratch *scratch; /* also only then                                 */
 };
 
 struct files_work;
@@ -185,17 +187,10 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socke
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(const struct files *files, const struct file *file);
-/* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
-struct scratch {
-	int in, out, bytes;
-};
-void scratch_close(struct scratch *scratch);
 void file_keep_content(int fd, struct file *file, struct scratch *scratch);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
-/* Whether nobody has the other end. */
-bool file_has_ended(int fd);
 /* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
  * open file description; `now` is what it is (NULL: fresh). Returns NULL or why not. */
 const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind);

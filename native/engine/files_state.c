@@ -299,13 +299,6 @@ static void keep_messages(int fd, struct file *file)
 	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
 }
 
-bool file_has_ended(int fd)
-{
-	struct pollfd end = { .fd = fd };
-
-	return poll(&end, 1, 0) == 1 && end.revents & POLLHUP;
-}
-
 void file_keep_content(int fd, struct file *file, struct scratch *scratch)
 {
 	int bytes = 0;

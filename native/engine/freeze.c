@@ -1,9 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * One checkpoint.  Every thread of every process is stopped; then, and only then, the
- * processes are cloned: the main one by its main thread, the others by their holders,
- * which share their memory (infect.c).  Then everything goes on.  What can wait, waits
- * until then (generation.c).
+ * One checkpoint.  Every thread of every process that is known is stopped; then, and only
+ * then, the processes are cloned: the main one by its main thread, the others by their
+ * holders, which share their memory (infect.c).  While the kernel does that, everything is
+ * read that is of this instant.  Then everything goes on.  What can wait, waits until then
+ * (generation.c).
+ *
+ * What is to be read in a process' own memory is read before its clone begins: the kernel
+ * lets nobody in while it clones (mmap_lock).
  */
 #include <errno.h>
 #include <sched.h>
@@ -54,16 +58,26 @@ static int stop_task(pid_t tid, void *arg)
 	return 0;
 }
 
-/* What fails is seen when it is waited for. */
-static int interrupt_task(pid_t tid, void *arg)
+/* Those that are known; what fails is seen when it is waited for. */
+static void interrupt_known(struct target *target)
 {
-	struct target *target = arg;
-	struct thread *t = thread_find(target, tid);
-	struct avc_error ignored = { 0 };
+	for (uint32_t i = 0; i < target->thread_count; i++) {
+		struct thread *t = &target->threads[i];
+		struct avc_error ignored = { 0 };
 
-	if (t && !t->attached)
-		t->seen = thread_stop(target, t, &ignored) == 0;
-	return 0;
+		if (!t->attached)
+			t->seen = thread_stop(target, t, &ignored) == 0;
+	}
+}
+
+/* Then nobody is left who could create another one. */
+static bool everybody_stopped(const struct target *target)
+{
+	int stopped = 0;
+
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		stopped += target->threads[i].seen && target->threads[i].stopped;
+	return stopped && proc_thread_count(target->task_dirfd) == stopped;
 }
 
 static void stop_begin(struct target *target)
@@ -72,10 +86,11 @@ static void stop_begin(struct target *target)
 		target->threads[i].seen = false;
 		target->threads[i].block = -1;
 	}
+	target->frozen = false;
+	target->begun = false;
 }
 
-/* Until a walk finds nobody new, for threads create threads while we walk.  Once
- * all known ones are stopped and none is new, there is no one left to create. */
+/* Until all are stopped, for threads create threads meanwhile: then a walk finds them. */
 static int stop_all(struct target *target, struct avc_error *err)
 {
 	for (;;) {
@@ -93,6 +108,8 @@ static int stop_all(struct target *target, struct avc_error *err)
 				*err = gone;
 			return -1;
 		}
+		if (everybody_stopped(target))
+			return 0;
 		if (proc_tasks(target->task_dirfd, stop_task, &walk))
 			return err->code ? -1
 					 : fail_errno(err, target->pid, "freeze", "getdents64",
@@ -105,10 +122,11 @@ static int stop_all(struct target *target, struct avc_error *err)
 int stop_process(struct target *target, struct avc_error *err)
 {
 	stop_begin(target);
+	interrupt_known(target);
 	return stop_all(target, err);
 }
 
-static int read_all(struct target *target, uint32_t slot, uint32_t *threads, struct avc_error *err)
+static int read_all(struct target *target, uint32_t slot, struct avc_error *err)
 {
 	uint32_t next = 1;
 
@@ -144,7 +162,7 @@ static int read_all(struct target *target, uint32_t slot, uint32_t *threads, str
 		if ((!t->known || t->known_tls != arch_tls(&t->regs)) && ask(target, t, err))
 			return -1;
 	}
-	*threads = next;
+	target->blocks = next;
 	return 0;
 }
 
@@ -163,18 +181,12 @@ static bool anybody_uses(const struct target *target, avc_remote base, size_t by
 	return false;
 }
 
-struct capture {
-	struct target *target;
-	struct generation *generation;
-};
-
 /* The tables do not change while the kernel clones: nobody runs. */
-static void capture_files(void *arg)
+static void capture_files(struct target *target, struct generation *generation)
 {
-	const struct capture *capture = arg;
-	struct generation *generation = capture->generation;
+	struct scratch scratch = { -1, -1, 0 };
 
-	files_capture(capture->target, generation, generation->branches > 0, NULL, 0,
+	files_capture(target, generation, generation->branches > 0, NULL, 0, &scratch,
 		      &generation->files_error);
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
@@ -185,14 +197,32 @@ static void capture_files(void *arg)
 		if (branch->target)
 			files_capture(branch->target, branch->image, true,
 				      parent ? parent->image->files : generation->files,
-				      parent ? parent->target->pid : capture->target->pid,
+				      parent ? parent->target->pid : target->pid, &scratch,
 				      &branch->image->files_error);
 	}
+	scratch_close(&scratch);
+}
+
+/* ECHILD, if it has none: the one question that needs no look at each thread. */
+static const struct inj_syscall *ask_for_children(struct inj_call *call)
+{
+	return call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);
+}
+
+/* Nobody has looked below one that had none at the last checkpoint. */
+static int hear_of_children(struct target *target, struct avc_error *err)
+{
+	const bool was_childless = target->childless;
+
+	target->childless = target->children->result == -ECHILD;
+	return was_childless && !target->childless
+		       ? fail(err, AVC_DEADLINE, EAGAIN, target->pid, "freeze", "",
+			      "it has just started another process")
+		       : 0;
 }
 
 /* Pads of guards that died, and of the process that forked this one. */
-static void drop_old_pads(struct target *target, struct generation *generation,
-			  struct inj_call *call)
+static void drop_old_pads(struct target *target, long *vm_pages, struct inj_call *call)
 {
 	if (!target->checkpoints)
 		return;
@@ -203,66 +233,279 @@ static void drop_old_pads(struct target *target, struct generation *generation,
 		if (anybody_uses(target, base, bytes))
 			return;
 		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-		generation->vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
+		*vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 	}
 }
 
-static int clone_app(struct target *target, struct thread *main_thread,
-		     struct generation *generation, struct freeze_times *times,
-		     struct avc_error *err)
+static int start_app_clone(struct target *target, struct thread *main_thread, long *vm_pages,
+			   struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
-	const struct inj_syscall *children;
-	const uint64_t start = now_ns();
-	struct capture capture = { target, generation };
-	pid_t template = 0;
 
+	*vm_pages = proc_vm_pages(target->statm_fd, NULL);
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(target, call);
 	memory_dofork(target->memory, call);
-	drop_old_pads(target, generation, call);
-	/* ECHILD, if it has none: the one question that needs no look at each thread. */
-	children = call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);
+	drop_old_pads(target, vm_pages, call);
+	target->children = ask_for_children(call);
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	if (borrow(target, main_thread, err))
+	target->asked_ns = now_ns();
+	if (borrow(target, main_thread, err) || pad_start(main_thread->tid, err))
 		return -1;
-	if (pad_run_clone_while(main_thread->tid, call, capture_files, &capture, &template, err)) {
+	target->cloning = true;
+	return 0;
+}
+
+static int await_app_clone(struct target *target, struct thread *main_thread,
+			   struct generation *generation, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->runner;
+
+	target->cloning = false;
+	if (pad_await_clone(main_thread->tid, call, &generation->template, err)) {
 		target->lost = err->code != AVC_KERNEL;
 		thread_runs_on(main_thread, err);
 		return -1;
 	}
-	times->clone_ns = now_ns() - start;
-	generation->template = template;
 	/* After the timers were asked: one that has expired just now is found here. */
 	pending_read(target);
-	timers_answer(target, call, now_ns() - start);
-	target->childless = children->result == -ECHILD;
-	return 0;
+	timers_answer(target, call, now_ns() - target->asked_ns);
+	return hear_of_children(target, err);
+}
+
+/* After its clone it has a few steps to go before it can be let go. */
+static int rest_app(struct thread *main_thread, struct avc_error *err)
+{
+	if (tracee_settle(main_thread->tid, err) == 0 && give_back(main_thread, err) == 0)
+		return 0;
+	main_thread->stopped = false;
+	return -1;
 }
 
 /* ---- the other processes ---------------------------------------------------------- */
 
+/* The holder shares the process' memory and descriptors; its clone is the template. */
+static int start_clone(struct target *target, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->holder;
+
+	/* Before the holder runs, which maps something for a moment. */
+	target->clone_pages = proc_vm_pages(target->statm_fd, NULL);
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
+	memory_dofork(target->memory, call);
+	drop_old_pads(target, &target->clone_pages, call);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	if (pad_send(&target->pad, target->holder, &target->holder_base, call, err) ||
+	    pad_start(target->holder, err))
+		return -1;
+	target->cloning = true;
+	target->lost = true; /* until we have heard of the clone */
+	return 0;
+}
+
+static int await_clone(struct target *target, pid_t *template, struct avc_error *err)
+{
+	const struct inj_call *call = &target->pad.control->holder;
+	struct thread *thread = thread_find(target, target->pid);
+
+	target->cloning = false;
+	if (pad_await_clone(target->holder, call, template, err))
+		return -1;
+	target->lost = false;
+	if (thread && call->call[0].result > 0)
+		thread->creds.future_lock = (int32_t)call->call[0].result;
+	return 0;
+}
+
+/* Timers only the process itself can tell of.  And young processes change what they are
+ * all the time: a name, a user.  All are asked at the same time. */
+static int ask_begin(struct target *target, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->runner;
+	struct thread *thread = thread_find(target, target->pid);
+
+	call_begin(call, INJ_AFTER_HOME);
+	timers_ask(target, call);
+	target->children = ask_for_children(call);
+	ask_add(target, false, call, &target->questions);
+	target->asked_ns = now_ns();
+	if (borrow(target, thread, err) || pad_start(thread->tid, err))
+		return -1;
+	target->asked = true;
+	return 0;
+}
+
+/* All are interrupted before the first is waited for: it takes each some time to get there. */
+static int ask_halt(struct target *target, struct avc_error *err)
+{
+	struct thread *thread = thread_find(target, target->pid);
+
+	if (pad_halt(thread->tid, &target->pad.control->runner, err) == 0)
+		return 0;
+	target->asked = false;
+	thread_runs_on(thread, err);
+	return -1;
+}
+
+static int ask_end(struct target *target, struct avc_error *err)
+{
+	struct inj_call *call = &target->pad.control->runner;
+	struct thread *thread = thread_find(target, target->pid);
+
+	target->asked = false;
+	if (tracee_await(thread->tid, NULL, err) != STOP_TRAP) {
+		thread_runs_on(thread, err);
+		return -1;
+	}
+	pending_read(target);
+	timers_answer(target, call, now_ns() - target->asked_ns);
+	return give_back(thread, err) || ask_answer(thread, call, &target->questions, err) ||
+			       hear_of_children(target, err)
+		       ? -1
+		       : 0;
+}
+
+/* Also of those that were asked before one failed. */
+static int hear_all(struct tree *tree, struct avc_error *err)
+{
+	int (*const step[])(struct target *, struct avc_error *) = { ask_halt, ask_end };
+	int result = 0;
+
+	for (size_t k = 0; k < sizeof step / sizeof *step; k++)
+		for (uint32_t i = 0; i < tree->members; i++) {
+			struct avc_error failed = { 0 };
+
+			if (tree->member[i]->asked && step[k](tree->member[i], &failed) &&
+			    !result) {
+				*err = failed;
+				result = -1;
+			}
+		}
+	return result;
+}
+
+/* It stands still: its clone begins, if it has a holder for that, and it answers meanwhile what
+ * it is asked, which changes nothing of its memory. */
+static int begin(struct target *target, uint32_t slot, struct avc_error *err)
+{
+	struct thread *thread = thread_find(target, target->pid);
+
+	if (!thread || !thread->stopped)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
+			    "its main thread has ended");
+	target->begun = true;
+	return read_all(target, slot, err) || vet(target, thread, err) ||
+			       (target->holder && start_clone(target, err)) ||
+			       ask_begin(target, err)
+		       ? -1
+		       : 0;
+}
+
+static int begin_app(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct thread *thread = thread_find(target, target->pid);
+
+	if (!thread || !thread->stopped)
+		return fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
+			    "its main thread has just ended");
+	target->begun = true;
+	if (read_all(target, generation->slot, err))
+		return -1;
+	generation->threads = target->blocks;
+	return start_app_clone(target, thread, &generation->vm_pages, err);
+}
+
+/* What it has just brought forth was taken for a thread of its own; a look tells. */
+static bool has_strangers(const struct target *target)
+{
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		if (target->threads[i].attached && !target->threads[i].seen)
+			return true;
+	return false;
+}
+
+/* As soon as everybody stands still who is known to be there: whoever is found after that is
+ * stopped, too, and has had nothing to do with the memory of the others.  (One that shares it
+ * is not protected: find_branches().)  One that has no holder yet waits for the others. */
+static int begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	if (!has_strangers(tree->main) && begin_app(tree->main, generation, err))
+		return -1;
+	for (uint32_t i = 1; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+
+		if (target && target->frozen && target->holder && target->pid == target->leader &&
+		    !has_strangers(target) && begin(target, generation->slot, err))
+			return -1;
+	}
+	return 0;
+}
+
+static int begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	if (!tree->main->begun && begin_app(tree->main, generation, err))
+		return -1;
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct target *target = generation->branch[i].target;
+
+		if (target && !target->begun && begin(target, generation->slot, err))
+			return -1;
+	}
+	return 0;
+}
+
+/* Of a process that was killed meanwhile, and all of them when the checkpoint failed. */
+static void drop_clones(struct tree *tree)
+{
+	for (uint32_t i = 0; i < tree->members; i++) {
+		struct target *target = tree->member[i];
+		struct avc_error ignored = { 0 };
+		pid_t template;
+
+		if (!target->cloning || await_clone(target, &template, &ignored))
+			continue;
+		tracee_kill(template);
+		target->lost = tracee_settle(target->holder, &ignored) != 0;
+	}
+}
+
 #define LOOKS 64
 #define LOOK_US 100
 
-/* Until a look at the whole tree finds nobody who is not stopped: processes create
- * processes while we look. */
-static int stop_tree(struct tree *tree, struct avc_error *err)
+/* Those that have something of ours; another child may have to execute a program before its
+ * parent can be stopped (vfork(2)). */
+static int stop_known(struct tree *tree, struct avc_error *err)
 {
 	stop_begin(tree->main);
-	for (uint32_t i = 0; i < tree->members; i++) {
-		tree->member[i]->frozen = false;
+	for (uint32_t i = 0; i < tree->members; i++)
 		stop_begin(tree->member[i]);
-	}
-	/* So that they stop at the same time, and not one after the other.  A child that has
-	 * nothing of ours may have to execute a program before its parent can be stopped. */
-	for (uint32_t i = 0; tree->count > 1 && i < tree->count; i++)
+	/* So that they stop at the same time, and not one after the other. */
+	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->kin[i].target && tree->kin[i].target->infected)
-			(void)proc_tasks(tree->kin[i].target->task_dirfd, interrupt_task,
-					 tree->kin[i].target);
+			interrupt_known(tree->kin[i].target);
 	if (stop_all(tree->main, err))
 		return -1;
+	for (uint32_t i = 1; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+		struct avc_error failed = { 0 };
+
+		if (!target || !target->infected)
+			continue;
+		target->frozen = stop_all(target, &failed) == 0;
+		if (!target->frozen && failed.code != AVC_GONE) {
+			*err = failed;
+			return -1;
+		}
+	}
+	return 0;
+}
+
+/* Until a look at the whole tree finds nobody who is not stopped: processes create
+ * processes while we look. */
+static int stop_others(struct tree *tree, struct avc_error *err)
+{
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */
 	if (tree->count <= 1 && tree->main->childless)
@@ -270,6 +513,8 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 	for (int looks = 0; looks < LOOKS; looks++) {
 		bool all = true;
 
+		if (tree_look(tree, err))
+			return -1;
 		for (uint32_t i = 1; i < tree->count; i++) {
 			struct target *t = tree->kin[i].target;
 			struct avc_error failed = { 0 };
@@ -290,10 +535,8 @@ static int stop_tree(struct tree *tree, struct avc_error *err)
 				usleep(LOOK_US); /* until it is a zombie, or nothing */
 			}
 		}
-		if (all && looks)
+		if (all)
 			return 0;
-		if (tree_look(tree, err))
-			return -1;
 	}
 	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",
 		    "its processes come and go too fast");
@@ -374,9 +617,8 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 		if (kin->ended) {
 			if (branch->parent == PARENT_INIT || branch->inside <= 0)
 				continue; /* init is just about to wait for it */
-			branch->status = proc_exit_status(kin->pid);
-			if (proc_read(kin->pid, "comm", branch->name, sizeof branch->name) > 0)
-				branch->name[strcspn(branch->name, "\n")] = 0;
+			branch->status = kin->stat.exit_status;
+			memcpy(branch->name, kin->stat.name, sizeof branch->name);
 		} else {
 			branch->image = calloc(1, sizeof *branch->image);
 			if (!branch->image)
@@ -391,133 +633,22 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
-static int read_branch(struct branch *branch, bool strict, struct mem_seen *seen,
+static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen,
 		       struct avc_error *err)
 {
 	struct target *target = branch->target;
 
 	if (strict)
 		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
-
-	if (pad_check(target, target->pid, err) ||
-	    memory_prepare(target->memory, &branch->image->image, seen, err) ||
-	    read_all(target, branch->image->slot, &branch->image->threads, err))
+	if (memory_prepare(target->memory, &branch->image->image, seen, err))
 		return -1;
-	branch->image->vm_pages = proc_vm_pages(target->statm_fd, NULL);
+	branch->image->threads = target->blocks;
 	memory_copy(target, branch->image->image);
 	files_mapped_copy(branch->image->mapped);
 	return 0;
 }
 
-/* Timers only the process itself can tell of.  And young processes change what they are
- * all the time: a name, a user.  All are asked at the same time. */
-struct asking {
-	struct target *target;
-	struct thread *thread;
-	struct questions questions;
-	uint64_t start;
-	bool asked;
-};
-
-static int ask_begin(struct asking *asking, struct avc_error *err)
-{
-	struct target *target = asking->target;
-	struct inj_call *call = &target->pad.control->runner;
-
-	asking->thread = thread_find(target, target->pid);
-	asking->start = now_ns();
-	if (!asking->thread || !asking->thread->stopped)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			    "its main thread has ended");
-	call_begin(call, INJ_AFTER_HOME);
-	timers_ask(target, call);
-	ask_add(target, false, call, &asking->questions);
-	if (borrow(target, asking->thread, err) || pad_start(asking->thread->tid, err))
-		return -1;
-	asking->asked = true;
-	return 0;
-}
-
-/* All are interrupted before the first is waited for: it takes each some time to get there. */
-static int ask_halt(struct asking *asking, struct avc_error *err)
-{
-	if (pad_halt(asking->thread->tid, &asking->target->pad.control->runner, err) == 0)
-		return 0;
-	asking->asked = false;
-	thread_runs_on(asking->thread, err);
-	return -1;
-}
-
-static int ask_end(struct asking *asking, struct avc_error *err)
-{
-	struct target *target = asking->target;
-	struct inj_call *call = &target->pad.control->runner;
-
-	asking->asked = false;
-	if (tracee_await(asking->thread->tid, NULL, err) != STOP_TRAP) {
-		thread_runs_on(asking->thread, err);
-		return -1;
-	}
-	pending_read(target);
-	timers_answer(target, call, now_ns() - asking->start);
-	return give_back(asking->thread, err) ||
-			       ask_answer(asking->thread, call, &asking->questions, err)
-		       ? -1
-		       : 0;
-}
-
-/* Also of those that were asked before one failed. */
-static int hear_all(struct asking *asking, uint32_t count, struct avc_error *err)
-{
-	int (*const step[])(struct asking *, struct avc_error *) = { ask_halt, ask_end };
-	int result = 0;
-
-	for (size_t k = 0; k < sizeof step / sizeof *step; k++)
-		for (uint32_t i = 0; i < count; i++) {
-			struct avc_error failed = { 0 };
-
-			if (asking[i].asked && step[k](&asking[i], &failed) && !result) {
-				*err = failed;
-				result = -1;
-			}
-		}
-	return result;
-}
-
-/* The holder shares the process' memory and descriptors; its clone is the template. */
-static int start_clone(struct branch *branch, struct avc_error *err)
-{
-	struct target *target = branch->target;
-	struct inj_call *call = &target->pad.control->holder;
-
-	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
-	memory_dofork(target->memory, call);
-	drop_old_pads(target, branch->image, call);
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	if (pad_send(&target->pad, target->holder, &target->holder_base, call, err) ||
-	    pad_start(target->holder, err))
-		return -1;
-	target->lost = true; /* until we have heard of the clone */
-	return 0;
-}
-
-static int await_clone(struct branch *branch, struct avc_error *err)
-{
-	struct target *target = branch->target;
-	const struct inj_call *call = &target->pad.control->holder;
-	struct thread *thread = thread_find(target, target->pid);
-
-	if (pad_await_clone(target->holder, call, &branch->image->template, err))
-		return -1;
-	target->lost = false;
-	if (thread && call->call[0].result > 0)
-		thread->creds.future_lock = (int32_t)call->call[0].result;
-	return 0;
-}
-
-static int find_branches(struct tree *tree, struct generation *generation, struct asking **asking,
-			 struct avc_error *err)
+static int find_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	if (tree->count <= 1)
 		return 0;
@@ -529,31 +660,20 @@ static int find_branches(struct tree *tree, struct generation *generation, struc
 				    "a child process has its parent's memory (CLONE_VM)");
 	if (make_branches(tree, generation, err))
 		return -1;
-	*asking = calloc(generation->branches + 1, sizeof **asking);
-	if (!*asking)
-		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		(*asking)[i].target = generation->branch[i].target;
+	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target &&
 		    prepare_stopped(tree, generation->branch[i].target, err))
 			return -1;
-	}
 	return 0;
 }
 
-/* Each is asked as soon as it has been read, and answers, and is cloned, while the next one is
- * read: what it is asked changes nothing of its memory. */
-static int read_branches(struct generation *generation, struct mem_seen *seen,
-			 struct asking *asking, bool clone, struct avc_error *err)
+static int keep_branches(struct generation *generation, struct mem_seen *seen,
+			 struct avc_error *err)
 {
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
-
-		if (branch->target &&
-		    (read_branch(branch, generation->mapped != NULL, seen, err) ||
-		     ask_begin(&asking[i], err) || (clone && start_clone(branch, err))))
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target &&
+		    keep_branch(&generation->branch[i], generation->mapped != NULL, seen, err))
 			return -1;
-	}
 	return 0;
 }
 
@@ -600,16 +720,21 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 	return result;
 }
 
-/* Their main threads make the holders, and have to be at rest for that. */
-static int make_and_clone(struct tree *tree, struct generation *generation, struct asking *asking,
-			  struct avc_error *err)
+/* Their main threads make the holders, and have to be at rest for that, as well as those of
+ * the processes above them. */
+static int clone_missing(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
-	if (hear_all(asking, generation->branches, err) || make_holders_missing(tree, err))
+	struct thread *main_thread = thread_find(tree->main, tree->main->pid);
+
+	if (await_app_clone(tree->main, main_thread, generation, err) ||
+	    rest_app(main_thread, err) || hear_all(tree, err) || make_holders_missing(tree, err))
 		return -1;
-	generation->taken_ns = now_ns();
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target && start_clone(&generation->branch[i], err))
+	for (uint32_t i = 1; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+
+		if (target && !target->cloning && start_clone(target, err))
 			return -1;
+	}
 	return 0;
 }
 
@@ -620,8 +745,9 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 
 		if (!branch->target)
 			continue;
-		if (await_clone(branch, err))
+		if (await_clone(branch->target, &branch->image->template, err))
 			return -1;
+		branch->image->vm_pages = branch->target->clone_pages;
 		branch->image->taken_ns = generation->taken_ns;
 	}
 	return 0;
@@ -643,16 +769,30 @@ void let_go_process(struct target *target, const struct thread *but)
 			let_go(target, &target->threads[i]);
 }
 
+/* Whoever is killed has no descriptors any more, which looks like a table with nothing in it.
+ * Of those that are still at what they were asked it will be seen then. */
+static int see_alive(const struct tree *tree, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->count; i++) {
+		const struct target *target = tree->kin[i].target;
+		struct arch_regs ignored;
+
+		if (target && !target->asked && !(i == 0 && target->cloning) &&
+		    arch_regs_get(target->pid, &ignored))
+			return fail_errno(err, target->pid, "freeze", "ptrace(GETREGS)",
+					  "it has ended");
+	}
+	return 0;
+}
+
 int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
 	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err)
 {
 	struct target *target = tree->main;
-	const uint64_t start = now_ns();
-	const bool was_childless = target->childless;
-	struct asking *asking = NULL;
 	struct avc_error failed = { 0 };
 	struct thread *main_thread;
-	bool cloned = false;
+	bool cloned;
+	uint64_t start;
 	int result;
 
 	*times = (struct freeze_times){ 0 };
@@ -660,58 +800,56 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	generation->pidfd = -1;
 	urgent_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	result = stop_tree(tree, err);
-	times->stop_ns = now_ns() - start;
-	main_thread = thread_find(target, target->pid);
-	if (!result && (!main_thread || !main_thread->stopped))
-		result = fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
-			      "its main thread has just ended");
+	start = now_ns();
+	result = stop_known(tree, err);
+	generation->taken_ns = now_ns();
+	times->stop_ns = generation->taken_ns - start;
 	if (!result)
-		result = read_all(target, generation->slot, &generation->threads, err);
-	if (!result)
-		result = keep_place_of_main(tree, generation, err);
+		result = begin_known(tree, generation, err) || stop_others(tree, err) ? -1 : 0;
+	/* The deadline is for getting things stopped; the clone of a big process takes its
+	 * time. */
+	tracee_deadline_set(timer, CLONE_NS);
 	if (!result) {
-		/* The deadline is for getting things stopped; the clone of a big
-		 * process takes its time. */
-		tracee_deadline_set(timer, CLONE_NS);
-		generation->vm_pages = proc_vm_pages(target->statm_fd, NULL);
 		memory_copy(target, generation->image);
 		files_mapped_copy(generation->mapped);
-		result = find_branches(tree, generation, &asking, err);
+		result = keep_place_of_main(tree, generation, err) ||
+					 find_branches(tree, generation, err) ||
+					 begin_others(tree, generation, err) ||
+					 keep_branches(generation, seen, err)
+				 ? -1
+				 : 0;
 	}
+	if (!result && !has_all_holders(tree))
+		result = clone_missing(tree, generation, err);
 	if (!result) {
-		const bool at_once = has_all_holders(tree);
-
-		generation->taken_ns = now_ns();
-		result = read_branches(generation, seen, asking, at_once, err);
-		if (!result && !at_once)
-			result = make_and_clone(tree, generation, asking, err);
+		capture_files(target, generation);
+		result = see_alive(tree, err);
 	}
-	if (!result) {
-		result = clone_app(target, main_thread, generation, times, err);
-		cloned = !result;
-	}
-	/* Also those that were asked before something failed. */
-	if (asking && hear_all(asking, generation->branches, result ? &failed : err))
+	/* Also what was begun before something failed. */
+	main_thread = thread_find(target, target->pid);
+	if (target->cloning &&
+	    await_app_clone(target, main_thread, generation, result ? &failed : err))
 		result = -1;
-	free(asking);
+	cloned = generation->template != 0;
+	if (hear_all(tree, result ? &failed : err))
+		result = -1;
 	if (!result)
 		result = await_clones(generation, err);
-	if (generation->branches)
-		times->clone_ns = now_ns() - generation->taken_ns;
-	/* The image is whole.  The main thread first: it has a few steps to go before it
-	 * can be let go, and would have to share the CPUs with everybody else. */
+	drop_clones(tree);
+	times->clone_ns = now_ns() - generation->taken_ns;
+	/* The image is whole.  The main thread first: it would have to share the CPUs with
+	 * everybody else. */
 	if (main_thread) {
 		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
-		if (cloned && (tracee_settle(main_thread->tid, err) || give_back(main_thread, err)))
-			main_thread->stopped = false;
+		if (cloned && main_thread->borrowed)
+			(void)rest_app(main_thread, err);
 		let_go(target, main_thread);
 	}
 	let_go_process(target, main_thread);
 	for (uint32_t i = 0; i < tree->members; i++)
 		let_go_process(tree->member[i], NULL);
-	tracee_deadline_clear(timer);
 	times->freeze_ns = now_ns() - start;
+	tracee_deadline_clear(timer);
 	urgent_end();
 	if (!cloned || result)
 		return -1;
@@ -722,8 +860,5 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].target)
 			generation->branch[i].target->checkpoints++;
-	if (was_childless && !target->childless)
-		return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "freeze", "",
-			    "it has just started another process");
 	return 0;
 }

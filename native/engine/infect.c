@@ -136,7 +136,7 @@ static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const u
 	struct arch_regs regs;
 
 	arch_stub_call(&regs, &thread->regs, cave, nr, arg);
-	if (suspend_seccomp(thread, true, err))
+	if (suspend_seccomp(thread, err))
 		return -1;
 	if (arch_regs_set(tid, &regs) || ptrace(PTRACE_SETSIGMASK, tid, sizeof all, &all))
 		return fail_errno(err, tid, "infect", "ptrace(SETREGS)", "it has gone");

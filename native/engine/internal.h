@@ -82,7 +82,9 @@ struct proc_stat {
 	pid_t parent, group, session, tty_group;
 	uint32_t tty, flags; /* PF_*                                            */
 	int threads;
-	uint64_t start; /* clock ticks after boot */
+	uint64_t start;  /* clock ticks after boot                            */
+	int exit_status; /* of a zombie, as wait(2) says it                   */
+	char name[16];
 };
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
@@ -90,8 +92,6 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 int proc_stat(pid_t pid, struct proc_stat *stat);
 /* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
 int proc_stat_of(int stat_fd, struct proc_stat *stat);
-/* How a zombie has ended, as wait(2) says it; 0 if that can not be found out. */
-int proc_exit_status(pid_t pid);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
 /* A thread of the process that has not ended: the main thread, as long as it has not.
@@ -105,6 +105,8 @@ int proc_children(pid_t pid, pid_t *children, int max);
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
 int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
+/* How many threads there are, by an open /proc/PID/task; 0: the process is gone. */
+int proc_thread_count(int task_dirfd);
 /* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be
  * NULL): how many are resident and of no file. */
 long proc_vm_pages(int statm_fd, long *anonymous);
@@ -209,6 +211,11 @@ struct creds {
 	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
 
+/* What a thread is asked (target.c); NULL: not that. */
+struct questions {
+	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
+};
+
 struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
@@ -216,6 +223,7 @@ struct thread {
 	int stop_signal;       /* the process is stopped by job control           */
 	int block;             /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;         /* sent into the pad; regs and sigmask are its own  */
+	bool vetted;           /* vet() has been at this stop                      */
 	struct arch_regs regs; /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
@@ -285,7 +293,12 @@ struct target {
 	/* A thread died while it may have been cloning: there may be a tracee that
 	 * nobody knows (link_kill_lost). */
 	bool lost;
-	bool childless;      /* it had no child process at the last checkpoint   */
+	bool childless;                     /* it had no child process at the last checkpoint   */
+	const struct inj_syscall *children; /* the question whether it has, in a freeze */
+	struct questions questions;         /* and what else it is asked               */
+	uint64_t asked_ns;
+	bool asked;
+	uint32_t blocks;     /* of the slot, that its threads take up in this freeze     */
 	long surveyed_pages; /* size when its mappings were looked at last      */
 	int sockets[SOCKETS_MAX];
 	uint32_t socket_count;
@@ -304,11 +317,14 @@ struct target {
 	uint64_t start;                  /* when it began; tells it from one with its number */
 	uint32_t images;                 /* generations that have one of it                  */
 	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
+	bool cloning;                    /* by its holder: freeze()                          */
+	long clone_pages;                /* its size when that began                         */
 	bool closing;                    /* by its holder: generation_close_tables()      */
 	bool doubtful;                   /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                    /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear;    /* what a process that is made from the main one has */
 	bool frozen;                     /* stopped in this freeze                            */
+	bool begun;                      /* and read, and asked                               */
 	bool adopts;                     /* it or one above it adopts orphans                 */
 	bool paused;                     /* between adopt_no_more() and adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
@@ -520,10 +536,12 @@ int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile
 int pad_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
 bool in_old_pad(const struct target *target, avc_remote address);
-/* The same for a stopped thread of the app, which gets home by itself if we die:
+/* Until it is let go: it runs only what is ours meanwhile. */
+int suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
+/* May this stopped thread be borrowed?  What of that is to be read in its memory. */
+int vet(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+/* The same as pad_run* for a stopped thread of the app, which gets home by itself if we die:
  * borrow, pad_run*, give_back.  give_back() needs a plain trap stop. */
-/* Only while it runs what is ours: of its own it must not do anything unseen. */
-int suspend_seccomp(const struct thread *thread, bool suspend, struct avc_error *err) warn_unused;
 int borrow(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 int give_back(struct thread *thread, struct avc_error *err);
 
@@ -721,9 +739,6 @@ int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
 /* What only a thread itself can tell (clear_child_tid, sigaltstack, credentials): added to
  * calls that it makes anyway, and what came of it.  `with_locks`: of its process, what is to
  * be locked in memory; there is a mapping more while that is found out. */
-struct questions {
-	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
-};
 void ask_add(const struct target *target, bool with_locks, struct inj_call *call,
 	     struct questions *questions);
 int ask_answer(struct thread *thread, const struct inj_call *call,
@@ -742,11 +757,17 @@ void rseq_fixup(int mem_fd, struct thread *thread);
 
 /* Before a freeze: what can be known of the app's descriptors while it runs. */
 int files_prepare(struct target *target, struct avc_error *err) warn_unused;
+/* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
+struct scratch {
+	int in, out, bytes;
+};
+void scratch_close(struct scratch *scratch);
 /* During it: what is of this instant.  `several`: the app has other processes, which may
  * have the other ends of pipes.  `kin`: what process `kin_pid` has, of the same freeze, or
  * NULL. */
 int files_capture(struct target *target, struct generation *generation, bool several,
-		  const struct files *kin, pid_t kin_pid, struct avc_error *err);
+		  const struct files *kin, pid_t kin_pid, struct scratch *scratch,
+		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
 /* The same for all processes: what they share of open files, and who of them is named.

@@ -301,10 +301,10 @@ bool in_old_pad(const struct target *target, avc_remote address)
 	return false;
 }
 
-int suspend_seccomp(const struct thread *thread, bool suspend, struct avc_error *err)
+int suspend_seccomp(const struct thread *thread, struct avc_error *err)
 {
 	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL,
-		   (long)(TRACE_OPTIONS_APP | (suspend ? PTRACE_O_SUSPEND_SECCOMP : 0))))
+		   (long)(TRACE_OPTIONS_APP | PTRACE_O_SUSPEND_SECCOMP)))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",
 				  "it has gone");
 	return 0;
@@ -328,12 +328,8 @@ int pad_check(struct target *target, pid_t tid, struct avc_error *err)
 	return 0;
 }
 
-int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+int vet(struct target *target, struct thread *thread, struct avc_error *err)
 {
-	const uint64_t all = ~UINT64_C(0);
-	struct inj_control *control = target->pad.control;
-	struct arch_regs home;
-
 	if (pad_check(target, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a pad that will be taken away. */
@@ -343,13 +339,25 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 	/* The kernel forgets a restartable sequence as soon as the thread is
 	 * seen elsewhere: it has to go on where the kernel would send it. */
 	rseq_fixup(target->mem_fd, thread);
+	thread->vetted = true;
+	return 0;
+}
+
+int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+{
+	const uint64_t all = ~UINT64_C(0);
+	struct inj_control *control = target->pad.control;
+	struct arch_regs home;
+
+	if (!thread->vetted && vet(target, thread, err))
+		return -1;
 	home = thread->regs;
 	arch_resume(&home);
 	arch_home_set(&control->home, &home, thread->sigmask);
 	/* Registers first: if we die between the two, the thread is in the pad
 	 * with its own mask and goes home with it.  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
-	if (suspend_seccomp(thread, true, err) ||
+	if (suspend_seccomp(thread, err) ||
 	    pad_send(&target->pad, thread->tid, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
@@ -365,6 +373,8 @@ int give_back(struct thread *thread, struct avc_error *err)
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
+	/* Its own seccomp filters are in force again when it is let go: nothing else
+	 * comes in between. */
 	thread->borrowed = false;
-	return suspend_seccomp(thread, false, err);
+	return 0;
 }

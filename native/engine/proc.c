@@ -9,6 +9,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -63,13 +64,13 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 
 static int parse_stat(const char *buf, struct proc_stat *stat)
 {
-	const char *p;
+	const char *name = strchr(buf, '('), *last = strrchr(buf, ' '), *p;
 	int tty;
 	unsigned long long start;
 
 	/* The name may hold anything, also ") R": the last ')' ends it. */
 	p = strrchr(buf, ')');
-	if (!p ||
+	if (!name || !last || !p ||
 	    sscanf(p + 1,
 		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
@@ -79,6 +80,8 @@ static int parse_stat(const char *buf, struct proc_stat *stat)
 	}
 	stat->tty = (uint32_t)tty;
 	stat->start = start;
+	stat->exit_status = atoi(last + 1);
+	snprintf(stat->name, sizeof stat->name, "%.*s", (int)(p - name - 1), name + 1);
 	return 0;
 }
 
@@ -94,16 +97,6 @@ int proc_stat_of(int stat_fd, struct proc_stat *stat)
 	char buf[1024];
 
 	return read_text(stat_fd, buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
-}
-
-int proc_exit_status(pid_t pid)
-{
-	char buf[1024], *p;
-
-	if (proc_read(pid, "stat", buf, sizeof buf) <= 0)
-		return 0;
-	p = strrchr(buf, ' '); /* the last field */
-	return p ? atoi(p + 1) : 0;
 }
 
 pid_t proc_inside(pid_t tid)
@@ -379,6 +372,15 @@ int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg)
 				return -1;
 		}
 	}
+}
+
+/* A directory has a link for itself and one for each directory in it (fs/proc/base.c,
+ * proc_task_getattr()). */
+int proc_thread_count(int task_dirfd)
+{
+	struct stat st;
+
+	return fstat(task_dirfd, &st) || st.st_nlink < 2 ? 0 : (int)st.st_nlink - 2;
 }
 
 long proc_vm_pages(int statm_fd, long *anonymous)

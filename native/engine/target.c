@@ -238,6 +238,7 @@ int thread_await(struct target *target, struct thread *thread, struct avc_error 
 		return -1;
 	}
 	thread->stopped = true;
+	thread->vetted = false;
 	thread->stop_signal = tracee_group_signal();
 	if (arch_regs_get(thread->tid, &thread->regs)) {
 		thread->stopped = false;

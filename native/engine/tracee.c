@@ -73,8 +73,11 @@ void tracee_deadline_set(timer_t timer, uint64_t ns)
 {
 	struct itimerspec t = { .it_interval.tv_nsec = TICK_NS, .it_value.tv_nsec = TICK_NS };
 
+	const bool ticking = deadline_ns != 0;
+
 	deadline_ns = now_ns() + ns;
-	timer_settime(timer, 0, &t, NULL);
+	if (!ticking)
+		timer_settime(timer, 0, &t, NULL);
 }
 
 void tracee_deadline_clear(timer_t timer)
@@ -205,9 +208,10 @@ int tracee_halt(pid_t tid, struct avc_error *err)
 
 bool tracee_is_ours(pid_t tid)
 {
-	struct proc_status status;
+	siginfo_t nothing_new;
 
-	return proc_status(tid, &status) == 0 && status.tracer == gettid();
+	return waitid(P_PID, (id_t)tid, &nothing_new,
+		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) == 0;
 }
 
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg)

@@ -36,6 +36,32 @@ static int add_kin(struct tree *tree, pid_t pid, int parent, struct avc_error *e
 	return 0;
 }
 
+static bool any_cloning(const struct tree *tree)
+{
+	bool cloning = tree->main->cloning;
+
+	for (uint32_t i = 0; i < tree->members; i++)
+		cloning |= tree->member[i]->cloning;
+	return cloning;
+}
+
+static bool is_member(const struct tree *tree, pid_t pid)
+{
+	for (uint32_t i = 0; i < tree->members; i++)
+		if (tree->member[i]->leader == pid)
+			return true;
+	return false;
+}
+
+/* A clone of ours: of a holder that is at it, or one of which we never heard. */
+static bool is_clone(const struct tree *tree, pid_t pid)
+{
+	if (is_member(tree, pid) || !tracee_is_ours(pid))
+		return false;
+	tree->main->lost |= !any_cloning(tree);
+	return true;
+}
+
 /* A child hangs on the thread that forked it. */
 static int look_at_task(pid_t tid, void *arg)
 {
@@ -46,7 +72,8 @@ static int look_at_task(pid_t tid, void *arg)
 
 	for (int i = 0; i < count; i++) {
 		if (look->parent == PARENT_INIT &&
-		    (children[i] == tree->main->leader || tree->is_ours(children[i], tree->arg)))
+		    (children[i] == tree->main->leader || tree->is_ours(children[i], tree->arg) ||
+		     is_clone(tree, children[i])))
 			continue;
 		if (add_kin(tree, children[i], look->parent, look->err))
 			return -1;
@@ -192,13 +219,6 @@ int tree_look(struct tree *tree, struct avc_error *err)
 		}
 		if (i) {
 			kin->target = find_member(tree, kin->pid, stat.start);
-			/* A clone of ours of which we never heard, and no orphan. */
-			if (!kin->target && kin->parent == PARENT_INIT &&
-			    tracee_is_ours(kin->pid)) {
-				tree->main->lost = true;
-				kin->pid = 0;
-				continue;
-			}
 			if (!kin->target) {
 				struct avc_error gone = { 0 };
 
@@ -215,7 +235,7 @@ int tree_look(struct tree *tree, struct avc_error *err)
 		}
 		/* Thread by thread only when the last checkpoint did not find that it
 		 * has none: then the next one will find that it has. */
-		if (!(i == 0 && tree->main->childless) &&
+		if (!kin->target->childless &&
 		    look_below(tree, kin->target->task_dirfd, (int)i, err))
 			return -1;
 	}

@@ -116,8 +116,8 @@ struct avc_event {
 	/* CHECKPOINT, MISSED: first PTRACE_INTERRUPT until the last thread runs
 	 * again, and parts of it                                                 */
 	uint64_t freeze_ns;
-	uint64_t stop_ns;  /* of it, until every thread had stopped         */
-	uint64_t clone_ns; /* of it, the kernel's clone                     */
+	uint64_t stop_ns;  /* of it, until every known thread had stopped   */
+	uint64_t clone_ns; /* of it, until everything was read and cloned   */
 	/* RESTORED                                                               */
 	uint64_t died_ns;    /* CLOCK_MONOTONIC when init had reaped the app  */
 	uint64_t restore_ns; /* died_ns until the last thread runs again      */
