@@ -5,542 +5,16 @@
  * holders, which share their memory (infect.c).  While the kernel does that, everything is
  * read that is of this instant.  Then everything goes on.  What can wait, waits until then
  * (generation.c).
- *
- * What is to be read in a process' own memory is read before its clone begins: the kernel
- * lets nobody in while it clones (mmap_lock).
  */
 #include <errno.h>
-#include <sched.h>
-#include <signal.h>
-#include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/mman.h>
-#include <sys/ptrace.h>
-#include <sys/syscall.h>
-#include <sys/wait.h>
-#include <unistd.h>
 
-#include "internal.h"
+#include "freeze.h"
 
 #define CLONE_NS (10 * NS_PER_S)
 
-struct walk {
-	struct target *target;
-	uint32_t fresh;
-	struct avc_error *err;
-};
-
-static int stop_task(pid_t tid, void *arg)
-{
-	struct walk *walk = arg;
-	struct target *target = walk->target;
-	struct thread *t = thread_find(target, tid);
-	struct avc_error gone = { 0 };
-
-	if (t && t->seen)
-		return 0;
-	if (!t)
-		t = thread_add(target, tid, walk->err);
-	if (!t)
-		return -1;
-	t->seen = true;
-	walk->fresh++;
-	if (t->attached)
-		return 0; /* born of a thread of ours: comes with its own stop */
-	if (thread_stop(target, t, &gone)) {
-		if (gone.code == AVC_GONE && tid != target->pid)
-			return 0; /* it ended meanwhile */
-		if (!walk->err->code)
-			*walk->err = gone;
-		return -1;
-	}
-	return 0;
-}
-
-/* Those that are known; what fails is seen when it is waited for. */
-static void interrupt_known(struct target *target)
-{
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		struct thread *t = &target->threads[i];
-		struct avc_error ignored = { 0 };
-
-		if (!t->attached)
-			t->seen = thread_stop(target, t, &ignored) == 0;
-	}
-}
-
-/* Then nobody is left who could create another one. */
-static bool everybody_stopped(const struct target *target)
-{
-	int stopped = 0;
-
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		stopped += target->threads[i].seen && target->threads[i].stopped;
-	return stopped && proc_thread_count(target->task_dirfd) == stopped;
-}
-
-static void stop_begin(struct target *target)
-{
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		target->threads[i].seen = false;
-		target->threads[i].block = -1;
-	}
-	target->frozen = false;
-	target->begun = false;
-}
-
-/* Until all are stopped, for threads create threads meanwhile: then a walk finds them. */
-static int stop_all(struct target *target, struct avc_error *err)
-{
-	for (;;) {
-		struct walk walk = { .target = target, .err = err };
-
-		for (uint32_t i = 0; i < target->thread_count; i++) {
-			struct thread *t = &target->threads[i];
-			struct avc_error gone = { 0 };
-
-			if (!t->attached || t->stopped || !thread_await(target, t, &gone))
-				continue;
-			if (gone.code == AVC_GONE && t->tid != target->pid)
-				continue;
-			if (!err->code)
-				*err = gone;
-			return -1;
-		}
-		if (everybody_stopped(target))
-			return 0;
-		if (proc_tasks(target->task_dirfd, stop_task, &walk))
-			return err->code ? -1
-					 : fail_errno(err, target->pid, "freeze", "getdents64",
-						      "it has ended");
-		if (!walk.fresh)
-			return 0;
-	}
-}
-
-int stop_process(struct target *target, struct avc_error *err)
-{
-	stop_begin(target);
-	interrupt_known(target);
-	return stop_all(target, err);
-}
-
-static int read_all(struct target *target, uint32_t slot, struct avc_error *err)
-{
-	uint32_t next = 1;
-
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		struct thread *t = &target->threads[i];
-
-		if (t->attached && !t->seen)
-			return fail(err, AVC_DEADLINE, EAGAIN, t->tid, "freeze", "",
-				    "it is just starting a process");
-		if (!t->stopped)
-			continue;
-		if (next >= target->pad.threads_max && t->tid != target->leader)
-			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
-				    "more threads than prepared for");
-		if (!arch_is_native(&t->regs))
-			return fail(err, AVC_UNSUPPORTED, 0, t->tid, "freeze", "",
-				    "it is a 32-bit program");
-		/* A thread that somebody who died sent into a pad finds its way out
-		 * in microseconds: such an image would be of the pad. */
-		if (pad_contains(&target->pad, arch_pc(&t->regs)))
-			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
-				    "a thread is in the pad");
-		if (in_old_pad(target, arch_pc(&t->regs)))
-			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
-				    "a thread is in an old pad");
-		t->block = t->tid == target->leader ? 0 : (int)next++;
-		if (thread_read(t, err))
-			return -1;
-		if (arch_frame_read_xstate(t->tid,
-					   pad_frame(&target->pad, slot, (uint32_t)t->block)))
-			return fail_errno(err, t->tid, "freeze", "ptrace(GETREGSET)",
-					  "its state can not be read");
-		if ((!t->known || t->known_tls != arch_tls(&t->regs)) && ask(target, t, err))
-			return -1;
-	}
-	target->blocks = next;
-	return 0;
-}
-
-static bool anybody_uses(const struct target *target, avc_remote base, size_t bytes)
-{
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		const struct thread *t = &target->threads[i];
-
-		for (unsigned int n = 0; n < 6; n++)
-			if (arch_syscall_arg(&t->regs, n) - base < bytes)
-				return true;
-		/* What we took for the app's own timeout (rewind.c). */
-		if (t->rewound.argument >= 0 && t->rewound.original - base < bytes)
-			return true;
-	}
-	return false;
-}
-
-/* The tables do not change while the kernel clones: nobody runs. */
-static void capture_files(struct target *target, struct generation *generation)
-{
-	struct scratch scratch = { -1, -1, 0 };
-
-	files_capture(target, generation, generation->branches > 0, NULL, 0, &scratch,
-		      &generation->files_error);
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
-		const struct branch *parent = branch->parent >= 0
-						      ? &generation->branch[branch->parent]
-						      : NULL;
-
-		if (branch->target)
-			files_capture(branch->target, branch->image, true,
-				      parent ? parent->image->files : generation->files,
-				      parent ? parent->target->pid : target->pid, &scratch,
-				      &branch->image->files_error);
-	}
-	scratch_close(&scratch);
-}
-
-/* ECHILD, if it has none: the one question that needs no look at each thread. */
-static const struct inj_syscall *ask_for_children(struct inj_call *call)
-{
-	return call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);
-}
-
-/* Nobody has looked below one that had none at the last checkpoint. */
-static int hear_of_children(struct target *target, struct avc_error *err)
-{
-	const bool was_childless = target->childless;
-
-	target->childless = target->children->result == -ECHILD;
-	return was_childless && !target->childless
-		       ? fail(err, AVC_DEADLINE, EAGAIN, target->pid, "freeze", "",
-			      "it has just started another process")
-		       : 0;
-}
-
-/* Pads of guards that died, and of the process that forked this one. */
-static void drop_old_pads(struct target *target, long *vm_pages, struct inj_call *call)
-{
-	if (!target->checkpoints)
-		return;
-	for (; target->old_pads && call->count < INJ_CALLS_MAX - 2; target->old_pads--) {
-		const avc_remote base = target->old_pad[target->old_pads - 1].base;
-		const size_t bytes = target->old_pad[target->old_pads - 1].bytes;
-
-		if (anybody_uses(target, base, bytes))
-			return;
-		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-		*vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
-	}
-}
-
-static int start_app_clone(struct target *target, struct thread *main_thread, long *vm_pages,
-			   struct avc_error *err)
-{
-	struct inj_call *call = &target->pad.control->runner;
-
-	*vm_pages = proc_vm_pages(target->statm_fd, NULL);
-	call_begin(call, INJ_AFTER_HOME);
-	timers_ask(target, call);
-	memory_dofork(target->memory, call);
-	drop_old_pads(target, vm_pages, call);
-	target->children = ask_for_children(call);
-	/* The descriptor table is shared, not copied: what the app closes is closed. */
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	target->asked_ns = now_ns();
-	if (borrow(target, main_thread, err) || pad_start(main_thread->tid, err))
-		return -1;
-	target->cloning = true;
-	return 0;
-}
-
-static int await_app_clone(struct target *target, struct thread *main_thread,
-			   struct generation *generation, struct avc_error *err)
-{
-	struct inj_call *call = &target->pad.control->runner;
-
-	target->cloning = false;
-	if (pad_await_clone(main_thread->tid, call, &generation->template, err)) {
-		target->lost = err->code != AVC_KERNEL;
-		thread_runs_on(main_thread, err);
-		return -1;
-	}
-	/* After the timers were asked: one that has expired just now is found here. */
-	pending_read(target);
-	timers_answer(target, call, now_ns() - target->asked_ns);
-	return hear_of_children(target, err);
-}
-
-/* After its clone it has a few steps to go before it can be let go. */
-static int rest_app(struct thread *main_thread, struct avc_error *err)
-{
-	if (tracee_settle(main_thread->tid, err) == 0 && give_back(main_thread, err) == 0)
-		return 0;
-	main_thread->stopped = false;
-	return -1;
-}
-
-/* ---- the other processes ---------------------------------------------------------- */
-
-/* The holder shares the process' memory and descriptors; its clone is the template. */
-static int start_clone(struct target *target, struct avc_error *err)
-{
-	struct inj_call *call = &target->pad.control->holder;
-
-	/* Before the holder runs, which maps something for a moment. */
-	target->clone_pages = proc_vm_pages(target->statm_fd, NULL);
-	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
-	memory_dofork(target->memory, call);
-	drop_old_pads(target, &target->clone_pages, call);
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	if (pad_send(&target->pad, target->holder, &target->holder_base, call, err) ||
-	    pad_start(target->holder, err))
-		return -1;
-	target->cloning = true;
-	target->lost = true; /* until we have heard of the clone */
-	return 0;
-}
-
-static int await_clone(struct target *target, pid_t *template, struct avc_error *err)
-{
-	const struct inj_call *call = &target->pad.control->holder;
-	struct thread *thread = thread_find(target, target->pid);
-
-	target->cloning = false;
-	if (pad_await_clone(target->holder, call, template, err))
-		return -1;
-	target->lost = false;
-	if (thread && call->call[0].result > 0)
-		thread->creds.future_lock = (int32_t)call->call[0].result;
-	return 0;
-}
-
-/* Timers only the process itself can tell of.  And young processes change what they are
- * all the time: a name, a user.  All are asked at the same time. */
-static int ask_begin(struct target *target, struct avc_error *err)
-{
-	struct inj_call *call = &target->pad.control->runner;
-	struct thread *thread = thread_find(target, target->pid);
-
-	call_begin(call, INJ_AFTER_HOME);
-	timers_ask(target, call);
-	target->children = ask_for_children(call);
-	ask_add(target, false, call, &target->questions);
-	target->asked_ns = now_ns();
-	if (borrow(target, thread, err) || pad_start(thread->tid, err))
-		return -1;
-	target->asked = true;
-	return 0;
-}
-
-/* All are interrupted before the first is waited for: it takes each some time to get there. */
-static int ask_halt(struct target *target, struct avc_error *err)
-{
-	struct thread *thread = thread_find(target, target->pid);
-
-	if (pad_halt(thread->tid, &target->pad.control->runner, err) == 0)
-		return 0;
-	target->asked = false;
-	thread_runs_on(thread, err);
-	return -1;
-}
-
-static int ask_end(struct target *target, struct avc_error *err)
-{
-	struct inj_call *call = &target->pad.control->runner;
-	struct thread *thread = thread_find(target, target->pid);
-
-	target->asked = false;
-	if (tracee_await(thread->tid, NULL, err) != STOP_TRAP) {
-		thread_runs_on(thread, err);
-		return -1;
-	}
-	pending_read(target);
-	timers_answer(target, call, now_ns() - target->asked_ns);
-	return give_back(thread, err) || ask_answer(thread, call, &target->questions, err) ||
-			       hear_of_children(target, err)
-		       ? -1
-		       : 0;
-}
-
-/* Also of those that were asked before one failed. */
-static int hear_all(struct tree *tree, struct avc_error *err)
-{
-	int (*const step[])(struct target *, struct avc_error *) = { ask_halt, ask_end };
-	int result = 0;
-
-	for (size_t k = 0; k < sizeof step / sizeof *step; k++)
-		for (uint32_t i = 0; i < tree->members; i++) {
-			struct avc_error failed = { 0 };
-
-			if (tree->member[i]->asked && step[k](tree->member[i], &failed) &&
-			    !result) {
-				*err = failed;
-				result = -1;
-			}
-		}
-	return result;
-}
-
-/* It stands still: its clone begins, if it has a holder for that, and it answers meanwhile what
- * it is asked, which changes nothing of its memory. */
-static int begin(struct target *target, uint32_t slot, struct avc_error *err)
-{
-	struct thread *thread = thread_find(target, target->pid);
-
-	if (!thread || !thread->stopped)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			    "its main thread has ended");
-	target->begun = true;
-	return read_all(target, slot, err) || vet(target, thread, err) ||
-			       (target->holder && start_clone(target, err)) ||
-			       ask_begin(target, err)
-		       ? -1
-		       : 0;
-}
-
-static int begin_app(struct target *target, struct generation *generation, struct avc_error *err)
-{
-	struct thread *thread = thread_find(target, target->pid);
-
-	if (!thread || !thread->stopped)
-		return fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
-			    "its main thread has just ended");
-	target->begun = true;
-	if (read_all(target, generation->slot, err))
-		return -1;
-	generation->threads = target->blocks;
-	return start_app_clone(target, thread, &generation->vm_pages, err);
-}
-
-/* What it has just brought forth was taken for a thread of its own; a look tells. */
-static bool has_strangers(const struct target *target)
-{
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].attached && !target->threads[i].seen)
-			return true;
-	return false;
-}
-
-/* As soon as everybody stands still who is known to be there: whoever is found after that is
- * stopped, too, and has had nothing to do with the memory of the others.  (One that shares it
- * is not protected: find_branches().)  One that has no holder yet waits for the others. */
-static int begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
-{
-	if (!has_strangers(tree->main) && begin_app(tree->main, generation, err))
-		return -1;
-	for (uint32_t i = 1; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
-
-		if (target && target->frozen && target->holder && target->pid == target->leader &&
-		    !has_strangers(target) && begin(target, generation->slot, err))
-			return -1;
-	}
-	return 0;
-}
-
-static int begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
-{
-	if (!tree->main->begun && begin_app(tree->main, generation, err))
-		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct target *target = generation->branch[i].target;
-
-		if (target && !target->begun && begin(target, generation->slot, err))
-			return -1;
-	}
-	return 0;
-}
-
-/* Of a process that was killed meanwhile, and all of them when the checkpoint failed. */
-static void drop_clones(struct tree *tree)
-{
-	for (uint32_t i = 0; i < tree->members; i++) {
-		struct target *target = tree->member[i];
-		struct avc_error ignored = { 0 };
-		pid_t template;
-
-		if (!target->cloning || await_clone(target, &template, &ignored))
-			continue;
-		tracee_kill(template);
-		target->lost = tracee_settle(target->holder, &ignored) != 0;
-	}
-}
-
-#define LOOKS 64
-#define LOOK_US 100
-
-/* Those that have something of ours; another child may have to execute a program before its
- * parent can be stopped (vfork(2)). */
-static int stop_known(struct tree *tree, struct avc_error *err)
-{
-	stop_begin(tree->main);
-	for (uint32_t i = 0; i < tree->members; i++)
-		stop_begin(tree->member[i]);
-	/* So that they stop at the same time, and not one after the other. */
-	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->kin[i].target && tree->kin[i].target->infected)
-			interrupt_known(tree->kin[i].target);
-	if (stop_all(tree->main, err))
-		return -1;
-	for (uint32_t i = 1; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
-		struct avc_error failed = { 0 };
-
-		if (!target || !target->infected)
-			continue;
-		target->frozen = stop_all(target, &failed) == 0;
-		if (!target->frozen && failed.code != AVC_GONE) {
-			*err = failed;
-			return -1;
-		}
-	}
-	return 0;
-}
-
-/* Until a look at the whole tree finds nobody who is not stopped: processes create
- * processes while we look. */
-static int stop_others(struct tree *tree, struct avc_error *err)
-{
-	/* It had no other one at the last checkpoint; whether that is still so, the clone
-	 * will tell. */
-	if (tree->count <= 1 && tree->main->childless)
-		return 0;
-	for (int looks = 0; looks < LOOKS; looks++) {
-		bool all = true;
-
-		if (tree_look(tree, err))
-			return -1;
-		for (uint32_t i = 1; i < tree->count; i++) {
-			struct target *t = tree->kin[i].target;
-			struct avc_error failed = { 0 };
-
-			if (tree->kin[i].ending) {
-				all = false;
-				usleep(LOOK_US);
-			}
-			if (!t || t->frozen)
-				continue;
-			all = false;
-			if (stop_all(t, &failed) == 0) {
-				t->frozen = true;
-			} else if (failed.code != AVC_GONE) {
-				*err = failed;
-				return -1;
-			} else {
-				usleep(LOOK_US); /* until it is a zombie, or nothing */
-			}
-		}
-		if (all)
-			return 0;
-	}
-	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",
-		    "its processes come and go too fast");
-}
+/* ---- who there is ------------------------------------------------------------------------- */
 
 /* One that was found while everything was stopped has nothing of ours yet. */
 static int prepare_stopped(struct tree *tree, struct target *target, struct avc_error *err)
@@ -633,21 +107,6 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
-static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen,
-		       struct avc_error *err)
-{
-	struct target *target = branch->target;
-
-	if (strict)
-		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
-	if (memory_prepare(target->memory, &branch->image->image, seen, err))
-		return -1;
-	branch->image->threads = target->blocks;
-	memory_copy(target, branch->image->image);
-	files_mapped_copy(branch->image->mapped);
-	return 0;
-}
-
 static int find_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	if (tree->count <= 1)
@@ -667,6 +126,23 @@ static int find_branches(struct tree *tree, struct generation *generation, struc
 	return 0;
 }
 
+/* ---- what is read of them all ------------------------------------------------------------- */
+
+static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen,
+		       struct avc_error *err)
+{
+	struct target *target = branch->target;
+
+	if (strict)
+		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+	if (memory_prepare(target->memory, &branch->image->image, seen, err))
+		return -1;
+	branch->image->threads = target->blocks;
+	memory_copy(target, branch->image->image);
+	files_mapped_copy(branch->image->mapped);
+	return 0;
+}
+
 static int keep_branches(struct generation *generation, struct mem_seen *seen,
 			 struct avc_error *err)
 {
@@ -676,6 +152,46 @@ static int keep_branches(struct generation *generation, struct mem_seen *seen,
 			return -1;
 	return 0;
 }
+
+/* The tables do not change while the kernel clones: nobody runs. */
+static void capture_files(struct target *target, struct generation *generation)
+{
+	struct scratch scratch = { -1, -1, 0 };
+
+	files_capture(target, generation, generation->branches > 0, NULL, 0, &scratch,
+		      &generation->files_error);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+		const struct branch *parent = branch->parent >= 0
+						      ? &generation->branch[branch->parent]
+						      : NULL;
+
+		if (branch->target)
+			files_capture(branch->target, branch->image, true,
+				      parent ? parent->image->files : generation->files,
+				      parent ? parent->target->pid : target->pid, &scratch,
+				      &branch->image->files_error);
+	}
+	scratch_close(&scratch);
+}
+
+/* Whoever is killed has no descriptors any more, which looks like a table with nothing in it.
+ * Of those that are still at what they were asked it will be seen then. */
+static int see_alive(const struct tree *tree, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->count; i++) {
+		const struct target *target = tree->kin[i].target;
+		struct arch_regs ignored;
+
+		if (target && !target->asked && !(i == 0 && target->cloning) &&
+		    arch_regs_get(target->pid, &ignored))
+			return fail_errno(err, target->pid, "freeze", "ptrace(GETREGS)",
+					  "it has ended");
+	}
+	return 0;
+}
+
+/* ---- clones ------------------------------------------------------------------------------- */
 
 static bool has_all_holders(const struct tree *tree)
 {
@@ -753,37 +269,7 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 	return 0;
 }
 
-/* ---- all of it ----------------------------------------------------------------------- */
-
-static void let_go(const struct target *target, struct thread *thread)
-{
-	if (thread->attached && thread->stopped)
-		rewind_count_stop(target, thread);
-	thread_release(thread);
-}
-
-void let_go_process(struct target *target, const struct thread *but)
-{
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (&target->threads[i] != but)
-			let_go(target, &target->threads[i]);
-}
-
-/* Whoever is killed has no descriptors any more, which looks like a table with nothing in it.
- * Of those that are still at what they were asked it will be seen then. */
-static int see_alive(const struct tree *tree, struct avc_error *err)
-{
-	for (uint32_t i = 0; i < tree->count; i++) {
-		const struct target *target = tree->kin[i].target;
-		struct arch_regs ignored;
-
-		if (target && !target->asked && !(i == 0 && target->cloning) &&
-		    arch_regs_get(target->pid, &ignored))
-			return fail_errno(err, target->pid, "freeze", "ptrace(GETREGS)",
-					  "it has ended");
-	}
-	return 0;
-}
+/* ---- all of it ------------------------------------------------------------------------------ */
 
 int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
 	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err)
@@ -842,8 +328,8 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	if (main_thread) {
 		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
 		if (cloned && main_thread->borrowed)
-			(void)rest_app(main_thread, err);
-		let_go(target, main_thread);
+			(void)rest_app(main_thread, &failed); /* or it is killed just now */
+		let_go_thread(target, main_thread);
 	}
 	let_go_process(target, main_thread);
 	for (uint32_t i = 0; i < tree->members; i++)

@@ -195,6 +195,7 @@ static int finish(struct target *target, struct generation *generation, struct b
 				  "it was killed");
 	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
 	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
+	target->anon_pages = generation->anon_pages;
 	close_fd(&statm_fd);
 	if (quieten(target, generation, branch || generation->stat.session == target->leader, err))
 		return -1;

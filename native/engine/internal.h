@@ -5,7 +5,7 @@
  *
  *   guard.c      the thread: waits, obeys, tells; guard_*.c: see guard.h
  *   link.c       to avckpt-init: control page, reports, verdicts
- *   freeze.c     one checkpoint: stop everything, read it, clone it, let go
+ *   freeze.c     one checkpoint: stop everything, read it, clone it, let go; see freeze.h
  *   restore.c    templates become the app again
  *   descend.c    a restored process makes its children
  *   remap.c      ... and their memory
@@ -319,6 +319,7 @@ struct target {
 	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
 	bool cloning;                    /* by its holder: freeze()                          */
 	long clone_pages;                /* its size when that began                         */
+	long anon_pages;                 /* of its last template; 0: none yet                */
 	bool closing;                    /* by its holder: generation_close_tables()      */
 	bool doubtful;                   /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                    /* its main thread is to wait for a task of ours       */

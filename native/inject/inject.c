@@ -78,14 +78,16 @@ static long find_future_lock(void)
 	const long at = raw_syscall(__NR_mmap, 0, 4096, PROT_READ | PROT_WRITE,
 				    MAP_PRIVATE | MAP_ANONYMOUS, (uint64_t)-1, 0);
 	uint8_t present = 0;
-	long dropped;
+	long flags = 0;
 
 	if (at < 0 && at > -4096)
 		return at;
-	SYS3(__NR_mincore, at, 4096, &present);
-	dropped = SYS3(__NR_madvise, at, 4096, MADV_DONTNEED);
+	if (SYS3(__NR_madvise, at, 4096, MADV_DONTNEED)) {
+		SYS3(__NR_mincore, at, 4096, &present);
+		flags = MCL_FUTURE | (present & 1 ? 0 : MCL_ONFAULT);
+	}
 	SYS2(__NR_munmap, at, 4096);
-	return dropped == 0 ? 0 : MCL_FUTURE | (present & 1 ? 0 : MCL_ONFAULT);
+	return flags;
 }
 
 /* Nobody interrupts it meanwhile: see park(). */
