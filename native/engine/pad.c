@@ -6,6 +6,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/futex.h>
+#include <linux/kcmp.h>
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
@@ -328,17 +329,25 @@ int pad_check(struct target *target, pid_t tid, struct avc_error *err)
 	return 0;
 }
 
+/* A holder has the memory of the program that it was made in. */
+static bool has_memory_of_holder(const struct target *target)
+{
+	return target->holder && syscall(SYS_kcmp, target->pid, target->holder, KCMP_VM, 0, 0) == 0;
+}
+
 int vet(struct target *target, struct thread *thread, struct avc_error *err)
 {
-	if (pad_check(target, thread->tid, err))
+	if (!has_memory_of_holder(target) && pad_check(target, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a pad that will be taken away. */
 	if (in_old_pad(target, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
 			    "still on its way home from a guard that died");
 	/* The kernel forgets a restartable sequence as soon as the thread is
-	 * seen elsewhere: it has to go on where the kernel would send it. */
-	rseq_fixup(target->mem_fd, thread);
+	 * seen elsewhere: it has to go on where the kernel would send it.  There
+	 * are no system calls in one. */
+	if (thread->call.nr < 0)
+		rseq_fixup(target->mem_fd, thread);
 	thread->vetted = true;
 	return 0;
 }
