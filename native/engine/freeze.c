@@ -138,7 +138,9 @@ static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen
 	if (memory_prepare(target->memory, &branch->image->image, seen, err))
 		return -1;
 	branch->image->threads = target->blocks;
-	memory_copy(target, branch->image->image);
+	/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */
+	memory_copy_own(target, branch->image->image);
+	memory_copy_shared(target, branch->image->image);
 	files_mapped_copy(branch->image->mapped);
 	return 0;
 }
@@ -296,7 +298,7 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	 * time. */
 	tracee_deadline_set(timer, CLONE_NS);
 	if (!result) {
-		memory_copy(target, generation->image);
+		memory_copy_shared(target, generation->image);
 		files_mapped_copy(generation->mapped);
 		result = keep_place_of_main(tree, generation, err) ||
 					 find_branches(tree, generation, err) ||

@@ -171,6 +171,7 @@ static int begin_app(struct target *target, struct generation *generation, struc
 	if (read_all(target, generation->slot, err))
 		return -1;
 	generation->threads = target->blocks;
+	memory_copy_own(target, generation->image);
 	return start_app_clone(target, thread, &generation->vm_pages, err);
 }
 

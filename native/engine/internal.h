@@ -658,8 +658,10 @@ void memory_free(struct memory *memory);
 int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
 void mem_image_free(struct mem_image *image);
-/* While everything is stopped: copies; and what to call before the clone. */
-void memory_copy(const struct target *target, struct mem_image *image);
+/* While everything is stopped: copies, what is its own when it stands still, what is shared
+ * when everybody does; and what to call before the clone. */
+void memory_copy_own(const struct target *target, struct mem_image *image);
+void memory_copy_shared(const struct target *target, struct mem_image *image);
 void memory_dofork(const struct memory *memory, struct inj_call *call);
 /* The template is smaller than the app: always fails, with EAGAIN if the next
  * attempt will be better. */

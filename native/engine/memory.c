@@ -206,21 +206,35 @@ int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_s
 	return 0;
 }
 
-void memory_copy(const struct target *target, struct mem_image *image)
+static void copy_areas(const struct target *target, struct mem_image *image, bool wiped)
 {
-	uint8_t *to = image ? image->data : NULL;
+	uint8_t *next = image ? image->data : NULL;
 
 	for (uint32_t i = 0; image && i < image->areas.count; i++) {
 		struct area *a = &image->areas.area[i];
-		const ssize_t n =
-			a->again   ? 0
-			: a->wiped ? read_whole(target->mem_fd, to, area_bytes(a), (off_t)a->start)
-				   : read_whole(a->fd, to, area_bytes(a), (off_t)a->offset);
+		uint8_t *to = next;
+		ssize_t n = 0;
 
+		next += area_room(a);
+		if (a->wiped != wiped)
+			continue;
+		if (wiped)
+			n = read_whole(target->mem_fd, to, area_bytes(a), (off_t)a->start);
+		else if (!a->again)
+			n = read_whole(a->fd, to, area_bytes(a), (off_t)a->offset);
 		a->kept = n > 0 ? (size_t)n : 0;
-		image->whole = image->whole && n >= 0 && (!a->wiped || a->kept == area_bytes(a));
-		to += area_room(a);
+		image->whole = image->whole && n >= 0 && (!wiped || a->kept == area_bytes(a));
 	}
+}
+
+void memory_copy_own(const struct target *target, struct mem_image *image)
+{
+	copy_areas(target, image, true);
+}
+
+void memory_copy_shared(const struct target *target, struct mem_image *image)
+{
+	copy_areas(target, image, false);
 }
 
 /* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
