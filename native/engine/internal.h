@@ -327,6 +327,7 @@ struct target {
 	bool frozen;                     /* stopped in this freeze                            */
 	bool begun;                      /* and read, and asked                               */
 	bool adopts;                     /* it or one above it adopts orphans                 */
+	bool reaper;                     /* it has been seen to adopt orphans                 */
 	bool paused;                     /* between adopt_no_more() and adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */

@@ -242,12 +242,15 @@ int tree_look(struct tree *tree, struct avc_error *err)
 	return 0;
 }
 
-static bool is_reaper(const struct target *target)
+/* Also one that was one before: what it has answered last may not be so any more, and a holder
+ * would be its child.  In a freeze all are asked again, and then it is certain. */
+static bool is_reaper(struct target *target)
 {
-	const struct thread *thread = target ? thread_find((struct target *)target, target->pid)
-					     : NULL;
+	const struct thread *thread = target ? thread_find(target, target->pid) : NULL;
 
-	return thread && thread->creds.subreaper;
+	if (thread)
+		target->reaper |= thread->creds.subreaper;
+	return target && target->reaper;
 }
 
 bool tree_has_reaper(const struct tree *tree, uint32_t i)
