@@ -585,15 +585,20 @@ static void keep_content(const struct look *look, struct file *f)
 		file_keep_content(f->ours, f, look->files->scratch);
 }
 
+static void drop_ours(struct file *f)
+{
+	if (f->ours > 0)
+		close(f->ours);
+	f->ours = 0;
+}
+
 static void keep_contents(const struct look *look)
 {
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
 
 		keep_content(look, f);
-		if (f->ours > 0)
-			close_fd(&f->ours);
-		f->ours = 0;
+		drop_ours(f);
 	}
 }
 
@@ -655,8 +660,7 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	close(look.fd_dir);
 	if (result) {
 		for (uint32_t i = 0; i < files->count; i++)
-			if (files->file[i].ours > 0)
-				close(files->file[i].ours);
+			drop_ours(&files->file[i]);
 		return -1;
 	}
 	qsort(files->file, files->count, sizeof *files->file, by_fd);

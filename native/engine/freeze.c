@@ -333,9 +333,9 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 			(void)rest_app(main_thread, &failed); /* or it is killed just now */
 		let_go_thread(target, main_thread);
 	}
-	let_go_process(target, main_thread);
+	let_go_process(target);
 	for (uint32_t i = 0; i < tree->members; i++)
-		let_go_process(tree->member[i], NULL);
+		let_go_process(tree->member[i]);
 	times->freeze_ns = now_ns() - start;
 	tracee_deadline_clear(timer);
 	urgent_end();

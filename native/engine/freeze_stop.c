@@ -119,11 +119,10 @@ void let_go_thread(const struct target *target, struct thread *thread)
 	thread_release(thread);
 }
 
-void let_go_process(struct target *target, const struct thread *but)
+void let_go_process(struct target *target)
 {
 	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (&target->threads[i] != but)
-			let_go_thread(target, &target->threads[i]);
+		let_go_thread(target, &target->threads[i]);
 }
 
 /* ---- all of them ------------------------------------------------------------------------ */

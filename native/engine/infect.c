@@ -404,7 +404,7 @@ static int hold_descendant(struct target *target, timer_t timer, uint64_t deadli
 		result = fail(err, AVC_GONE, 0, target->pid, "make holder", "", "it has ended");
 	if (!result)
 		result = thread_read(thread, err) || hold_stopped(target, target->init, err);
-	let_go_process(target, NULL);
+	let_go_process(target);
 	tracee_deadline_clear(timer);
 	urgent_end();
 	return result;

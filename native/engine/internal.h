@@ -105,6 +105,8 @@ int proc_children(pid_t pid, pid_t *children, int max);
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
 int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
+/* Whether two tasks have the same memory (kcmp(2)). */
+bool proc_same_memory(pid_t a, pid_t b);
 /* How many threads there are, by an open /proc/PID/task; 0: the process is gone. */
 int proc_thread_count(int task_dirfd);
 /* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be
@@ -317,7 +319,7 @@ struct target {
 	uint64_t start;                  /* when it began; tells it from one with its number */
 	uint32_t images;                 /* generations that have one of it                  */
 	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
-	bool cloning;                    /* by its holder: freeze()                          */
+	bool cloning;                    /* by its holder, the main one by itself: freeze()  */
 	long clone_pages;                /* its size when that began                         */
 	long anon_pages;                 /* of its last template; 0: none yet                */
 	bool closing;                    /* by its holder: generation_close_tables()      */
@@ -842,9 +844,9 @@ struct freeze_times {
 	uint64_t freeze_ns, stop_ns, clone_ns;
 };
 
-/* Every thread of one process is stopped; all go on, but one (NULL: none). */
+/* Every thread of one process is stopped; all go on. */
 int stop_process(struct target *target, struct avc_error *err) warn_unused;
-void let_go_process(struct target *target, const struct thread *but);
+void let_go_process(struct target *target);
 /* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
  * shared memory that is prepared for already.
  * On return the app runs, whatever happened. */

@@ -6,7 +6,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/futex.h>
-#include <linux/kcmp.h>
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
@@ -332,7 +331,7 @@ int pad_check(struct target *target, pid_t tid, struct avc_error *err)
 /* A holder has the memory of the program that it was made in. */
 static bool has_memory_of_holder(const struct target *target)
 {
-	return target->holder && syscall(SYS_kcmp, target->pid, target->holder, KCMP_VM, 0, 0) == 0;
+	return target->holder && proc_same_memory(target->pid, target->holder);
 }
 
 int vet(struct target *target, struct thread *thread, struct avc_error *err)

@@ -5,6 +5,7 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/kcmp.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -372,6 +373,11 @@ int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg)
 				return -1;
 		}
 	}
+}
+
+bool proc_same_memory(pid_t a, pid_t b)
+{
+	return syscall(SYS_kcmp, a, b, KCMP_VM, 0, 0) == 0;
 }
 
 /* A directory has a link for itself and one for each directory in it (fs/proc/base.c,

@@ -6,11 +6,9 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
-#include <linux/kcmp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/syscall.h>
 #include <unistd.h>
 
 #include "internal.h"
@@ -266,7 +264,7 @@ bool tree_shares_memory(const struct tree *tree, uint32_t i)
 	const int parent = tree->kin[i].parent;
 
 	return parent >= 0 && tree->kin[parent].target &&
-	       syscall(SYS_kcmp, tree->kin[i].pid, tree->kin[parent].pid, KCMP_VM, 0, 0) == 0;
+	       proc_same_memory(tree->kin[i].pid, tree->kin[parent].pid);
 }
 
 /* ---- the end of one --------------------------------------------------------------- */
