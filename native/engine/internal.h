@@ -328,8 +328,7 @@ struct target {
 	const struct creds *forebear;    /* what a process that is made from the main one has */
 	bool frozen;                     /* stopped in this freeze                            */
 	bool begun;                      /* and read, and asked                               */
-	bool adopts;                     /* it or one above it adopts orphans                 */
-	bool reaper;                     /* it has been seen to adopt orphans                 */
+	bool adopts;                     /* it or one above it adopts orphans, or may do so    */
 	bool paused;                     /* between adopt_no_more() and adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */
@@ -702,7 +701,7 @@ void unhold_soon(struct target *target);
 
 /* Looks who there is; new ones are opened. */
 int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
-/* Whether kin[i] or a process above it adopts orphans, as far as is known. */
+/* Whether kin[i] or a process above it adopts orphans, or could not be asked whether it does. */
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether kin[i] has its parent's memory, and not its own: after vfork(2) until it has
  * executed a program. */

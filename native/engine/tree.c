@@ -240,21 +240,19 @@ int tree_look(struct tree *tree, struct avc_error *err)
 	return 0;
 }
 
-/* Also one that was one before: what it has answered last may not be so any more, and a holder
- * would be its child.  In a freeze all are asked again, and then it is certain. */
-static bool is_reaper(struct target *target)
+/* Who could not be asked is just ending, and nobody knows of it yet: what is found here also
+ * holds for the one that is restored in its place (guard_death.c, hold_all()). */
+static bool may_be_reaper(struct target *target)
 {
 	const struct thread *thread = target ? thread_find(target, target->pid) : NULL;
 
-	if (thread)
-		target->reaper |= thread->creds.subreaper;
-	return target && target->reaper;
+	return !thread || !thread->known || thread->creds.subreaper;
 }
 
 bool tree_has_reaper(const struct tree *tree, uint32_t i)
 {
 	for (int k = (int)i; k >= 0; k = tree->kin[k].parent)
-		if (is_reaper(tree->kin[k].target))
+		if (may_be_reaper(tree->kin[k].target))
 			return true;
 	return false;
 }
