@@ -42,6 +42,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from avckpt import native  # noqa: E402
 from avckpt.errors import AvckptError  # noqa: E402
 from avckpt.events import Event, EventKind, GuardConfig  # noqa: E402
+from avckpt.pressure import templates_of  # noqa: E402
 from harness import free_port  # noqa: E402 - tests, whose folder is no package
 from native.board import Board, Seen  # noqa: E402
 
@@ -258,11 +259,10 @@ def hold(way: Way, folder: Path, before: Sequence[str] = ()) -> Held:
         until = time.monotonic() + 3 * way.interval_s
         while time.monotonic() < until:
             server.wait(way.interval_s / 10)
-            templates = server.templates()
-            if len(templates) != way.keep:
+            if len(server.templates()) != way.keep:
                 continue
             with contextlib.suppress(OSError):
-                held = [memory_kb(pid) for pid in templates]
+                held = [memory_kb(pid) for pid in templates_of(server.init_pid)]
                 app = memory_kb(_app(server))
                 pages = sum(each["pss"] for each in held) + app["pss"] - app["rss"]
                 if pages / 1024 > highest:

@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 sys.path.insert(0, str(ROOT / "tests"))
 
+from avckpt.pressure import held_bytes, templates_of  # noqa: E402
 from harness import (  # noqa: E402 - tests, whose folder is no package
     SIDECAR_NAME,
     CommandFailed,
@@ -112,14 +113,13 @@ def memory_kb(pid: int) -> dict[str, int]:
     }
 
 
-def templates(init_pid: int) -> list[int]:
-    """The templates among the children of an avckpt-init."""
-    found = []
+def app_of(init_pid: int) -> int:
+    """The program below an avckpt-init."""
     for pid in descendants(init_pid)[1:]:
         with contextlib.suppress(OSError):
-            if Path(f"/proc/{pid}/comm").read_text().strip() == "avckpt-tmpl":
-                found.append(pid)
-    return found
+            if Path(f"/proc/{pid}/comm").read_text().strip() == PROGRAM[0]:
+                return pid
+    raise BenchFailed("the program is not there any more")
 
 
 @contextlib.contextmanager
@@ -128,7 +128,7 @@ def avckpt_run() -> Iterator[int]:
     command = [*avckpt_command(), "run", "--label", f"avckpt.interval={INTERVAL}", "--"]
     process = subprocess.Popen([*command, str(VICTIMS / "build" / PROGRAM[0]), *PROGRAM[1:]], stdout=subprocess.DEVNULL)
     try:
-        eventually(lambda: len(templates(process.pid)) > 0 or process.poll() is not None, "avckpt run protects")
+        eventually(lambda: len(templates_of(process.pid)) > 0 or process.poll() is not None, "avckpt run protects")
         if process.poll() is not None:
             raise BenchFailed(f"avckpt run ended with {process.returncode}")
         yield process.pid
@@ -148,8 +148,9 @@ class Idle:
     container_plain_percent: float
     run_percent: float
     run_program_percent: float
-    template_private_mb: float
-    template_page_tables_mb: float
+    templates: int
+    templates_mb: float
+    page_tables_mb: float
     sidecar_rss_mb: float
 
     @property
@@ -193,8 +194,8 @@ def measure(seconds: float) -> Idle:
             for meter in meters.values():
                 meter.look()
         took_s = time.monotonic() - started
-        held = [memory_kb(pid) for pid in templates(init)]
-        if not held:
+        templates = templates_of(init)
+        if not templates:
             raise BenchFailed("the container has no template any more")
         percent = {name: meter.total_ns / 1e9 / took_s * 100 for name, meter in meters.items()}
         return Idle(
@@ -204,8 +205,9 @@ def measure(seconds: float) -> Idle:
             container_plain_percent=round(percent["plain"], 3),
             run_percent=round(percent["run"], 3),
             run_program_percent=round(percent["program"], 3),
-            template_private_mb=round(max(m["private"] for m in held) / 1024, 2),
-            template_page_tables_mb=round(max(m["page_tables"] for m in held) / 1024, 2),
+            templates=len(templates),
+            templates_mb=round(held_bytes(app_of(init), templates) / 2**20, 2),
+            page_tables_mb=round(sum(memory_kb(pid)["page_tables"] for pid in templates) / 1024, 2),
             sidecar_rss_mb=round(sum(memory_kb(pid)["rss"] for pid in descendants(sidecar_pid)) / 1024, 1),
         )
 
@@ -223,8 +225,8 @@ def show(idle: Idle) -> None:
         table.add_row(name, f"{ours:.3f}", f"{program:.3f}", f"{added:.3f}", verdict)
     console.print(table)
     console.print(
-        f"a template of {MEGABYTES} MB that was not written to since: {idle.template_private_mb} MB of its own, "
-        f"{idle.template_page_tables_mb} MB page tables; the sidecar's RSS: {idle.sidecar_rss_mb} MB"
+        f"{idle.templates} templates of {MEGABYTES} MB that was not written to since: {idle.templates_mb} MB of "
+        f"their own, {idle.page_tables_mb} MB page tables; the sidecar's RSS: {idle.sidecar_rss_mb} MB"
     )
 
 

@@ -31,6 +31,7 @@ from avckpt.artifacts import init_binary  # noqa: E402
 from avckpt.client import Client as Api  # noqa: E402
 from avckpt.errors import AvckptError  # noqa: E402
 from avckpt.events import Command  # noqa: E402
+from avckpt.pressure import held_bytes, templates_of  # noqa: E402
 from harness import (  # noqa: E402 - tests, whose folder is no package
     RUN_DIR,
     CommandFailed,
@@ -45,7 +46,7 @@ from native.board import Board  # noqa: E402
 
 from bench.idle import memory_kb  # noqa: E402
 from bench.peers_world import BOARDS_INSIDE, IMAGE, PROGRAMS_INSIDE, World  # noqa: E402
-from bench.subjects import BenchFailed, Guarded, Idle, children, eventually  # noqa: E402
+from bench.subjects import BenchFailed, Guarded, Idle, eventually  # noqa: E402
 from bench.workload import PROGRAMS, Client, find_server  # noqa: E402
 
 BEAT_US = 100
@@ -207,15 +208,14 @@ class Below(Idle):
             eventually(lambda: not Path(f"/proc/{self.init_pid}").exists(), "the server's namespace has ended")
 
 
-def templates_mb(init_pid: int) -> float:
-    """What the templates below avckpt-init hold: pages that they alone have, and page tables."""
-    held = 0
-    for child in children(init_pid):
+def templates_mb(init_pid: int, app_pid: int) -> float:
+    """What the templates below avckpt-init hold: pages that the app does not have, and page tables."""
+    templates = templates_of(init_pid)
+    tables_kb = 0
+    for template in templates:
         with contextlib.suppress(OSError):
-            if Path(f"/proc/{child}/comm").read_text().strip() == "avckpt-tmpl":
-                memory = memory_kb(child)
-                held += memory["private"] + memory["page_tables"]
-    return held / 1024
+            tables_kb += memory_kb(template)["page_tables"]
+    return held_bytes(app_pid, templates) / 2**20 + tables_kb / 1024
 
 
 class AvckptEngine(Subject):
@@ -241,7 +241,8 @@ class AvckptEngine(Subject):
                     raise
                 self.refused.append(str(error))
         took_ms = (time.monotonic() - started) * 1e3
-        return Taken(took_ms, event.freeze_s * 1e3, templates_mb(self._below.init_pid) / max(1, event.generations))
+        held = templates_mb(self._below.init_pid, self.app_pid())
+        return Taken(took_ms, event.freeze_s * 1e3, held / max(1, event.generations))
 
     def crash(self) -> Recovered:
         return Recovered(self._guarded.kill(self.app_pid()).restore_ms)
@@ -318,7 +319,7 @@ class AvckptPodman(InContainer):
         event = self._command()
         took_ms = (time.monotonic() - started) * 1e3
         entry = self._entry()
-        held = templates_mb(entry["init_pid"]) / max(1, entry["generations"])
+        held = templates_mb(entry["init_pid"], entry["app_pid"]) / max(1, entry["generations"])
         return Taken(took_ms, event["freeze_s"] * 1e3, held)
 
     def crash(self) -> Recovered:

@@ -30,7 +30,7 @@ class Census:
     def take(self) -> Row | None:
         """The figures of now; None: the application is not there, for it is being restored."""
         row: Row = {"at_s": round(time.monotonic(), 3)}
-        apps, templates, holders, zombies, tasks = [], [], 0, 0, 0
+        apps, templates, spares, holders, zombies, tasks = [], [], 0, 0, 0, 0
         with contextlib.suppress(OSError):
             for pid in below(self.init_pid):
                 name, state = name_and_state(pid)
@@ -39,6 +39,8 @@ class Census:
                     zombies += 1
                 elif name == "avckpt-tmpl":
                     templates.append(pid)
+                elif name == "avckpt-spare":
+                    spares += 1
                 elif name == "avckpt-hold":
                     holders += 1
                 else:
@@ -50,6 +52,7 @@ class Census:
             row["templates.processes"] = len(templates)
             for name in ("rss_kb", "private_kb", "page_tables_kb", "maps"):
                 row[f"templates.{name}"] = sum(of_process(pid)[name] for pid in templates)
+            row["spares.processes"] = spares
             row["holders.processes"] = holders
             row["container.zombies"] = zombies
             row["container.pids"] = tasks

@@ -270,28 +270,15 @@ static int join_group(struct member *member, const struct branch *branch, struct
 	return puppet_flush(puppet, err);
 }
 
-/* The main process, a fork of its template, is registered with rseq(2); those that are made
- * here register last of all. */
-static const struct inj_thread *registered(const struct family *family, int host)
-{
-	return host < 0 ? pad_thread(&family->main->pad, family->generation->slot, 0) : NULL;
-}
-
 static int become(struct family *family, uint32_t index, struct avc_error *err)
 {
 	struct branch *branch = &family->generation->branch[index];
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
-	const struct inj_thread *thread = registered(family,
-						     inherit_host(family->generation, index));
-	const struct remap *plan = inherit_plan(family->main, family->generation, index, err);
+	const struct remap *plan = inherit_plan(family->generation, index, err);
 
 	if (!plan || puppet_open_mail(puppet, err))
 		return -1;
-	/* An orphan comes from one in between that has none (kernel/rseq.c, CLONE_VM). */
-	if (thread && thread->rseq && branch->parent != PARENT_INIT)
-		puppet_call(puppet, SYS_rseq, thread->rseq, thread->rseq_bytes, 1 /* UNREGISTER */,
-			    thread->rseq_signature, 0, 0);
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
 	    remap(plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
 	    place(member, branch, err) || puppet_put_files(puppet, &family->table[index], err))
@@ -312,8 +299,8 @@ static void do_chores(void *arg)
 	if (chores->done)
 		return; /* the number was not the right one */
 	chores->done = true;
-	if (chores->child >= 0 && !inherit_plan(family->main, family->generation,
-						(uint32_t)chores->child, &chores->error))
+	if (chores->child >= 0 &&
+	    !inherit_plan(family->generation, (uint32_t)chores->child, &chores->error))
 		chores->result = -1;
 	else if (chores->last >= 0)
 		chores->result = become(family, (uint32_t)chores->last, &chores->error);

@@ -31,11 +31,13 @@ void oom_score_adj_set(pid_t pid, const char *value)
 	close(fd);
 }
 
-static int quieten(struct target *target, struct generation *generation, bool session_leader,
-		   struct avc_error *err)
+static int quieten(struct target *target, struct generation *generation,
+		   const struct branch *branch, struct avc_error *err)
 {
+	const struct thread *cloned = branch ? NULL : thread_find(target, target->pid);
 	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
 	struct inj_call *call = &slot->template_call;
+	const struct inj_syscall *rseq = NULL;
 	const pid_t pid = generation->template;
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
@@ -48,23 +50,30 @@ static int quieten(struct target *target, struct generation *generation, bool se
 	memcpy(call->out, "avckpt-tmpl", 12);
 	call_begin(call, INJ_AFTER_PARK);
 	/* Out of the app's session or process group, or the number stays taken. */
-	if (session_leader)
+	if (branch || generation->stat.session == target->leader)
 		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
 	else
 		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
 	call_add(call, SYS_prctl, PR_GET_NAME, pad_remote(&target->pad, call->out + TEMPLATE_NAME),
 		 0, 0, 0);
 	call_add(call, SYS_prctl, PR_SET_NAME, pad_remote(&target->pad, call->out), 0, 0, 0);
+	/* Or the kernel would write to its memory each time it runs, and to what is made of
+	 * that.  A holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
+	if (cloned && cloned->rseq)
+		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
+				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
 	if (pad_send(&target->pad, pid, &generation->base, call, err) || pad_run(pid, call, err))
 		return -1;
+	if (rseq && rseq->result)
+		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
+			    "refused");
 	oom_score_adj_set(pid, "1000");
 	return 0;
 }
 
 /* A main thread that has ended while others go on: it is there again until they are,
  * and ends again. */
-static void fill_ended(struct target *target, struct generation *generation,
-		       const struct thread *cloned, struct setup *setup)
+static void fill_ended(struct target *target, struct generation *generation)
 {
 	struct inj_thread *block = pad_thread(&target->pad, generation->slot, 0);
 
@@ -75,10 +84,6 @@ static void fill_ended(struct target *target, struct generation *generation,
 	};
 	if (proc_read(target->leader, "comm", block->name, sizeof block->name) > 0)
 		block->name[strcspn(block->name, "\n")] = 0;
-	/* fork(2) has given it that of the thread that was cloned, who wants it back. */
-	if (cloned->rseq)
-		setup_add(setup, INJ_BEFORE, "rseq", SYS_rseq, cloned->rseq, cloned->rseq_bytes,
-			  RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
 }
 
 /* Fills the slot in from what freeze() has read: one block per thread. */
@@ -157,7 +162,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 	}
 	close(mem_fd);
 	if (generation->headless)
-		fill_ended(target, generation, main_thread, &setup);
+		fill_ended(target, generation);
 	generation->sandboxed = status.seccomp == 1 ||
 				status.seccomp_filters > target->plain_filters;
 	if (memory_finish(target, generation, status.locked_kb, &setup, err))
@@ -175,7 +180,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 	 * put back. */
 	slot->group = generation->group > 0 ? generation->group : target->inside;
 	slot->session_leader = stat->session == target->leader;
-	slot->placed = slot->fresh = target->descendant;
+	slot->placed = target->descendant;
 	/* Of several processes: descend.c. */
 	slot->tty_fd = !branch && stat->tty && stat->tty_group == stat->group
 			       ? files_find_device(generation->files, stat->tty)
@@ -197,7 +202,7 @@ static int finish(struct target *target, struct generation *generation, struct b
 	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
 	target->anon_pages = generation->anon_pages;
 	close_fd(&statm_fd);
-	if (quieten(target, generation, branch || generation->stat.session == target->leader, err))
+	if (quieten(target, generation, branch, err))
 		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
@@ -293,6 +298,7 @@ void generation_close_tables(const struct generation *generation)
 
 static void image_drop(struct generation *image)
 {
+	spare_drop(image);
 	if (image->template)
 		tracee_end(image->template, image->pidfd);
 	else

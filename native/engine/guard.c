@@ -273,6 +273,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		watch(guard, &n, guard->generations[i].pidfd);
+		if (guard->generations[i].spare)
+			watch(guard, &n, guard->generations[i].spare_pidfd);
 		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
 			if (guard->generations[i].branch[k].image)
 				watch(guard, &n, guard->generations[i].branch[k].image->pidfd);
@@ -366,9 +368,7 @@ static void *guard_main(void *arg)
 		}
 		carry_out(guard);
 		if (guard->ahead)
-			guard->ahead = guard->count &&
-				       inherit_next(&guard->target,
-						    &guard->generations[guard->count - 1]);
+			work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;
 		if (!guard->attached)

@@ -52,7 +52,8 @@ struct avc_guard {
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* when it was found dying, some time more: see reap_unknown() */
 	uint32_t misses;         /* in a row, of one that is unsupported     */
-	bool ahead;              /* there may be something to inherit_next() */
+	bool cramped;            /* there is no room for spares              */
+	bool ahead;              /* there may be something to work_ahead()   */
 	uint32_t room;           /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
@@ -120,6 +121,8 @@ int check_strict(struct avc_guard *guard, const struct generation *generation, p
 void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
 int find_app(struct avc_guard *guard, struct avc_error *err);
 void checkpoint(struct avc_guard *guard, uint64_t ticket);
+/* Of what a restore from the newest generation can be spared, some. */
+void work_ahead(struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 

@@ -8,9 +8,13 @@
 
 #include "guard.h"
 
+#define SPARE_NS (5 * NS_PER_S)
+#define SPARE_END_MS 50
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
-#define AHEAD_SHARE 100 /* of an interval at most is spent on what may come      */
+/* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
+#define INHERIT_SHARE 100
+#define SPARE_SHARE 20
 #define MISSES_UNTIL_UNPROTECTED 3
 
 /* ---- checkpoint --------------------------------------------------------------- */
@@ -211,9 +215,40 @@ static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 	const uint64_t interval_ns = guard->config.interval_ns;
 	struct avc_error later = { 0 };
 
-	guard->ahead = fresh->branches &&
-		       inherit_begin(fresh, interval_ns ? interval_ns / AHEAD_SHARE : UINT64_MAX,
+	guard->ahead = !fresh->branches ||
+		       inherit_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX,
 				     &later) == 0;
+	for (uint32_t i = 0; i < guard->count; i++)
+		spare_drop(&guard->generations[i]);
+}
+
+static bool wants_spare(const struct avc_guard *guard, struct generation *newest)
+{
+	const uint64_t interval_ns = guard->config.interval_ns;
+
+	return !newest->spared && !guard->cramped &&
+	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
+}
+
+void work_ahead(struct avc_guard *guard)
+{
+	struct generation *newest;
+	struct avc_error error = { 0 };
+
+	guard->ahead = guard->count > 0;
+	if (!guard->ahead)
+		return;
+	newest = &guard->generations[guard->count - 1];
+	if (!wants_spare(guard, newest)) {
+		guard->ahead = inherit_next(newest);
+		return;
+	}
+	newest->spared = true;
+	tracee_deadline_set(guard->timer, SPARE_NS);
+	/* A template that was killed is seen to by reap_dead(). */
+	if (spare_make(&guard->target, newest, &error) && !pidfd_ended(newest->pidfd))
+		lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
+	tracee_deadline_clear(guard->timer);
 }
 
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
@@ -264,6 +299,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		files_settle_family(target, &fresh,
 				    guard->count ? &guard->generations[guard->count - 1] : NULL);
 	fresh.number = ++guard->number;
+	fresh.clone_ns = times.clone_ns;
 	begin_ahead(guard, &fresh);
 	keep_generation(guard, &fresh);
 	link_arm(&guard->link, true);
@@ -274,6 +310,23 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	return 0;
 }
 
+/* A limit of processes, or of memory, leaves no room for a template: spares have to go. */
+static bool give_up_spares(struct avc_guard *guard, const struct avc_error *err)
+{
+	bool any = false;
+
+	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
+		return false;
+	for (uint32_t i = 0; i < guard->count; i++) {
+		any |= guard->generations[i].spare != 0;
+		spare_drop(&guard->generations[i]);
+	}
+	guard->cramped |= any;
+	for (int ms = 0; any && tracee_reap_ending() && ms < SPARE_END_MS; ms++)
+		usleep(1000);
+	return any;
+}
+
 /* EAGAIN means that something was not as it was known to be, and is known now: memory
  * that has to be copied aside, or a process. */
 static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
@@ -282,6 +335,8 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 		*err = (struct avc_error){ 0 };
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
+		if (give_up_spares(guard, err))
+			continue;
 		if (err->code != AVC_DEADLINE || err->errnum != EAGAIN || tries == TAKE_TRIES)
 			return -1;
 	}

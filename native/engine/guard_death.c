@@ -153,6 +153,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					       pad_slot(&target->pad, generation->slot)->pid,
 					       &failed) == 0;
 		adopt_family(guard, generation);
+		generation->spared = false; /* that one is used up */
+		guard->ahead = true;
 		guard->restores++;
 		guard->lineage = generation->lineage;
 		guard->restored_from = generation->number;

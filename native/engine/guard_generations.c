@@ -77,7 +77,7 @@ bool is_ours(pid_t pid, const void *arg)
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct generation *generation = &guard->generations[i];
 
-		if (generation->template == pid)
+		if (generation->template == pid || generation->spare == pid)
 			return true;
 		for (uint32_t k = 0; k < generation->branches; k++)
 			if (generation->branch[k].image &&
@@ -246,6 +246,8 @@ void reap_dead(struct avc_guard *guard)
 	 * reaped what is ours: then it is no news.  A death does not wait. */
 	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
 		(void)tracee_reap_ending();
+		for (uint32_t i = 0; i < guard->count; i++)
+			(void)spare_is_there(&guard->generations[i]);
 		for (uint32_t i = guard->count; i-- > 0;)
 			if (has_ended(&guard->generations[i]))
 				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);

@@ -90,15 +90,8 @@ static void rest(const struct generation *generation, int branch)
 	snapshot_rest(branch < 0 ? all->main : all->heir[branch].snapshot);
 }
 
-/* The main process, a fork of its template, is registered with rseq(2), and the kernel has
- * written there; the others register last of all. */
-static avc_remote touched(const struct target *main, const struct generation *generation, int host)
-{
-	return host < 0 ? pad_thread(&main->pad, generation->slot, 0)->rseq : 0;
-}
-
-const struct remap *inherit_plan(const struct target *main, struct generation *generation,
-				 uint32_t index, struct avc_error *err)
+const struct remap *inherit_plan(struct generation *generation, uint32_t index,
+				 struct avc_error *err)
 {
 	struct heir *heir = &generation->inheritance->heir[index];
 	struct snapshot *want, *is;
@@ -109,14 +102,13 @@ const struct remap *inherit_plan(const struct target *main, struct generation *g
 	is = want ? snapshot_of(generation, heir->host, err) : NULL;
 	if (!is)
 		return NULL;
-	heir->plan = remap_plan(generation->branch[index].target, want, is,
-				touched(main, generation, heir->host), err);
+	heir->plan = remap_plan(generation->branch[index].target, want, is, err);
 	rest(generation, (int)index);
 	rest(generation, heir->host);
 	return heir->plan;
 }
 
-bool inherit_next(const struct target *main, struct generation *generation)
+bool inherit_next(struct generation *generation)
 {
 	struct inheritance *all = generation->inheritance;
 
@@ -131,7 +123,7 @@ bool inherit_next(const struct target *main, struct generation *generation)
 		if (pages < WORTH_PAGES || pages * PAGE_NS > all->left_ns)
 			continue;
 		all->left_ns -= pages * PAGE_NS;
-		(void)inherit_plan(main, generation, i, &later);
+		(void)inherit_plan(generation, i, &later);
 		return true;
 	}
 	snapshot_rest(all->main);

@@ -358,9 +358,13 @@ struct generation {
 	uint64_t number; /* 0: unused                                        */
 	pid_t template;
 	int pidfd;
+	pid_t spare; /* a fork of it, for the next restore (spare.c); 0: none   */
+	int spare_pidfd;
+	bool spared; /* it was tried to make one                                */
 	uint32_t slot;
 	uint32_t threads;
 	uint64_t taken_ns;
+	uint64_t clone_ns; /* what the clones of it took                      */
 	bool quiescent;
 	/* Taken from a process that had been restored lately: of the same lineage
 	 * as what that one was restored from, and as suspect. */
@@ -1024,9 +1028,9 @@ void copier_free(struct copier *copier);
 struct remap;
 
 /* What makes the memory of a fork of `is` that of `want`.  Both snapshots have to stay.
- * `touched`: an address at which the kernel has written since.  NULL on error. */
+ * NULL on error. */
 struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
-			 avc_remote touched, struct avc_error *err);
+			 struct avc_error *err);
 /* Does it, with a puppet that is in the pad of the plan's target already; but the copier
  * may not have finished. */
 int remap(const struct remap *plan, struct puppet *puppet, struct copier *copier,
@@ -1042,11 +1046,20 @@ int inherit_begin(struct generation *generation, uint64_t ahead_ns,
 /* Who is to fork a branch's process: another branch, or PARENT_MAIN. */
 int inherit_host(const struct generation *generation, uint32_t index);
 /* How it is made of that fork; NULL on error. */
-const struct remap *inherit_plan(const struct target *main, struct generation *generation,
-				 uint32_t index, struct avc_error *err);
+const struct remap *inherit_plan(struct generation *generation, uint32_t index,
+				 struct avc_error *err);
 /* Finds out about one more of them, so that a restore need not; false: that is all. */
-bool inherit_next(const struct target *main, struct generation *generation);
+bool inherit_next(struct generation *generation);
 void inherit_free(struct inheritance *inheritance);
+
+/* ---- spare.c ------------------------------------------------------------------------ */
+
+/* Makes one for a generation that is whole, if the kernel lets it.  -1: nothing can be restored
+ * from the generation any more. */
+int spare_make(struct target *target, struct generation *generation,
+	       struct avc_error *err) warn_unused;
+bool spare_is_there(struct generation *generation);
+void spare_drop(struct generation *generation);
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 

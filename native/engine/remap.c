@@ -294,8 +294,7 @@ static int add_run(struct remap *r, const struct mapping *m, enum page what, avc
 	return 0;
 }
 
-static int compare_piece(struct remap *r, const struct piece *piece, avc_remote touched,
-			 struct avc_error *err)
+static int compare_piece(struct remap *r, const struct piece *piece, struct avc_error *err)
 {
 	static const struct pages nothing;
 	const struct pages *wanted = snapshot_pages(r->want, piece->want, err);
@@ -314,11 +313,8 @@ static int compare_piece(struct remap *r, const struct piece *piece, avc_remote 
 			continue;
 		for (size_t i = 0, count = (end - start) / PAGE; i < count; i++) {
 			const avc_remote page = start + i * PAGE;
-			enum page what = compare(want ? want[i] : 0, is ? is[i] : 0);
+			const enum page what = compare(want ? want[i] : 0, is ? is[i] : 0);
 
-			/* The kernel has written to it since (rseq(2)). */
-			if (touched - page < PAGE && want && is_own(want[i]))
-				what = PAGE_COPY;
 			if (what != PAGE_SAME &&
 			    add_run(r, piece->want, what, page, page + PAGE, err))
 				return -1;
@@ -348,7 +344,7 @@ static int fill(const struct remap *r, struct puppet *puppet, struct copier *cop
 /* ---- all of it ----------------------------------------------------------------------- */
 
 struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
-			 avc_remote touched, struct avc_error *err)
+			 struct avc_error *err)
 {
 	struct remap *r = calloc(1, sizeof *r);
 
@@ -362,7 +358,7 @@ struct remap *remap_plan(const struct target *target, struct snapshot *want, str
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (piece->want && !piece->want->shared && compare_piece(r, piece, touched, err))
+		if (piece->want && !piece->want->shared && compare_piece(r, piece, err))
 			goto failed;
 	}
 	return r;

@@ -103,21 +103,25 @@ static int send_off(struct target *target, struct generation *generation, pid_t 
 	return 0;
 }
 
-/* One fork of the template.  If it is to have children, it stays stopped. */
+/* One fork of the template, or what is to have the memory of its spare.  If it is to have
+ * children, it stays stopped. */
 static int fork_template(struct target *target, struct generation *generation, pid_t *pid,
 			 int *pidfd, bool again, struct sandbox **sandbox, struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
 	struct inj_call *call = &slot->template_call;
+	const bool spare = spare_is_there(generation);
+	const pid_t from = spare ? generation->spare : generation->template;
 	pid_t child = 0;
 
 	/* The first time there are calls of files_restore() before it. */
 	if (again)
 		call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	if (pad_send(pad, generation->template, &generation->base, call, err) ||
-	    pad_run_clone(generation->template, call, &child, err))
+	call_add(call, SYS_clone, (spare ? CLONE_VM : 0) | CLONE_FILES | CLONE_PARENT | SIGCHLD, 0,
+		 0, 0, 0);
+	if (pad_send(pad, from, &generation->base, call, err) ||
+	    pad_run_clone(from, call, &child, err))
 		return -1;
 	if (tracee_await(child, NULL, err) != STOP_TRAP)
 		return -1;
@@ -135,13 +139,13 @@ static int fork_template(struct target *target, struct generation *generation, p
 			tracee_kill(child);
 			slot->state = INJ_WRONG_PID;
 		}
-		return tracee_settle(generation->template, err);
+		return tracee_settle(from, err);
 	}
 	if (send_off(target, generation, child, sandbox, err))
 		return -1;
 	*pid = child;
 	/* The template can come to rest meanwhile. */
-	return tracee_settle(generation->template, err);
+	return tracee_settle(from, err);
 }
 
 static int describe_failure(const struct pad *pad, const struct inj_slot *slot,
@@ -335,6 +339,7 @@ int restore(struct target *target, struct generation *generation, struct link *l
 		proc_await_end(*pid);
 	}
 	restore_go(target, generation, sandbox);
+	spare_drop(generation); /* it has the memory of what runs now */
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 

@@ -232,7 +232,7 @@ static void run_setup(struct inj_slot *slot, int32_t tid, uint64_t list)
 }
 
 /* What every thread has to do for itself, before anybody runs. */
-static void set_up(struct inj_slot *slot, struct inj_thread *t, int first)
+static void set_up(struct inj_slot *slot, struct inj_thread *t)
 {
 	long r;
 
@@ -246,8 +246,7 @@ static void set_up(struct inj_slot *slot, struct inj_thread *t, int first)
 	/* A CPU that is there no more is no reason not to run. */
 	if (t->affinity_bytes)
 		SYS3(__NR_sched_setaffinity, 0, t->affinity_bytes, t->affinity);
-	/* The first thread's registration came along with fork (rseq(2)). */
-	if (t->rseq && !first) {
+	if (t->rseq) {
 		r = SYS4(__NR_rseq, t->rseq, t->rseq_bytes, 0, t->rseq_signature);
 		if (r)
 			fail(slot, INJ_STEP_RSEQ, t->tid, r);
@@ -288,7 +287,7 @@ static void wait_for_go(struct inj_slot *slot, enum inj_go stage)
 
 void inj_thread(struct inj_slot *slot, struct inj_thread *t)
 {
-	set_up(slot, t, 0);
+	set_up(slot, t);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) == slot->threads)
 		futex_wake(&slot->ready);
 	wait_for_go(slot, INJ_GO_ALL);
@@ -373,7 +372,7 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_BEFORE]);
 	for (uint32_t i = 1; i < slot->threads; i++)
 		spawn(slot, thread_of(slot, i), &last);
-	set_up(slot, me, !slot->fresh);
+	set_up(slot, me);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) != slot->threads) {
 		uint32_t n;
 

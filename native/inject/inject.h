@@ -181,8 +181,6 @@ struct inj_slot {
 	int32_t group; /* process group, inside                          */
 	uint32_t session_leader;
 	uint32_t placed; /* session and group are right already                */
-	uint32_t fresh;  /* it is not a fork of what it is to be: the first
-			  * thread has to register with rseq(2), too           */
 	int32_t tty_fd;  /* -1, or a descriptor of the tty it was in the
 	                       * foreground of                                  */
 	uint32_t threads;

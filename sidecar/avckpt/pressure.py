@@ -143,12 +143,12 @@ def held_bytes(app_pid: int, template_pids: Iterable[int]) -> int:
 
 
 def templates_of(init_pid: int) -> list[int]:
-    """The templates below an avckpt-init; empty when it is gone."""
+    """The templates below an avckpt-init, with the newest one's spare; empty when it is gone."""
     found = []
     with contextlib.suppress(OSError):
         for pid in Path(f"/proc/{init_pid}/task/{init_pid}/children").read_text().split():
             with contextlib.suppress(OSError):
-                if Path(f"/proc/{pid}/comm").read_text() == "avckpt-tmpl\n":
+                if Path(f"/proc/{pid}/comm").read_text() in ("avckpt-tmpl\n", "avckpt-spare\n"):
                     found.append(int(pid))
     return found
 

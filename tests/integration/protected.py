@@ -88,7 +88,7 @@ def start_victim(
 
 
 def ours(container: Container, name: str = "avckpt-") -> list[int]:
-    """Templates ("avckpt-tmpl") and holder ("avckpt-hold") in a container, by their PIDs on the host."""
+    """Templates ("avckpt-tmpl"), spare ("avckpt-spare") and holder ("avckpt-hold") in a container; PIDs on the host."""
     init = container.pid
     found = []
     for pid in Path(f"/proc/{init}/task/{init}/children").read_text().split():

@@ -149,7 +149,7 @@ def progress(victim: Victim) -> None:
 
 
 def ours(victim: Victim, name: str = "avckpt-") -> list[int]:
-    """Templates ("avckpt-tmpl") and holders ("avckpt-hold") in its container."""
+    """Templates ("avckpt-tmpl"), spare ("avckpt-spare") and holders ("avckpt-hold") in its container."""
     found = [look(pid) for pid in children_of(victim.pid)]
     return [m.pid for m in found if m is not None and m.name.startswith(name) and not m.is_zombie]
 

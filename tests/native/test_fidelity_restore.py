@@ -62,17 +62,20 @@ def test_restore_on_command(tmp_path: Path) -> None:
 
 
 def test_names_in_the_process_list(tmp_path: Path) -> None:
-    """Templates and holder say what they are; the restored application is called what it was."""
+    """Templates, spare and holder say what they are; the restored application is called what it was."""
     with Victim("idle 1 5", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         before = threads(victim.app)
         command_line = Path(f"/proc/{victim.app}/cmdline").read_bytes()
         for _ in range(3):
             guard.command("checkpoint")
-        wait_until(lambda: len(victim.others()) == 3, 5, "the first template has gone")
-        others = [Path(f"/proc/{pid}/comm").read_text().strip() for pid in victim.others()]
-        assert sorted(others) == ["avckpt-hold", "avckpt-tmpl", "avckpt-tmpl"]
+
+        def names() -> list[str]:
+            return sorted(Path(f"/proc/{pid}/comm").read_text().strip() for pid in victim.others())
+
+        wanted = ["avckpt-hold", "avckpt-spare", "avckpt-tmpl", "avckpt-tmpl"]
+        wait_until(lambda: names() == wanted, 5, "the first template has gone, and the last one has a spare")
         scores = [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in victim.others()]
-        assert sorted(scores)[1:] == [1000, 1000]
+        assert sorted(scores)[1:] == [1000, 1000, 1000]
         since = guard.mark()
         victim.kill_app()
         guard.wait("restored", since=since)
@@ -127,14 +130,14 @@ def test_nothing_is_left_behind(tmp_path: Path) -> None:
 
         def cycle(restores: int) -> tuple[int, int, int, int]:
             guard.burst(30)
-            wait_until(lambda: len(victim.others()) == 3, 5, "two templates and the holder")
+            wait_until(lambda: len(victim.others()) == 4, 5, "two templates, a spare and the holder")
             for _ in range(restores):
                 since = guard.mark()
                 victim.kill_app()
                 guard.wait("restored", since=since)
                 victim.wait_beats(2)
                 guard.burst(5)
-            wait_until(lambda: len(victim.others()) == 3, 5, "two templates and the holder are left")
+            wait_until(lambda: len(victim.others()) == 4, 5, "two templates, a spare and the holder are left")
             return (guard.fds(), pads(victim.app), len(children_of(victim.pid)), mappings(guard.pid))
 
         first = cycle(3)
