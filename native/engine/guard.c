@@ -258,7 +258,9 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	const uint64_t now = now_ns();
 	const uint64_t check_ns = exec_check_due(guard);
-	const uint64_t due = guard->next_ns < check_ns ? guard->next_ns : check_ns;
+	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : UINT64_MAX;
+	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
+	const uint64_t due = guard->next_ns < sooner_ns ? guard->next_ns : sooner_ns;
 	uint64_t ns = due > now ? due - now : 0;
 	struct timespec timeout;
 	nfds_t n = 0;
@@ -287,12 +289,9 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 
 		ns = ns < slice ? ns : slice;
 	}
-	if (guard->ahead)
-		ns = 0;
 	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
 				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(guard->fds, n,
-		    due == UINT64_MAX && !straggling && !guard->ahead ? NULL : &timeout, NULL);
+	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
 }
 
 /* Nobody is to believe that there are checkpoints when there are none. */
@@ -367,7 +366,7 @@ static void *guard_main(void *arg)
 			break;
 		}
 		carry_out(guard);
-		if (guard->ahead)
+		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
 			work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;

@@ -19,6 +19,7 @@
 #define COMMANDS_MAX 64
 #define RESTORES_MAX 64
 #define DYING_NS NS_PER_S
+#define AHEAD_AFTER_NS (20 * NS_PER_MS) /* the app has been held up, and goes first          */
 
 struct command {
 	enum avc_command command;
@@ -53,7 +54,7 @@ struct avc_guard {
 	uint64_t dying_until_ns; /* when it was found dying, some time more: see reap_unknown() */
 	uint32_t misses;         /* in a row, of one that is unsupported     */
 	bool cramped;            /* there is no room for spares              */
-	bool ahead;              /* there may be something to work_ahead()   */
+	uint64_t ahead_ns;       /* when to work_ahead(); UINT64_MAX: never  */
 	uint32_t room;           /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
@@ -121,7 +122,8 @@ int check_strict(struct avc_guard *guard, const struct generation *generation, p
 void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
 int find_app(struct avc_guard *guard, struct avc_error *err);
 void checkpoint(struct avc_guard *guard, uint64_t ticket);
-/* Of what a restore from the newest generation can be spared, some. */
+/* Of what a restore from the newest generation can be spared, some; when nobody is just ending,
+ * which takes a CPU as well. */
 void work_ahead(struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */

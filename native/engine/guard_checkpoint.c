@@ -215,11 +215,22 @@ static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 	const uint64_t interval_ns = guard->config.interval_ns;
 	struct avc_error later = { 0 };
 
-	guard->ahead = !fresh->branches ||
-		       inherit_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX,
-				     &later) == 0;
-	for (uint32_t i = 0; i < guard->count; i++)
+	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
+	if (fresh->branches &&
+	    inherit_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX, &later))
+		guard->ahead_ns = UINT64_MAX; /* there is no memory for it */
+}
+
+/* Of those before the newest; there is one at most. */
+static bool drop_old_spare(struct avc_guard *guard)
+{
+	bool any = false;
+
+	for (uint32_t i = 0; i + 1 < guard->count; i++) {
+		any |= guard->generations[i].spare != 0;
 		spare_drop(&guard->generations[i]);
+	}
+	return any;
 }
 
 static bool wants_spare(const struct avc_guard *guard, struct generation *newest)
@@ -230,25 +241,35 @@ static bool wants_spare(const struct avc_guard *guard, struct generation *newest
 	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
 }
 
-void work_ahead(struct avc_guard *guard)
+static void make_spare(struct avc_guard *guard, struct generation *newest)
 {
-	struct generation *newest;
 	struct avc_error error = { 0 };
 
-	guard->ahead = guard->count > 0;
-	if (!guard->ahead)
-		return;
-	newest = &guard->generations[guard->count - 1];
-	if (!wants_spare(guard, newest)) {
-		guard->ahead = inherit_next(newest);
-		return;
-	}
 	newest->spared = true;
 	tracee_deadline_set(guard->timer, SPARE_NS);
 	/* A template that was killed is seen to by reap_dead(). */
 	if (spare_make(&guard->target, newest, &error) && !pidfd_ended(newest->pidfd))
 		lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
 	tracee_deadline_clear(guard->timer);
+}
+
+void work_ahead(struct avc_guard *guard)
+{
+	struct generation *newest;
+	bool more = true;
+
+	guard->ahead_ns = UINT64_MAX;
+	if (!guard->count)
+		return;
+	newest = &guard->generations[guard->count - 1];
+	if (drop_old_spare(guard))
+		; /* which has to end first */
+	else if (wants_spare(guard, newest))
+		make_spare(guard, newest);
+	else
+		more = inherit_next(newest);
+	if (more)
+		guard->ahead_ns = now_ns();
 }
 
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)

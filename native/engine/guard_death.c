@@ -154,7 +154,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					       &failed) == 0;
 		adopt_family(guard, generation);
 		generation->spared = false; /* that one is used up */
-		guard->ahead = true;
+		guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
 		guard->restores++;
 		guard->lineage = generation->lineage;
 		guard->restored_from = generation->number;

@@ -9,6 +9,7 @@ import random
 import signal
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -101,30 +102,44 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
 def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
     """It must not take much of a CPU."""
     command = f"idle {MEGABYTES} 1"
-    with Victim(command, tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+    with Victim(command, tmp_path) as victim, GuardProcess(config(0.06), [victim.pid]) as guard:
         for _ in range(20):
             guard.wait("checkpoint", since=guard.mark())
             assert not spares(victim)
         die_and_come_back(victim, guard)
 
 
-# Its four threads, the holder, a template; the next one, and then a spare of the one before.
-@pytest.mark.parametrize("processes", [7, 8])
-def test_none_when_it_may_not_have_another_process(processes: int, tmp_path: Path) -> None:
-    """What it may have is for templates."""
+@contextlib.contextmanager
+def limited(processes: int) -> Iterator[tuple[Victim, GuardProcess]]:
+    """One of four threads that may have so many: with a holder and a template there are six."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # the victim is not root
         user = "/usr/bin/setpriv --reuid 54322 --regid 54322 --clear-groups --bounding-set -all --inh-caps -all"
         command = f"{user} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD / 'idle'} 0 4"
         with Victim(command, Path(folder)) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
-            for _ in range(4):
-                assert guard.command("checkpoint")["kind"] == "checkpoint"
-                time.sleep(0.05)
-                for _ in range(2):
-                    die_and_come_back(victim, guard)
-            if processes == 7:
-                assert not spares(victim)
-            assert not [event for event in guard.events if event.get("kind") == "missed"]
+            yield victim, guard
+
+
+def test_none_when_it_may_not_have_another_process() -> None:
+    with limited(6) as (victim, guard):
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        time.sleep(0.1)
+        assert not spares(victim)
+        for _ in range(5):
+            die_and_come_back(victim, guard)
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+def test_it_makes_room_for_a_template() -> None:
+    """The next template is worth more than the spare of the last one."""
+    with limited(7) as (victim, guard):
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        wait_spare(victim)
+        for _ in range(5):
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            time.sleep(0.1)
+            assert not spares(victim)
+            die_and_come_back(victim, guard)
 
 
 def test_priorities_are_kept(tmp_path: Path) -> None:
