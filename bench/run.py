@@ -44,7 +44,7 @@ CYCLES = 40
 QUICK_CYCLES = 5
 WARM_UP_CYCLES = 2
 """Not counted: the first checkpoint brings the engine's code into the process."""
-PAUSE_S = (0.05, 0.09)
+PAUSE_S = (0.1, 0.15)
 """Between fork, checkpoint and kill: the spare of 1 GB is there then, and its making disturbs nothing."""
 BEAT_US = 100
 

@@ -258,7 +258,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	const uint64_t now = now_ns();
 	const uint64_t check_ns = exec_check_due(guard);
-	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : UINT64_MAX;
+	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
+							     : tracee_ending_due();
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
 	const uint64_t due = guard->next_ns < sooner_ns ? guard->next_ns : sooner_ns;
 	uint64_t ns = due > now ? due - now : 0;
@@ -320,6 +321,7 @@ static void let_go(struct avc_guard *guard)
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		unhold(guard->tree.member[i]);
 	/* The end of this thread detaches what is left. */
+	tracee_end_now();
 	while (((guard->target.threads && all_stragglers(guard)) || tracee_reap_ending()) &&
 	       now_ns() < end)
 		usleep(200);

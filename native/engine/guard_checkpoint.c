@@ -9,7 +9,8 @@
 #include "guard.h"
 
 #define SPARE_NS (5 * NS_PER_S)
-#define SPARE_END_MS 50
+#define ENDING_MS 50
+#define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
@@ -230,6 +231,7 @@ static bool drop_old_spare(struct avc_guard *guard)
 		any |= guard->generations[i].spare != 0;
 		spare_drop(&guard->generations[i]);
 	}
+	tracee_end_now();
 	return any;
 }
 
@@ -331,21 +333,23 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	return 0;
 }
 
-/* A limit of processes, or of memory, leaves no room for a template: spares have to go. */
-static bool give_up_spares(struct avc_guard *guard, const struct avc_error *err)
+/* A limit of processes, or of memory, leaves no room for a template: spares have to go, and
+ * those that were to go a little later. */
+static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
-	bool any = false;
-
 	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
 		return false;
 	for (uint32_t i = 0; i < guard->count; i++) {
-		any |= guard->generations[i].spare != 0;
+		guard->cramped |= guard->generations[i].spare != 0;
 		spare_drop(&guard->generations[i]);
 	}
-	guard->cramped |= any;
-	for (int ms = 0; any && tracee_reap_ending() && ms < SPARE_END_MS; ms++)
+	if (tracee_ending_pidfd(0) < 0)
+		return false;
+	tracee_end_now();
+	for (int ms = 0; tracee_reap_ending() && ms < ENDING_MS; ms++)
 		usleep(1000);
-	return any;
+	usleep(INIT_REAPS_US);
+	return true;
 }
 
 /* EAGAIN means that something was not as it was known to be, and is known now: memory
@@ -356,9 +360,8 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 		*err = (struct avc_error){ 0 };
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
-		if (give_up_spares(guard, err))
-			continue;
-		if (err->code != AVC_DEADLINE || err->errnum != EAGAIN || tries == TAKE_TRIES)
+		if (tries == TAKE_TRIES ||
+		    (!make_way(guard, err) && (err->code != AVC_DEADLINE || err->errnum != EAGAIN)))
 			return -1;
 	}
 }

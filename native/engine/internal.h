@@ -478,11 +478,16 @@ int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
 /* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
 void tracee_kill(pid_t pid);
-/* The same without waiting for its end: the kernel takes some 10 ms for each GB that it has
- * mapped, and longer if it gets no CPU.  Takes `pidfd`.  Until tracee_reap_ending() has reaped
- * it, it is_ending(): the task, of this thread.  That returns how many are left. */
+/* The same some milliseconds later, and without waiting for its end: the kernel takes some 10 ms
+ * for each GB that it has mapped, and longer if it gets no CPU.  Takes `pidfd`.  Until
+ * tracee_reap_ending() has killed and reaped it, it is_ending(): the task, of this thread.  That
+ * returns how many are left, and tracee_ending_due() when to call it again if there is no news of
+ * theirs: CLOCK_MONOTONIC, UINT64_MAX: never. */
 void tracee_end(pid_t pid, int pidfd);
 uint32_t tracee_reap_ending(void);
+uint64_t tracee_ending_due(void);
+/* Kills them now. */
+void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
 /* Of the i-th of them, to be watched; -1: there are no more. */
 int tracee_ending_pidfd(uint32_t i);

@@ -242,11 +242,15 @@ void tracee_kill(pid_t pid)
 
 /* Those beyond that are waited for. */
 #define ENDING_MAX 64
+/* The app has just been held up, and goes first: an end keeps a CPU from it for as long as the
+ * kernel does not look up from the page tables. */
+#define END_AFTER_NS (10 * NS_PER_MS)
 
 static __thread struct {
 	struct {
 		pid_t pid;
 		int pidfd;
+		uint64_t kill_ns; /* 0: it was killed                                */
 	} task[ENDING_MAX];
 	uint32_t count;
 } ending;
@@ -259,20 +263,34 @@ void tracee_end(pid_t pid, int pidfd)
 		close_fd(&pidfd);
 		return;
 	}
-	kill(pid, SIGKILL);
 	ending.task[ending.count].pid = pid;
+	ending.task[ending.count].kill_ns = now_ns() + END_AFTER_NS;
 	ending.task[ending.count++].pidfd = pidfd;
+}
+
+static void end_until(uint64_t now)
+{
+	for (uint32_t i = 0; i < ending.count; i++)
+		if (ending.task[i].kill_ns && ending.task[i].kill_ns <= now) {
+			kill(ending.task[i].pid, SIGKILL);
+			ending.task[i].kill_ns = 0;
+		}
+}
+
+void tracee_end_now(void)
+{
+	end_until(UINT64_MAX);
 }
 
 uint32_t tracee_reap_ending(void)
 {
 	uint32_t left = 0;
 
+	end_until(now_ns());
 	for (uint32_t i = 0; i < ending.count; i++) {
 		int status;
 		const pid_t r = waitpid(ending.task[i].pid, &status,
 					__WALL | __WNOTHREAD | WNOHANG);
-
 		/* Other stops are on its way to its end. */
 		if (r == 0 || (r > 0 && WIFSTOPPED(status)))
 			ending.task[left++] = ending.task[i];
@@ -281,6 +299,16 @@ uint32_t tracee_reap_ending(void)
 	}
 	ending.count = left;
 	return left;
+}
+
+uint64_t tracee_ending_due(void)
+{
+	uint64_t due = UINT64_MAX;
+
+	for (uint32_t i = 0; i < ending.count; i++)
+		if (ending.task[i].kill_ns && ending.task[i].kill_ns < due)
+			due = ending.task[i].kill_ns;
+	return due;
 }
 
 bool tracee_is_ending(pid_t pid)

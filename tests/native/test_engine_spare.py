@@ -136,7 +136,8 @@ def test_it_makes_room_for_a_template() -> None:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         wait_spare(victim)
         for _ in range(5):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            answer = guard.command("checkpoint")
+            assert answer["kind"] == "checkpoint", str(answer)
             time.sleep(0.1)
             assert not spares(victim)
             die_and_come_back(victim, guard)
