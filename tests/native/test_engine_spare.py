@@ -143,6 +143,10 @@ def test_it_makes_room_for_a_template() -> None:
             die_and_come_back(victim, guard)
 
 
+def policies(victim: Victim, name: str) -> set[int]:
+    return {os.sched_getscheduler(pid) for pid in ours(victim, name)}
+
+
 def test_priorities_are_kept(tmp_path: Path) -> None:
     """It is made at an ordinary priority, so that the application runs; what is restored has its own."""
     with Victim("idle 50 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
@@ -150,9 +154,9 @@ def test_priorities_are_kept(tmp_path: Path) -> None:
         os.sched_setaffinity(victim.app, {0})
         for _ in range(3):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
-            spare = wait_spare(victim)
-            wait_until(lambda pid=spare: os.sched_getscheduler(pid) == os.SCHED_FIFO, 5, "the spare has it again")
-            assert {os.sched_getscheduler(pid) for pid in ours(victim, "avckpt-tmpl")} == {os.SCHED_FIFO}
+            wait_spare(victim)
+            wait_until(lambda: policies(victim, "avckpt-spare") == {os.SCHED_FIFO}, 5, "the spare has it again")
+            assert policies(victim, "avckpt-tmpl") == {os.SCHED_FIFO}
             for _ in range(2):
                 die_and_come_back(victim, guard)
                 assert os.sched_getscheduler(victim.app) == os.SCHED_FIFO
