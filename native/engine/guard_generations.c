@@ -163,6 +163,7 @@ void let_executed_go(struct avc_guard *guard, bool all)
 
 	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
 		drop_all(guard);
+		tracee_end_now(); /* they have the table that exec(2) has left */
 		unhold(main);
 	}
 	for (uint32_t i = 0; i < guard->tree.members; i++) {

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A template becomes the app again: it forks a process with the app's own PID,
- * which puts itself together (inject.c, inj_restore) and waits until everything
- * is there; then all its threads go at once.  The new process is not traced.
+ * A template becomes the app again: it forks a process with the app's own PID, or its spare
+ * gives its memory to one (spare.c), which puts itself together (inject.c, inj_restore) and waits
+ * until everything is there; then all its threads go at once.  The new process is not traced.
  */
 #include <errno.h>
 #include <linux/futex.h>
