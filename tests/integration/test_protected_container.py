@@ -108,7 +108,9 @@ def test_podman_restart_keeps_protection(sidecar: Sidecar, container: ContainerF
 
 def test_nothing_is_left_of_a_removed_container(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
-    wait_until(lambda: len(ours(victim.container)) == 3, 5, "two templates, one holder")
+    # At most intervals an old template is just ending, too.
+    for name, at_least in (("avckpt-tmpl", 2), ("avckpt-hold", 1), ("avckpt-spare", 1)):
+        wait_until(lambda: len(ours(victim.container, name)) >= at_least, 5, f"{at_least} of {name}")  # noqa: B023
     pids = ours(victim.container)
     started = time.monotonic()
     victim.container.remove()
