@@ -127,8 +127,13 @@ def avckpt_run() -> Iterator[int]:
     """The program under `avckpt run`; the PID of the latter."""
     command = [*avckpt_command(), "run", "--label", f"avckpt.interval={INTERVAL}", "--"]
     process = subprocess.Popen([*command, str(VICTIMS / "build" / PROGRAM[0]), *PROGRAM[1:]], stdout=subprocess.DEVNULL)
+
+    def protects() -> bool:
+        # Its init is a child of it.
+        return any(templates_of(pid) for pid in descendants(process.pid))
+
     try:
-        eventually(lambda: len(templates_of(process.pid)) > 0 or process.poll() is not None, "avckpt run protects")
+        eventually(lambda: protects() or process.poll() is not None, "avckpt run protects")
         if process.poll() is not None:
             raise BenchFailed(f"avckpt run ended with {process.returncode}")
         yield process.pid
