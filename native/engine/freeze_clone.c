@@ -147,7 +147,8 @@ int await_app_clone(struct target *target, struct thread *main_thread,
 		return -1;
 	}
 	/* After the timers were asked: one that has expired just now is found here. */
-	pending_read(target);
+	if (pending_read(target, err))
+		return -1;
 	timers_answer(target, call, now_ns() - target->asked_ns);
 	return hear_of_children(target, err);
 }
@@ -250,10 +251,10 @@ static int ask_end(struct target *target, struct avc_error *err)
 		thread_runs_on(thread, err);
 		return -1;
 	}
-	pending_read(target);
+	if (give_back(thread, err) || pending_read(target, err))
+		return -1;
 	timers_answer(target, call, now_ns() - target->asked_ns);
-	return give_back(thread, err) || ask_answer(thread, call, &target->questions, err) ||
-			       hear_of_children(target, err)
+	return ask_answer(thread, call, &target->questions, err) || hear_of_children(target, err)
 		       ? -1
 		       : 0;
 }

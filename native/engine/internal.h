@@ -598,8 +598,8 @@ const char *setup_name(const struct pad *pad, avc_remote address);
 
 struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
- * thread.signalled. */
-void pending_read(struct target *target);
+ * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
+int pending_read(struct target *target, struct avc_error *err) warn_unused;
 /* One that the app dies of as soon as it runs again; 0: none. */
 int pending_deadly(const struct pending *pending);
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */

@@ -32,8 +32,7 @@ struct pending *pending_new(void)
 	return calloc(1, sizeof(struct pending));
 }
 
-/* A thread that was killed meanwhile has none any more: nor has the whole process. */
-static void read_queue(struct pending *pending, pid_t tid, int block)
+static int read_queue(struct pending *pending, pid_t tid, int block, struct avc_error *err)
 {
 	struct __ptrace_peeksiginfo_args args = {
 		.flags = block < 0 ? PTRACE_PEEKSIGINFO_SHARED : 0,
@@ -44,16 +43,21 @@ static void read_queue(struct pending *pending, pid_t tid, int block)
 	for (;;) {
 		const long n = ptrace(PTRACE_PEEKSIGINFO, tid, &args, pending->buffer);
 
+		if (n < 0)
+			return fail_errno(err, tid, "freeze", "ptrace(PEEKSIGINFO)",
+					  "it has been killed");
+		if (n == 0)
+			return 0;
 		for (long i = 0; i < n; i++) {
 			if (pending->count == PENDING_MAX) {
 				pending->too_many = true;
-				return;
+				return 0;
 			}
 			pending->signal[pending->count].block = block;
 			pending->signal[pending->count++].info = pending->buffer[i];
 		}
-		if (n < args.nr)
-			return;
+		/* Fewer than asked for need not be the last ones: a signal of our own, as of
+		 * the deadline's timer, ends the call, too (kernel/ptrace.c). */
 		args.off += (uint64_t)n;
 		args.nr = AT_ONCE;
 	}
@@ -144,7 +148,7 @@ static int find_deadly(const struct target *target, const struct dispositions *d
 	return 0;
 }
 
-void pending_read(struct target *target)
+int pending_read(struct target *target, struct avc_error *err)
 {
 	struct pending *pending = target->pending;
 	struct dispositions dispositions;
@@ -158,14 +162,15 @@ void pending_read(struct target *target)
 		t->signalled = false;
 		if (t->block < 0)
 			continue;
-		if (t->tid == target->pid)
-			read_queue(pending, t->tid, -1);
-		read_queue(pending, t->tid, t->block);
+		if ((t->tid == target->pid && read_queue(pending, t->tid, -1, err)) ||
+		    read_queue(pending, t->tid, t->block, err))
+			return -1;
 	}
 	if (pending->count && read_dispositions(target->pid, &dispositions)) {
 		assign(target, &dispositions);
 		pending->deadly = find_deadly(target, &dispositions);
 	}
+	return 0;
 }
 
 int pending_deadly(const struct pending *pending)

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
+import threading
+import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -36,3 +40,39 @@ def test_a_deadly_signal_is_in_no_image(signum: int, tmp_path: Path) -> None:
             guard.wait("checkpoint", since=since)
             deaths = [event for event in guard.events if event.get("kind") == "died"]
             assert len(deaths) == n, deaths[-3:]
+
+
+class Ticks:
+    """A storm of the signal that the guard's deadline sends it (tracee.c), which ends its calls early."""
+
+    SIGNAL = signal.SIGRTMAX - 2
+
+    def __init__(self, guard: GuardProcess) -> None:
+        tasks = Path(f"/proc/{guard.pid}/task")
+        (self._tid,) = [int(task.name) for task in tasks.iterdir() if (task / "comm").read_text() == "avckpt-guard\n"]
+        self._pid, self._over = guard.pid, threading.Event()
+        self._thread = threading.Thread(target=self._send)
+
+    def __enter__(self) -> Ticks:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _send(self) -> None:
+        tgkill = partial(ctypes.CDLL(None).syscall, 234, self._pid, self._tid, self.SIGNAL)
+        while not self._over.is_set():
+            tgkill()
+            until = time.perf_counter() + 30e-6  # more often, nothing else would get done
+            while time.perf_counter() < until:
+                pass
+
+
+def test_signals_of_the_guard_cut_no_queue_short(tmp_path: Path) -> None:
+    """PTRACE_PEEKSIGINFO tells of fewer signals than there are when one comes for who asks."""
+    with Victim("pending 12", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        with Ticks(guard):
+            kill_at_random(guard, victim, 60, (0.005, 0.08))
