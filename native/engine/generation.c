@@ -303,6 +303,8 @@ static void image_drop(struct generation *image)
 		tracee_end(image->template, image->pidfd);
 	else
 		close_fd(&image->pidfd);
+	if (spare_is_unknown(image))
+		tracee_end_now(); /* the kernel has made one by now, or makes none */
 	mem_image_free(image->image);
 	free(image->timers);
 	free(image->attributes);

@@ -276,8 +276,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		watch(guard, &n, guard->generations[i].pidfd);
-		if (guard->generations[i].spare)
-			watch(guard, &n, guard->generations[i].spare_pidfd);
+		if (guard->generations[i].spare.pid)
+			watch(guard, &n, guard->generations[i].spare.pidfd);
 		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
 			if (guard->generations[i].branch[k].image)
 				watch(guard, &n, guard->generations[i].branch[k].image->pidfd);

@@ -8,7 +8,7 @@
 
 #include "guard.h"
 
-#define SPARE_NS (5 * NS_PER_S)
+#define SPARE_NS (NS_PER_S / 2)
 #define ENDING_MS 50
 #define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
@@ -228,7 +228,7 @@ static bool drop_old_spare(struct avc_guard *guard)
 	bool any = false;
 
 	for (uint32_t i = 0; i + 1 < guard->count; i++) {
-		any |= guard->generations[i].spare != 0;
+		any |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);
 	}
 	tracee_end_now();
@@ -239,7 +239,7 @@ static bool wants_spare(const struct avc_guard *guard, struct generation *newest
 {
 	const uint64_t interval_ns = guard->config.interval_ns;
 
-	return !newest->spared && !guard->cramped &&
+	return !newest->spare.tried && !guard->cramped &&
 	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
 }
 
@@ -247,7 +247,6 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 {
 	struct avc_error error = { 0 };
 
-	newest->spared = true;
 	tracee_deadline_set(guard->timer, SPARE_NS);
 	/* A template that was killed is seen to by reap_dead(). */
 	if (spare_make(&guard->target, newest, &error) && !pidfd_ended(newest->pidfd))
@@ -340,7 +339,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
 		return false;
 	for (uint32_t i = 0; i < guard->count; i++) {
-		guard->cramped |= guard->generations[i].spare != 0;
+		guard->cramped |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);
 	}
 	if (tracee_ending_pidfd(0) < 0)

@@ -153,7 +153,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					       pad_slot(&target->pad, generation->slot)->pid,
 					       &failed) == 0;
 		adopt_family(guard, generation);
-		generation->spared = false; /* that one is used up */
+		generation->spare.tried = false; /* that one is used up */
 		guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
 		guard->restores++;
 		guard->lineage = generation->lineage;

@@ -18,6 +18,7 @@ void drop_generation(struct avc_guard *guard, uint32_t i)
 	/* Disarmed first: a death in between is then final at once. */
 	if (guard->count == 1 && guard->link.ctl)
 		link_arm(&guard->link, false);
+	guard->target.lost |= spare_is_unknown(&guard->generations[i]);
 	generation_drop(&guard->generations[i]);
 	guard->count--;
 	memmove(&guard->generations[i], &guard->generations[i + 1],
@@ -77,7 +78,7 @@ bool is_ours(pid_t pid, const void *arg)
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct generation *generation = &guard->generations[i];
 
-		if (generation->template == pid || generation->spare == pid)
+		if (generation->template == pid || generation->spare.pid == pid)
 			return true;
 		for (uint32_t k = 0; k < generation->branches; k++)
 			if (generation->branch[k].image &&

@@ -353,14 +353,23 @@ struct branch {
 
 struct inheritance;
 
+/* A fork of a template, for the next restore (spare.c). */
+struct spare {
+	pid_t pid; /* 0: none                                           */
+	int pidfd;
+	bool tried; /* it was begun to make one                          */
+	/* What the template has been told to do for it and has not done yet. */
+	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
+	struct scheduling scheduling; /* the template's own                        */
+	bool aside;                   /* it has another policy for as long         */
+};
+
 /* Also the image of one process of several: then what is of the whole is unused. */
 struct generation {
 	uint64_t number; /* 0: unused                                        */
 	pid_t template;
 	int pidfd;
-	pid_t spare; /* a fork of it, for the next restore (spare.c); 0: none   */
-	int spare_pidfd;
-	bool spared; /* it was tried to make one                                */
+	struct spare spare;
 	uint32_t slot;
 	uint32_t threads;
 	uint64_t taken_ns;
@@ -1059,11 +1068,17 @@ void inherit_free(struct inheritance *inheritance);
 
 /* ---- spare.c ------------------------------------------------------------------------ */
 
-/* Makes one for a generation that is whole, if the kernel lets it.  -1: nothing can be restored
- * from the generation any more. */
+/* Makes one for a generation that is whole, if the kernel lets it, and if it comes to that
+ * before the deadline.  -1: nothing can be restored from the generation any more. */
 int spare_make(struct target *target, struct generation *generation,
 	       struct avc_error *err) warn_unused;
+/* Before the template is used for anything else: waits until it has done what it had not at
+ * the deadline of spare_make().  -1: it has not, AVC_DEADLINE, or as above. */
+int spare_await(struct target *target, struct generation *generation,
+		struct avc_error *err) warn_unused;
 bool spare_is_there(struct generation *generation);
+/* There may be one that only the kernel knows of (link_kill_lost). */
+bool spare_is_unknown(const struct generation *generation);
 void spare_drop(struct generation *generation);
 
 /* ---- restore.c, for one process of several ----------------------------------------- */

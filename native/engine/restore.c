@@ -112,7 +112,7 @@ static int fork_template(struct target *target, struct generation *generation, p
 	struct inj_slot *slot = pad_slot(pad, generation->slot);
 	struct inj_call *call = &slot->template_call;
 	const bool spare = spare_is_there(generation);
-	const pid_t from = spare ? generation->spare : generation->template;
+	const pid_t from = spare ? generation->spare.pid : generation->template;
 	pid_t child = 0;
 
 	/* The first time there are calls of files_restore() before it. */
@@ -290,7 +290,9 @@ int restore(struct target *target, struct generation *generation, struct link *l
 		return fail_errno(err, 0, "restore", "calloc", "out of memory");
 	}
 	tracee_deadline_set(timer, FORK_NS);
-	result = files_restore(target, generation, config, link->init, tables, notes, err);
+	result = spare_await(target, generation, err);
+	if (!result)
+		result = files_restore(target, generation, config, link->init, tables, notes, err);
 	if (!result && generation->branches) {
 		family = family_new(target, generation, helper, link, timer, tables, err);
 		result = family ? 0 : -1;

@@ -43,54 +43,88 @@ static int step_back(pid_t pid, const struct scheduling *was)
 	return (int)syscall(SYS_sched_setattr, pid, was->attr, 0);
 }
 
-static int fork_spare(struct target *target, struct generation *generation, struct avc_error *err)
+static struct inj_call *call_of(const struct target *target, const struct generation *generation)
+{
+	return &pad_slot(&target->pad, generation->slot)->template_call;
+}
+
+static int begin_fork(struct target *target, struct generation *generation, struct avc_error *err)
 {
 	const struct pad *pad = &target->pad;
-	struct inj_call *call = &pad_slot(pad, generation->slot)->template_call;
-	pid_t spare = 0;
+	struct inj_call *call = call_of(target, generation);
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
 	if (pad_send(pad, generation->template, &generation->base, call, err) ||
-	    pad_run_clone(generation->template, call, &spare, err)) {
-		target->lost = target->lost || err->code != AVC_KERNEL;
+	    pad_start(generation->template, err))
+		return -1;
+	generation->spare.work = SPARE_FORK;
+	return 0;
+}
+
+static int end_fork(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct spare *spare = &generation->spare;
+
+	if (pad_await_clone(generation->template, call_of(target, generation), &spare->pid, err)) {
+		target->lost |= err->code != AVC_KERNEL && err->code != AVC_DEADLINE;
 		return -1;
 	}
-	generation->spare = spare;
-	generation->spare_pidfd = proc_pidfd_open(spare);
-	return tracee_settle(generation->template, err);
+	if (!tracee_is_ours(spare->pid))
+		spare->pid = 0; /* link_kill_lost() did not know it */
+	spare->pidfd = proc_pidfd_open(spare->pid);
+	spare->work = SPARE_REST;
+	return 0;
 }
 
 static bool name_spare(const struct target *target, const struct generation *generation)
 {
 	const struct pad *pad = &target->pad;
-	struct inj_call *call = &pad_slot(pad, generation->slot)->template_call;
-	const pid_t spare = generation->spare;
+	struct inj_call *call = call_of(target, generation);
+	const pid_t spare = generation->spare.pid;
 	struct avc_error gone = { 0 };
 
 	memcpy(call->out, "avckpt-spare", 13);
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_prctl, PR_SET_NAME, pad_remote(pad, call->out), 0, 0, 0);
-	return generation->spare_pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
+	return generation->spare.pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
 	       pad_send(pad, spare, &generation->base, call, &gone) == 0 &&
 	       pad_run(spare, call, &gone) == 0;
 }
 
 int spare_make(struct target *target, struct generation *generation, struct avc_error *err)
 {
-	struct avc_error refused = { 0 };
-	struct scheduling was;
-	const bool aside = step_aside(generation->template, &was);
-	const int result = fork_spare(target, generation, &refused);
+	struct spare *spare = &generation->spare;
 
-	if (generation->spare && (result || !name_spare(target, generation) ||
-				  (aside && step_back(generation->spare, &was))))
-		spare_drop(generation);
-	if (result && refused.code != AVC_KERNEL) {
+	spare->tried = true;
+	spare->aside = step_aside(generation->template, &spare->scheduling);
+	if (begin_fork(target, generation, err))
+		return -1;
+	if (spare_await(target, generation, err) == 0)
+		return 0;
+	/* A frozen cgroup, or others have the CPUs; spare_await() goes on with it. */
+	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
+}
+
+int spare_await(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct spare *spare = &generation->spare;
+	struct avc_error refused = { 0 };
+
+	if (!spare->work)
+		return 0;
+	if (spare->work == SPARE_FORK && end_fork(target, generation, &refused) &&
+	    refused.code != AVC_KERNEL) {
 		*err = refused;
 		return -1;
 	}
-	if (aside && step_back(generation->template, &was))
+	if (spare->work == SPARE_REST && tracee_halt(generation->template, err))
+		return -1;
+	spare->work = SPARE_NO_WORK;
+	if (spare->pid && (!name_spare(target, generation) ||
+			   (spare->aside && step_back(spare->pid, &spare->scheduling))))
+		spare_drop(generation);
+	if (spare->aside && step_back(generation->template, &spare->scheduling))
 		return fail_errno(err, generation->template, "make spare", "sched_setattr",
 				  "its scheduling can not be put back");
 	return 0;
@@ -98,15 +132,20 @@ int spare_make(struct target *target, struct generation *generation, struct avc_
 
 bool spare_is_there(struct generation *generation)
 {
-	if (generation->spare && pidfd_ended(generation->spare_pidfd))
+	if (generation->spare.pid && pidfd_ended(generation->spare.pidfd))
 		spare_drop(generation);
-	return generation->spare != 0;
+	return generation->spare.pid != 0;
+}
+
+bool spare_is_unknown(const struct generation *generation)
+{
+	return generation->spare.work == SPARE_FORK;
 }
 
 void spare_drop(struct generation *generation)
 {
-	if (generation->spare)
-		tracee_end(generation->spare, generation->spare_pidfd);
-	generation->spare = 0;
-	generation->spare_pidfd = -1;
+	if (generation->spare.pid)
+		tracee_end(generation->spare.pid, generation->spare.pidfd);
+	generation->spare.pid = 0;
+	generation->spare.pidfd = -1;
 }

@@ -8,9 +8,12 @@ import os
 import random
 import signal
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from harness import wait_until
@@ -162,3 +165,142 @@ def test_priorities_are_kept(tmp_path: Path) -> None:
                 assert os.sched_getscheduler(victim.app) == os.SCHED_FIFO
                 assert os.sched_getparam(victim.app).sched_priority == 7
                 assert os.sched_getaffinity(victim.app) == {0}
+
+
+class Cgroup:
+    """One of a hierarchy that is there, with a knob to keep what is in it from running."""
+
+    def __init__(self, roots: Sequence[str], knob: str, go: str, wait: str) -> None:
+        found = [
+            Path("/sys/fs/cgroup", root) for root in roots if Path("/sys/fs/cgroup", root, "cgroup.procs").exists()
+        ]
+        if not found:
+            pytest.skip(f"no cgroups with {knob} here")
+        self._folder = found[0] / f"avckpt-test-{os.getpid()}"
+        self._knob, self._go, self._wait = knob, go, wait
+
+    def __enter__(self) -> Cgroup:
+        self._folder.mkdir()
+        if not (self._folder / self._knob).exists():
+            self._folder.rmdir()
+            pytest.skip(f"no {self._knob} in {self._folder}")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.go()
+        wait_until(self._removed, 5, "the cgroup is empty")
+
+    def _removed(self) -> bool:
+        with contextlib.suppress(OSError):
+            self._folder.rmdir()
+        return not self._folder.exists()
+
+    def take(self, pid: int) -> None:
+        (self._folder / "cgroup.procs").write_text(str(pid))
+
+    def wait(self) -> None:
+        (self._folder / self._knob).write_text(self._wait)
+
+    def go(self) -> None:
+        (self._folder / self._knob).write_text(self._go)
+
+
+def freezer(version: int) -> Cgroup:
+    """As `podman pause` uses it: cgroups(7), freezer; or cgroup.freeze of version 2."""
+    if version == 1:
+        return Cgroup(["freezer"], "freezer.state", go="THAWED", wait="FROZEN")
+    return Cgroup(["", "unified"], "cgroup.freeze", go="0", wait="1")
+
+
+def throttle() -> Cgroup:
+    """A hundredth of a CPU: `podman run --cpus=0.01`."""
+    if Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us").exists():
+        return Cgroup(["cpu"], "cpu.cfs_quota_us", go="-1", wait="1000")
+    return Cgroup([""], "cpu.max", go="max", wait="1000")
+
+
+@contextlib.contextmanager
+def inside(cgroup: Cgroup, command: str, folder: Path) -> Iterator[tuple[Victim, GuardProcess]]:
+    """Ends with a container in which is what should be, and no more."""
+    with cgroup, Victim(command, folder) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
+        cgroup.take(victim.pid)
+        cgroup.take(victim.app)
+        yield victim, guard
+        victim.check()
+        wait_until(lambda: len(spares(victim)) == 1 and len(ours(victim)) == 3, 5, "template, spare, holder, no more")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("pause_s", [0.05, 1.5])
+def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) -> None:
+    """A template that was to make a spare and could not is still what is restored from."""
+    pause = freezer(version)
+    with inside(pause, "threads 4 1", tmp_path) as (victim, guard):
+        taken = guard.command("checkpoint")
+        pause.wait()
+        time.sleep(pause_s)
+        assert not spares(victim), "it was made before the pause"
+        victim.kill_app()
+        pause.go()
+        assert guard.wait("restored")["generation"] == taken["generation"]
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+def slow_ones() -> list[Any]:
+    return [pytest.param(partial(freezer, 1), id="1"), pytest.param(partial(freezer, 2), id="2"), throttle]
+
+
+@pytest.mark.parametrize("slow", slow_ones())
+def test_made_slowly(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
+    """The application dies when its template has been told to make one, and has made it, or not."""
+    rng, cgroup = random.Random(1), slow()
+    with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
+        for number in range(10):
+            taken = guard.command("checkpoint")
+            time.sleep(rng.uniform(0.015, 0.03))
+            cgroup.wait()
+            time.sleep(rng.choice([0.02, 0.6, 1.0]))
+            since = guard.mark()
+            victim.kill_app()
+            cgroup.go()
+            assert guard.wait("restored", since=since)["generation"] == taken["generation"], number
+            victim.wait_beats(5)
+
+
+@pytest.mark.parametrize("slow", slow_ones())
+def test_its_template_is_killed_in_the_making(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
+    """Nobody knows yet whether there is a spare; none is left."""
+    rng, cgroup = random.Random(2), slow()
+    with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
+        for _ in range(6):
+            guard.command("checkpoint")
+            (template,) = ours(victim, "avckpt-tmpl")
+            time.sleep(rng.uniform(0.015, 0.03))
+            cgroup.wait()
+            time.sleep(rng.choice([0.6, 1.0]))
+            since = guard.mark()
+            os.kill(template, signal.SIGKILL)
+            time.sleep(rng.choice([0.0, 0.1]))
+            cgroup.go()
+            guard.wait("dropped", since=since)
+            wait_until(lambda: len(ours(victim)) == 1, 5, "the holder alone")
+            victim.wait_beats(5)
+        guard.command("checkpoint")
+
+
+@pytest.mark.parametrize("slow", slow_ones())
+def test_the_guard_stops_in_the_making(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
+    with slow() as cgroup, Victim("idle 200 2", tmp_path) as victim:
+        with GuardProcess(config(keep=1), [victim.pid]) as guard:
+            cgroup.take(victim.pid)
+            cgroup.take(victim.app)
+            guard.command("checkpoint")
+            cgroup.wait()
+            time.sleep(0.8)
+            # Who is frozen is not ended by SIGKILL before it thaws, with version 1.
+            later = threading.Timer(1, cgroup.go)
+            later.start()
+            guard.stop()
+            later.join()
+        victim.wait_beats(5)
+        assert not ours(victim)
