@@ -303,4 +303,4 @@ def test_the_guard_stops_in_the_making(slow: Callable[[], Cgroup], tmp_path: Pat
             guard.stop()
             later.join()
         victim.wait_beats(5)
-        assert not ours(victim)
+        wait_until(lambda: not ours(victim), 5, "nothing of ours is left")

@@ -195,7 +195,8 @@ def meddle_until_noticed(victim: subprocess.Popen[str], deed: Callable[[], objec
 )
 def test_foreign_state_is_noticed(start: Start, board: Board, command: str, deed: str, complaint: str) -> None:
     victim = start(*command.split())
-    argv = ["gdb", "-q", "-batch", "-p", str(victim.pid)]
+    # A signal that comes during a call must not leave the victim in it.
+    argv = ["gdb", "-q", "-batch", "-p", str(victim.pid), "-ex", "set unwindonsignal on"]
     for step in deed.split("|"):
         argv += ["-ex", step]
     err = meddle_until_noticed(victim, lambda: subprocess.run(argv, capture_output=True, timeout=30))
