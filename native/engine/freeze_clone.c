@@ -142,7 +142,7 @@ int await_app_clone(struct target *target, struct thread *main_thread,
 
 	target->cloning = false;
 	if (pad_await_clone(main_thread->tid, call, &generation->template, err)) {
-		target->lost = err->code != AVC_KERNEL;
+		target->lost |= err->code != AVC_KERNEL;
 		thread_runs_on(main_thread, err);
 		return -1;
 	}

@@ -105,7 +105,9 @@ void tend_tree(struct avc_guard *guard);
  * `all`: whether or not it is time to look.  When it is: CLOCK_MONOTONIC, UINT64_MAX: never. */
 void let_executed_go(struct avc_guard *guard, bool all);
 uint64_t exec_check_due(const struct avc_guard *guard);
+/* Tracees of ours that nobody knows of. */
 void kill_lost(struct avc_guard *guard);
+void await_spares(struct avc_guard *guard);
 void reap_dead(struct avc_guard *guard);
 void reap_unknown(const struct avc_guard *guard);
 uint32_t dispensable(const struct avc_guard *guard, bool probation);

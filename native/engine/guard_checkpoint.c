@@ -179,6 +179,7 @@ static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 static void abandon(struct avc_guard *guard, struct generation *fresh)
 {
 	generation_drop(fresh);
+	tracee_end_now(); /* they have the tables of processes that are in no generation yet */
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		guard->tree.member[i]->doubtful |= guard->tree.member[i]->lost;
 	if (guard->tree.members)
@@ -268,7 +269,7 @@ void work_ahead(struct avc_guard *guard)
 	else if (wants_spare(guard, newest))
 		make_spare(guard, newest);
 	else
-		more = inherit_next(newest);
+		more = !newest->spare.work && inherit_next(newest); /* which reads its memory */
 	if (more)
 		guard->ahead_ns = now_ns();
 }
@@ -338,6 +339,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
 	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
 		return false;
+	await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
 		guard->cramped |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);

@@ -10,6 +10,9 @@
 
 #include "guard.h"
 
+#define ENDED_NS (50 * NS_PER_MS) /* for the templates of a generation that was lost       */
+#define ENDED_STEP_US 200
+
 /* ---- death and restore --------------------------------------------------------- */
 
 static int say_restored(void *arg, struct avc_error *err)
@@ -87,6 +90,17 @@ static void release_new(struct avc_guard *guard, const struct generation *genera
 			release(guard, guard->tree.member[i]);
 }
 
+/* Nor do templates of a generation that was lost by this death: theirs are the same tables.
+ * And they count where processes are limited. */
+static void wait_ended(void)
+{
+	const uint64_t end = now_ns() + ENDED_NS;
+
+	tracee_end_now();
+	while (tracee_reap_ending() && now_ns() < end)
+		usleep(ENDED_STEP_US);
+}
+
 /* The other processes are those of the generation now; of what they had before they died
  * nothing is open any more (generation_close_tables()). */
 static void adopt_family(struct avc_guard *guard, const struct generation *generation)
@@ -113,9 +127,10 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 	guard->target.childless = !generation->branches;
 }
 
-/* The newest generation; when restores are used up, the one before it. */
+/* The newest generation; when restores are used up, the one before it.  There were `had`
+ * when the app died. */
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
-		       enum avc_reason reason, struct avc_error *error)
+		       enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
 	struct avc_event event = event_new(guard, AVC_EVENT_RESTORED);
 	struct target *target = &guard->target;
@@ -139,6 +154,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		release_new(guard, generation);
+		if (guard->count < had)
+			wait_ended();
 		if (restore(target, generation, &guard->link, config, guard->timer,
 			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
 			    &failed)) {
@@ -221,6 +238,7 @@ static void reap_tracees(void *arg)
 void died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
+	const uint32_t had = guard->count;
 	struct avc_error error = { 0 };
 	enum avc_reason reason;
 
@@ -258,7 +276,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
 		give_up(guard, report, AVC_REASON_EMPTY, &error);
-	} else if (!bring_back(guard, report, reason, &error)) {
+	} else if (!bring_back(guard, report, reason, had, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (guard->target.pid) {
 		hold_all(guard);

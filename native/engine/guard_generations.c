@@ -10,6 +10,7 @@
 #include "guard.h"
 
 #define CONTAINER_END_MS 20
+#define LATE_SPARE_NS (1 * NS_PER_MS)
 
 /* ---- generations ------------------------------------------------------------ */
 
@@ -100,8 +101,25 @@ bool is_known_process(pid_t pid, const void *arg)
 	return is_ours(pid, guard);
 }
 
+/* Of those that were late (spare_make), whichever has been made by now. */
+void await_spares(struct avc_guard *guard)
+{
+	for (uint32_t i = 0; i < guard->count; i++) {
+		struct avc_error late = { 0 };
+
+		if (!guard->generations[i].spare.work)
+			continue;
+		tracee_deadline_set(guard->timer, LATE_SPARE_NS);
+		/* Or it is still on its way; who was killed is seen to by reap_dead(). */
+		if (spare_await(&guard->target, &guard->generations[i], &late))
+			guard->target.lost |= late.code != AVC_DEADLINE;
+		tracee_deadline_clear(guard->timer);
+	}
+}
+
 void kill_lost(struct avc_guard *guard)
 {
+	await_spares(guard);
 	link_kill_lost(&guard->link, is_known_process, guard);
 	guard->target.lost = false;
 	for (uint32_t i = 0; i < guard->tree.members; i++)

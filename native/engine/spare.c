@@ -70,8 +70,12 @@ static int end_fork(struct target *target, struct generation *generation, struct
 		target->lost |= err->code != AVC_KERNEL && err->code != AVC_DEADLINE;
 		return -1;
 	}
-	if (!tracee_is_ours(spare->pid))
-		spare->pid = 0; /* link_kill_lost() did not know it */
+	if (!tracee_is_ours(spare->pid)) {
+		/* The template was killed before it could tell, or link_kill_lost() did not
+		 * know of the spare. */
+		spare->pid = 0;
+		target->lost = true;
+	}
 	spare->pidfd = proc_pidfd_open(spare->pid);
 	spare->work = SPARE_REST;
 	return 0;
