@@ -91,7 +91,7 @@ static void release_new(struct avc_guard *guard, const struct generation *genera
 }
 
 /* Nor do templates of a generation that was lost by this death: theirs are the same tables.
- * And they count where processes are limited. */
+ * And they count where processes are limited, as a spare does. */
 static void wait_ended(void)
 {
 	const uint64_t end = now_ns() + ENDED_NS;
@@ -136,6 +136,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 	struct target *target = &guard->target;
 	const struct avc_config *config = &guard->config;
 	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
+	bool ending = guard->count < had;
 
 	event.ticket = guard->restore_ticket;
 	while (guard->count) {
@@ -154,14 +155,21 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		release_new(guard, generation);
-		if (guard->count < had)
+		if (ending)
 			wait_ended();
 		if (restore(target, generation, &guard->link, config, guard->timer,
 			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
 			    &failed)) {
-			if (!error->code)
-				*error = failed;
-			drop_generation(guard, guard->count - 1);
+			/* Perhaps because the spare was killed when it was needed, or was one
+			 * process too many.  The template is as good as before. */
+			if (generation->spare.pid) {
+				spare_drop(generation);
+			} else {
+				if (!error->code)
+					*error = failed;
+				drop_generation(guard, guard->count - 1);
+			}
+			ending = true;
 			kill_lost(guard);
 			continue;
 		}

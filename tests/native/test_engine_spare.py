@@ -6,7 +6,9 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import select
 import signal
+import subprocess
 import tempfile
 import threading
 import time
@@ -74,6 +76,30 @@ def test_killed_it_is_no_loss(tmp_path: Path) -> None:
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
 
 
+@pytest.mark.parametrize("command", ["threads 4 1", "tree 3"])
+def test_killed_while_it_is_used(command: str, tmp_path: Path) -> None:
+    """From inside the container, at any moment of a restore."""
+    rng = random.Random(3)
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(60):
+            taken = guard.command("checkpoint")
+            spare, since = os.pidfd_open(wait_spare(victim)), guard.mark()
+            dead = os.pidfd_open(victim.app)
+            after_s = rng.uniform(0, 0.002)
+            victim.kill_app()
+            select.select([dead], [], [])
+            until = time.monotonic() + after_s
+            while time.monotonic() < until:
+                pass
+            with contextlib.suppress(ProcessLookupError):  # it was used already
+                signal.pidfd_send_signal(spare, signal.SIGKILL)
+            os.close(spare)
+            os.close(dead)
+            assert guard.wait("restored", since=since)["generation"] == taken["generation"]
+            victim.wait_beats(5)
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
 def test_killed_while_it_is_made(tmp_path: Path) -> None:
     """The application dies at any moment of that; a death may wait for it, but comes to no harm."""
     rng = random.Random(1)
@@ -112,13 +138,15 @@ def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
         die_and_come_back(victim, guard)
 
 
+SOMEBODY = "/usr/bin/setpriv --reuid 54322 --regid 54322 --clear-groups --bounding-set -all --inh-caps -all"
+
+
 @contextlib.contextmanager
 def limited(processes: int) -> Iterator[tuple[Victim, GuardProcess]]:
     """One of four threads that may have so many: with a holder and a template there are six."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # the victim is not root
-        user = "/usr/bin/setpriv --reuid 54322 --regid 54322 --clear-groups --bounding-set -all --inh-caps -all"
-        command = f"{user} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD / 'idle'} 0 4"
+        command = f"{SOMEBODY} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD / 'idle'} 0 4"
         with Victim(command, Path(folder)) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
             yield victim, guard
 
@@ -144,6 +172,21 @@ def test_it_makes_room_for_a_template() -> None:
             time.sleep(0.1)
             assert not spares(victim)
             die_and_come_back(victim, guard)
+
+
+def test_it_is_one_process_too_many() -> None:
+    """Fewer are allowed than when it was made: the template alone is as good as before."""
+    with limited(7) as (victim, guard):
+        taken = guard.command("checkpoint")
+        wait_spare(victim)
+        for pid in ours(victim):
+            subprocess.run([*SOMEBODY.split(), "/usr/bin/prlimit", f"--pid={pid}", "--nproc=6:7"], check=True)
+        for _ in range(3):
+            die_and_come_back(victim, guard)
+        assert {event["generation"] for event in guard.events if event.get("kind") == "restored"} == {
+            taken["generation"]
+        }
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
 
 
 def policies(victim: Victim, name: str) -> set[int]:
