@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import random
 import select
@@ -21,6 +22,7 @@ import pytest
 from harness import wait_until
 from native.family import ours
 from native.guarded import BUILD, GuardProcess, Victim, config
+from native.init_peer import children_of
 
 MEGABYTES = 300
 
@@ -287,6 +289,38 @@ def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) 
         pause.go()
         assert guard.wait("restored")["generation"] == taken["generation"]
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+def shares_memory(a: int, b: int) -> bool:
+    """kcmp(2), KCMP_VM; the number of the call is that of x86-64."""
+    return bool(ctypes.CDLL(None).syscall(312, a, b, 1, 0, 0) == 0)
+
+
+def test_made_late_it_is_used(tmp_path: Path) -> None:
+    """Its template was frozen in the making; what is restored has its memory, which it shares until it is ended."""
+    pause = freezer(2)
+    with inside(pause, "threads 4 1", tmp_path) as (victim, guard):
+        shared = False
+        for _ in range(10):
+            guard.command("checkpoint")
+            wait_until(lambda: len(ours(victim)) == 2, 5, "holder and template")
+            (template,) = ours(victim, "avckpt-tmpl")
+            pause.wait()
+            time.sleep(0.8)
+            assert not spares(victim), "it was made before the pause"
+            pause.go()
+            wait_until(lambda: len(ours(victim)) == 3, 5, "it is there")
+            (late,) = {*ours(victim, "avckpt-tmpl"), *spares(victim)} - {template}
+            since = guard.mark()
+            victim.kill_app()
+            until = time.monotonic() + 1
+            while not shared and time.monotonic() < until:
+                shared = any(shares_memory(late, pid) for pid in children_of(victim.pid) if pid != late)
+            guard.wait("restored", since=since)
+            victim.wait_beats(5)
+            if shared:
+                break
+        assert shared
 
 
 def slow_ones() -> list[Any]:

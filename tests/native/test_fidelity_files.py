@@ -41,6 +41,12 @@ def disturb(victim: Victim) -> None:
     wait_until(lambda: victim.see().counter[2] > before or victim.see().violations, 5, "it has", 0.001)
 
 
+def wait_looked(victim: Victim, before: int) -> None:
+    """Until it has looked at its descriptors more often than `before`, and found nothing wrong."""
+    wait_until(lambda: victim.see().counter[1] > before or victim.see().violations, 5, "it has looked", 0.001)
+    victim.check()
+
+
 def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json:
     """Kills it, and waits until it is there again, and has looked at its descriptors."""
     before = victim.see().counter[1]
@@ -48,7 +54,7 @@ def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json
     victim.kill_app()
     event = guard.wait("restored", since=since)
     if looks:
-        wait_until(lambda: victim.see().counter[1] > before or victim.see().violations, 5, "it has looked", 0.001)
+        wait_looked(victim, before)
     victim.check()
     return event
 
@@ -396,6 +402,20 @@ def test_closed_by_workers_while_a_checkpoint_is_looked_through(tmp_path: Path) 
     ):
         kill_at_random(guard, victim, 100, (0.0, 0.02))
         victim.check()
+
+
+def test_what_a_newer_generation_has_open_is_in_nobodys_way(tmp_path: Path) -> None:
+    """A port that a new worker has taken over between two checkpoints, when the older one is gone back to."""
+    with Victim(f"listeners handed-over {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        older = checkpoint(guard)["generation"]
+        for _ in range(3):
+            before = victim.see().counter[1]
+            disturb(victim)
+            checkpoint(guard)
+            event = guard.command("unhealthy")
+            assert (event["kind"], event["generation"]) == ("restored", older), event
+            assert "error" not in event, event
+            wait_looked(victim, before)
 
 
 def test_a_name_that_somebody_else_has_is_told(tmp_path: Path) -> None:

@@ -340,6 +340,61 @@ static void deserted_setup(void)
 			work(parent);
 }
 
+/* ---- a port that goes over to a new worker ----------------------------------------------- */
+
+static struct sockaddr_in handed;
+
+static int listen_port(void)
+{
+	const int s = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+	const int yes = 1; /* connections that have ended keep it to themselves else */
+
+	must(setsockopt(s, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes) == 0 &&
+		     bind(s, (struct sockaddr *)&handed, sizeof handed) == 0 && listen(s, 3) == 0,
+	     "listen");
+	return s;
+}
+
+static void handed_over_setup(void)
+{
+	socklen_t bytes = sizeof handed;
+
+	handed.sin_family = AF_INET;
+	fd[0] = listen_port();
+	must(getsockname(fd[0], (struct sockaddr *)&handed, &bytes) == 0, "getsockname");
+}
+
+static void handed_over_disturb(void)
+{
+	int ready[2];
+	char word = 0;
+
+	close(fd[0]);
+	must(pipe(ready) == 0, "pipe");
+	if (!fork()) {
+		listen_port();
+		must(write(ready[1], &word, 1) == 1, "write");
+		for (;;)
+			pause();
+	}
+	must(read(ready[0], &word, 1) == 1, "the worker");
+	close(ready[0]);
+	close(ready[1]);
+}
+
+static void handed_over_verify(void)
+{
+	const int client = socket(AF_INET, SOCK_STREAM, 0);
+	int server;
+
+	CHECK(connect(client, (struct sockaddr *)&handed, sizeof handed) == 0,
+	      "port %d can not be connected to: %s", ntohs(handed.sin_port), strerror(errno));
+	server = accept(fd[0], NULL, NULL);
+	CHECK(server >= 0, "nobody comes in: %s", strerror(errno));
+	close(server);
+	close(client);
+}
+
 /* ---- one that somebody else has the name of ------------------------------------------ */
 
 static void taken_setup(void)
@@ -609,6 +664,7 @@ static const struct scenario scenarios[] = {
 	{ "dropped", dropped_setup, dropped_disturb, dropped_verify },
 	{ "family", family_setup, family_disturb, family_verify },
 	{ "deserted", deserted_setup, nothing, nothing },
+	{ "handed-over", handed_over_setup, handed_over_disturb, handed_over_verify },
 	{ "taken", taken_setup, taken_disturb, taken_verify },
 	{ "datagrams", datagrams_setup, datagrams_disturb, datagrams_verify },
 	{ "rebound", rebound_setup, rebound_disturb, rebound_verify },
