@@ -323,6 +323,23 @@ def test_made_late_it_is_used(tmp_path: Path) -> None:
         assert shared
 
 
+def test_made_late_it_makes_room_for_a_template() -> None:
+    """It counts where processes are limited, also as long as nobody has met it."""
+    with freezer(2) as pause, limited(7) as (victim, guard):
+        pause.take(victim.pid)
+        pause.take(victim.app)
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        pause.wait()
+        time.sleep(0.8)
+        assert not spares(victim), "it was made before the pause"
+        pause.go()
+        answer = guard.command("checkpoint")
+        assert answer["kind"] == "checkpoint", str(answer)
+        time.sleep(0.1)
+        assert len(ours(victim)) == 2
+        die_and_come_back(victim, guard)
+
+
 def slow_ones() -> list[Any]:
     return [pytest.param(partial(freezer, 1), id="1"), pytest.param(partial(freezer, 2), id="2"), throttle]
 
