@@ -100,7 +100,7 @@ static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t fla
 	if (pad_send(puppet->pad, puppet->pid, &puppet->base, call, err) ||
 	    pad_run_clone_while(puppet->pid, call, chores ? do_chores : NULL, chores, child, err))
 		return -1;
-	if (tracee_await(*child, NULL, err) != STOP_TRAP || tracee_settle(puppet->pid, err))
+	if (tracee_settle(puppet->pid, err) || tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
 	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
 		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
@@ -111,46 +111,77 @@ static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t fla
 static int take_back(struct puppet *host, pid_t child, pid_t inside, struct avc_error *err)
 {
 	tracee_kill(child);
+	if (inside <= 0)
+		return 0; /* nobody had to wait for it */
 	puppet_call(host, SYS_wait4, (uint64_t)inside, 0, __WALL, 0, 0, 0);
 	puppet_soften(host, NULL);
 	return puppet_flush(host, err);
 }
 
-/* Forks the host until the child has the number. */
+/* A child of the host's, with the number if nobody else has taken it.  `copy`: a child of the
+ * host's that is as it came out of fork(2), and gives its memory to this one; 0: there is none. */
+static int fork_once(struct family *family, struct member *host, const struct branch *branch,
+		     pid_t copy, struct chores *chores, pid_t *child, struct avc_error *err)
+{
+	struct inj_call *runner = &host->puppet.pad->control->runner;
+	struct puppet from = host->puppet;
+	pid_t between = 0;
+	int result;
+
+	/* An orphan's parent has ended: so does one that is there for that. */
+	if (branch->parent == PARENT_INIT) {
+		if (clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
+			return -1;
+		between = proc_inside(from.pid);
+	}
+	if (copy)
+		from.pid = copy;
+	result = last_pid_set(family->helper, branch->inside - 1, err) ||
+		 clone_task(&from, runner, SIGCHLD | (copy ? CLONE_VM | CLONE_PARENT : 0), chores,
+			    child, err);
+	if (between && take_back(&host->puppet, from.pid, between, err))
+		return -1;
+	return result ? -1 : 0;
+}
+
+/* Until it has the number.  The kernel gives it one at the end of the fork (kernel/fork.c,
+ * copy_process()), when everything is copied: what is big may never get it where others fork all
+ * the time.  So the first that has another one is kept as a copy.  To give its memory away takes
+ * no time. */
 static int fork_host(struct family *family, struct member *host, const struct branch *branch,
 		     struct chores *chores, pid_t *child, struct avc_error *err)
 {
-	struct inj_call *runner = &host->puppet.pad->control->runner;
+	const bool orphan = branch->parent == PARENT_INIT;
+	pid_t copy = 0;
 
 	for (int i = 0; i < TRIES; i++) {
-		struct puppet between = host->puppet;
-		pid_t inside, between_inside = 0;
-		int result;
+		struct avc_error failed = { 0 };
+		bool made;
 
 		if (i)
 			usleep(TRY_AGAIN_US);
 		family->flush |= i > 0;
 		*child = 0;
-		/* An orphan's parent has ended: so does one that is there for that. */
-		if (branch->parent == PARENT_INIT) {
-			if (clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL,
-				       &between.pid, err))
-				return -1;
-			between_inside = proc_inside(between.pid);
+		made = fork_once(family, host, branch, copy, chores, child, &failed) == 0;
+		if (made && proc_inside(*child) == branch->inside)
+			return copy ? take_back(&host->puppet, copy, proc_inside(copy), err) : 0;
+		if (made && !copy && !orphan) {
+			copy = *child;
+			continue;
 		}
-		result = last_pid_set(family->helper, branch->inside - 1, err) ||
-			 clone_task(&between, runner, SIGCHLD, chores, child, err);
-		inside = *child ? proc_inside(*child) : 0;
-		if (between_inside && take_back(&host->puppet, between.pid, between_inside, err))
+		if (!made && !*child && !copy) {
+			*err = failed;
 			return -1;
-		if (result)
-			return -1;
-		if (inside == branch->inside)
-			return 0;
-		if (between_inside)
+		}
+		if (*child && orphan)
 			tracee_kill(*child); /* init's */
-		else if (take_back(&host->puppet, *child, inside, err))
+		else if (*child && take_back(&host->puppet, *child, proc_inside(*child), err))
 			return -1;
+		/* One of them was killed, or is one too many where processes are limited. */
+		if (!made && copy && take_back(&host->puppet, copy, proc_inside(copy), err))
+			return -1;
+		if (!made)
+			copy = 0;
 	}
 	return fail(err, AVC_KERNEL, EEXIST, branch->inside, "restore", "clone",
 		    "PID %d is taken by somebody else", branch->inside);

@@ -240,7 +240,7 @@ static bool wants_spare(const struct avc_guard *guard, struct generation *newest
 {
 	const uint64_t interval_ns = guard->config.interval_ns;
 
-	return !newest->spare.tried && !guard->cramped &&
+	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
 	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
 }
 

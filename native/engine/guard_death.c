@@ -164,6 +164,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			 * process too many.  The template is as good as before. */
 			if (generation->spare.pid) {
 				spare_drop(generation);
+				generation->spare.unwanted = true;
 			} else {
 				if (!error->code)
 					*error = failed;

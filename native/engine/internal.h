@@ -357,7 +357,8 @@ struct inheritance;
 struct spare {
 	pid_t pid; /* 0: none                                           */
 	int pidfd;
-	bool tried; /* it was begun to make one                          */
+	bool tried;    /* it was begun to make one                               */
+	bool unwanted; /* a restore with one failed                              */
 	/* What the template has been told to do for it and has not done yet. */
 	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
 	struct scheduling scheduling; /* the template's own                        */
@@ -889,6 +890,10 @@ void oom_score_adj_set(pid_t pid, const char *value);
 
 /* ---- restore.c ------------------------------------------------------------------ */
 
+/* What takes less than a millisecond or so to fork gets the number that it is to have sooner or
+ * later, also where others fork all the time.  What has more pages is copied first (spare.c). */
+#define COPIED_PAGES 16384
+
 struct restore_times {
 	uint64_t restore_ns, fork_ns, threads_ns;
 	struct avc_error notice; /* what could not be put back                  */
@@ -1072,6 +1077,9 @@ void inherit_free(struct inheritance *inheritance);
  * before the deadline.  -1: nothing can be restored from the generation any more. */
 int spare_make(struct target *target, struct generation *generation,
 	       struct avc_error *err) warn_unused;
+/* While the app is dead: at the template's own priority, and until it is there or refused. */
+int spare_make_now(struct target *target, struct generation *generation,
+		   struct avc_error *err) warn_unused;
 /* Before the template is used for anything else: waits until it has done what it had not at
  * the deadline of spare_make().  -1: it has not, AVC_DEADLINE, or as above. */
 int spare_await(struct target *target, struct generation *generation,

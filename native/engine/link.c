@@ -212,11 +212,19 @@ void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void
 		    const void *arg)
 {
 	pid_t children[CHILDREN_MAX];
-	const int count = proc_children(link->init, children, CHILDREN_MAX);
+	bool any;
 
-	for (int i = 0; i < count; i++)
-		if (!known(children[i], arg) && tracee_is_ours(children[i]))
-			tracee_kill(children[i]);
+	/* One that was just cloning, or was the parent of another, leaves that behind. */
+	do {
+		const int count = proc_children(link->init, children, CHILDREN_MAX);
+
+		any = false;
+		for (int i = 0; i < count; i++)
+			if (!known(children[i], arg) && tracee_is_ours(children[i])) {
+				tracee_kill(children[i]);
+				any = true;
+			}
+	} while (any);
 }
 
 void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),

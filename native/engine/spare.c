@@ -110,6 +110,13 @@ int spare_make(struct target *target, struct generation *generation, struct avc_
 	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
 }
 
+int spare_make_now(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	generation->spare.tried = true;
+	generation->spare.aside = false;
+	return begin_fork(target, generation, err) || spare_await(target, generation, err) ? -1 : 0;
+}
+
 int spare_await(struct target *target, struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;

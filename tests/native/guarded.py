@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -282,6 +282,24 @@ def kill_at_random(
         victim.wait_beats(3)
         assert inside(victim.app) == pid
         assert victim.see().pid == acting
+
+
+@contextlib.contextmanager
+def meanwhile(command: Sequence[str], count: int = 1) -> Iterator[None]:
+    """Others are at work; of sessions of their own, which counts (sched(7), autogroups)."""
+    loops = [subprocess.Popen(command, start_new_session=True) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+def forks_beside(victim: Victim) -> contextlib.AbstractContextManager[None]:
+    """Somebody forks all the time in the victim's PID namespace, as a shell of `podman exec` does."""
+    loop = "while :; do /bin/true; done"
+    return meanwhile(["nsenter", "--pid", f"--target={victim.pid}", "sh", "-c", loop])
 
 
 WHERE = ("", "--in-child")

@@ -18,10 +18,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from harness import wait_until
 from native.family import ours
-from native.guarded import BUILD, GuardProcess, Victim, config
+from native.guarded import BUILD, GuardProcess, Victim, config, forks_beside
 from native.init_peer import children_of
 
 MEGABYTES = 300
@@ -130,6 +131,18 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
         die_and_come_back(victim, guard)
 
 
+def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:
+    """Its number would be theirs when the kernel has copied so much."""
+    with (
+        Victim(f"idle {MEGABYTES} 2", tmp_path) as victim,
+        forks_beside(victim),
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        for _ in range(10):
+            assert guard.command("checkpoint", timeout_s=30)["kind"] == "checkpoint"
+            die_and_come_back(victim, guard)
+
+
 def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
     """It must not take much of a CPU."""
     command = f"idle {MEGABYTES} 1"
@@ -143,14 +156,19 @@ def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
 SOMEBODY = "/usr/bin/setpriv --reuid 54322 --regid 54322 --clear-groups --bounding-set -all --inh-caps -all"
 
 
+def processes_of(user: int) -> list[int]:
+    return [process.pid for process in psutil.process_iter(["uids"]) if process.info["uids"].real == user]
+
+
 @contextlib.contextmanager
-def limited(processes: int) -> Iterator[tuple[Victim, GuardProcess]]:
-    """One of four threads that may have so many: with a holder and a template there are six."""
+def limited(processes: int, victim: str = "idle 0 4") -> Iterator[tuple[Victim, GuardProcess]]:
+    """One that may have so many.  Of four threads, with a holder and a template, there are six."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # the victim is not root
-        command = f"{SOMEBODY} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD / 'idle'} 0 4"
-        with Victim(command, Path(folder)) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
-            yield victim, guard
+        command = f"{SOMEBODY} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD}/{victim}"
+        with Victim(command, Path(folder)) as made, GuardProcess(config(keep=1), [made.pid]) as guard:
+            yield made, guard
+        wait_until(lambda: not processes_of(54322), 5, "nobody is left who counts with the next ones")
 
 
 def test_none_when_it_may_not_have_another_process() -> None:
@@ -188,6 +206,15 @@ def test_it_is_one_process_too_many() -> None:
         assert {event["generation"] for event in guard.events if event.get("kind") == "restored"} == {
             taken["generation"]
         }
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+def test_there_is_no_room_for_copies_of_a_big_parent() -> None:
+    """Seven processes, as many holders and templates, and somebody who takes numbers: children are forked without."""
+    with limited(21, "prefork 6 30") as (victim, guard), forks_beside(victim):
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        for _ in range(3):
+            die_and_come_back(victim, guard)
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
 
 

@@ -11,10 +11,9 @@ import dataclasses
 import os
 import random
 import signal
-import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +21,7 @@ from avckpt.events import GuardConfig
 from harness import wait_until
 from native.family import (
     kill_main,
+    look,
     main_process,
     members,
     ours,
@@ -30,7 +30,8 @@ from native.family import (
     pss_kb,
     wait_whole,
 )
-from native.guarded import GuardProcess, Victim, config
+from native.guarded import GuardProcess, Victim, config, forks_beside, meanwhile
+from native.init_peer import children_of
 from native.test_engine_tracer_killed import storm
 
 LONG = os.environ.get("AVCKPT_LONG") == "1"
@@ -129,17 +130,56 @@ def test_a_stopped_job_is_stopped_again(tmp_path: Path) -> None:
         kill_again_and_again(guard, victim, KILLS, 0.15)
 
 
-@contextlib.contextmanager
-def busy_cpus() -> Iterator[None]:
-    """Somebody else wants more of them than there are; of a session of its own, which counts (sched(7), autogroups)."""
-    command = [sys.executable, "-c", "while True: pass"]
-    loops = [subprocess.Popen(command, start_new_session=True) for _ in range(len(os.sched_getaffinity(0)) + 1)]
-    try:
-        yield
-    finally:
-        for loop in loops:
-            loop.kill()
-            loop.wait()
+def busy_cpus() -> contextlib.AbstractContextManager[None]:
+    """More of them are wanted than there are."""
+    return meanwhile([sys.executable, "-c", "while True: pass"], len(os.sched_getaffinity(0)) + 1)
+
+
+@pytest.mark.parametrize("command", ["prefork 6 100", "tree 9 --orphan"])
+def test_numbers_are_taken_by_others(command: str, tmp_path: Path) -> None:
+    """By `podman exec`, say; also of children that take long to fork, or are init's."""
+    with (
+        Victim(command, tmp_path) as victim,
+        forks_beside(victim),
+        GuardProcess(steady(0.05), [victim.pid]) as guard,
+    ):
+        kill_again_and_again(guard, victim, 2 * KILLS, 0.15, orphans=command.count("--orphan"))
+
+
+def kill_others(victim: Victim, family: set[int], over: threading.Event) -> None:
+    """Children of the main process that have other numbers than those of the family."""
+    while not over.is_set():
+        for main in children_of(victim.pid):
+            for child in children_of(main):
+                member = look(child)
+                if member and not member.is_zombie and member.inside not in family:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(child, signal.SIGKILL)
+
+
+def test_copies_are_killed(tmp_path: Path) -> None:
+    """Those that others have taken the number of; by the OOM killer, say."""
+    over = threading.Event()
+    with (
+        Victim("prefork 6 100", tmp_path) as victim,
+        forks_beside(victim),
+        GuardProcess(steady(), [victim.pid]) as guard,
+    ):
+        main = victim.app
+        family = {member.inside for member in map(look, [main, *children_of(main)]) if member}
+        killer = threading.Thread(target=kill_others, args=(victim, family, over))
+        killer.start()
+        try:
+            for _ in range(4 * KILLS):
+                checkpoint(guard)
+                since = guard.mark()
+                kill_main(victim)
+                guard.wait("restored", since=since)
+                progress(victim)
+        finally:
+            over.set()
+            killer.join()
+        assert not [event for event in guard.events if event["kind"] == "dropped"]
 
 
 def test_killed_before_a_checkpoint_is_complete(tmp_path: Path) -> None:
