@@ -2,6 +2,7 @@
  *
  * What follows a death: a restore, or init being told to end.
  */
+#include <errno.h>
 #include <signal.h>
 #include <string.h>
 #include <sys/syscall.h>
@@ -136,7 +137,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 	struct target *target = &guard->target;
 	const struct avc_config *config = &guard->config;
 	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
-	bool ending = guard->count < had;
+	bool ending = guard->count < had, again = false;
 
 	event.ticket = guard->restore_ticket;
 	while (guard->count) {
@@ -162,13 +163,15 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			    &failed)) {
 			/* Perhaps because the spare was killed when it was needed, or was one
 			 * process too many.  The template is as good as before. */
-			if (generation->spare.pid) {
+			if (generation->spare.pid && !again) {
 				spare_drop(generation);
-				generation->spare.unwanted = true;
+				generation->spare.unwanted = failed.errnum == EAGAIN;
+				again = true;
 			} else {
 				if (!error->code)
 					*error = failed;
 				drop_generation(guard, guard->count - 1);
+				again = false;
 			}
 			ending = true;
 			kill_lost(guard);

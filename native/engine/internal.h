@@ -358,7 +358,7 @@ struct spare {
 	pid_t pid; /* 0: none                                           */
 	int pidfd;
 	bool tried;    /* it was begun to make one                               */
-	bool unwanted; /* a restore with one failed                              */
+	bool unwanted; /* it was one process too many for a restore              */
 	/* What the template has been told to do for it and has not done yet. */
 	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
 	struct scheduling scheduling; /* the template's own                        */

@@ -438,7 +438,7 @@ static void check_laps(void)
 	uint64_t sum = 0;
 	int i;
 
-	must(!pthread_mutex_lock(&shared->lock), "lock");
+	lock_shared();
 	for (i = 0; i < SLOTS_MAX; i++)
 		sum += shared->slot[i];
 	CHECK(sum == shared->laps, "the slots hold %lu laps, and %lu were counted", sum,
