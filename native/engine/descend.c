@@ -144,6 +144,18 @@ static int fork_once(struct family *family, struct member *host, const struct br
 	return result ? -1 : 0;
 }
 
+/* Who was killed between making it and telling us has left it in the way. */
+static int take_back_untold(struct puppet *host, pid_t inside, struct avc_error *err)
+{
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(host->pid, children, CHILDREN_MAX);
+
+	for (int i = 0; i < count; i++)
+		if (proc_inside(children[i]) == inside && tracee_is_ours(children[i]))
+			return take_back(host, children[i], inside, err);
+	return 0;
+}
+
 /* Until it has the number.  The kernel gives it one at the end of the fork (kernel/fork.c,
  * copy_process()), when everything is copied: what is big may never get it where others fork all
  * the time.  So the first that has another one is kept as a copy.  To give its memory away takes
@@ -178,7 +190,8 @@ static int fork_host(struct family *family, struct member *host, const struct br
 		else if (*child && take_back(&host->puppet, *child, proc_inside(*child), err))
 			return -1;
 		/* One of them was killed, or is one too many where processes are limited. */
-		if (!made && copy && take_back(&host->puppet, copy, proc_inside(copy), err))
+		if (!made && ((copy && take_back(&host->puppet, copy, proc_inside(copy), err)) ||
+			      take_back_untold(&host->puppet, branch->inside, err)))
 			return -1;
 		if (!made)
 			copy = 0;
