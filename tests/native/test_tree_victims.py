@@ -227,7 +227,11 @@ DEEDS: dict[str, tuple[str, Callable[[Victim], None], str]] = {
         lambda v: os.kill(members(v)[1].pid, signal.SIGKILL),
         "was killed by signal 9",
     ),
-    "no terminal": ("terminal", take_the_terminal, "the group in the foreground|the terminal's session|status 1$"),
+    "no terminal": (
+        "terminal",
+        take_the_terminal,
+        "the group in the foreground|the terminal's session|tcsetpgrp|status 1$",
+    ),
     "continued": (
         "terminal --stopped",
         lambda v: os.kill(next(m.pid for m in members(v) if m.state == "T"), signal.SIGCONT),
