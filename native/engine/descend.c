@@ -108,8 +108,10 @@ static int clone_task(struct puppet *puppet, struct inj_call *call, uint64_t fla
 }
 
 /* A child of the host's that came to nothing, or was only in between. */
-static int take_back(struct puppet *host, pid_t child, pid_t inside, struct avc_error *err)
+static int take_back(struct puppet *host, pid_t child, struct avc_error *err)
 {
+	const pid_t inside = proc_inside(child);
+
 	tracee_kill(child);
 	if (inside <= 0)
 		return 0; /* nobody had to wait for it */
@@ -124,22 +126,20 @@ static int fork_once(struct family *family, struct member *host, const struct br
 		     pid_t copy, struct chores *chores, pid_t *child, struct avc_error *err)
 {
 	struct inj_call *runner = &host->puppet.pad->control->runner;
+	const bool orphan = branch->parent == PARENT_INIT;
 	struct puppet from = host->puppet;
-	pid_t between = 0;
 	int result;
 
 	/* An orphan's parent has ended: so does one that is there for that. */
-	if (branch->parent == PARENT_INIT) {
-		if (clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
-			return -1;
-		between = proc_inside(from.pid);
-	}
+	if (orphan &&
+	    clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
+		return -1;
 	if (copy)
 		from.pid = copy;
 	result = last_pid_set(family->helper, branch->inside - 1, err) ||
 		 clone_task(&from, runner, SIGCHLD | (copy ? CLONE_VM | CLONE_PARENT : 0), chores,
 			    child, err);
-	if (between && take_back(&host->puppet, from.pid, between, err))
+	if (orphan && take_back(&host->puppet, from.pid, err))
 		return -1;
 	return result ? -1 : 0;
 }
@@ -152,7 +152,7 @@ static int take_back_untold(struct puppet *host, pid_t inside, struct avc_error 
 
 	for (int i = 0; i < count; i++)
 		if (proc_inside(children[i]) == inside && tracee_is_ours(children[i]))
-			return take_back(host, children[i], inside, err);
+			return take_back(host, children[i], err);
 	return 0;
 }
 
@@ -176,7 +176,7 @@ static int fork_host(struct family *family, struct member *host, const struct br
 		*child = 0;
 		made = fork_once(family, host, branch, copy, chores, child, &failed) == 0;
 		if (made && proc_inside(*child) == branch->inside)
-			return copy ? take_back(&host->puppet, copy, proc_inside(copy), err) : 0;
+			return copy ? take_back(&host->puppet, copy, err) : 0;
 		if (made && !copy && !orphan) {
 			copy = *child;
 			continue;
@@ -187,14 +187,15 @@ static int fork_host(struct family *family, struct member *host, const struct br
 		}
 		if (*child && orphan)
 			tracee_kill(*child); /* init's */
-		else if (*child && take_back(&host->puppet, *child, proc_inside(*child), err))
+		else if (*child && take_back(&host->puppet, *child, err))
 			return -1;
+		if (made)
+			continue;
 		/* One of them was killed, or is one too many where processes are limited. */
-		if (!made && ((copy && take_back(&host->puppet, copy, proc_inside(copy), err)) ||
-			      take_back_untold(&host->puppet, branch->inside, err)))
+		if ((copy && take_back(&host->puppet, copy, err)) ||
+		    take_back_untold(&host->puppet, branch->inside, err))
 			return -1;
-		if (!made)
-			copy = 0;
+		copy = 0;
 	}
 	return fail(err, AVC_KERNEL, EEXIST, branch->inside, "restore", "clone",
 		    "PID %d is taken by somebody else", branch->inside);

@@ -108,6 +108,8 @@ uint64_t exec_check_due(const struct avc_guard *guard);
 /* Tracees of ours that nobody knows of. */
 void kill_lost(struct avc_guard *guard);
 void await_spares(struct avc_guard *guard);
+/* Those that are just ending, for 50 ms at most. */
+void wait_ended(void);
 void reap_dead(struct avc_guard *guard);
 void reap_unknown(const struct avc_guard *guard);
 uint32_t dispensable(const struct avc_guard *guard, bool probation);

@@ -9,7 +9,6 @@
 #include "guard.h"
 
 #define SPARE_NS (NS_PER_S / 2)
-#define ENDING_MS 50
 #define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
@@ -346,9 +345,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	}
 	if (tracee_ending_pidfd(0) < 0)
 		return false;
-	tracee_end_now();
-	for (int ms = 0; tracee_reap_ending() && ms < ENDING_MS; ms++)
-		usleep(1000);
+	wait_ended();
 	usleep(INIT_REAPS_US);
 	return true;
 }

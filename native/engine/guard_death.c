@@ -11,9 +11,6 @@
 
 #include "guard.h"
 
-#define ENDED_NS (50 * NS_PER_MS) /* for the templates of a generation that was lost       */
-#define ENDED_STEP_US 200
-
 /* ---- death and restore --------------------------------------------------------- */
 
 static int say_restored(void *arg, struct avc_error *err)
@@ -91,17 +88,6 @@ static void release_new(struct avc_guard *guard, const struct generation *genera
 			release(guard, guard->tree.member[i]);
 }
 
-/* Nor do templates of a generation that was lost by this death: theirs are the same tables.
- * And they count where processes are limited, as a spare does. */
-static void wait_ended(void)
-{
-	const uint64_t end = now_ns() + ENDED_NS;
-
-	tracee_end_now();
-	while (tracee_reap_ending() && now_ns() < end)
-		usleep(ENDED_STEP_US);
-}
-
 /* The other processes are those of the generation now; of what they had before they died
  * nothing is open any more (generation_close_tables()). */
 static void adopt_family(struct avc_guard *guard, const struct generation *generation)
@@ -156,6 +142,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		release_new(guard, generation);
+		/* Nor do templates of one that was lost by this death: theirs are the same
+		 * tables.  And they count where processes are limited, as a spare does. */
 		if (ending)
 			wait_ended();
 		if (restore(target, generation, &guard->link, config, guard->timer,

@@ -11,6 +11,8 @@
 
 #define CONTAINER_END_MS 20
 #define LATE_SPARE_NS (1 * NS_PER_MS)
+#define ENDED_NS (50 * NS_PER_MS)
+#define ENDED_STEP_US 200
 
 /* ---- generations ------------------------------------------------------------ */
 
@@ -99,6 +101,15 @@ bool is_known_process(pid_t pid, const void *arg)
 		if (guard->tree.member[i]->leader == pid)
 			return true;
 	return is_ours(pid, guard);
+}
+
+void wait_ended(void)
+{
+	const uint64_t end = now_ns() + ENDED_NS;
+
+	tracee_end_now();
+	while (tracee_reap_ending() && now_ns() < end)
+		usleep(ENDED_STEP_US);
 }
 
 /* Of those that were late (spare_make), whichever has been made by now. */

@@ -96,15 +96,20 @@ static bool name_spare(const struct target *target, const struct generation *gen
 	       pad_run(spare, call, &gone) == 0;
 }
 
+static int make(struct target *target, struct generation *generation, bool aside,
+		struct avc_error *err)
+{
+	generation->spare.tried = true;
+	generation->spare.aside = aside;
+	return begin_fork(target, generation, err) || spare_await(target, generation, err) ? -1 : 0;
+}
+
 int spare_make(struct target *target, struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 
-	spare->tried = true;
-	spare->aside = step_aside(generation->template, &spare->scheduling);
-	if (begin_fork(target, generation, err))
-		return -1;
-	if (spare_await(target, generation, err) == 0)
+	if (make(target, generation, step_aside(generation->template, &spare->scheduling), err) ==
+	    0)
 		return 0;
 	/* A frozen cgroup, or others have the CPUs; spare_await() goes on with it. */
 	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
@@ -112,9 +117,7 @@ int spare_make(struct target *target, struct generation *generation, struct avc_
 
 int spare_make_now(struct target *target, struct generation *generation, struct avc_error *err)
 {
-	generation->spare.tried = true;
-	generation->spare.aside = false;
-	return begin_fork(target, generation, err) || spare_await(target, generation, err) ? -1 : 0;
+	return make(target, generation, false, err);
 }
 
 int spare_await(struct target *target, struct generation *generation, struct avc_error *err)
