@@ -46,10 +46,34 @@ static int listen_unix(int type, const char *path, int backlog)
 	return s;
 }
 
+/* At a port of 127.0.0.1, 0: one that is free. With `reuse` (SO_REUSEADDR) it is free although
+ * connections to it have ended a moment ago. */
+static int listen_inet(uint16_t port, int flags, int reuse)
+{
+	const struct sockaddr_in address = { .sin_family = AF_INET,
+					     .sin_port = port,
+					     .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
+	const int s = socket(AF_INET, SOCK_STREAM | flags, 0);
+
+	must(setsockopt(s, SOL_SOCKET, SO_REUSEADDR, &reuse, sizeof reuse) == 0 &&
+		     bind(s, (const struct sockaddr *)&address, sizeof address) == 0 &&
+		     listen(s, 7) == 0,
+	     "listen");
+	return s;
+}
+
 static void remember_name(int i)
 {
 	name_bytes[i] = sizeof name[i];
 	must(getsockname(fd[i], (struct sockaddr *)&name[i], &name_bytes[i]) == 0, "getsockname");
+}
+
+static uint16_t remembered_port(int i)
+{
+	struct sockaddr_in address;
+
+	memcpy(&address, &name[i], sizeof address);
+	return address.sin_port;
 }
 
 static void expect_name(int i)
@@ -325,13 +349,10 @@ static _Noreturn void work(pid_t parent)
 
 static void deserted_setup(void)
 {
-	const struct sockaddr_in any = { .sin_family = AF_INET };
 	const pid_t parent = getpid();
 	struct stat st;
 
-	fd[0] = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
-	must(bind(fd[0], (const struct sockaddr *)&any, sizeof any) == 0 && listen(fd[0], 3) == 0,
-	     "listen");
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 0);
 	fd[1] = make_file("shared", "", O_RDWR);
 	must(unlink(path_of("shared")) == 0 && fstat(fd[1], &st) == 0, "unlink");
 	shared_ino = st.st_ino;
@@ -342,26 +363,10 @@ static void deserted_setup(void)
 
 /* ---- a port that goes over to a new worker ----------------------------------------------- */
 
-static struct sockaddr_in handed;
-
-static int listen_port(void)
-{
-	const int s = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-	const int yes = 1; /* connections that have ended keep it to themselves else */
-
-	must(setsockopt(s, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes) == 0 &&
-		     bind(s, (struct sockaddr *)&handed, sizeof handed) == 0 && listen(s, 3) == 0,
-	     "listen");
-	return s;
-}
-
 static void handed_over_setup(void)
 {
-	socklen_t bytes = sizeof handed;
-
-	handed.sin_family = AF_INET;
-	fd[0] = listen_port();
-	must(getsockname(fd[0], (struct sockaddr *)&handed, &bytes) == 0, "getsockname");
+	fd[0] = listen_inet(0, SOCK_NONBLOCK, 1);
+	remember_name(0);
 }
 
 static void handed_over_disturb(void)
@@ -372,7 +377,7 @@ static void handed_over_disturb(void)
 	close(fd[0]);
 	must(pipe(ready) == 0, "pipe");
 	if (!fork()) {
-		listen_port();
+		listen_inet(remembered_port(0), 0, 1);
 		must(write(ready[1], &word, 1) == 1, "write");
 		for (;;)
 			pause();
@@ -387,8 +392,8 @@ static void handed_over_verify(void)
 	const int client = socket(AF_INET, SOCK_STREAM, 0);
 	int server;
 
-	CHECK(connect(client, (struct sockaddr *)&handed, sizeof handed) == 0,
-	      "port %d can not be connected to: %s", ntohs(handed.sin_port), strerror(errno));
+	CHECK(connect(client, (struct sockaddr *)&name[0], name_bytes[0]) == 0,
+	      "port %d can not be connected to: %s", ntohs(remembered_port(0)), strerror(errno));
 	server = accept(fd[0], NULL, NULL);
 	CHECK(server >= 0, "nobody comes in: %s", strerror(errno));
 	close(server);
@@ -476,21 +481,9 @@ static void datagrams_verify(void)
 
 /* ---- the same address again, by number and all ------------------------------------------- */
 
-static int listen_inet(uint16_t port)
-{
-	struct sockaddr_in address = { .sin_family = AF_INET,
-				       .sin_port = port,
-				       .sin_addr.s_addr = htonl(INADDR_LOOPBACK) };
-	const int s = socket(AF_INET, SOCK_STREAM, 0);
-
-	must(bind(s, (struct sockaddr *)&address, sizeof address) == 0 && listen(s, 7) == 0,
-	     "listen");
-	return s;
-}
-
 static void rebound_setup(void)
 {
-	fd[0] = listen_inet(0);
+	fd[0] = listen_inet(0, 0, 0);
 	fd[1] = listen_unix(SOCK_STREAM, path_of("server"), 3);
 	remember_name(0);
 	remember_name(1);
@@ -498,11 +491,8 @@ static void rebound_setup(void)
 
 static void rebound_disturb(void)
 {
-	struct sockaddr_in port;
-
-	memcpy(&port, &name[0], sizeof port);
 	close(fd[0]);
-	must(listen_inet(port.sin_port) == fd[0], "another number");
+	must(listen_inet(remembered_port(0), 0, 0) == fd[0], "another number");
 	close(fd[1]);
 	unlink(path_of("server"));
 	must(listen_unix(SOCK_STREAM, path_of("server"), 3) == fd[1], "another number");
