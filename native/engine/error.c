@@ -9,9 +9,11 @@
 
 #include "internal.h"
 
+/* No byte more is read than there is room for: names come out of the pad, too, where the end
+ * of one may just be overwritten. */
 static void copy(char *to, size_t size, const char *from)
 {
-	snprintf(to, size, "%s", from ? from : "");
+	snprintf(to, size, "%.*s", (int)size - 1, from ? from : "");
 }
 
 static int vfail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid,

@@ -642,7 +642,7 @@ static int fill_wiped(struct target *target, struct generation *generation, stru
 			setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise, a->start,
 				  area_bytes(a), MADV_WIPEONFORK, 0, 0);
 		}
-		if (call->count == INJ_CALLS_MAX || (call->count && i + 1 == image->areas.count)) {
+		if (call->count >= INJ_CALLS_MAX || (call->count && i + 1 == image->areas.count)) {
 			if (pad_send(&target->pad, generation->template, &generation->base, call,
 				     err) ||
 			    pad_run(generation->template, call, err))

@@ -139,8 +139,13 @@ void call_begin(struct inj_call *call, enum inj_after after)
 struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
 			     uint64_t d, uint64_t e)
 {
-	struct inj_syscall *s = &call->call[call->count++];
+	/* The pad is the app's to scribble on, and its other threads run while one of them is
+	 * asked: not even a number that was written just now is believed. */
+	const uint32_t count = __atomic_load_n(&call->count, __ATOMIC_RELAXED);
+	const uint32_t i = count < INJ_CALLS_MAX ? count : INJ_CALLS_MAX - 1;
+	struct inj_syscall *s = &call->call[i];
 
+	call->count = i + 1;
 	*s = (struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, 0 }, .result = -ENOSYS };
 	return s;
 }

@@ -151,14 +151,13 @@ static int fork_template(struct target *target, struct generation *generation, p
 static int describe_failure(const struct pad *pad, const struct inj_slot *slot,
 			    struct avc_error *err)
 {
-	const char *name = slot->error_at < sizeof step_names / sizeof *step_names
-				   ? step_names[slot->error_at]
-				   : NULL;
+	const uint32_t at = __atomic_load_n(&slot->error_at, __ATOMIC_RELAXED);
+	const char *name = at < sizeof step_names / sizeof *step_names ? step_names[at] : NULL;
 
-	if (slot->error_at == INJ_STEP_TID)
+	if (at == INJ_STEP_TID)
 		return fail(err, AVC_KERNEL, slot->error, slot->pid, "restore", "clone",
 			    "thread number %d is taken by somebody else", slot->error_tid);
-	if (slot->error_at == INJ_STEP_SETUP)
+	if (at == INJ_STEP_SETUP)
 		return fail(err, AVC_KERNEL, slot->error, slot->pid, "restore",
 			    setup_name(pad, slot->error_setup), "thread %d could not be put back",
 			    slot->error_tid);
