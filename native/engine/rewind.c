@@ -51,6 +51,7 @@ static const struct rewindable {
 	/* Sockets with SO_RCVTIMEO or SO_SNDTIMEO (socket(7)). */
 	{ SYS_read, RECEIVE, 0 },
 	{ SYS_readv, RECEIVE, 0 },
+	{ SYS_preadv2, RECEIVE, 0 },
 	{ SYS_recvfrom, RECEIVE, 0 },
 	{ SYS_recvmsg, RECEIVE, 0 },
 	{ SYS_recvmmsg, RECEIVE, 0 },
@@ -59,6 +60,8 @@ static const struct rewindable {
 	{ SYS_connect, SEND, 0 },
 	{ SYS_write, SEND, 0 },
 	{ SYS_writev, SEND, 0 },
+	{ SYS_pwritev2, SEND, 0 },
+	{ SYS_sendfile, SEND, 0 },
 	{ SYS_sendto, SEND, 0 },
 	{ SYS_sendmsg, SEND, 0 },
 	{ SYS_sendmmsg, SEND, 0 },

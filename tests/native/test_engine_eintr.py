@@ -11,6 +11,8 @@ from native.guarded import GuardProcess, Victim, config
 
 CHECKPOINTS = 10_000
 KINDS_AT = 8
+KINDS, TIMED = 22, 18
+"""Kinds of calls in eintr.c; how many of them have a timeout and are part of "all"."""
 UNWOKEN = {9, 10, 11, 19}
 """Places on the board of kinds that nothing wakes: the three sleeps; and io_getevents, which "all" leaves out."""
 
@@ -29,13 +31,13 @@ def test_no_eintr_over_ten_thousand_checkpoints(tmp_path: Path) -> None:
         # A few may miss their deadline on a busy machine.
         done = guard.burst(CHECKPOINTS + 100, timeout_s=360)
         assert done["taken"] >= CHECKPOINTS, done
-        calls = victim.see().counter[KINDS_AT : KINDS_AT + 20]
+        calls = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
         victim.wait_beats(20)
         victim.check()
         assert victim.see().counter[1] == 0
         # None is stuck in a call whose wake-up was lost: each comes back once more.
-        later = victim.see().counter[KINDS_AT : KINDS_AT + 20]
-        stuck = [n for n in range(20) if n not in UNWOKEN and later[n] == calls[n]]
+        later = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
+        stuck = [n for n in range(KINDS) if n not in UNWOKEN and later[n] == calls[n]]
         assert stuck == [], f"of {victim.command}, as listed in eintr.c: {stuck}"
 
 
@@ -50,9 +52,9 @@ def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, 
         time.sleep(2.2 * seconds)
         seen = victim.see()
         victim.check()
-        counts = seen.counter[KINDS_AT : KINDS_AT + 19]
+        counts = seen.counter[KINDS_AT : KINDS_AT + KINDS]
         timed = [n for n in counts if n]
-        assert len(timed) == 16, f"kinds that have come back at all: {counts}"
+        assert len(timed) == TIMED, f"kinds that have come back at all: {counts}"
         assert min(timed) >= 2, counts
         assert seen.counter[1] == 0
 
@@ -69,8 +71,8 @@ def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
             since = guard.mark()
             victim.kill_app()
             guard.wait("restored", since=since)
-        calls = victim.see().counter[KINDS_AT : KINDS_AT + 19]
+        calls = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
         time.sleep(1.5)
         victim.check()
-        later = victim.see().counter[KINDS_AT : KINDS_AT + 19]
-        assert sum(after > before for before, after in zip(calls, later)) == 16, (calls, later)
+        later = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
+        assert sum(after > before for before, after in zip(calls, later)) == TIMED, (calls, later)

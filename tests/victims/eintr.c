@@ -29,7 +29,9 @@
 #include <sys/msg.h>
 #include <sys/select.h>
 #include <sys/sem.h>
+#include <sys/sendfile.h>
 #include <sys/socket.h>
+#include <sys/uio.h>
 #include <sys/un.h>
 
 #include "victim.h"
@@ -44,7 +46,7 @@ static sigset_t usr1, waiting; /* the mask of this process, and another one */
 struct place {
 	double seconds; /* 0: no timeout */
 	struct timespec timeout;
-	int pipe_fd[2], pair_fd[2], listen_fd, epoll_fd, sem_id, msg_id;
+	int pipe_fd[2], pair_fd[2], listen_fd, epoll_fd, program_fd, sem_id, msg_id;
 	struct sockaddr_un listen_at;
 	socklen_t listen_len;
 	uint32_t word;
@@ -81,12 +83,12 @@ static int drain(long ready)
 	return (int)ready;
 }
 
-static void set_receive_timeout(int fd)
+static void set_timeout(int fd, int option)
 {
 	struct timeval tv = { (time_t)here->seconds,
 			      (long)((here->seconds - (double)(time_t)here->seconds) * 1e6) };
 
-	must(!setsockopt(fd, SOL_SOCKET, SO_RCVTIMEO, &tv, sizeof(tv)), "SO_RCVTIMEO");
+	must(!setsockopt(fd, SOL_SOCKET, option, &tv, sizeof(tv)), "a timeout");
 }
 
 /* The calls: 1 woken, 0 timed out, -1 with errno. */
@@ -258,6 +260,26 @@ static int do_io_getevents(void)
 	return (int)syscall(SYS_io_getevents, here->aio, 1, 1, &event, timeout());
 }
 
+static int do_preadv2(void)
+{
+	char c;
+	struct iovec to = { &c, 1 };
+
+	if (preadv2(here->pair_fd[0], &to, 1, -1, 0) < 0)
+		return errno == EAGAIN ? 0 : -1;
+	return 1;
+}
+
+/* Waits when nobody has read the datagrams before it. */
+static int do_sendfile(void)
+{
+	off_t at = 0;
+
+	if (sendfile(here->pair_fd[0], here->program_fd, &at, 1) < 0)
+		return errno == EAGAIN ? 0 : -1;
+	return 1;
+}
+
 /* The wake-ups. */
 
 static void wake_pipe(void)
@@ -283,6 +305,13 @@ static void wake_accept(void)
 static void wake_recv(void)
 {
 	must(send(here->pair_fd[1], "", 1, 0) == 1, "send");
+}
+
+static void wake_send(void)
+{
+	char c;
+
+	must(recv(here->pair_fd[1], &c, 1, MSG_DONTWAIT) == 1 || errno == EAGAIN, "recv");
 }
 
 static void wake_signal(void)
@@ -333,6 +362,8 @@ static const struct kind {
 	{ "semop", do_semop, wake_sem, true },
 	{ "msgrcv", do_msgrcv, wake_msg, true },
 	{ "io_getevents", do_io_getevents, NULL, false },
+	{ "preadv2", do_preadv2, wake_recv, false },
+	{ "sendfile", do_sendfile, wake_send, false },
 };
 
 static struct place places[sizeof(kinds) / sizeof(kinds[0])];
@@ -345,6 +376,8 @@ static void set_up(const struct kind *kind, double seconds)
 	here->seconds = kind->untimed ? 0 : seconds;
 	must(!pipe(here->pipe_fd), "pipe");
 	must(!socketpair(AF_UNIX, SOCK_DGRAM, 0, here->pair_fd), "socketpair");
+	here->program_fd = open("/proc/self/exe", O_RDONLY);
+	must(here->program_fd >= 0, "/proc/self/exe");
 	here->epoll_fd = epoll_create1(0);
 	must(here->epoll_fd >= 0 &&
 		     !epoll_ctl(here->epoll_fd, EPOLL_CTL_ADD, here->pipe_fd[0], &event),
@@ -360,8 +393,9 @@ static void set_up(const struct kind *kind, double seconds)
 	     "getsockname");
 	must(!listen(here->listen_fd, 8), "listen");
 	if (here->seconds > 0) {
-		set_receive_timeout(here->listen_fd);
-		set_receive_timeout(here->pair_fd[0]);
+		set_timeout(here->listen_fd, SO_RCVTIMEO);
+		set_timeout(here->pair_fd[0], SO_RCVTIMEO);
+		set_timeout(here->pair_fd[0], SO_SNDTIMEO);
 	}
 	if (kind->call == do_semtimedop || kind->call == do_semop)
 		must((here->sem_id = semget(IPC_PRIVATE, 1, 0600)) >= 0, "semget");
