@@ -297,6 +297,17 @@ static bool is_channel(const struct file *f)
 					f->socket->domain == AF_UNIX && !f->socket->listening);
 }
 
+/* What an idle socket has become between the two looks must not be forgotten. */
+static bool is_outdated(int fd, const struct file_socket *s)
+{
+	int listens = 0;
+	socklen_t bytes = sizeof listens;
+
+	return s->idle &&
+	       (file_socket_was_used(fd, s) ||
+		(!getsockopt(fd, SOL_SOCKET, SO_ACCEPTCONN, &listens, &bytes) && listens));
+}
+
 static int look_at(struct look *look, int number, struct avc_error *err)
 {
 	struct files *files = look->files;
@@ -364,6 +375,11 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		/* What was opened since is not made again. */
 		if (f->socket && look->depth != FILES_NOW)
 			file_look_at_manner(fd, f->socket, look->init);
+	}
+	if (look->depth == FILES_FROZEN && known && f->socket && is_outdated(fd, f->socket)) {
+		f->known = false; /* for its heirs (look_at_inherited())         */
+		file_look_at_socket(fd, f);
+		file_look_at_manner(fd, f->socket, look->init);
 	}
 	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
 	    !(f->flags & O_PATH))

@@ -68,6 +68,7 @@ struct file_mark { /* of inotify                                               *
 struct file_socket {
 	int domain, type, protocol;
 	bool listening, connected;
+	bool idle;   /* has never been connected, and does not listen                    */
 	int backlog; /* -1: not asked yet                                         */
 	/* Of those that can be made again: file_socket_is_alone()                 */
 	uint32_t uid, gid;
@@ -204,6 +205,8 @@ void file_socket_free(struct file_socket *socket);
 bool file_socket_is_alone(const struct file_socket *socket);
 /* What only matters if it has to be made again: options, user, the file of its name. */
 void file_look_at_manner(int fd, struct file_socket *socket, pid_t init);
+/* Whether one that was idle has got a name or a connection since. */
+bool file_socket_was_used(int fd, const struct file_socket *socket);
 /* Whether getsockname(2) says the same of `fd`. */
 bool file_socket_has_name(int fd, const struct file_socket *socket);
 /* Those that are not so yet.  Returns NULL or what failed. */

@@ -190,6 +190,8 @@ void file_socket_free(struct file_socket *s)
 
 bool file_socket_is_alone(const struct file_socket *s)
 {
+	if (s->idle)
+		return true;
 	if (s->domain == AF_UNIX)
 		return file_unix_is_alone(s);
 	return (s->domain == AF_INET || s->domain == AF_INET6 || s->domain == AF_NETLINK) &&
@@ -203,6 +205,14 @@ bool file_socket_has_name(int fd, const struct file_socket *s)
 
 	return getsockname(fd, (struct sockaddr *)&local, &bytes) == 0 && bytes == s->local_bytes &&
 	       !memcmp(&local, &s->local, bytes);
+}
+
+bool file_socket_was_used(int fd, const struct file_socket *s)
+{
+	struct sockaddr_storage remote;
+	socklen_t bytes = sizeof remote;
+
+	return !file_socket_has_name(fd, s) || !getpeername(fd, (struct sockaddr *)&remote, &bytes);
 }
 
 void file_look_at_manner(int fd, struct file_socket *s, pid_t init)

@@ -163,6 +163,23 @@ static void give_up_deleted(struct files_work *work)
 	}
 }
 
+/* Who was about to give it a name, or to connect it, will do so again, and the kernel lets
+ * nobody do that twice (bind(2): EINVAL, connect(2): EISCONN). */
+static void give_up_used(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		int fd;
+
+		if (!w->socket || !w->socket->idle || work->source[i] < 0)
+			continue;
+		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
+		if (fd >= 0 && file_socket_was_used(fd, w->socket))
+			work->source[i] = -1;
+		close_fd(&fd);
+	}
+}
+
 /* Somewhere else in the table, perhaps: the app may have moved it. */
 static void find_moved(struct files_work *work)
 {
@@ -678,6 +695,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	give_up_read(work);
 	give_up_pidfds(work);
 	give_up_deleted(work);
+	give_up_used(work);
 	break_pairs(work);
 	return 0;
 }

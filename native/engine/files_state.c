@@ -45,6 +45,18 @@ static int option(int fd, int level, int name)
 	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
 }
 
+static bool is_idle(int fd, const struct file_socket *s)
+{
+	struct pollfd state = { .fd = fd, .events = POLLRDHUP };
+
+	if ((s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6) ||
+	    s->type == SOCK_RAW || s->listening || s->connected || poll(&state, 1, 0) < 0 ||
+	    state.revents & POLLRDHUP)
+		return false;
+	/* A stream hangs up when it has no connection, but not while it gets one (tcp_poll()). */
+	return s->type == SOCK_DGRAM || state.revents & POLLHUP;
+}
+
 void file_look_at_socket(int fd, struct file *file)
 {
 	struct file_socket *s = calloc(1, sizeof *s);
@@ -70,6 +82,7 @@ void file_look_at_socket(int fd, struct file *file)
 	}
 	if (s->listening && s->domain == AF_UNIX)
 		s->backlog = -1;
+	s->idle = is_idle(fd, s);
 	file_socket_free(file->socket);
 	file->socket = s;
 }

@@ -378,7 +378,7 @@ def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["unix", "datagrams", "rebound", "options", "dropped", "family"])
+@pytest.mark.parametrize("scenario", ["unix", "datagrams", "rebound", "early", "options", "dropped", "family"])
 def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
     """Under their names, with their options; also those that the restore before had made."""
     with (
@@ -392,6 +392,16 @@ def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
                 for _again in range(2):
                     event = restored(victim, guard)
                     assert "error" not in event, event
+
+
+def test_a_socket_that_is_just_being_bound(tmp_path: Path) -> None:
+    """Whatever the moment of the checkpoint, it has a name afterwards if and only if bind(2) was over."""
+    with (
+        Victim(f"listeners brief {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(0.005), [victim.pid]) as guard,
+    ):
+        kill_at_random(guard, victim, 100, (0.0, 0.02))
+        victim.check()
 
 
 def test_closed_by_workers_while_a_checkpoint_is_looked_through(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@
 #include <arpa/inet.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
+#include <pthread.h>
 #include <stddef.h>
 #include <sys/epoll.h>
 #include <sys/fsuid.h>
@@ -513,6 +514,111 @@ static void rebound_verify(void)
 	expect_server(1, SOCK_STREAM, &name[1], name_bytes[1]);
 }
 
+/* ---- that were only just made --------------------------------------------------------------- */
+
+#define EARLY 7
+
+static const struct {
+	int domain, type;
+	bool connects;
+} early[EARLY] = {
+	{ AF_INET, SOCK_STREAM, false },    { AF_INET, SOCK_STREAM, true },
+	{ AF_INET6, SOCK_STREAM, false },   { AF_INET, SOCK_DGRAM, false },
+	{ AF_UNIX, SOCK_STREAM, false },    { AF_UNIX, SOCK_STREAM, true },
+	{ AF_UNIX, SOCK_SEQPACKET, false },
+};
+
+static void early_setup(void)
+{
+	const int yes = 1;
+
+	for (int i = 0; i < EARLY; i++) {
+		fd[i] = socket(early[i].domain, early[i].type, 0);
+		must(fd[i] >= 0 && !setsockopt(fd[i], SOL_SOCKET, SO_KEEPALIVE, &yes, sizeof yes),
+		     "socket");
+	}
+	fd[EARLY] = listen_inet(0, 0, 0);
+	fd[EARLY + 1] = listen_unix(SOCK_STREAM, "@early", 100);
+	remember_name(EARLY);
+	remember_name(EARLY + 1);
+}
+
+static void early_disturb(void)
+{
+	for (int i = 0; i < EARLY; i++) {
+		const int to = early[i].domain == AF_UNIX ? EARLY + 1 : EARLY;
+		struct sockaddr_storage any = { .ss_family = (sa_family_t)early[i].domain };
+		/* Of a Unix socket: an abstract name that the kernel chooses. */
+		const socklen_t bytes = early[i].domain == AF_UNIX   ? sizeof any.ss_family
+					: early[i].domain == AF_INET ? sizeof(struct sockaddr_in)
+								     : sizeof(struct sockaddr_in6);
+
+		CHECK(!(early[i].connects
+				? connect(fd[i], (struct sockaddr *)&name[to], name_bytes[to])
+				: bind(fd[i], (struct sockaddr *)&any, bytes)),
+		      "socket %d can not be used: %s", i, strerror(errno));
+		if (early[i].connects)
+			close(accept(fd[to], NULL, NULL)); /* there is not much room */
+		CHECK(early[i].connects || early[i].type == SOCK_DGRAM || !listen(fd[i], 5),
+		      "socket %d can not listen: %s", i, strerror(errno));
+	}
+}
+
+static void early_verify(void)
+{
+	for (int i = 0; i < EARLY; i++) {
+		struct sockaddr_storage is = { 0 };
+		socklen_t bytes = sizeof is;
+		int yes = 0;
+
+		CHECK(!getsockname(fd[i], (struct sockaddr *)&is, &bytes) &&
+			      (early[i].domain == AF_UNIX ? bytes == sizeof is.ss_family
+							  : !((struct sockaddr_in *)&is)->sin_port),
+		      "socket %d has a name", i);
+		bytes = sizeof is;
+		CHECK(getpeername(fd[i], (struct sockaddr *)&is, &bytes) && errno == ENOTCONN,
+		      "socket %d is connected", i);
+		bytes = sizeof yes;
+		CHECK(!getsockopt(fd[i], SOL_SOCKET, SO_KEEPALIVE, &yes, &bytes) && yes,
+		      "socket %d has lost an option", i);
+	}
+}
+
+/* ---- that are made, bound and closed all the time ------------------------------------------ */
+
+static int listen_later(void)
+{
+	const struct sockaddr_in any = { .sin_family = AF_INET };
+	const int s = socket(AF_INET, SOCK_STREAM, 0);
+
+	must(s >= 0, "socket");
+	nap_us(300);
+	CHECK(!bind(s, (const struct sockaddr *)&any, sizeof any), "bind: %s", strerror(errno));
+	return s;
+}
+
+static void *be_brief(void *unused)
+{
+	for (;;) {
+		const int s = listen_later();
+		struct sockaddr_in is = { 0 };
+		socklen_t bytes = sizeof is;
+
+		nap_us(300);
+		CHECK(!getsockname(s, (struct sockaddr *)&is, &bytes) && is.sin_port,
+		      "a socket has lost its name");
+		close(s);
+	}
+	return unused;
+}
+
+static void brief_setup(void)
+{
+	pthread_t thread;
+
+	must(!pthread_create(&thread, NULL, be_brief, NULL), "pthread_create");
+}
+
 /* ---- options --------------------------------------------------------------------------------- */
 
 #define TCP_SERVER 0
@@ -658,6 +764,8 @@ static const struct scenario scenarios[] = {
 	{ "taken", taken_setup, taken_disturb, taken_verify },
 	{ "datagrams", datagrams_setup, datagrams_disturb, datagrams_verify },
 	{ "rebound", rebound_setup, rebound_disturb, rebound_verify },
+	{ "early", early_setup, early_disturb, early_verify },
+	{ "brief", brief_setup, nothing, nothing },
 	{ "options", options_setup, options_disturb, options_verify },
 };
 
