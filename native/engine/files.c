@@ -212,6 +212,7 @@ static struct file *take_known(const struct look *look, struct file *f)
 		f->cloexec = k->cloexec;
 	f->outside = k->outside;
 	f->id = k->id;
+	f->pipe_bytes = k->pipe_bytes;
 	f->shared = k->shared;
 	f->owner_type = k->owner_type;
 	f->owner = k->owner;
@@ -370,6 +371,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		f->kind = kind_of(f);
 		f->outside = is_inits(look, f);
 		look_at_owner(fd, f);
+		if (f->kind == FILE_PIPE)
+			f->pipe_bytes = fcntl(fd, F_GETPIPE_SZ);
 		if (f->kind == FILE_SOCKET)
 			file_look_at_socket(fd, f);
 		/* What was opened since is not made again. */

@@ -120,6 +120,7 @@ struct file {
 	int64_t told_offset;
 	struct file_lock *lock; /* allocated                                     */
 	uint32_t lock_count;
+	int pipe_bytes;             /* F_GETPIPE_SZ                                       */
 	bool remote;                /* a network file system: no questions while frozen       */
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
@@ -247,8 +248,8 @@ const char *file_put_marks(int fd, const struct file *want, const struct file *n
 /* The file that it was, by its path: an O_PATH descriptor, or -1. */
 int file_open_path(const struct file *want, pid_t init);
 int file_make(const struct file *want, pid_t template, pid_t init, const char **why);
-/* Both ends of a pipe or socket pair. */
-int file_make_pair(const struct file *want, int ends[2]);
+/* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
+int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
 /* A socket or pipe that reads as closed by the other side, after what was in it. */
 int file_make_dead(const struct file *want, pid_t template);
 

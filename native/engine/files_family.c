@@ -257,7 +257,7 @@ static void join_lost(const struct tables *tables, struct files_work *work, cons
 		return;
 	}
 	other = find_other(tables, w, &made_already);
-	if (!other || made_already || file_make_pair(w, ends))
+	if (!other || made_already || file_make_pair(w, other, ends))
 		return;
 	/* pipe(2): the first is the one to read from. */
 	writer = w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY;

@@ -301,9 +301,18 @@ int file_make(const struct file *want, pid_t template, pid_t init, const char **
 	return open_empty(want);
 }
 
-int file_make_pair(const struct file *want, int ends[2])
+int file_make_pair(const struct file *want, const struct file *other, int ends[2])
 {
-	if (want->kind == FILE_PIPE)
-		return pipe2(ends, O_CLOEXEC);
-	return socketpair(AF_UNIX, want->socket->type | SOCK_CLOEXEC, 0, ends);
+	if (want->kind == FILE_PIPE) {
+		if (pipe2(ends, O_CLOEXEC))
+			return -1;
+		if (want->pipe_bytes != fcntl(ends[0], F_GETPIPE_SZ))
+			(void)fcntl(ends[0], F_SETPIPE_SZ, want->pipe_bytes);
+		return 0;
+	}
+	if (socketpair(AF_UNIX, want->socket->type | SOCK_CLOEXEC, 0, ends))
+		return -1;
+	file_put_options(ends[0], want->socket);
+	file_put_options(ends[1], other->socket);
+	return 0;
 }

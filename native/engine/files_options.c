@@ -215,11 +215,18 @@ bool file_socket_was_used(int fd, const struct file_socket *s)
 	return !file_socket_has_name(fd, s) || !getpeername(fd, (struct sockaddr *)&remote, &bytes);
 }
 
+/* socketpair(2): whoever is connected by name has one end with a name. */
+static bool is_of_pair(const struct file_socket *s)
+{
+	return s->domain == AF_UNIX && s->connected && s->local_bytes == sizeof(sa_family_t) &&
+	       s->remote_bytes == sizeof(sa_family_t);
+}
+
 void file_look_at_manner(int fd, struct file_socket *s, pid_t init)
 {
 	struct stat st;
 
-	if (!file_socket_is_alone(s) || fstat(fd, &st))
+	if (!(file_socket_is_alone(s) || is_of_pair(s)) || fstat(fd, &st))
 		return;
 	s->uid = st.st_uid;
 	s->gid = st.st_gid;

@@ -303,8 +303,13 @@ static void lost_verify(void)
 
 /* ---- bytes in pipes and socket pairs ------------------------------------------------------------- */
 
+#define PIPE_BYTES (256 * 1024)
+
 static void content_setup(void)
 {
+	const struct timeval patience = { 7, 0 };
+	const int buffer = 100000;
+
 	must(pipe2(fd, O_NONBLOCK) == 0, "pipe");
 	must(write(fd[1], "wake", 4) == 4, "write");
 	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd + 2) == 0, "socketpair");
@@ -315,8 +320,12 @@ static void content_setup(void)
 	must(write(fd[7], scratch, 50000) == 50000, "write");
 	must(pipe(fd + 8) == 0 && write(fd[9], "one end", 7) == 7, "pipe");
 	must(pipe(fd + 10) == 0 && write(fd[11], "both ends", 9) == 9, "pipe");
+	must(fcntl(fd[10], F_SETPIPE_SZ, PIPE_BYTES) == PIPE_BYTES, "F_SETPIPE_SZ");
 	must(socketpair(AF_UNIX, SOCK_STREAM, 0, fd + 12) == 0 && write(fd[13], "pair", 4) == 4,
 	     "socketpair");
+	must(!setsockopt(fd[12], SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience) &&
+		     !setsockopt(fd[13], SOL_SOCKET, SO_SNDBUF, &buffer, sizeof buffer),
+	     "setsockopt");
 }
 
 static void content_disturb(void)
@@ -333,6 +342,8 @@ static void content_disturb(void)
 
 static void content_verify(void)
 {
+	struct timeval patience = { 0 };
+	socklen_t length = sizeof patience;
 	int bytes = 0;
 
 	expect_text(fd[0], "wake", "a pipe");
@@ -349,6 +360,14 @@ static void content_verify(void)
 	expect_text(fd[12], "pair", "a pair of which one end was closed");
 	CHECK(write(fd[12], "x", 1) == 1 && read(fd[13], scratch, 1) == 1,
 	      "a pair made again does not work");
+	bytes = fcntl(fd[11], F_GETPIPE_SZ);
+	CHECK(bytes == PIPE_BYTES, "a pipe made again has room for %d bytes", bytes);
+	CHECK(!getsockopt(fd[12], SOL_SOCKET, SO_RCVTIMEO, &patience, &length) &&
+		      patience.tv_sec == 7,
+	      "an end of a pair made again has no timeout");
+	length = sizeof bytes;
+	CHECK(!getsockopt(fd[13], SOL_SOCKET, SO_SNDBUF, &bytes, &length) && bytes == 200000,
+	      "an end of a pair made again has room for %d bytes", bytes);
 	/* As it was, for the next time. */
 	must(write(fd[1], "wake", 4) == 4 && write(fd[2], "hello you", 9) == 9, "write");
 	must(write(fd[9], "one end", 7) == 7 && write(fd[11], "both ends", 9) == 9 &&
