@@ -243,6 +243,8 @@ const char *file_put_stream(int fd, const struct file *want, const struct file *
 const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init);
 
 /* files_make.c */
+/* Of a pseudoterminal, the side that programs run on. */
+bool file_is_pts(const struct file *file);
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
  * may be set on success as well: what is not as it was. */
 /* The file that it was, by its path: an O_PATH descriptor, or -1. */

@@ -5,6 +5,7 @@
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/major.h>
 #include <linux/openat2.h>
 #include <netinet/in.h>
 #include <sched.h>
@@ -16,10 +17,14 @@
 #include <sys/signalfd.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/sysmacros.h>
 #include <sys/timerfd.h>
 #include <unistd.h>
 
 #include "files.h"
+
+/* drivers/tty/pty.c */
+#define PTMX_MINOR 2
 
 static bool is_the_one(int fd, const struct file *want)
 {
@@ -105,6 +110,28 @@ static int open_empty(const struct file *want)
 	return open("/dev/null", (want->flags & (O_ACCMODE | O_PATH)) | O_CLOEXEC);
 }
 
+bool file_is_pts(const struct file *f)
+{
+	return f->kind == FILE_DEVICE && major(f->rdev) >= UNIX98_PTY_SLAVE_MAJOR &&
+	       major(f->rdev) < UNIX98_PTY_SLAVE_MAJOR + UNIX98_PTY_MAJOR_COUNT;
+}
+
+/* Whether whoever opens it has something of his own: not so with /dev/null and its like, nor
+ * with terminals, but with /dev/ptmx. */
+static bool is_another_instance(const struct file *want)
+{
+	if (want->kind != FILE_DEVICE || want->flags & O_PATH || file_is_pts(want))
+		return false;
+	switch (major(want->rdev)) {
+	case MEM_MAJOR:
+	case TTY_MAJOR:
+		return false;
+	case TTYAUX_MAJOR:
+		return minor(want->rdev) == PTMX_MINOR;
+	}
+	return true;
+}
+
 static int make_named(const struct file *want, pid_t template, pid_t init, const char **why)
 {
 	int found = file_open_path(want, init), fd = -1;
@@ -116,6 +143,8 @@ static int make_named(const struct file *want, pid_t template, pid_t init, const
 		close(found);
 		if (fd < 0)
 			*why = "it was closed since the checkpoint and can not be opened again";
+		else if (is_another_instance(want))
+			*why = "it was closed since the checkpoint: the device was opened anew";
 	} else {
 		*why = "it was closed since the checkpoint and is not there any more";
 	}

@@ -20,17 +20,16 @@
 #include <string.h>
 #include <sys/epoll.h>
 #include <sys/ioctl.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
-#include <sys/sysmacros.h>
 #include <termios.h>
 #include <unistd.h>
 
 #include "files.h"
 
 #define NAME_SHOWN 48
-#define TTY_SLAVES 136 /* eight major numbers: pts(4), linux/major.h */
 
 void files_note(struct files_work *work, const struct file *f, const char *problem)
 {
@@ -108,8 +107,7 @@ static void give_up_hung_up(struct files_work *work)
 		struct termios settings;
 		int fd;
 
-		if (w->kind != FILE_DEVICE || major(w->rdev) < TTY_SLAVES ||
-		    major(w->rdev) >= TTY_SLAVES + 8 || work->source[i] < 0)
+		if (!file_is_pts(w) || work->source[i] < 0)
 			continue;
 		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
 		if (fd >= 0 && tcgetattr(fd, &settings) && errno == EIO)
@@ -348,10 +346,25 @@ static void close_list(struct files_work *work)
 	work->listed = 0;
 }
 
+/* What came of the calls that were made last. */
+static void note_refused(struct files_work *work, uint32_t count)
+{
+	for (uint32_t i = 0; i < count; i++) {
+		const struct inj_syscall *s = &list_of(work)[i];
+		const struct file *w = s->nr == SYS_dup3 && s->result < 0
+					       ? files_find(work->want, (int)s->arg[1])
+					       : NULL;
+
+		if (w)
+			files_note(work, w, "it could not be put in its place");
+	}
+}
+
 static int flush(struct files_work *work, struct avc_error *err)
 {
 	const struct target *target = work->target;
 	struct inj_call *call = call_of(work);
+	const uint32_t listed = work->listed;
 	int result = 0;
 
 	close_list(work);
@@ -361,6 +374,8 @@ static int flush(struct files_work *work, struct avc_error *err)
 						     : &work->generation->base,
 				  call, err) ||
 			 pad_run(work->table, call, err);
+	if (!result)
+		note_refused(work, listed);
 	call_begin(call, INJ_AFTER_PARK);
 	return result ? -1 : 0;
 }
@@ -548,8 +563,26 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 	return 0;
 }
 
+/* To hand descriptors over takes some more, and there may be one with a number that was allowed
+ * once.  Limits beyond what it may give itself need CAP_SYS_RESOURCE (setrlimit(2)). */
+static void allow_numbers(pid_t pid, int room, struct rlimit *before)
+{
+	struct rlimit more;
+
+	if (prlimit(pid, RLIMIT_NOFILE, NULL, before) || before->rlim_cur >= (rlim_t)room)
+		return;
+	more = (struct rlimit){ (rlim_t)room, before->rlim_max };
+	if (more.rlim_max < more.rlim_cur)
+		more.rlim_max = more.rlim_cur;
+	if (prlimit(pid, RLIMIT_NOFILE, &more, NULL) == 0)
+		return;
+	more.rlim_cur = more.rlim_max = before->rlim_max;
+	prlimit(pid, RLIMIT_NOFILE, &more, NULL);
+}
+
 static int put_lost(struct files_work *work, struct avc_error *err)
 {
+	struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
 	const struct pad *pad = &work->target->pad;
 	struct inj_call *call = call_of(work);
 	struct numbers numbers = { .room = 16 };
@@ -571,6 +604,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 			numbers.taken[work->now->file[i].fd] = 1;
 	if (flush(work, err))
 		goto out;
+	allow_numbers(work->table, numbers.room, &limit);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
 		 pad_remote(pad, call->out), 0);
 	if (flush(work, err))
@@ -602,6 +636,8 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 		result = 0;
 	close(ours);
 out:
+	if (limit.rlim_cur < (rlim_t)numbers.room)
+		prlimit(work->table, RLIMIT_NOFILE, &limit, NULL);
 	free(numbers.taken);
 	return result;
 }

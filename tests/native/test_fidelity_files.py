@@ -73,7 +73,7 @@ def disturb_and_restore(victim: Victim, guard: GuardProcess) -> None:
 @pytest.mark.parametrize(
     "scenario",
     [
-        *("opened", "closed", "replaced", "deleted", "offset", "lost"),
+        *("opened", "closed", "replaced", "deleted", "offset", "lost", "full"),
         *("content", "events", "timer", "epoll", "watched", "flags", "locks"),
     ],
 )
@@ -109,6 +109,15 @@ def test_what_was_watched_since_is_forgotten_though_others_have_it(where: str, t
             event = restored(victim, guard)
             os.close(ours)
             assert "error" not in event, event
+
+
+def test_a_device_that_is_opened_anew_is_told(tmp_path: Path) -> None:
+    with Victim(f"descriptors device {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        error = restored(victim, guard)["error"]["detail"]
+        assert "ptmx" in error and "opened anew" in error
+        assert "more)" not in error, "/dev/null is the same for everybody"
 
 
 def test_a_file_that_is_gone_reads_as_empty_and_is_told(tmp_path: Path) -> None:

@@ -375,6 +375,62 @@ static void content_verify(void)
 	     "write");
 }
 
+/* ---- a device of which each who opens it has another one ------------------------------------- */
+
+static void device_setup(void)
+{
+	fd[0] = open("/dev/ptmx", O_RDWR | O_NOCTTY);
+	fd[1] = open("/dev/null", O_RDWR);
+	must(fd[0] >= 0 && fd[1] >= 0, "open");
+}
+
+static void device_disturb(void)
+{
+	close(fd[0]);
+	close(fd[1]);
+}
+
+static void device_verify(void)
+{
+	CHECK(is_open(fd[0]) && is_open(fd[1]), "a device is not open");
+}
+
+/* ---- no room for more ------------------------------------------------------------------------- */
+
+#define FULL 64
+#define BEYOND 900
+
+/* All numbers are taken that the process may have, and one that it may have no more. */
+static void full_setup(void)
+{
+	struct rlimit limit;
+
+	must(!getrlimit(RLIMIT_NOFILE, &limit) && limit.rlim_max > BEYOND, "RLIMIT_NOFILE");
+	fd[0] = open("/dev/zero", O_RDONLY);
+	must(dup2(fd[0], BEYOND) == BEYOND, "dup2");
+	limit.rlim_cur = FULL;
+	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	while (dup(fd[0]) >= 0)
+		;
+}
+
+static void full_disturb(void)
+{
+	close(FULL - 1);
+	close(BEYOND);
+}
+
+static void full_verify(void)
+{
+	struct rlimit limit;
+
+	CHECK(is_open(FULL - 1) && is_open(BEYOND), "%d: %d, %d: %d", FULL - 1, is_open(FULL - 1),
+	      BEYOND, is_open(BEYOND));
+	CHECK(dup(fd[0]) < 0 && errno == EMFILE && !getrlimit(RLIMIT_NOFILE, &limit) &&
+		      limit.rlim_cur == FULL,
+	      "another limit");
+}
+
 /* ---- eventfd, timerfd, signalfd -------------------------------------------------------------------- */
 
 static uint64_t timer_end_ns;
@@ -788,6 +844,8 @@ static const struct scenario scenarios[] = {
 	{ "gone", gone_setup, deleted_disturb, gone_verify },
 	{ "offset", offset_setup, offset_disturb, offset_verify },
 	{ "keep", offset_setup, offset_disturb, keep_verify },
+	{ "device", device_setup, device_disturb, device_verify },
+	{ "full", full_setup, full_disturb, full_verify },
 	{ "lost", lost_setup, lost_disturb, lost_verify },
 	{ "content", content_setup, content_disturb, content_verify },
 	{ "events", events_setup, events_disturb, events_verify },
