@@ -34,6 +34,9 @@ _STORE_FLAGS = {
 }
 """Global options with a value that decide where Podman finds a container."""
 
+_STORE_SWITCHES = {"--transient-store"}
+"""The same, without a value or with one behind "="."""
+
 _OTHER_FLAGS = {
     "--cdi-spec-dir",
     "--cgroup-manager",
@@ -165,8 +168,8 @@ def store_flags(argv: list[str], anywhere: bool = False) -> list[str]:
         if not word.startswith("-"):
             if not anywhere:
                 break
-        elif has_value:
-            if name in _STORE_FLAGS:
+        elif has_value or name in _STORE_SWITCHES:
+            if name in _STORE_FLAGS | _STORE_SWITCHES:
                 flags.append(word)
         elif name in _STORE_FLAGS | _OTHER_FLAGS:
             value = next(words, None)

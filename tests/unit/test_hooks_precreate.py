@@ -261,6 +261,8 @@ def test_no_id_is_said_so() -> None:
             "podman --syslog --hooks-dir /h --storage-opt a=b --storage-opt=c=d create",
             ["--storage-opt=a=b", "--storage-opt=c=d"],
         ),
+        ("podman --transient-store --root /a run", ["--transient-store", "--root=/a"]),
+        ("podman --root /a --transient-store=true container", ["--root=/a", "--transient-store=true"]),
         ("podman --tmpdir", []),
     ],
 )
