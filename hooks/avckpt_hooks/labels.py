@@ -341,6 +341,19 @@ LABELS: dict[str, Label] = {
 """Every label a user may set."""
 
 
+LOOKALIKE = re.compile(r"avckpt[._-]", re.IGNORECASE)
+"""How names begin that were meant for us, right or wrong."""
+
+
+def meant_by(name: str) -> str:
+    """The label that was probably meant by a name that is not ours; "" if it looks like none."""
+    import difflib  # costs milliseconds: not for names that are nothing like ours
+
+    plain = name.lower().replace("_", ".").replace("-", ".")
+    near = difflib.get_close_matches(plain, LABELS, n=1, cutoff=0.9)
+    return near[0] if near else ""
+
+
 def _unknown(key: str) -> LabelError:
     import difflib  # a mistake may cost the milliseconds that this takes, a start may not
 

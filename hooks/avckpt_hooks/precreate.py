@@ -35,6 +35,8 @@ example, the start of Python alone may take as long as that."""
 
 _MARK = b'"avckpt.'
 """Without it in a text of JSON, no label or annotation of ours is in there."""
+_LOOKALIKE = b'"avckpt'
+"""Without it in a text of JSON in lower case, none that was meant for us is."""
 _OTHER_INITS = ("/run/podman-init", "/dev/init")
 _SYSTEMD = ("/sbin/init", "/usr/sbin/init", "/lib/systemd/systemd", "/usr/lib/systemd/systemd")
 
@@ -75,7 +77,7 @@ def rewrite(config: bytes, parent: int) -> bytes:
                 f"cannot read a container's labels ({unknown}): if avckpt.enable is one of them, it runs unprotected",
                 parent,
             )
-    if _MARK not in spec and _MARK not in config:
+    if _LOOKALIKE not in spec.lower() and _LOOKALIKE not in config.lower():
         return config
     return _rewrite_labelled(config, container, spec, parent)
 
@@ -89,11 +91,17 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
     about = json.loads(spec)
     name = about.get("name") or container[:12] or "?"
     annotations = data.get("annotations") or {}
+    given = about.get("labels") or {}
     try:
-        wanted = labels.merge(about.get("labels") or {}, annotations)
+        wanted = labels.merge(given, annotations)
         policy = labels.parse_policy(wanted)
     except labels.LabelError as error:
         raise Refused(f"container {name}: {error}") from error
+    for key in sorted({*given, *annotations}):
+        if labels.LOOKALIKE.match(key) and not key.startswith(labels.PREFIX):
+            meant = labels.meant_by(key)
+            hint = f"did you mean {meant}?" if meant else f"avckpt's begin with {labels.PREFIX}"
+            warn(f"container {name}: the label {key} means nothing; {hint}", parent)
     if not policy.enable and not (policy.listens and _is_ours()):
         return config
     annotations = {**annotations, **wanted, "avckpt.name": name, "avckpt.version": VERSION}

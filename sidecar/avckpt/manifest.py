@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
-from avckpt_hooks.labels import LABELS, PREFIX, LabelError, merge, parse_policy
+from avckpt_hooks.labels import LABELS, PREFIX, LabelError, meant_by, merge, parse_policy
 
 from avckpt import yamlfile
 from avckpt.errors import ConfigError
@@ -290,8 +290,8 @@ class _Reader:
     def _is_ours(self, key: str, place: Place, service: str) -> bool:
         if key.startswith(PREFIX):
             return not _is_open(key)
-        meant = key.lower().replace("_", ".").replace("-", ".")
-        if meant in LABELS:
+        meant = meant_by(key)
+        if meant:
             self._complain(place, f"{key} is no label of avckpt's; did you mean {meant}?", service)
         return False
 

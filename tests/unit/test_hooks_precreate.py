@@ -161,6 +161,28 @@ def test_a_bad_label_fails_and_tells_the_one_who_started_podman(hook: Hook) -> N
     assert result.said.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("key", "hint"),
+    [
+        ("avckpt_enable", "did you mean avckpt.enable?"),
+        ("avckpt-enable", "did you mean avckpt.enable?"),
+        ("AVCKPT.enable", "did you mean avckpt.enable?"),
+        ("Avckpt.Restore_On", "did you mean avckpt.restore.on?"),
+        ("avckpt_colour", "avckpt's begin with avckpt."),
+    ],
+)
+def test_a_label_that_looks_like_one_of_ours_is_said(hook: Hook, key: str, hint: str) -> None:
+    config, spec = sample("plain")
+    spec = json.dumps({**json.loads(spec), "labels": {key: "true"}})
+    name = json.loads(spec)["name"]
+    result = hook(config, spec)
+    assert (result.status, result.out) == (0, config)
+    assert result.said == f"avckpt: container {name}: the label {key} means nothing; {hint}\n"
+    annotated = json.loads(config)
+    annotated["annotations"][key] = "true"
+    assert f"the label {key} means nothing" in hook(json.dumps(annotated).encode(), None).said
+
+
 def test_a_client_of_the_rest_service_finds_the_reason_in_the_configuration(hook: Hook) -> None:
     config, spec = sample("labelled")
     result = hook(config, with_labels(spec, enable="true", keep="99"), ("system", "service"))

@@ -80,6 +80,7 @@ def test_maps_lists_annotations_anchors_and_merge_keys(path: Path) -> None:
         ("[avckpt.enable: true]", "avckpt.enable: in a list, write it as avckpt.enable=VALUE"),
         ("avckpt.enable=maybe", "label avckpt.enable=maybe: neither true nor false"),
         ("[avckpt_enable=true]", "avckpt_enable is no label of avckpt's; did you mean avckpt.enable?"),
+        ("[avkpt.enable=true]", "avkpt.enable is no label of avckpt's; did you mean avckpt.enable?"),
         ("{Avckpt.Restore-On: exit}", "Avckpt.Restore-On is no label of avckpt's; did you mean avckpt.restore.on?"),
         ("[avckpt.version=1]", "label avckpt.version=1: avckpt sets this itself"),
         ("['avckpt.nonsense=${X}']", "label avckpt.nonsense: unknown label"),
