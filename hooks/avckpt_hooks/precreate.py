@@ -38,7 +38,8 @@ _MARK = b'"avckpt.'
 _LOOKALIKE = b'"avckpt'
 """Without it in a text of JSON in lower case, none that was meant for us is."""
 _OTHER_INITS = ("/run/podman-init", "/dev/init")
-_SYSTEMD = ("/sbin/init", "/usr/sbin/init", "/lib/systemd/systemd", "/usr/lib/systemd/systemd")
+_ONLY_AS_PID_1 = ("init", "systemd", "s6-svscan")
+"""Programs, wherever they are, that end or do less when they are not PID 1: systemd, s6-overlay (/init), s6."""
 
 
 class Refused(Exception):
@@ -110,7 +111,7 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
         data["annotations"] = annotations
         add_hooks(data, told=True)
         return json.dumps(data, separators=(",", ":")).encode()
-    reason = _unprotectable(data)
+    reason = _unprotectable(data, container)
     if reason:
         warn(f"container {name} runs unprotected: {reason}", parent)
         return config
@@ -210,13 +211,20 @@ def warn(line: str, parent: int) -> bool:
     return tell.parent(line, parent) and not podman.is_service(parent)
 
 
-def _unprotectable(data: dict[str, Any]) -> str:
+def _unprotectable(data: dict[str, Any], container: str) -> str:
     """Why a container is better left as it is; "" if nothing speaks against it."""
     if not _is_ours():
         return "only containers of root can be protected, and this Podman is rootless"
-    args = (data.get("process") or {}).get("args") or [""]
-    if args[0] in _SYSTEMD:
-        return f"its command is {args[0]}, and systemd must itself be PID 1"
+    process = data.get("process") or {}
+    command = (process.get("args") or [""])[0]
+    if os.path.basename(command) in _ONLY_AS_PID_1 and command not in _OTHER_INITS:
+        return (
+            f"its command is {command}, which must itself be PID 1; "
+            "to protect its program, start that without it (--entrypoint)"
+        )
+    # What Podman tells a systemd, and nothing else (--systemd, by default for some commands).
+    if container and f"container_uuid={container[:32]}" in (process.get("env") or []):
+        return "Podman starts it as systemd, which must itself be PID 1; if it is none, give --systemd=false"
     if not init_binary():
         return "avckpt-init is missing; run `avckpt install` again"
     return ""

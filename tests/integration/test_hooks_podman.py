@@ -182,6 +182,39 @@ def test_init_runs_in_front_of_a_protected_container(
     assert hooked.inspect(name)["Config"]["Cmd"][0] == "sh"
 
 
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--systemd=always"], "Podman starts it as systemd"),
+        (["--entrypoint", '["/init", "-c"]'], "its command is /init"),
+    ],
+    ids=["systemd", "s6-overlay"],
+)
+def test_what_must_be_process_1_is_left_alone(
+    hooked: Podman, receiver: Receiver, base_image: str, name: str, tmp_path: Path, options: list[str], why: str
+) -> None:
+    init = tmp_path / "init"
+    init.write_text('#!/bin/sh\nexec sh "$@"\n')
+    init.chmod(0o755)
+    full = ["--label", "avckpt.enable=true", "--network=none", "--volume", f"{init}:/init:ro", *options]
+    words = [SHOW_PID_1] if "--entrypoint" in options else ["sh", "-c", SHOW_PID_1]
+    done = hooked.run("run", "--pull=never", "--name", name, *full, base_image, *words)
+    assert not done.stdout.startswith(INIT)
+    assert done.stderr.startswith(f"avckpt: container {name} runs unprotected: {why}, which must itself be PID 1; ")
+    assert done.stderr.count("\n") == 1
+    assert receiver.registered == []
+
+
+def test_output_for_the_log_goes_to_process_2(
+    hooked: Podman, receiver: Receiver, base_image: str, name: str
+) -> None:
+    """As cron images have it: process 1 is no longer the application, and not to be written to."""
+    command = "for n in 1 2; do (echo by way of $n >>/proc/$n/fd/1) 2>/dev/null; done; cat /proc/1/comm"
+    options = ["--label", "avckpt.enable=true", "--network=none"]
+    _, out, _ = foreground(hooked, name, *options, image=base_image, command=command)
+    assert out.splitlines() == ["by way of 2", "avckpt-init"]
+
+
 def test_the_stop_signal_reaches_init(hooked: Podman, receiver: Receiver, base_image: str, name: str) -> None:
     options = ["--label", "avckpt.enable=true", "--network=none", "--stop-signal", "SIGINT"]
     _, out, _ = foreground(hooked, name, *options, image=base_image)

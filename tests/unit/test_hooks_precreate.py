@@ -210,14 +210,36 @@ def test_annotations_are_enough_when_labels_can_not_be_read(hook: Hook) -> None:
     assert hook(config, None).config["process"]["args"][0] == "/run/avckpt-init"
 
 
-def test_systemd_is_left_alone(hook: Hook) -> None:
+@pytest.mark.parametrize(
+    "command", ["/sbin/init", "/usr/local/sbin/init", "/init", "/opt/systemd/systemd --user", "s6-svscan /etc/s6"]
+)
+def test_what_must_itself_be_process_1_is_left_alone(hook: Hook, command: str) -> None:
     config, spec = sample("labelled")
     data = json.loads(config)
-    data["process"]["args"] = ["/sbin/init"]
+    data["process"]["args"] = command.split()
     config = json.dumps(data).encode()
     result = hook(config, spec)
     assert result.out == config
-    assert "systemd must itself be PID 1" in result.said
+    assert result.said == (
+        f"avckpt: container web runs unprotected: its command is {command.split()[0]}, which must itself be PID 1; "
+        "to protect its program, start that without it (--entrypoint)\n"
+    )
+
+
+def test_what_podman_takes_for_systemd_is_left_alone(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    data = json.loads(config)
+    # As Podman does for --systemd=always, and by default for the commands it knows.
+    data["process"]["env"].append(f"container_uuid={podman.container_id(config)[:32]}")
+    config = json.dumps(data).encode()
+    result = hook(config, spec)
+    assert result.out == config
+    assert result.said == (
+        "avckpt: container web runs unprotected: Podman starts it as systemd, which must itself be PID 1; "
+        "if it is none, give --systemd=false\n"
+    )
+    data["process"]["env"][-1] = "container_uuid=of the user's own"
+    assert hook(json.dumps(data).encode(), spec).config["process"]["args"][0] == "/run/avckpt-init"
 
 
 def test_nonsense_on_standard_input_comes_out_again(hook: Hook) -> None:
