@@ -4,7 +4,9 @@
 Everything written is listed in a manifest, and `uninstall()` removes what the
 manifest lists and nothing else.  Every file is written beside its place and
 renamed into it: running containers have avckpt-init mounted, and a hook may be
-starting at any moment.
+starting at any moment.  They are renamed when all are written: a disk that is
+full leaves the installation as it was, and not one of two versions mixed, whose
+hooks could keep containers from starting.
 """
 
 from __future__ import annotations
@@ -13,8 +15,7 @@ import contextlib
 import json
 import os
 import subprocess
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import avckpt
@@ -33,6 +34,8 @@ CONFIG_DIR = Path("/etc/avckpt")
 
 HOOK_PROGRAM = LIBEXEC / "avckpt-hook"
 INIT_PROGRAM = LIBEXEC / "avckpt-init"
+_PACKAGE = LIBEXEC / "avckpt_hooks"
+_CACHE = _PACKAGE / "__pycache__"
 
 _PYTHONS = ("/usr/bin/python3", "/usr/local/bin/python3", "/bin/python3")
 _HOST = Path("/")
@@ -68,36 +71,68 @@ class Manifest:
             ) from error
 
 
-@dataclass
-class _Writer:
-    """Writes files under `root` and remembers what it made."""
+@dataclass(frozen=True)
+class _File:
+    """One that is installed; `path` as on the host."""
 
-    root: Path
-    files: list[Path] = field(default_factory=list)
-    directories: list[Path] = field(default_factory=list)
+    path: Path
+    content: bytes
+    mode: int = 0o644
+    """0: a symbolic link to `content`."""
+
+    def write(self, to: Path) -> None:
+        """Raises OSError."""
+        if self.mode:
+            to.write_bytes(self.content)
+            to.chmod(self.mode)
+        else:
+            to.symlink_to(self.content.decode())
+
+    def is_at(self, place: Path) -> bool:
+        """Whether that is what stands there.  Raises OSError."""
+        found = os.readlink(place).encode() if place.is_symlink() else place.read_bytes()
+        return found == self.content
+
+
+class _Writer:
+    """Writes files under `root`: beside their places, until `put_in_place()`."""
+
+    def __init__(self, root: Path, undo: contextlib.ExitStack) -> None:
+        self._root = root
+        self._undo = undo
+        self._written: list[tuple[Path, Path]] = []
+        self.files: list[Path] = []
+        self.directories: list[Path] = []
+        """Those that had to be made, parents first."""
 
     def directory(self, path: Path) -> None:
         """Makes `path` and its parents, as far as they are missing."""
-        missing = [p for p in (path, *path.parents) if not under(self.root, p).exists()]
+        missing = [p for p in (path, *path.parents) if not under(self._root, p).exists()]
         for p in reversed(missing):
-            under(self.root, p).mkdir(mode=0o755)
-            under(self.root, p).chmod(0o755)  # whatever the umask says: users inside containers come here
+            under(self._root, p).mkdir(mode=0o755)
+            self._undo.callback(_remove_if_empty, under(self._root, p))
+            under(self._root, p).chmod(0o755)  # whatever the umask says: users inside containers come here
             self.directories.append(p)
 
-    def file(self, path: Path, content: bytes, mode: int = 0o644) -> None:
-        """Writes `content` to `path`, at once or not at all."""
-        self.directory(path.parent)
-        with _renamed_into(under(self.root, path)) as temporary:
-            temporary.write_bytes(content)
-            temporary.chmod(mode)
-        self.files.append(path)
+    def file(self, file: _File) -> None:
+        """Writes it beside its place."""
+        self.directory(file.path.parent)
+        place = under(self._root, file.path)
+        temporary = place.with_name(f".{place.name}.{os.getpid()}.new")
+        try:
+            temporary.unlink(missing_ok=True)
+            self._undo.callback(temporary.unlink, missing_ok=True)
+            file.write(temporary)
+        except OSError as error:  # of a full disk it names no file
+            raise OSError(error.errno, error.strerror, str(place)) from error
+        self._written.append((temporary, place))
+        self.files.append(file.path)
 
-    def link(self, path: Path, target: str) -> None:
-        """Makes `path` a symbolic link to `target`."""
-        self.directory(path.parent)
-        with _renamed_into(under(self.root, path)) as temporary:
-            temporary.symlink_to(target)
-        self.files.append(path)
+    def put_in_place(self) -> None:
+        """Renames them into their places, in order; then there is nothing to be undone."""
+        for temporary, place in self._written:
+            os.replace(temporary, place)
+        self._undo.pop_all()
 
 
 def install(root: Path = _HOST) -> list[str]:
@@ -109,43 +144,61 @@ def install(root: Path = _HOST) -> list[str]:
     """
     if os.geteuid() != 0:
         raise Denied("this needs root (sudo avckpt install)")
-    before = Manifest.read(root)
+    before = Manifest.read(root) or Manifest(avckpt.__version__)
     python = _hook_python(root)
-    init = artifacts.init_binary().read_bytes()
-    package = artifacts.hooks_source()
-    writer = _Writer(root)
-    done = []
+    files = _own_files(python)
+    done = [
+        f"{INIT_PROGRAM}: the init of protected containers",
+        f"{HOOK_PROGRAM}: the hooks, run by {python}",
+        f"{HOOKS_DIR}: tells Podman when to call them",
+    ]
+    if under(root, TMPFILES.parent).is_dir():
+        files.append(_File(TMPFILES, b"# avckpt: where hooks and sidecar meet\nd /run/avckpt 0755 root root -\n"))
+        done.append(f"{TMPFILES}: makes {RUN_DIR} when the machine starts")
+    # Last: from here on Podman calls the hooks.
+    directories = containers_conf.with_directory(root, HOOKS_DIR, without=DROP_IN)
+    files.append(_File(DROP_IN, _drop_in(directories).encode()))
+    done.append(f"{DROP_IN}: hooks_dir of every Podman command, restarts included")
+    state = "nothing was changed"
     try:
-        writer.file(INIT_PROGRAM, init, 0o755)
-        done.append(f"{INIT_PROGRAM}: the init of protected containers")
-        for source in sorted(package.glob("*.py")):
-            content = source.read_bytes()
-            executable = source.name == "__main__.py"
-            if executable:
-                content = content.replace(b"/usr/bin/python3", python.encode(), 1)
-            writer.file(LIBEXEC / package.name / source.name, content, 0o755 if executable else 0o644)
-        _compile(writer, python, package.name)
-        writer.link(HOOK_PROGRAM, f"{package.name}/__main__.py")
-        done.append(f"{HOOK_PROGRAM}: the hooks, run by {python}")
-        for source in sorted(artifacts.oci_hooks_source().glob("*.json")):
-            writer.file(HOOKS_DIR / source.name, source.read_bytes())
-        done.append(f"{HOOKS_DIR}: tells Podman when to call them")
-        writer.directory(RUN_DIR)
-        writer.directory(CONFIG_DIR)
-        if under(root, TMPFILES.parent).is_dir():
-            writer.file(TMPFILES, b"# avckpt: where hooks and sidecar meet\nd /run/avckpt 0755 root root -\n")
-            done.append(f"{TMPFILES}: makes {RUN_DIR} when the machine starts")
-        # Last: from here on Podman calls the hooks.
-        directories = containers_conf.with_directory(root, HOOKS_DIR, without=DROP_IN)
-        writer.file(DROP_IN, _drop_in(directories).encode())
-        done.append(f"{DROP_IN}: hooks_dir of every Podman command, restarts included")
-        done += _finish(writer, before)
+        with contextlib.ExitStack() as undo:
+            writer = _Writer(root, undo)
+            for file in files:
+                writer.file(file)
+            for path in (RUN_DIR, CONFIG_DIR, _CACHE):
+                writer.directory(path)
+            # It names all that is there from now on, however far we come.
+            new = [path for path in writer.files if path not in before.files]
+            made = [*before.directories, *(path for path in writer.directories if path not in before.directories)]
+            _record(root, [*new, *before.files], made)
+            state = "only a part is in place: mend that, and run avckpt install again"
+            writer.put_in_place()
+        installed = [*_compile(root, python), *writer.files]
+        for path in before.files:
+            if path not in installed and _remove(under(root, path)):
+                done.append(f"removed {path}: this version has no use for it")
+        _record(root, installed, made)
     except OSError as error:
-        if writer.files:
-            _finish(writer, before)  # so that uninstall finds what there is
-        raise ConfigError(f"{error.filename} can not be written: {error.strerror}") from error
+        where = error.filename2 or error.filename  # of a rename, the new name
+        raise ConfigError(f"{where} can not be written: {error.strerror}; {state}") from error
     environ = os.environ if root == _HOST else {}
     return done + [f"warning: {line}" for line in containers_conf.problems(HOOKS_DIR, root, environ)]
+
+
+def outdated(root: Path = _HOST) -> list[Path]:
+    """Installed files that are not as this avckpt has them, also those that are gone.  Raises ConfigError.
+
+    A version number does not tell: between two releases all builds have the same.
+    """
+    found = []
+    for file in _own_files(_hook_python(root)):
+        try:
+            same = file.is_at(under(root, file.path))
+        except OSError:
+            same = False
+        if not same:
+            found.append(file.path)
+    return found
 
 
 def uninstall(root: Path = _HOST) -> list[str]:
@@ -181,35 +234,39 @@ def under(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-def _finish(writer: _Writer, before: Manifest | None) -> list[str]:
-    """Writes the manifest, and removes what only an older version had."""
-    done = []
-    directories = list(before.directories if before else ())
-    stale = [path for path in (before.files if before else ()) if path not in writer.files]
-    for path in stale:
-        if _remove(under(writer.root, path)):
-            done.append(f"removed {path}: this version has no use for it")
-    writer.directory(MANIFEST.parent)
-    directories += [path for path in writer.directories if path not in directories]
+def _own_files(python: str) -> list[_File]:
+    """What this avckpt installs on every machine.  Raises ConfigError."""
+    files = [_File(INIT_PROGRAM, artifacts.init_binary().read_bytes(), 0o755)]
+    package = artifacts.hooks_source()
+    for source in sorted(package.glob("*.py")):
+        content = source.read_bytes()
+        executable = source.name == "__main__.py"
+        if executable:
+            content = content.replace(b"/usr/bin/python3", python.encode(), 1)
+        files.append(_File(_PACKAGE / source.name, content, 0o755 if executable else 0o644))
+    files.append(_File(HOOK_PROGRAM, f"{_PACKAGE.name}/__main__.py".encode(), 0))
+    files += [
+        _File(HOOKS_DIR / path.name, path.read_bytes()) for path in sorted(artifacts.oci_hooks_source().glob("*.json"))
+    ]
+    return files
+
+
+def _record(root: Path, files: list[Path], directories: list[Path]) -> None:
+    """Writes the manifest, at once or not at all.  Raises OSError."""
     content = {
         "version": avckpt.__version__,
-        "files": [str(path) for path in writer.files],
+        "files": [str(path) for path in files],
         "directories": [str(path) for path in directories],
     }
-    writer.file(MANIFEST, json.dumps(content, indent=1).encode() + b"\n")
-    return done
+    with contextlib.ExitStack() as undo:
+        writer = _Writer(root, undo)
+        writer.file(_File(MANIFEST, json.dumps(content, indent=1).encode() + b"\n"))
+        writer.put_in_place()
 
 
-@contextlib.contextmanager
-def _renamed_into(path: Path) -> Iterator[Path]:
-    """A name beside `path`; what the block puts there takes the place of `path` at once."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
-    temporary.unlink(missing_ok=True)
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _remove_if_empty(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.rmdir()
 
 
 def _remove(path: Path) -> bool:
@@ -239,16 +296,13 @@ def _hook_python(root: Path) -> str:
     return name
 
 
-def _compile(writer: _Writer, python: str, package: str) -> None:
+def _compile(root: Path, python: str) -> list[Path]:
     """Byte code for the hooks: they start for every container, and run with -B."""
-    if writer.root != _HOST:
-        return  # the host's Python can not be run from here
-    folder = LIBEXEC / package
-    cache = folder / "__pycache__"
-    writer.directory(cache)
+    if root != _HOST:
+        return []  # the host's Python can not be run from here
     # Not fatal: without byte code the hooks are slower, no more.
-    subprocess.run([python, "-IS", "-m", "compileall", "-q", str(folder)], check=False, stdout=subprocess.DEVNULL)
-    writer.files += sorted(cache.glob("*.pyc"))
+    subprocess.run([python, "-IS", "-m", "compileall", "-q", str(_PACKAGE)], check=False, stdout=subprocess.DEVNULL)
+    return sorted(_CACHE.glob("*.pyc"))
 
 
 def _drop_in(directories: list[str]) -> str:

@@ -205,9 +205,7 @@ def test_what_must_be_process_1_is_left_alone(
     assert receiver.registered == []
 
 
-def test_output_for_the_log_goes_to_process_2(
-    hooked: Podman, receiver: Receiver, base_image: str, name: str
-) -> None:
+def test_output_for_the_log_goes_to_process_2(hooked: Podman, receiver: Receiver, base_image: str, name: str) -> None:
     """As cron images have it: process 1 is no longer the application, and not to be written to."""
     command = "for n in 1 2; do (echo by way of $n >>/proc/$n/fd/1) 2>/dev/null; done; cat /proc/1/comm"
     options = ["--label", "avckpt.enable=true", "--network=none"]

@@ -29,7 +29,9 @@ def log(tmp_path: Path) -> Iterator[socket.socket]:
 
 def journal(line: str, log: str = "") -> None:
     """Calls `tell.journal(line)` where `log` is /dev/log (empty: there is none).  Raises TimeoutExpired."""
-    inside = 'mount -t tmpfs none /dev; [ -z "$1" ] || { touch /dev/log; mount --bind "$1" /dev/log; }; shift; exec "$@"'
+    inside = (
+        'mount -t tmpfs none /dev; [ -z "$1" ] || { touch /dev/log; mount --bind "$1" /dev/log; }; shift; exec "$@"'
+    )
     script = f"import sys; sys.path.insert(0, {str(HOOKS)!r}); from avckpt_hooks import tell; tell.journal(sys.argv[1])"
     command = ["unshare", "--mount", "sh", "-c", inside, "sh", log, sys.executable, "-c", script, line]
     done = subprocess.run(command, timeout=10, check=False, stdin=subprocess.PIPE, capture_output=True, text=True)

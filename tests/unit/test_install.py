@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import multiprocessing
 import os
 import stat
 import subprocess
@@ -24,10 +26,14 @@ if os.geteuid() != 0:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A host with a Python, systemd's folders and a Podman configuration."""
+    return host(tmp_path)
+
+
+def host(root: Path) -> Path:
     for folder in ("usr/bin", "usr/local/bin", "etc/containers/containers.conf.d", "etc/tmpfiles.d", "run"):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "usr/bin/python3").symlink_to("/usr/bin/python3")
-    return tmp_path
+        (root / folder).mkdir(parents=True)
+    (root / "usr/bin/python3").symlink_to("/usr/bin/python3")
+    return root
 
 
 def tree(root: Path) -> dict[str, tuple[int, bytes]]:
@@ -176,6 +182,71 @@ def test_an_installation_that_breaks_off_can_be_removed(root: Path) -> None:
     assert not (root / "etc/containers/containers.conf.d/50-avckpt.conf").exists()
     install.uninstall(root)
     assert tree(root) == before
+
+
+def full_disk(root: Path) -> None:
+    """In a process of its own, with `root` on a disk that has room for a new init and little more."""
+    root.mkdir()
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.unshare(0x00020000) == 0  # CLONE_NEWNS
+    assert libc.mount(None, b"/", None, 0x44000, None) == 0  # MS_REC | MS_PRIVATE
+    assert libc.mount(b"none", str(root).encode(), b"tmpfs", 0, b"size=4m") == 0
+    host(root)
+    install.install(root)
+    (root / "usr/local/libexec/avckpt/avckpt-init").write_bytes(b"of an older version")
+    before = tree(root)
+    room = len(artifacts.init_binary().read_bytes()) + 8_000
+    with (root / "full").open("wb") as file:
+        while os.statvfs(root).f_bavail * os.statvfs(root).f_bsize > room:
+            file.write(bytes(4096))
+            file.flush()
+    with pytest.raises(
+        ConfigError, match=r"/avckpt_hooks/\w+\.py can not be written: No space left on device; nothing was changed$"
+    ):
+        install.install(root)
+    (root / "full").unlink()
+    assert tree(root) == before
+    install.install(root)
+    assert install.outdated(root) == []
+
+
+def test_an_upgrade_on_a_full_disk_changes_nothing(tmp_path: Path) -> None:
+    done = multiprocessing.get_context("fork").Process(target=full_disk, args=(tmp_path / "root",))
+    done.start()
+    done.join()
+    assert done.exitcode == 0
+
+
+def test_an_upgrade_that_breaks_off_half_way_removes_nothing(root: Path) -> None:
+    install.install(root)
+    before = tree(root)
+    old = root / "usr/local/libexec/avckpt/avckpt_hooks/old.py"
+    manifest = root / "usr/local/share/avckpt/manifest.json"
+    old.write_text("")
+    data = json.loads(manifest.read_text())
+    data["files"].insert(0, "/usr/local/libexec/avckpt/avckpt_hooks/old.py")
+    manifest.write_text(json.dumps(data))
+    drop_in = root / "etc/containers/containers.conf.d/50-avckpt.conf"
+    drop_in.unlink()
+    drop_in.mkdir()
+    with pytest.raises(ConfigError, match=f"{drop_in} can not be written: Is a directory; only a part is in place"):
+        install.install(root)
+    assert old.exists()
+    assert {*before} <= {*tree(root)}
+    assert set(json.loads(manifest.read_text())["files"]) == set(data["files"])
+    drop_in.rmdir()
+    install.install(root)
+    assert not old.exists()
+    install.uninstall(root)
+    assert not (root / "usr/local/libexec").exists()
+
+
+def test_files_of_another_build_are_found(root: Path) -> None:
+    install.install(root)
+    assert install.outdated(root) == []
+    (root / "usr/local/libexec/avckpt/avckpt-init").write_bytes(b"of an older build")
+    (root / "usr/local/libexec/avckpt/avckpt_hooks/podman.py").unlink()
+    assert [path.name for path in install.outdated(root)] == ["avckpt-init", "podman.py"]
 
 
 def test_a_damaged_manifest_is_said(root: Path) -> None:
