@@ -7,6 +7,7 @@ that every verdict can be tested without a machine that deserves it.
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import json
 import os
@@ -14,13 +15,13 @@ import platform
 import shutil
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import avckpt
-from avckpt import containers_conf
+from avckpt import containers_conf, install
 from avckpt.errors import AvckptError
 from avckpt.install import HOOK_PROGRAM, HOOKS_DIR, INIT_PROGRAM, Manifest
 
@@ -88,6 +89,8 @@ class Facts:
     """None: nothing is installed."""
     missing_files: tuple[str, ...]
     """Files of the installation that are gone."""
+    outdated_files: tuple[str, ...]
+    """Those that are not as this avckpt has them."""
     hook_problem: str
     """What went wrong when the hook was started without a stage; empty: nothing."""
     init_problem: str
@@ -207,12 +210,13 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
         yield Check("hooks", Status.FAIL, "not installed: labels do nothing, and Podman does not say so", again)
         return
     if facts.missing_files:
-        shown = ", ".join(facts.missing_files[:3]) + (" ..." if len(facts.missing_files) > 3 else "")
-        yield Check("hooks", Status.FAIL, f"of the installation is missing: {shown}", again)
+        yield Check("hooks", Status.FAIL, f"of the installation is missing: {_few(facts.missing_files)}", again)
     elif facts.hook_problem:
         yield Check("hooks", Status.FAIL, f"{HOOK_PROGRAM} does not run: {facts.hook_problem}", again)
     elif facts.installed_version != avckpt.__version__:
         yield Check("hooks", Status.WARN, f"of version {facts.installed_version}, this is {avckpt.__version__}", again)
+    elif facts.outdated_files:
+        yield Check("hooks", Status.WARN, f"of another build than this avckpt: {_few(facts.outdated_files)}", again)
     else:
         yield Check("hooks", Status.OK, f"version {facts.installed_version}, {HOOK_PROGRAM}")
     if facts.init_problem:
@@ -225,6 +229,10 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
             yield Check("hooks_dir", Status.FAIL, what, remedy)
     else:
         yield Check("hooks_dir", Status.OK, f"Podman looks into {HOOKS_DIR}")
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
 def _judge_sidecar(facts: Facts) -> Check:
@@ -254,7 +262,7 @@ def _judge_config(config: ConfigFacts) -> Check:
 
 def gather() -> Facts:
     """Looks at this machine.  Changes nothing."""
-    installed, missing, broken = _installation()
+    installed, missing, outdated, broken = _installation()
     info, problem = _sidecar()
     return Facts(
         kernel=platform.release(),
@@ -269,6 +277,7 @@ def gather() -> Facts:
         hooks_dir_problems=tuple(containers_conf.problems(HOOKS_DIR, environ=os.environ)),
         installed_version=installed,
         missing_files=missing,
+        outdated_files=outdated,
         hook_problem=broken or (_hook_problem() if installed and not missing else ""),
         init_problem=init_problem(INIT_PROGRAM) if installed else "",
         sidecar_version=str(info["version"]) if info else None,
@@ -297,15 +306,18 @@ def init_problem(path: Path) -> str:
     return f"{path} is not static" if pt_interp in kinds else ""
 
 
-def _installation() -> tuple[str | None, tuple[str, ...], str]:
-    """Version, missing files, and what keeps us from knowing."""
+def _installation() -> tuple[str | None, tuple[str, ...], tuple[str, ...], str]:
+    """Version, missing and outdated files, and what keeps us from knowing."""
     try:
         manifest = Manifest.read()
     except AvckptError as error:
-        return "unknown", (), str(error)
+        return "unknown", (), (), str(error)
     if manifest is None:
-        return None, (), ""
-    return manifest.version, tuple(str(path) for path in manifest.files if not path.exists()), ""
+        return None, (), (), ""
+    outdated: tuple[str, ...] = ()
+    with contextlib.suppress(AvckptError):  # nothing of our own to compare them with
+        outdated = tuple(map(str, install.outdated()))
+    return manifest.version, tuple(str(path) for path in manifest.files if not path.exists()), outdated, ""
 
 
 def _hook_problem() -> str:

@@ -72,6 +72,9 @@ def prepare(run_dir: Path, *, install_hooks: bool, say: Say) -> None:
     if failed:
         remedy = "; or have it done by avckpt up --install" if any(c.name in INSTALLABLE for c in failed) else ""
         raise ConfigError("; ".join(f"{c.name}: {c.detail} ({c.remedy})" for c in failed) + remedy)
+    for check in missing:
+        if check.name in INSTALLABLE:
+            say(f"warning: {check.name}: {check.detail} ({check.remedy})")
     sidecar_container.ensure(run_dir, say)
     problem = Client(run_dir).info().get("config", {}).get("problem")
     if problem:

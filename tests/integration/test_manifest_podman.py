@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from avckpt.install import LIBEXEC
 from harness import (
     BASE_IMAGE,
     CONFIG_DIR,
@@ -187,6 +188,16 @@ def test_hooks_are_installed_only_when_asked_for(project: Project, sidecar: Side
     finally:
         sidecar.avckpt("install")
         sidecar.restart()  # its mount of /etc/avckpt is that of the old folder
+
+
+def test_hooks_of_another_build_are_said_and_brought_up_to_date(project: Project, sidecar: Sidecar) -> None:
+    project.write(SERVICES)
+    with (LIBEXEC / "avckpt_hooks" / "tell.py").open("a") as installed:
+        installed.write("# of another build\n")
+    warning = f"warning: hooks: of another build than this avckpt: {installed.name} (run: sudo avckpt install)"
+    assert warning in project.avckpt("up", "by-map").stderr
+    assert "warning: " not in project.avckpt("up", "--install", "by-map").stderr
+    assert "of another build" not in Path(installed.name).read_text()
 
 
 def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Project, sidecar: Sidecar) -> None:
