@@ -22,7 +22,7 @@ TIMEOUT_S = 40.0
 """For a whole request; longer than the sidecar itself waits for the engine."""
 
 START_IT = (
-    "start it with: podman run -d --name avckpt-sidecar --privileged --pid=host --network=none "
+    "start it with: podman run -d --restart=always --name avckpt-sidecar --privileged --pid=host --network=none "
     "-v /run/avckpt:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
 )
 

@@ -48,7 +48,8 @@ def ensure(run_dir: Path, say: Callable[[str], None]) -> None:
 def options(run_dir: Path) -> list[str]:
     """What `podman run` has to be told for a sidecar."""
     config = ["--volume", f"{CONFIG_DIR}:{CONFIG_DIR}:ro"] if CONFIG_DIR.is_dir() else []
-    return ["--privileged", "--pid=host", "--network=none", "--volume", f"{run_dir}:/run/avckpt", *config]
+    volumes = ["--volume", f"{run_dir}:/run/avckpt", *config]
+    return ["--restart=always", "--privileged", "--pid=host", "--network=none", *volumes]
 
 
 def answers(client: Client) -> bool:

@@ -9,7 +9,8 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-from harness import CONFIG_DIR, SIDECAR_NAME, take_checkpoint
+from avckpt import sidecar_container
+from harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
 
 if TYPE_CHECKING:
     from harness import Completed, Container, ContainerFactory, Podman, Sidecar
@@ -82,6 +83,33 @@ def test_a_killed_sidecar_is_replaced_by_one_that_adopts(container: ContainerFac
     os.kill(app, signal.SIGKILL)
     sidecar.wait_restores(web)
     assert numbers(web).count(0) == 1
+
+
+def test_a_crashed_sidecar_comes_back_and_a_stopped_one_does_not(
+    container: ContainerFactory, sidecar: Sidecar, podman: Podman
+) -> None:
+    def daemon() -> int:
+        pid: int = podman.inspect(SIDECAR_NAME)["State"]["Pid"]
+        return pid
+
+    web = container.protected(*COUNT, labels=QUICK)
+    sidecar.stop()
+    try:
+        sidecar_container.ensure(RUN_DIR, print)
+        sidecar.wait_generation(web)
+        for _ in range(2):
+            killed = daemon()
+            os.kill(killed, signal.SIGKILL)
+            wait_until(lambda: daemon() not in (0, killed) and sidecar.answers(), 20, "another sidecar answers")  # noqa: B023
+            assert sidecar.wait_generation(web)["adopted"]
+        podman.run("stop", SIDECAR_NAME)
+        time.sleep(3)
+        assert not sidecar.running
+        sidecar_container.ensure(RUN_DIR, print)
+        assert sidecar.wait_generation(web)["adopted"]
+        assert numbers(web).count(0) == 1
+    finally:
+        sidecar.restart()
 
 
 def test_the_command_line_in_its_container(container: ContainerFactory, sidecar: Sidecar, podman: Podman) -> None:
