@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avckpt.client import Client
-from avckpt.errors import AvckptError, SidecarUnreachable
+from avckpt.errors import SidecarUnreachable
 
 NAME = "avckpt-sidecar"
 IMAGE = "localhost/avckpt-sidecar"
@@ -81,8 +81,11 @@ def _podman(*args: str, check: bool = True) -> subprocess.CompletedProcess[str]:
     try:
         done = subprocess.run(["podman", *args], capture_output=True, text=True, check=False, timeout=60)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise AvckptError(f"podman {args[0]}: {error}") from error
+        raise SidecarUnreachable(f"the sidecar does not answer, and podman {args[0]} failed: {error}") from error
     if check and done.returncode != 0:
         lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise AvckptError(f"podman {args[0]} {NAME}: {lines[-1]}")
+        raise SidecarUnreachable(
+            f"the container {NAME} can not be started: podman {args[0]}: {lines[-1]}; "
+            f"mend that, or remove it (podman rm -f {NAME}) and try again"
+        )
     return done

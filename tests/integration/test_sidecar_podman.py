@@ -9,7 +9,9 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
+import pytest
 from avckpt import sidecar_container
+from avckpt.errors import SidecarUnreachable
 from harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
 
 if TYPE_CHECKING:
@@ -108,6 +110,18 @@ def test_a_crashed_sidecar_comes_back_and_a_stopped_one_does_not(
         sidecar_container.ensure(RUN_DIR, print)
         assert sidecar.wait_generation(web)["adopted"]
         assert numbers(web).count(0) == 1
+    finally:
+        sidecar.restart()
+
+
+def test_a_sidecar_that_can_not_be_started_is_said(sidecar: Sidecar, podman: Podman, base_image: str) -> None:
+    sidecar.stop()
+    try:
+        podman.run("create", "--name", SIDECAR_NAME, "--network=none", base_image, "/no/such/program")
+        with pytest.raises(
+            SidecarUnreachable, match=f"the container {SIDECAR_NAME} can not be started: podman start: "
+        ):
+            sidecar_container.ensure(RUN_DIR, print)
     finally:
         sidecar.restart()
 
