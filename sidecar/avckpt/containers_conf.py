@@ -2,8 +2,9 @@
 """Which hook directories Podman uses: the part of containers.conf(5) that avckpt lives by.
 
 Podman reads its own defaults, then each file below; a later `hooks_dir` takes
-the place of an earlier one.  With CONTAINERS_CONF in the environment it reads
-that file only, and no drop-in.
+the place of an earlier one, or is added to it from `{append=true}` in one of
+them on, until `{append=false}` (newer Podman only).  With CONTAINERS_CONF in
+the environment it reads that file only, and no drop-in.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ class HooksDirs:
 def read(root: Path = _HOST, environ: Mapping[str, str] | None = None, without: Path | None = None) -> HooksDirs:
     """What Podman's configuration under `root` comes to, as if the file `without` were not there."""
     found = HooksDirs(DEFAULT, None)
+    append = False
     for path in _files(root, environ or {}):
-        if path == without:
-            continue
-        directories = _hooks_dir(root, path)
-        if directories is not None:
-            found = HooksDirs(directories, path)
+        said = None if path == without else _hooks_dir(root, path)
+        if said is not None:
+            append = append if said.append is None else said.append
+            found = HooksDirs((*found.directories, *said.directories) if append else said.directories, path)
     return found
 
 
@@ -86,7 +87,16 @@ def _seen(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-def _hooks_dir(root: Path, path: Path) -> tuple[str, ...] | None:
+@dataclass(frozen=True)
+class _HooksDir:
+    """What one file says."""
+
+    directories: tuple[str, ...]
+    append: bool | None
+    """To what was said before, here and later; None: as it was."""
+
+
+def _hooks_dir(root: Path, path: Path) -> _HooksDir | None:
     """`hooks_dir` of the table [engine] in a file; None if it does not say.
 
     TOML as far as this key needs it: Python has a reader since 3.11 only.
@@ -107,5 +117,7 @@ def _hooks_dir(root: Path, path: Path) -> tuple[str, ...] | None:
         if found["table"] is not None:
             table = found["table"].strip()
         elif ".".join(filter(None, (table, found["key"].strip()))) == "engine.hooks_dir":
-            value = tuple(a or b for a, b in re.findall(r""""([^"\n]*)"|'([^'\n]*)'""", found["list"]))
+            strings = tuple(a or b for a, b in re.findall(r""""([^"\n]*)"|'([^'\n]*)'""", found["list"]))
+            append = re.findall(r"\{\s*append\s*=\s*(true|false)\s*\}", found["list"])
+            value = _HooksDir(strings, append[-1] == "true" if append else None)
     return value

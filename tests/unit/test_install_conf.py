@@ -53,6 +53,28 @@ def test_toml(tmp_path: Path, text: str, directories: tuple[str, ...]) -> None:
     assert containers_conf.read(tmp_path).directories == directories
 
 
+@pytest.mark.parametrize(
+    ("lists", "directories"),
+    [
+        (['"/a"', '"/b", {append=true}'], ("/a", "/b")),
+        (['"/a", { append = true }', '"/b"'], (*DEFAULT, "/a", "/b")),
+        (['"/a"', '"/b"', '"/c",\n{append=true},\n', '"/d"'], ("/b", "/c", "/d")),  # as containers.conf(5) has it
+        (['"/a", {append=true}', '"/b"', '"/c", {append=false}', '"/d"'], ("/d",)),
+        (["{append=true}", '"/b"'], (*DEFAULT, "/b")),
+    ],
+)
+def test_lists_that_are_added_to_earlier_ones(tmp_path: Path, lists: list[str], directories: tuple[str, ...]) -> None:
+    for n, entries in enumerate(lists):
+        write(tmp_path, f"/etc/containers/containers.conf.d/{n}.conf", f"[engine]\nhooks_dir = [{entries}]\n")
+    assert containers_conf.read(tmp_path).directories == directories
+
+
+def test_a_list_behind_ours_that_is_added_hides_nothing(tmp_path: Path) -> None:
+    write(tmp_path, "/etc/containers/containers.conf.d/50-avckpt.conf", '[engine]\nhooks_dir=["/ours"]\n')
+    write(tmp_path, "/etc/containers/containers.conf.d/99-mine.conf", '[engine]\nhooks_dir=["/mine", {append=true}]\n')
+    assert containers_conf.problems(OURS, tmp_path) == []
+
+
 def test_containers_conf_in_the_environment_hides_the_drop_in(tmp_path: Path) -> None:
     write(tmp_path, "/etc/containers/containers.conf.d/50-avckpt.conf", '[engine]\nhooks_dir=["/ours"]\n')
     mine = write(tmp_path, "/etc/mine.conf", "[containers]\n")
