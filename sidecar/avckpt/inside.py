@@ -154,11 +154,33 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
 
 
 def _credentials(pid: int) -> tuple[str, list[str]]:
-    """What avckpt-inside wants of /proc/PID/status: UID:GID:capabilities:NNP, and the groups."""
+    """What avckpt-inside wants of /proc/PID/status: UID:GID:capabilities:NNP, and the groups.
+
+    The numbers are those of the container's user namespace, in which they are
+    asked for: /proc gives them as we have them.
+    """
     fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
+    uid = _inside(int(fields["Uid"].split()[1]), Path(f"/proc/{pid}/uid_map").read_text())
+    gid_map = Path(f"/proc/{pid}/gid_map").read_text()
+    gid = _inside(int(fields["Gid"].split()[1]), gid_map)
+    if uid is None or gid is None:
+        raise AvckptError("its main process has a user or group that its user namespace does not", pid=pid)
     sets = [fields[name].strip() for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")]
-    numbers = [fields["Uid"].split()[1], fields["Gid"].split()[1], *sets, fields["NoNewPrivs"].strip()]
-    return ":".join(numbers), fields["Groups"].split()
+    # A group without a number in there (one of the host's, kept) can not be asked for.
+    groups = [_inside(int(group), gid_map) for group in fields["Groups"].split()]
+    return (
+        ":".join([str(uid), str(gid), *sets, fields["NoNewPrivs"].strip()]),
+        [str(group) for group in groups if group is not None],
+    )
+
+
+def _inside(number: int, id_map: str) -> int | None:
+    """A UID or GID of ours in the user namespace of a uid_map or gid_map; None: it has none there."""
+    for line in id_map.splitlines():
+        first, ours, count = map(int, line.split())
+        if ours <= number < ours + count:
+            return first + number - ours
+    return None
 
 
 def _with(environ: bytes, more: Mapping[str, str]) -> bytes:
