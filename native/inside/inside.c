@@ -35,6 +35,7 @@
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
 #include <sys/resource.h>
+#include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/time.h>
@@ -298,29 +299,51 @@ static void drop_privileges(void)
 	}
 }
 
-static _Noreturn void become_command(const sigset_t *mask)
+/* Whoever has CAP_SYS_PTRACE in the container's PID namespace can take a process in
+ * there over, also one that is not dumpable.  So privileges go first, and what the
+ * container can make last for as long as it likes comes when they are gone: its
+ * control groups (a CPU quota, a freezer) and its working directory (FUSE). */
+static _Noreturn void become_command(int gate)
 {
-	/* Nobody in there may look at us before we are one of them. */
+	char go;
+
 	must(prctl(PR_SET_DUMPABLE, 0, 0, 0, 0) == 0, "prctl(SET_DUMPABLE)");
 	must(setsid() >= 0, "setsid");
 	for (int i = 0; i < job.cgroup_count; i++)
-		must(write(job.cgroup_fds[i], "0", 1) == 1, "cgroup.procs");
-	must(fchdir(job.cwd_fd) == 0, "fchdir");
+		close(job.cgroup_fds[i]);
 	for (int i = 0; i < RLIM_NLIMITS; i++)
 		if (setrlimit((__rlimit_resource_t)i, &job.limits[i]))
 			errno = 0; /* higher than ours, and we may not: ours stays */
 	umask(022);
 	must(close_range(3, ~0U, CLOSE_RANGE_CLOEXEC) == 0, "close_range");
 	drop_privileges();
-	/* After the change of credentials, which clears it. */
+	/* After the change of credentials, which clears it.  A parent that has died
+	 * before that has closed the gate. */
 	must(prctl(PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0) == 0, "prctl(SET_PDEATHSIG)");
+	must(write(gate, "", 1) == 1 && read(gate, &go, 1) == 1, "avckpt-inside has ended");
+	/* Who may not enter the main process's directory could do nothing there, and
+	 * stays in the root directory. */
+	must(fchdir(job.cwd_fd) == 0 || errno == EACCES, "fchdir");
 	for (int sig = 1; sig < NSIG; sig++)
 		signal(sig, SIG_DFL);
-	sigprocmask(SIG_SETMASK, mask, NULL);
 	environ = job.env;
 	execvp(job.command[0], job.command);
 	dprintf(2, "%s: %s\n", job.command[0], strerror(errno));
 	_exit(errno == ENOENT ? EXIT_NOT_FOUND : EXIT_CANNOT_RUN);
+}
+
+/* Waits until the child has given up its privileges, and lets it go on in the
+ * container's control groups.  A child that ends before that has said why. */
+static void let_go(pid_t child, int gate)
+{
+	char ready, pid[16];
+	int len = snprintf(pid, sizeof pid, "%d", child);
+
+	if (read(gate, &ready, 1) != 1)
+		return;
+	for (int i = 0; i < job.cgroup_count; i++)
+		must(write(job.cgroup_fds[i], pid, (size_t)len) == len, "cgroup.procs");
+	send(gate, "", 1, MSG_NOSIGNAL);
 }
 
 static int64_t now_ms(void)
@@ -336,8 +359,8 @@ int main(int argc, char **argv)
 	int namespaces = CLONE_NEWNS | CLONE_NEWUTS | CLONE_NEWIPC | CLONE_NEWNET | CLONE_NEWPID |
 			 CLONE_NEWCGROUP;
 	int64_t deadline;
-	sigset_t wanted, mask;
-	int status = 0;
+	sigset_t wanted;
+	int gate[2], status = 0;
 	pid_t child;
 
 	(void)argc;
@@ -350,21 +373,25 @@ int main(int argc, char **argv)
 		  &(struct itimerval){
 			  .it_value = { job.timeout_ms / 1000, job.timeout_ms % 1000 * 1000 + 1 } },
 		  NULL);
-	sigemptyset(&mask);
-	sigprocmask(SIG_SETMASK, &mask, NULL);
+	sigemptyset(&wanted);
+	sigprocmask(SIG_SETMASK, &wanted, NULL);
 	read_model();
+	must(socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, gate) == 0, "socketpair");
 	if (other_user_namespace())
 		namespaces |= CLONE_NEWUSER;
 	must(setns(job.pidfd, namespaces) == 0, "setns");
-	sigemptyset(&wanted);
+	child = fork(); /* setns(2) of a PID namespace is for children */
+	must(child >= 0, "fork");
+	if (child == 0) {
+		close(gate[0]);
+		become_command(gate[1]);
+	}
+	close(gate[1]);
+	let_go(child, gate[0]);
 	sigaddset(&wanted, SIGCHLD);
 	sigaddset(&wanted, SIGTERM);
 	sigaddset(&wanted, SIGALRM);
 	sigprocmask(SIG_BLOCK, &wanted, NULL);
-	child = fork(); /* setns(2) of a PID namespace is for children */
-	must(child >= 0, "fork");
-	if (child == 0)
-		become_command(&mask);
 	while (waitpid(child, &status, WNOHANG) == 0) {
 		const int64_t left = deadline - now_ms();
 		struct timespec wait = { left / 1000, left % 1000 * 1000000 };

@@ -13,7 +13,7 @@ import pytest
 from avckpt.cgroup import groups_of
 from avckpt.errors import TargetGone
 from avckpt.inside import OUTPUT_BYTES, Done, _sealed_program, run_inside
-from harness import Container, ContainerFactory, wait_until
+from harness import Container, ContainerFactory, Podman, wait_until
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root")
 
@@ -121,13 +121,60 @@ def test_nothing_of_ours_can_be_written_to_in_there(container: ContainerFactory)
         ]
         assert Path(f"/proc/{helper}/exe").readlink() == Path("/memfd:avckpt-inside (deleted)")
         await task
-        with pytest.raises(PermissionError):  # sealed: also for a second writer, once nobody runs it
-            os.write(os.open(f"/proc/self/fd/{_sealed_program()}", os.O_RDWR), b"x")
+        with (
+            open(f"/proc/self/fd/{_sealed_program()}", "rb+", buffering=0) as program,
+            pytest.raises(PermissionError),  # sealed: also for a second writer, once nobody runs it
+        ):
+            program.write(b"x")
 
     try:
         asyncio.run(look())
     finally:
         os.close(pidfd)
+
+
+def test_a_container_can_hold_only_what_has_no_privileges(container: ContainerFactory, podman: Podman) -> None:
+    """Its quota of CPU time, and more so its freezer, must not meet the host's root in its PID namespace."""
+    options = ["--user", "1000:1000", "--cap-drop", "all", "--security-opt", "seccomp=unconfined"]
+    made = container("sleep", "1000", options=[*options, "--network", "none"])
+    pidfd = os.pidfd_open(made.pid)
+
+    def child_of(pid: int, name: bytes) -> int:
+        (found,) = [
+            int(child)
+            for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+            if Path(f"/proc/{child}/cmdline").read_bytes().startswith(name)
+        ]
+        return found
+
+    async def look() -> None:
+        task = asyncio.create_task(run_inside(pidfd, ["true"], timeout_s=30))
+        await asyncio.sleep(1)
+        try:
+            held = Path("/proc", str(child_of(child_of(os.getpid(), b"avckpt-inside\0"), b"")))
+            assert (held / "cgroup").read_text() == Path(f"/proc/{made.pid}/cgroup").read_text()
+            status = dict(line.split(":\t", 1) for line in (held / "status").read_text().splitlines())
+            assert {status["Uid"], status["Gid"]} == {"1000\t1000\t1000\t1000"}
+            assert {int(status[name], 16) for name in ("CapPrm", "CapEff", "CapBnd", "CapInh", "CapAmb")} == {0}
+        finally:
+            podman.run("unpause", made.name)
+            done = await task
+        assert done.status == 0
+
+    podman.run("pause", made.name)
+    try:
+        asyncio.run(look())
+    finally:
+        os.close(pidfd)
+
+
+def test_a_directory_that_its_user_may_not_enter(
+    container: ContainerFactory, inside: Callable[[Container], Run]
+) -> None:
+    """The runtime has put the main process there as root."""
+    made = container("sleep", "1000", options=["--user", "1000:1000", "--workdir", "/root"])
+    done = inside(made)("pwd")
+    assert (done.status, done.output) == (0, "/")
 
 
 def test_a_container_that_has_ended(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
