@@ -40,7 +40,7 @@ def see_whole_tree() -> None:
         finally:
             os.close(fd)
     whole = {mount.controllers for mount in _mounts("self") if mount.root == "/"}
-    for line in Path("/proc/self/cgroup").read_text().splitlines():
+    for line in _lines(Path("/proc/self/cgroup")):
         _, names, _ = line.split(":", 2)
         controllers = frozenset(names.split(",")) - {""}
         if controllers in whole or os.path.isdir("/proc/1/root/sys/fs/cgroup"):
@@ -118,7 +118,7 @@ def groups_of(pid: int) -> Groups:
     directories: list[Path] = []
     memory = freezer = unified = None
     version = 2
-    for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
+    for line in _lines(Path(f"/proc/{pid}/cgroup")):
         _, names, path = line.split(":", 2)
         controllers = frozenset(names.split(",")) - {""}
         directory = _directory(controllers, path)
@@ -152,14 +152,14 @@ def _directory(controllers: frozenset[str], path: str) -> Path | None:
 
 def _mounts(owner: str) -> list[Mount]:
     try:
-        lines = Path(f"/proc/{owner}/mountinfo").read_text().splitlines()
+        lines = _lines(Path(f"/proc/{owner}/mountinfo"))
     except OSError:
         return []
     mounts = []
     for line in lines:
         # proc(5): id parent dev root where options... - type source super-options
         before, _, after = line.partition(" - ")
-        words, (kind, _, options) = before.split(), after.split(" ", 2)
+        words, (kind, _, options) = before.split(" "), after.split(" ", 2)
         if kind == "cgroup2":
             mounts.append(Mount(2, frozenset(), words[3], Path(words[4])))
         elif kind == "cgroup":
@@ -168,6 +168,14 @@ def _mounts(owner: str) -> list[Mount]:
                 Mount(1, frozenset(o for o in named if not o.startswith("release_agent")), words[3], Path(words[4]))
             )
     return mounts
+
+
+def _lines(path: Path) -> list[str]:
+    """A file of /proc with names in it: they may be any bytes, and only blanks, newlines and backslashes are escaped.
+
+    Raises OSError.
+    """
+    return os.fsdecode(path.read_bytes()).split("\n")[:-1]
 
 
 def _read(path: Path) -> str:

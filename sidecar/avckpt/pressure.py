@@ -148,7 +148,8 @@ def templates_of(init_pid: int) -> list[int]:
     with contextlib.suppress(OSError):
         for pid in Path(f"/proc/{init_pid}/task/{init_pid}/children").read_text().split():
             with contextlib.suppress(OSError):
-                if Path(f"/proc/{pid}/comm").read_text() in ("avckpt-tmpl\n", "avckpt-spare\n"):
+                # The application is a child, too, and its name may be any bytes.
+                if Path(f"/proc/{pid}/comm").read_bytes() in (b"avckpt-tmpl\n", b"avckpt-spare\n"):
                     found.append(int(pid))
     return found
 

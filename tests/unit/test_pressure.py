@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from avckpt.pressure import BACK_AFTER_MOST_S, BACK_AFTER_S, Advice, Allowance, HostPressure, held_bytes
+from avckpt.pressure import BACK_AFTER_MOST_S, BACK_AFTER_S, Advice, Allowance, HostPressure, held_bytes, templates_of
 
 MB = 1 << 20
 LIMIT = 100 * MB
@@ -79,3 +79,15 @@ def test_of_a_process_that_is_gone_nothing_is_held() -> None:
     process = subprocess.Popen(["true"])
     process.wait()
     assert held_bytes(process.pid, [process.pid]) == 0
+
+
+def test_a_child_whose_name_is_no_text_is_no_template(tmp_path: Path) -> None:
+    """The kernel cuts a name at 15 bytes, in the middle of a letter if need be."""
+    program = tmp_path / "переводчик"
+    program.symlink_to("/bin/sleep")
+    with subprocess.Popen([str(program), "60"]) as process:
+        try:
+            assert not Path(f"/proc/{process.pid}/comm").read_bytes().decode(errors="ignore").startswith("переводчик")
+            assert templates_of(os.getpid()) == []
+        finally:
+            process.kill()
