@@ -42,6 +42,7 @@ from avckpt.listener import bind_socket
 from avckpt.metrics import CONTENT_TYPE, Held, Metrics
 from avckpt.openapi import document
 from avckpt.pressure import held_bytes, templates_of
+from avckpt.printable import printable
 from avckpt.protected import Protected
 from avckpt.registry import Registry
 from avckpt.reload import Reloaded
@@ -203,7 +204,9 @@ def _after(request: web.Request) -> int | None:
     if text is None:
         return None
     if not text.isdecimal() or not text.isascii() or len(text) > 18:
-        raise web.HTTPBadRequest(reason=f"after (or Last-Event-ID) is {_shown(text)}, not the number of an event")
+        raise web.HTTPBadRequest(
+            reason=f"after (or Last-Event-ID) is {printable(text)[:40]}, not the number of an event"
+        )
     return int(text)
 
 
@@ -216,12 +219,8 @@ def _since(request: web.Request) -> float | None:
     except ValueError:
         since = math.nan
     if not math.isfinite(since):
-        raise web.HTTPBadRequest(reason=f"since is {_shown(text)}, not seconds since 1970")
+        raise web.HTTPBadRequest(reason=f"since is {printable(text)[:40]}, not seconds since 1970")
     return since
-
-
-def _shown(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)[:40]
 
 
 def _with_memory(container: Protected) -> dict[str, object]:

@@ -29,6 +29,7 @@ from avckpt.errors import AvckptError, TargetGone
 from avckpt.event_record import EventRecord, Kind
 from avckpt.events import Command
 from avckpt.inside import Done, run_inside
+from avckpt.printable import printable
 from avckpt.protected import Protected
 
 if TYPE_CHECKING:
@@ -200,7 +201,7 @@ async def _check_for_ever(ward: Ward, pidfd: int, check: HealthCheck, tell: Call
 def describe(done: Done, check: HealthCheck) -> str:
     """How a check failed, in a clause."""
     text = f"no answer within {check.timeout_s:g} s" if done.timed_out else f"status {done.status}"
-    said = " ".join(done.output.split())
+    said = printable(" ".join(done.output.split()))
     return f"{text}: {said[:OUTPUT_SHOWN]}" if said else text
 
 

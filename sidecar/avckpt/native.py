@@ -13,6 +13,7 @@ from typing import Any
 
 from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
 from avckpt.events import Command, Event, EventKind, GuardConfig, Reason
+from avckpt.printable import printable
 
 try:
     from avckpt._native import ffi, lib
@@ -214,5 +215,6 @@ def _error(err: Any) -> AvckptError:
 
 
 def _text(chars: Any) -> str:
-    # ffi.string() stops at the first NUL, or at the array's end.
-    return str(ffi.string(chars).decode("utf-8", "replace"))
+    # ffi.string() stops at the first NUL, or at the array's end.  Names of the
+    # application's files may be in it.
+    return printable(ffi.string(chars).decode("utf-8", "replace"))

@@ -24,6 +24,7 @@ from avckpt.errors import AvckptError, TargetGone
 from avckpt.event_record import EXPECTED, EventRecord, Kind
 from avckpt.events import signal_name
 from avckpt.inside import run_inside
+from avckpt.printable import printable
 from avckpt.process import has_ended, pid_of
 from avckpt.protected import Protected
 
@@ -140,7 +141,7 @@ async def _deliver(receiver: _Receiver, how: Notify, record: EventRecord) -> str
         stdin=json.dumps(record.to_json()).encode() + b"\n",
         env=environment_of(record),
     )
-    words = " ".join(how.command)
+    words = printable(" ".join(how.command))
     said = _one_line(done.output)
     if done.timed_out:
         raise AvckptError(f"{words}: killed after {EXEC_TIMEOUT_S:g} s{said}")
@@ -289,5 +290,5 @@ def _status(pid: int) -> dict[str, str]:
 def _one_line(output: str) -> str:
     """The end of what a command said, as an addition to a message."""
     last = output.strip().rpartition("\n")[2]
-    shown = "".join(c if c.isprintable() else "?" for c in last)[:160]
+    shown = printable(last)[:160]
     return f": {shown}" if shown else ""

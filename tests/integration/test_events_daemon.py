@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -375,3 +376,25 @@ def test_memory_that_several_generations_hold_together_counts_once(local: LocalS
     wait_until(lambda: "written" in web.output.read_text(), 20, "it has written to all of it")
     assert 29e6 < scrape(local)["avckpt_generations_memory_bytes['web']"] < 36e6
     assert 29e6 < local.row(web)["memory_bytes"] < 36e6
+
+
+def test_an_application_can_not_write_lines_of_its_own(local: LocalSidecar, tmp_path: Path) -> None:
+    """The name of a file of its own is part of what is told: into the log, and onto a terminal."""
+    name = "x\n2026-01-01 ERROR web: all is lost\x1b[2K"
+    path = tmp_path / name
+    program = (
+        "import os, signal, sys\n"
+        f"fd = os.open({str(path)!r}, os.O_RDONLY | os.O_CREAT)\n"
+        f"signal.signal(signal.SIGUSR1, lambda *_: (os.close(fd), os.unlink({str(path)!r})))\n"
+        "while True: signal.pause()\n"
+    )
+    web = local.protected("web", [sys.executable, "-c", program], ON_COMMAND)
+    wait_until(path.exists, 5, "the file is open")
+    take_checkpoint(local.avckpt, "web")
+    os.kill(web.app_pid, signal.SIGUSR1)
+    wait_until(lambda: not path.exists(), 5, "it is closed and gone")
+    crash(local, web)
+    (restored,) = [event for event in Client(local.run_dir).history() if event["kind"] == "restored"]
+    assert r"x\n2026-01-01 ERROR web: all is lost\x1b[2K" in restored["message"]
+    assert "\x1b" not in local.log + local.avckpt("events").stdout + local.avckpt("ps").stdout
+    assert "2026-01-01" not in [line[:10] for line in local.log.splitlines()]

@@ -78,3 +78,4 @@ def test_how_it_failed_in_words() -> None:
         "status 7: curl: (7) refused"
     )
     assert len(describe(Done(7, False, "x" * 500, 0.1), check)) < 140
+    assert describe(Done(7, False, "all\nwell\x1b[2K\x7f\x9b2K", 0.1), check) == r"status 7: all well\x1b[2K\x7f\x9b2K"
