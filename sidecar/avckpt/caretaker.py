@@ -43,7 +43,7 @@ class _Care(Generic[W]):
 class Caretaker(Generic[W]):
     """`begin()` and `end()` it for every container, `close()` it at the end."""
 
-    def __init__(self, run_dir: Path, tell: Callable[[W, EventRecord], object]) -> None:
+    def __init__(self, run_dir: Path, tell: Callable[[W, EventRecord], EventRecord]) -> None:
         self._health_dir = run_dir / "health"
         self._tell = tell
         self._cares: dict[int, _Care[W]] = {}

@@ -236,6 +236,15 @@ def class_of_code(code: int) -> type[AvckptError]:
         return AvckptError
 
 
+def of_any(error: Exception) -> AvckptError:
+    """An exception as one of ours: itself, or what Python or the kernel said."""
+    if isinstance(error, AvckptError):
+        return error
+    if isinstance(error, OSError) and error.errno:
+        return KernelError("the kernel said no", errno=error.errno)
+    return AvckptError(f"{type(error).__name__}: {error}")
+
+
 def from_json(data: Mapping[str, object]) -> AvckptError:
     """The exception that `to_json()` described; what is missing reads as empty."""
 

@@ -272,6 +272,10 @@ def _crashes(record: EventRecord) -> str:
     return f" ({record.attempt} time(s))" if record.attempt else ""
 
 
+def _detail(record: EventRecord) -> str:
+    return f"{record.detail}: {record.error}" if record.error else record.detail
+
+
 _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.REGISTERED: lambda record: record.detail,
     Kind.ATTACHED: lambda record: f"attached to application {record.app_pid} (inside {record.app_pid_inside})",
@@ -283,8 +287,8 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.RESTORED: _restored,
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
     Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
-    Kind.HEALTH: lambda record: record.detail,
-    Kind.CONFIGURED: lambda record: f"{record.detail}: {record.error}" if record.error else record.detail,
+    Kind.HEALTH: _detail,
+    Kind.CONFIGURED: _detail,
     Kind.REFUSED: lambda record: f"command refused: {record.error}",
     Kind.ENDED: lambda record: f"ended: {record.detail}" if record.detail else "ended",
     Kind.NOTIFIED: lambda record: record.detail,

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from avckpt.cgroup import groups_of
-from avckpt.errors import AvckptError, TargetGone
+from avckpt.errors import AvckptError, TargetGone, of_any
 from avckpt.event_record import EventRecord, Kind
 from avckpt.events import Command
 from avckpt.inside import Done, run_inside
@@ -115,6 +115,10 @@ class Pulse:
         return True
 
 
+Tell = Callable[[EventRecord], EventRecord]
+"""Tells everybody; returns the event as it was told, with a number (`seq`) if it is kept."""
+
+
 class Ward(Protocol):
     """What is needed of a container's watch."""
 
@@ -123,36 +127,39 @@ class Ward(Protocol):
     guard: Guard | None
 
 
-async def watch_health(ward: Ward, answer: Path, tell: Callable[[EventRecord], object]) -> None:
+async def watch_health(ward: Ward, answer: Path, tell: Tell) -> None:
     """Checks one container until it is cancelled or the container has ended.
 
     `answer` is the file in which the hook's process says what the health check
     is (`protocol.health_path()`).
     """
-    pidfd = os.dup(ward.pidfd)  # the container may end at any time, and its watch with it
-    try:
-        check = await _known(answer, tell)
-        if check is not None:
-            await _check_for_ever(ward, pidfd, check, tell)
-    except TargetGone:
+    check = await _known(answer, tell)
+    if check is None:
         return
-    finally:
-        os.close(pidfd)
+    watcher = _Watcher(ward, tell, Pulse(check))
+    with contextlib.suppress(TargetGone):
+        while True:
+            await asyncio.sleep(check.interval_s)
+            await watcher.look()
 
 
-async def _known(answer: Path, tell: Callable[[EventRecord], object]) -> HealthCheck | None:
+async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
     deadline = time.monotonic() + KNOWN_WITHIN_S
     why = "the hooks did not find it out"
     while time.monotonic() < deadline:
-        with contextlib.suppress(FileNotFoundError):
-            try:
-                said = json.loads(answer.read_text())
-                check = health_check_of(said.get("healthcheck"))
-                if check is not None:
-                    return check
-                why = said.get("error") or "it has none (podman run --health-cmd, or HEALTHCHECK in its image)"
-            except (ValueError, AttributeError) as error:
-                why = f"{answer} can not be read: {error}"
+        try:
+            said = json.loads(answer.read_bytes())
+            check = health_check_of(said.get("healthcheck"))
+            if check is not None:
+                return check
+            why = said.get("error") or "it has none (podman run --health-cmd, or HEALTHCHECK in its image)"
+            break
+        except FileNotFoundError:
+            pass  # not yet
+        except OSError as error:  # no descriptors left, for example: it may work in a moment
+            why = f"{answer} can not be read: {error.strerror}"
+        except (ValueError, AttributeError) as error:
+            why = f"{answer} can not be read: {error}"
             break
         await asyncio.sleep(LOOK_S)
     tell(
@@ -161,41 +168,77 @@ async def _known(answer: Path, tell: Callable[[EventRecord], object]) -> HealthC
     return None
 
 
-async def _check_for_ever(ward: Ward, pidfd: int, check: HealthCheck, tell: Callable[[EventRecord], object]) -> None:
-    pulse = Pulse(check)
-    troubled = False
-    while True:
-        await asyncio.sleep(check.interval_s)
-        container = ward.container
+@dataclass
+class _Watcher:
+    """One container's checks, from one to the next."""
+
+    ward: Ward
+    tell: Tell
+    pulse: Pulse
+    troubled: bool = False
+    """Something went wrong since a check has passed, and somebody was told."""
+
+    async def look(self) -> None:
+        """One check, and what comes of it.  Raises TargetGone when the container has ended, and nothing else."""
+        container = self.ward.container
         if not container.app_pid or _is_paused(container.init_pid):
-            continue
+            return
         restores = container.restores
         try:
-            done = await run_inside(pidfd, check.command, timeout_s=check.timeout_s)
+            done = await self._run()
         except TargetGone:
             raise
-        except AvckptError as error:
+        except Exception as error:  # noqa: BLE001 - whatever stops this check, the next one may work
             # Ours to mend, and nothing that a rollback would: not counted.
-            tell(EventRecord(Kind.HEALTH, detail="its health check can not be run", error=error))
-            continue
+            self._complain("its health check can not be run", of_any(error))
+            return
         if container.restores != restores or _is_paused(container.init_pid):
-            continue  # the check has seen two applications, or one that could not answer
-        unhealthy = pulse.take(done.status == 0, time.time() - container.registered_at)
+            return  # the check has seen two applications, or one that could not answer
+        unhealthy = self.pulse.take(done.status == 0, time.time() - container.registered_at)
         if done.status == 0:
-            if troubled:
-                tell(EventRecord(Kind.HEALTH, detail="its health check passes again"))
-            troubled = False
-            _order(ward, Command.VOUCH, 0)
-        elif unhealthy or pulse.failures:
-            troubled = True
-            count = check.retries if unhealthy else pulse.failures
-            what_now = ""
-            if unhealthy:
-                what_now = ": rolled back" if container.generations else ": nothing is held to go back to"
-            detail = f"its health check failed {count} time(s) of {check.retries}{what_now} ({describe(done, check)})"
-            tell(EventRecord(Kind.HEALTH, detail=detail))
-            if unhealthy and container.generations:
-                _order(ward, Command.UNHEALTHY, 0)
+            self._passed()
+        elif unhealthy or self.pulse.failures:
+            self._failed(done, unhealthy)
+
+    async def _run(self) -> Done:
+        pidfd = os.dup(self.ward.pidfd)  # the container may end at any time, and its watch with it
+        try:
+            return await run_inside(pidfd, self.pulse.check.command, timeout_s=self.pulse.check.timeout_s)
+        finally:
+            os.close(pidfd)
+
+    def _passed(self) -> None:
+        if self.troubled:
+            self.tell(EventRecord(Kind.HEALTH, detail="its health check passes again"))
+        self.troubled = False
+        with contextlib.suppress(AvckptError):  # it has ended, or the next check that passes vouches
+            self._order(Command.VOUCH)
+
+    def _failed(self, done: Done, unhealthy: bool) -> None:
+        check = self.pulse.check
+        count = check.retries if unhealthy else self.pulse.failures
+        detail = f"its health check failed {count} time(s) of {check.retries}"
+        why = AvckptError(describe(done, check))
+        if not unhealthy:
+            self._complain(detail, why)
+        elif not self.ward.container.generations:
+            self._complain(f"{detail}, nothing is held to go back to", why)
+        else:
+            try:
+                self._order(Command.UNHEALTHY)
+            except AvckptError as error:
+                self._complain(f"{detail}, it can not be rolled back", error)
+            else:
+                self.troubled = True
+                self.tell(EventRecord(Kind.HEALTH, detail=f"{detail}: rolled back ({why})"))
+
+    def _complain(self, detail: str, error: AvckptError) -> None:
+        # Who was not told of it (that is not done at every interval) need not hear that it is over.
+        self.troubled |= self.tell(EventRecord(Kind.HEALTH, detail=detail, error=error)).seq > 0
+
+    def _order(self, command: Command) -> None:
+        if self.ward.guard is not None:
+            self.ward.guard.command(command, 0)
 
 
 def describe(done: Done, check: HealthCheck) -> str:
@@ -203,12 +246,6 @@ def describe(done: Done, check: HealthCheck) -> str:
     text = f"no answer within {check.timeout_s:g} s" if done.timed_out else f"status {done.status}"
     said = printable(" ".join(done.output.split()))
     return f"{text}: {said[:OUTPUT_SHOWN]}" if said else text
-
-
-def _order(ward: Ward, command: Command, ticket: int) -> None:
-    if ward.guard is not None:
-        with contextlib.suppress(TargetGone):
-            ward.guard.command(command, ticket)
 
 
 def _is_paused(init_pid: int) -> bool:

@@ -219,7 +219,9 @@ def _close_if_open(fd: int, inode: int) -> None:
 def _readable(fd: int) -> bool:
     import select
 
-    return bool(select.select([fd], [], [], 0)[0])
+    poller = select.poll()  # select(2) takes no descriptor above 1023
+    poller.register(fd, select.POLLIN)
+    return bool(poller.poll(0))
 
 
 @functools.cache

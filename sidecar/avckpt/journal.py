@@ -7,8 +7,8 @@ import logging
 
 from avckpt.event_record import EXPECTED, EventRecord, Kind
 
-MISSED_EVERY_S = 60.0
-"""Missed checkpoints of one container are told at most this often."""
+SELDOM_S = 60.0
+"""What may go wrong at every interval (a checkpoint, a health check) is told at most this often, of one container."""
 
 LEVELS = {
     Kind.REGISTERED: logging.INFO,
@@ -27,6 +27,22 @@ LEVELS = {
 """Levels of the kinds that are always told.  What is below INFO is routine: it is not kept in the history."""
 
 
+class _Seldom:
+    """Lines of something that is told at most every `SELDOM_S`; the others are counted."""
+
+    def __init__(self) -> None:
+        self._told_s = 0.0
+        self._untold = 0
+
+    def line(self, record: EventRecord) -> tuple[int, str] | None:
+        if self._told_s and record.monotonic_s - self._told_s < SELDOM_S:
+            self._untold += 1
+            return None
+        more = f" (and {self._untold} more since this was last said)" if self._untold else ""
+        self._told_s, self._untold = record.monotonic_s, 0
+        return logging.WARNING, f"{record.message}{more}"
+
+
 class Journal:
     """Makes the lines of one container.  Remembers what it has said, so that nothing is said every interval."""
 
@@ -34,8 +50,8 @@ class Journal:
         self._held = False
         self._unprotected = ""
         self._lacking = ""
-        self._missed_told_s = 0.0
-        self._missed_untold = 0
+        self._missed = _Seldom()
+        self._unhealthy = _Seldom()
 
     def line(self, record: EventRecord) -> tuple[int, str] | None:
         """A logging level and the text (without the container's name), or None for silence."""
@@ -43,7 +59,9 @@ class Journal:
         if kind is Kind.CHECKPOINT:
             return self._checkpoint(record)
         if kind is Kind.MISSED:
-            return self._missed(record)
+            return self._missed.line(record)
+        if kind is Kind.HEALTH and record.error is not None:
+            return self._unhealthy.line(record)
         if kind is Kind.UNPROTECTED:
             return self._lost(record)
         if kind is Kind.GAVE_UP and record.outcome in EXPECTED:
@@ -63,16 +81,6 @@ class Journal:
             self._held = True
             return logging.INFO, f"protected: first {record.message.replace(':', ',', 1)}"
         return logging.DEBUG, record.message
-
-    def _missed(self, record: EventRecord) -> tuple[int, str] | None:
-        since_s = record.monotonic_s - self._missed_told_s
-        if self._missed_told_s and since_s < MISSED_EVERY_S:
-            self._missed_untold += 1
-            return None
-        more = f" (and {self._missed_untold} more since this was last said)" if self._missed_untold else ""
-        self._missed_told_s = record.monotonic_s
-        self._missed_untold = 0
-        return logging.WARNING, f"{record.message}{more}"
 
     def _lost(self, record: EventRecord) -> tuple[int, str] | None:
         # The guard looks again every interval: say it once per reason.

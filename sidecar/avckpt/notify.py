@@ -20,7 +20,7 @@ from typing import Protocol
 
 from avckpt_hooks.labels import Notify
 
-from avckpt.errors import AvckptError, TargetGone
+from avckpt.errors import AvckptError, Busy, TargetGone, of_any
 from avckpt.event_record import EXPECTED, EventRecord, Kind
 from avckpt.events import signal_name
 from avckpt.inside import run_inside
@@ -96,10 +96,15 @@ class Notifier:
         cookie = watch.container.cookie
         receiver = self._receivers.get(cookie)
         if receiver is None:
-            receiver = self._receivers[cookie] = _Receiver(os.dup(watch.pidfd), watch.container)
+            try:
+                pidfd = os.dup(watch.pidfd)
+            except OSError as error:
+                self._failed(watch.container, record, of_any(error))
+                return
+            receiver = self._receivers[cookie] = _Receiver(pidfd, watch.container)
             receiver.task = asyncio.get_running_loop().create_task(self._deliver_all(cookie, receiver))
         if len(receiver.waiting) >= BACKLOG:
-            self._failed(receiver, record, f"{BACKLOG} notifications are waiting for it already")
+            self._failed(watch.container, record, Busy(f"{BACKLOG} notifications are waiting for it already"))
             return
         receiver.waiting.append((how, record))
 
@@ -110,18 +115,18 @@ class Notifier:
                 how, record = receiver.waiting.popleft()
                 try:
                     done = await _deliver(receiver, how, record)
-                except (AvckptError, OSError) as error:
+                except Exception as error:  # noqa: BLE001 - whatever stops this one, the next may be delivered
                     if has_ended(receiver.pidfd):
                         return
-                    self._failed(receiver, record, str(error))
+                    self._failed(receiver.container, record, of_any(error))
                 else:
                     self._tell(receiver.container, Kind.NOTIFIED, f"notified of {record.container} {done}")
         finally:
             del self._receivers[cookie]
             os.close(receiver.pidfd)
 
-    def _failed(self, receiver: _Receiver, record: EventRecord, why: str) -> None:
-        self._tell(receiver.container, Kind.NOTIFY_FAILED, f"{record.container} {record.kind.value}: {why}")
+    def _failed(self, receiver: Protected, record: EventRecord, why: AvckptError) -> None:
+        self._tell(receiver, Kind.NOTIFY_FAILED, f"{record.container} {record.kind.value}: {why}")
 
 
 async def _deliver(receiver: _Receiver, how: Notify, record: EventRecord) -> str:

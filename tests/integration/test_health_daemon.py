@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import resource
 import signal
+import socket
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.client import Client
 from avckpt.pressure import templates_of
 from harness import wait_until
 from local_sidecar import Container, LocalSidecar, local_sidecar
@@ -35,19 +39,21 @@ def sick(tmp_path: Path) -> Path:
     return tmp_path / "sick"
 
 
-def checked(sidecar: LocalSidecar, name: str, sick: Path, labels: dict[str, str]) -> Container:
-    """A protected container with a health check, as the hook's process leaves it for the sidecar."""
+def checked(
+    sidecar: LocalSidecar, name: str, sick: Path, labels: dict[str, str], state: str = "protected"
+) -> Container:
+    """A container with a health check, as the hook's process leaves it for the sidecar, once it is in that state."""
     made = sidecar.protected(name, NAP, labels)
     health = sidecar.run_dir / "health"
     health.mkdir(exist_ok=True)
     check = {
-        "Test": ["CMD-SHELL", f"test ! -e {sick}"],
+        "Test": ["CMD-SHELL", f"touch {sick}.looked; test ! -e {sick}"],
         "Interval": 200_000_000,
         "Timeout": 5_000_000_000,
         "Retries": 2,
     }
     (health / f"{made.id}.json").write_text(json.dumps({"healthcheck": check}))
-    sidecar.wait_for(made, state="protected")
+    sidecar.wait_for(made, state=state)
     return made
 
 
@@ -100,3 +106,46 @@ def test_a_new_configuration_begins_and_ends_checks(sidecar: LocalSidecar, sick:
     wait_until(lambda: not held & set(templates_of(made.init_pid)), 20, "every generation is a new one")
     assert unhealthy(sidecar) == before
     assert sidecar.row(made)["generations"] <= 2
+
+
+def test_a_check_works_with_many_descriptors(sidecar: LocalSidecar, sick: Path) -> None:
+    """select(2) ends at 1023: sixty containers or so."""
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    sidecar.start()
+    with contextlib.ExitStack() as undo:
+        for _ in range(1050):
+            client = undo.enter_context(socket.socket(socket.AF_UNIX))
+            client.connect(str(sidecar.run_dir / "api.sock"))
+        checked(sidecar, "node", sick, UNHEALTHY)
+        sick.touch()
+        wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
+
+
+def test_what_goes_wrong_with_a_check_is_told_once_and_does_not_end_them(sidecar: LocalSidecar, sick: Path) -> None:
+    sidecar.start()
+    checked(sidecar, "node", sick, UNHEALTHY)
+    wait_until(Path(f"{sick}.looked").exists, 10, "it is checked")
+    assert sidecar.process is not None
+    pid = sidecar.process.pid
+    before = resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+    wait_until(lambda: "its health check can not be run: the kernel said no" in sidecar.log, 10, "it is said")
+    time.sleep(1)  # some more of them
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
+    wait_until(lambda: "its health check passes again" in sidecar.log, 10, "it goes on")
+    assert sidecar.log.count("its health check can not be run") == 1
+    sick.touch()
+    wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
+
+
+def test_a_check_that_keeps_failing_fills_no_history(sidecar: LocalSidecar, sick: Path) -> None:
+    sidecar.start()
+    # No checkpoint, and so no roll back, which could end it.
+    checked(sidecar, "node", sick, {**UNHEALTHY, "avckpt.interval": "1h"}, state="starting")
+    for _ in range(2):
+        sick.touch()
+        time.sleep(1.5)
+        sick.unlink()
+        time.sleep(0.6)
+    told = [event["message"] for event in Client(sidecar.run_dir).history() if event["kind"] == "health"]
+    assert told == ["its health check failed 1 time(s) of 2: status 1", "its health check passes again"]

@@ -8,9 +8,9 @@ import signal
 
 import pytest
 from avckpt.errors import AvckptError, DeadlineMissed, KernelError, Unsupported
-from avckpt.event_record import EventRecord, of_guard
+from avckpt.event_record import EventRecord, Kind, of_guard
 from avckpt.events import Event, EventKind, Reason
-from avckpt.journal import MISSED_EVERY_S, Journal
+from avckpt.journal import SELDOM_S, Journal
 
 
 def missed(at_s: float) -> EventRecord:
@@ -42,9 +42,28 @@ def test_missed_checkpoints_are_counted_not_repeated() -> None:
     assert first[0] == logging.WARNING
     assert journal.line(missed(101.0)) is None
     assert journal.line(missed(102.0)) is None
-    later = journal.line(missed(100.0 + MISSED_EVERY_S))
+    later = journal.line(missed(100.0 + SELDOM_S))
     assert later is not None
     assert later[1].endswith("(and 2 more since this was last said)")
+
+
+def health(at_s: float, detail: str, error: AvckptError | None = None) -> EventRecord:
+    return EventRecord(Kind.HEALTH, monotonic_s=at_s, detail=detail, error=error)
+
+
+def test_a_check_that_fails_is_told_once_a_minute_and_what_is_done_about_it_always() -> None:
+    journal = Journal()
+    status = AvckptError("status 1")
+    assert journal.line(health(100.0, "failed 1 time(s) of 3", status)) == (
+        logging.WARNING,
+        "failed 1 time(s) of 3: status 1",
+    )
+    assert journal.line(health(101.0, "failed 2 time(s) of 3", status)) is None
+    assert journal.line(health(102.0, "failed 3 time(s) of 3: rolled back")) is not None
+    assert journal.line(health(103.0, "failed 1 time(s) of 3", status)) is None
+    later = journal.line(health(100.0 + SELDOM_S, "failed 2 time(s) of 3", status))
+    assert later is not None
+    assert later[1] == "failed 2 time(s) of 3: status 1 (and 2 more since this was last said)"
 
 
 def test_unprotected_is_said_once_per_reason() -> None:
