@@ -67,6 +67,8 @@ class Protected:
     last_quiescent: bool | None = None
     last_death: str = ""
     last_death_at: float | None = None
+    last_death_ns: int = 0
+    """The same on CLOCK_MONOTONIC, for durations; 0: has not happened."""
     last_restore_s: float | None = None
     last_restore_age_s: float | None = None
     """How old the generation was that the last restore went back to."""
@@ -86,7 +88,7 @@ class Protected:
         if kind is EventKind.ATTACHED:
             self.reason = "no checkpoint yet"
         elif kind is EventKind.CHECKPOINT:
-            self._to(State.PROTECTED, self._crashing(at))
+            self._to(State.PROTECTED, self._crashing(event.at_ns))
             self.checkpoints += 1
             self.generation = event.generation
             self.generations = event.generations
@@ -106,6 +108,7 @@ class Protected:
             self._to(State.RESTORING)
             self.last_death = describe_wait_status(event.wait_status)
             self.last_death_at = at
+            self.last_death_ns = event.at_ns
         elif kind is EventKind.RESTORED:
             self.restores = event.restores
             self.attempt = event.attempt
@@ -114,7 +117,7 @@ class Protected:
             self.threads = event.threads
             self.last_restore_s = event.restore_s
             self.last_restore_age_s = event.age_s
-            self._to(State.PROTECTED, self._crashing(at))
+            self._to(State.PROTECTED, self._crashing(event.at_ns))
         elif kind is EventKind.DROPPED:
             self.generations = event.generations
             self.dropped += 1
@@ -182,10 +185,10 @@ class Protected:
             "ended_at": self.ended_at,
         }
 
-    def _crashing(self, at: float) -> str:
+    def _crashing(self, at_ns: int) -> str:
         """What is tried against a crash that comes back; empty: nothing."""
         window_s = self.config.restore_window_s
-        if self.attempt < 2 or self.last_death_at is None or at - self.last_death_at > window_s:
+        if self.attempt < 2 or at_ns - self.last_death_ns > window_s * 1e9:
             return ""
         text = f"keeps crashing: restore {self.attempt} of {self.config.restore_max} within {window_s:g} s"
         return f"{text}; given up: {self.last_dropped}" if self.last_dropped else text

@@ -20,6 +20,7 @@ CONFIG = GuardConfig(
     restore_window_s=60.0,
     quiesce_s=0.02,
 )
+S = 1_000_000_000
 ATTACHED = Event(EventKind.ATTACHED, 1, app_pid=4711, app_pid_inside=2)
 CHECKPOINT = Event(
     EventKind.CHECKPOINT,
@@ -105,6 +106,17 @@ def test_a_restore_is_remembered() -> None:
     assert container.last_death == "killed by SIGKILL"
     assert container.last_death_at == 1003.0
     assert (container.last_restore_s, container.last_restore_age_s) == (0.006, 1.5)
+
+
+def test_what_keeps_crashing_is_said_whatever_the_time_of_day() -> None:
+    """The clock is set from 1970 to now between a crash and the next checkpoint."""
+    died = Event(EventKind.DIED, 1, at_ns=100 * S, wait_status=signal.SIGKILL)
+    restored = Event(EventKind.RESTORED, 1, at_ns=100 * S, attempt=2, generations=1)
+    container = protected(ATTACHED, CHECKPOINT, died, restored)
+    container.apply(Event(EventKind.CHECKPOINT, 1, at_ns=101 * S), 1.8e9)
+    assert container.reason == "keeps crashing: restore 2 of 5 within 60 s"
+    container.apply(Event(EventKind.CHECKPOINT, 1, at_ns=161 * S), 1.8e9)
+    assert container.reason == ""
 
 
 def test_the_end_says_how_it_ended() -> None:
