@@ -30,6 +30,7 @@ from avckpt.event_record import EventRecord, Kind
 from avckpt.events import Command
 from avckpt.inside import Done, run_inside
 from avckpt.printable import printable
+from avckpt.process import age_s
 from avckpt.protected import Protected
 
 if TYPE_CHECKING:
@@ -48,18 +49,22 @@ class HealthCheck:
     """What is run, and when it counts.  The defaults are Podman's."""
 
     command: tuple[str, ...]
-    interval_s: float = 30.0
+    interval_s: float
+    """0: it is switched off."""
     timeout_s: float = 30.0
     retries: int = 3
     start_period_s: float = 0.0
     """Failures that early do not count, as long as no check has passed."""
+    has_startup_check: bool = False
+    """No failure counts, however late, as long as no check has passed."""
 
 
-def health_check_of(found: object) -> HealthCheck | None:
+def health_check_of(found: object, *, has_startup_check: bool = False) -> HealthCheck | None:
     """A health check from `podman inspect` (`Config.Healthcheck`); None: the container has none.
 
-    Durations there are nanoseconds, and 0 is Podman's default.  Raises
-    ValueError for what is not such a thing.
+    Durations there are nanoseconds, and what is 0 is not there.  An interval of 0 is
+    `--health-interval=disable`: who names none has got Podman's default by then.
+    Raises ValueError for what is not such a thing.
     """
     if not found:
         return None
@@ -73,7 +78,7 @@ def health_check_of(found: object) -> HealthCheck | None:
         return None
     command = ("/bin/sh", "-c", words[0]) if kind == "CMD-SHELL" else tuple(words if kind == "CMD" else test)
 
-    def seconds(key: str, default: float) -> float:
+    def seconds(key: str, default: float = 0.0) -> float:
         value = found.get(key) or 0
         if not isinstance(value, int) or value < 0:
             raise ValueError(f"{key} is {value!r}")
@@ -82,12 +87,14 @@ def health_check_of(found: object) -> HealthCheck | None:
     retries = found.get("Retries") or HealthCheck.retries
     if not isinstance(retries, int) or retries < 1:
         raise ValueError(f"Retries is {retries!r}")
+    interval_s = seconds("Interval")
     return HealthCheck(
         command,
-        max(seconds("Interval", HealthCheck.interval_s), LEAST_INTERVAL_S),
+        max(interval_s, LEAST_INTERVAL_S) if interval_s else 0.0,
         seconds("Timeout", HealthCheck.timeout_s),
         retries,
-        seconds("StartPeriod", 0.0),
+        seconds("StartPeriod"),
+        has_startup_check,
     )
 
 
@@ -106,7 +113,7 @@ class Pulse:
         if healthy:
             self.failures, self.passed = 0, True
             return False
-        if not self.passed and age_s < self.check.start_period_s:
+        if not self.passed and (self.check.has_startup_check or age_s < self.check.start_period_s):
             return False
         self.failures += 1
         if self.failures < self.check.retries:
@@ -149,10 +156,13 @@ async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
     while time.monotonic() < deadline:
         try:
             said = json.loads(answer.read_bytes())
-            check = health_check_of(said.get("healthcheck"))
-            if check is not None:
+            has_startup_check = bool(said.get("startup_healthcheck"))
+            check = health_check_of(said.get("healthcheck"), has_startup_check=has_startup_check)
+            if check is not None and check.interval_s:
                 return check
             why = said.get("error") or "it has none (podman run --health-cmd, or HEALTHCHECK in its image)"
+            if check is not None:
+                why = "it is switched off (--health-interval=disable)"
             break
         except FileNotFoundError:
             pass  # not yet
@@ -162,9 +172,7 @@ async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
             why = f"{answer} can not be read: {error}"
             break
         await asyncio.sleep(LOOK_S)
-    tell(
-        EventRecord(Kind.HEALTH, detail=f"avckpt.restore.on names unhealthy, but its health check is not known: {why}")
-    )
+    tell(EventRecord(Kind.HEALTH, detail=f"avckpt.restore.on names unhealthy, but no health check is run: {why}"))
     return None
 
 
@@ -194,7 +202,7 @@ class _Watcher:
             return
         if container.restores != restores or _is_paused(container.init_pid):
             return  # the check has seen two applications, or one that could not answer
-        unhealthy = self.pulse.take(done.status == 0, time.time() - container.registered_at)
+        unhealthy = self.pulse.take(done.status == 0, age_s(container.init_pid))
         if done.status == 0:
             self._passed()
         elif unhealthy or self.pulse.failures:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import select
+import time
 from pathlib import Path
 
 from avckpt.errors import TargetGone
@@ -22,6 +23,16 @@ def start_time(pid: int) -> int:
     # Field 2 is the name in parentheses and may hold anything, parentheses too.
     fields = stat[stat.rindex(b")") + 2 :].split()
     return int(fields[22 - 3])
+
+
+def age_s(pid: int) -> float:
+    """Seconds since `pid` started, time asleep with the machine included.
+
+    By the kernel's clock: the time of day of a vehicle jumps by decades when it
+    first hears what time it is.  Raises TargetGone when there is no such process.
+    """
+    started = start_time(pid) / os.sysconf("SC_CLK_TCK")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - started
 
 
 def open_pidfd(pid: int, started: int) -> int:

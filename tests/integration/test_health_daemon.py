@@ -40,9 +40,12 @@ def sick(tmp_path: Path) -> Path:
 
 
 def checked(
-    sidecar: LocalSidecar, name: str, sick: Path, labels: dict[str, str], state: str = "protected"
+    sidecar: LocalSidecar, name: str, sick: Path, labels: dict[str, str], state: str = "protected", **more: object
 ) -> Container:
-    """A container with a health check, as the hook's process leaves it for the sidecar, once it is in that state."""
+    """A container with a health check, as the hook's process leaves it for the sidecar, once it is in that state.
+
+    `more` is what the check has besides.
+    """
     made = sidecar.protected(name, NAP, labels)
     health = sidecar.run_dir / "health"
     health.mkdir(exist_ok=True)
@@ -51,6 +54,7 @@ def checked(
         "Interval": 200_000_000,
         "Timeout": 5_000_000_000,
         "Retries": 2,
+        **more,
     }
     (health / f"{made.id}.json").write_text(json.dumps({"healthcheck": check}))
     sidecar.wait_for(made, state=state)
@@ -79,6 +83,29 @@ def test_an_adopted_container_is_checked_again(sidecar: LocalSidecar, sick: Path
     wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
     sick.unlink()
     wait_until(lambda: "its health check passes again" in sidecar.log, 20, "it is healthy again")
+
+
+def test_the_start_period_is_the_containers_and_not_the_sidecars(sidecar: LocalSidecar, sick: Path) -> None:
+    sidecar.start()
+    started = time.monotonic()
+    sick.touch()
+    checked(sidecar, "node", sick, UNHEALTHY, StartPeriod=4_000_000_000)
+    time.sleep(max(started + 3 - time.monotonic(), 0))
+    assert unhealthy(sidecar) == 0
+    sidecar.stop()
+    time.sleep(max(started + 4 - time.monotonic(), 0))
+    sidecar.start()
+    restarted = time.monotonic()
+    wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
+    assert time.monotonic() - restarted < 4
+
+
+def test_a_check_that_is_switched_off_is_not_run(sidecar: LocalSidecar, sick: Path) -> None:
+    sidecar.start()
+    sick.touch()
+    checked(sidecar, "node", sick, UNHEALTHY, Interval=0)
+    wait_until(lambda: "no health check is run: it is switched off" in sidecar.log, 10, "it is said")
+    assert not Path(f"{sick}.looked").exists()
 
 
 def test_a_new_configuration_begins_and_ends_checks(sidecar: LocalSidecar, sick: Path) -> None:

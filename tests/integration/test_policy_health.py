@@ -113,7 +113,7 @@ def test_a_container_without_a_health_check_says_so(
     victim = start_victim(
         sidecar, container, tmp_path, "crash", labels={"restore.on": "signal,unhealthy"}, generation=0
     )
-    wait_told(sidecar, victim.container, "health", "names unhealthy, but its health check is not known: it has none")
+    wait_told(sidecar, victim.container, "health", "names unhealthy, but no health check is run: it has none")
 
 
 def test_a_paused_container_is_not_unhealthy(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:

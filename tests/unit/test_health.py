@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import time
+
 import pytest
 from avckpt.health import HealthCheck, Pulse, describe, health_check_of
 from avckpt.inside import Done
+from avckpt.process import age_s
 
 S = 1_000_000_000
 
@@ -26,10 +31,17 @@ def test_as_podman_inspect_has_it() -> None:
     ],
 )
 def test_commands(test: list[str], command: tuple[str, ...]) -> None:
-    found = health_check_of({"Test": test})
+    found = health_check_of({"Test": test, "Interval": 30 * S})
     assert found is not None
     assert found.command == command
     assert (found.interval_s, found.timeout_s, found.retries, found.start_period_s) == (30, 30, 3, 0)
+
+
+def test_without_an_interval_it_is_switched_off() -> None:
+    """As Podman shows `--health-interval=disable`."""
+    found = health_check_of({"Test": ["CMD-SHELL", "true"], "Timeout": 30 * S, "Retries": 3})
+    assert found is not None
+    assert found.interval_s == 0
 
 
 @pytest.mark.parametrize("nothing", [None, {}, {"Test": ["NONE"]}, {"Test": []}, {"Test": ["CMD"]}])
@@ -53,7 +65,7 @@ def test_what_is_no_health_check(wrong: object) -> None:
 
 
 def pulse(**changes: float) -> Pulse:
-    return Pulse(HealthCheck(("true",), **{"retries": 3, **changes}))  # type: ignore[arg-type]
+    return Pulse(HealthCheck(("true",), 1.0, **{"retries": 3, **changes}))  # type: ignore[arg-type]
 
 
 def test_so_many_failures_in_a_row() -> None:
@@ -71,8 +83,24 @@ def test_failures_within_the_start_period_do_not_count_until_one_has_passed() ->
     assert counting.take(False, 2.0)
 
 
+def test_with_a_startup_check_nothing_counts_until_one_has_passed() -> None:
+    counting = pulse(retries=1, has_startup_check=True)
+    assert not counting.take(False, 1000.0)
+    assert not counting.take(True, 1001.0)
+    assert counting.take(False, 1002.0)
+
+
+def test_the_age_of_a_process_does_not_depend_on_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    with subprocess.Popen(["sleep", "60"]) as process:
+        time.sleep(0.2)
+        monkeypatch.setattr(time, "time", lambda: 0.0)
+        assert 0.1 < age_s(process.pid) < 10
+        assert age_s(os.getpid()) > age_s(process.pid)
+        process.kill()
+
+
 def test_how_it_failed_in_words() -> None:
-    check = HealthCheck(("true",), timeout_s=1.5)
+    check = HealthCheck(("true",), 1.0, timeout_s=1.5)
     assert describe(Done(137, True, "", 1.5), check) == "no answer within 1.5 s"
     assert describe(Done(7, False, "curl: (7)\n  refused" + "x" * 500, 0.1), check).startswith(
         "status 7: curl: (7) refused"
