@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -27,16 +28,16 @@ from avckpt.pressure import LEAST_WORTH_BYTES, Advice, Allowance, HostPressure, 
 log = logging.getLogger("avckpt")
 
 LOOK_S = 1.0
-"""How often limits are looked at, while there is a container with a limit or one that is short."""
+"""How often limits are looked at."""
 W = TypeVar("W", bound=Ward)
 
 
 @dataclass
 class _Care(Generic[W]):
     ward: W
+    groups: Groups
+    """Where its memory is counted, and limited now or later."""
     allowance: Allowance = field(default_factory=Allowance)
-    groups: Groups | None = None
-    """Where its memory is counted, if it has a limit."""
     health: asyncio.Task[None] | None = None
 
 
@@ -49,6 +50,11 @@ class Caretaker(Generic[W]):
         self._cares: dict[int, _Care[W]] = {}
         self._host: HostPressure | None = None
         self._looking: asyncio.Task[None] | None = None
+        self._relieving: asyncio.Task[None] | None = None
+        # What generations hold is read here, one process at a time: that waits for
+        # each one's mmap_lock, which takes long just when memory is short, while
+        # hooks have a second to be answered.
+        self._reader = ThreadPoolExecutor(1, "memory")
 
     def start(self) -> None:
         """Begins to watch the host's memory."""
@@ -58,12 +64,11 @@ class Caretaker(Generic[W]):
 
     def begin(self, ward: W, policy: Policy) -> None:
         """A container that is guarded from now on."""
-        care = _Care(ward)
-        self._cares[ward.container.cookie] = care
-        with contextlib.suppress(OSError):  # it has just ended
+        try:
             groups = groups_of(ward.container.init_pid)
-            if groups.memory_limit_bytes() is not None:
-                care.groups = groups
+        except OSError:  # it has just ended
+            groups = Groups((), None, None)
+        care = self._cares[ward.container.cookie] = _Care(ward, groups)
         if policy.restore_on.unhealthy:
             self._watch_health(care)
         self._look_if_needed()
@@ -90,8 +95,7 @@ class Caretaker(Generic[W]):
     async def close(self) -> None:
         """Ends everything that is under way."""
         tasks = [care.health for care in self._cares.values() if care.health is not None]
-        if self._looking is not None:
-            tasks.append(self._looking)
+        tasks += [task for task in (self._looking, self._relieving) if task is not None]
         self._cares.clear()
         for task in tasks:
             task.cancel()
@@ -101,6 +105,7 @@ class Caretaker(Generic[W]):
             if self._host.fd is not None:
                 asyncio.get_running_loop().remove_reader(self._host.fd)
             self._host.close()
+        self._reader.shutdown(wait=False)
 
     def _watch_health(self, care: _Care[W]) -> None:
         ward, tell = care.ward, self._tell
@@ -112,7 +117,7 @@ class Caretaker(Generic[W]):
 
     def _must_look(self) -> bool:
         blind = self._host is not None and self._host.fd is None
-        return any(blind or care.groups is not None or care.allowance.short for care in self._cares.values())
+        return any(blind or care.groups.memory or care.allowance.short for care in self._cares.values())
 
     def _look_if_needed(self) -> None:
         if self._must_look() and (self._looking is None or self._looking.done()):
@@ -125,32 +130,43 @@ class Caretaker(Generic[W]):
             if self._host is not None and self._host.fd is None and self._host.is_high():
                 self._host_is_short()
             for care in list(self._cares.values()):
-                advice = self._advise(care)
+                advice = await self._advise(care)
                 if advice is Advice.DROP_OLDEST:
                     self._order(care, Command.DROP_OLDEST)
                 elif advice is Advice.REFILL:
                     self._order(care, Command.REFILL)
 
-    def _advise(self, care: _Care[W]) -> Advice:
-        container = care.ward.container
-        if care.groups is None:
-            return care.allowance.come_back(now_s())
-        used, limit = care.groups.memory_used_bytes(), care.groups.memory_limit_bytes()
+    async def _advise(self, care: _Care[W]) -> Advice:
+        # The limit may be another one each time (podman update --memory).
+        limit = care.groups.memory_limit_bytes()
+        used = care.groups.memory_used_bytes() if limit is not None else None
         if used is None or limit is None:
             return care.allowance.come_back(now_s())
-        held = 0
-        if container.generations and care.allowance.near_limit(used, limit):
-            held = held_bytes(container.app_pid, templates_of(container.init_pid))
+        held = await self._held(care) if care.allowance.near_limit(used, limit) else 0
         return care.allowance.advise(used, limit, held, now_s())
 
+    async def _held(self, care: _Care[W]) -> int:
+        """What giving all its generations up would free."""
+        container = care.ward.container
+        if not container.generations:
+            return 0
+        init_pid, app_pid = container.init_pid, container.app_pid
+        return await asyncio.get_running_loop().run_in_executor(
+            self._reader, lambda: held_bytes(app_pid, templates_of(init_pid))
+        )
+
     def _host_is_short(self) -> None:
+        # Pressure that lasts is told every second; to look who holds most may take longer.
+        if self._relieving is None or self._relieving.done():
+            self._relieving = asyncio.get_running_loop().create_task(self._relieve())
+            self._relieving.add_done_callback(_log_failure)
+
+    async def _relieve(self) -> None:
         most, held_most = None, LEAST_WORTH_BYTES
-        for care in self._cares.values():
-            container = care.ward.container
-            if container.generations:
-                held = held_bytes(container.app_pid, templates_of(container.init_pid))
-                if held >= held_most:
-                    most, held_most = care, held
+        for care in list(self._cares.values()):
+            held = await self._held(care)
+            if held >= held_most:
+                most, held_most = care, held
         if most is None:
             return
         most.allowance.gave_up(now_s())

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A limit that a container is given while it runs: a real daemon and a real control group, without Podman."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from harness import ROOT, take_checkpoint, wait_until
+from host_pressure import make_group, remove_group
+from local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
+from native.board import Board
+
+HOARD = ROOT / "tests/victims/build/hoard"
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+
+
+@pytest.fixture
+def group() -> Iterator[Path]:
+    """Without a limit; whoever is in it has ended by the end of the test."""
+    made = make_group()
+    yield made
+    remove_group(made)
+
+
+@pytest.fixture
+def local(group: Path, tmp_path: Path) -> Iterator[LocalSidecar]:
+    with local_sidecar(tmp_path) as sidecar:
+        sidecar.start()
+        yield sidecar
+
+
+def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_path: Path) -> None:
+    subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
+    first = (group / "memory.limit_in_bytes").exists()
+    limit, used = [
+        group / name
+        for name in (["memory.limit_in_bytes", "memory.usage_in_bytes"] if first else ["memory.max", "memory.current"])
+    ]
+    (group / ("memory.limit_in_bytes" if first else "memory.high")).write_text("-1" if first else "max")
+    board = Board(tmp_path / "board")
+    web = local.container("web", [str(HOARD), "40", "--board", str(board.path)])
+    wait_until(lambda: board.see().ready, 10, "it is ready")
+    for pid in (web.init_pid, web.app_pid):
+        (group / "cgroup.procs").write_text(str(pid))
+    assert web.hook("prestart", ON_COMMAND) == ""
+    local.wait_for(web, app_pid_inside=2)
+    take_checkpoint(local.avckpt, "web")
+    os.kill(web.app_pid, signal.SIGUSR1)
+    wait_until(lambda: board.see().counter[0] >= 40, 20, "it has written all of it again")
+    assert local.row(web)["generations"] == 1
+    limit.write_text(str(int(int(used.read_text()) * 1.05)))
+    wait_until(lambda: local.row(web)["dropped"], 10, "a generation is given up")
+    limit.write_text("-1" if first else "max")
+    assert "memory is short" in local.row(web)["last_dropped"]
