@@ -14,6 +14,7 @@ import fcntl
 import itertools
 import logging
 import os
+import resource
 import signal
 import time
 from collections.abc import Iterator, Mapping
@@ -424,6 +425,12 @@ def only_one(run_dir: Path) -> Iterator[None]:
         os.close(fd)  # which unlocks; the file stays, or two could lock two files
 
 
+def raise_descriptor_limit() -> None:
+    """Allows this process as many descriptors as it may allow itself: each container takes a dozen or two."""
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
 def serve(run_dir: Path, config_path: Path) -> None:
     """Runs the sidecar in the foreground until it is told to stop.
 
@@ -432,6 +439,7 @@ def serve(run_dir: Path, config_path: Path) -> None:
     """
     native.probe()
     cgroup.see_whole_tree()
+    raise_descriptor_limit()
     try:
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
         with only_one(run_dir):

@@ -8,6 +8,7 @@ handler must answer at once.
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import socket
@@ -27,6 +28,9 @@ Handler = Callable[[Union[Register, Deregister], Union[int, None]], None]
 
 MAX_WAITING = 64
 """Connections that have not sent their request yet."""
+PAUSE_S = 0.2
+"""How long nobody is accepted when the kernel has nothing left for it."""
+SHORT_OF = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
 def bind_socket(path: Path, kind: socket.SocketKind) -> socket.socket:
@@ -55,11 +59,16 @@ class HookListener:
         self._handler = handler
         self._loop = asyncio.get_running_loop()
         self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._pause: asyncio.TimerHandle | None = None
+        self._is_short = False
+        """Nobody could be accepted the last time, which has been said."""
         self._socket = bind_socket(path, socket.SOCK_SEQPACKET)
         self._loop.add_reader(self._socket, self._accept)
 
     def close(self) -> None:
         """Ends every connection and removes the socket."""
+        if self._pause is not None:
+            self._pause.cancel()
         self._loop.remove_reader(self._socket)
         self._socket.close()
         for connection in list(self._timers):
@@ -71,12 +80,30 @@ class HookListener:
             connection, _ = self._socket.accept()
         except (BlockingIOError, ConnectionAbortedError):
             return
+        except OSError as error:
+            if error.errno not in SHORT_OF:
+                raise
+            self._wait(error)
+            return
+        self._is_short = False
         connection.setblocking(False)
         if len(self._timers) >= MAX_WAITING:
             connection.close()
             return
         self._timers[connection] = self._loop.call_later(protocol.TIMEOUT_S, self._drop, connection)
         self._loop.add_reader(connection, self._serve, connection)
+
+    def _wait(self, error: OSError) -> None:
+        """Accepts nobody for a moment: who waits goes on waiting, so that the socket stays readable."""
+        if not self._is_short:
+            log.error(
+                "hooks can not be answered (%s): containers that start now run unprotected at first; "
+                "give the sidecar more descriptors (podman run --ulimit nofile=N)",
+                error.strerror,
+            )
+        self._is_short = True
+        self._loop.remove_reader(self._socket)
+        self._pause = self._loop.call_later(PAUSE_S, self._loop.add_reader, self._socket, self._accept)
 
     def _serve(self, connection: socket.socket) -> None:
         try:

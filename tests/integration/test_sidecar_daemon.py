@@ -9,6 +9,7 @@ import fcntl
 import json
 import os
 import re
+import resource
 import signal
 import stat
 import struct
@@ -191,6 +192,17 @@ def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:
     row = idle_sidecar.wait_for(web, state="protected")
     assert row["adopted"]
     assert [path.stem for path in (idle_sidecar.run_dir / "containers").iterdir()] == [web.id]
+
+
+def test_it_takes_all_the_descriptors_it_may(idle_sidecar: LocalSidecar) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        idle_sidecar.start()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert idle_sidecar.process is not None
+    assert resource.prlimit(idle_sidecar.process.pid, resource.RLIMIT_NOFILE) == (hard, hard)
 
 
 def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSidecar) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 import socket
 import stat
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -86,6 +88,29 @@ def test_a_silent_hook_is_dropped_and_blocks_nobody(monkeypatch: pytest.MonkeyPa
             return answer, silent.recv(100)
 
     assert served(lambda request, pidfd: None, talk) == (None, b"")
+
+
+def test_without_descriptors_it_waits_and_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
+    def talk() -> tuple[str | None, float]:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as hook:
+            hook.settimeout(5)
+            before = resource.getrlimit(resource.RLIMIT_NOFILE)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+            try:
+                hook.connect(protocol.hooks_socket())
+                hook.send(Deregister(id="ab" * 32).encode())
+                begun = time.process_time()
+                time.sleep(0.7)
+                busy_s = time.process_time() - begun
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, before)
+            return protocol.decode_reply(hook.recv(1000)), busy_s
+
+    answer, busy_s = served(lambda request, pidfd: None, talk)
+    assert answer is None
+    assert busy_s < 0.2
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith("hooks can not be answered (Too many open files): ")
 
 
 def test_the_socket_is_roots_alone_and_replaces_a_dead_one(run_dir: Path) -> None:
