@@ -2,8 +2,9 @@
 """The sidecar's daemon: one guard per protected container.
 
 asyncio, one thread.  It sleeps until something happens: a hook's request, an
-event of the engine, an init that ends, a request on the API, a signal.  What is
-urgent (death to resume) happens in the engine's own threads, not here.
+event of the engine, an init that ends, a request on the API, a signal, or it is
+time to look at the records.  What is urgent (death to resume) happens in the
+engine's own threads, not here.
 """
 
 from __future__ import annotations
@@ -49,14 +50,16 @@ from avckpt.listener import HookListener
 from avckpt.metrics import Metrics
 from avckpt.notify import Notifier
 from avckpt.policy import Settings, changes, settings_of
-from avckpt.process import has_ended, pid_of
+from avckpt.process import has_ended, is_foreign, pid_of
 from avckpt.protected import Protected
-from avckpt.records import adoptable
+from avckpt.records import NOT_SEEN, Records
 from avckpt.registry import Registry
 from avckpt.reload import Reloaded
 
 log = logging.getLogger("avckpt")
 
+LOOK_S = 5.0
+"""How often records are looked for whose hooks did not reach us."""
 COMMAND_TIMEOUT_S = 30.0
 """How long a command waits for the engine's answer."""
 
@@ -94,6 +97,7 @@ class Daemon:
         self.run_dir = run_dir
         self.configuration = Configuration(config_path)
         self.registry = Registry()
+        self.records = Records(run_dir / "containers")
         self.feed = Feed()
         self.history = History(run_dir / "history.jsonl")
         self.metrics = Metrics()
@@ -127,14 +131,18 @@ class Daemon:
         # Listen first, adopt second: a container that starts in between then
         # comes twice, not never.
         hooks = HookListener(self.run_dir / "hooks.sock", self._hook)
+        looking = None
         try:
             self.caretaker.start()
             await api.start()
             self._adopt()
+            looking = loop.create_task(self._look_for_records())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
             await stop.wait()
             log.info("asked to stop: %d container(s) run on unprotected", len(self._watches))
         finally:
+            if looking is not None:
+                looking.cancel()
             hooks.close()
             self.feed.close()
             await api.close()
@@ -178,7 +186,7 @@ class Daemon:
         return container, record
 
     def reload(self) -> list[Reloaded]:
-        """Takes the configuration file as it is now, for every container.
+        """Takes the configuration file as it is now, for every container, those included that were missed so far.
 
         Running ones keep their guard and what it holds.  Returns those for which
         something changed, or should have.  Raises ConfigError, and nothing
@@ -186,6 +194,7 @@ class Daemon:
         """
         self.configuration.load()
         log.info("%s was read", self.configuration.path)
+        self._adopt()
         outcomes = [self._reconfigure(watch) for watch in list(self._watches.values())]
         return [outcome for outcome in outcomes if outcome is not None]
 
@@ -241,19 +250,32 @@ class Daemon:
             self._watch(request, pidfd, adopted=False)
 
     def _adopt(self) -> None:
-        for record, pidfd in adoptable(self.run_dir / "containers"):
+        for record, pidfd in self.records.adoptable(lambda container_id: self._live_run(container_id) is not None):
             try:
                 self._watch(record, pidfd, adopted=True)
-            except AvckptError as error:
-                log.error("%s: runs unprotected: %s", record.name or record.id[:12], error)
+            except (AvckptError, OSError) as error:
+                self.records.complain(record.id, f"{record.name or record.id[:12]}: runs unprotected: {error}")
+
+    async def _look_for_records(self) -> None:
+        """Finds the containers whose hooks got no answer: too many at a time, no descriptors, a sidecar that hung."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            self._adopt()
+
+    def _live_run(self, container_id: str) -> Protected | None:
+        """The run of a container that is watched, unless it has just ended."""
+        known = self.registry.by_id(container_id)
+        return None if known is None or has_ended(self._watches[known.cookie].pidfd) else known
 
     def _watch(self, request: Register, pidfd: int, *, adopted: bool) -> None:
         """Starts protecting a container.  `pidfd` is ours from here on, whatever happens."""
         with closed_on_error(pidfd):
             if has_ended(pidfd):
                 raise TargetGone("the container has ended already")
-            known = self.registry.by_id(request.id)
-            if known is not None and not has_ended(self._watches[known.cookie].pidfd):
+            if is_foreign(pidfd):
+                raise Denied(NOT_SEEN)
+            known = self._live_run(request.id)
+            if known is not None:
                 # Both are alive, so the same PID is the same process.
                 if known.init_pid == pid_of(pidfd):
                     os.close(pidfd)

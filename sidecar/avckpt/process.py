@@ -64,12 +64,22 @@ def has_ended(pidfd: int) -> bool:
     return bool(poller.poll(0))
 
 
+def is_foreign(pidfd: int) -> bool:
+    """Whether the process is in a PID namespace that is neither ours nor below ours."""
+    return _fdinfo_pid(pidfd) == 0
+
+
 def pid_of(pidfd: int) -> int:
     """The PID behind a pidfd, in our own PID namespace; 0 when it is not visible here or has ended.
 
     For people, and for telling whether two *live* pidfds are the same process.
     """
+    return max(_fdinfo_pid(pidfd), 0)
+
+
+def _fdinfo_pid(pidfd: int) -> int:
+    """0: it has no number in our namespace; -1: it has ended and was waited for (pidfd_show_fdinfo() in the kernel)."""
     for line in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines():
         if line.startswith("Pid:"):
-            return max(int(line.split()[1]), 0)
-    return 0
+            return int(line.split()[1])
+    return -1

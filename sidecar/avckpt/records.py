@@ -7,39 +7,77 @@ import contextlib
 import json
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from avckpt_hooks.protocol import ProtocolError, Register
+from avckpt_hooks.protocol import Register
 
-from avckpt.errors import TargetGone
+from avckpt.errors import Denied, TargetGone
 from avckpt.process import open_pidfd
 
 log = logging.getLogger("avckpt")
 
+PID_MOST = 1 << 22
+"""PID_MAX_LIMIT, include/linux/threads.h."""
+OWN_NAMESPACE = os.stat("/proc/self/ns/pid").st_ino
+NOT_SEEN = "the sidecar does not see the host's processes: start it with --pid=host"
 
-def adoptable(directory: Path) -> Iterator[tuple[Register, int]]:
-    """Every recorded container whose init still lives, with a pidfd that becomes the caller's.
 
-    Records of containers that have ended are removed; unreadable ones are left
-    where they are and logged.
-    """
-    for path in sorted(directory.glob("*.json")):
-        try:
-            text = path.read_bytes()
-        except FileNotFoundError:
-            continue  # its container has just stopped
-        try:
-            record = Register.from_record(json.loads(text))
-        except (ProtocolError, ValueError) as error:
-            log.warning("%s is not a record of a container (%s): left alone", path, error)
-            continue
-        try:
-            pidfd = open_pidfd(record.pid, record.starttime)
-        except TargetGone:
-            remove_if(path, text)
-            continue
-        yield record, pidfd
+class Records:
+    """The records in a directory, which may be looked at again and again.  What is wrong with one is logged once."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._complaints: dict[str, str] = {}
+        """By file name, as long as there is the file."""
+
+    def adoptable(self, is_known: Callable[[str], bool]) -> Iterator[tuple[Register, int]]:
+        """Every recorded container whose init still lives, with a pidfd that becomes the caller's.
+
+        Those whose id `is_known` are left out, at the cost of a listing.  Records
+        of containers that have ended are removed; those that can not be read, or
+        whose PID means nothing here, are left where they are and logged.
+        """
+        paths = sorted(self._directory.glob("*.json"))
+        names = {path.name for path in paths}
+        self._complaints = {name: line for name, line in self._complaints.items() if name in names}
+        for path in paths:
+            if is_known(path.stem):
+                continue
+            try:
+                text = path.read_bytes()
+                record = _parse(text)
+                pidfd = open_pidfd(record.pid, record.starttime)
+            except FileNotFoundError:
+                continue  # its container has just stopped
+            except TargetGone:
+                remove_if(path, text)
+            except Denied as error:
+                self.complain(path.stem, str(error))
+            except OSError as error:
+                self.complain(path.stem, f"the container of {path} runs unprotected: {error.strerror}")
+            except ValueError as error:
+                self.complain(path.stem, f"{path} is not a record of a container ({error}): left alone")
+            else:
+                yield record, pidfd
+
+    def complain(self, container_id: str, line: str) -> None:
+        """Logs what is wrong with a record, unless that was said at the last look."""
+        name = f"{container_id}.json"
+        if self._complaints.get(name) != line:
+            log.error("%s", line)
+        self._complaints[name] = line
+
+
+def _parse(text: bytes) -> Register:
+    """Raises ValueError when it is no record, Denied when its PID is one of a PID namespace that we do not see."""
+    data = json.loads(text)
+    record = Register.from_record(data)
+    if not 0 < record.pid <= PID_MOST:
+        raise ValueError(f"its pid is {record.pid}")
+    if data.get("pid_namespace", OWN_NAMESPACE) != OWN_NAMESPACE:
+        raise Denied(f"runs unprotected: {NOT_SEEN}", container=record.name or record.id[:12])
+    return record
 
 
 def remove_if(path: Path, text: bytes) -> None:

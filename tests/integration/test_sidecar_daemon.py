@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pytest
 from harness import ROOT, avckpt_command, run, wait_until
-from local_sidecar import ON_COMMAND, QUICK, LocalSidecar, children, ended, local_sidecar
+from local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, children, ended, local_sidecar
 
 SLEEPER = ["sleep", "1000"]
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
@@ -192,6 +192,69 @@ def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:
     row = idle_sidecar.wait_for(web, state="protected")
     assert row["adopted"]
     assert [path.stem for path in (idle_sidecar.run_dir / "containers").iterdir()] == [web.id]
+
+
+def missed(local: LocalSidecar, name: str, labels: dict[str, str]) -> Container:
+    """A container whose hook does not reach the sidecar (too many at a time, say), but leaves its record."""
+    made = local.container(name, SLEEPER)
+    socket = local.run_dir / "hooks.sock"
+    socket.rename(f"{socket}.away")
+    try:
+        assert "runs unprotected" in made.hook("prestart", labels)
+    finally:
+        Path(f"{socket}.away").rename(socket)
+    return made
+
+
+def test_a_container_whose_hook_got_no_answer_is_adopted(local: LocalSidecar) -> None:
+    web = missed(local, "web", QUICK)
+    row = local.wait_for(web, state="protected", timeout_s=15)
+    assert row["adopted"]
+    assert local.log.count("web: ") == 2  # adopted, first checkpoint
+
+
+def test_a_reload_adopts_it_at_once(local: LocalSidecar) -> None:
+    web = missed(local, "web", QUICK)
+    local.avckpt("reload")
+    assert local.row(web)["adopted"]
+
+
+def test_one_that_can_not_be_adopted_is_told_once(local: LocalSidecar) -> None:
+    web = missed(local, "web", {**QUICK, "avckpt.keep": "many"})
+    for _ in range(3):
+        local.avckpt("reload")
+    assert local.log.count("web: runs unprotected: ") == 1
+    assert local.row(web) == {}
+
+
+def test_a_sidecar_that_does_not_see_the_hosts_processes_says_so(local: LocalSidecar) -> None:
+    """Its container was started without --pid=host."""
+    why = "the sidecar does not see the host's processes: start it with --pid=host"
+    old, new = local.container("old", SLEEPER), local.container("new", SLEEPER)
+    assert old.hook("prestart", QUICK) == ""
+    record = local.run_dir / "containers" / f"{old.id}.json"
+    record.write_text(
+        json.dumps({**json.loads(record.read_text()), "pid_namespace": os.stat("/proc/self/ns/pid").st_ino})
+    )
+    local.stop()
+    with local.run_dir.with_suffix(".log").open("ab") as log:
+        blind = subprocess.Popen(
+            ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc", *avckpt_command(), "sidecar"],
+            env={**os.environ, **local.env},
+            stderr=log,
+        )
+    try:
+        wait_until((local.run_dir / "hooks.sock").exists, 20, "it listens")
+        wait_until(lambda: "is ready" in local.log.rpartition("asked to stop")[2], 20, "it has looked at the records")
+        said = new.hook("prestart", QUICK)
+        assert f"new runs unprotected: the sidecar said: {why}" in said
+        assert f"old: runs unprotected: {why}" in local.log
+        assert record.exists()
+    finally:
+        blind.kill()
+        blind.wait()
+    local.start()
+    local.wait_for(old, state="protected")
 
 
 def test_it_takes_all_the_descriptors_it_may(idle_sidecar: LocalSidecar) -> None:

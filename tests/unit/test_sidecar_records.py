@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from avckpt.errors import TargetGone
 from avckpt.process import has_ended, open_pidfd, pid_of, start_time
-from avckpt.records import adoptable, remove_if
+from avckpt.records import NOT_SEEN, Records, remove_if
 from avckpt_hooks.protocol import Register
 
 
@@ -25,16 +25,21 @@ def sleeper() -> Iterator[subprocess.Popen[bytes]]:
     process.wait()
 
 
-def record(directory: Path, digit: str, pid: int, started: int) -> Path:
+def record(directory: Path, digit: str, pid: int, started: int, **more: object) -> Path:
     register = Register(id=digit * 64, name=f"n{digit}", pid=pid, starttime=started, bundle="/b", annotations={})
     path = directory / f"{register.id}.json"
-    path.write_text(json.dumps(register.record()))
+    path.write_text(json.dumps({**register.record(), **more}))
     return path
+
+
+def adoptable(directory: Path, known: str = "") -> list[tuple[Register, int]]:
+    """What a sidecar that has just started, and knows one container at most, would adopt."""
+    return list(Records(directory).adoptable(lambda container_id: container_id == known))
 
 
 def test_a_living_container_is_adopted(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
     path = record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
-    [(register, pidfd)] = list(adoptable(tmp_path))
+    [(register, pidfd)] = adoptable(tmp_path)
     assert register.name == "na"
     assert pid_of(pidfd) == sleeper.pid
     assert path.exists()
@@ -44,7 +49,7 @@ def test_a_living_container_is_adopted(tmp_path: Path, sleeper: subprocess.Popen
 def test_a_reused_pid_is_not(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
     path = record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid) - 1)
     before = len(os.listdir("/proc/self/fd"))
-    assert list(adoptable(tmp_path)) == []
+    assert adoptable(tmp_path) == []
     assert not path.exists()
     assert len(os.listdir("/proc/self/fd")) == before
 
@@ -59,7 +64,7 @@ def test_an_ended_one_is_not(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -
     with pytest.raises(TargetGone):
         open_pidfd(sleeper.pid, started)
     path = record(tmp_path, "a", sleeper.pid, started)
-    assert list(adoptable(tmp_path)) == []
+    assert adoptable(tmp_path) == []
     assert not path.exists()
     sleeper.wait()
     with pytest.raises(TargetGone):
@@ -71,7 +76,7 @@ def test_an_ended_one_is_not(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -
 def test_what_is_no_record_is_left_alone(tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / ("b" * 64 + ".json")
     path.write_text(text)
-    assert list(adoptable(tmp_path)) == []
+    assert adoptable(tmp_path) == []
     assert path.exists()
     assert str(path) in caplog.text
 
@@ -79,7 +84,46 @@ def test_what_is_no_record_is_left_alone(tmp_path: Path, text: str, caplog: pyte
 def test_one_bad_record_does_not_hide_the_others(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
     (tmp_path / ("0" * 64 + ".json")).write_text("{")
     record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
-    [(_, pidfd)] = list(adoptable(tmp_path))
+    [(_, pidfd)] = adoptable(tmp_path)
+    os.close(pidfd)
+
+
+@pytest.mark.parametrize("pid", [0, -1, 2**22 + 1, 2**40])
+def test_what_can_be_no_pid_is_left_alone(tmp_path: Path, pid: int, caplog: pytest.LogCaptureFixture) -> None:
+    path = record(tmp_path, "a", pid, 1)
+    assert adoptable(tmp_path) == []
+    assert path.exists()
+    assert f"its pid is {pid}" in caplog.text
+
+
+def test_what_can_not_be_opened_hides_no_other(
+    tmp_path: Path, sleeper: subprocess.Popen[bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / ("0" * 64 + ".json")).mkdir()
+    record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
+    [(_, pidfd)] = adoptable(tmp_path)
+    os.close(pidfd)
+    assert "Is a directory" in caplog.text
+
+
+def test_who_is_known_is_not_looked_at(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
+    path = record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid) - 1)
+    assert adoptable(tmp_path, known="a" * 64) == []
+    assert path.exists()
+
+
+def test_a_pid_of_another_namespace_means_nothing(
+    tmp_path: Path, sleeper: subprocess.Popen[bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    own = os.stat("/proc/self/ns/pid").st_ino
+    path = record(tmp_path, "a", sleeper.pid, 1, pid_namespace=own + 1)
+    records = Records(tmp_path)
+    for _ in range(2):
+        assert list(records.adoptable(lambda _: False)) == []
+    assert path.exists()
+    assert [each.getMessage() for each in caplog.records] == [f"na: runs unprotected: {NOT_SEEN}"]
+    record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid), pid_namespace=own)
+    [(_, pidfd)] = records.adoptable(lambda _: False)
     os.close(pidfd)
 
 
