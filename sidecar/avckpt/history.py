@@ -23,12 +23,14 @@ log = logging.getLogger("avckpt")
 
 LIMIT = 1000
 """Events kept."""
+AGAIN_S = 10.0
+"""What could not be written is tried again with the first event after this time: a full disk may not stay full."""
 
 
 class History:
     """The events of a machine since it started, at most `limit`.  For one thread.
 
-    What can not be written is kept in memory, and the log says so once.
+    What can not be written is kept in memory until it can, and the log says so once.
     """
 
     def __init__(self, path: Path, limit: int = LIMIT) -> None:
@@ -37,7 +39,9 @@ class History:
         self._kept: deque[EventRecord] = deque(maxlen=limit)
         self._lines = 0
         self._fd = -1
-        self._failed = False
+        self._closed = False
+        self._failed_s: float | None = None
+        """When it could not be written (CLOCK_MONOTONIC); None: all is well."""
         whole = self._load()
         # The time of day as the first number: numbers given out before a
         # history was lost are smaller, so that nobody who resumes after one of
@@ -51,10 +55,10 @@ class History:
         record = dataclasses.replace(record, seq=self._next)
         self._next += 1
         self._kept.append(record)
-        if self._lines >= 2 * self._limit:
-            self._compact()
-        else:
+        if self._failed_s is None and self._lines < 2 * self._limit:
             self._append(record)
+        elif self._failed_s is None or time.monotonic() - self._failed_s >= AGAIN_S:
+            self._compact()
         return record
 
     def after(self, seq: int | None = None, since: float | None = None) -> list[EventRecord]:
@@ -72,7 +76,7 @@ class History:
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1
-        self._failed = True
+        self._closed = True
 
     def _load(self) -> bool:
         """Reads the file; False when there is something in it that must go before it is added to."""
@@ -98,7 +102,7 @@ class History:
         return whole
 
     def _append(self, record: EventRecord) -> None:
-        if self._failed:
+        if self._closed:
             return
         line = _line(record)
         try:
@@ -115,7 +119,7 @@ class History:
 
     def _compact(self) -> None:
         """Replaces the file by what is kept, at once or not at all."""
-        if self._failed:
+        if self._closed:
             return
         aside = self._path.with_name(f"{self._path.name}.new")
         try:
@@ -132,10 +136,14 @@ class History:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+        if self._failed_s is not None:
+            self._failed_s = None
+            log.info("%s is written again", self._path)
 
     def _complain(self, error: OSError) -> None:
-        self._failed = True
-        log.error("%s can not be used (%s): events are kept in memory only", self._path, error.strerror)
+        if self._failed_s is None:
+            log.error("%s can not be used (%s): events are kept in memory only", self._path, error.strerror)
+        self._failed_s = time.monotonic()
 
 
 def _line(record: EventRecord) -> bytes:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import resource
 import signal
 import stat
 import subprocess
@@ -90,6 +91,29 @@ def test_what_can_not_be_written_is_kept_in_memory_and_said_once(path: Path, cap
     assert history.after() == records
     assert [record.message for record in caplog.records] == [
         f"{path} can not be used (Is a directory): events are kept in memory only"
+    ]
+
+
+def test_it_is_whole_again_once_it_can_be_written(
+    path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that is full for a while: here a limit on the length of files, met in the middle of a line."""
+    caplog.set_level("INFO", "avckpt")
+    history = History(path)
+    records = [history.add(died(1.0))]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, before[1]))
+    try:
+        records += [history.add(died(at)) for at in (2.0, 3.0)]
+        monkeypatch.setattr("avckpt.history.AGAIN_S", 0.0)
+        records.append(history.add(died(4.0)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    records.append(history.add(died(5.0)))
+    assert History(path).after() == records
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{path} can not be used (File too large): events are kept in memory only",
+        f"{path} is written again",
     ]
 
 
