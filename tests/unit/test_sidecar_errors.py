@@ -8,8 +8,19 @@ import errno
 import pytest
 from avckpt import errors
 from avckpt._native import ffi
-from avckpt.errors import AvckptError, Code, Denied, ExitCode, KernelError, NoSuchContainer, class_of_code, from_json
+from avckpt.errors import (
+    AvckptError,
+    Code,
+    Denied,
+    ExitCode,
+    KernelError,
+    NoSuchContainer,
+    SidecarUnreachable,
+    class_of_code,
+    from_json,
+)
 from avckpt.events import Command, EventKind, Reason
+from harness import ROOT
 
 
 def test_the_line_a_person_sees() -> None:
@@ -35,6 +46,12 @@ def test_all_fields_cross_the_api(cls: type[AvckptError]) -> None:
     back = from_json(error.to_json())
     assert type(back) is cls
     assert back.to_json() == error.to_json()
+
+
+@pytest.mark.parametrize("cls", [cls for cls in errors._CLASSES if cls is not SidecarUnreachable])
+def test_every_kind_is_in_the_apis_description(cls: type[AvckptError]) -> None:
+    """But that of the one error for which there is no sidecar to say it."""
+    assert f"`{cls.kind}`" in (ROOT / "docs/api.md").read_text()
 
 
 def test_what_a_newer_sidecar_says_is_still_an_error() -> None:
