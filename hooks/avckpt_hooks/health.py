@@ -49,10 +49,14 @@ def ask_later(container: str, parent: int) -> None:
 
 
 def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
-    """Asks, and writes what is said: the health check as `podman inspect` has it, or null."""
+    """Asks, and writes what is said: the health checks as `podman inspect` has them, or null."""
     try:
-        found = json.loads(ask(time.monotonic() + GIVE_UP_S))[0]["Config"].get("Healthcheck")
-        answer = {"healthcheck": found}
+        config = json.loads(ask(time.monotonic() + GIVE_UP_S))[0]["Config"]
+        # The latter since Podman 4.5.
+        answer = {
+            "healthcheck": config.get("Healthcheck"),
+            "startup_healthcheck": config.get("StartupHealthCheck"),
+        }
     except (podman.Unknown, ValueError, LookupError, AttributeError) as error:
         answer = {"healthcheck": None, "error": str(error)}
         if _has_ended(container):

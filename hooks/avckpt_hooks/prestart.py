@@ -74,13 +74,18 @@ def starttime(pid: int) -> int:
 
 
 def write_record(registration: protocol.Register) -> None:
-    """Writes the container's record, at once or not at all."""
+    """Writes the container's record, at once or not at all.
+
+    With the PID namespace that its PID is of: a sidecar without --pid=host is in
+    another one, and must not take the container for one that has ended.
+    """
     path = protocol.record_path(registration.id)
     os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
     temporary = f"{path}.{os.getpid()}"
+    record = {**registration.record(), "pid_namespace": os.stat("/proc/self/ns/pid").st_ino}
     try:
         with open(temporary, "w") as file:
-            json.dump(registration.record(), file)
+            json.dump(record, file)
             file.write("\n")
         os.replace(temporary, path)
     except OSError:

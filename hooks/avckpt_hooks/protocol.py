@@ -63,12 +63,12 @@ def records_dir() -> str:
 
 
 def record_path(container_id: str) -> str:
-    """The record of one container: the JSON of its `Register`, without "op"."""
+    """The record of one container: the JSON of its `Register`, without "op", and `pid_namespace`, its inode."""
     return os.path.join(records_dir(), container_id + ".json")
 
 
 def health_path(container_id: str) -> str:
-    """The health check of one container, {"healthcheck": as `podman inspect` has it, or null}."""
+    """The checks of one container, {"healthcheck", "startup_healthcheck"}: as `podman inspect` has them, or null."""
     return os.path.join(run_dir(), "health", container_id + ".json")
 
 

@@ -8,6 +8,7 @@ should start at once.
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Iterable
@@ -32,6 +33,8 @@ with 125 if it could not start it.
 """
 
 
+START_AGAIN_S = 3.0
+"""How long a sidecar that could not start waits before it ends, in a container."""
 STATE_STYLES = {"protected": "green", "starting": "yellow", "restoring": "yellow", "unprotected": "bold red"}
 
 
@@ -117,6 +120,9 @@ def sidecar(verbose: bool, config: Path) -> None:
         serve(_run_dir(), config)
     except AvckptError as error:
         click.echo(f"avckpt: {error}", err=True)
+        # Podman starts its container again at once, for ever (--restart=always).
+        if "container" in os.environ:  # podman-run(1)
+            time.sleep(START_AGAIN_S)
         sys.exit(int(ExitCode.FAILED))
 
 

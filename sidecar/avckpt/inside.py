@@ -159,7 +159,8 @@ def _credentials(pid: int) -> tuple[str, list[str]]:
     The numbers are those of the container's user namespace, in which they are
     asked for: /proc gives them as we have them.
     """
-    fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
+    status = Path(f"/proc/{pid}/status").read_text(errors="replace")  # its name may be any bytes
+    fields = dict(line.split(":", 1) for line in status.split("\n") if ":" in line)
     uid = _inside(int(fields["Uid"].split()[1]), Path(f"/proc/{pid}/uid_map").read_text())
     gid_map = Path(f"/proc/{pid}/gid_map").read_text()
     gid = _inside(int(fields["Gid"].split()[1]), gid_map)

@@ -286,7 +286,7 @@ def _status(pid: int) -> dict[str, str]:
     """/proc/PID/status, proc(5); only a name when there is no such process."""
     fields = {"Name": ""}
     with suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines():
+        for line in Path(f"/proc/{pid}/status").read_text(errors="replace").split("\n"):
             name, _, value = line.partition(":")
             fields[name] = value.strip()
     return fields

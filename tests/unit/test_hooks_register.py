@@ -99,8 +99,8 @@ def test_prestart_registers_with_a_pidfd(listener: socket.socket, process: subpr
     assert (request.id, request.name, request.pid, request.bundle) == (ID, "web", process.pid, "/b")
     assert request.annotations["avckpt.enable"] == "true"
     record = json.loads(Path(protocol.record_path(ID)).read_text())
-    assert record == request.record()
-    assert protocol.Register.from_record(record).record() == record
+    assert record == {**request.record(), "pid_namespace": os.stat("/proc/self/ns/pid").st_ino}
+    assert protocol.Register.from_record(record).record() == request.record()
 
 
 def test_prestart_records_the_start_time_of_a_process_with_an_odd_name(run_dir: Path) -> None:

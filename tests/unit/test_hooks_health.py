@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the hooks write down of a container's health checks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from avckpt_hooks import health, protocol
+
+ID = "d" * 64
+CHECK = {"Test": ["CMD-SHELL", "true"], "Interval": 30_000_000_000}
+
+
+@pytest.fixture(autouse=True)
+def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container that lives."""
+    monkeypatch.setenv("AVCKPT_RUN_DIR", str(tmp_path))
+    Path(protocol.records_dir()).mkdir()
+    Path(protocol.record_path(ID)).touch()
+
+
+@pytest.mark.parametrize("startup", [None, {**CHECK, "Successes": 1}])
+def test_both_checks_are_written_down(startup: dict[str, object] | None) -> None:
+    """As `podman inspect` has them; it leaves out what there is none of."""
+    config = {"Healthcheck": CHECK, **({"StartupHealthCheck": startup} if startup else {})}
+    health.write_answer(ID, lambda deadline: json.dumps([{"Config": config}]).encode())
+    assert json.loads(Path(protocol.health_path(ID)).read_bytes()) == {
+        "healthcheck": CHECK,
+        "startup_healthcheck": startup,
+    }
