@@ -16,6 +16,7 @@ from avckpt import compose
 from avckpt.compose import Started
 from avckpt.errors import AvckptError
 from avckpt.vehicle import judge
+from harness import wait_until
 
 
 class Fake(compose.Compose):
@@ -62,7 +63,8 @@ def test_one_that_waits_in_vain_is_ended(podman: Path, waits: str, words: str, l
     with pytest.raises(AvckptError, match=f"it waited in vain for {words}"):
         Fake(waits.format(podman)).up([], lambda line: None)
     assert least_s <= time.monotonic() - started < 10
-    assert left_over(podman) == []
+    # They were told to end, and podman-compose did: they may need a moment longer.
+    wait_until(lambda: left_over(podman) == [], 5, "nobody waits any more")
 
 
 @pytest.mark.parametrize("other", ["{0} pull image", "{0} wait --condition=stopped a", "{0} start a"])
