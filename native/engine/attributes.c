@@ -48,9 +48,23 @@ struct answers {
 	int32_t memory_policy;
 	uint32_t group[GROUPS_KEPT];
 	uint64_t nodes[NODE_WORDS];
+	uint64_t state_permitted;
 };
 
-enum { FSUID, FSGID, SECUREBITS, NO_NEW_PRIVS, SLACK, SECCOMP, GROUP_COUNT, POLICY };
+enum {
+	FSUID,
+	FSGID,
+	SECUREBITS,
+	NO_NEW_PRIVS,
+	SLACK,
+	SECCOMP,
+	GROUP_COUNT,
+	POLICY,
+	PERSONALITY,
+	CAPS,
+	BOUNDING,
+	AMBIENT
+};
 
 void scheduling_read(pid_t tid, struct scheduling *s)
 {
@@ -77,10 +91,14 @@ const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_r
 	call_add(call, SYS_prctl, PR_GET_SECCOMP, 0, 0, 0, 0);
 	call_add(call, SYS_getgroups, 0, 0, 0, 0, 0);
 	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS, 0, 0);
+	call_add(call, SYS_personality, 0xffffffff, 0, 0, 0, 0);
+	call_add(call, SYS_capget, AT(header), AT(caps), 0, 0, 0);
+	call_add(call, INJ_CAPS, PR_CAPBSET_READ, 0, 0, 0, 0);
+	call_add(call, INJ_CAPS, PR_CAP_AMBIENT, AT(caps), 0, 0, 0);
+	call_add(call, ARCH_STATE_CALL, ARCH_STATE_PERMITTED, AT(state_permitted), 0, 0, 0);
 	call_add(call, SYS_getgroups, GROUPS_KEPT, AT(group), 0, 0, 0);
 	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8, 0, 0);
 	call_add(call, SYS_getresgid, AT(gid), AT(gid) + 4, AT(gid) + 8, 0, 0);
-	call_add(call, SYS_capget, AT(header), AT(caps), 0, 0, 0);
 	call_add(call, SYS_prctl, PR_GET_PDEATHSIG, AT(death_signal), 0, 0, 0);
 	call_add(call, SYS_prctl, PR_GET_CHILD_SUBREAPER, AT(subreaper), 0, 0, 0);
 #undef AT
@@ -96,6 +114,10 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	memcpy(c->uid, a->uid, sizeof a->uid);
 	memcpy(c->gid, a->gid, sizeof a->gid);
 	memcpy(c->caps, a->caps, sizeof c->caps);
+	c->bounding = (uint64_t)first[BOUNDING].result;
+	c->ambient = (uint64_t)first[AMBIENT].result;
+	c->personality = (uint32_t)first[PERSONALITY].result;
+	c->state_permitted = a->state_permitted;
 	c->fsuid = (uint32_t)first[FSUID].result;
 	c->fsgid = (uint32_t)first[FSGID].result;
 	c->securebits = (uint32_t)first[SECUREBITS].result;
@@ -134,22 +156,52 @@ static bool differ_in_groups(const struct creds *a, const struct creds *b)
 	return a->group_count != b->group_count || memcmp(a->group, b->group, sizeof a->group);
 }
 
-/* A thread that has fewer rights than the main thread, or other ones.  To go on with
- * more than it had would be wrong: these must succeed. */
-static void lower(const struct creds *from, const struct creds *to, struct setup *setup)
+enum { EFFECTIVE, PERMITTED, INHERITABLE };
+
+static uint64_t caps_of(const struct creds *c, int set)
+{
+	return c->caps[set] | (uint64_t)c->caps[set + 3] << 32;
+}
+
+static void add_capset(struct setup *setup, uint64_t effective, uint64_t permitted,
+		       uint64_t inheritable)
 {
 	const struct {
 		uint32_t header[2], caps[6];
 	} data = {
 		.header = { CAPABILITY_VERSION_3, 0 },
-		.caps = { to->caps[0], to->caps[1], to->caps[2], to->caps[3], to->caps[4],
-			  to->caps[5] },
+		.caps = { (uint32_t)effective, (uint32_t)permitted, (uint32_t)inheritable,
+			  (uint32_t)(effective >> 32), (uint32_t)(permitted >> 32),
+			  (uint32_t)(inheritable >> 32) },
 	};
 	const avc_remote at = setup_data(setup, &data, sizeof data);
+
+	setup_add_thread(setup, "capset", SYS_capset, at, at + sizeof data.header, 0, 0, 0);
+}
+
+static bool differ_in_securebits(const struct creds *from, const struct creds *to)
+{
+	return ((from->securebits ^ to->securebits) & ~(uint32_t)SECBIT_KEEP_CAPS) != 0;
+}
+
+static bool raises_ambient(const struct creds *from, const struct creds *to)
+{
+	/* Another user has none. */
+	return to->ambient &&
+	       (to->ambient != from->ambient || memcmp(from->uid, to->uid, sizeof to->uid));
+}
+
+/* A thread that has fewer rights than the main thread, or other ones.  To go on with
+ * more than it had would be wrong: these must succeed. */
+static void lower(const struct creds *from, const struct creds *to, struct setup *setup)
+{
 	const bool uids = memcmp(from->uid, to->uid, sizeof to->uid) != 0;
-	const bool caps = uids || memcmp(from->caps, to->caps, sizeof to->caps) != 0;
-	/* Or the capabilities would go with the user. */
-	const uint32_t keep = from->securebits | SECBIT_KEEP_CAPS;
+	const bool caps = uids || memcmp(from->caps, to->caps, sizeof to->caps) ||
+			  from->bounding != to->bounding || from->ambient != to->ambient ||
+			  differ_in_securebits(from, to) ||
+			  /* The file system's user takes capabilities along, too. */
+			  from->fsuid != to->fsuid;
+	uint32_t bits = from->securebits;
 
 	if (differ_in_groups(from, to))
 		setup_add_thread(setup, "setgroups", SYS_setgroups, (uint64_t)to->group_count,
@@ -157,52 +209,68 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 	if (memcmp(from->gid, to->gid, sizeof to->gid))
 		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
 				 to->gid[2], 0, 0);
-	if (uids) {
-		if (from->securebits != keep)
-			setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1, 0,
-					 0, 0);
+	/* Or the capabilities would go with the user. */
+	if (uids && !(bits & SECBIT_KEEP_CAPS)) {
+		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1, 0, 0, 0);
+		bits |= SECBIT_KEEP_CAPS;
+	}
+	if (uids)
 		setup_add_thread(setup, "setresuid", SYS_setresuid, to->uid[0], to->uid[1],
 				 to->uid[2], 0, 0);
-		if (!(to->securebits & SECBIT_KEEP_CAPS))
-			setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 0, 0,
-					 0, 0);
-	}
+	if ((bits ^ to->securebits) & SECBIT_KEEP_CAPS)
+		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS,
+				 (to->securebits & SECBIT_KEEP_CAPS) != 0, 0, 0, 0);
+	/* Those that were effective have gone all the same, and are needed once more. */
+	if (caps)
+		add_capset(setup, caps_of(from, PERMITTED), caps_of(from, PERMITTED),
+			   caps_of(to, INHERITABLE));
 	if (from->fsgid != to->fsgid || to->fsgid != to->gid[1])
 		setup_add_thread(setup, "setfsgid", SYS_setfsgid, to->fsgid, 0, 0, 0, 0);
 	if (from->fsuid != to->fsuid || to->fsuid != to->uid[1])
 		setup_add_thread(setup, "setfsuid", SYS_setfsuid, to->fsuid, 0, 0, 0, 0);
-	if ((from->securebits ^ to->securebits) & ~(uint32_t)SECBIT_KEEP_CAPS)
+	/* After what is inheritable, of which nothing may be out of bounds. */
+	if (from->bounding != to->bounding)
+		setup_add_thread(setup, "prctl(CAPBSET_DROP)", INJ_CAPS_CHANGE, PR_CAPBSET_DROP,
+				 from->bounding & ~to->bounding, 0, 0, 0);
+	if (from->ambient & ~to->ambient)
+		setup_add_thread(setup, "prctl(CAP_AMBIENT)", SYS_prctl, PR_CAP_AMBIENT,
+				 PR_CAP_AMBIENT_CLEAR_ALL, 0, 0, 0);
+	if (raises_ambient(from, to))
+		setup_add_thread(setup, "prctl(CAP_AMBIENT)", INJ_CAPS_CHANGE, PR_CAP_AMBIENT,
+				 to->ambient, 0, 0, 0);
+	if (differ_in_securebits(from, to))
 		setup_add_thread(setup, "prctl(SECUREBITS)", SYS_prctl, PR_SET_SECUREBITS,
 				 to->securebits, 0, 0, 0);
-	/* Also the file system's user takes capabilities along. */
-	if (caps || from->fsuid != to->fsuid)
-		setup_add_thread(setup, "capset", SYS_capset, at, at + sizeof data.header, 0, 0, 0);
+	if (caps)
+		add_capset(setup, caps_of(to, EFFECTIVE), caps_of(to, PERMITTED),
+			   caps_of(to, INHERITABLE));
 	if (to->no_new_privs && !from->no_new_privs)
 		setup_add_thread(setup, "prctl(NO_NEW_PRIVS)", SYS_prctl, PR_SET_NO_NEW_PRIVS, 1, 0,
 				 0, 0);
 }
 
-/* Each capability set of `to` within the permitted ones of `from`? */
+/* Each set of capabilities of `to` within what `from` may have? */
 static bool has_less(const struct creds *from, const struct creds *to)
 {
-	return !(to->caps[1] & ~from->caps[1]) && !(to->caps[4] & ~from->caps[4]);
+	return !(caps_of(to, PERMITTED) & ~caps_of(from, PERMITTED)) &&
+	       !(to->bounding & ~from->bounding) &&
+	       !(caps_of(to, INHERITABLE) &
+		 ~(caps_of(from, INHERITABLE) | (caps_of(from, PERMITTED) & from->bounding)));
 }
 
-int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
-			    const struct thread *t, struct setup *setup, struct avc_error *err)
+/* What a thread may do without takes a right to do without it. */
+static bool may_be_lowered(const struct creds *from, const struct creds *to)
 {
-	/* One that is not the main process is made from that, as are its threads. */
-	const struct creds *from = target->descendant ? target->forebear : &main_thread->creds;
-	const struct creds *to = &t->creds;
+	const bool may = caps_of(from, PERMITTED) >> CAP_SETPCAP & 1;
 
-	if (to->death_signal)
-		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
-				 to->death_signal, 0, 0, 0);
-	if (t == main_thread && to->subreaper)
-		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
-				 0, 0);
-	if (t == main_thread && !target->descendant)
-		return 0;
+	return (may || (from->bounding == to->bounding && !differ_in_securebits(from, to))) &&
+	       !(from->securebits & SECBIT_NO_CAP_AMBIENT_RAISE && raises_ambient(from, to));
+}
+
+/* A thread that is made by another one gets what it has not from that. */
+static int set_apart(const struct target *target, pid_t inside, const struct creds *from,
+		     const struct creds *to, struct setup *setup, struct avc_error *err)
+{
 	if (to->slack_ns && to->slack_ns != from->slack_ns)
 		setup_add_thread(setup, "prctl(TIMERSLACK)", SYS_prctl, PR_SET_TIMERSLACK,
 				 to->slack_ns, 0, 0, 0)
@@ -218,16 +286,46 @@ int attributes_setup_thread(const struct target *target, const struct thread *ma
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 			    "thread %d has other supplementary groups than the main thread, which "
 			    "can not be put back",
-			    t->inside);
+			    inside);
 	if (to->seccomp != from->seccomp || to->filters != from->filters)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "its threads differ in their seccomp filters (thread %d)", t->inside);
+			    "its threads differ in their seccomp filters (thread %d)", inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 			    "%s %d has privileges that the main %s has given up",
-			    target->descendant ? "process" : "thread", t->inside,
+			    target->descendant ? "process" : "thread", inside,
+			    target->descendant ? "process" : "thread");
+	if (!may_be_lowered(from, to))
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "%s %d has other capability sets (bounding, ambient, securebits) than "
+			    "the main %s, which lacks CAP_SETPCAP to give up the same",
+			    target->descendant ? "process" : "thread", inside,
 			    target->descendant ? "process" : "thread");
 	lower(from, to, setup);
+	return 0;
+}
+
+int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
+			    const struct thread *t, struct setup *setup, struct avc_error *err)
+{
+	/* One that is not the main process is made from that, as are its threads. */
+	const struct creds *from = target->descendant ? target->forebear : &main_thread->creds;
+	const struct creds *to = &t->creds;
+
+	if (t == main_thread && to->subreaper)
+		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
+				 0, 0);
+	if ((t != main_thread || target->descendant) &&
+	    set_apart(target, t->inside, from, to, setup, err))
+		return -1;
+	/* A process that is made gets its own with what else it has (manner.c). */
+	if (to->personality != main_thread->creds.personality)
+		setup_add_thread(setup, "personality", SYS_personality, to->personality, 0, 0, 0,
+				 0);
+	/* After a change of users, which takes it away. */
+	if (to->death_signal)
+		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
+				 to->death_signal, 0, 0, 0);
 	return 0;
 }
 

@@ -16,7 +16,10 @@
 
 #include "internal.h"
 
-#define TEMPLATE_NAME 16        /* in template_call.out: what it had got by fork(2) */
+/* In template_call.out: what the template had got by fork(2). */
+#define TEMPLATE_NAME 16
+#define TEMPLATE_ALTSTACK 32
+#define TEMPLATE_ATTRIBUTES 64
 #define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
 
 /* The OOM killer is to take templates first; undone in what is restored. */
@@ -31,13 +34,29 @@ void oom_score_adj_set(pid_t pid, const char *value)
 	close(fd);
 }
 
+/* A fork of the main thread has what that had at that instant, but for what fork(2) resets. */
+static int hear_template(struct target *target, struct thread *cloned, const struct inj_call *call,
+			 const struct inj_syscall *attributes, struct avc_error *err)
+{
+	const struct creds was = cloned->creds;
+
+	attributes_answer(attributes, call->out + TEMPLATE_ATTRIBUTES, &cloned->creds);
+	cloned->creds.death_signal = was.death_signal;
+	cloned->creds.subreaper = was.subreaper;
+	cloned->creds.slack_ns = was.slack_ns;
+	cloned->creds.filters = was.filters;
+	cloned->creds.future_lock = was.future_lock;
+	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
+	return ask_others(target, cloned, &was, err);
+}
+
 static int quieten(struct target *target, struct generation *generation,
 		   const struct branch *branch, struct avc_error *err)
 {
-	const struct thread *cloned = branch ? NULL : thread_find(target, target->pid);
+	struct thread *cloned = branch ? NULL : thread_find(target, target->pid);
 	struct inj_slot *slot = pad_slot(&target->pad, generation->slot);
 	struct inj_call *call = &slot->template_call;
-	const struct inj_syscall *rseq = NULL;
+	const struct inj_syscall *rseq = NULL, *dumpable, *attributes = NULL;
 	const pid_t pid = generation->template;
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
@@ -47,6 +66,7 @@ static int quieten(struct target *target, struct generation *generation,
 			  PTRACE_O_SUSPEND_SECCOMP)) ||
 	    arch_regs_get(pid, &generation->base))
 		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
+	memset(call->out, 0, sizeof call->out);
 	memcpy(call->out, "avckpt-tmpl", 12);
 	call_begin(call, INJ_AFTER_PARK);
 	/* Out of the app's session or process group, or the number stays taken. */
@@ -57,6 +77,14 @@ static int quieten(struct target *target, struct generation *generation,
 	call_add(call, SYS_prctl, PR_GET_NAME, pad_remote(&target->pad, call->out + TEMPLATE_NAME),
 		 0, 0, 0);
 	call_add(call, SYS_prctl, PR_SET_NAME, pad_remote(&target->pad, call->out), 0, 0, 0);
+	dumpable = call_add(call, SYS_prctl, PR_GET_DUMPABLE, 0, 0, 0, 0);
+	if (cloned) {
+		call_add(call, SYS_sigaltstack, 0,
+			 pad_remote(&target->pad, call->out + TEMPLATE_ALTSTACK), 0, 0, 0);
+		attributes =
+			attributes_ask(call, call->out + TEMPLATE_ATTRIBUTES,
+				       pad_remote(&target->pad, call->out + TEMPLATE_ATTRIBUTES));
+	}
 	/* Or the kernel would write to its memory each time it runs, and to what is made of
 	 * that.  A holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
 	if (cloned && cloned->rseq)
@@ -67,8 +95,9 @@ static int quieten(struct target *target, struct generation *generation,
 	if (rseq && rseq->result)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
+	generation->dumpable = dumpable->result;
 	oom_score_adj_set(pid, "1000");
-	return 0;
+	return attributes ? hear_template(target, cloned, call, attributes, err) : 0;
 }
 
 /* A main thread that has ended while others go on: it is there again until they are,
@@ -156,8 +185,6 @@ static int fill_slot(struct target *target, struct generation *generation,
 			close(mem_fd);
 			return -1;
 		}
-		if (branch && !b)
-			branch_setup_dumpable(branch, &setup);
 		pending_setup_thread(target, &t, &setup);
 	}
 	close(mem_fd);
@@ -172,6 +199,11 @@ static int fill_slot(struct target *target, struct generation *generation,
 		return -1;
 	if (timers_setup(target, generation, &setup, err))
 		return -1;
+	/* A change of users takes it from the whole process, whichever thread it is. */
+	if (generation->dumpable == 0 || generation->dumpable == 1)
+		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
+			  (uint64_t)generation->dumpable, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
 	if (setup.notice.code)
 		generation->notice = setup.notice;
 	slot->threads = generation->threads;
@@ -188,22 +220,27 @@ static int fill_slot(struct target *target, struct generation *generation,
 	return setup_end(&setup, target->pid, err);
 }
 
+/* What has to be known before anything is filled in: what the others are made from. */
+static int begin_template(struct target *target, struct generation *generation,
+			  const struct branch *branch, struct avc_error *err)
+{
+	generation->pidfd = proc_pidfd_open(generation->template);
+	if (generation->pidfd < 0)
+		return fail_errno(err, generation->template, "keep template", "pidfd_open",
+				  "it was killed");
+	return quieten(target, generation, branch, err);
+}
+
 static int finish(struct target *target, struct generation *generation, struct branch *branch,
 		  struct avc_error *err)
 {
 	int statm_fd;
 	long pages;
 
-	generation->pidfd = proc_pidfd_open(generation->template);
-	if (generation->pidfd < 0)
-		return fail_errno(err, generation->template, "keep template", "pidfd_open",
-				  "it was killed");
 	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
 	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
 	target->anon_pages = generation->anon_pages;
 	close_fd(&statm_fd);
-	if (quieten(target, generation, branch, err))
-		return -1;
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
 	if (branch && branch_learn(branch, err))
@@ -218,8 +255,11 @@ static int finish_branch(struct branch *branch, struct avc_error *err)
 	struct target *target = branch->target;
 
 	/* The holder rests again. */
-	return tracee_settle(target->holder, err) || finish(target, branch->image, branch, err) ? -1
-												: 0;
+	return tracee_settle(target->holder, err) ||
+			       begin_template(target, branch->image, branch, err) ||
+			       finish(target, branch->image, branch, err)
+		       ? -1
+		       : 0;
 }
 
 int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
@@ -229,6 +269,8 @@ int generation_finish(struct target *target, struct generation *generation, stru
 
 	if (generation->branches && !main_thread)
 		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
+	if (begin_template(target, generation, NULL, err))
+		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 		struct avc_error failed = { 0 };

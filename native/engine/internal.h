@@ -201,6 +201,9 @@ struct creds {
 	uint32_t uid[3], gid[3]; /* real, effective, saved                      */
 	uint32_t fsuid, fsgid;
 	uint32_t caps[6]; /* as capget(2) has them                            */
+	uint64_t bounding, ambient;
+	uint64_t state_permitted; /* arch.h, ARCH_STATE_PERMITTED                     */
+	uint32_t personality;
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
 	int32_t seccomp;  /* mode                                             */
@@ -389,6 +392,7 @@ struct generation {
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
 	int stop_signal;       /* stopped by that (job control), 0: it was not     */
+	int64_t dumpable;      /* prctl(2), PR_GET_DUMPABLE                        */
 	struct proc_stat stat; /* as of the freeze                                */
 	/* The main process' group, and the one in the foreground of its terminal; inside,
 	 * 0: none that could be seen. */
@@ -633,7 +637,7 @@ void timers_advance(const struct timer_image *image, uint64_t now);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 
-#define ATTRIBUTES_ASK_BYTES 368
+#define ATTRIBUTES_ASK_BYTES 376
 /* While it is stopped, from outside. */
 void scheduling_read(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
@@ -769,6 +773,10 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 	       const struct questions *questions, struct avc_error *err) warn_unused;
 /* Asks a stopped thread just that. */
 int ask(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+/* The main thread was asked, and had other credentials before: a change may be one of all
+ * threads (nptl(7), setuid(3)), so these are asked again, too (EAGAIN). */
+int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
+	       struct avc_error *err) warn_unused;
 /* The threads there are now; those that ended are forgotten. */
 int take_stock(struct target *target, struct avc_error *err) warn_unused;
 /* Gets known every thread that is not yet, one at a time, before a freeze. */
@@ -959,8 +967,6 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table,
 
 /* After the app runs again: what only the template can tell. */
 int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
-/* To a thread's calls. */
-void branch_setup_dumpable(const struct branch *branch, struct setup *setup);
 void branch_forget(struct branch *branch);
 /* A restored process gets it, with the puppet's next flush. */
 int manner_put(struct puppet *puppet, const struct branch *branch,

@@ -30,7 +30,8 @@ struct action { /* struct sigaction as the kernel has it                        
 
 struct manner {
 	struct action action[SIGNALS];
-	int64_t brk, personality, dumpable;
+	int64_t brk;
+	uint32_t personality;
 	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
 	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
 	uint32_t umask;
@@ -113,7 +114,7 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	uint8_t *memory = pad_files(pad, image->slot) + INJ_FILES_BYTES / 2;
 	struct inj_syscall *list = (struct inj_syscall *)memory;
 	struct action *action = (struct action *)(list + SIGNALS + 8);
-	uint64_t *permitted = (uint64_t *)(action + SIGNALS);
+	const struct thread *main_thread = thread_find(branch->target, branch->target->pid);
 	struct manner *manner = calloc(1, sizeof *manner);
 	uint32_t n = 0;
 
@@ -125,14 +126,8 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 						  .arg = { (uint64_t)i + 1, 0,
 							   pad_remote(pad, &action[i]), 8 } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
-	list[n++] = (struct inj_syscall){ .nr = SYS_personality, .arg = { 0xffffffff } };
-	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_DUMPABLE } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_THP_DISABLE } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_MEMORY_MERGE } };
-	*permitted = 0;
-	list[n++] = (struct inj_syscall){
-		.nr = ARCH_STATE_CALL, .arg = { ARCH_STATE_PERMITTED, pad_remote(pad, permitted) }
-	};
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
 	if (pad_send(pad, image->template, &image->base, call, err) ||
@@ -140,11 +135,11 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 		return -1;
 	memcpy(manner->action, action, sizeof manner->action);
 	manner->brk = list[SIGNALS].result;
-	manner->personality = list[SIGNALS + 1].result;
-	manner->dumpable = list[SIGNALS + 2].result;
-	manner->no_huge_pages = list[SIGNALS + 3].result;
-	manner->merging = list[SIGNALS + 4].result;
-	manner->state_permitted = *permitted;
+	manner->no_huge_pages = list[SIGNALS + 1].result;
+	manner->merging = list[SIGNALS + 2].result;
+	/* These are no part of what its holder shares: it was asked itself, in the freeze. */
+	manner->personality = main_thread->creds.personality;
+	manner->state_permitted = main_thread->creds.state_permitted;
 	/* The template has limits of the time when the holder was made. */
 	if (read_mm(image->template, manner) || read_status(image->template, manner) ||
 	    (proc_limits(branch->target->pid, manner->limit) &&
@@ -152,14 +147,6 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 		return fail_errno(err, image->template, "keep template", "open(/proc)",
 				  "it was killed");
 	return 0;
-}
-
-void branch_setup_dumpable(const struct branch *branch, struct setup *setup)
-{
-	/* A change of users takes it away. */
-	setup_add_thread(setup, "", SYS_prctl, PR_SET_DUMPABLE, (uint64_t)branch->manner->dumpable,
-			 0, 0, 0)
-		->flags = INJ_MAY_FAIL;
 }
 
 void branch_forget(struct branch *branch)
@@ -283,7 +270,7 @@ int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_er
 	if (put_folders(puppet, branch->image->template, err))
 		return -1;
 	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
-	puppet_call(puppet, SYS_personality, (uint64_t)manner->personality, 0, 0, 0, 0, 0);
+	puppet_call(puppet, SYS_personality, manner->personality, 0, 0, 0, 0, 0);
 	memcpy(arguments->action, manner->action, sizeof arguments->action);
 	for (int i = 0; i < SIGNALS; i++)
 		if (i + 1 != SIGKILL && i + 1 != SIGSTOP &&

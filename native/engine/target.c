@@ -471,6 +471,17 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 	return 0;
 }
 
+int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
+	       struct avc_error *err)
+{
+	if (target->thread_count == 1 || !memcmp(was, &thread->creds, sizeof *was))
+		return 0;
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		target->threads[i].known &= &target->threads[i] == thread;
+	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "read state", "",
+		    "its threads are just changing what they may do");
+}
+
 struct walk {
 	struct target *target;
 	uint32_t count, fresh;

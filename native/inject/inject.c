@@ -90,6 +90,40 @@ static long find_future_lock(void)
 	return flags;
 }
 
+static long capability(uint64_t option, uint64_t ambient, uint64_t number)
+{
+	return option == PR_CAP_AMBIENT ? raw_syscall(__NR_prctl, option, ambient, number, 0, 0, 0)
+					: SYS2(__NR_prctl, option, number);
+}
+
+/* There is no call that tells more than one of them. */
+static long find_caps(uint64_t option, const uint32_t *others)
+{
+	long set = 0, r;
+
+	/* What is ambient is inheritable, and hardly anything is. */
+	if (option == PR_CAP_AMBIENT && !(others[2] | others[5]))
+		return 0;
+	for (uint64_t i = 0; i < 63; i++) {
+		r = capability(option, PR_CAP_AMBIENT_IS_SET, i);
+		if (r < 0)
+			break; /* the kernel has no more */
+		set |= r << i;
+	}
+	return set;
+}
+
+static long change_caps(uint64_t option, uint64_t set)
+{
+	for (uint64_t i = 0; i < 63; i++) {
+		const long r = set >> i & 1 ? capability(option, PR_CAP_AMBIENT_RAISE, i) : 0;
+
+		if (r < 0)
+			return r;
+	}
+	return 0;
+}
+
 /* Nobody interrupts it meanwhile: see park(). */
 static void make_pause(struct inj_call *call)
 {
@@ -116,6 +150,8 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 			make_pause(call);
 		else if (s->nr == INJ_FUTURE_LOCK)
 			s->result = find_future_lock();
+		else if (s->nr == INJ_CAPS)
+			s->result = find_caps(s->arg[0], (const uint32_t *)s->arg[1]);
 		else if (s->nr == __NR_clone)
 			s->result = inj_clone(s->arg[0], s->arg[1], s->arg[2], s->arg[3],
 					      s->arg[4]);
@@ -210,6 +246,8 @@ static long make_call(const struct inj_syscall *s)
 		return make_timer(arg[0], arg[1], (int32_t *)arg[2], (int32_t)arg[3]);
 	if (s->nr == INJ_PIDFD_OPEN)
 		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
+	if (s->nr == INJ_CAPS_CHANGE)
+		return change_caps(arg[0], arg[1]);
 	return raw_syscall(s->nr, arg[0], arg[1], arg[2], arg[3], arg[4], arg[5]);
 }
 

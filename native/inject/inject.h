@@ -54,6 +54,9 @@ struct inj_syscall {
 #define INJ_PAUSE (-4)
 /* Likewise, with what mlockall(2) was told of memory to come for a result. */
 #define INJ_FUTURE_LOCK (-2)
+/* With a set of capabilities for a result: the bounding set (arg[0] PR_CAPBSET_READ) or the
+ * ambient one (PR_CAP_AMBIENT; arg[1]: where capget(2) has left the others). */
+#define INJ_CAPS (-5)
 
 enum inj_after {
 	INJ_AFTER_HOME = 0, /* go back to the interrupted context (struct inj_home) */
@@ -103,6 +106,9 @@ struct inj_setup {
 #define INJ_TIMER_CREATE (-1)
 /* Likewise: pidfd_open(arg[1], arg[2]), as the descriptor arg[0] with the flags arg[3]. */
 #define INJ_PIDFD_OPEN (-2)
+/* Likewise, for each capability of the set arg[1]: out of the bounding set (arg[0]
+ * PR_CAPBSET_DROP) or into the ambient one (PR_CAP_AMBIENT). */
+#define INJ_CAPS_CHANGE (-3)
 
 enum inj_setup_flag {
 	INJ_MUST = 0,

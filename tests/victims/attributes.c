@@ -8,6 +8,7 @@
  */
 #include <linux/capability.h>
 #include <linux/mempolicy.h>
+#include <linux/securebits.h>
 #include <pthread.h>
 #include <sched.h>
 #include <signal.h>
@@ -73,6 +74,17 @@ static void add_prctl(struct look *look, const char *name, int option)
 	add(look, "%s %d\n", name, prctl(option, 0, 0, 0, 0));
 }
 
+static void add_caps(struct look *look, const char *name, int option, int second)
+{
+	unsigned long set = 0;
+	int i;
+
+	for (i = 0; i < 64; i++)
+		if (prctl(option, second >= 0 ? second : i, second >= 0 ? i : 0, 0, 0) == 1)
+			set |= 1ul << i;
+	add(look, "%s %lx\n", name, set);
+}
+
 static void add_prctl_to(struct look *look, const char *name, int option)
 {
 	int value = 0;
@@ -93,6 +105,8 @@ static void look_at_me(struct look *look)
 	must(!syscall(SYS_capget, &header, caps), "capget");
 	for (i = 0; i < 6; i++)
 		add(look, "caps %d: %x\n", i, caps[i]);
+	add_caps(look, "bounding", PR_CAPBSET_READ, -1);
+	add_caps(look, "ambient", PR_CAP_AMBIENT, PR_CAP_AMBIENT_IS_SET);
 	must(!syscall(SYS_getresuid, &id[0], &id[1], &id[2]), "getresuid");
 	add(look, "uid %u %u %u\n", id[0], id[1], id[2]);
 	must(!syscall(SYS_getresgid, &id[0], &id[1], &id[2]), "getresgid");
@@ -110,7 +124,6 @@ static void look_at_me(struct look *look)
 	add(look, "fsuid %ld fsgid %ld\n", syscall(SYS_setfsuid, -1), syscall(SYS_setfsgid, -1));
 	add_prctl(look, "slack", PR_GET_TIMERSLACK);
 	add_prctl(look, "securebits", PR_GET_SECUREBITS);
-	add_prctl(look, "dumpable", PR_GET_DUMPABLE);
 	add_prctl(look, "thp", PR_GET_THP_DISABLE);
 	add_prctl(look, "mce", PR_MCE_KILL_GET);
 	add_prctl_to(look, "pdeathsig", PR_GET_PDEATHSIG);
@@ -127,6 +140,8 @@ static void look_at_me(struct look *look)
 	/* One thread only: others might get their hands on its descriptors. */
 	if (syscall(SYS_gettid) != getpid())
 		return;
+	/* Whoever changes its user changes that of all. */
+	add_prctl(look, "dumpable", PR_GET_DUMPABLE);
 	add_file(look, "/proc/self/status", true);
 	add_file(look, "/proc/self/oom_score_adj", false);
 	add_file(look, "/proc/self/coredump_filter", false);
@@ -183,6 +198,45 @@ static void set_user(void)
 	must(!syscall(SYS_setresuid, 1001, 1002, 1003), "setresuid");
 }
 
+static void set_death_signal(void)
+{
+	must(!prctl(PR_SET_PDEATHSIG, SIGUSR1), "PR_SET_PDEATHSIG");
+}
+
+/* The signal last: a change of users takes it away. */
+static void set_user_with_signal(void)
+{
+	set_user();
+	set_death_signal();
+}
+
+static void set_bounds(void)
+{
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2];
+
+	must(!syscall(SYS_capget, &header, data), "capget");
+	data[0].inheritable |= 1u << CAP_KILL | 1u << CAP_CHOWN;
+	must(!syscall(SYS_capset, &header, data), "capset");
+	must(!prctl(PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, CAP_KILL, 0, 0), "PR_CAP_AMBIENT");
+	must(!prctl(PR_CAPBSET_DROP, CAP_KILL, 0, 0, 0), "PR_CAPBSET_DROP");
+	must(!prctl(PR_CAPBSET_DROP, CAP_SYS_TIME, 0, 0, 0), "PR_CAPBSET_DROP");
+	must(!prctl(PR_SET_SECUREBITS, SECBIT_NOROOT | SECBIT_NO_CAP_AMBIENT_RAISE, 0, 0, 0),
+	     "PR_SET_SECUREBITS");
+}
+
+static void set_bounds_and_user(void)
+{
+	set_bounds();
+	must(!prctl(PR_SET_KEEPCAPS, 1), "PR_SET_KEEPCAPS");
+	set_user();
+}
+
+static void set_personality(void)
+{
+	must(personality(ADDR_NO_RANDOMIZE | STICKY_TIMEOUTS) >= 0, "personality");
+}
+
 static void set_user_with_caps(void)
 {
 	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
@@ -206,11 +260,6 @@ static void set_no_new_privs(void)
 	must(!prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "PR_SET_NO_NEW_PRIVS");
 }
 
-static void set_death_signal(void)
-{
-	must(!prctl(PR_SET_PDEATHSIG, SIGUSR1), "PR_SET_PDEATHSIG");
-}
-
 static void set_groups(void)
 {
 	const gid_t groups[] = { 2001, 2002 };
@@ -231,9 +280,23 @@ static void set_nothing(void)
 }
 
 static void (*const kinds[])(void) = {
-	set_nice,   set_round_robin,   set_batch,        set_io_priority,  set_slack,
-	set_user,   set_fs_user,       set_no_new_privs, set_death_signal, set_user_with_caps,
-	set_groups, set_memory_policy, set_nothing,
+	set_nice,
+	set_round_robin,
+	set_batch,
+	set_io_priority,
+	set_slack,
+	set_user,
+	set_user_with_signal,
+	set_fs_user,
+	set_no_new_privs,
+	set_death_signal,
+	set_user_with_caps,
+	set_bounds,
+	set_bounds_and_user,
+	set_personality,
+	set_groups,
+	set_memory_policy,
+	set_nothing,
 };
 
 static void *work(void *arg)
@@ -299,6 +362,8 @@ int main(int argc, char **argv)
 	}
 	while (__atomic_load_n(&board->counter[1], __ATOMIC_RELAXED) < n)
 		nap_us(1000);
+	if (!inherited)
+		must(!prctl(PR_SET_DUMPABLE, 1), "PR_SET_DUMPABLE");
 	look_at_me(was);
 	victim_ready();
 	for (;;) {
