@@ -240,6 +240,7 @@ struct thread {
 	 * as long as it looks like the same thread. */
 	bool known;
 	uint32_t asked; /* checkpoints since                                */
+	bool young;     /* was asked once only: it may just be setting itself up    */
 	pid_t inside;
 	uint64_t known_tls;
 	uint64_t clear_tid;

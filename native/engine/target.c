@@ -466,6 +466,7 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 		thread->creds.future_lock = (int32_t)locks->result;
 	thread->creds.filters = filters_read(thread->tid);
 	thread->known_tls = arch_tls(&thread->regs);
+	thread->young = !thread->known;
 	thread->known = true;
 	thread->asked = 0;
 	return 0;
@@ -543,9 +544,9 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 
 		if (t->known) {
 			t->asked++;
-			if (t->asked < ASK_AGAIN_AFTER || again == ASK_AGAIN_AT_ONCE)
+			if (!t->young && (t->asked < ASK_AGAIN_AFTER || again == ASK_AGAIN_AT_ONCE))
 				continue;
-			again++;
+			again += !t->young;
 		}
 		tracee_deadline_set(timer, deadline_ns);
 		if (thread_stop(target, t, &gone) || thread_await(target, t, &gone) ||
