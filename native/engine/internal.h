@@ -107,6 +107,10 @@ int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
 int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
 /* Whether two tasks have the same memory (kcmp(2)). */
 bool proc_same_memory(pid_t a, pid_t b);
+/* Likewise the same descriptor table, or the same working directory and umask: 1 or 0; -1: it can
+ * not be told.  One that is just ending has none. */
+enum shared { SHARED_FILES, SHARED_FOLDERS };
+int proc_shares(pid_t a, pid_t b, enum shared what);
 /* How many threads there are, by an open /proc/PID/task; 0: the process is gone. */
 int proc_thread_count(int task_dirfd);
 /* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be

@@ -380,6 +380,14 @@ bool proc_same_memory(pid_t a, pid_t b)
 	return syscall(SYS_kcmp, a, b, KCMP_VM, 0, 0) == 0;
 }
 
+int proc_shares(pid_t a, pid_t b, enum shared what)
+{
+	const long order = syscall(SYS_kcmp, a, b, what == SHARED_FILES ? KCMP_FILES : KCMP_FS, 0,
+				   0);
+
+	return order < 0 ? -1 : order == 0;
+}
+
 /* A directory has a link for itself and one for each directory in it (fs/proc/base.c,
  * proc_task_getattr()). */
 int proc_thread_count(int task_dirfd)

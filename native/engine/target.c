@@ -7,8 +7,10 @@
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/ioctl.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -16,6 +18,7 @@
 #include "internal.h"
 
 #define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h */
+#define PIDFS_MAGIC 0xff     /* the same, PIDFS_IOCTL_MAGIC */
 #define ASK_AGAIN_AFTER 8    /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
 
@@ -529,6 +532,61 @@ static int by_inside(const void *a, const void *b)
 	return (x->inside > y->inside) - (x->inside < y->inside);
 }
 
+/* unshare(2): those that are restored have the main thread's.  It is stopped. */
+static int check_unshared(const struct target *target, const struct thread *t,
+			  struct avc_error *err)
+{
+	const char *what = NULL;
+
+	if (proc_shares(target->pid, t->tid, SHARED_FILES) == 0)
+		what = "a descriptor table of its own (CLONE_FILES)";
+	else if (proc_shares(target->pid, t->tid, SHARED_FOLDERS) == 0)
+		what = "a working directory of its own (CLONE_FS)";
+	/* A main thread that is just ending has none. */
+	if (!what || proc_is_exiting(target->pid) || proc_is_exiting(t->tid))
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "thread %d has %s",
+		    proc_inside(t->tid), what);
+}
+
+/* 0: the kernel does not tell (it does since Linux 6.11), or the task is ending. */
+static uint64_t space_of(int pidfd, unsigned int kind)
+{
+	struct stat st = { 0 };
+	int fd = ioctl(pidfd, _IO(PIDFS_MAGIC, kind), 0);
+
+	if (fd >= 0 && fstat(fd, &st))
+		st.st_ino = 0;
+	close_fd(&fd);
+	return st.st_ino;
+}
+
+/* Those that it can have without a working directory of its own.  Not from /proc: see
+ * ask_add(). */
+static int check_spaces(const struct target *target, const struct thread *t, struct avc_error *err)
+{
+	static const struct {
+		unsigned int kind; /* linux/pidfd.h, PIDFD_GET_..._NAMESPACE */
+		const char *name;
+	} spaces[] = { { 4, "network" }, { 10, "UTS" }, { 2, "IPC" }, { 1, "cgroup" } };
+	int result = 0, pidfd;
+
+	if (t->tid == target->pid)
+		return 0;
+	pidfd = (int)syscall(SYS_pidfd_open, t->tid, PIDFD_THREAD_);
+	for (size_t i = 0; !result && pidfd >= 0 && i < sizeof spaces / sizeof *spaces; i++) {
+		const uint64_t own = space_of(pidfd, spaces[i].kind),
+			       others = space_of(target->pidfd, spaces[i].kind);
+
+		if (own && others && own != others)
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				      "thread %d has a namespace of its own (%s)", t->inside,
+				      spaces[i].name);
+	}
+	close_fd(&pidfd);
+	return result;
+}
+
 int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
 {
 	uint32_t again = 0;
@@ -550,10 +608,12 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 		}
 		tracee_deadline_set(timer, deadline_ns);
 		if (thread_stop(target, t, &gone) || thread_await(target, t, &gone) ||
-		    ask(target, t, &gone))
+		    check_unshared(target, t, &gone) || ask(target, t, &gone))
 			t->known = false;
 		thread_release(t);
 		tracee_deadline_clear(timer);
+		if (!gone.code && check_spaces(target, t, &gone))
+			t->known = false;
 		if (gone.code && gone.code != AVC_GONE) {
 			*err = gone;
 			return -1;

@@ -193,6 +193,24 @@ static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 	return proc_stat(pid, stat);
 }
 
+/* clone(2): what one of them opens, or where it goes, is the other's, too; those that are
+ * restored have tables and directories of their own. */
+static int check_sharing(const struct tree *tree, const struct kin *kin, struct avc_error *err)
+{
+	const struct target *parent = kin->parent >= 0 ? tree->kin[kin->parent].target : NULL;
+	const char *what = NULL;
+
+	if (parent && proc_shares(kin->pid, parent->pid, SHARED_FILES) == 1)
+		what = "descriptor table (CLONE_FILES)";
+	else if (parent && proc_shares(kin->pid, parent->pid, SHARED_FOLDERS) == 1)
+		what = "working directory (CLONE_FS)";
+	/* Two that are just ending have none. */
+	if (!what || proc_is_exiting(kin->pid))
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, kin->pid, "look at processes", "",
+		    "process %d shares its %s with its parent", proc_inside(kin->pid), what);
+}
+
 int tree_look(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
@@ -220,6 +238,8 @@ int tree_look(struct tree *tree, struct avc_error *err)
 			if (!kin->target) {
 				struct avc_error gone = { 0 };
 
+				if (check_sharing(tree, kin, err))
+					return -1;
 				kin->target = add_member(tree, kin->pid, stat.start, &gone);
 				if (!kin->target && gone.code != AVC_GONE) {
 					*err = gone;

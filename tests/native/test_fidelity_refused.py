@@ -27,6 +27,12 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported nested", "a container in the container"),
         ("unsupported filter", "differ in their seccomp filters"),
         ("unsupported groups", "other supplementary groups"),
+        ("unsupported folder", "a working directory of its own"),
+        ("unsupported files", "a descriptor table of its own"),
+        ("unsupported network", "a namespace of its own (network)"),
+        ("unsupported bounds", "lacks CAP_SETPCAP"),
+        ("unsupported shared-files", "shares its descriptor table"),
+        ("unsupported shared-folder", "shares its working directory"),
     ],
 )
 def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path) -> None:

@@ -17,6 +17,12 @@
  *   filter    one thread under a seccomp filter more than the others, which have one
  *   groups    one thread with other groups, which the main thread may not set
  *   hugefile  the same, of a file (a memfd)
+ *   folder    one thread with a working directory of its own
+ *   files     one thread with descriptors of its own
+ *   network   one thread in a network of its own
+ *   bounds    one thread with a smaller bounding set, which the main thread may not lower
+ *   shared-files, shared-folder   a child process with the descriptors, or the working
+ *             directory, of its parent
  */
 #include <linux/aio_abi.h>
 #include <linux/capability.h>
@@ -230,17 +236,122 @@ static bool start_groups(void)
 	return !syscall(SYS_capset, &header, data);
 }
 
+static void *apart(void *arg)
+{
+	if (unshare(*(const int *)arg))
+		unavailable("unshare");
+	count(1, 1);
+	for (;;)
+		pause();
+	return NULL;
+}
+
+static void give_up(struct __user_cap_data_struct *data)
+{
+	data[0].effective &= ~(1u << CAP_SETPCAP);
+	data[0].permitted &= ~(1u << CAP_SETPCAP);
+}
+
+/* The other one has given the right up, too, or would be refused for having more. */
+static void *bounded(void *arg)
+{
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2] = { { 0 } };
+
+	if (prctl(PR_CAPBSET_DROP, CAP_CHOWN, 0, 0, 0) || syscall(SYS_capget, &header, data))
+		unavailable("PR_CAPBSET_DROP");
+	give_up(data);
+	if (syscall(SYS_capset, &header, data))
+		unavailable("capset");
+	count(1, 1);
+	for (;;)
+		pause();
+	return arg;
+}
+
+static bool start_thread(void *(*work)(void *), int arg)
+{
+	static int given;
+	const uint64_t before = board->counter[1];
+	pthread_t thread;
+
+	given = arg;
+	if (pthread_create(&thread, NULL, work, &given))
+		return false;
+	while (board->counter[1] == before)
+		nap_us(100);
+	return true;
+}
+
+static bool start_folder(void)
+{
+	return start_thread(apart, CLONE_FS);
+}
+
+static bool start_files(void)
+{
+	return start_thread(apart, CLONE_FILES);
+}
+
+static bool start_network(void)
+{
+	return start_thread(apart, CLONE_NEWNET);
+}
+
+static bool start_bounds(void)
+{
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2] = { { 0 } };
+
+	if (!start_thread(bounded, 0) || syscall(SYS_capget, &header, data))
+		return false;
+	give_up(data);
+	return !syscall(SYS_capset, &header, data);
+}
+
+static bool start_child(unsigned long flags)
+{
+	const long child = syscall(SYS_clone, flags | SIGCHLD, 0, 0, 0, 0);
+
+	if (!child)
+		for (;;)
+			pause();
+	return child > 0;
+}
+
+static bool start_shared_files(void)
+{
+	return start_child(CLONE_FILES);
+}
+
+static bool start_shared_folder(void)
+{
+	return start_child(CLONE_FS);
+}
+
 static const struct kind {
 	const char *name;
 	bool (*start)(void);
 	void (*stop)(void);
 } kinds[] = {
-	{ "iouring", start_iouring, stop_fd },     { "aio", start_aio, stop_aio },
-	{ "traced", start_traced, NULL },          { "sysvshm", start_sysvshm, stop_sysvshm },
-	{ "sysvsem", start_sysvsem, NULL },        { "shared", start_shared, stop_shared },
-	{ "userfault", start_userfault, stop_fd }, { "huge", start_huge, stop_huge },
-	{ "nested", start_nested, NULL },          { "filter", start_filter, NULL },
-	{ "groups", start_groups, NULL },          { "hugefile", start_hugefile, stop_huge },
+	{ "iouring", start_iouring, stop_fd },
+	{ "aio", start_aio, stop_aio },
+	{ "traced", start_traced, NULL },
+	{ "sysvshm", start_sysvshm, stop_sysvshm },
+	{ "sysvsem", start_sysvsem, NULL },
+	{ "shared", start_shared, stop_shared },
+	{ "userfault", start_userfault, stop_fd },
+	{ "huge", start_huge, stop_huge },
+	{ "nested", start_nested, NULL },
+	{ "filter", start_filter, NULL },
+	{ "groups", start_groups, NULL },
+	{ "hugefile", start_hugefile, stop_huge },
+	{ "folder", start_folder, NULL },
+	{ "files", start_files, NULL },
+	{ "network", start_network, NULL },
+	{ "bounds", start_bounds, NULL },
+	{ "shared-files", start_shared_files, NULL },
+	{ "shared-folder", start_shared_folder, NULL },
 };
 
 int main(int argc, char **argv)
