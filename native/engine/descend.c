@@ -22,6 +22,7 @@
 #define TRIES 64
 #define TRY_AGAIN_US 200
 #define STEP_NS (5 * NS_PER_S)
+#define FILES_SPARE 64
 
 struct member {
 	pid_t pid; /* 0: not made yet                                         */
@@ -39,7 +40,7 @@ struct family {
 	timer_t timer;
 	const struct files_table *table; /* by branch                            */
 	struct copier *copier;
-	bool flush;            /* some have had children that ended                  */
+	uint64_t flush;        /* signals of children that ended (sigset_t)       */
 	struct member first;   /* the main process                              */
 	struct member *member; /* by branch                                   */
 };
@@ -89,6 +90,13 @@ struct chores {
 	bool done;
 };
 
+/* Has ended, or will, and its parent is told. */
+static void note_end(struct family *family, const struct branch *branch)
+{
+	if (branch->exit_signal > 0)
+		family->flush |= UINT64_C(1) << (branch->exit_signal - 1);
+}
+
 static void do_chores(void *arg);
 
 /* One clone of a stopped task that rests in the pad; *child is in its first stop. */
@@ -137,8 +145,10 @@ static int fork_once(struct family *family, struct member *host, const struct br
 	if (copy)
 		from.pid = copy;
 	result = last_pid_set(family->helper, branch->inside - 1, err) ||
-		 clone_task(&from, runner, SIGCHLD | (copy ? CLONE_VM | CLONE_PARENT : 0), chores,
-			    child, err);
+		 clone_task(&from, runner,
+			    ((uint64_t)branch->exit_signal & CSIGNAL) |
+				    (copy ? CLONE_VM | CLONE_PARENT : 0),
+			    chores, child, err);
 	if (orphan && take_back(&host->puppet, from.pid, err))
 		return -1;
 	return result ? -1 : 0;
@@ -172,7 +182,8 @@ static int fork_host(struct family *family, struct member *host, const struct br
 
 		if (i)
 			usleep(TRY_AGAIN_US);
-		family->flush |= i > 0;
+		if (i)
+			note_end(family, branch);
 		*child = 0;
 		made = fork_once(family, host, branch, copy, chores, child, &failed) == 0;
 		if (made && proc_inside(*child) == branch->inside)
@@ -329,8 +340,7 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	    place(member, branch, err) || puppet_put_files(puppet, &family->table[index], err))
 		return -1;
 	take_terminal(puppet, branch);
-	/* It may have more open than it may open now. */
-	if (manner_put_limits(puppet, branch, err) || puppet_flush(puppet, err))
+	if (puppet_flush(puppet, err))
 		return -1;
 	close_fd(&puppet->socket);
 	return 0;
@@ -363,6 +373,14 @@ static int finish_copies(struct family *family, struct avc_error *err)
 	while (copier_help(family->copier))
 		go_on(family);
 	return copier_finish(family->copier, err);
+}
+
+/* What it has open is below that, with some for those that are only on their way. */
+static uint32_t files_of(const struct family *family, uint32_t index)
+{
+	const struct files_table *table = &family->table[index];
+
+	return (table->count ? (uint32_t)table->entry[table->count - 1].fd : 0) + FILES_SPARE;
 }
 
 /* `last` is the one that was forked last and is not yet what it is to be; -1: none. */
@@ -401,13 +419,45 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 		return -1;
 	}
 	if (branch->target) {
+		manner_lift_limits(member->pid, files_of(family, index));
 		*last = (int)index;
 		return 0;
 	}
-	family->flush = true;
-	if (make_zombie(member, branch, err))
-		return -1;
-	member->traced = false;
+	return place(member, branch, err) || puppet_flush(&member->puppet, err) ? -1 : 0;
+}
+
+/* When nobody is to join a group that they lead any more. */
+static int end_zombies(struct family *family, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < family->generation->branches; i++) {
+		const struct branch *branch = &family->generation->branch[i];
+		struct member *member = &family->member[i];
+
+		if (branch->target)
+			continue;
+		note_end(family, branch);
+		if (make_zombie(member, branch, err))
+			return -1;
+		member->traced = false;
+	}
+	return 0;
+}
+
+/* Those that have ended again have told their parents, who know it already. */
+static int flush_signals(struct family *family, struct puppet *puppet, struct avc_error *err)
+{
+	avc_remote remote;
+	uint64_t *data;
+
+	do {
+		data = puppet_data(puppet, &remote);
+		data[0] = family->flush;
+		data[1] = data[2] = 0;
+		puppet_call(puppet, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8, 0, 0);
+		puppet_soften(puppet, NULL);
+		if (puppet_flush(puppet, err))
+			return -1;
+	} while (puppet->list[0].result > 0);
 	return 0;
 }
 
@@ -444,31 +494,20 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	if (finish_copies(family, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target &&
-		    join_group(&family->member[i], &generation->branch[i], err))
+		if (join_group(&family->member[i], &generation->branch[i], err))
 			return -1;
+	if (end_zombies(family, err))
+		return -1;
 	for (int i = -1; i < (int)generation->branches; i++)
 		if ((i < 0 || (generation->branch[i].target &&
 			       generation->branch[i].session == generation->branch[i].inside)) &&
 		    put_foreground(&member_of(family, i)->puppet,
 				   i < 0 ? generation : generation->branch[i].image, err))
 			return -1;
-	/* Those that have ended again have told their parents, who know it already. */
-	for (int i = -1; family->flush && i < (int)generation->branches; i++) {
-		struct puppet *puppet = &member_of(family, i)->puppet;
-		avc_remote remote;
-		uint64_t *data;
-
-		if (i >= 0 && !generation->branch[i].target)
-			continue;
-		data = puppet_data(puppet, &remote);
-		data[0] = UINT64_C(1) << (SIGCHLD - 1);
-		data[1] = data[2] = 0;
-		puppet_call(puppet, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8, 0, 0);
-		puppet_soften(puppet, NULL);
-		if (puppet_flush(puppet, err))
+	for (int i = -1; family->flush && i < (int)generation->branches; i++)
+		if ((i < 0 || generation->branch[i].target) &&
+		    flush_signals(family, &member_of(family, i)->puppet, err))
 			return -1;
-	}
 	return 0;
 }
 
@@ -495,6 +534,7 @@ static int await_member(struct family *family, uint32_t index, struct avc_error 
 	if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
 		return -1;
 	restore_note(branch->target, branch->image, member->pid, notes);
+	manner_put_limits(member->pid, branch, notes);
 	return memory_put_back(branch->image->image, member->pid, err);
 }
 

@@ -88,6 +88,7 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 		branch->target = kin->target;
 		branch->session = number_inside(tree, kin->stat.session);
 		branch->group = number_inside(tree, kin->stat.group);
+		branch->exit_signal = kin->stat.exit_signal;
 		if (kin->ended) {
 			if (branch->parent == PARENT_INIT || branch->inside <= 0)
 				continue; /* init is just about to wait for it */

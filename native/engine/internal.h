@@ -83,6 +83,7 @@ struct proc_stat {
 	uint32_t tty, flags; /* PF_*                                            */
 	int threads;
 	uint64_t start;  /* clock ticks after boot                            */
+	int exit_signal; /* that its parent gets when it ends, 0: none        */
 	int exit_status; /* of a zombie, as wait(2) says it                   */
 	char name[16];
 };
@@ -353,6 +354,7 @@ struct branch {
 	pid_t session, group;  /* inside; 0: outside of the app           */
 	struct manner *manner; /* manner.c                                */
 	pid_t pid;             /* as of the freeze; then as restored last */
+	int exit_signal;       /* struct proc_stat                       */
 	int status;            /* of one that had ended, as from wait(2)  */
 	char name[16];         /* the same                                */
 };
@@ -976,9 +978,10 @@ void branch_forget(struct branch *branch);
 /* A restored process gets it, with the puppet's next flush. */
 int manner_put(struct puppet *puppet, const struct branch *branch,
 	       struct avc_error *err) warn_unused;
-/* When it has everything open: there may be more of it than may be opened. */
-int manner_put_limits(struct puppet *puppet, const struct branch *branch,
-		      struct avc_error *err) warn_unused;
+/* Until then nothing is limited: it may have more than it may have now, and its parent may have
+ * lowered its own limits since.  Its descriptors are below `files`. */
+void manner_lift_limits(pid_t pid, uint32_t files);
+void manner_put_limits(pid_t pid, const struct branch *branch, struct avc_error *notes);
 
 /* ---- descend.c ------------------------------------------------------------------------- */
 

@@ -9,6 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/prctl.h>
+#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
@@ -21,6 +22,7 @@
 #define PR_SET_MEMORY_MERGE 67 /* since Linux 6.4 */
 #define PR_GET_MEMORY_MERGE 68
 #endif
+#define BARRIERS_REGISTERED (1 << 9) /* membarrier(2), since Linux 6.3 */
 
 /* ---- after a checkpoint ------------------------------------------------------------ */
 
@@ -34,6 +36,7 @@ struct manner {
 	uint32_t personality;
 	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
 	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
+	int64_t barriers;               /* membarrier(2): commands that register it          */
 	uint32_t umask;
 	int64_t dumped;            /* core(5), coredump_filter; -1: the kernel does not dump  */
 	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
@@ -128,6 +131,7 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_THP_DISABLE } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_MEMORY_MERGE } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_membarrier, .arg = { BARRIERS_REGISTERED } };
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
 	if (pad_send(pad, image->template, &image->base, call, err) ||
@@ -137,6 +141,7 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	manner->brk = list[SIGNALS].result;
 	manner->no_huge_pages = list[SIGNALS + 1].result;
 	manner->merging = list[SIGNALS + 2].result;
+	manner->barriers = list[SIGNALS + 3].result;
 	/* These are no part of what its holder shares: it was asked itself, in the freeze. */
 	manner->personality = main_thread->creds.personality;
 	manner->state_permitted = main_thread->creds.state_permitted;
@@ -160,7 +165,6 @@ void branch_forget(struct branch *branch)
 /* What the calls refer to, in the puppet's memory. */
 struct arguments {
 	struct action action[SIGNALS];
-	uint64_t limit[LIMITS][2];
 	struct { /* struct prctl_mm_map                                     */
 		uint64_t mm[11];
 		uint64_t auxv;
@@ -191,18 +195,36 @@ static void put_mm(struct puppet *puppet, const struct manner *manner)
 	puppet_soften(puppet, "what it knows of its heap and arguments could not be put back");
 }
 
-int manner_put_limits(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
+void manner_lift_limits(pid_t pid, uint32_t files)
 {
-	struct arguments *arguments = arguments_of(puppet);
+	for (int i = 0; i < LIMITS; i++) {
+		struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
 
-	memcpy(arguments->limit, branch->manner->limit, sizeof arguments->limit);
-	for (uint64_t i = 0; i < LIMITS; i++) {
-		if (puppet_ask(puppet, SYS_prlimit64, 0, i,
-			       pad_remote(puppet->pad, &arguments->limit[i]), 0, 0, 0, err))
-			return -1;
-		puppet_soften(puppet, "a resource limit could not be put back");
+		/* Of descriptors there may not be any number (sysctl fs.nr_open). */
+		if (i == RLIMIT_NOFILE && prlimit(pid, i, NULL, &limit) == 0) {
+			limit.rlim_max = limit.rlim_max > files ? limit.rlim_max : files;
+			limit.rlim_cur = limit.rlim_max;
+		}
+		if (prlimit(pid, i, &limit, NULL) == 0)
+			continue;
+		/* We may not; but up to there everybody may. */
+		if (prlimit(pid, i, NULL, &limit) == 0) {
+			limit.rlim_cur = limit.rlim_max;
+			(void)prlimit(pid, i, &limit, NULL);
+		}
 	}
-	return 0;
+}
+
+void manner_put_limits(pid_t pid, const struct branch *branch, struct avc_error *notes)
+{
+	for (int i = 0; i < LIMITS; i++) {
+		const struct rlimit limit = { branch->manner->limit[i][0],
+					      branch->manner->limit[i][1] };
+
+		if (prlimit(pid, i, &limit, NULL))
+			fail_errno(notes, branch->inside, "restore", "prlimit",
+				   "a resource limit could not be put back");
+	}
 }
 
 static bool same_root(pid_t a, pid_t b)
@@ -277,6 +299,8 @@ int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_er
 		    puppet_ask(puppet, SYS_rt_sigaction, (uint64_t)i + 1,
 			       pad_remote(puppet->pad, &arguments->action[i]), 0, 8, 0, 0, err))
 			return -1;
+	for (int64_t left = manner->barriers; left > 0; left &= left - 1)
+		puppet_call(puppet, SYS_membarrier, (uint64_t)(left & -left), 0, 0, 0, 0, 0);
 	put_mm(puppet, manner);
 	put_dumped(puppet, manner->dumped);
 	if (manner->state_permitted >> ARCH_STATE_NUMBER & 1)

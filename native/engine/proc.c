@@ -73,9 +73,11 @@ static int parse_stat(const char *buf, struct proc_stat *stat)
 	p = strrchr(buf, ')');
 	if (!name || !last || !p ||
 	    sscanf(p + 1,
-		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu",
+		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu"
+		   " %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %d",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
-		   &stat->tty_group, &stat->flags, &stat->threads, &start) != 9) {
+		   &stat->tty_group, &stat->flags, &stat->threads, &start,
+		   &stat->exit_signal) != 10) {
 		errno = EPROTO;
 		return -1;
 	}

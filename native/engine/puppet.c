@@ -73,7 +73,7 @@ static const char *name_of(long nr)
 		{ SYS_prlimit64, "prlimit" }, { SYS_prctl, "prctl" },
 		{ SYS_setsid, "setsid" },     { SYS_setpgid, "setpgid" },
 		{ SYS_ioctl, "ioctl" },       { SYS_socketpair, "socketpair" },
-		{ SYS_chroot, "chroot" },
+		{ SYS_chroot, "chroot" },     { SYS_membarrier, "membarrier" },
 	};
 
 	for (size_t i = 0; i < sizeof names / sizeof *names; i++)

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from harness import wait_until
 from native.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 
 
@@ -22,6 +23,45 @@ def test_attributes(command: str, where: str, tmp_path: Path) -> None:
     """Scheduling, I/O priority, credentials, prctl settings; limits, umask, directories."""
     with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 40, (0.01, 0.12))
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("kind", ["exit-signal", "zombie-group", "limits", "barriers"])
+def test_traits(kind: str, where: str, tmp_path: Path) -> None:
+    """Of children: what their end tells, the group of one that has ended; limits; membarrier(2)."""
+    with Victim(f"traits {kind} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 10, (0.01, 0.12))
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_a_personality_that_changes(where: str, tmp_path: Path) -> None:
+    """Also of a process whose holder was made before."""
+    with Victim(f"traits personality {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        wait_until(lambda: victim.see().counter[0] == 1, 5, "it changes")
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        kill(guard, victim)
+
+
+@pytest.mark.parametrize("kind", ["setup", "disarmed"])
+def test_a_thread_that_changes(kind: str, tmp_path: Path) -> None:
+    """One that sets itself up when it is seen for the first time; one in a handler, which has no alternate stack."""
+    with Victim(f"traits {kind}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(1 if kind == "setup" else 4):
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+        victim.board.set_counter(1, 1)
+        wait_until(lambda: victim.see().counter[0] == 1, 5, "it goes on")
+        victim.wait_beats()
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        kill(guard, victim)
+
+
+def kill(guard: GuardProcess, victim: Victim) -> None:
+    """Once; it goes on."""
+    since = guard.mark()
+    victim.kill_app()
+    guard.wait("restored", since=since)
+    victim.wait_beats(20)
 
 
 def test_one_that_may_not_have_another_process(tmp_path: Path) -> None:

@@ -1,0 +1,319 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * traits KIND: what the kernel knows of a process or thread and tells it in one word or
+ * two.  The victim says all the time what it finds, and nothing may ever be other than it
+ * was.
+ *
+ *   exit-signal   a child whose end is told by SIGUSR1, and one that had ended so
+ *   zombie-group  a process in the group of one that has ended, which nobody waited for
+ *   limits        a child that has more than its parent may have, which has lowered its limits
+ *   barriers      membarrier(2), registered
+ *   personality   another one than at first (it changes 200 ms after the start)
+ *   setup         a thread that sets its alternate stack and its name up a little after it began
+ *   disarmed      a thread on an alternate stack that it has given up (SS_AUTODISARM)
+ */
+#include <linux/membarrier.h>
+#include <pthread.h>
+#include <sched.h>
+#include <sys/personality.h>
+#include <sys/prctl.h>
+#include <sys/resource.h>
+
+#include "victim.h"
+
+#define SS_AUTODISARM_ (1u << 31) /* linux/signal.h, which does not go with signal.h */
+#define STACK_BYTES 65536
+#define MUCH (200ul << 20)
+
+static char was[512], is[512], stack[STACK_BYTES];
+static pid_t kid, dead;
+static volatile int ready;
+static stack_t thread_stack;
+static char thread_name[16];
+
+static void wait_ended(pid_t pid)
+{
+	siginfo_t info;
+
+	must(!waitid(P_PID, (id_t)pid, &info, WEXITED | WNOWAIT | __WALL), "waitid");
+}
+
+static _Noreturn void rest(void)
+{
+	for (;;)
+		pause();
+}
+
+/* ---- exit-signal ---------------------------------------------------------------------- */
+
+static pid_t clone_with(int signal)
+{
+	return (pid_t)syscall(SYS_clone, (unsigned long)signal, 0, 0, 0, 0);
+}
+
+static void setup_exit_signal(void)
+{
+	signal(SIGUSR1, SIG_IGN);
+	signal(SIGUSR2, SIG_IGN);
+	dead = clone_with(SIGUSR2);
+	if (!dead)
+		_exit(3);
+	must(dead > 0, "clone");
+	wait_ended(dead);
+	kid = clone_with(SIGUSR1);
+	must(kid >= 0, "clone");
+	if (!kid)
+		rest();
+}
+
+/* A plain wait(2) is for those with SIGCHLD. */
+static void look_at_exit_signal(char *to, size_t size)
+{
+	siginfo_t info = { 0 };
+	const int plain = waitid(P_PID, (id_t)kid, &info, WEXITED | WNOWAIT | WNOHANG),
+		  of_clones = waitid(P_PID, (id_t)kid, &info,
+				     WEXITED | WNOWAIT | WNOHANG | __WCLONE);
+
+	memset(&info, 0, sizeof(info));
+	snprintf(to, size, "child: wait %d, for clones %d; the dead one: wait %d,", plain,
+		 of_clones, waitid(P_PID, (id_t)dead, &info, WEXITED | WNOWAIT | WNOHANG));
+	waitid(P_PID, (id_t)dead, &info, WEXITED | WNOWAIT | WNOHANG | __WCLONE);
+	snprintf(to + strlen(to), size - strlen(to), " status %d", info.si_status);
+}
+
+/* ---- zombie-group ------------------------------------------------------------------------- */
+
+static void setup_zombie_group(void)
+{
+	int gate[2];
+	char byte;
+
+	must(!pipe(gate), "pipe");
+	dead = fork();
+	if (!dead)
+		_exit(read(gate[0], &byte, 1) == 1 ? 3 : 4);
+	must(!setpgid(dead, dead), "setpgid");
+	kid = fork();
+	if (!kid)
+		rest();
+	must(!setpgid(kid, dead), "setpgid");
+	must(write(gate[1], "", 1) == 1, "write");
+	wait_ended(dead);
+	close(gate[0]);
+	close(gate[1]);
+}
+
+static void look_at_zombie_group(char *to, size_t size)
+{
+	snprintf(to, size, "group of the dead one %d, of the other one %d", getpgid(dead),
+		 getpgid(kid));
+}
+
+/* ---- limits ------------------------------------------------------------------------------- */
+
+/* Soft ones: to have more than a hard one takes a right (CAP_SYS_RESOURCE) that not every
+ * guard has. */
+static void set_limit(int which, rlim_t value)
+{
+	struct rlimit limit;
+
+	must(!getrlimit(which, &limit), "getrlimit");
+	limit.rlim_cur = value;
+	must(!setrlimit(which, &limit), "setrlimit");
+}
+
+static void setup_limits(void)
+{
+	kid = fork();
+	if (!kid) {
+		void *much;
+
+		set_limit(RLIMIT_NOFILE, 300);
+		must(dup2(STDOUT_FILENO, 200) == 200, "dup2");
+		much = mmap(NULL, MUCH, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+		must(much != MAP_FAILED, "mmap");
+		set_limit(RLIMIT_NOFILE, 100);
+		set_limit(RLIMIT_FSIZE, 1 << 30);
+		raise(SIGSTOP);
+		rest();
+	}
+	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
+	must(!kill(kid, SIGCONT), "kill");
+	set_limit(RLIMIT_NOFILE, 16);
+	set_limit(RLIMIT_AS, MUCH / 2);
+	set_limit(RLIMIT_FSIZE, 1 << 20);
+}
+
+static void look_at_limits(char *to, size_t size)
+{
+	static const int which[] = { RLIMIT_NOFILE, RLIMIT_AS, RLIMIT_FSIZE };
+	char path[64];
+
+	snprintf(path, sizeof(path), "/proc/%d/fd/200", kid);
+	snprintf(to, size, "descriptor 200: %d", access(path, F_OK));
+	for (size_t i = 0; i < sizeof(which) / sizeof(*which); i++) {
+		struct rlimit own, its;
+
+		must(!getrlimit(which[i], &own) && !prlimit(kid, which[i], NULL, &its), "prlimit");
+		snprintf(to + strlen(to), size - strlen(to), "; %d: %lu %lu, mine %lu %lu",
+			 which[i], its.rlim_cur, its.rlim_max, own.rlim_cur, own.rlim_max);
+	}
+}
+
+/* ---- barriers ------------------------------------------------------------------------------ */
+
+static void setup_barriers(void)
+{
+	must(!syscall(SYS_membarrier, MEMBARRIER_CMD_REGISTER_PRIVATE_EXPEDITED, 0, 0),
+	     "membarrier");
+	must(!syscall(SYS_membarrier, MEMBARRIER_CMD_REGISTER_GLOBAL_EXPEDITED, 0, 0),
+	     "membarrier");
+}
+
+static void look_at_barriers(char *to, size_t size)
+{
+	snprintf(to, size, "barrier %ld, registered %ld",
+		 syscall(SYS_membarrier, MEMBARRIER_CMD_PRIVATE_EXPEDITED, 0, 0),
+		 syscall(SYS_membarrier, 1 << 9, 0, 0));
+}
+
+/* ---- personality ----------------------------------------------------------------------------- */
+
+static uint64_t started_ns;
+
+static void setup_personality(void)
+{
+	started_ns = now_ns();
+}
+
+static void look_at_personality(char *to, size_t size)
+{
+	static bool changed;
+
+	if (!changed && now_ns() - started_ns > 200000000) {
+		changed = true;
+		must(personality(ADDR_NO_RANDOMIZE) >= 0, "personality");
+		count(0, 1);
+	}
+	snprintf(to, size, "%s",
+		 (personality(0xffffffff) == ADDR_NO_RANDOMIZE) == changed ? "right" : "wrong");
+}
+
+/* ---- setup, disarmed ---------------------------------------------------------------------- */
+
+/* What a thread finds of itself. */
+static void tell(void)
+{
+	must(!sigaltstack(NULL, &thread_stack), "sigaltstack");
+	must(!prctl(PR_GET_NAME, thread_name), "PR_GET_NAME");
+	ready++;
+}
+
+static void *set_up_late(void *arg)
+{
+	const stack_t own = { .ss_sp = stack, .ss_size = STACK_BYTES };
+
+	while (!__atomic_load_n(&board->counter[1], __ATOMIC_ACQUIRE))
+		nap_us(1000);
+	must(!sigaltstack(&own, NULL), "sigaltstack");
+	must(!prctl(PR_SET_NAME, "late"), "PR_SET_NAME");
+	count(0, 1);
+	for (;; nap_us(1000))
+		tell();
+	return arg;
+}
+
+static void stay(int signal)
+{
+	(void)signal;
+	count(0, 1);
+	for (;; nap_us(1000))
+		tell();
+}
+
+static void *disarm(void *arg)
+{
+	const stack_t own = { .ss_sp = stack,
+			      .ss_flags = (int)SS_AUTODISARM_,
+			      .ss_size = STACK_BYTES };
+
+	must(!sigaltstack(&own, NULL), "sigaltstack");
+	while (!__atomic_load_n(&board->counter[1], __ATOMIC_ACQUIRE))
+		nap_us(1000);
+	raise(SIGUSR2);
+	return arg;
+}
+
+static void start(void *(*work)(void *))
+{
+	const struct sigaction action = { .sa_handler = stay, .sa_flags = SA_ONSTACK };
+	pthread_t thread;
+
+	sigaction(SIGUSR2, &action, NULL);
+	must(!pthread_create(&thread, NULL, work, NULL), "pthread_create");
+}
+
+static void setup_late(void)
+{
+	start(set_up_late);
+}
+
+static void setup_disarmed(void)
+{
+	start(disarm);
+}
+
+/* Nothing, before counter 1 of the board lets the thread go on. */
+static void look_at_thread(char *to, size_t size)
+{
+	static bool seen;
+	const int before = ready;
+
+	if (!seen && !ready) {
+		snprintf(to, size, "nothing");
+		return;
+	}
+	for (int i = 0; i < 5000 && ready < before + 2; i++)
+		nap_us(1000);
+	snprintf(to, size, "flags %x of %zu bytes, name %s", (unsigned int)thread_stack.ss_flags,
+		 thread_stack.ss_size, thread_name);
+	if (!seen)
+		strcpy(was, to);
+	seen = true;
+}
+
+/* ---- all of them ---------------------------------------------------------------------------- */
+
+static const struct {
+	const char *name;
+	void (*setup)(void);
+	void (*look)(char *to, size_t size);
+} kinds[] = {
+	{ "exit-signal", setup_exit_signal, look_at_exit_signal },
+	{ "zombie-group", setup_zombie_group, look_at_zombie_group },
+	{ "limits", setup_limits, look_at_limits },
+	{ "barriers", setup_barriers, look_at_barriers },
+	{ "personality", setup_personality, look_at_personality },
+	{ "setup", setup_late, look_at_thread },
+	{ "disarmed", setup_disarmed, look_at_thread },
+};
+
+int main(int argc, char **argv)
+{
+	void (*look)(char *to, size_t size) = NULL;
+
+	victim_start(&argc, argv, 1, "KIND");
+	for (size_t i = 0; i < sizeof(kinds) / sizeof(*kinds); i++)
+		if (!strcmp(argv[1], kinds[i].name)) {
+			look = kinds[i].look;
+			kinds[i].setup();
+		}
+	must(look != NULL, "no such kind");
+	look(was, sizeof(was));
+	victim_ready();
+	for (;; nap_us(2000)) {
+		look(is, sizeof(is));
+		CHECK(!strcmp(was, is), "was \"%s\", is \"%s\"", was, is);
+		beat();
+	}
+}
