@@ -5,6 +5,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
@@ -532,6 +533,16 @@ static int by_inside(const void *a, const void *b)
 	return (x->inside > y->inside) - (x->inside < y->inside);
 }
 
+/* A process that one of them has just brought forth stands among them, too, until the next
+ * look (adopt()). */
+static bool is_thread(const struct target *target, pid_t tid)
+{
+	char number[16];
+
+	snprintf(number, sizeof number, "%d", tid);
+	return faccessat(target->task_dirfd, number, F_OK, 0) == 0;
+}
+
 /* unshare(2): those that are restored have the main thread's.  It is stopped. */
 static int check_unshared(const struct target *target, const struct thread *t,
 			  struct avc_error *err)
@@ -545,6 +556,8 @@ static int check_unshared(const struct target *target, const struct thread *t,
 	/* A main thread that is just ending has none. */
 	if (!what || proc_is_exiting(target->pid) || proc_is_exiting(t->tid))
 		return 0;
+	if (!is_thread(target, t->tid))
+		return fail(err, AVC_GONE, 0, t->tid, "check", "", "it is no thread");
 	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "thread %d has %s",
 		    proc_inside(t->tid), what);
 }
@@ -578,7 +591,7 @@ static int check_spaces(const struct target *target, const struct thread *t, str
 		const uint64_t own = space_of(pidfd, spaces[i].kind),
 			       others = space_of(target->pidfd, spaces[i].kind);
 
-		if (own && others && own != others)
+		if (own && others && own != others && is_thread(target, t->tid))
 			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
 				      "thread %d has a namespace of its own (%s)", t->inside,
 				      spaces[i].name);
