@@ -199,6 +199,8 @@ static int fill_slot(struct target *target, struct generation *generation,
 		return -1;
 	if (timers_setup(target, generation, &setup, err))
 		return -1;
+	if (branch)
+		manner_setup_limits(branch, &setup);
 	/* A change of users takes it from the whole process, whichever thread it is. */
 	if (generation->dumpable == 0 || generation->dumpable == 1)
 		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,

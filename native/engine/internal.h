@@ -981,7 +981,8 @@ int manner_put(struct puppet *puppet, const struct branch *branch,
 /* Until then nothing is limited: it may have more than it may have now, and its parent may have
  * lowered its own limits since.  Its descriptors are below `files`. */
 void manner_lift_limits(pid_t pid, uint32_t files);
-void manner_put_limits(pid_t pid, const struct branch *branch, struct avc_error *notes);
+/* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
+void manner_setup_limits(const struct branch *branch, struct setup *setup);
 
 /* ---- descend.c ------------------------------------------------------------------------- */
 

@@ -215,16 +215,14 @@ void manner_lift_limits(pid_t pid, uint32_t files)
 	}
 }
 
-void manner_put_limits(pid_t pid, const struct branch *branch, struct avc_error *notes)
+void manner_setup_limits(const struct branch *branch, struct setup *setup)
 {
-	for (int i = 0; i < LIMITS; i++) {
-		const struct rlimit limit = { branch->manner->limit[i][0],
-					      branch->manner->limit[i][1] };
-
-		if (prlimit(pid, i, &limit, NULL))
-			fail_errno(notes, branch->inside, "restore", "prlimit",
-				   "a resource limit could not be put back");
-	}
+	for (uint64_t i = 0; i < LIMITS; i++)
+		setup_add(setup, INJ_AFTER, "prlimit", SYS_prlimit64, 0, i,
+			  setup_data(setup, branch->manner->limit[i],
+				     sizeof branch->manner->limit[i]),
+			  0, 0)
+			->flags = INJ_MAY_FAIL;
 }
 
 static bool same_root(pid_t a, pid_t b)
