@@ -211,7 +211,7 @@ def test_it_is_one_process_too_many() -> None:
 
 def test_there_is_no_room_for_copies_of_a_big_parent() -> None:
     """Seven processes, as many holders and templates, and somebody who takes numbers: children are forked without."""
-    with limited(21, "prefork 6 30") as (victim, guard), forks_beside(victim):
+    with limited(21, "prefork 6 12") as (victim, guard), forks_beside(victim):
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         for _ in range(3):
             die_and_come_back(victim, guard)
