@@ -8,6 +8,7 @@
  * gup_must_unshare()).  Written by process_vm_writev(2): /proc/PID/mem copies each page
  * once more on its way, and a page that is written to is its writer's own anyway.
  */
+#include <errno.h>
 #include <fcntl.h>
 #include <pthread.h>
 #include <stdlib.h>
@@ -61,6 +62,14 @@ struct copier *copier_new(struct avc_error *err)
 	return copier;
 }
 
+/* The kernel gives no reason when it comes to a page that it can not get at after others. */
+static bool is_all(ssize_t done, size_t bytes)
+{
+	if (done >= 0 && (size_t)done < bytes)
+		errno = EIO;
+	return done == (ssize_t)bytes;
+}
+
 /* What its owner may not read or write only its tracer may, by /proc/PID/mem
  * (fs/proc/base.c, proc_mem_foll_force()); a kernel can be without the other
  * (CONFIG_CROSS_MEMORY_ATTACH). */
@@ -71,7 +80,7 @@ static bool put(const struct source *source, uint8_t *buffer, size_t bytes, avc_
 
 	return (plain &&
 		process_vm_writev(source->pid, &here, 1, &there, 1, 0) == (ssize_t)bytes) ||
-	       pwrite(source->to, buffer, bytes, (off_t)at) == (ssize_t)bytes;
+	       is_all(pwrite(source->to, buffer, bytes, (off_t)at), bytes);
 }
 
 static int copy(const struct source *source, uint8_t *buffer, avc_remote start, avc_remote end,
@@ -80,7 +89,7 @@ static int copy(const struct source *source, uint8_t *buffer, avc_remote start, 
 	for (avc_remote at = start; at < end;) {
 		const size_t bytes = end - at < BUFFER_BYTES ? end - at : BUFFER_BYTES;
 
-		if (pread(source->from, buffer, bytes, (off_t)at) != (ssize_t)bytes)
+		if (!is_all(pread(source->from, buffer, bytes, (off_t)at), bytes))
 			return fail_errno(err, source->template, "restore memory", "read(mem)",
 					  "it can not be read at %lx", (unsigned long)at);
 		if (!put(source, buffer, bytes, at, plain))

@@ -27,7 +27,14 @@ struct piece {
 	bool kept;
 };
 
-enum page { PAGE_SAME, PAGE_COPY, PAGE_DROP };
+enum page {
+	PAGE_SAME,
+	PAGE_COPY,
+	PAGE_DROP,
+	PAGE_GUARD,    /* becomes a guard page                                   */
+	PAGE_OPEN,     /* is one, and is to be empty                             */
+	PAGE_OPEN_COPY /* is one, and is to be copied                           */
+};
 
 struct run {
 	avc_remote start, end;
@@ -260,7 +267,22 @@ static int map_new(const struct remap *r, struct puppet *puppet, struct avc_erro
 #define PAGEMAP_PRESENT (UINT64_C(1) << 63)
 #define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
 #define PAGEMAP_FILE (UINT64_C(1) << 61)
+#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
 #define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
+/* Where it stands in the page table: a swap entry of the last type, which is none, with
+ * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
+#define GUARD_MARKER (UINT64_C(4) << 5 | 31)
+/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE; the headers may be older. */
+#define GUARD_INSTALL 102
+#define GUARD_REMOVE 103
+
+/* A guard page without a mapping of its own (madvise(2), Linux 6.13). */
+static bool is_guard(uint64_t frame)
+{
+	return frame & PAGEMAP_GUARD ||
+	       (frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED | PAGEMAP_FRAME)) ==
+		       (PAGEMAP_SWAPPED | GUARD_MARKER);
+}
 
 static bool is_own(uint64_t frame)
 {
@@ -270,6 +292,10 @@ static bool is_own(uint64_t frame)
 /* Of a private mapping.  What is of a file is there by itself. */
 static enum page compare(uint64_t want, uint64_t is)
 {
+	if (is_guard(want))
+		return is_guard(is) ? PAGE_SAME : PAGE_GUARD;
+	if (is_guard(is))
+		return is_own(want) ? PAGE_OPEN_COPY : PAGE_OPEN;
 	if (!is_own(want))
 		return is_own(is) ? PAGE_DROP : PAGE_SAME;
 	if (is_own(is) && want & PAGEMAP_FRAME &&
@@ -323,6 +349,21 @@ static int compare_piece(struct remap *r, const struct piece *piece, struct avc_
 	return 0;
 }
 
+static int advice_of(enum page what)
+{
+	switch (what) {
+	case PAGE_DROP:
+		return MADV_DONTNEED;
+	case PAGE_GUARD:
+		return GUARD_INSTALL;
+	case PAGE_OPEN:
+	case PAGE_OPEN_COPY:
+		return GUARD_REMOVE;
+	default:
+		return 0;
+	}
+}
+
 static int fill(const struct remap *r, struct puppet *puppet, struct copier *copier,
 		struct avc_error *err)
 {
@@ -330,12 +371,20 @@ static int fill(const struct remap *r, struct puppet *puppet, struct copier *cop
 		return -1;
 	for (uint32_t i = 0; i < r->runs; i++) {
 		const struct run *run = &r->run[i];
+		const int advice = advice_of(run->what);
 
-		/* The last of the calls are made with what comes next. */
-		if (run->what == PAGE_COPY
-			    ? copier_add(copier, run->start, run->end, run->plain, err)
-			    : puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
-					 MADV_DONTNEED, 0, 0, 0, err))
+		if (advice && puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
+					 (uint64_t)advice, 0, 0, 0, err))
+			return -1;
+	}
+	/* Nothing can be written where a guard page still is. */
+	if (puppet_flush(puppet, err))
+		return -1;
+	for (uint32_t i = 0; i < r->runs; i++) {
+		const struct run *run = &r->run[i];
+
+		if ((run->what == PAGE_COPY || run->what == PAGE_OPEN_COPY) &&
+		    copier_add(copier, run->start, run->end, run->plain, err))
 			return -1;
 	}
 	return 0;

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from harness import wait_until
-from native.guarded import GuardProcess, Victim, config, kill_at_random
+from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
 
 
 @pytest.fixture(autouse=True)
@@ -84,6 +85,42 @@ def test_small_shared_memory_is_rolled_back_beside_a_large_one(tmp_path: Path) -
     with Victim("mappings 64 --large", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
         assert "65536 kB of shared memory" in guard.wait("checkpoint")["error"]["message"]
         kill_at_random(guard, victim, 10, (0.01, 0.15))
+
+
+def restored(victim: Victim, guard: GuardProcess) -> Json:
+    """Disturbs it and kills it; what is told when it is there again and has looked at what it has."""
+    before, disturbed, since = victim.see().counter[1], victim.see().counter[2], guard.mark()
+    os.kill(victim.player, signal.SIGUSR1)
+    wait_until(lambda: victim.see().counter[2] > disturbed or victim.see().violations, 5, "it has", 0.001)
+    victim.kill_app()
+    event = guard.wait("restored", since=since)
+    wait_until(lambda: victim.see().counter[1] > before or victim.see().violations, 5, "it has looked", 0.001)
+    victim.check()
+    return event
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("scenario", ["guard", "unguard", "sealed", "late", "droppable", "growing"])
+def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
+    """From each of two checkpoints, again and again, with nothing to be told."""
+    command = f"regions {scenario} {tmp_path} {where}"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(2):
+            taken = guard.command("checkpoint")
+            assert (taken["kind"], taken.get("error")) == ("checkpoint", None)
+            for _kill in range(3):
+                event = restored(victim, guard)
+                assert "error" not in event, event
+            if scenario == "late":
+                break  # sealed for good
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_what_was_sealed_since_can_not_go_back_and_is_told(where: str, tmp_path: Path) -> None:
+    command = f"regions changed {tmp_path} {where}"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert "sealed" in restored(victim, guard)["error"]["message"]
 
 
 @pytest.fixture

@@ -1,0 +1,283 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Memory of kinds that few programs have, each in a mapping of its own.
+ *
+ *   regions SCENARIO FOLDER     see scenario.h
+ *
+ *   guard      guard pages without a mapping of their own (MADV_GUARD_INSTALL)
+ *   unguard    a parent has them, its child has taken them away and uses the pages
+ *   sealed     a memfd that nobody may write to any more, mapped shared
+ *   late       one that nobody may map for writing any more, which is sealed so after the checkpoint
+ *   changed    one that was written and sealed since: it can not go back
+ *   droppable  memory that is wiped in forks and dropped when it is short (MAP_DROPPABLE)
+ *   growing    memory that grows downwards (MAP_GROWSDOWN)
+ *   attached   System V shared memory
+ */
+#include <sys/ipc.h>
+#include <sys/shm.h>
+
+#include "scenario.h"
+
+#define PAGE 4096
+#ifndef MADV_GUARD_INSTALL
+#define MADV_GUARD_INSTALL 102
+#define MADV_GUARD_REMOVE 103
+#endif
+#ifndef F_SEAL_FUTURE_WRITE
+#define F_SEAL_FUTURE_WRITE 0x10
+#endif
+#define DROPPABLE 0x08 /* MAP_DROPPABLE, since Linux 6.11 */
+
+static char *at;
+
+static char *map(size_t pages, int protection, int flags, int f)
+{
+	char *p = mmap(NULL, pages * PAGE, protection, flags, f, 0);
+
+	must(p != MAP_FAILED, "mmap");
+	return p;
+}
+
+/* ---- guard pages --------------------------------------------------------------------- */
+
+enum { GUARDED_PAGES = 16, GUARD = 4, GUARDS = 4 };
+
+/* The kernel reads it for us, and does not mind. */
+static bool is_readable(const char *p)
+{
+	int ends[2];
+	bool readable;
+
+	must(!pipe(ends), "pipe");
+	readable = write(ends[1], p, 1) == 1;
+	CHECK(readable || errno == EFAULT, "write: %s", strerror(errno));
+	close(ends[0]);
+	close(ends[1]);
+	return readable;
+}
+
+static void install(char *region)
+{
+	if (madvise(region + GUARD * PAGE, GUARDS * PAGE, MADV_GUARD_INSTALL))
+		unavailable("MADV_GUARD_INSTALL");
+}
+
+/* So big that the engine looks only where there is something in it. */
+static char *untouched;
+enum { MANY_PAGES = 5 << 18 };
+
+static void guard_setup(void)
+{
+	at = map(GUARDED_PAGES, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	memset(at, 7, GUARDED_PAGES * PAGE);
+	install(at);
+	untouched = map(MANY_PAGES, PROT_READ | PROT_WRITE,
+			MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1);
+	install(untouched);
+}
+
+static void guard_disturb(void)
+{
+	must(!madvise(at, GUARDED_PAGES * PAGE, MADV_GUARD_REMOVE), "MADV_GUARD_REMOVE");
+	memset(at, 8, GUARDED_PAGES * PAGE);
+}
+
+static void guard_verify(void)
+{
+	for (int i = 0; i < GUARDED_PAGES; i++) {
+		const bool guard = i >= GUARD && i < GUARD + GUARDS;
+
+		CHECK(is_readable(at + i * PAGE) == !guard &&
+			      is_readable(untouched + i * PAGE) == !guard,
+		      "page %d is a guard no more, or is one now", i);
+		CHECK(guard || (at[i * PAGE] == 7 && !untouched[i * PAGE]), "page %d holds %d", i,
+		      at[i * PAGE]);
+	}
+}
+
+static struct {
+	volatile uint64_t looks, wrong;
+} * reported;
+
+static void unguard_in_child(void)
+{
+	must(!madvise(at + GUARD * PAGE, GUARDS * PAGE, MADV_GUARD_REMOVE), "MADV_GUARD_REMOVE");
+	memset(at + GUARD * PAGE, 5, 2 * PAGE);
+	for (;;) {
+		for (int i = 0; i < GUARDS; i++)
+			reported->wrong += !is_readable(at + (GUARD + i) * PAGE) ||
+					   at[(GUARD + i) * PAGE] != (i < 2 ? 5 : 0);
+		reported->looks++;
+		usleep(1000);
+	}
+}
+
+static void unguard_verify(void)
+{
+	const uint64_t looks = reported->looks;
+
+	for (int i = 0; i < 5000 && reported->looks < looks + 2; i++)
+		nap_us(1000);
+	CHECK(reported->looks >= looks + 2, "the child looks no more");
+	CHECK(!reported->wrong, "the child's pages are not what they were");
+	CHECK(!is_readable(at + GUARD * PAGE), "the parent has lost its guard pages");
+}
+
+static void unguard_setup(void)
+{
+	reported = (void *)map(1, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1);
+	at = map(GUARDED_PAGES, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	memset(at, 7, GUARDED_PAGES * PAGE);
+	install(at);
+	if (fork() == 0)
+		unguard_in_child();
+	unguard_verify();
+}
+
+/* ---- seals ---------------------------------------------------------------------------- */
+
+static void open_memfd(int protection)
+{
+	fd[0] = memfd_create("sealed", MFD_ALLOW_SEALING | MFD_CLOEXEC);
+	must(fd[0] >= 0 && !ftruncate(fd[0], 2 * PAGE) && pwrite(fd[0], "then", 5, 0) == 5,
+	     "memfd_create");
+	at = map(2, protection, MAP_SHARED, fd[0]);
+}
+
+static void seal(int seals)
+{
+	must(!fcntl(fd[0], F_ADD_SEALS, seals | F_SEAL_GROW | F_SEAL_SHRINK), "F_ADD_SEALS");
+}
+
+static void expect_content(const char *text)
+{
+	CHECK(!strcmp(at, text), "it is \"%s\" and not \"%s\"", at, text);
+}
+
+static void sealed_setup(void)
+{
+	open_memfd(PROT_READ);
+	seal(F_SEAL_WRITE);
+}
+
+static void late_setup(void)
+{
+	open_memfd(PROT_READ | PROT_WRITE);
+}
+
+static void late_disturb(void)
+{
+	seal(F_SEAL_FUTURE_WRITE);
+	strcpy(at, "now");
+}
+
+static void expect_then(void)
+{
+	expect_content("then");
+}
+
+/* What could become writable would be in the way of the seal, also in a template. */
+static void changed_setup(void)
+{
+	char name[32];
+
+	fd[0] = memfd_create("sealed", MFD_ALLOW_SEALING | MFD_CLOEXEC);
+	snprintf(name, sizeof name, "/proc/self/fd/%d", fd[0]);
+	fd[1] = open(name, O_RDONLY | O_CLOEXEC);
+	must(fd[1] >= 0 && !ftruncate(fd[0], 2 * PAGE) && pwrite(fd[0], "then", 5, 0) == 5, name);
+	at = map(2, PROT_READ, MAP_SHARED, fd[1]);
+}
+
+static void changed_disturb(void)
+{
+	must(pwrite(fd[0], "now", 4, 0) == 4, "pwrite");
+	seal(F_SEAL_WRITE);
+}
+
+static void expect_now(void)
+{
+	expect_content("now");
+}
+
+/* ---- what comes and goes -------------------------------------------------------------- */
+
+static void droppable_setup(void)
+{
+	at = mmap(NULL, PAGE, PROT_READ | PROT_WRITE, MAP_ANONYMOUS | DROPPABLE, -1, 0);
+	if (at == MAP_FAILED)
+		unavailable("MAP_DROPPABLE");
+	strcpy(at, "a seed");
+}
+
+static void droppable_verify(void)
+{
+	pid_t child;
+	int status;
+
+	strcpy(at, "a seed");
+	child = fork();
+	if (child == 0)
+		_exit(*at != 0);
+	CHECK(waitpid(child, &status, 0) == child && !status, "a fork has the seed of its parent");
+}
+
+enum { ROOM_PAGES = 2048 }; /* more than the kernel leaves free below (stack_guard_gap) */
+static int grown;
+
+static void growing_setup(void)
+{
+	char *room = map(ROOM_PAGES, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+
+	must(!munmap(room, ROOM_PAGES * PAGE), "munmap");
+	at = mmap(room + (ROOM_PAGES - 1) * PAGE, PAGE, PROT_READ | PROT_WRITE,
+		  MAP_PRIVATE | MAP_ANONYMOUS | MAP_GROWSDOWN | MAP_FIXED_NOREPLACE, -1, 0);
+	must(at != MAP_FAILED, "MAP_GROWSDOWN");
+	*at = 7;
+}
+
+static void growing_verify(void)
+{
+	CHECK(*at == 7, "it holds %d", *at);
+	grown++;
+	at[-grown * PAGE] = 7; /* a fault, if it does not grow */
+}
+
+static int segment;
+
+static void attached_setup(void)
+{
+	segment = shmget(IPC_PRIVATE, 2 * PAGE, 0600);
+	at = segment < 0 ? (void *)-1 : shmat(segment, NULL, 0);
+	must(at != (void *)-1 && !shmctl(segment, IPC_RMID, NULL), "shmat");
+	strcpy(at, "shared");
+}
+
+/* It would be gone if nobody had it attached. */
+static void attached_verify(void)
+{
+	struct shmid_ds info;
+	char *again = shmat(segment, NULL, 0);
+
+	CHECK(again != (void *)-1 && !strcmp(again, "shared") && !strcmp(at, "shared"),
+	      "the segment is another one");
+	CHECK(!shmctl(segment, IPC_STAT, &info) && info.shm_nattch >= 2, "%lu have it attached",
+	      (unsigned long)info.shm_nattch);
+	CHECK(!shmdt(at), "shmdt: %s", strerror(errno));
+	at = again;
+}
+
+static const struct scenario scenarios[] = {
+	{ "guard", guard_setup, guard_disturb, guard_verify },
+	{ "unguard", unguard_setup, nothing, unguard_verify },
+	{ "sealed", sealed_setup, nothing, expect_then },
+	{ "late", late_setup, late_disturb, expect_then },
+	{ "changed", changed_setup, changed_disturb, expect_now },
+	{ "droppable", droppable_setup, nothing, droppable_verify },
+	{ "growing", growing_setup, nothing, growing_verify },
+	{ "attached", attached_setup, nothing, attached_verify },
+};
+
+int main(int argc, char **argv)
+{
+	play(argc, argv, scenarios, sizeof scenarios / sizeof *scenarios);
+}
