@@ -534,7 +534,7 @@ static int await_member(struct family *family, uint32_t index, struct avc_error 
 	if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
 		return -1;
 	restore_note(branch->target, branch->image, member->pid, notes);
-	return memory_put_back(branch->image->image, member->pid, err);
+	return memory_put_back(branch->image->image, member->pid, notes, err);
 }
 
 /* It asks nothing of us while it puts itself together: no numbers for threads, no

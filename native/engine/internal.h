@@ -704,8 +704,9 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 extern const char private_huge_pages[];
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
-/* At a restore, before anything runs. */
-int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err) warn_unused;
+/* At a restore, before anything runs; *notes: what can not be written. */
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *notes,
+		    struct avc_error *err) warn_unused;
 
 /* ---- infect.c ----------------------------------------------------------------- */
 

@@ -740,21 +740,59 @@ int memory_finish(struct target *target, struct generation *generation, int64_t 
 	return 0;
 }
 
-int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *err)
+/* Whether it is what the image has, by the memory of a process. */
+static bool is_equal(int mem_fd, const struct area *a, const uint8_t *image)
+{
+	uint8_t page[ARCH_PAGE_BYTES];
+
+	for (size_t at = 0, bytes; at < a->kept; at += bytes) {
+		bytes = a->kept - at < sizeof page ? a->kept - at : sizeof page;
+		if (pread(mem_fd, page, bytes, (off_t)(a->start + at)) != (ssize_t)bytes ||
+		    memcmp(page, image + at, bytes) != 0)
+			return false;
+	}
+	return true;
+}
+
+/* By the file, which need not be mapped for writing; and by the process's memory, which may
+ * still be written though the file may not (F_SEAL_FUTURE_WRITE, and hugetlbfs does not know
+ * write(2)). */
+static int put_back(const struct area *a, pid_t pid, int mem_fd, const uint8_t *from,
+		    struct avc_error *notes, struct avc_error *err)
+{
+	const ssize_t n = a->huge ? 0 : pwrite(a->fd, from, a->kept, (off_t)a->offset);
+
+	if (n == (ssize_t)a->kept)
+		return 0;
+	if (!a->huge && (n >= 0 || errno != EPERM))
+		return fail_errno(err, pid, "restore", "pwrite",
+				  "shared memory can not be written");
+	if (pwrite(mem_fd, from, a->kept, (off_t)a->start) == (ssize_t)a->kept)
+		return 0;
+	if (a->huge)
+		return fail_errno(err, pid, "restore", "write(mem)",
+				  "shared memory can not be written");
+	/* What was sealed at the checkpoint is what it was. */
+	if (!is_equal(mem_fd, a, from))
+		fail(notes, AVC_UNSUPPORTED, EPERM, pid, "restore", "pwrite",
+		     "%zu kB of shared memory have been sealed since, and are not rolled back",
+		     area_bytes(a) / 1024);
+	return 0;
+}
+
+int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *notes,
+		    struct avc_error *err)
 {
 	const uint8_t *from = image ? image->data : NULL;
 	int mem_fd = -1, result = 0;
 
 	for (uint32_t i = 0; !result && image && i < image->areas.count; i++) {
 		const struct area *a = &image->areas.area[i];
-		const off_t at = (off_t)(a->huge ? a->start : a->offset);
 
-		if (a->huge && mem_fd < 0)
+		if (mem_fd < 0)
 			mem_fd = proc_open(pid, "mem", O_RDWR);
-		if (!a->wiped && a->kept &&
-		    pwrite(a->huge ? mem_fd : a->fd, from, a->kept, at) != (ssize_t)a->kept)
-			result = fail_errno(err, pid, "restore", "pwrite",
-					    "shared memory can not be written");
+		if (!a->wiped && a->kept)
+			result = put_back(a, pid, mem_fd, from, notes, err);
 		from += area_room(a);
 	}
 	close_fd(&mem_fd);

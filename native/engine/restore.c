@@ -319,7 +319,7 @@ int restore(struct target *target, struct generation *generation, struct link *l
 	if (!result)
 		restore_note(target, generation, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, *pid, err);
+		result = memory_put_back(generation->image, *pid, notes, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {

@@ -12,6 +12,7 @@
  *   droppable  memory that is wiped in forks and dropped when it is short (MAP_DROPPABLE)
  *   growing    memory that grows downwards (MAP_GROWSDOWN)
  *   attached   System V shared memory
+ *   unmoved    memory that nobody may unmap or protect otherwise (mseal(2))
  */
 #include <sys/ipc.h>
 #include <sys/shm.h>
@@ -136,12 +137,16 @@ static void unguard_setup(void)
 
 /* ---- seals ---------------------------------------------------------------------------- */
 
-static void open_memfd(int protection)
+/* fd[1] is the same for reading.  By the other one mapped, it could become writable, which would
+ * be in the way of F_SEAL_WRITE; also in a template. */
+static void open_memfd(void)
 {
+	char name[32];
+
 	fd[0] = memfd_create("sealed", MFD_ALLOW_SEALING | MFD_CLOEXEC);
-	must(fd[0] >= 0 && !ftruncate(fd[0], 2 * PAGE) && pwrite(fd[0], "then", 5, 0) == 5,
-	     "memfd_create");
-	at = map(2, protection, MAP_SHARED, fd[0]);
+	snprintf(name, sizeof name, "/proc/self/fd/%d", fd[0]);
+	fd[1] = open(name, O_RDONLY | O_CLOEXEC);
+	must(fd[1] >= 0 && !ftruncate(fd[0], 2 * PAGE) && pwrite(fd[0], "then", 5, 0) == 5, name);
 }
 
 static void seal(int seals)
@@ -156,13 +161,15 @@ static void expect_content(const char *text)
 
 static void sealed_setup(void)
 {
-	open_memfd(PROT_READ);
+	open_memfd();
 	seal(F_SEAL_WRITE);
+	at = map(2, PROT_READ, MAP_SHARED, fd[1]);
 }
 
 static void late_setup(void)
 {
-	open_memfd(PROT_READ | PROT_WRITE);
+	open_memfd();
+	at = map(2, PROT_READ | PROT_WRITE, MAP_SHARED, fd[0]);
 }
 
 static void late_disturb(void)
@@ -176,15 +183,9 @@ static void expect_then(void)
 	expect_content("then");
 }
 
-/* What could become writable would be in the way of the seal, also in a template. */
 static void changed_setup(void)
 {
-	char name[32];
-
-	fd[0] = memfd_create("sealed", MFD_ALLOW_SEALING | MFD_CLOEXEC);
-	snprintf(name, sizeof name, "/proc/self/fd/%d", fd[0]);
-	fd[1] = open(name, O_RDONLY | O_CLOEXEC);
-	must(fd[1] >= 0 && !ftruncate(fd[0], 2 * PAGE) && pwrite(fd[0], "then", 5, 0) == 5, name);
+	open_memfd();
 	at = map(2, PROT_READ, MAP_SHARED, fd[1]);
 }
 
@@ -266,6 +267,20 @@ static void attached_verify(void)
 	at = again;
 }
 
+static void unmoved_setup(void)
+{
+	at = map(1, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	if (syscall(462 /* SYS_mseal */, at, PAGE, 0))
+		unavailable("mseal");
+	*at = 7;
+}
+
+static void unmoved_verify(void)
+{
+	CHECK(*at == 7, "it holds %d", *at);
+	CHECK(mprotect(at, PAGE, PROT_READ) && errno == EPERM, "it is not sealed any more");
+}
+
 static const struct scenario scenarios[] = {
 	{ "guard", guard_setup, guard_disturb, guard_verify },
 	{ "unguard", unguard_setup, nothing, unguard_verify },
@@ -275,6 +290,7 @@ static const struct scenario scenarios[] = {
 	{ "droppable", droppable_setup, nothing, droppable_verify },
 	{ "growing", growing_setup, nothing, growing_verify },
 	{ "attached", attached_setup, nothing, attached_verify },
+	{ "unmoved", unmoved_setup, nothing, unmoved_verify },
 };
 
 int main(int argc, char **argv)
