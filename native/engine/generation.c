@@ -296,7 +296,7 @@ int generation_finish(struct target *target, struct generation *generation, stru
 		return -1;
 	if (again.code)
 		*err = again;
-	return again.code ? -1 : 0;
+	return again.code || inherit_check(generation, err) ? -1 : 0;
 }
 
 void generation_close_files(struct target *target, struct generation *image)

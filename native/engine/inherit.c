@@ -65,6 +65,19 @@ int inherit_host(const struct generation *generation, uint32_t index)
 	return generation->inheritance->heir[index].host;
 }
 
+static const struct generation *image_of(const struct generation *generation, int branch)
+{
+	return branch < 0 ? generation : generation->branch[branch].image;
+}
+
+static struct snapshot *look_at(const struct generation *generation, int branch,
+				struct avc_error *err)
+{
+	const struct generation *image = image_of(generation, branch);
+
+	return snapshot_new(image->template, image->image, err);
+}
+
 static struct snapshot *snapshot_of(struct generation *generation, int branch,
 				    struct avc_error *err)
 {
@@ -72,9 +85,7 @@ static struct snapshot *snapshot_of(struct generation *generation, int branch,
 	struct snapshot **snapshot = branch < 0 ? &all->main : &all->heir[branch].snapshot;
 
 	if (!*snapshot)
-		*snapshot = snapshot_new(branch < 0 ? generation->template
-						    : generation->branch[branch].image->template,
-					 err);
+		*snapshot = look_at(generation, branch, err);
 	return *snapshot;
 }
 
@@ -106,6 +117,29 @@ const struct remap *inherit_plan(struct generation *generation, uint32_t index,
 	rest(generation, (int)index);
 	rest(generation, heir->host);
 	return heir->plan;
+}
+
+int inherit_check(const struct generation *generation, struct avc_error *err)
+{
+	int result = 0;
+
+	for (uint32_t i = 0; !result && i < generation->branches; i++) {
+		const struct branch *branch = &generation->branch[i];
+		const int host = host_of(generation, branch);
+		struct snapshot *want, *is;
+
+		/* Few have anything of the kind. */
+		if (!branch->target ||
+		    (!mem_image_has(branch->image->image, MAPPING_ONLY_HERE) &&
+		     !mem_image_has(image_of(generation, host)->image, MAPPING_SEALED)))
+			continue;
+		want = look_at(generation, (int)i, err);
+		is = want ? look_at(generation, host, err) : NULL;
+		result = is ? remap_check(branch->target, want, is, err) : -1;
+		snapshot_free(want);
+		snapshot_free(is);
+	}
+	return result;
 }
 
 bool inherit_next(struct generation *generation)

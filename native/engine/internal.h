@@ -126,16 +126,19 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 bool proc_is_exiting(pid_t tid);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
-	MAPPING_DONTFORK = 1,   /* dc */
-	MAPPING_WIPEONFORK = 2, /* wf */
-	MAPPING_DEVICE = 4,     /* io */
-	MAPPING_LOCKED = 8,     /* lo */
-	MAPPING_DROPPABLE = 16, /* dp */
-	MAPPING_HUGETLB = 32,   /* ht */
-	MAPPING_HUGE = 64,      /* hg: transparent huge pages               */
-	MAPPING_SMALL = 128,    /* nh */
-	MAPPING_DONTDUMP = 256, /* dd */
-	MAPPING_MERGEABLE = 512 /* mg */
+	MAPPING_DONTFORK = 1,    /* dc */
+	MAPPING_WIPEONFORK = 2,  /* wf */
+	MAPPING_DEVICE = 4,      /* io */
+	MAPPING_LOCKED = 8,      /* lo */
+	MAPPING_DROPPABLE = 16,  /* dp */
+	MAPPING_HUGETLB = 32,    /* ht */
+	MAPPING_HUGE = 64,       /* hg: transparent huge pages               */
+	MAPPING_SMALL = 128,     /* nh */
+	MAPPING_DONTDUMP = 256,  /* dd */
+	MAPPING_MERGEABLE = 512, /* mg */
+	MAPPING_GROWING = 1024,  /* gd: downwards                           */
+	MAPPING_SEALED = 2048,   /* sl: mseal(2)                            */
+	MAPPING_ONLY_HERE = 4096 /* no other process could map it: memory.c  */
 };
 
 struct mapping {
@@ -143,7 +146,7 @@ struct mapping {
 	uint64_t offset, inode, device;
 	char mode[5]; /* "rwxp"                                           */
 	bool shared;
-	uint32_t flags; /* enum mapping_flag; of "smaps" only               */
+	uint32_t flags; /* enum mapping_flag; of "smaps", or of an image    */
 	char name[64];  /* its beginning                                    */
 };
 
@@ -171,6 +174,8 @@ struct proc_status {
 int proc_status(pid_t tid, struct proc_status *status);
 /* "/proc/PID/NAME" opened, or -1 with errno. */
 int proc_open(pid_t pid, const char *name, int flags);
+/* What is mapped there. */
+int proc_open_mapped(pid_t pid, const struct mapping *mapping, int flags);
 
 /* ---- threads and targets ---------------------------------------------------- */
 
@@ -686,10 +691,14 @@ struct mem_seen {
 struct memory *memory_new(void);
 void memory_forget(struct memory *memory); /* it is another program         */
 void memory_free(struct memory *memory);
-/* Room for what is to be copied in the freeze; *image NULL: nothing. */
+/* Room for what is to be copied in the freeze. */
 int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
 void mem_image_free(struct mem_image *image);
+/* What only "smaps" tells of a mapping and a restore has to know, as of the checkpoint: enum
+ * mapping_flag.  And whether it is so of any. */
+uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
+bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
 /* While everything is stopped: copies, what is its own when it stands still, what is shared
  * when everybody does; and what to call before the clone. */
 void memory_copy_own(const struct target *target, struct mem_image *image);
@@ -1030,7 +1039,8 @@ struct snapshot {
 	struct pages *pages; /* by mapping, of those that were asked for              */
 };
 
-struct snapshot *snapshot_new(pid_t template, struct avc_error *err);
+/* `image`: of the same process. */
+struct snapshot *snapshot_new(pid_t template, const struct mem_image *image, struct avc_error *err);
 void snapshot_free(struct snapshot *snapshot);
 /* Frees what it knows of pages, until it is asked for them again; NULL: nothing to do. */
 void snapshot_rest(struct snapshot *snapshot);
@@ -1066,6 +1076,10 @@ struct remap;
  * NULL on error. */
 struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
 			 struct avc_error *err);
+/* Whether there is a way from the one to the other, while it is not needed yet: of some mappings
+ * only who has them can give them to others, and only by a fork. */
+int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
+		struct avc_error *err) warn_unused;
 /* Does it, with a puppet that is in the pad of the plan's target already; but the copier
  * may not have finished. */
 int remap(const struct remap *plan, struct puppet *puppet, struct copier *copier,
@@ -1083,6 +1097,8 @@ int inherit_host(const struct generation *generation, uint32_t index);
 /* How it is made of that fork; NULL on error. */
 const struct remap *inherit_plan(struct generation *generation, uint32_t index,
 				 struct avc_error *err);
+/* Of a checkpoint: whether the processes can be made of their parents at all. */
+int inherit_check(const struct generation *generation, struct avc_error *err) warn_unused;
 /* Finds out about one more of them, so that a restore need not; false: that is all. */
 bool inherit_next(struct generation *generation);
 void inherit_free(struct inheritance *inheritance);

@@ -35,6 +35,7 @@
 
 #define AREAS_MAX 64
 #define HOLES_MAX 8
+#define MSEAL 462            /* mseal(2), since Linux 6.10; the headers may be older */
 #define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
 #define OTHERS_NS (10 * NS_PER_S)
 #define SMAPS_SHARE 50 /* the long file is read in at most 1/50 of the time */
@@ -65,19 +66,12 @@ struct areas {
 	struct area area[AREAS_MAX];
 };
 
-/* What madvise(2) was told of private memory, in a process whose restore maps it anew. */
-struct advised {
+/* Stretches of memory with one or the other of some flags. */
+struct marks {
 	uint32_t count;
 	struct {
 		avc_remote start, end;
-		uint32_t flags;
-	} area[AREAS_MAX];
-};
-
-struct locked {
-	uint32_t count;
-	struct {
-		avc_remote start, end;
+		uint32_t flags; /* enum mapping_flag                            */
 	} area[AREAS_MAX];
 };
 
@@ -96,15 +90,17 @@ struct memory {
 	uint64_t others_bytes; /* and that of others, too                        */
 	uint32_t named_count;
 	struct named named[AREAS_MAX];
-	uint64_t look_ns; /* what the last look at all processes took          */
-	struct advised advised;
-	struct locked locked;
+	uint64_t look_ns;     /* what the last look at all processes took          */
+	struct marks advised; /* what madvise(2) was told, where a restore maps it anew */
+	struct marks locked;
+	struct marks kinds; /* as mem_image.kinds                              */
 	int64_t locked_kb;
 	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
 };
 
 struct mem_image {
 	struct areas areas; /* descriptors are duplicates                      */
+	struct marks kinds; /* what a restore has to know of mappings          */
 	bool whole;         /* everything could be read                        */
 	size_t bytes;
 	uint8_t data[];
@@ -154,6 +150,22 @@ void mem_image_free(struct mem_image *image)
 	free(image);
 }
 
+uint32_t mem_image_marks(const struct mem_image *image, avc_remote address)
+{
+	for (uint32_t i = 0; image && i < image->kinds.count; i++)
+		if (image->kinds.area[i].start <= address && address < image->kinds.area[i].end)
+			return image->kinds.area[i].flags;
+	return 0;
+}
+
+bool mem_image_has(const struct mem_image *image, enum mapping_flag flag)
+{
+	for (uint32_t i = 0; image && i < image->kinds.count; i++)
+		if (image->kinds.area[i].flags & flag)
+			return true;
+	return false;
+}
+
 /* ---- before and during a freeze ------------------------------------------------ */
 
 /* True if it was seen before. */
@@ -178,8 +190,6 @@ int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_s
 	size_t bytes = 0;
 
 	*image = NULL;
-	if (!memory->areas.count)
-		return 0;
 	for (uint32_t i = 0; i < memory->areas.count; i++) {
 		struct area *a = &memory->areas.area[i];
 
@@ -189,7 +199,7 @@ int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_s
 	*image = malloc(sizeof **image + bytes);
 	if (!*image)
 		return fail_errno(err, 0, "keep memory", "malloc", "out of memory");
-	(*image)->areas.count = 0;
+	(*image)->areas.count = (*image)->kinds.count = 0;
 	(*image)->whole = true;
 	(*image)->bytes = bytes;
 	memset((*image)->data, 0, bytes); /* page faults now, not in the freeze */
@@ -309,6 +319,7 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 
 struct survey {
 	const struct target *target;
+	pid_t template;
 	struct memory *memory;
 	struct areas *areas;
 	uint64_t layout, shared_bytes, limit;
@@ -438,22 +449,60 @@ static uint32_t advice_of(const struct mapping *m)
 	return flags;
 }
 
-static void find_advised(struct advised *advised, const struct mapping *m)
+/* Those beyond AREAS_MAX are not known: of advice that is no harm, and what can not be mapped
+ * again is seen at the restore. */
+static void mark(struct marks *marks, const struct mapping *m, uint32_t flags)
 {
-	const uint32_t flags = advice_of(m);
-
 	if (!flags || m->start >= ARCH_USER_END)
 		return;
-	if (advised->count && advised->area[advised->count - 1].end == m->start &&
-	    advised->area[advised->count - 1].flags == flags) {
-		advised->area[advised->count - 1].end = m->end;
+	if (marks->count && marks->area[marks->count - 1].end == m->start &&
+	    marks->area[marks->count - 1].flags == flags) {
+		marks->area[marks->count - 1].end = m->end;
 		return;
 	}
-	if (advised->count == AREAS_MAX)
-		return; /* advice is no more than that */
-	advised->area[advised->count].start = m->start;
-	advised->area[advised->count].end = m->end;
-	advised->area[advised->count++].flags = flags;
+	if (marks->count == AREAS_MAX)
+		return;
+	marks->area[marks->count].start = m->start;
+	marks->area[marks->count].end = m->end;
+	marks->area[marks->count++].flags = flags;
+}
+
+/* A file, or a device.  It is not opened to find out whether it can be: that breaks leases, and may
+ * take its time. */
+static bool has_path(const struct mapping *m)
+{
+	static const char *const others[] = { "/memfd:", "/secretmem", "/dmabuf:" };
+
+	for (size_t i = 0; i < sizeof others / sizeof *others; i++)
+		if (!strncmp(m->name, others[i], strlen(others[i])))
+			return false;
+	return m->name[0] == '/';
+}
+
+/* A restored process that does not have it from its parent would have to map it itself, of what
+ * is behind it: not of a socket's ring (packet(7)), of memfd_secret(2), or for writing of a memfd
+ * that is sealed. */
+static bool is_only_here(pid_t template, const struct mapping *m)
+{
+	int fd, seals;
+
+	if (!m->shared || !m->inode || has_path(m))
+		return false;
+	fd = proc_open_mapped(template, m, O_RDONLY | O_NONBLOCK);
+	if (fd < 0)
+		return errno == ENXIO;
+	seals = fcntl(fd, F_GET_SEALS); /* -1: it knows none */
+	close(fd);
+	return m->mode[1] == 'w' && seals > 0 && seals & (F_SEAL_WRITE | F_SEAL_FUTURE_WRITE);
+}
+
+static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
+{
+	const uint32_t kind = m->flags & (MAPPING_DROPPABLE | MAPPING_GROWING | MAPPING_SEALED);
+
+	return survey->target->descendant && is_only_here(survey->template, m)
+		       ? kind | MAPPING_ONLY_HERE
+		       : kind;
 }
 
 static int find_area(const struct mapping *m, void *arg)
@@ -466,8 +515,11 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
-	if (survey->target->descendant && !is_pad(survey->target, m->start))
-		find_advised(&survey->memory->advised, m);
+	if (!is_pad(survey->target, m->start)) {
+		mark(&survey->memory->kinds, m, kind_of(survey, m));
+		if (survey->target->descendant)
+			mark(&survey->memory->advised, m, advice_of(m));
+	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
 	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->target, m->start))
 		return 0;
@@ -519,11 +571,9 @@ static bool same_areas(const struct areas *a, const struct areas *b)
 /* The shared memory itself, by the mapping of the template. */
 static int open_area(pid_t template, struct area *a, struct avc_error *err)
 {
-	char name[64];
+	const struct mapping at = { .start = a->start, .end = a->end };
 
-	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)a->start,
-		 (unsigned long)a->end);
-	a->fd = proc_open(template, name, O_RDWR);
+	a->fd = proc_open_mapped(template, &at, O_RDWR);
 	if (a->fd < 0)
 		return fail_errno(err, template, "keep memory", "open(map_files)",
 				  "shared memory can not be reached");
@@ -586,11 +636,12 @@ static int check_areas(struct target *target, const struct generation *generatio
 	start = now_ns();
 	survey = (struct survey){
 		.target = target,
+		.template = generation->template,
 		.memory = memory,
 		.limit = target->shm_bytes,
 		.areas = found,
 	};
-	memory->advised.count = 0;
+	memory->advised.count = memory->kinds.count = 0;
 	if (proc_mappings(generation->template, "smaps", find_area, &survey))
 		result = fail_errno(err, generation->template, "keep memory", "read(smaps)",
 				    "it was killed");
@@ -610,6 +661,8 @@ static int check_areas(struct target *target, const struct generation *generatio
 	memory->layout = result ? 0 : survey.layout;
 	free(found);
 out:
+	if (generation->image)
+		generation->image->kinds = memory->kinds;
 	if (!result && generation->image && !generation->image->whole)
 		result = fail(err, AVC_DEADLINE, 0, target->pid, "keep memory", "",
 			      "its shared memory can not be read");
@@ -657,18 +710,7 @@ static int fill_wiped(struct target *target, struct generation *generation, stru
 
 static int find_locked(const struct mapping *m, void *arg)
 {
-	struct locked *locked = arg;
-
-	if (!(m->flags & MAPPING_LOCKED))
-		return 0;
-	if (locked->count && locked->area[locked->count - 1].end == m->start) {
-		locked->area[locked->count - 1].end = m->end;
-		return 0;
-	}
-	if (locked->count == AREAS_MAX)
-		return 0; /* the last ones stay unlocked: nothing breaks */
-	locked->area[locked->count].start = m->start;
-	locked->area[locked->count++].end = m->end;
+	mark(arg, m, m->flags & MAPPING_LOCKED);
 	return 0;
 }
 
@@ -684,7 +726,7 @@ static void lock_again(struct target *target, int64_t locked_kb, struct setup *s
 	if (locked_kb > 0 &&
 	    (locked_kb != memory->locked_kb || memory->layout != memory->locked_layout ||
 	     start - memory->locked_read_ns > memory->locked_cost_ns * SMAPS_SHARE)) {
-		struct locked found = { 0 };
+		struct marks found = { 0 };
 
 		/* Of one that has just died there is nothing to be seen any more; what
 		 * was known of it is right, as a rule. */
@@ -716,6 +758,16 @@ static void advise_again(const struct memory *memory, struct setup *setup)
 					->flags = INJ_MAY_FAIL;
 }
 
+/* After all that is mapped and advised. */
+static void seal_again(const struct memory *memory, struct setup *setup)
+{
+	for (uint32_t i = 0; i < memory->kinds.count; i++)
+		if (memory->kinds.area[i].flags & MAPPING_SEALED)
+			setup_add(setup, INJ_BEFORE, "mseal", MSEAL, memory->kinds.area[i].start,
+				  memory->kinds.area[i].end - memory->kinds.area[i].start, 0, 0, 0)
+				->flags = INJ_MAY_FAIL;
+}
+
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
@@ -725,6 +777,8 @@ int memory_finish(struct target *target, struct generation *generation, int64_t 
 		return -1;
 	lock_again(target, locked_kb, setup);
 	advise_again(target->memory, setup);
+	if (target->descendant)
+		seal_again(target->memory, setup);
 	if (main_thread && main_thread->creds.future_lock)
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
 			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)

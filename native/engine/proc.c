@@ -26,6 +26,15 @@ int proc_open(pid_t pid, const char *name, int flags)
 	return open(path, flags | O_CLOEXEC);
 }
 
+int proc_open_mapped(pid_t pid, const struct mapping *m, int flags)
+{
+	char name[64];
+
+	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)m->start,
+		 (unsigned long)m->end);
+	return proc_open(pid, name, flags);
+}
+
 /* From the start, also of one that was read before; what is read is terminated. */
 static ssize_t read_text(int fd, char *buf, size_t size)
 {
@@ -212,7 +221,7 @@ static const struct {
 	{ "dc", MAPPING_DONTFORK },  { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
 	{ "lo", MAPPING_LOCKED },    { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
 	{ "hg", MAPPING_HUGE },      { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
-	{ "mg", MAPPING_MERGEABLE },
+	{ "mg", MAPPING_MERGEABLE }, { "gd", MAPPING_GROWING },    { "sl", MAPPING_SEALED },
 };
 
 static uint32_t parse_flags(const char *p)

@@ -19,6 +19,7 @@
 #include "internal.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
+#define DROPPABLE 0x08 /* MAP_DROPPABLE, since Linux 6.11; the headers may be older */
 
 /* A stretch that is in one mapping of both at most. */
 struct piece {
@@ -68,10 +69,17 @@ static bool is_file(const struct mapping *m)
 	return m->inode != 0;
 }
 
+/* By which it was mapped. */
+static uint32_t kind_of(const struct mapping *m)
+{
+	return (m->flags & (MAPPING_DROPPABLE | MAPPING_GROWING)) |
+	       (is_stack(m) ? MAPPING_GROWING : 0);
+}
+
 static bool same_backing(const struct mapping *a, const struct mapping *b)
 {
 	return a->shared == b->shared && is_stack(a) == is_stack(b) && a->inode == b->inode &&
-	       is_special(a) == is_special(b) &&
+	       is_special(a) == is_special(b) && kind_of(a) == kind_of(b) &&
 	       (!is_file(a) ||
 		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
 }
@@ -193,14 +201,9 @@ static int move_special(const struct remap *r, struct puppet *puppet, struct avc
 
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	char name[64];
-	int fd = -1;
+	const int fd = m->shared ? proc_open_mapped(template, m, O_RDWR) : -1;
 
-	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)m->start,
-		 (unsigned long)m->end);
-	if (m->shared)
-		fd = proc_open(template, name, O_RDWR);
-	return fd >= 0 ? fd : proc_open(template, name, O_RDONLY);
+	return fd >= 0 ? fd : proc_open_mapped(template, m, O_RDONLY);
 }
 
 /* Libraries are mapped in several pieces, one after the other: opened once. */
@@ -231,12 +234,16 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 {
 	const struct mapping *m = piece->want;
 	const uint64_t bytes = piece->end - piece->start, prot = (uint64_t)protection(m);
-	const int stack = is_stack(m) ? MAP_GROWSDOWN | MAP_STACK : 0;
-	const int flags = MAP_FIXED | (m->shared ? MAP_SHARED : MAP_PRIVATE | MAP_NORESERVE);
+	const int flags = MAP_FIXED |
+			  (m->shared                      ? MAP_SHARED
+			   : m->flags & MAPPING_DROPPABLE ? DROPPABLE
+							  : MAP_PRIVATE | MAP_NORESERVE);
+	const int growing = kind_of(m) & MAPPING_GROWING ? MAP_GROWSDOWN : 0;
 
 	if (!is_file(m))
 		return puppet_ask(puppet, SYS_mmap, piece->start, bytes, prot,
-				  (uint64_t)(flags | MAP_ANONYMOUS | stack), (uint64_t)-1, 0, err);
+				  (uint64_t)(flags | MAP_ANONYMOUS | growing), (uint64_t)-1, 0,
+				  err);
 	return give_file(r, puppet, m, given, err) ||
 			       puppet_ask(puppet, SYS_mmap, piece->start, bytes, prot,
 					  (uint64_t)flags, 1, m->offset + (piece->start - m->start),
@@ -414,6 +421,46 @@ struct remap *remap_plan(const struct target *target, struct snapshot *want, str
 failed:
 	remap_free(r);
 	return NULL;
+}
+
+/* mseal(2): nobody takes it away or protects it otherwise, not in a fork either. */
+static bool is_stuck(const struct piece *piece)
+{
+	return piece->is && piece->is->flags & MAPPING_SEALED &&
+	       (!piece->kept || protection(piece->is) != protection(piece->want));
+}
+
+static bool is_lost(const struct piece *piece)
+{
+	return piece->want && piece->want->flags & MAPPING_ONLY_HERE && !piece->kept;
+}
+
+int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
+		struct avc_error *err)
+{
+	struct remap r = { .target = target, .want = want, .is = is };
+	const struct mapping *a = find_special(&is->maps, "[vdso]");
+	const struct mapping *b = find_special(&want->maps, "[vdso]");
+	int result = cut(&r, err);
+
+	if (!result && a && b && a->flags & MAPPING_SEALED && a->start != b->start)
+		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			      "process %d has executed another program, and the kernel seals its "
+			      "vDSO (mseal(2))",
+			      target->inside);
+	for (uint32_t i = 0; !result && i < r.pieces; i++) {
+		if (is_lost(&r.piece[i]))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+				      "process %d has mapped what no other process can map: %s",
+				      target->inside, r.piece[i].want->name);
+		else if (is_stuck(&r.piece[i]))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+				      "process %d has other memory than its parent where that has "
+				      "sealed it (mseal(2))",
+				      target->inside);
+	}
+	free(r.piece);
+	return result;
 }
 
 int remap(const struct remap *r, struct puppet *puppet, struct copier *copier,

@@ -46,7 +46,7 @@ static int add_mapping(const struct mapping *m, void *arg)
 	return 0;
 }
 
-struct snapshot *snapshot_new(pid_t template, struct avc_error *err)
+struct snapshot *snapshot_new(pid_t template, const struct mem_image *image, struct avc_error *err)
 {
 	struct snapshot *snapshot = calloc(1, sizeof *snapshot);
 
@@ -61,6 +61,8 @@ struct snapshot *snapshot_new(pid_t template, struct avc_error *err)
 		snapshot_free(snapshot);
 		return NULL;
 	}
+	for (uint32_t i = 0; i < snapshot->maps.count; i++)
+		snapshot->maps.map[i].flags = mem_image_marks(image, snapshot->maps.map[i].start);
 	snapshot->pages = calloc(snapshot->maps.count + 1, sizeof *snapshot->pages);
 	if (!snapshot->pages) {
 		fail_errno(err, template, "restore memory", "calloc", "out of memory");

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import signal
@@ -99,8 +100,13 @@ def restored(victim: Victim, guard: GuardProcess) -> Json:
     return event
 
 
-@pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["guard", "unguard", "sealed", "late", "droppable", "growing"])
+@pytest.mark.parametrize(
+    ("scenario", "where"),
+    [
+        *itertools.product(["guard", "unguard", "sealed", "droppable", "growing", "unmoved"], WHERE),
+        ("late", ""),  # a child could not map it again
+    ],
+)
 def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
     """From each of two checkpoints, again and again, with nothing to be told."""
     command = f"regions {scenario} {tmp_path} {where}"
