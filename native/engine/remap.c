@@ -13,6 +13,8 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/shm.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -229,6 +231,38 @@ static int give_file(const struct remap *r, struct puppet *puppet, const struct 
 	return result;
 }
 
+/* All of a segment of System V shared memory.  Its inode has the number of the segment
+ * (ipc/shm.c, newseg()). */
+static bool is_segment(pid_t template, const struct mapping *m)
+{
+	struct stat st = { 0 };
+	int fd = -1;
+
+	if (m->shared && !m->offset && !strncmp(m->name, "/SYSV", 5))
+		fd = open_mapped(template, m);
+	if (fd < 0 || fstat(fd, &st))
+		st.st_size = 0;
+	close_fd(&fd);
+	return ((uint64_t)st.st_size + PAGE - 1) / PAGE == (m->end - m->start) / PAGE;
+}
+
+/* In the place of what has been mapped, or shmdt(2) would not know it.  Who may not attach it any
+ * more keeps that. */
+static int attach(const struct remap *r, struct puppet *puppet, const struct piece *piece,
+		  struct avc_error *err)
+{
+	const struct mapping *m = piece->want;
+	const int flags = SHM_REMAP | (m->mode[1] == 'w' ? 0 : SHM_RDONLY) |
+			  (m->mode[2] == 'x' ? SHM_EXEC : 0);
+
+	if (piece->start != m->start || piece->end != m->end || !is_segment(r->want->template, m))
+		return 0;
+	if (puppet_ask(puppet, SYS_shmat, m->inode, m->start, (uint64_t)flags, 0, 0, 0, err))
+		return -1;
+	puppet_soften(puppet, "System V shared memory is only mapped: it can not be detached");
+	return puppet_flush(puppet, err);
+}
+
 static int map_piece(const struct remap *r, struct puppet *puppet, const struct piece *piece,
 		     const struct mapping **given, struct avc_error *err)
 {
@@ -247,7 +281,8 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 	return give_file(r, puppet, m, given, err) ||
 			       puppet_ask(puppet, SYS_mmap, piece->start, bytes, prot,
 					  (uint64_t)flags, 1, m->offset + (piece->start - m->start),
-					  err)
+					  err) ||
+			       attach(r, puppet, piece, err)
 		       ? -1
 		       : 0;
 }

@@ -103,7 +103,7 @@ def restored(victim: Victim, guard: GuardProcess) -> Json:
 @pytest.mark.parametrize(
     ("scenario", "where"),
     [
-        *itertools.product(["guard", "unguard", "sealed", "droppable", "growing", "unmoved"], WHERE),
+        *itertools.product(["guard", "unguard", "sealed", "droppable", "growing", "attached", "unmoved"], WHERE),
         ("late", ""),  # a child could not map it again
     ],
 )
