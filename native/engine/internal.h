@@ -1167,6 +1167,8 @@ void rewind_forget(struct target *target, struct thread *thread);
 /* Looks at a running app for what can not be protected.  0, or -1 with
  * AVC_UNSUPPORTED and the reason in words. */
 int support_check(struct target *target, struct avc_error *err) warn_unused;
+/* The same of a stopped thread. */
+int support_check_thread(pid_t tid, struct avc_error *err) warn_unused;
 /* Whether the (running, infected) process has another program: what was brought into it
  * is gone. */
 bool has_executed(const struct target *target);

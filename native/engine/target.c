@@ -390,7 +390,7 @@ static int read_signal_state(struct thread *thread, struct avc_error *err)
 	thread->rseq = rseq.pointer;
 	thread->rseq_bytes = rseq.bytes;
 	thread->rseq_signature = rseq.signature;
-	return 0;
+	return support_check_thread(thread->tid, err);
 }
 
 int thread_read(struct thread *thread, struct avc_error *err)

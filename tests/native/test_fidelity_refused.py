@@ -33,6 +33,14 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported bounds", "lacks CAP_SETPCAP"),
         ("unsupported shared-files", "shares its descriptor table"),
         ("unsupported shared-folder", "shares its working directory"),
+        ("unsupported dispatch", "Syscall User Dispatch"),
+        ("unsupported dispatch --in-child", "Syscall User Dispatch"),
+        ("unsupported limited", "RLIMIT_AS"),
+        ("unsupported limited --in-child", "RLIMIT_AS"),
+        ("unsupported ring --in-child", "no other process can map: socket:"),
+        ("unsupported secret --in-child", "no other process can map: /secretmem"),
+        ("unsupported future --in-child", "no other process can map: /memfd:future"),
+        ("unsupported stuck", "mseal"),
     ],
 )
 def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path) -> None:
@@ -55,7 +63,10 @@ def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path
 
 @pytest.mark.parametrize(
     ("kind", "why"),
-    [("iouring", "io_uring"), ("aio", "AIO"), ("userfault", "userfaultfd"), ("nested", "a container in the container")],
+    [
+        *(("iouring", "io_uring"), ("aio", "AIO"), ("userfault", "userfaultfd")),
+        *(("nested", "a container in the container"), ("dispatch", "Syscall User Dispatch"), ("stuck", "mseal")),
+    ],
 )
 def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
     """What was held until then is given up: the application is another one now."""

@@ -23,10 +23,20 @@
  *   bounds    one thread with a smaller bounding set, which the main thread may not lower
  *   shared-files, shared-folder   a child process with the descriptors, or the working
  *             directory, of its parent
+ *   dispatch  its system calls are dispatched by itself, and while it makes none are blocked
+ *             (PR_SET_SYSCALL_USER_DISPATCH)
+ *   limited   may have 32 MB of memory more (RLIMIT_AS)
+ *   ring      has a packet socket's ring mapped
+ *   secret    has memory of memfd_secret(2) mapped
+ *   future    has a memfd mapped for writing that is sealed against that (F_SEAL_FUTURE_WRITE)
+ *   stuck     has sealed memory (mseal(2)), and a child that is another program
  */
+#include <arpa/inet.h>
 #include <linux/aio_abi.h>
 #include <linux/capability.h>
 #include <linux/filter.h>
+#include <linux/if_ether.h>
+#include <linux/if_packet.h>
 #include <linux/io_uring.h>
 #include <linux/seccomp.h>
 #include <pthread.h>
@@ -35,8 +45,10 @@
 #include <sys/ipc.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
+#include <sys/resource.h>
 #include <sys/sem.h>
 #include <sys/shm.h>
+#include <sys/socket.h>
 #include <sys/wait.h>
 
 #include "victim.h"
@@ -329,6 +341,128 @@ static bool start_shared_folder(void)
 	return start_child(CLONE_FS);
 }
 
+static volatile char selector; /* of the dispatch: 1 blocks */
+static bool dispatched;
+
+static void on_dispatch(int signal, siginfo_t *info, void *context)
+{
+	(void)signal;
+	(void)context;
+	selector = 0;
+	violation("system call %d, which it has not made, has come to it", info->si_syscall);
+}
+
+static bool start_dispatch(void)
+{
+	const struct sigaction act = { .sa_sigaction = on_dispatch, .sa_flags = SA_SIGINFO };
+
+	sigaction(SIGSYS, &act, NULL);
+	dispatched = !prctl(59 /* PR_SET_SYSCALL_USER_DISPATCH */, 1, 0, 0, &selector);
+	return dispatched;
+}
+
+static void stop_dispatch(void)
+{
+	dispatched = prctl(59, 0, 0, 0, 0) != 0;
+}
+
+/* Without a system call, for the clock needs none. */
+static void be_dispatched(void)
+{
+	const uint64_t end = now_ns() + 2000000;
+
+	selector = 1;
+	while (now_ns() < end)
+		;
+	selector = 0;
+}
+
+static bool start_limited(void)
+{
+	struct rlimit limit;
+	long pages = 0;
+	FILE *statm = fopen("/proc/self/statm", "re");
+
+	if (!statm || fscanf(statm, "%ld", &pages) != 1 || getrlimit(RLIMIT_AS, &limit))
+		return false;
+	fclose(statm);
+	limit.rlim_cur = (rlim_t)pages * 4096 + (32 << 20);
+	return !setrlimit(RLIMIT_AS, &limit);
+}
+
+static void stop_limited(void)
+{
+	struct rlimit limit;
+
+	must(!getrlimit(RLIMIT_AS, &limit), "getrlimit");
+	limit.rlim_cur = limit.rlim_max;
+	must(!setrlimit(RLIMIT_AS, &limit), "setrlimit");
+}
+
+static bool start_ring(void)
+{
+	struct tpacket_req ring = { 65536, 2, 2048, 64 };
+
+	fd = socket(AF_PACKET, SOCK_RAW, htons(ETH_P_ALL));
+	if (fd < 0 || setsockopt(fd, SOL_PACKET, PACKET_RX_RING, &ring, sizeof ring))
+		return false;
+	memory = mmap(NULL, 131072, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	return memory != MAP_FAILED;
+}
+
+static void stop_ring(void)
+{
+	munmap(memory, 131072);
+	close(fd);
+}
+
+static bool map_file(int file)
+{
+	if (file < 0 || ftruncate(file, 4096))
+		return false;
+	memory = mmap(NULL, 4096, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+	fd = file;
+	return memory != MAP_FAILED;
+}
+
+static bool start_secret(void)
+{
+	return map_file((int)syscall(447 /* SYS_memfd_secret */, O_CLOEXEC));
+}
+
+static bool start_future(void)
+{
+	return map_file(memfd_create("future", MFD_ALLOW_SEALING | MFD_CLOEXEC)) &&
+	       !fcntl(fd, F_ADD_SEALS, 0x10 /* F_SEAL_FUTURE_WRITE */);
+}
+
+static void stop_file(void)
+{
+	munmap(memory, 4096);
+	close(fd);
+}
+
+static pid_t other;
+
+static bool start_stuck(void)
+{
+	memory = mmap(NULL, 65536, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+	if (memory == MAP_FAILED || syscall(462 /* SYS_mseal */, memory, 65536, 0))
+		return false;
+	other = fork();
+	if (other == 0) {
+		execl("/bin/sleep", "sleep", "1000", NULL);
+		_exit(1);
+	}
+	return other > 0;
+}
+
+static void stop_stuck(void)
+{
+	kill(other, SIGKILL);
+	waitpid(other, NULL, 0);
+}
+
 static const struct kind {
 	const char *name;
 	bool (*start)(void);
@@ -352,6 +486,12 @@ static const struct kind {
 	{ "bounds", start_bounds, NULL },
 	{ "shared-files", start_shared_files, NULL },
 	{ "shared-folder", start_shared_folder, NULL },
+	{ "dispatch", start_dispatch, stop_dispatch },
+	{ "limited", start_limited, stop_limited },
+	{ "ring", start_ring, stop_ring },
+	{ "secret", start_secret, stop_file },
+	{ "future", start_future, stop_file },
+	{ "stuck", start_stuck, stop_stuck },
 };
 
 int main(int argc, char **argv)
@@ -396,6 +536,8 @@ int main(int argc, char **argv)
 			to_ns = 0;
 			board->counter[0] = 0;
 		}
+		if (dispatched)
+			be_dispatched();
 		beat();
 		nap_us(1000);
 	}
