@@ -19,6 +19,7 @@
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
 #include <sys/random.h>
+#include <sys/resource.h>
 #include <sys/syscall.h>
 #include <sys/uio.h>
 #include <sys/wait.h>
@@ -30,6 +31,7 @@
 #define PADS_START UINT64_C(0x200000000000)
 #define PADS (UINT64_C(1) << 19)
 #define PAD_DISTANCE (UINT64_C(64) << 20)
+#define PAD_SHARE 16 /* of what may be mapped, the pad is a 16th at most */
 _Static_assert(CAVE_BYTES >= ARCH_STUB_BYTES, "the stub must fit");
 
 /* True if the last bytes of the mapping are a stub that a guard which died could not
@@ -178,6 +180,24 @@ static uint64_t where_to_map(const struct target *target)
 	return PADS_START + target->nonce % PADS * PAD_DISTANCE;
 }
 
+/* RLIMIT_AS counts the pad, too: what the app could still map before it has to be able to map
+ * with it, as far as one can tell.  So only where the pad is next to nothing of that. */
+static int check_room(const struct target *target, size_t bytes, struct avc_error *err)
+{
+	const long pages = proc_vm_pages(target->statm_fd, NULL);
+	uint64_t limit[LIMITS][2];
+
+	if (pages < 0 || proc_limits(target->pid, limit))
+		return fail_errno(err, target->pid, "infect", "open(limits)", "it has ended");
+	if (limit[RLIMIT_AS][0] == ~UINT64_C(0) ||
+	    (uint64_t)pages * ARCH_PAGE_BYTES + PAD_SHARE * bytes <= limit[RLIMIT_AS][0])
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "infect", "",
+		    "it may map so little more memory (RLIMIT_AS, ulimit -v) that it would miss "
+		    "the %zu kB which protection takes",
+		    bytes / 1024);
+}
+
 static int make_pad(struct target *target, struct thread *thread, avc_remote cave, uint32_t slots,
 		    uint32_t threads_max, struct avc_error *err)
 {
@@ -187,6 +207,8 @@ static int make_pad(struct target *target, struct thread *thread, avc_remote cav
 			    (uint64_t)-1,           0 };
 	long base, result;
 
+	if (check_room(target, pad->bytes, err))
+		return -1;
 	if (stub_syscall(thread, cave, SYS_mmap, arg, &base, err))
 		return -1;
 	if (base < 0 && base > -4096)
