@@ -276,7 +276,8 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
 	if (target->mem_fd < 0)
 		return fail_errno(err, target->pid, "infect", "open(mem)", "it has ended");
-	if (check_task(target, thread, err) || survey(target, arch_pc(&thread->regs), &cave, err))
+	if (support_check_thread(thread->tid, err) || check_task(target, thread, err) ||
+	    survey(target, arch_pc(&thread->regs), &cave, err))
 		return -1;
 	rseq_fixup(target->mem_fd, thread);
 	home = thread->regs;

@@ -341,6 +341,8 @@ static bool has_memory_of_holder(const struct target *target)
 
 int vet(struct target *target, struct thread *thread, struct avc_error *err)
 {
+	if (support_check_thread(thread->tid, err))
+		return -1;
 	if (!has_memory_of_holder(target) && pad_check(target, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a pad that will be taken away. */

@@ -390,7 +390,7 @@ static int read_signal_state(struct thread *thread, struct avc_error *err)
 	thread->rseq = rseq.pointer;
 	thread->rseq_bytes = rseq.bytes;
 	thread->rseq_signature = rseq.signature;
-	return support_check_thread(thread->tid, err);
+	return 0;
 }
 
 int thread_read(struct thread *thread, struct avc_error *err)
@@ -631,7 +631,9 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 			*err = gone;
 			return -1;
 		}
+		t->seen |= t->known; /* or it is no thread */
 	}
+	threads_forget_unseen(target);
 	qsort(target->threads, target->thread_count, sizeof *target->threads, by_inside);
 	return 0;
 }
