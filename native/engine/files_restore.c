@@ -100,35 +100,76 @@ static void break_pairs(struct files_work *work)
 
 /* A terminal whose session's leader has died is hung up: what was open of it stays dead
  * (drivers/tty/tty_io.c, __tty_hangup()), and has to be opened again. */
-static void give_up_hung_up(struct files_work *work)
+static bool is_hung_up(int fd, const struct file *w)
 {
-	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file *w = &work->want->file[i];
-		struct termios settings;
-		int fd;
+	struct termios settings;
 
-		if (!file_is_pts(w) || work->source[i] < 0)
-			continue;
-		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
-		if (fd >= 0 && tcgetattr(fd, &settings) && errno == EIO)
-			work->source[i] = -1;
-		close_fd(&fd);
-	}
+	(void)w;
+	return tcgetattr(fd, &settings) && errno == EIO;
+}
+
+static bool has_the_last(const struct file *w)
+{
+	return w->kind == FILE_SOCKET && w->ended && w->content;
 }
 
 /* Nobody can send again what was read since from a socket that has no other end. */
-static void give_up_read(struct files_work *work)
+static bool was_read(int fd, const struct file *w)
 {
+	int bytes = 0;
+
+	return ioctl(fd, FIONREAD, &bytes) || (uint32_t)bytes != w->content_bytes;
+}
+
+static bool has_node(const struct file *w)
+{
+	return w->socket && w->socket->node;
+}
+
+/* Nobody finds a Unix socket any more whose file was deleted since: made again, it has one. */
+static bool is_deleted(int fd, const struct file *w)
+{
+	return file_unix_is_deleted(fd, w->socket);
+}
+
+static bool was_idle(const struct file *w)
+{
+	return w->socket && w->socket->idle;
+}
+
+/* Who was about to give it a name, or to connect it, will do so again, and the kernel lets
+ * nobody do that twice (bind(2): EINVAL, connect(2): EISCONN). */
+static bool was_used(int fd, const struct file *w)
+{
+	return file_socket_was_used(fd, w->socket);
+}
+
+/* It is there still, and of no use: another one is made. */
+static void give_up_useless(struct files_work *work)
+{
+	static const struct {
+		bool (*concerns)(const struct file *w);
+		bool (*is_useless)(int fd, const struct file *w);
+	} doubts[] = {
+		{ file_is_pts, is_hung_up },
+		{ has_the_last, was_read },
+		{ has_node, is_deleted },
+		{ was_idle, was_used },
+	};
+
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
-		int fd, bytes = 0;
 
-		if (w->kind != FILE_SOCKET || !w->ended || !w->content || work->source[i] < 0)
-			continue;
-		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
-		if (fd < 0 || ioctl(fd, FIONREAD, &bytes) || (uint32_t)bytes != w->content_bytes)
-			work->source[i] = -1;
-		close_fd(&fd);
+		for (size_t k = 0; k < sizeof doubts / sizeof *doubts; k++) {
+			int fd = -1;
+
+			if (work->source[i] >= 0 && doubts[k].concerns(w))
+				fd = files_borrow(work->table_pidfd,
+						  work->now->file[work->source[i]].fd);
+			if (fd >= 0 && doubts[k].is_useless(fd, w))
+				work->source[i] = -1;
+			close_fd(&fd);
+		}
 	}
 }
 
@@ -142,39 +183,6 @@ static void give_up_pidfds(struct files_work *work)
 			continue;
 		work->source[files_leader(work->want, w)] = -1;
 		work->lost[i] = true;
-	}
-}
-
-/* Nobody finds a Unix socket any more whose file was deleted since: made again, it has one. */
-static void give_up_deleted(struct files_work *work)
-{
-	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file *w = &work->want->file[i];
-		int fd;
-
-		if (!w->socket || !w->socket->node || work->source[i] < 0)
-			continue;
-		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
-		if (fd >= 0 && file_unix_is_deleted(fd, w->socket))
-			work->source[i] = -1;
-		close_fd(&fd);
-	}
-}
-
-/* Who was about to give it a name, or to connect it, will do so again, and the kernel lets
- * nobody do that twice (bind(2): EINVAL, connect(2): EISCONN). */
-static void give_up_used(struct files_work *work)
-{
-	for (uint32_t i = 0; i < work->want->count; i++) {
-		const struct file *w = &work->want->file[i];
-		int fd;
-
-		if (!w->socket || !w->socket->idle || work->source[i] < 0)
-			continue;
-		fd = files_borrow(work->table_pidfd, work->now->file[work->source[i]].fd);
-		if (fd >= 0 && file_socket_was_used(fd, w->socket))
-			work->source[i] = -1;
-		close_fd(&fd);
 	}
 }
 
@@ -727,11 +735,8 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_staying(work);
 	find_moved(work);
-	give_up_hung_up(work);
-	give_up_read(work);
+	give_up_useless(work);
 	give_up_pidfds(work);
-	give_up_deleted(work);
-	give_up_used(work);
 	break_pairs(work);
 	return 0;
 }
