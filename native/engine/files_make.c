@@ -96,8 +96,7 @@ static int open_mapped(const struct file *want, pid_t template)
 		if (sscanf(line, "%lx-%lx %*s %*x %*s %lu", &start, &end, &ino) != 3 ||
 		    ino != want->ino)
 			continue;
-		snprintf(path, sizeof path, "map_files/%lx-%lx", start, end);
-		fd = proc_open(template, path, O_PATH);
+		fd = proc_open_mapped(template, start, end, O_PATH);
 		if (fd >= 0 && !is_the_one(fd, want))
 			close_fd(&fd);
 	}

@@ -51,18 +51,15 @@ static int take_area(const struct mapping *m, void *arg)
 	struct files_mapped *mapped = look->mapped;
 	struct mapped_area *a = &mapped->area[mapped->count];
 	const size_t bytes = m->end - m->start;
-	char name[64];
 
 	if (!is_data(m) || mapped->count == MAPPED_MAX || bytes > look->bytes_left)
 		return 0;
-	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)m->start,
-		 (unsigned long)m->end);
 	*a = (struct mapped_area){
 		.start = m->start,
 		.end = m->end,
 		.offset = m->offset,
 		.inode = m->inode,
-		.fd = proc_open(look->pid, name, O_RDONLY | O_CLOEXEC),
+		.fd = proc_open_mapped(look->pid, m->start, m->end, O_RDONLY),
 	};
 	if (a->fd < 0)
 		return 0;

@@ -571,23 +571,6 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 	return 0;
 }
 
-/* To hand descriptors over takes some more, and there may be one with a number that was allowed
- * once.  Limits beyond what it may give itself need CAP_SYS_RESOURCE (setrlimit(2)). */
-static void allow_numbers(pid_t pid, int room, struct rlimit *before)
-{
-	struct rlimit more;
-
-	if (prlimit(pid, RLIMIT_NOFILE, NULL, before) || before->rlim_cur >= (rlim_t)room)
-		return;
-	more = (struct rlimit){ (rlim_t)room, before->rlim_max };
-	if (more.rlim_max < more.rlim_cur)
-		more.rlim_max = more.rlim_cur;
-	if (prlimit(pid, RLIMIT_NOFILE, &more, NULL) == 0)
-		return;
-	more.rlim_cur = more.rlim_max = before->rlim_max;
-	prlimit(pid, RLIMIT_NOFILE, &more, NULL);
-}
-
 static int put_lost(struct files_work *work, struct avc_error *err)
 {
 	struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
@@ -612,7 +595,11 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 			numbers.taken[work->now->file[i].fd] = 1;
 	if (flush(work, err))
 		goto out;
-	allow_numbers(work->table, numbers.room, &limit);
+	/* To hand descriptors over takes some more, and there may be one with a number that was
+	 * allowed once. */
+	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
+	    limit.rlim_cur < (rlim_t)numbers.room)
+		limit_lift(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
 		 pad_remote(pad, call->out), 0);
 	if (flush(work, err))

@@ -174,8 +174,9 @@ struct proc_status {
 int proc_status(pid_t tid, struct proc_status *status);
 /* "/proc/PID/NAME" opened, or -1 with errno. */
 int proc_open(pid_t pid, const char *name, int flags);
-/* What is mapped there. */
-int proc_open_mapped(pid_t pid, const struct mapping *mapping, int flags);
+/* What is mapped there (proc(5), map_files), or -1 with errno.  Needs CAP_CHECKPOINT_RESTORE or
+ * CAP_SYS_ADMIN. */
+int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags);
 
 /* ---- threads and targets ---------------------------------------------------- */
 
@@ -991,6 +992,9 @@ int manner_put(struct puppet *puppet, const struct branch *branch,
 /* Until then nothing is limited: it may have more than it may have now, and its parent may have
  * lowered its own limits since.  Its descriptors are below `files`. */
 void manner_lift_limits(pid_t pid, uint32_t files);
+/* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
+ * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
+void limit_lift(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
 void manner_setup_limits(const struct branch *branch, struct setup *setup);
 

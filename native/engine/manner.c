@@ -195,24 +195,25 @@ static void put_mm(struct puppet *puppet, const struct manner *manner)
 	puppet_soften(puppet, "what it knows of its heap and arguments could not be put back");
 }
 
+void limit_lift(pid_t pid, int which, uint64_t least)
+{
+	struct rlimit now, lifted;
+
+	if (prlimit(pid, which, NULL, &now))
+		return;
+	lifted.rlim_cur = lifted.rlim_max = now.rlim_max > least ? now.rlim_max : least;
+	if (prlimit(pid, which, &lifted, NULL) == 0)
+		return;
+	/* We may not; but up to there everybody may. */
+	now.rlim_cur = now.rlim_max;
+	(void)prlimit(pid, which, &now, NULL);
+}
+
 void manner_lift_limits(pid_t pid, uint32_t files)
 {
-	for (int i = 0; i < LIMITS; i++) {
-		struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
-
-		/* Of descriptors there may not be any number (sysctl fs.nr_open). */
-		if (i == RLIMIT_NOFILE && prlimit(pid, i, NULL, &limit) == 0) {
-			limit.rlim_max = limit.rlim_max > files ? limit.rlim_max : files;
-			limit.rlim_cur = limit.rlim_max;
-		}
-		if (prlimit(pid, i, &limit, NULL) == 0)
-			continue;
-		/* We may not; but up to there everybody may. */
-		if (prlimit(pid, i, NULL, &limit) == 0) {
-			limit.rlim_cur = limit.rlim_max;
-			(void)prlimit(pid, i, &limit, NULL);
-		}
-	}
+	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
+	for (int i = 0; i < LIMITS; i++)
+		limit_lift(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
 }
 
 void manner_setup_limits(const struct branch *branch, struct setup *setup)

@@ -488,7 +488,7 @@ static bool is_only_here(pid_t template, const struct mapping *m)
 
 	if (!m->shared || !m->inode || has_path(m))
 		return false;
-	fd = proc_open_mapped(template, m, O_RDONLY | O_NONBLOCK);
+	fd = proc_open_mapped(template, m->start, m->end, O_RDONLY | O_NONBLOCK);
 	if (fd < 0)
 		return errno == ENXIO;
 	seals = fcntl(fd, F_GET_SEALS); /* -1: it knows none */
@@ -571,9 +571,7 @@ static bool same_areas(const struct areas *a, const struct areas *b)
 /* The shared memory itself, by the mapping of the template. */
 static int open_area(pid_t template, struct area *a, struct avc_error *err)
 {
-	const struct mapping at = { .start = a->start, .end = a->end };
-
-	a->fd = proc_open_mapped(template, &at, O_RDWR);
+	a->fd = proc_open_mapped(template, a->start, a->end, O_RDWR);
 	if (a->fd < 0)
 		return fail_errno(err, template, "keep memory", "open(map_files)",
 				  "shared memory can not be reached");
@@ -808,47 +806,51 @@ static bool is_equal(int mem_fd, const struct area *a, const uint8_t *image)
 	return true;
 }
 
-/* By the file, which need not be mapped for writing; and by the process's memory, which may
- * still be written though the file may not (F_SEAL_FUTURE_WRITE, and hugetlbfs does not know
- * write(2)). */
-static int put_back(const struct area *a, pid_t pid, int mem_fd, const uint8_t *from,
-		    struct avc_error *notes, struct avc_error *err)
+/* By the process's memory, which may still be written though the file may not
+ * (F_SEAL_FUTURE_WRITE, and hugetlbfs does not know write(2)). */
+static int put_into_memory(const struct area *a, pid_t pid, const uint8_t *from,
+			   struct avc_error *notes, struct avc_error *err)
+{
+	int mem_fd = proc_open(pid, "mem", O_RDWR), result = 0;
+
+	if (pwrite(mem_fd, from, a->kept, (off_t)a->start) == (ssize_t)a->kept)
+		;
+	else if (a->huge)
+		result = fail_errno(err, pid, "restore", "write(mem)",
+				    "shared memory can not be written");
+	else if (!is_equal(mem_fd, a, from)) /* what was sealed at the checkpoint is */
+		fail(notes, AVC_UNSUPPORTED, EPERM, pid, "restore", "pwrite",
+		     "%zu kB of shared memory have been sealed since, and are not rolled back",
+		     area_bytes(a) / 1024);
+	close_fd(&mem_fd);
+	return result;
+}
+
+/* By the file, which need not be mapped for writing. */
+static int put_back(const struct area *a, pid_t pid, const uint8_t *from, struct avc_error *notes,
+		    struct avc_error *err)
 {
 	const ssize_t n = a->huge ? 0 : pwrite(a->fd, from, a->kept, (off_t)a->offset);
 
 	if (n == (ssize_t)a->kept)
 		return 0;
-	if (!a->huge && (n >= 0 || errno != EPERM))
-		return fail_errno(err, pid, "restore", "pwrite",
-				  "shared memory can not be written");
-	if (pwrite(mem_fd, from, a->kept, (off_t)a->start) == (ssize_t)a->kept)
-		return 0;
-	if (a->huge)
-		return fail_errno(err, pid, "restore", "write(mem)",
-				  "shared memory can not be written");
-	/* What was sealed at the checkpoint is what it was. */
-	if (!is_equal(mem_fd, a, from))
-		fail(notes, AVC_UNSUPPORTED, EPERM, pid, "restore", "pwrite",
-		     "%zu kB of shared memory have been sealed since, and are not rolled back",
-		     area_bytes(a) / 1024);
-	return 0;
+	if (a->huge || (n < 0 && errno == EPERM))
+		return put_into_memory(a, pid, from, notes, err);
+	return fail_errno(err, pid, "restore", "pwrite", "shared memory can not be written");
 }
 
 int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *notes,
 		    struct avc_error *err)
 {
 	const uint8_t *from = image ? image->data : NULL;
-	int mem_fd = -1, result = 0;
+	int result = 0;
 
 	for (uint32_t i = 0; !result && image && i < image->areas.count; i++) {
 		const struct area *a = &image->areas.area[i];
 
-		if (mem_fd < 0)
-			mem_fd = proc_open(pid, "mem", O_RDWR);
 		if (!a->wiped && a->kept)
-			result = put_back(a, pid, mem_fd, from, notes, err);
+			result = put_back(a, pid, from, notes, err);
 		from += area_room(a);
 	}
-	close_fd(&mem_fd);
 	return result;
 }

@@ -48,14 +48,10 @@ size_t pad_layout(struct pad *pad, uint32_t slots, uint32_t threads_max)
 int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t nonce,
 	     struct avc_error *err)
 {
-	char name[64];
 	void *map;
 	int fd;
 
-	/* Needs CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN (proc(5), map_files). */
-	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)base,
-		 (unsigned long)(base + bytes));
-	fd = proc_open(pid, name, O_RDWR);
+	fd = proc_open_mapped(pid, base, base + bytes, O_RDWR);
 	if (fd < 0)
 		return fail_errno(err, pid, "infect", "open(map_files)",
 				  "the pad can not be reached");

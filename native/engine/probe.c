@@ -79,11 +79,8 @@ int avc_engine_probe(struct avc_error *err)
 		return fail_errno(err, 0, "probe", "fork", "no child");
 	result = probe_child(child, err);
 	if (!result) {
-		char name[64];
-
-		snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)page,
-			 (unsigned long)page + ARCH_PAGE_BYTES);
-		fd = proc_open(child, name, O_RDWR);
+		fd = proc_open_mapped(child, (avc_remote)page, (avc_remote)page + ARCH_PAGE_BYTES,
+				      O_RDWR);
 		if (fd < 0)
 			result = fail_errno(err, 0, "probe", "open(map_files)",
 					    "needs CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN");

@@ -26,12 +26,11 @@ int proc_open(pid_t pid, const char *name, int flags)
 	return open(path, flags | O_CLOEXEC);
 }
 
-int proc_open_mapped(pid_t pid, const struct mapping *m, int flags)
+int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
 {
 	char name[64];
 
-	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)m->start,
-		 (unsigned long)m->end);
+	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)start, (unsigned long)end);
 	return proc_open(pid, name, flags);
 }
 

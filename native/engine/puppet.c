@@ -65,15 +65,23 @@ static const char *name_of(long nr)
 		long nr;
 		const char *name;
 	} names[] = {
-		{ SYS_mmap, "mmap" },         { SYS_munmap, "munmap" },
-		{ SYS_mprotect, "mprotect" }, { SYS_mremap, "mremap" },
-		{ SYS_madvise, "madvise" },   { SYS_recvmsg, "recvmsg" },
-		{ SYS_dup3, "dup3" },         { SYS_fcntl, "fcntl" },
-		{ SYS_fchdir, "fchdir" },     { SYS_rt_sigaction, "rt_sigaction" },
-		{ SYS_prlimit64, "prlimit" }, { SYS_prctl, "prctl" },
-		{ SYS_setsid, "setsid" },     { SYS_setpgid, "setpgid" },
-		{ SYS_ioctl, "ioctl" },       { SYS_socketpair, "socketpair" },
-		{ SYS_chroot, "chroot" },     { SYS_membarrier, "membarrier" },
+		{ SYS_mmap, "mmap" },
+		{ SYS_munmap, "munmap" },
+		{ SYS_mprotect, "mprotect" },
+		{ SYS_mremap, "mremap" },
+		{ SYS_madvise, "madvise" },
+		{ SYS_recvmsg, "recvmsg" },
+		{ SYS_dup3, "dup3" },
+		{ SYS_fcntl, "fcntl" },
+		{ SYS_fchdir, "fchdir" },
+		{ SYS_rt_sigaction, "rt_sigaction" },
+		{ SYS_prctl, "prctl" },
+		{ SYS_setsid, "setsid" },
+		{ SYS_setpgid, "setpgid" },
+		{ SYS_ioctl, "ioctl" },
+		{ SYS_socketpair, "socketpair" },
+		{ SYS_chroot, "chroot" },
+		{ SYS_membarrier, "membarrier" },
 	};
 
 	for (size_t i = 0; i < sizeof names / sizeof *names; i++)

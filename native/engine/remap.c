@@ -203,9 +203,9 @@ static int move_special(const struct remap *r, struct puppet *puppet, struct avc
 
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared ? proc_open_mapped(template, m, O_RDWR) : -1;
+	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
 
-	return fd >= 0 ? fd : proc_open_mapped(template, m, O_RDONLY);
+	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }
 
 /* Libraries are mapped in several pieces, one after the other: opened once. */

@@ -29,7 +29,7 @@ from pathlib import Path
 from avckpt.artifacts import inside_binary
 from avckpt.cgroup import groups_of
 from avckpt.errors import AvckptError, KernelError, TargetGone
-from avckpt.process import has_ended, pid_of
+from avckpt.process import has_ended, pid_of, status
 
 OUTPUT_BYTES = 4096
 """How much of a command's output is kept; the rest is read and thrown away."""
@@ -159,18 +159,17 @@ def _credentials(pid: int) -> tuple[str, list[str]]:
     The numbers are those of the container's user namespace, in which they are
     asked for: /proc gives them as we have them.
     """
-    status = Path(f"/proc/{pid}/status").read_text(errors="replace")  # its name may be any bytes
-    fields = dict(line.split(":", 1) for line in status.split("\n") if ":" in line)
+    fields = status(pid)
     uid = _inside(int(fields["Uid"].split()[1]), Path(f"/proc/{pid}/uid_map").read_text())
     gid_map = Path(f"/proc/{pid}/gid_map").read_text()
     gid = _inside(int(fields["Gid"].split()[1]), gid_map)
     if uid is None or gid is None:
         raise AvckptError("its main process has a user or group that its user namespace does not", pid=pid)
-    sets = [fields[name].strip() for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")]
+    sets = [fields[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")]
     # A group without a number in there (one of the host's, kept) can not be asked for.
     groups = [_inside(int(group), gid_map) for group in fields["Groups"].split()]
     return (
-        ":".join([str(uid), str(gid), *sets, fields["NoNewPrivs"].strip()]),
+        ":".join([str(uid), str(gid), *sets, fields["NoNewPrivs"]]),
         [str(group) for group in groups if group is not None],
     )
 

@@ -26,6 +26,7 @@ from avckpt.events import signal_name
 from avckpt.inside import run_inside
 from avckpt.printable import printable
 from avckpt.process import has_ended, pid_of
+from avckpt.process import status as status_of
 from avckpt.protected import Protected
 
 EXEC_TIMEOUT_S = 5.0
@@ -284,12 +285,10 @@ def _waits_for(tid: str, bit: int) -> bool:
 
 def _status(pid: int) -> dict[str, str]:
     """/proc/PID/status, proc(5); only a name when there is no such process."""
-    fields = {"Name": ""}
-    with suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text(errors="replace").split("\n"):
-            name, _, value = line.partition(":")
-            fields[name] = value.strip()
-    return fields
+    try:
+        return status_of(pid)
+    except OSError:
+        return {"Name": ""}
 
 
 def _one_line(output: str) -> str:

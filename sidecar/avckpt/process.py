@@ -35,6 +35,13 @@ def age_s(pid: int) -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started
 
 
+def status(pid: int) -> dict[str, str]:
+    """The fields of /proc/PID/status, proc(5).  Raises OSError, also when there is no such process."""
+    text = Path(f"/proc/{pid}/status").read_text(errors="replace")  # its name may be any bytes
+    lines = (line.partition(":") for line in text.split("\n"))
+    return {name: value.strip() for name, colon, value in lines if colon}
+
+
 def open_pidfd(pid: int, started: int) -> int:
     """A pidfd of the process that has this PID *and* this start time; the caller closes it.
 
