@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * fork MB: the yardstick.  Memory as tests/victims/idle.c has it (one anonymous
+ * fork MB [--thp]: the yardstick.  Memory as tests/victims/idle.c has it (one anonymous
  * mapping, every page touched), one thread.  For every line on stdin it makes one
  * fork(2), whose child ends at once, and prints how long the call took in the
  * parent, in nanoseconds.
@@ -8,6 +8,7 @@
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/mman.h>
 #include <sys/wait.h>
 #include <time.h>
@@ -23,18 +24,22 @@ static uint64_t now_ns(void)
 
 int main(int argc, char **argv)
 {
-	const size_t bytes = argc == 2 ? (size_t)atol(argv[1]) << 20 : 0;
+	const size_t bytes = argc > 1 ? (size_t)atol(argv[1]) << 20 : 0;
 	uint64_t *memory;
 	char line[16];
 
-	if (argc != 2) {
-		fprintf(stderr, "usage: %s MB\n", argv[0]);
+	if (argc < 2 || argc > 3 || (argc == 3 && strcmp(argv[2], "--thp") != 0)) {
+		fprintf(stderr, "usage: %s MB [--thp]\n", argv[0]);
 		return 2;
 	}
 	memory = mmap(NULL, bytes + 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1,
 		      0);
 	if (memory == MAP_FAILED) {
 		perror("fork: mmap");
+		return 1;
+	}
+	if (argc == 3 && madvise(memory, bytes, MADV_HUGEPAGE)) {
+		perror("fork: madvise");
 		return 1;
 	}
 	for (size_t at = 0; at < bytes / 8; at += 512)

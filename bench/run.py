@@ -59,6 +59,7 @@ class Row:
     mb: int
     threads: int
     descriptors: int
+    thp: bool
     fork_ms: float
     freeze_ms: float
     reap_ms: float
@@ -103,13 +104,15 @@ class Parts:
     restore_rest_ms: float
 
 
-def measure(mb: int, threads: int, descriptors: int, cycles: int, soon: bool, folder: Path) -> tuple[Row, Parts]:
+def measure(
+    mb: int, threads: int, descriptors: int, thp: bool, cycles: int, soon: bool, folder: Path
+) -> tuple[Row, Parts]:
     """One victim, `cycles` times; `soon`: killed before there is a spare.  Raises BenchFailed, AvckptError."""
     rng = random.Random(mb * 1000 + threads)
     forks, checkpoints, recoveries = [], [], []
     with (
-        Forker(mb) as forker,
-        Idle(mb, threads, beat_us=BEAT_US, folder=folder, descriptors=descriptors) as idle,
+        Forker(mb, thp=thp) as forker,
+        Idle(mb, threads, beat_us=BEAT_US, folder=folder, descriptors=descriptors, thp=thp) as idle,
         Guarded(idle) as guarded,
     ):
         app_pid = idle.app_pid
@@ -132,6 +135,7 @@ def measure(mb: int, threads: int, descriptors: int, cycles: int, soon: bool, fo
         mb=mb,
         threads=threads,
         descriptors=descriptors,
+        thp=thp,
         fork_ms=round(median(forks), 4),
         freeze_ms=round(median(c.freeze_s * 1e3 for c in checkpoints), 4),
         reap_ms=round(median(r.reap_ms for r in recoveries), 4),
@@ -218,6 +222,7 @@ def main() -> int:
     parser.add_argument("--mb", type=_numbers, default=MEGABYTES, help="sizes, e.g. 10,100")
     parser.add_argument("--threads", type=_numbers, default=THREADS, help="numbers of threads, e.g. 1,20")
     parser.add_argument("--descriptors", type=int, default=0, help="open so many more (%(default)s)")
+    parser.add_argument("--thp", action="store_true", help="memory in transparent huge pages")
     parser.add_argument("--soon", action="store_true", help="kill right after the checkpoint, before there is a spare")
     parser.add_argument("--output", type=Path, default=RESULTS, help="where the results go (%(default)s)")
     args = parser.parse_args()
@@ -237,7 +242,7 @@ def main() -> int:
                 if not args.json:
                     what = f"{mb} MB, {threads} threads, {descriptors} descriptors, {cycles} cycles"
                     console.print(f"{what} (load {os.getloadavg()[0]:.1f}) ...", style="dim")
-                row, part = measure(mb, threads, descriptors, cycles, args.soon, Path(folder))
+                row, part = measure(mb, threads, descriptors, args.thp, cycles, args.soon, Path(folder))
                 rows.append(row)
                 parts.append(part)
     except (BenchFailed, AvckptError) as error:

@@ -57,12 +57,11 @@ def children(pid: int) -> list[int]:
 
 
 class Forker:
-    """bench/fork.c with `mb` MB of touched memory."""
+    """bench/fork.c with `mb` MB of touched memory; with `thp` in transparent huge pages."""
 
-    def __init__(self, mb: int) -> None:
-        self._process = subprocess.Popen(
-            [BUILD / "fork", str(mb)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-        )
+    def __init__(self, mb: int, *, thp: bool = False) -> None:
+        command = [BUILD / "fork", str(mb), *(["--thp"] if thp else [])]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
         if self._hear() != "ready":
             raise BenchFailed(f"bench/fork.c does not start with {mb} MB")
 
@@ -92,11 +91,14 @@ class Forker:
 class Idle:
     """tests/victims/idle.c below avckpt-init, which is PID 1 of a PID namespace of its own."""
 
-    def __init__(self, mb: int, threads: int, *, beat_us: int, folder: Path, descriptors: int = 0) -> None:
+    def __init__(
+        self, mb: int, threads: int, *, beat_us: int, folder: Path, descriptors: int = 0, thp: bool = False
+    ) -> None:
         self.board = Board(folder / f"idle-{mb}-{threads}-{time.monotonic_ns()}")
         command: list[str | Path] = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child=KILL", init_binary()]
         command += ["--wait-ms", "2000", "--", VICTIMS / "build" / "idle", str(mb), str(threads)]
         command += ["--beat-us", str(beat_us), "--descriptors", str(descriptors), "--board", self.board.path]
+        command += ["--thp"] if thp else []
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         self.init_pid = 0
 

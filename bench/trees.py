@@ -7,7 +7,7 @@ Four questions, each with the limit that the project has set itself:
 
 - freeze:   a tree, against 1.5 times the sum of the forks of its processes plus 30 us per thread;
 - workers:  restore of a main process with 8 prefork workers that share 200 MB, against 3 times the restore of
-            one process of 200 MB;
+            one process of 200 MB; with small pages and with transparent huge pages;
 - exec:     what a child of 100 MB private memory that has executed a program adds to a restore, against the
             time of copying 100 MB plus 5 ms;
 - commands: 1,000 short commands in a loop under 100 ms checkpoints, against the same loop unprotected plus 10 %.
@@ -50,7 +50,7 @@ WARM_UP_CYCLES = 2
 AHEAD_S = 0.1
 """From a checkpoint to a kill: what a restore is spared of is done then."""
 COMMANDS = 1000
-TREES = ("tree 8", "tree 24 --threads 4", "prefork 8 200", "prefork 2 20 --private 100")
+TREES = ("tree 8", "tree 24 --threads 4", "prefork 8 200", "prefork 8 200 --thp", "prefork 2 20 --private 100")
 PATIENCE_S = 60.0
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 132)
@@ -163,9 +163,13 @@ def measure_restore(command: str, cycles: int, folder: Path) -> float:
 
 
 def measure_workers(cycles: int, folder: Path) -> list[Figure]:
-    alone = measure_restore("prefork 0 200", cycles, folder)
-    took = measure_restore("prefork 8 200", cycles, folder)
-    return [Figure("restore of 8 workers sharing 200 MB", took, 3 * alone, f"3 x {alone:.2f} (one process of 200 MB)")]
+    found = []
+    for pages, option in (("", ""), (" of huge pages", " --thp")):
+        alone = measure_restore(f"prefork 0 200{option}", cycles, folder)
+        took = measure_restore(f"prefork 8 200{option}", cycles, folder)
+        how = f"3 x {alone:.2f} (one process of 200 MB)"
+        found.append(Figure(f"restore of 8 workers sharing 200 MB{pages}", took, 3 * alone, how))
+    return found
 
 
 def copy_ms(mb: int, cycles: int) -> float:

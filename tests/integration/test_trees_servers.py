@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from harness import ContainerFactory, Sidecar, wait_until
 from integration.trees import LONG, Load, Tree, start_tree, write_files
-from native.family import pss_kb
+from native.family import memory_kb
 
 KILLS = 50 if LONG else 4
 
@@ -140,7 +140,7 @@ def test_workers_share_their_memory_after_a_restore(
     tree = gunicorn(sidecar, container, tmp_path)
     wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
     tree.next_generation()
-    before = sum(pss_kb(member.pid) for member in tree.members())
+    before = sum(memory_kb(member.pid, "Pss") for member in tree.members())
     tree.kill()
-    after = sum(pss_kb(member.pid) for member in tree.members())
+    after = sum(memory_kb(member.pid, "Pss") for member in tree.members())
     assert after < 1.3 * before + 8192, (before, after)

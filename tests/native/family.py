@@ -154,10 +154,10 @@ def ours(victim: Victim, name: str = "avckpt-") -> list[int]:
     return [m.pid for m in found if m is not None and m.name.startswith(name) and not m.is_zombie]
 
 
-def pss_kb(pid: int) -> int:
-    """Proportional set size: what a process has of memory when shared pages are divided."""
+def memory_kb(pid: int, what: str) -> int:
+    """A line of smaps_rollup; "Pss", say: what a process has of memory when shared pages are divided."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    found = re.search(r"^Pss:\s+(\d+) kB", text, re.M)
+    found = re.search(rf"^{what}:\s+(\d+) kB", text, re.M)
     assert found, text
     return int(found[1])
 
@@ -170,10 +170,10 @@ __all__ = [
     "look",
     "main_process",
     "members",
+    "memory_kb",
     "ours",
     "places",
     "progress",
-    "pss_kb",
     "strangers",
     "wait_whole",
 ]

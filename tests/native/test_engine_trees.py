@@ -24,10 +24,10 @@ from native.family import (
     look,
     main_process,
     members,
+    memory_kb,
     ours,
     places,
     progress,
-    pss_kb,
     wait_whole,
 )
 from native.guarded import GuardProcess, Victim, config, forks_beside, meanwhile
@@ -308,24 +308,29 @@ def test_a_child_that_is_killed_is_the_applications_business(command: str, tmp_p
         assert not [event for event in guard.events if event.get("kind") in ("died", "restored", "unprotected")]
 
 
-def test_pages_stay_shared(tmp_path: Path) -> None:
-    """Prefork workers share their data after a restore as they did before it; proportional sizes are the measure."""
+@pytest.mark.parametrize("thp", [False, True], ids=["small pages", "huge pages"])
+def test_pages_stay_shared(thp: bool, tmp_path: Path) -> None:
+    """Prefork workers share their data after a restore as they did before it; proportional sizes are the measure.
+
+    Of transparent huge pages workers keep all that they have written nothing to.
+    """
     megabytes, workers = 60, 6
 
     def held_kb() -> int:
         # A holder has the application's memory itself, and would count it twice.
-        held = sum(pss_kb(m.pid) for m in members(victim))
+        held = sum(memory_kb(m.pid, "Pss") for m in members(victim))
         for template in ours(victim, "avckpt-tmpl"):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # an old one, just ending
-                held += pss_kb(template)
+                held += memory_kb(template, "Pss")
         return held
 
     with (
-        Victim(f"prefork {workers} {megabytes} --touch 256", tmp_path) as victim,
+        Victim(f"prefork {workers} {megabytes} --touch 256{' --thp' * thp}", tmp_path) as victim,
         GuardProcess(steady(keep=1), [victim.pid]) as guard,
     ):
         alone = held_kb()
         assert alone < (megabytes + 20) * 1024
+        huge = (megabytes - 6) * 1024 if thp else 0
         for n in range(1, 4):
             checkpoint(guard)
             with_templates = held_kb()
@@ -336,6 +341,7 @@ def test_pages_stay_shared(tmp_path: Path) -> None:
             victim.wait_beats(300)  # its workers read all of it, which must not unshare it
             assert len(members(victim)) == workers + 1
             assert held_kb() < with_templates + workers * 2048, (alone, with_templates)
+            assert all(memory_kb(m.pid, "AnonHugePages") >= huge for m in members(victim))
 
 
 def test_a_template_killed_from_inside_costs_a_generation(tmp_path: Path) -> None:

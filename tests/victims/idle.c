@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * idle MB THREADS [--beat-us N] [--descriptors N]: touched memory, blocked threads and
- * descriptors of all kinds, for measuring.  THREADS counts the main one, which beats every
- * N us (1000).
+ * idle MB THREADS [--beat-us N] [--descriptors N] [--thp]: touched memory, blocked threads
+ * and descriptors of all kinds, for measuring.  THREADS counts the main one, which beats
+ * every N us (1000).  With --thp the memory is of transparent huge pages.
  */
 #include <pthread.h>
 #include <sys/epoll.h>
@@ -65,9 +65,11 @@ int main(int argc, char **argv)
 	size_t bytes, at;
 	uint64_t *memory;
 	pthread_attr_t attr;
+	bool thp;
 	int i;
 
-	victim_start(&argc, argv, 2, "MB THREADS [--beat-us N] [--descriptors N]");
+	thp = victim_flag(&argc, argv, "--thp");
+	victim_start(&argc, argv, 2, "MB THREADS [--beat-us N] [--descriptors N] [--thp]");
 	for (i = 1; i + 1 < argc; i++)
 		if (!strcmp(argv[i], "--beat-us"))
 			beat_us = atol(argv[i + 1]);
@@ -76,9 +78,7 @@ int main(int argc, char **argv)
 	mb = atol(argv[1]);
 	threads = atol(argv[2]);
 	bytes = (size_t)mb << 20;
-	memory = mmap(NULL, bytes + 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1,
-		      0);
-	must(memory != MAP_FAILED, "mmap");
+	memory = victim_memory(bytes, thp);
 	for (at = 0; at < bytes / 8; at += 512)
 		memory[at] = mix(at, 1);
 	pthread_attr_init(&attr);

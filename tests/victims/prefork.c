@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * prefork WORKERS MB [--touch KB] [--private MB] [--sparse]: a server that loads its data and
- * then forks its workers, which share it.
+ * prefork WORKERS MB [--touch KB] [--private MB] [--sparse] [--thp]: a server that loads its
+ * data and then forks its workers, which share it.
  *
  * Each worker has changed the first KB kilobytes (64) of the data for itself, and
  * goes on reading all of it.  With --private MB the workers execute the program
  * anew and have MB of memory of their own instead.  With --sparse they have
- * given back every other page.
+ * given back every other page.  With --thp the shared data is in transparent huge pages.
  * Counter 0: pages read by workers; 2, 3: forks (family.h); 7 + i: laps of worker i (the
  * first 24).
  */
@@ -16,7 +16,7 @@ enum { PAGE_WORDS = 512 };
 
 static uint64_t *memory;
 static size_t pages, touched;
-static bool sparse;
+static bool sparse, thp;
 static const char *board_path;
 
 static void fill(size_t mb)
@@ -24,9 +24,7 @@ static void fill(size_t mb)
 	size_t page;
 
 	pages = mb << 8;
-	memory = mmap(NULL, (mb << 20) + 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS,
-		      -1, 0);
-	must(memory != MAP_FAILED, "mmap");
+	memory = victim_memory(mb << 20, thp);
 	for (page = 0; page < pages; page++)
 		memory[page * PAGE_WORDS] = mix(page, 1);
 }
@@ -108,6 +106,7 @@ int main(int argc, char **argv)
 	if (argc > 4 && !strcmp(argv[1], "--worker"))
 		work_execed(argv);
 	sparse = victim_flag(&argc, argv, "--sparse");
+	thp = victim_flag(&argc, argv, "--thp");
 	touched = 16;
 	for (i = 1; i + 1 < argc; i++) {
 		if (!strcmp(argv[i], "--touch"))
@@ -117,7 +116,7 @@ int main(int argc, char **argv)
 		else if (!strcmp(argv[i], "--board"))
 			board_path = argv[i + 1];
 	}
-	victim_start(&argc, argv, 2, "WORKERS MB [--touch KB] [--private MB] [--sparse]");
+	victim_start(&argc, argv, 2, "WORKERS MB [--touch KB] [--private MB] [--sparse] [--thp]");
 	workers = atoi(argv[1]);
 	family.main = getpid();
 	know_family("prefork");

@@ -156,6 +156,18 @@ static inline bool victim_flag(int *argc, char **argv, const char *name)
 	return false;
 }
 
+/* Anonymous memory that nothing has touched.  With `thp` of transparent huge pages, as far as
+ * there are any; it ends within a page of the other kind. */
+static inline void *victim_memory(size_t bytes, bool thp)
+{
+	void *memory = mmap(NULL, bytes + 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS,
+			    -1, 0);
+
+	must(memory != MAP_FAILED, "mmap");
+	must(!thp || madvise(memory, bytes, MADV_HUGEPAGE) == 0, "madvise");
+	return memory;
+}
+
 static pid_t victim_child;
 
 static inline void victim_pass_on(int signal)
