@@ -60,7 +60,7 @@ class Forker:
     """bench/fork.c with `mb` MB of touched memory; with `thp` in transparent huge pages."""
 
     def __init__(self, mb: int, *, thp: bool = False) -> None:
-        command = [BUILD / "fork", str(mb), *(["--thp"] if thp else [])]
+        command = [str(BUILD / "fork"), str(mb), *(["--thp"] if thp else [])]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
         if self._hear() != "ready":
             raise BenchFailed(f"bench/fork.c does not start with {mb} MB")
