@@ -82,6 +82,7 @@ static const char *name_of(long nr)
 		{ SYS_socketpair, "socketpair" },
 		{ SYS_chroot, "chroot" },
 		{ SYS_membarrier, "membarrier" },
+		{ SYS_shmat, "shmat" },
 	};
 
 	for (size_t i = 0; i < sizeof names / sizeof *names; i++)

@@ -201,9 +201,25 @@ static int move_special(const struct remap *r, struct puppet *puppet, struct avc
 	return 0;
 }
 
+/* Whether what is mapped was open for writing, and not for reading alone: the link says so
+ * (fs/proc/base.c, proc_map_files_instantiate()). */
+static bool is_open_for_writing(pid_t template, const struct mapping *m)
+{
+	char path[64];
+	struct stat st;
+
+	snprintf(path, sizeof path, "/proc/%d/map_files/%lx-%lx", template,
+		 (unsigned long)m->start, (unsigned long)m->end);
+	return lstat(path, &st) == 0 && st.st_mode & S_IWUSR;
+}
+
+/* By a descriptor for more, what is shared could be made writable that never was; and of a file
+ * in an overlay a copy would be made. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
+	const int fd = m->shared && is_open_for_writing(template, m)
+			       ? proc_open_mapped(template, m->start, m->end, O_RDWR)
+			       : -1;
 
 	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }
@@ -215,7 +231,7 @@ static int give_file(const struct remap *r, struct puppet *puppet, const struct 
 	int fd, result;
 
 	if (m && *given && m->device == (*given)->device && m->inode == (*given)->inode &&
-	    m->shared == (*given)->shared)
+	    !m->shared && !(*given)->shared)
 		return 0;
 	if (*given && puppet_ask(puppet, SYS_close, 1, 0, 0, 0, 0, 0, err))
 		return -1;
@@ -252,7 +268,8 @@ static int attach(const struct remap *r, struct puppet *puppet, const struct pie
 		  struct avc_error *err)
 {
 	const struct mapping *m = piece->want;
-	const int flags = SHM_REMAP | (m->mode[1] == 'w' ? 0 : SHM_RDONLY) |
+	const int flags = SHM_REMAP |
+			  (is_open_for_writing(r->want->template, m) ? 0 : SHM_RDONLY) |
 			  (m->mode[2] == 'x' ? SHM_EXEC : 0);
 
 	if (piece->start != m->start || piece->end != m->end || !is_segment(r->want->template, m))
@@ -260,7 +277,11 @@ static int attach(const struct remap *r, struct puppet *puppet, const struct pie
 	if (puppet_ask(puppet, SYS_shmat, m->inode, m->start, (uint64_t)flags, 0, 0, 0, err))
 		return -1;
 	puppet_soften(puppet, "System V shared memory is only mapped: it can not be detached");
-	return puppet_flush(puppet, err);
+	return puppet_ask(puppet, SYS_mprotect, m->start, m->end - m->start,
+			  (uint64_t)protection(m), 0, 0, 0, err) ||
+			       puppet_flush(puppet, err)
+		       ? -1
+		       : 0;
 }
 
 static int map_piece(const struct remap *r, struct puppet *puppet, const struct piece *piece,

@@ -100,10 +100,13 @@ def restored(victim: Victim, guard: GuardProcess) -> Json:
     return event
 
 
+KINDS = ["guard", "unguard", "sealed", "droppable", "growing", "attached", "readable", "readonly", "unmoved"]
+
+
 @pytest.mark.parametrize(
     ("scenario", "where"),
     [
-        *itertools.product(["guard", "unguard", "sealed", "droppable", "growing", "attached", "unmoved"], WHERE),
+        *itertools.product(KINDS, WHERE),
         ("late", ""),  # a child could not map it again
     ],
 )

@@ -12,6 +12,8 @@
  *   droppable  memory that is wiped in forks and dropped when it is short (MAP_DROPPABLE)
  *   growing    memory that grows downwards (MAP_GROWSDOWN)
  *   attached   System V shared memory
+ *   readable   the same, attached for writing, and protected from it for now
+ *   readonly   a file that was not open for writing, mapped shared
  *   unmoved    memory that nobody may unmap or protect otherwise (mseal(2))
  */
 #include <sys/ipc.h>
@@ -267,6 +269,41 @@ static void attached_verify(void)
 	at = again;
 }
 
+static void readable_setup(void)
+{
+	attached_setup();
+	must(!mprotect(at, 2 * PAGE, PROT_READ), "mprotect");
+}
+
+static void readable_verify(void)
+{
+	CHECK(!mprotect(at, 2 * PAGE, PROT_READ | PROT_WRITE), "mprotect: %s", strerror(errno));
+	strcpy(at, "shared");
+	attached_verify();
+	must(!mprotect(at, 2 * PAGE, PROT_READ), "mprotect");
+}
+
+static char *writable;
+
+/* One after the other, which is found first. */
+static void readonly_setup(void)
+{
+	const int f = make_file("map", "then", O_RDONLY | O_CLOEXEC);
+
+	writable = map(1, PROT_READ | PROT_WRITE, MAP_SHARED, open(path_of("map"), O_RDWR));
+	at = map(1, PROT_READ, MAP_SHARED, f);
+	must(at < writable, "map");
+}
+
+static void readonly_verify(void)
+{
+	strcpy(writable, "now");
+	CHECK(!strcmp(at, "now"), "it is \"%s\"", at);
+	strcpy(writable, "then");
+	CHECK(mprotect(at, PAGE, PROT_READ | PROT_WRITE) && errno == EACCES,
+	      "it can be made writable");
+}
+
 static void unmoved_setup(void)
 {
 	at = map(1, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
@@ -290,6 +327,8 @@ static const struct scenario scenarios[] = {
 	{ "droppable", droppable_setup, nothing, droppable_verify },
 	{ "growing", growing_setup, nothing, growing_verify },
 	{ "attached", attached_setup, nothing, attached_verify },
+	{ "readable", readable_setup, nothing, readable_verify },
+	{ "readonly", readonly_setup, nothing, readonly_verify },
 	{ "unmoved", unmoved_setup, nothing, unmoved_verify },
 };
 
