@@ -126,19 +126,20 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 bool proc_is_exiting(pid_t tid);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
-	MAPPING_DONTFORK = 1,    /* dc */
-	MAPPING_WIPEONFORK = 2,  /* wf */
-	MAPPING_DEVICE = 4,      /* io */
-	MAPPING_LOCKED = 8,      /* lo */
-	MAPPING_DROPPABLE = 16,  /* dp */
-	MAPPING_HUGETLB = 32,    /* ht */
-	MAPPING_HUGE = 64,       /* hg: transparent huge pages               */
-	MAPPING_SMALL = 128,     /* nh */
-	MAPPING_DONTDUMP = 256,  /* dd */
-	MAPPING_MERGEABLE = 512, /* mg */
-	MAPPING_GROWING = 1024,  /* gd: downwards                           */
-	MAPPING_SEALED = 2048,   /* sl: mseal(2)                            */
-	MAPPING_ONLY_HERE = 4096 /* no other process could map it: memory.c  */
+	MAPPING_DONTFORK = 1,     /* dc */
+	MAPPING_WIPEONFORK = 2,   /* wf */
+	MAPPING_DEVICE = 4,       /* io */
+	MAPPING_LOCKED = 8,       /* lo */
+	MAPPING_DROPPABLE = 16,   /* dp */
+	MAPPING_HUGETLB = 32,     /* ht */
+	MAPPING_HUGE = 64,        /* hg: transparent huge pages               */
+	MAPPING_SMALL = 128,      /* nh */
+	MAPPING_DONTDUMP = 256,   /* dd */
+	MAPPING_MERGEABLE = 512,  /* mg */
+	MAPPING_GROWING = 1024,   /* gd: downwards                           */
+	MAPPING_SEALED = 2048,    /* sl: mseal(2)                            */
+	MAPPING_ONLY_HERE = 4096, /* no other process could map it: memory.c */
+	MAPPING_SPECIAL = 8192    /* mapping_is_special()                    */
 };
 
 struct mapping {
@@ -154,6 +155,9 @@ struct mapping {
  * returns < 0.  0 or -1. */
 int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
 		  void *arg);
+
+/* The vDSO, or what belongs to it. */
+bool mapping_is_special(const struct mapping *m);
 
 /* /proc/PID/limits, as getrlimit(2) numbers them; ~0: no limit.  0 or -1. */
 #define LIMITS 16

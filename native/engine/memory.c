@@ -500,6 +500,8 @@ static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
 {
 	const uint32_t kind = m->flags & (MAPPING_DROPPABLE | MAPPING_GROWING | MAPPING_SEALED);
 
+	if (kind && mapping_is_special(m))
+		return kind | MAPPING_SPECIAL;
 	return survey->target->descendant && is_only_here(survey->template, m)
 		       ? kind | MAPPING_ONLY_HERE
 		       : kind;
@@ -756,11 +758,13 @@ static void advise_again(const struct memory *memory, struct setup *setup)
 					->flags = INJ_MAY_FAIL;
 }
 
-/* After all that is mapped and advised. */
+/* After all that is mapped and advised.  What the kernel has sealed (CONFIG_MSEAL_SYSTEM_MAPPINGS)
+ * is so in a fork; Podman's seccomp profile need not know mseal(2). */
 static void seal_again(const struct memory *memory, struct setup *setup)
 {
 	for (uint32_t i = 0; i < memory->kinds.count; i++)
-		if (memory->kinds.area[i].flags & MAPPING_SEALED)
+		if ((memory->kinds.area[i].flags & (MAPPING_SEALED | MAPPING_SPECIAL)) ==
+		    MAPPING_SEALED)
 			setup_add(setup, INJ_BEFORE, "mseal", MSEAL, memory->kinds.area[i].start,
 				  memory->kinds.area[i].end - memory->kinds.area[i].start, 0, 0, 0)
 				->flags = INJ_MAY_FAIL;

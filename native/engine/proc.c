@@ -284,6 +284,11 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 	return result < 0 ? -1 : 0;
 }
 
+bool mapping_is_special(const struct mapping *m)
+{
+	return !strncmp(m->name, "[vdso", 5) || !strncmp(m->name, "[vvar", 5);
+}
+
 static void parse_ids(const char *p, uint32_t id[4])
 {
 	sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]);

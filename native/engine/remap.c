@@ -56,11 +56,6 @@ struct remap {
 
 /* ---- mappings ------------------------------------------------------------------- */
 
-static bool is_special(const struct mapping *m)
-{
-	return !strncmp(m->name, "[vdso", 5) || !strncmp(m->name, "[vvar", 5);
-}
-
 static bool is_stack(const struct mapping *m)
 {
 	return !strcmp(m->name, "[stack]");
@@ -81,7 +76,7 @@ static uint32_t kind_of(const struct mapping *m)
 static bool same_backing(const struct mapping *a, const struct mapping *b)
 {
 	return a->shared == b->shared && is_stack(a) == is_stack(b) && a->inode == b->inode &&
-	       is_special(a) == is_special(b) && kind_of(a) == kind_of(b) &&
+	       mapping_is_special(a) == mapping_is_special(b) && kind_of(a) == kind_of(b) &&
 	       (!is_file(a) ||
 		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
 }
@@ -89,7 +84,7 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 /* What stays where it is whatever happens; where our pad is nothing else is touched. */
 static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
 {
-	return is_special(m) || pad_contains(&r->target->pad, address);
+	return mapping_is_special(m) || pad_contains(&r->target->pad, address);
 }
 
 static const struct mapping *at(const struct mappings *maps, uint32_t *next, avc_remote address)
@@ -208,8 +203,8 @@ static bool is_open_for_writing(pid_t template, const struct mapping *m)
 	char path[64];
 	struct stat st;
 
-	snprintf(path, sizeof path, "/proc/%d/map_files/%lx-%lx", template,
-		 (unsigned long)m->start, (unsigned long)m->end);
+	snprintf(path, sizeof path, "/proc/%d/map_files/%lx-%lx", template, (unsigned long)m->start,
+		 (unsigned long)m->end);
 	return lstat(path, &st) == 0 && st.st_mode & S_IWUSR;
 }
 
@@ -268,8 +263,7 @@ static int attach(const struct remap *r, struct puppet *puppet, const struct pie
 		  struct avc_error *err)
 {
 	const struct mapping *m = piece->want;
-	const int flags = SHM_REMAP |
-			  (is_open_for_writing(r->want->template, m) ? 0 : SHM_RDONLY) |
+	const int flags = SHM_REMAP | (is_open_for_writing(r->want->template, m) ? 0 : SHM_RDONLY) |
 			  (m->mode[2] == 'x' ? SHM_EXEC : 0);
 
 	if (piece->start != m->start || piece->end != m->end || !is_segment(r->want->template, m))
