@@ -11,7 +11,6 @@
 #include <string.h>
 #include <sys/eventfd.h>
 #include <sys/prctl.h>
-#include <sys/syscall.h>
 #include <unistd.h>
 
 #include "guard.h"
@@ -123,7 +122,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	syscall(SYS_pidfd_send_signal, guard->target.pidfd, SIGKILL, NULL, 0);
+	target_kill(&guard->target);
 }
 
 static bool take_command(struct avc_guard *guard, struct command *command)

@@ -5,7 +5,6 @@
 #include <errno.h>
 #include <signal.h>
 #include <string.h>
-#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -270,8 +269,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	}
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		if (guard->tree.member[i]->pid)
-			syscall(SYS_pidfd_send_signal, guard->tree.member[i]->pidfd, SIGKILL, NULL,
-				0);
+			target_kill(guard->tree.member[i]);
 	link_kill_leftovers(&guard->link, is_ours, reap_tracees, guard);
 	if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");

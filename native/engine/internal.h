@@ -296,6 +296,7 @@ struct target {
 	pid_t leader; /* the process's own number                            */
 	pid_t inside; /* the same in its own namespace                       */
 	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd;
+	int leader_pidfd; /* when pidfd is of another thread: of the process    */
 	struct pad pad;
 	bool infected; /* the pad is known to be in this process           */
 	pid_t holder;  /* 0: none                                          */
@@ -767,6 +768,8 @@ int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error
 /* Before anything else is done with it: the main thread may have ended, and others go
  * on (pthread_exit(3)). */
 int target_follow(struct target *target, struct avc_error *err) warn_unused;
+/* All of it, whichever of its threads have ended meanwhile. */
+void target_kill(const struct target *target);
 /* Forgets the process (the pad stays mapped here: templates live in it). */
 void target_close(struct target *target);
 /* The entry for a tid; NULL when there is no room. */

@@ -26,6 +26,7 @@
 void target_init(struct target *target)
 {
 	*target = (struct target){ .pidfd = -1,
+				   .leader_pidfd = -1,
 				   .task_dirfd = -1,
 				   .mem_fd = -1,
 				   .timers_fd = -1,
@@ -67,6 +68,9 @@ static int follow(struct target *target, struct avc_error *err)
 	close_fd(&target->pidfd);
 	close_fd(&target->statm_fd);
 	target->pid = pid;
+	/* Its number is nobody else's as long as there are others. */
+	if (pid != target->leader && target->leader_pidfd < 0)
+		target->leader_pidfd = proc_pidfd_open(target->leader);
 	target->statm_fd = proc_open(pid, "statm", O_RDONLY);
 	target->pidfd = pid == target->leader ? proc_pidfd_open(pid)
 					      : (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
@@ -82,6 +86,12 @@ static int follow(struct target *target, struct avc_error *err)
 int target_follow(struct target *target, struct avc_error *err)
 {
 	return proc_live_thread(target->pid) == target->pid ? 0 : follow(target, err);
+}
+
+void target_kill(const struct target *target)
+{
+	syscall(SYS_pidfd_send_signal,
+		target->leader_pidfd < 0 ? target->pidfd : target->leader_pidfd, SIGKILL, NULL, 0);
 }
 
 int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err)
@@ -108,6 +118,7 @@ int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error
 void target_close(struct target *target)
 {
 	close_fd(&target->pidfd);
+	close_fd(&target->leader_pidfd);
 	close_fd(&target->task_dirfd);
 	close_fd(&target->mem_fd);
 	close_fd(&target->timers_fd);

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -40,6 +42,16 @@ def test_the_end_of_the_last_thread(tmp_path: Path) -> None:
         victim.wait_beats()
         victim.kill_app(signal.SIGUSR1)
         assert victim.end(5) == 7
+
+
+def test_it_is_rolled_back_when_asked(tmp_path: Path) -> None:
+    """Though the thread that stood for the process at the checkpoint has ended since."""
+    with Victim("headless 3 --changing", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        for _ in range(5):
+            guard.wait("checkpoint", since=guard.mark())  # some are missed: that thread ends meanwhile
+            time.sleep(random.uniform(0.0, 0.05))
+            assert guard.command("restore", timeout_s=5)["kind"] == "restored"
+            victim.wait_beats()
 
 
 def test_a_guard_that_comes_later(tmp_path: Path) -> None:

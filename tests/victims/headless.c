@@ -1,9 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * headless N: a process whose main thread has ended while N threads go on.
+ * headless N [--changing]: a process whose main thread has ended while N threads go on.
  * Each looks all the time whether it is still itself, and whether the main thread is still
  * what it was: a zombie.  SIGUSR1: all end, and with
- * the last of them the process (status 7).
+ * the last of them the process (status 7).  With --changing another one takes the place of each
+ * after 20 ms.
  */
 #include <pthread.h>
 #include <signal.h>
@@ -15,6 +16,19 @@
 static volatile sig_atomic_t leaving;
 static uint64_t laps; /* of all, under the lock; goes back with a restore */
 static pthread_mutex_t lock;
+static bool changing;
+
+static void *work(void *arg);
+
+static void start(void *arg)
+{
+	pthread_attr_t detached;
+	pthread_t thread;
+
+	pthread_attr_init(&detached);
+	pthread_attr_setdetachstate(&detached, PTHREAD_CREATE_DETACHED);
+	must(!pthread_create(&thread, &detached, work, arg), "pthread_create");
+}
 
 static char main_state(void)
 {
@@ -41,6 +55,7 @@ static void *work(void *arg)
 {
 	const pid_t tid = (pid_t)syscall(SYS_gettid);
 	const bool beats = arg == NULL;
+	const uint64_t until_ns = now_ns() + 20000000;
 	char name[16], is[16];
 
 	snprintf(name, sizeof name, "worker-%d", tid);
@@ -50,7 +65,7 @@ static void *work(void *arg)
 		nap_us(200);
 	if (beats)
 		victim_ready();
-	while (!leaving) {
+	while (!leaving && !(changing && now_ns() > until_ns)) {
 		CHECK(syscall(SYS_gettid) == tid, "thread %d is %ld now", tid, syscall(SYS_gettid));
 		CHECK(!pthread_getname_np(pthread_self(), is, sizeof is) && !strcmp(is, name),
 		      "%s is called %s", name, is);
@@ -63,6 +78,10 @@ static void *work(void *arg)
 			beat();
 		}
 		usleep(500); /* SIGUSR1 may cut it short */
+	}
+	if (!leaving) {
+		start(arg);
+		return NULL;
 	}
 	for (;;)
 		syscall(SYS_exit, STATUS);
@@ -78,17 +97,17 @@ static void leave(int signal)
 int main(int argc, char **argv)
 {
 	pthread_mutexattr_t checking;
-	pthread_t thread;
 	long n;
 
-	victim_start(&argc, argv, 1, "N");
+	changing = victim_flag(&argc, argv, "--changing");
+	victim_start(&argc, argv, 1, "N [--changing]");
 	signal(SIGUSR1, leave);
 	pthread_mutexattr_init(&checking);
 	pthread_mutexattr_settype(&checking, PTHREAD_MUTEX_ERRORCHECK);
 	pthread_mutex_init(&lock, &checking);
 	n = atol(argv[1]);
 	for (long i = 0; i < n; i++)
-		must(!pthread_create(&thread, NULL, work, (void *)i), "pthread_create");
+		start((void *)i);
 	for (;;)
 		syscall(SYS_exit, 0);
 }
