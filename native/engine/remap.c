@@ -242,35 +242,47 @@ static int give_file(const struct remap *r, struct puppet *puppet, const struct 
 	return result;
 }
 
-/* All of a segment of System V shared memory.  Its inode has the number of the segment
- * (ipc/shm.c, newseg()). */
-static bool is_segment(pid_t template, const struct mapping *m)
+static bool is_sysv(const struct mapping *m)
 {
-	struct stat st = { 0 };
-	int fd = -1;
+	return m->shared && !strncmp(m->name, "/SYSV", 5);
+}
 
-	if (m->shared && !m->offset && !strncmp(m->name, "/SYSV", 5))
-		fd = open_mapped(template, m);
+/* All of a segment, and not a part that is protected otherwise. */
+static bool is_whole(pid_t template, const struct piece *piece)
+{
+	const struct mapping *m = piece->want;
+	struct stat st = { 0 };
+	int fd = open_mapped(template, m);
+
 	if (fd < 0 || fstat(fd, &st))
 		st.st_size = 0;
 	close_fd(&fd);
-	return ((uint64_t)st.st_size + PAGE - 1) / PAGE == (m->end - m->start) / PAGE;
+	return !m->offset && piece->start == m->start && piece->end == m->end &&
+	       ((uint64_t)st.st_size + PAGE - 1) / PAGE == (m->end - m->start) / PAGE;
 }
 
 /* In the place of what has been mapped, or shmdt(2) would not know it.  Who may not attach it any
- * more keeps that. */
+ * more keeps that.  Its inode has the number of the segment (ipc/shm.c, newseg()). */
 static int attach(const struct remap *r, struct puppet *puppet, const struct piece *piece,
 		  struct avc_error *err)
 {
+	static const char only_mapped[] =
+		"System V shared memory is only mapped: it can not be detached";
 	const struct mapping *m = piece->want;
-	const int flags = SHM_REMAP | (is_open_for_writing(r->want->template, m) ? 0 : SHM_RDONLY) |
-			  (m->mode[2] == 'x' ? SHM_EXEC : 0);
+	int flags = SHM_REMAP | (m->mode[2] == 'x' ? SHM_EXEC : 0);
 
-	if (piece->start != m->start || piece->end != m->end || !is_segment(r->want->template, m))
+	if (!is_sysv(m))
 		return 0;
+	if (!is_whole(r->want->template, piece)) {
+		fail(puppet->notes, AVC_UNSUPPORTED, 0, puppet->inside, "restore", "", "%s",
+		     only_mapped);
+		return 0;
+	}
+	if (!is_open_for_writing(r->want->template, m))
+		flags |= SHM_RDONLY;
 	if (puppet_ask(puppet, SYS_shmat, m->inode, m->start, (uint64_t)flags, 0, 0, 0, err))
 		return -1;
-	puppet_soften(puppet, "System V shared memory is only mapped: it can not be detached");
+	puppet_soften(puppet, only_mapped);
 	return puppet_ask(puppet, SYS_mprotect, m->start, m->end - m->start,
 			  (uint64_t)protection(m), 0, 0, 0, err) ||
 			       puppet_flush(puppet, err)

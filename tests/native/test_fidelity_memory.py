@@ -107,7 +107,8 @@ KINDS = ["guard", "unguard", "sealed", "droppable", "growing", "attached", "read
     ("scenario", "where"),
     [
         *itertools.product(KINDS, WHERE),
-        ("late", ""),  # a child could not map it again
+        ("divided", ""),  # a child could not attach it again
+        ("late", ""),  # nor map it
     ],
 )
 def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
@@ -122,6 +123,13 @@ def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
                 assert "error" not in event, event
             if scenario == "late":
                 break  # sealed for good
+
+
+def test_a_divided_segment_is_only_mapped_and_told(tmp_path: Path) -> None:
+    command = f"regions divided {tmp_path} --in-child"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert "can not be detached" in restored(victim, guard)["error"]["message"]
 
 
 @pytest.mark.parametrize("where", WHERE)

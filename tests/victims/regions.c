@@ -13,6 +13,7 @@
  *   growing    memory that grows downwards (MAP_GROWSDOWN)
  *   attached   System V shared memory
  *   readable   the same, attached for writing, and protected from it for now
+ *   divided    the same, the first half protected from writing
  *   readonly   a file that was not open for writing, mapped shared
  *   unmoved    memory that nobody may unmap or protect otherwise (mseal(2))
  */
@@ -283,6 +284,18 @@ static void readable_verify(void)
 	must(!mprotect(at, 2 * PAGE, PROT_READ), "mprotect");
 }
 
+static void divided_setup(void)
+{
+	attached_setup();
+	must(!mprotect(at, PAGE, PROT_READ), "mprotect");
+}
+
+static void divided_verify(void)
+{
+	at[PAGE]++;
+	CHECK(!strcmp(at, "shared"), "it is \"%s\"", at);
+}
+
 static char *writable;
 
 /* One after the other, which is found first. */
@@ -328,6 +341,7 @@ static const struct scenario scenarios[] = {
 	{ "growing", growing_setup, nothing, growing_verify },
 	{ "attached", attached_setup, nothing, attached_verify },
 	{ "readable", readable_setup, nothing, readable_verify },
+	{ "divided", divided_setup, nothing, divided_verify },
 	{ "readonly", readonly_setup, nothing, readonly_verify },
 	{ "unmoved", unmoved_setup, nothing, unmoved_verify },
 };
