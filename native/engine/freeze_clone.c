@@ -22,16 +22,14 @@
 #define CLONE_PROCESS_NS 100000
 #define CLONE_PAGE_NS 90
 
-#define SS_AUTODISARM_ (1u << 31) /* linux/signal.h */
-
 /* ---- what is read ----------------------------------------------------------------------- */
 
 /* In a handler, on an alternate stack that it has given up for as long (sigaltstack(2),
- * SS_AUTODISARM).  Any other can not be changed by who is on it. */
+ * SS_AUTODISARM), or was when it was asked last.  Any other can not be changed by who is on it. */
 static bool may_be_disarmed(const struct thread *t)
 {
-	return t->altstack[1] & SS_AUTODISARM_ &&
-	       arch_sp(&t->regs) - t->altstack[0] < t->altstack[2];
+	return t->disarmed || (t->altstack[1] & SS_AUTODISARM_ &&
+			       arch_sp(&t->regs) - t->altstack[0] < t->altstack[2]);
 }
 
 static int read_all(struct target *target, uint32_t slot, struct avc_error *err)

@@ -56,6 +56,7 @@
 #define CHILDREN_MAX 4096 /* of init: orphans, holders and templates, too   */
 /* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13; glibc before 2.35 lacks the name. */
 #define PTRACE_GET_RSEQ 0x420f
+#define SS_AUTODISARM_ (1u << 31) /* linux/signal.h, which does not go with signal.h */
 
 #define warn_unused __attribute__((warn_unused_result))
 
@@ -260,6 +261,7 @@ struct thread {
 	uint64_t known_tls;
 	uint64_t clear_tid;
 	uint64_t altstack[3]; /* sp, flags, size                                */
+	bool disarmed;        /* has none as long as it is in a handler on it   */
 	char name[16];
 	struct creds creds;
 	struct scheduling scheduling; /* at this freeze                         */
@@ -796,10 +798,10 @@ void ask_add(const struct target *target, bool with_locks, struct inj_call *call
 	     struct questions *questions);
 int ask_answer(struct thread *thread, const struct inj_call *call,
 	       const struct questions *questions, struct avc_error *err) warn_unused;
-/* Asks a stopped thread just that. */
+/* Asks a stopped thread just that; if it is the main thread, ask_others(). */
 int ask(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 /* The main thread was asked, and had other credentials before: a change may be one of all
- * threads (nptl(7), setuid(3)), so these are asked again, too (EAGAIN). */
+ * threads (nptl(7), setuid(3)), so these are to be asked again, too (EAGAIN). */
 int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
 	       struct avc_error *err) warn_unused;
 /* The threads there are now; those that ended are forgotten. */

@@ -445,14 +445,19 @@ void ask_add(const struct target *target, bool with_locks, struct inj_call *call
 int ask(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
+	const bool is_main = thread->tid == target->pid, asked_before = thread->inside != 0;
+	struct creds was = thread->creds;
 	struct questions questions;
 
 	call_begin(call, INJ_AFTER_HOME);
-	ask_add(target, thread->tid == target->pid, call, &questions);
+	ask_add(target, is_main, call, &questions);
 	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
 	    pad_run(thread->tid, call, err))
 		return -1;
-	return give_back(thread, err) ? -1 : ask_answer(thread, call, &questions, err);
+	if (give_back(thread, err) || ask_answer(thread, call, &questions, err))
+		return -1;
+	was.future_lock = thread->creds.future_lock; /* no matter of threads */
+	return is_main && asked_before ? ask_others(target, thread, &was, err) : 0;
 }
 
 int ask_answer(struct thread *thread, const struct inj_call *call,
@@ -460,6 +465,7 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 {
 	const struct inj_syscall *altstack = questions->altstack, *inside = questions->inside,
 				 *name = questions->name, *locks = questions->locks;
+	bool was_disarming;
 
 	if (questions->tid_address->result)
 		return fail(err, AVC_UNSUPPORTED, (int)-questions->tid_address->result, thread->tid,
@@ -469,7 +475,9 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 		return fail(err, AVC_KERNEL, (int)-altstack->result, thread->tid, "read state",
 			    "sigaltstack", "refused");
 	memcpy(&thread->clear_tid, call->out, 8);
+	was_disarming = thread->disarmed || thread->altstack[1] & SS_AUTODISARM_;
 	memcpy(thread->altstack, call->out + 8, 24);
+	thread->disarmed = was_disarming && thread->altstack[1] & SS_DISABLE;
 	if (inside->result <= 0 || name->result)
 		return fail(err, AVC_KERNEL, (int)-name->result, thread->tid, "read state",
 			    "prctl(PR_GET_NAME)", "refused");

@@ -49,11 +49,40 @@ def test_a_thread_that_changes(kind: str, tmp_path: Path) -> None:
     with Victim(f"traits {kind}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(1 if kind == "setup" else 4):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
-        victim.board.set_counter(1, 1)
-        wait_until(lambda: victim.see().counter[0] == 1, 5, "it goes on")
+        lead(victim, 1)
         victim.wait_beats()
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         kill(guard, victim)
+
+
+def test_a_thread_that_leaves_a_handler(tmp_path: Path) -> None:
+    """It has its alternate stack again, which it did not have while it was asked in the handler."""
+    with Victim("traits rearmed", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for step in (0, 1, 2):
+            lead(victim, step)
+            for _ in range(4):
+                assert guard.command("checkpoint")["kind"] == "checkpoint"
+        victim.wait_beats()
+        kill(guard, victim)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_all_threads_change_users(where: str, tmp_path: Path) -> None:
+    """Whichever of them the next checkpoint asks (after many quiet ones not all): it has them all as they are now."""
+    with Victim(f"traits users {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for change in range(1, 13):
+            for _ in range(change):
+                assert guard.command("checkpoint")["kind"] == "checkpoint"
+            lead(victim, change)
+            answer = guard.command("checkpoint")
+            assert answer["kind"] == "checkpoint", answer
+            kill(guard, victim)
+
+
+def lead(victim: Victim, step: int) -> None:
+    """It waits for the step on its board, takes it, and says so there."""
+    victim.board.set_counter(1, step)
+    wait_until(lambda: victim.see().counter[0] == step, 5, f"it has come to step {step}")
 
 
 def kill(guard: GuardProcess, victim: Victim) -> None:

@@ -11,7 +11,11 @@
  *   personality   another one than at first (it changes 200 ms after the start)
  *   setup         a thread that sets its alternate stack and its name up a little after it began
  *   disarmed      a thread on an alternate stack that it has given up (SS_AUTODISARM)
+ *   rearmed       the same, which has left it when counter 1 of the board is 2
+ *   users         threads that change their groups and user, all of them (setuid(3)), each time
+ *                 counter 1 of the board does; counter 0 follows
  */
+#include <grp.h>
 #include <linux/membarrier.h>
 #include <pthread.h>
 #include <sched.h>
@@ -24,6 +28,7 @@
 #define SS_AUTODISARM_ (1u << 31) /* linux/signal.h, which does not go with signal.h */
 #define STACK_BYTES 65536
 #define MUCH (200ul << 20)
+#define USERS 4
 
 static char was[512], is[512], stack[STACK_BYTES];
 static pid_t kid, dead;
@@ -199,7 +204,7 @@ static void look_at_personality(char *to, size_t size)
 		 (personality(0xffffffff) == ADDR_NO_RANDOMIZE) == changed ? "right" : "wrong");
 }
 
-/* ---- setup, disarmed ---------------------------------------------------------------------- */
+/* ---- setup, disarmed, rearmed ------------------------------------------------------------- */
 
 /* What a thread finds of itself. */
 static void tell(void)
@@ -231,6 +236,15 @@ static void stay(int signal)
 		tell();
 }
 
+/* A handler, too; what is told of is the thread outside of it. */
+static void leave(int signal)
+{
+	(void)signal;
+	count(0, 1);
+	while (__atomic_load_n(&board->counter[1], __ATOMIC_ACQUIRE) < 2)
+		nap_us(1000);
+}
+
 static void *disarm(void *arg)
 {
 	const stack_t own = { .ss_sp = stack,
@@ -241,12 +255,15 @@ static void *disarm(void *arg)
 	while (!__atomic_load_n(&board->counter[1], __ATOMIC_ACQUIRE))
 		nap_us(1000);
 	raise(SIGUSR2);
+	count(0, 1);
+	for (;; nap_us(1000))
+		tell();
 	return arg;
 }
 
-static void start(void *(*work)(void *))
+static void start(void *(*work)(void *), void (*handler)(int))
 {
-	const struct sigaction action = { .sa_handler = stay, .sa_flags = SA_ONSTACK };
+	const struct sigaction action = { .sa_handler = handler, .sa_flags = SA_ONSTACK };
 	pthread_t thread;
 
 	sigaction(SIGUSR2, &action, NULL);
@@ -255,12 +272,17 @@ static void start(void *(*work)(void *))
 
 static void setup_late(void)
 {
-	start(set_up_late);
+	start(set_up_late, stay);
 }
 
 static void setup_disarmed(void)
 {
-	start(disarm);
+	start(disarm, stay);
+}
+
+static void setup_rearmed(void)
+{
+	start(disarm, leave);
 }
 
 /* Nothing, before counter 1 of the board lets the thread go on. */
@@ -282,6 +304,72 @@ static void look_at_thread(char *to, size_t size)
 	seen = true;
 }
 
+/* ---- users --------------------------------------------------------------------------------- */
+
+static struct {
+	volatile uint64_t looks, found;
+} user[USERS];
+static uint64_t changes;
+
+/* Group and user, as the kernel knows them of this thread. */
+static uint64_t who_i_am(void)
+{
+	gid_t group = 0;
+
+	must(syscall(SYS_getgroups, 1, &group) == 1, "getgroups");
+	return (uint64_t)group << 32 | (uint64_t)syscall(SYS_geteuid);
+}
+
+static void *be_user(void *arg)
+{
+	const size_t i = (size_t)arg;
+
+	/* A nap that the change cuts short (nptl(7)). */
+	for (;; usleep(1000)) {
+		user[i].found = who_i_am();
+		user[i].looks++;
+	}
+	return NULL;
+}
+
+/* The user last, who may not change the groups. */
+static void change_users(void)
+{
+	const gid_t group = (gid_t)(3000 + changes);
+
+	must(!seteuid(0) && !setgroups(1, &group) && !seteuid(1000), "setgroups");
+}
+
+static void setup_users(void)
+{
+	pthread_t thread;
+
+	change_users();
+	for (size_t i = 0; i < USERS; i++)
+		must(!pthread_create(&thread, NULL, be_user, (void *)i), "pthread_create");
+}
+
+static void look_at_users(char *to, size_t size)
+{
+	const uint64_t asked = __atomic_load_n(&board->counter[1], __ATOMIC_ACQUIRE);
+
+	if (asked > changes) {
+		changes = asked;
+		change_users();
+		__atomic_store_n(&board->counter[0], asked, __ATOMIC_RELEASE);
+	}
+	snprintf(to, size, "all are alike");
+	for (size_t i = 0; i < USERS; i++) {
+		const uint64_t before = user[i].looks;
+
+		while (user[i].looks < before + 2)
+			nap_us(1000);
+		if (user[i].found != who_i_am())
+			snprintf(to, size, "thread %zu is %lx, the main thread %lx", i,
+				 user[i].found, who_i_am());
+	}
+}
+
 /* ---- all of them ---------------------------------------------------------------------------- */
 
 static const struct {
@@ -296,6 +384,8 @@ static const struct {
 	{ "personality", setup_personality, look_at_personality },
 	{ "setup", setup_late, look_at_thread },
 	{ "disarmed", setup_disarmed, look_at_thread },
+	{ "rearmed", setup_rearmed, look_at_thread },
+	{ "users", setup_users, look_at_users },
 };
 
 int main(int argc, char **argv)
