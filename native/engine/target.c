@@ -577,7 +577,7 @@ static int check_unshared(const struct target *target, const struct thread *t,
 		return 0;
 	if (!is_thread(target, t->tid))
 		return fail(err, AVC_GONE, 0, t->tid, "check", "", "it is no thread");
-	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "thread %d has %s",
+	return fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "", "thread %d has %s",
 		    proc_inside(t->tid), what);
 }
 
@@ -611,7 +611,7 @@ static int check_spaces(const struct target *target, const struct thread *t, str
 			       others = space_of(target->pidfd, spaces[i].kind);
 
 		if (own && others && own != others && is_thread(target, t->tid))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			result = fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "",
 				      "thread %d has a namespace of its own (%s)", t->inside,
 				      spaces[i].name);
 	}

@@ -78,6 +78,20 @@ def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
         victim.wait_beats(20)
 
 
+def test_of_one_thread_and_not_for_long(tmp_path: Path) -> None:
+    """A checkpoint is missed, and those that were held are good."""
+    with Victim("unsupported network signal 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        victim.kill_app(signal.SIGUSR1)
+        wait_until(lambda: victim.see().counter[0] == 1, 5, "a thread is in a network of its own")
+        answer = guard.command("checkpoint")
+        assert answer["kind"] == "missed", answer
+        assert "a namespace of its own (network)" in answer["error"]["message"]
+        wait_until(lambda: victim.see().counter[0] == 0, 5, "it is back")
+        assert guard.command("checkpoint")["generations"] == 2
+        assert not [event for event in guard.events if event["kind"] == "unprotected"]
+
+
 def test_a_tracer_of_its_own(tmp_path: Path) -> None:
     """Somebody's debugger comes first; when it leaves, protection comes back."""
     with Victim("unsupported traced", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:

@@ -248,10 +248,19 @@ static bool start_groups(void)
 	return !syscall(SYS_capset, &header, data);
 }
 
+static volatile bool together_again;
+
 static void *apart(void *arg)
 {
-	if (unshare(*(const int *)arg))
+	const int flag = *(const int *)arg,
+		  network = open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC);
+
+	if (unshare(flag))
 		unavailable("unshare");
+	count(1, 1);
+	while (flag != CLONE_NEWNET || !together_again)
+		nap_us(1000);
+	must(!setns(network, CLONE_NEWNET), "setns");
 	count(1, 1);
 	for (;;)
 		pause();
@@ -308,6 +317,15 @@ static bool start_files(void)
 static bool start_network(void)
 {
 	return start_thread(apart, CLONE_NEWNET);
+}
+
+static void stop_network(void)
+{
+	const uint64_t before = board->counter[1];
+
+	together_again = true;
+	while (board->counter[1] == before)
+		nap_us(100);
 }
 
 static bool start_bounds(void)
@@ -482,7 +500,7 @@ static const struct kind {
 	{ "hugefile", start_hugefile, stop_huge },
 	{ "folder", start_folder, NULL },
 	{ "files", start_files, NULL },
-	{ "network", start_network, NULL },
+	{ "network", start_network, stop_network },
 	{ "bounds", start_bounds, NULL },
 	{ "shared-files", start_shared_files, NULL },
 	{ "shared-folder", start_shared_folder, NULL },
