@@ -28,7 +28,8 @@
 #define IOPRIO_WHO_PROCESS 1
 #define CAPABILITY_VERSION_3 0x20080522
 #define NODE_BITS (64 * NODE_WORDS)
-#define FILTER_MAX 4096 /* instructions (linux/bpf_common.h, BPF_MAXINSNS) */
+#define FILTER_MAX 4096   /* instructions (linux/bpf_common.h, BPF_MAXINSNS) */
+#define LOCKS 0xaaaaaaaau /* securebits: each locks the one below it (linux/securebits.h) */
 
 struct attributes {
 	char oom_score_adj[16];
@@ -267,6 +268,18 @@ static bool may_be_lowered(const struct creds *from, const struct creds *to)
 	       !(from->securebits & SECBIT_NO_CAP_AMBIENT_RAISE && raises_ambient(from, to));
 }
 
+/* What is locked in `from` is locked and as it is in `to`, too, and lower() has no need to change
+ * it on the way: nobody may (prctl(2), PR_SET_SECUREBITS and PR_SET_KEEPCAPS). */
+static bool fits_locks(const struct creds *from, const struct creds *to)
+{
+	const uint32_t locks = from->securebits & LOCKS;
+	uint32_t changed = from->securebits ^ to->securebits;
+
+	if (memcmp(from->uid, to->uid, sizeof to->uid) && !(from->securebits & SECBIT_KEEP_CAPS))
+		changed |= SECBIT_KEEP_CAPS;
+	return !(locks & ~to->securebits) && !(locks >> 1 & changed);
+}
+
 /* A thread that is made by another one gets what it has not from that. */
 static int set_apart(const struct target *target, pid_t inside, const struct creds *from,
 		     const struct creds *to, struct setup *setup, struct avc_error *err)
@@ -299,6 +312,12 @@ static int set_apart(const struct target *target, pid_t inside, const struct cre
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 			    "%s %d has other capability sets (bounding, ambient, securebits) than "
 			    "the main %s, which lacks CAP_SETPCAP to give up the same",
+			    target->descendant ? "process" : "thread", inside,
+			    target->descendant ? "process" : "thread");
+	if (!fits_locks(from, to))
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "%s %d has another user or other securebits than the main %s, which "
+			    "has locked its own",
 			    target->descendant ? "process" : "thread", inside,
 			    target->descendant ? "process" : "thread");
 	lower(from, to, setup);

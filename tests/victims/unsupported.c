@@ -21,6 +21,10 @@
  *   files     one thread with descriptors of its own
  *   network   one thread in a network of its own
  *   bounds    one thread with a smaller bounding set, which the main thread may not lower
+ *   locked, locked-child  one thread, or a child process, without a securebit that the main
+ *             thread has locked
+ *   user      one thread of another user, and the main thread has locked that capabilities are
+ *             not kept over that
  *   shared-files, shared-folder   a child process with the descriptors, or the working
  *             directory, of its parent
  *   dispatch  its system calls are dispatched by itself, and while it makes none are blocked
@@ -39,6 +43,7 @@
 #include <linux/if_packet.h>
 #include <linux/io_uring.h>
 #include <linux/seccomp.h>
+#include <linux/securebits.h>
 #include <pthread.h>
 #include <sched.h>
 #include <signal.h>
@@ -339,6 +344,32 @@ static bool start_bounds(void)
 	return !syscall(SYS_capset, &header, data);
 }
 
+static void *other_user(void *arg)
+{
+	if (*(const int *)arg && syscall(SYS_setresuid, 1001, 1001, 1001))
+		unavailable("setresuid");
+	count(1, 1);
+	for (;;)
+		pause();
+	return arg;
+}
+
+static bool lock_securebits(unsigned long bits)
+{
+	return !prctl(PR_SET_SECUREBITS, bits, 0, 0, 0);
+}
+
+static bool start_locked(void)
+{
+	return start_thread(other_user, false) &&
+	       lock_securebits(SECBIT_NOROOT | SECBIT_NOROOT_LOCKED);
+}
+
+static bool start_user(void)
+{
+	return lock_securebits(SECBIT_KEEP_CAPS_LOCKED) && start_thread(other_user, true);
+}
+
 static bool start_child(unsigned long flags)
 {
 	const long child = syscall(SYS_clone, flags | SIGCHLD, 0, 0, 0, 0);
@@ -347,6 +378,11 @@ static bool start_child(unsigned long flags)
 		for (;;)
 			pause();
 	return child > 0;
+}
+
+static bool start_locked_child(void)
+{
+	return start_child(0) && lock_securebits(SECBIT_NOROOT | SECBIT_NOROOT_LOCKED);
 }
 
 static bool start_shared_files(void)
@@ -502,6 +538,9 @@ static const struct kind {
 	{ "files", start_files, NULL },
 	{ "network", start_network, stop_network },
 	{ "bounds", start_bounds, NULL },
+	{ "locked", start_locked, NULL },
+	{ "locked-child", start_locked_child, NULL },
+	{ "user", start_user, NULL },
 	{ "shared-files", start_shared_files, NULL },
 	{ "shared-folder", start_shared_folder, NULL },
 	{ "dispatch", start_dispatch, stop_dispatch },
