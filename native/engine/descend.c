@@ -419,7 +419,7 @@ static int make_member(struct family *family, uint32_t index, int *last, struct 
 		return -1;
 	}
 	if (branch->target) {
-		manner_lift_limits(member->pid, files_of(family, index));
+		manner_lift_limits(member->pid, branch, files_of(family, index));
 		*last = (int)index;
 		return 0;
 	}

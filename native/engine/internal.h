@@ -1000,7 +1000,7 @@ int manner_put(struct puppet *puppet, const struct branch *branch,
 	       struct avc_error *err) warn_unused;
 /* Until then nothing is limited: it may have more than it may have now, and its parent may have
  * lowered its own limits since.  Its descriptors are below `files`. */
-void manner_lift_limits(pid_t pid, uint32_t files);
+void manner_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
 /* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
  * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
 void limit_lift(pid_t pid, int which, uint64_t least);

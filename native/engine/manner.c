@@ -209,20 +209,21 @@ void limit_lift(pid_t pid, int which, uint64_t least)
 	(void)prlimit(pid, which, &now, NULL);
 }
 
-void manner_lift_limits(pid_t pid, uint32_t files)
+void manner_lift_limits(pid_t pid, const struct branch *branch, uint32_t files)
 {
 	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
 	for (int i = 0; i < LIMITS; i++)
 		limit_lift(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
+	limit_lift(pid, RLIMIT_NOFILE, branch->manner->limit[RLIMIT_NOFILE][1]);
 }
 
 void manner_setup_limits(const struct branch *branch, struct setup *setup)
 {
 	for (uint64_t i = 0; i < LIMITS; i++)
-		setup_add(setup, INJ_AFTER, "prlimit", SYS_prlimit64, 0, i,
+		setup_add(setup, INJ_AFTER, "prlimit", INJ_LIMIT, i,
 			  setup_data(setup, branch->manner->limit[i],
 				     sizeof branch->manner->limit[i]),
-			  0, 0)
+			  0, 0, 0)
 			->flags = INJ_MAY_FAIL;
 }
 

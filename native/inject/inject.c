@@ -238,6 +238,18 @@ static long open_pidfd(uint64_t fd, uint64_t pid, uint64_t flags, uint64_t cloex
 	return r;
 }
 
+static long put_limit(uint64_t which, const uint64_t *limit)
+{
+	const long r = SYS4(__NR_prlimit64, 0, which, limit, 0);
+	uint64_t now[2]; /* soft, hard */
+
+	if (r && SYS4(__NR_prlimit64, 0, which, 0, now) == 0) {
+		now[0] = limit[0] < now[1] ? limit[0] : now[1];
+		SYS4(__NR_prlimit64, 0, which, now, 0);
+	}
+	return r;
+}
+
 static long make_call(const struct inj_syscall *s)
 {
 	const uint64_t *arg = s->arg;
@@ -248,6 +260,8 @@ static long make_call(const struct inj_syscall *s)
 		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
 	if (s->nr == INJ_CAPS_CHANGE)
 		return change_caps(arg[0], arg[1]);
+	if (s->nr == INJ_LIMIT)
+		return put_limit(arg[0], (const uint64_t *)arg[1]);
 	return raw_syscall(s->nr, arg[0], arg[1], arg[2], arg[3], arg[4], arg[5]);
 }
 

@@ -109,6 +109,9 @@ struct inj_setup {
 /* Likewise, for each capability of the set arg[1]: out of the bounding set (arg[0]
  * PR_CAPBSET_DROP) or into the ambient one (PR_CAP_AMBIENT). */
 #define INJ_CAPS_CHANGE (-3)
+/* Likewise: setrlimit(arg[0], arg[1]), or as much of that as a process may that has no right to a
+ * higher hard limit than it has. */
+#define INJ_LIMIT (-4)
 
 enum inj_setup_flag {
 	INJ_MUST = 0,

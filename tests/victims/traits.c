@@ -7,6 +7,8 @@
  *   exit-signal   a child whose end is told by SIGUSR1, and one that had ended so
  *   zombie-group  a process in the group of one that has ended, which nobody waited for
  *   limits        a child that has more than its parent may have, which has lowered its limits
+ *   hard-limits   a child that may give itself more than its parent, which has lowered its own
+ *                 hard limits; it has given up the right to raise such (CAP_SYS_RESOURCE)
  *   barriers      membarrier(2), registered
  *   personality   another one than at first (it changes 200 ms after the start)
  *   setup         a thread that sets its alternate stack and its name up a little after it began
@@ -16,6 +18,7 @@
  *                 counter 1 of the board does; counter 0 follows
  */
 #include <grp.h>
+#include <linux/capability.h>
 #include <linux/membarrier.h>
 #include <pthread.h>
 #include <sched.h>
@@ -162,6 +165,61 @@ static void look_at_limits(char *to, size_t size)
 		must(!getrlimit(which[i], &own) && !prlimit(kid, which[i], NULL, &its), "prlimit");
 		snprintf(to + strlen(to), size - strlen(to), "; %d: %lu %lu, mine %lu %lu",
 			 which[i], its.rlim_cur, its.rlim_max, own.rlim_cur, own.rlim_max);
+	}
+}
+
+/* ---- hard-limits -------------------------------------------------------------------------- */
+
+static const int lowered[] = { RLIMIT_NOFILE, RLIMIT_FSIZE };
+static bool may_raise;
+
+static void set_hard_limit(int which, rlim_t value)
+{
+	const struct rlimit limit = { value, value };
+
+	must(!setrlimit(which, &limit), "setrlimit");
+}
+
+static bool give_up_raising(void)
+{
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2];
+	bool had;
+
+	must(!syscall(SYS_capget, &header, data), "capget");
+	had = data[0].permitted >> CAP_SYS_RESOURCE & 1;
+	data[0].permitted &= ~(1u << CAP_SYS_RESOURCE);
+	data[0].effective &= data[0].permitted;
+	must(!syscall(SYS_capset, &header, data), "capset");
+	return had;
+}
+
+static void setup_hard_limits(void)
+{
+	may_raise = give_up_raising();
+	kid = fork();
+	if (!kid) {
+		set_limit(RLIMIT_NOFILE, 100);
+		set_limit(RLIMIT_FSIZE, 1 << 20);
+		raise(SIGSTOP);
+		rest();
+	}
+	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
+	must(!kill(kid, SIGCONT), "kill");
+	set_hard_limit(RLIMIT_NOFILE, 256);
+	set_hard_limit(RLIMIT_FSIZE, 1 << 30);
+}
+
+/* Hard ones as far as the guard may raise them, which has no more rights than this had. */
+static void look_at_hard_limits(char *to, size_t size)
+{
+	*to = 0;
+	for (size_t i = 0; i < sizeof(lowered) / sizeof(*lowered); i++) {
+		struct rlimit its;
+
+		must(!prlimit(kid, lowered[i], NULL, &its), "prlimit");
+		snprintf(to + strlen(to), size - strlen(to), "%d: %lu %lu; ", lowered[i],
+			 its.rlim_cur, may_raise ? its.rlim_max : 0);
 	}
 }
 
@@ -380,6 +438,7 @@ static const struct {
 	{ "exit-signal", setup_exit_signal, look_at_exit_signal },
 	{ "zombie-group", setup_zombie_group, look_at_zombie_group },
 	{ "limits", setup_limits, look_at_limits },
+	{ "hard-limits", setup_hard_limits, look_at_hard_limits },
 	{ "barriers", setup_barriers, look_at_barriers },
 	{ "personality", setup_personality, look_at_personality },
 	{ "setup", setup_late, look_at_thread },
