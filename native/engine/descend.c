@@ -93,7 +93,8 @@ struct chores {
 /* Has ended, or will, and its parent is told. */
 static void note_end(struct family *family, const struct branch *branch)
 {
-	if (branch->exit_signal > 0)
+	/* clone(2) takes any number of eight bits for a signal. */
+	if (branch->exit_signal > 0 && branch->exit_signal < NSIG)
 		family->flush |= UINT64_C(1) << (branch->exit_signal - 1);
 }
 

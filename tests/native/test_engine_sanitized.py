@@ -85,7 +85,9 @@ def guarding(program: Path, victim: Victim, interval_ms: int, commands: int, out
     assert status == 0, guard.said
 
 
-@pytest.mark.parametrize("command", ["threads 8 4", "crash", "busy 4", "tree 8", "prefork 2 1 --private 20"])
+@pytest.mark.parametrize(
+    "command", ["threads 8 4", "crash", "busy 4", "tree 8", "prefork 2 1 --private 20", "traits exit-signal"]
+)
 def test_kills_and_restores(command: str, guard_program: Path, tmp_path: Path) -> None:
     rng = random.Random(command)
     with Victim(command, tmp_path) as victim:

@@ -4,7 +4,8 @@
  * two.  The victim says all the time what it finds, and nothing may ever be other than it
  * was.
  *
- *   exit-signal   a child whose end is told by SIGUSR1, and one that had ended so
+ *   exit-signal   a child whose end is told by SIGUSR1, one that had ended so, and one that had
+ *                 ended with what is no signal
  *   zombie-group  a process in the group of one that has ended, which nobody waited for
  *   limits        a child that has more than its parent may have, which has lowered its limits
  *   hard-limits   a child that may give itself more than its parent, which has lowered its own
@@ -32,9 +33,10 @@
 #define STACK_BYTES 65536
 #define MUCH (200ul << 20)
 #define USERS 4
+#define NO_SIGNAL 200
 
 static char was[512], is[512], stack[STACK_BYTES];
-static pid_t kid, dead;
+static pid_t kid, dead, untold;
 static volatile int ready;
 static stack_t thread_stack;
 static char thread_name[16];
@@ -63,6 +65,11 @@ static void setup_exit_signal(void)
 {
 	signal(SIGUSR1, SIG_IGN);
 	signal(SIGUSR2, SIG_IGN);
+	untold = clone_with(NO_SIGNAL);
+	if (!untold)
+		_exit(4);
+	must(untold > 0, "clone");
+	wait_ended(untold);
 	dead = clone_with(SIGUSR2);
 	if (!dead)
 		_exit(3);
@@ -87,6 +94,8 @@ static void look_at_exit_signal(char *to, size_t size)
 		 of_clones, waitid(P_PID, (id_t)dead, &info, WEXITED | WNOWAIT | WNOHANG));
 	waitid(P_PID, (id_t)dead, &info, WEXITED | WNOWAIT | WNOHANG | __WCLONE);
 	snprintf(to + strlen(to), size - strlen(to), " status %d", info.si_status);
+	waitid(P_PID, (id_t)untold, &info, WEXITED | WNOWAIT | WNOHANG | __WCLONE);
+	snprintf(to + strlen(to), size - strlen(to), ", of the other %d", info.si_status);
 }
 
 /* ---- zombie-group ------------------------------------------------------------------------- */
