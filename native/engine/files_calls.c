@@ -7,6 +7,7 @@
 #include <fcntl.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/resource.h>
 #include <sys/syscall.h>
 
 #include "files.h"
@@ -115,6 +116,32 @@ static void list_pidfd(struct setup *setup, const struct file *w)
 		->flags = INJ_MAY_FAIL;
 }
 
+static bool has_pidfds(const struct files *files)
+{
+	for (uint32_t i = 0; i < files->count; i++)
+		if (files->file[i].pid_inside)
+			return true;
+	return false;
+}
+
+void files_lift_limit(const struct files *want, pid_t pid)
+{
+	if (has_pidfds(want))
+		limit_lift(pid, RLIMIT_NOFILE, (uint64_t)want->file[want->count - 1].fd + 2);
+}
+
+/* Of the main process; the others put all of theirs back (manner.c). */
+static void list_limit(const struct files_work *work, struct setup *setup)
+{
+	uint64_t limit[LIMITS][2];
+
+	if (proc_limits(work->generation->template, limit) == 0)
+		setup_add(setup, INJ_OWNERS, "", INJ_LIMIT, RLIMIT_NOFILE,
+			  setup_data(setup, limit[RLIMIT_NOFILE], sizeof limit[RLIMIT_NOFILE]), 0,
+			  0, 0)
+			->flags = INJ_MAY_FAIL;
+}
+
 /* Made again, and bound (files_make.c).  Whoever connects is told who listens (unix(7),
  * SO_PEERCRED), so the process must have its own user by then. */
 static void list_listen(const struct files_work *work, struct setup *setup, const struct file *w,
@@ -146,6 +173,8 @@ void files_list_calls(struct files_work *work)
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->want->file[i].pid_inside)
 			list_pidfd(setup, &work->want->file[i]);
+	if (!work->target->descendant && has_pidfds(work->want))
+		list_limit(work, setup);
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
 

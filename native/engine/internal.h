@@ -850,6 +850,9 @@ struct files_table {
 int files_restore(struct target *target, struct generation *generation,
 		  const struct avc_config *config, pid_t init, struct files_table *table,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
+/* A process that is to be restored opens its pidfds itself: as many descriptors as it takes, until
+ * it puts its limit back after that. */
+void files_lift_limit(const struct files *want, pid_t pid);
 void files_table_free(struct files_table *table);
 /* A descriptor of that device, as stat(2) numbers it; -1: there is none. */
 int files_find_device(const struct files *files, uint32_t rdev);

@@ -132,6 +132,7 @@ static int fork_template(struct target *target, struct generation *generation, p
 		tracee_kill(child);
 		return -1;
 	}
+	files_lift_limit(generation->files, child);
 	if (generation->branches) {
 		if (proc_inside(child) == slot->pid) {
 			*pid = child;

@@ -370,7 +370,7 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["messages", "pidfds", "child"])
+@pytest.mark.parametrize("scenario", ["messages", "pidfds", "child", "full"])
 def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
     """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
     with (

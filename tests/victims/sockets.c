@@ -6,6 +6,7 @@
  */
 #include <poll.h>
 #include <sys/epoll.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
 
@@ -139,6 +140,38 @@ static void pidfds_verify(void)
 	      "the flags of a pidfd");
 }
 
+/* ---- and no room for more ------------------------------------------------------------------ */
+
+#define FULL 64
+#define BEYOND 900
+
+/* All numbers are taken that it may have, and a pidfd has one that it may have no more. */
+static void full_setup(void)
+{
+	struct rlimit limit;
+
+	fd[0] = pidfd_of(getpid(), 0);
+	must(dup2(fd[0], BEYOND) == BEYOND, "dup2");
+	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
+	limit.rlim_cur = FULL;
+	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	while (dup(STDOUT_FILENO) >= 0)
+		;
+}
+
+static void full_verify(void)
+{
+	struct rlimit limit;
+
+	CHECK(dup(STDOUT_FILENO) < 0 && errno == EMFILE && !getrlimit(RLIMIT_NOFILE, &limit) &&
+		      limit.rlim_cur == FULL && limit.rlim_max > BEYOND,
+	      "another limit");
+	close(FULL - 1);
+	expect_process(fd[0], getpid());
+	expect_process(BEYOND, getpid());
+	CHECK(dup(STDOUT_FILENO) == FULL - 1, "another number");
+}
+
 /* ---- a child that is watched, as event loops do ------------------------------------------- */
 
 static pid_t watched;
@@ -194,6 +227,7 @@ static const struct scenario scenarios[] = {
 	{ "messages", messages_setup, messages_disturb, messages_verify },
 	{ "child", child_setup, child_disturb, child_verify },
 	{ "pidfds", pidfds_setup, pidfds_disturb, pidfds_verify },
+	{ "full", full_setup, nothing, full_verify },
 	{ "rights", rights_setup, nothing, nothing },
 };
 
