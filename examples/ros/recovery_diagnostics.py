@@ -6,10 +6,11 @@
 
 Every protected container is one diagnostic status, "avckpt: NAME": OK while it
 is protected, WARN for ~hold seconds after a recovery, ERROR while it runs
-unprotected or when it could not be restored, STALE when it has just ended or the
-sidecar does not answer.  Changes are published as they happen, everything once in
-~period seconds.  Reads the sidecar's event stream on its Unix socket, so it runs as
-root, on the host or in a container with -v /run/avckpt:/run/avckpt.
+unprotected, as long as nothing is held to go back to or when it could not be
+restored, STALE when it has just ended or the sidecar does not answer.  Changes are
+published as they happen, everything once in ~period seconds.  Reads the sidecar's
+event stream on its Unix socket, so it runs as root, on the host or in a container
+with -v /run/avckpt:/run/avckpt.
 
 Parameters: ~socket (/run/avckpt/api.sock), ~period (1.0 s), ~hold (10.0 s).
 """
@@ -79,6 +80,8 @@ def status_of(event: dict[str, Any], hold_s: float = 10.0) -> Status:
     level = LEVELS.get(kind, WARN)
     if kind == "gave_up" and event.get("outcome") in MEANT:
         level = STALE
+    if kind in ("missed", "dropped") and event.get("generations") == 0:
+        level = ERROR
     values = {name: str(event[name]) for name in SHOWN if event.get(name) is not None}
     values["event"] = kind
     if event.get("group"):

@@ -414,6 +414,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	event.kind = AVC_EVENT_MISSED;
+	event.generations = guard->count; /* another pad may have cost them all */
 	event.ticket = ticket;
 	event.error = error;
 	emit(guard, &event);

@@ -192,9 +192,11 @@ void let_executed_go(struct avc_guard *guard, bool all)
 	const uint64_t now = now_ns();
 
 	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
-		drop_all(guard);
+		while (guard->count)
+			lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
 		tracee_end_now(); /* they have the table that exec(2) has left */
 		unhold(main);
+		main->infected = false; /* what was mapped there went with its memory */
 	}
 	for (uint32_t i = 0; i < guard->tree.members; i++) {
 		struct target *target = guard->tree.member[i];

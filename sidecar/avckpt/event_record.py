@@ -202,7 +202,7 @@ def of_guard(
         outcome=_outcome(event),
         wait_status=event.wait_status if kind in _DEATHS else None,
         generation=event.generation if counted else None,
-        generations=event.generations if counted else None,
+        generations=event.generations if counted or kind is Kind.MISSED else None,
         age_s=event.age_s if restored or kind is Kind.DROPPED else None,
         lost_s=event.age_s + event.restore_s if restored else None,
         freeze_s=freeze_s,
@@ -268,6 +268,10 @@ def _restored(record: EventRecord) -> str:
     )
 
 
+def _nothing_held(record: EventRecord) -> str:
+    return "; nothing is held to go back to" if record.generations == 0 else ""
+
+
 def _crashes(record: EventRecord) -> str:
     return f" ({record.attempt} time(s))" if record.attempt else ""
 
@@ -280,7 +284,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.REGISTERED: lambda record: record.detail,
     Kind.ATTACHED: lambda record: f"attached to application {record.app_pid} (inside {record.app_pid_inside})",
     Kind.CHECKPOINT: lambda record: f"checkpoint: {_checkpoint(record)}",
-    Kind.MISSED: lambda record: f"checkpoint missed: {record.error}",
+    Kind.MISSED: lambda record: f"checkpoint missed: {record.error}{_nothing_held(record)}",
     Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
     # Whether this is bad news is known only with what follows.
     Kind.DIED: lambda record: f"died: {describe_wait_status(record.wait_status or 0)}",

@@ -47,6 +47,7 @@ class Reason(enum.IntEnum):
     MEMORY = 11
     KILLED = 12
     CRASHED = 13
+    EXECUTED = 14
 
 
 GAVE_UP_WORDS = {
@@ -64,6 +65,7 @@ DROPPED_WORDS = {
     Reason.UNHEALTHY: "it was taken after the last good health check",
     Reason.MEMORY: "memory is short",
     Reason.KILLED: "its template was killed (by the OOM killer, or from inside)",
+    Reason.EXECUTED: "the application has executed another program",
 }
 """Why a generation was given up before its time."""
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 
 from avckpt.event_record import EXPECTED, EventRecord, Kind
+from avckpt.events import DROPPED_WORDS, Reason
 
 SELDOM_S = 60.0
 """What may go wrong at every interval (a checkpoint, a health check) is told at most this often, of one container."""
@@ -58,12 +59,18 @@ class Journal:
         kind = record.kind
         if kind is Kind.CHECKPOINT:
             return self._checkpoint(record)
+        was_held = self._held
+        if record.generations == 0:
+            self._held = False
         if kind is Kind.MISSED:
-            return self._missed.line(record)
+            # One that cost what was held is always told.
+            return (logging.WARNING, record.message) if was_held and not self._held else self._missed.line(record)
         if kind is Kind.HEALTH and record.error is not None:
             return self._unhealthy.line(record)
         if kind is Kind.UNPROTECTED:
             return self._lost(record)
+        if kind is Kind.DROPPED and record.detail == DROPPED_WORDS[Reason.EXECUTED]:
+            return logging.INFO, record.message  # as the entry points of many images do
         if kind is Kind.GAVE_UP and record.outcome in EXPECTED:
             return logging.INFO, record.message
         if kind is Kind.CONFIGURED and record.error is not None:

@@ -84,6 +84,9 @@ class Protected:
         if event.app_pid:
             self.app_pid = event.app_pid
             self.app_pid_inside = event.app_pid_inside
+        self.generations = event.generations
+        if not self.generations:
+            self.memory_bytes = 0
         kind = event.kind
         if kind is EventKind.ATTACHED:
             self.reason = "no checkpoint yet"
@@ -91,19 +94,15 @@ class Protected:
             self._to(State.PROTECTED, self._crashing(event.at_ns))
             self.checkpoints += 1
             self.generation = event.generation
-            self.generations = event.generations
             self.threads = event.threads
             self.last_checkpoint_at = at
             self.last_freeze_s = event.freeze_s
             self.last_quiescent = event.quiescent
         elif kind is EventKind.MISSED:
-            # What was held is still held: the state stays what it is.
             self.missed += 1
-            self.reason = f"checkpoint missed: {event.error}"
+            self._suffer(f"checkpoint missed: {event.error}")
         elif kind is EventKind.UNPROTECTED:
             self._to(State.UNPROTECTED, str(event.error))
-            self.generations = 0
-            self.memory_bytes = 0
         elif kind is EventKind.DIED:
             self._to(State.RESTORING)
             self.last_death = describe_wait_status(event.wait_status)
@@ -113,19 +112,16 @@ class Protected:
             self.restores = event.restores
             self.attempt = event.attempt
             self.generation = event.generation
-            self.generations = event.generations
             self.threads = event.threads
             self.last_restore_s = event.restore_s
             self.last_restore_age_s = event.age_s
             self._to(State.PROTECTED, self._crashing(event.at_ns))
         elif kind is EventKind.DROPPED:
-            self.generations = event.generations
             self.dropped += 1
             self.last_dropped = f"generation {event.generation}: {DROPPED_WORDS.get(event.reason, '')}"
-            if self.state is State.PROTECTED and not event.generations:
-                self._to(State.UNPROTECTED, f"{self.last_dropped}; checkpoints go on as soon as they can")
-            elif self.state is State.PROTECTED:
-                self.reason = f"{self.last_dropped}; {event.generations} left"
+            if self.state is State.PROTECTED:
+                left = f"; {event.generations} left" if event.generations else ""
+                self._suffer(f"{self.last_dropped}{left}")
         elif kind is EventKind.GAVE_UP:
             how = describe_wait_status(event.wait_status)
             self._to(State.ENDED, f"{how}; {why_not_restored(event.reason, event.error)}")
@@ -192,6 +188,13 @@ class Protected:
             return ""
         text = f"keeps crashing: restore {self.attempt} of {self.config.restore_max} within {window_s:g} s"
         return f"{text}; given up: {self.last_dropped}" if self.last_dropped else text
+
+    def _suffer(self, reason: str) -> None:
+        """Something went wrong: what is held protects as before, if anything is."""
+        if self.state is State.PROTECTED and not self.generations:
+            self._to(State.UNPROTECTED, f"{reason}; checkpoints go on as soon as they can")
+        else:
+            self.reason = reason
 
     def _to(self, state: State, reason: str = "") -> None:
         self.state = state

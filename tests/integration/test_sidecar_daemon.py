@@ -14,13 +14,15 @@ import signal
 import stat
 import struct
 import subprocess
+import sys
 import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import ROOT, avckpt_command, run, wait_until
+from cgroups import freezer
+from harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
 from local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, children, ended, local_sidecar
 
 SLEEPER = ["sleep", "1000"]
@@ -177,6 +179,65 @@ def test_what_can_not_be_protected_runs_unprotected_and_says_so(local: LocalSide
     assert refused.stderr.startswith("avckpt: web runs unprotected: ")
     assert local.log.count("web: runs unprotected") == 1
     assert not ended(web)
+
+
+def test_a_program_that_executes_another_is_unprotected_until_the_next_checkpoint(
+    local: LocalSidecar, tmp_path: Path
+) -> None:
+    """An entry point that takes its time, say."""
+    go = tmp_path / "go"
+    os.mkfifo(go)
+    web = local.protected("web", ["sh", "-c", f"read line < {go}; exec sleep 1000"], ON_COMMAND)
+    local.wait_for(web, app_pid_inside=2)
+    take_checkpoint(local.avckpt, "web")
+    go.write_text("now\n")
+    row = local.wait_for(web, state="unprotected", generations=0)
+    assert row["reason"].startswith("generation 1: the application has executed another program")
+    assert local.avckpt("restore", "web", check=False).status == 5
+    take_checkpoint(local.avckpt, "web")
+    local.wait_for(web, state="protected", generations=1)
+    os.kill(web.app_pid, signal.SIGKILL)
+    local.wait_for(web, restores=1, state="protected")
+    lines = [line.partition("web: ")[2] for line in local.log.splitlines() if "web: " in line]
+    assert "generation 1 is given up: the application has executed another program" in lines
+    assert len([line for line in lines if line.startswith("protected: first checkpoint")]) == 2
+    assert not [line for line in local.log.splitlines() if "WARNING" in line and "executed" in line]
+
+
+MANY = """
+import signal, sys, threading, time
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})
+open(sys.argv[1], "w").close()
+signal.sigwait({signal.SIGUSR1})
+for _ in range(40):
+    threading.Thread(target=time.sleep, args=(1000,)).start()
+open(sys.argv[1], "w").close()
+"""
+"""Starts more threads than a process of one thread is given room for, when it is told to."""
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local: LocalSidecar, tmp_path: Path) -> None:
+    """There are more threads than there was room for, and then they can not be stopped (`podman pause`)."""
+    there = tmp_path / "there"
+    web = local.protected("web", [sys.executable, "-c", MANY, str(there)], ON_COMMAND)
+    wait_until(there.exists, 10, "it is ready")
+    take_checkpoint(local.avckpt, "web")
+    there.unlink()
+    with freezer(version) as pause, contextlib.ExitStack() as undo:
+        undo.callback(signal.pidfd_send_signal, web.pidfd, signal.SIGKILL)
+        os.kill(web.app_pid, signal.SIGUSR1)
+        wait_until(there.exists, 10, "it has its threads")
+        pause.take(web.app_pid)
+        pause.wait()
+        assert local.avckpt("checkpoint", "web", check=False).status == 1
+        row = local.row(web)
+        assert (row["state"], row["generations"]) == ("unprotected", 0)
+        assert row["reason"].startswith("checkpoint missed: ")
+        assert "nothing is held to go back to" in local.log
+        pause.go()
+        take_checkpoint(local.avckpt, "web")
+        local.wait_for(web, state="protected", generations=1)
 
 
 def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:

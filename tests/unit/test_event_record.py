@@ -138,5 +138,5 @@ def test_messages() -> None:
     assert unhealthy.message.startswith("unhealthy, rolled back, restored in 6.0 ms from generation 4 (1.5 s old)")
     nothing = Event(EventKind.GAVE_UP, 1, reason=Reason.EMPTY, wait_status=9, error=NothingToRestore("none"))
     assert of_guard(nothing).message == "not restored (killed by SIGKILL): no checkpoint was held"
-    missed = of_guard(Event(EventKind.MISSED, 1, freeze_s=0.05, error=DeadlineMissed("too slow")))
+    missed = of_guard(Event(EventKind.MISSED, 1, generations=2, freeze_s=0.05, error=DeadlineMissed("too slow")))
     assert (missed.message, missed.freeze_s) == ("checkpoint missed: too slow", 0.05)

@@ -88,6 +88,19 @@ def test_the_board_over_time(node: ModuleType) -> None:
     assert levels(1031.0) == [("avckpt: sidecar", node.OK)]
 
 
+@pytest.mark.parametrize("kind", [Kind.DROPPED, Kind.MISSED])
+def test_nothing_held_is_an_error_until_there_is_something_again(node: ModuleType, kind: Kind) -> None:
+    board = node.Board(hold_s=10.0)
+    board.lose("")
+    board.take(event(Kind.CHECKPOINT, generations=1))
+    board.take(event(kind, generations=1))
+    assert [status.level for status in board.statuses(1011.0)] == [node.OK, node.OK]
+    board.take(event(kind, generations=0))
+    assert [status.level for status in board.statuses(2000.0)] == [node.OK, node.ERROR]
+    board.take(event(Kind.CHECKPOINT, generations=1))
+    assert [status.level for status in board.statuses(2000.0)] == [node.OK, node.OK]
+
+
 def test_it_resumes_where_it_was_when_the_sidecar_comes_back(node: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "api.sock"
     now = time.time()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import signal
 
@@ -45,6 +46,31 @@ def test_missed_checkpoints_are_counted_not_repeated() -> None:
     later = journal.line(missed(100.0 + SELDOM_S))
     assert later is not None
     assert later[1].endswith("(and 2 more since this was last said)")
+
+
+def test_a_miss_that_cost_what_was_held_is_told_at_once_and_so_is_the_next_checkpoint() -> None:
+    journal = Journal()
+    journal.line(missed(100.0))
+    journal.line(checkpoint(1))
+    kept = dataclasses.replace(missed(101.0), generations=1)
+    assert journal.line(kept) is None
+    level, text = journal.line(missed(102.0)) or (0, "")
+    assert level == logging.WARNING
+    assert text == "checkpoint missed: a thread did not stop; nothing is held to go back to"
+    assert journal.line(missed(103.0)) is None
+    assert (journal.line(checkpoint(2)) or (0, ""))[0] == logging.INFO
+
+
+@pytest.mark.parametrize(("reason", "level"), [(Reason.MEMORY, logging.WARNING), (Reason.EXECUTED, logging.INFO)])
+def test_the_checkpoint_after_the_last_generation_was_given_up_is_told(reason: Reason, level: int) -> None:
+    journal = Journal()
+    journal.line(checkpoint(1))
+    journal.line(checkpoint(2))
+    dropped = Event(EventKind.DROPPED, 1, reason=reason, generation=1, generations=1)
+    assert (journal.line(of_guard(dropped)) or (0, ""))[0] == level
+    assert (journal.line(checkpoint(3)) or (0, ""))[0] == logging.DEBUG
+    assert (journal.line(of_guard(dataclasses.replace(dropped, generations=0))) or (0, ""))[0] == level
+    assert (journal.line(checkpoint(4)) or (0, ""))[0] == logging.INFO
 
 
 def health(at_s: float, detail: str, error: AvckptError | None = None) -> EventRecord:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 
 import pytest
@@ -33,7 +34,7 @@ CHECKPOINT = Event(
     freeze_s=0.0025,
     quiescent=True,
 )
-MISSED = Event(EventKind.MISSED, 1, error=DeadlineMissed("thread 4712 did not stop", pid=4712))
+MISSED = Event(EventKind.MISSED, 1, generations=1, error=DeadlineMissed("thread 4712 did not stop", pid=4712))
 UNPROTECTED = Event(EventKind.UNPROTECTED, 1, error=Unsupported("it has an io_uring"))
 DIED = Event(EventKind.DIED, 1, wait_status=signal.SIGKILL, reason=Reason.SIGNAL)
 RESTORED = Event(
@@ -92,6 +93,14 @@ def test_a_missed_checkpoint_is_counted_and_keeps_what_is_held() -> None:
     assert "thread 4712 did not stop" in container.reason
     container.apply(CHECKPOINT, 1010.0)
     assert container.reason == ""
+
+
+def test_a_missed_checkpoint_that_cost_what_was_held_leaves_it_unprotected() -> None:
+    container = protected(ATTACHED, CHECKPOINT, dataclasses.replace(MISSED, generations=0))
+    assert (container.state, container.generations) == (State.UNPROTECTED, 0)
+    assert "thread 4712 did not stop" in container.reason
+    container.apply(CHECKPOINT, 1010.0)
+    assert (container.state, container.reason) == (State.PROTECTED, "")
 
 
 def test_unprotected_gives_up_what_was_held_and_says_why() -> None:

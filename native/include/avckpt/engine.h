@@ -62,7 +62,9 @@ enum avc_event_kind {
 	AVC_EVENT_ATTACHED = 1,    /* init found and agreed with; app_pid is set  */
 	AVC_EVENT_CHECKPOINT = 2,  /* a generation was taken                      */
 	AVC_EVENT_MISSED = 3,      /* a checkpoint could not be taken; `error`.
-	                            * The guard tries again at the next interval  */
+	                            * The guard tries again at the next interval.
+	                            * What was held is, unless it was to make way
+	                            * for this one: see `generations`             */
 	AVC_EVENT_UNPROTECTED = 4, /* the app can not be protected as it is;
 	                            * `error` is why.  Held generations are given
 	                            * up.  The guard looks again every interval   */
@@ -75,7 +77,7 @@ enum avc_event_kind {
 	AVC_EVENT_REFUSED = 9,     /* a command could not be carried out          */
 	AVC_EVENT_DROPPED = 10     /* `generation` was given up before its time;
 	                            * `reason` is why: CRASHED (`attempt` times),
-	                            * UNHEALTHY, MEMORY, KILLED                   */
+	                            * UNHEALTHY, MEMORY, KILLED, EXECUTED         */
 };
 
 enum avc_reason {
@@ -93,8 +95,9 @@ enum avc_reason {
 	AVC_REASON_MEMORY = 11,    /* dropped: AVC_COMMAND_DROP_OLDEST            */
 	AVC_REASON_KILLED = 12,    /* dropped: somebody killed the template (the
 	                            * OOM killer takes templates first)           */
-	AVC_REASON_CRASHED = 13    /* dropped: what was restored from it, or what
+	AVC_REASON_CRASHED = 13,   /* dropped: what was restored from it, or what
 	                            * it was taken from, keeps crashing           */
+	AVC_REASON_EXECUTED = 14   /* dropped: the app is another program now     */
 };
 
 /* One thing that happened.  Fields that mean nothing for a kind are 0. */
