@@ -194,6 +194,7 @@ class _Watcher:
         restores = container.restores
         try:
             done = await self._run()
+            app_age_s = age_s(container.init_pid)
         except TargetGone:
             raise
         except Exception as error:  # noqa: BLE001 - whatever stops this check, the next one may work
@@ -202,7 +203,7 @@ class _Watcher:
             return
         if container.restores != restores or _is_paused(container.init_pid):
             return  # the check has seen two applications, or one that could not answer
-        unhealthy = self.pulse.take(done.status == 0, age_s(container.init_pid))
+        unhealthy = self.pulse.take(done.status == 0, app_age_s)
         if done.status == 0:
             self._passed()
         elif unhealthy or self.pulse.failures:

@@ -36,22 +36,24 @@ class Records:
 
         Those whose id `is_known` are left out, at the cost of a listing.  Records
         of containers that have ended are removed; those that can not be read, or
-        whose PID means nothing here, are left where they are and logged.
+        whose PID means nothing here, are left where they are and logged.  Raises
+        nothing: whatever is wrong now may be right at the next look.
         """
-        paths = sorted(self._directory.glob("*.json"))
-        names = {path.name for path in paths}
+        try:
+            names = sorted(name for name in os.listdir(self._directory) if name.endswith(".json"))
+        except FileNotFoundError:
+            return  # no hook has left one yet
+        except OSError as error:
+            self.complain("", f"{self._directory} can not be read, containers may run unprotected: {error.strerror}")
+            return
         self._complaints = {name: line for name, line in self._complaints.items() if name in names}
-        for path in paths:
+        for path in map(self._directory.joinpath, names):
             if is_known(path.stem):
                 continue
             try:
-                text = path.read_bytes()
-                record = _parse(text)
-                pidfd = open_pidfd(record.pid, record.starttime)
+                found = _open(path)
             except FileNotFoundError:
                 continue  # its container has just stopped
-            except TargetGone:
-                remove_if(path, text)
             except Denied as error:
                 self.complain(path.stem, str(error))
             except OSError as error:
@@ -59,14 +61,29 @@ class Records:
             except ValueError as error:
                 self.complain(path.stem, f"{path} is not a record of a container ({error}): left alone")
             else:
-                yield record, pidfd
+                if found is not None:
+                    yield found
 
     def complain(self, container_id: str, line: str) -> None:
-        """Logs what is wrong with a record, unless that was said at the last look."""
+        """Logs what is wrong with a record ("": with all of them), unless that was said at the last look."""
         name = f"{container_id}.json"
         if self._complaints.get(name) != line:
             log.error("%s", line)
         self._complaints[name] = line
+
+
+def _open(path: Path) -> tuple[Register, int] | None:
+    """The container of a record, with a pidfd; None when it has ended: then the record is removed.
+
+    Raises OSError, and what _parse() does.
+    """
+    text = path.read_bytes()
+    record = _parse(text)
+    try:
+        return record, open_pidfd(record.pid, record.starttime)
+    except TargetGone:
+        remove_if(path, text)
+        return None
 
 
 def _parse(text: bytes) -> Register:
@@ -84,15 +101,19 @@ def remove_if(path: Path, text: bytes) -> None:
     """Removes a record if it still says `text`.
 
     A container that is being restarted replaces its record at any moment, so it
-    is taken aside first, looked at, and put back if it is a new one.
+    is taken aside first, looked at, and put back if it is a new one.  Raises OSError.
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.rename(aside)
     except FileNotFoundError:
         return
-    if aside.read_bytes() != text:
-        # link(2) does not replace: a still newer record wins.
-        with contextlib.suppress(FileExistsError):
-            os.link(aside, path)
-    aside.unlink()
+    is_it = False
+    try:
+        is_it = aside.read_bytes() == text
+    finally:
+        if not is_it:
+            # link(2) does not replace: a still newer record wins.
+            with contextlib.suppress(FileExistsError):
+                os.link(aside, path)
+        aside.unlink()

@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import resource
 import subprocess
 import time
+from types import SimpleNamespace
 
 import pytest
-from avckpt.health import HealthCheck, Pulse, describe, health_check_of
+from avckpt.event_record import EventRecord
+from avckpt.events import GuardConfig
+from avckpt.health import HealthCheck, Pulse, _Watcher, describe, health_check_of
 from avckpt.inside import Done
 from avckpt.process import age_s
+from avckpt.protected import Protected
 
 S = 1_000_000_000
 
@@ -97,6 +103,34 @@ def test_the_age_of_a_process_does_not_depend_on_the_time_of_day(monkeypatch: py
         assert 0.1 < age_s(process.pid) < 10
         assert age_s(os.getpid()) > age_s(process.pid)
         process.kill()
+
+
+def test_descriptors_that_run_out_do_not_end_the_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    told: list[EventRecord] = []
+
+    async def run(watcher: _Watcher) -> Done:
+        with open("/dev/null") as file:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (file.fileno(), limits[1]))
+        return Done(1, False, "", 0.1)
+
+    def tell(record: EventRecord) -> EventRecord:
+        told.append(record)
+        return record
+
+    config = GuardConfig(3.0, 3, True, True, frozenset(), 5, 60.0, 0.02)
+    me = os.getpid()
+    container = Protected(id="ab" * 32, name="web", cookie=1, init_pid=me, app_pid=me, config=config, registered_at=0.0)
+    monkeypatch.setattr(_Watcher, "_run", run)
+    watcher = _Watcher(SimpleNamespace(container=container, pidfd=-1, guard=None), tell, pulse(retries=1))
+    loop = asyncio.new_event_loop()
+    try:
+        loop.run_until_complete(watcher.look())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        loop.close()
+    (record,) = told
+    assert "Too many open files" in record.message
 
 
 def test_how_it_failed_in_words() -> None:

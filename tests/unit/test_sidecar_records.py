@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -104,6 +105,57 @@ def test_what_can_not_be_opened_hides_no_other(
     [(_, pidfd)] = adoptable(tmp_path)
     os.close(pidfd)
     assert "Is a directory" in caplog.text
+
+
+def test_without_descriptors_nobody_is_found_and_later_everybody(
+    tmp_path: Path, sleeper: subprocess.Popen[bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
+    records = Records(tmp_path)
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    for free in (0, 1):  # one is enough for the directory, and for a record's text
+        resource.setrlimit(resource.RLIMIT_NOFILE, (first_free() + free, limits[1]))
+        try:
+            assert [list(records.adoptable(lambda _: False)) for _ in range(2)] == [[], []]
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    said = [each.getMessage() for each in caplog.records]
+    assert len(said) == 2
+    assert said[0] == f"{tmp_path} can not be read, containers may run unprotected: Too many open files"
+    [(_, pidfd)] = records.adoptable(lambda _: False)
+    os.close(pidfd)
+
+
+def first_free() -> int:
+    """The descriptor that the next open(2) will give."""
+    with open("/dev/null") as file:
+        return file.fileno()
+
+
+def test_a_record_that_can_not_be_removed_hides_no_other(
+    tmp_path: Path, sleeper: subprocess.Popen[bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    ended = record(tmp_path, "0", sleeper.pid, start_time(sleeper.pid) - 1)
+    (tmp_path / f".{ended.name}.{os.getpid()}").mkdir()
+    record(tmp_path, "a", sleeper.pid, start_time(sleeper.pid))
+    [(_, pidfd)] = adoptable(tmp_path)
+    os.close(pidfd)
+    assert ended.exists()
+    assert "Is a directory" in caplog.text
+
+
+def test_a_record_that_can_not_be_looked_at_is_put_back(tmp_path: Path) -> None:
+    path = tmp_path / ("c" * 64 + ".json")
+    path.write_text("new")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (first_free(), limits[1]))
+    try:
+        with pytest.raises(OSError, match="Too many open files"):
+            remove_if(path, b"new")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_who_is_known_is_not_looked_at(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -> None:
