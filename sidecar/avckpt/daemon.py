@@ -59,7 +59,7 @@ from avckpt.reload import Reloaded
 log = logging.getLogger("avckpt")
 
 LOOK_S = 5.0
-"""How often records are looked for whose hooks did not reach us."""
+"""How often is looked for containers that could not be protected when they came."""
 COMMAND_TIMEOUT_S = 30.0
 """How long a command waits for the engine's answer."""
 
@@ -136,7 +136,7 @@ class Daemon:
             self.caretaker.start()
             await api.start()
             self._adopt()
-            looking = loop.create_task(self._look_for_records())
+            looking = loop.create_task(self._keep_catching_up())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
             await stop.wait()
             log.info("asked to stop: %d container(s) run on unprotected", len(self._watches))
@@ -194,8 +194,8 @@ class Daemon:
         """
         self.configuration.load()
         log.info("%s was read", self.configuration.path)
-        self._adopt()
         outcomes = [self._reconfigure(watch) for watch in list(self._watches.values())]
+        self._catch_up()
         return [outcome for outcome in outcomes if outcome is not None]
 
     def _reconfigure(self, watch: Watch) -> Reloaded | None:
@@ -256,11 +256,20 @@ class Daemon:
             except (AvckptError, OSError) as error:
                 self.records.complain(record.id, f"{record.name or record.id[:12]}: runs unprotected: {error}")
 
-    async def _look_for_records(self) -> None:
-        """Finds the containers whose hooks got no answer: too many at a time, no descriptors, a sidecar that hung."""
+    def _catch_up(self) -> None:
+        """Protects whoever could not be when it came: for want of descriptors, threads, memory or an answer."""
+        self._adopt()
+        for watch in list(self._watches.values()):
+            if watch.guard is None and watch.settings.policy.enable and not has_ended(watch.pidfd):
+                self._start_guard(watch)
+
+    async def _keep_catching_up(self) -> None:
         while True:
             await asyncio.sleep(LOOK_S)
-            self._adopt()
+            try:
+                self._catch_up()
+            except Exception:
+                log.exception("looking for containers that are not protected; it is tried again")
 
     def _live_run(self, container_id: str) -> Protected | None:
         """The run of a container that is watched, unless it has just ended."""
@@ -301,16 +310,21 @@ class Daemon:
         if problem is not None:
             detail = f"{self.configuration.path} does not hold for it"
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail=detail, error=problem))
-        if not settings.policy.enable:
+        if settings.policy.enable:
+            self._start_guard(watch)
+        else:
             container.listen()
-            return
+
+    def _start_guard(self, watch: Watch) -> None:
+        """What keeps it from starting is told, and it is tried again at the next look."""
+        container = watch.container
         try:
-            watch.guard = self._engine.start_guard(pidfd, container.config, container.cookie)
+            watch.guard = self._engine.start_guard(watch.pidfd, container.config, container.cookie)
         except AvckptError as error:
             container.fail(str(error))
             self.tell(watch, EventRecord(Kind.UNPROTECTED, error=error))
         else:
-            self.caretaker.begin(watch, settings.policy)
+            self.caretaker.begin(watch, watch.settings.policy)
 
     # Events
 
@@ -352,11 +366,20 @@ class Daemon:
             at = time.time() - (time.monotonic_ns() - event.at_ns) / 1e9
             container.apply(event, at)
             if event.kind is EventKind.ENDED:
-                continue  # which is told once the container's own end is known
+                # The container's own end is told once it is known.
+                if watch.guard is not None and not has_ended(watch.pidfd):
+                    self._lose_guard(watch, watch.guard)
+                continue
             record = self.tell(watch, self._record(watch, event, at))
             _, answer = self._answers.get(event.ticket, (0, None))
             if answer is not None and not answer.done():
                 answer.set_result((event, record))
+
+    def _lose_guard(self, watch: Watch, guard: native.Guard) -> None:
+        """It could not do its work, and said why; the next one may."""
+        self.caretaker.end(watch)
+        guard.stop()  # its thread has ended
+        watch.guard = None
 
     def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
         if event.kind is EventKind.CHECKPOINT:

@@ -89,7 +89,7 @@ class Protected:
             self.memory_bytes = 0
         kind = event.kind
         if kind is EventKind.ATTACHED:
-            self.reason = "no checkpoint yet"
+            self._to(State.STARTING, "no checkpoint yet")
         elif kind is EventKind.CHECKPOINT:
             self._to(State.PROTECTED, self._crashing(event.at_ns))
             self.checkpoints += 1

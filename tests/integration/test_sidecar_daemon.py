@@ -274,6 +274,59 @@ def test_a_container_whose_hook_got_no_answer_is_adopted(local: LocalSidecar) ->
     assert local.log.count("web: ") == 2  # adopted, first checkpoint
 
 
+@contextlib.contextmanager
+def descriptors_left(local: LocalSidecar, count: int) -> Iterator[None]:
+    """The sidecar can open `count` files more, as long as the block runs; nobody is to talk to it for long."""
+    assert local.process is not None
+    pid = local.process.pid
+    limits = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    time.sleep(0.5)  # it closes the connections of those who have just asked
+    used = {int(fd) for fd in os.listdir(f"/proc/{pid}/fd")}
+    free = [fd for fd in range(len(used) + count + 1) if fd not in used]
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (free[count], limits[1]))
+    try:
+        yield
+    finally:
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
+
+
+def test_descriptors_that_run_out_keep_nobody_from_being_adopted_later(local: LocalSidecar) -> None:
+    web = missed(local, "web", QUICK)
+    with descriptors_left(local, 0):
+        time.sleep(6)  # it looks every 5 s
+    assert "can not be read, containers may run unprotected: Too many open files" in local.log
+    assert local.wait_for(web, state="protected", timeout_s=15)["adopted"]
+
+
+def test_a_guard_for_which_there_are_no_descriptors_is_started_later(local: LocalSidecar) -> None:
+    web = local.container("web", SLEEPER)
+    # The hook's connection, the container's pidfd, and one to look at that.
+    with descriptors_left(local, 3):
+        assert web.hook("prestart", QUICK) == ""
+    row = local.wait_for(web, state="unprotected")
+    assert "Too many open files" in row["reason"]
+    local.wait_for(web, state="protected", timeout_s=15)
+    os.kill(web.app_pid, signal.SIGKILL)
+    local.wait_for(web, restores=1, state="protected")
+    assert local.log.count("web: runs unprotected: ") == 1
+
+
+def test_a_guard_that_could_not_begin_is_started_anew(local: LocalSidecar) -> None:
+    """Its thread makes a timer, which takes room in the queue of signals."""
+    assert local.process is not None
+    limits = resource.prlimit(local.process.pid, resource.RLIMIT_SIGPENDING)
+    resource.prlimit(local.process.pid, resource.RLIMIT_SIGPENDING, (0, limits[1]))
+    try:
+        web = local.protected("web", SLEEPER)
+        assert "timer" in local.wait_for(web, state="unprotected")["reason"]
+    finally:
+        resource.prlimit(local.process.pid, resource.RLIMIT_SIGPENDING, limits)
+    local.avckpt("reload")
+    local.wait_for(web, state="protected")
+    os.kill(web.app_pid, signal.SIGKILL)
+    local.wait_for(web, restores=1, state="protected")
+
+
 def test_a_reload_adopts_it_at_once(local: LocalSidecar) -> None:
     web = missed(local, "web", QUICK)
     local.avckpt("reload")
