@@ -26,11 +26,11 @@ def main() -> int:
     try:
         state = json.loads(sys.stdin.buffer.read())
         name = (state.get("annotations") or {}).get("avckpt.name") or state["id"][:12]
-        why = register(state)
+        problem = register(state)
     except Exception as error:  # noqa: BLE001 - whatever goes wrong here, the app runs
-        why = f"{type(error).__name__}: {error}"
-    if why:
-        line = f"avckpt: container {name} runs unprotected: {why}"
+        problem = f"runs unprotected: {type(error).__name__}: {error}"
+    if problem:
+        line = f"avckpt: container {name} {problem}"
         tell.journal(line)
         if "--told" not in sys.argv[2:]:
             # runc passes our standard error on, crun does not; both have the
@@ -40,7 +40,7 @@ def main() -> int:
 
 
 def register(state: dict[str, Any]) -> str:
-    """Registers the container of an OCI state.  Returns why it is not protected, or ""."""
+    """Registers the container of an OCI state.  Returns what is wrong with its protection, in a clause, or ""."""
     pid = state["pid"]
     pidfd = os.pidfd_open(pid)
     try:
@@ -50,20 +50,37 @@ def register(state: dict[str, Any]) -> str:
             pid=pid,
             starttime=starttime(pid),
             bundle=state.get("bundle", ""),
-            annotations=state["annotations"],
+            # Those of others may be longer than a packet.
+            annotations={key: value for key, value in state["annotations"].items() if key.startswith("avckpt.")},
         )
-        write_record(registration)
+        unwritten = ""
         try:
-            refusal = protocol.exchange(registration.encode(), pidfd)
-        except TimeoutError:
-            return f"the sidecar did not answer within {protocol.TIMEOUT_S:g} s"
+            write_record(registration)
         except OSError as error:
-            return f"no sidecar listens on {protocol.hooks_socket()} ({error.strerror})"
-        except protocol.ProtocolError as error:
-            return f"the sidecar's answer makes no sense: {error}"
-        return f"the sidecar said: {refusal}" if refusal else ""
+            unwritten = f"{protocol.records_dir()} can not be written ({error.strerror})"
+        refusal = ask(registration, pidfd)
     finally:
         os.close(pidfd)
+    if refusal:
+        return f"runs unprotected: {refusal}" + (f"; and {unwritten}" if unwritten else "")
+    return f"is not known to a sidecar that starts later: {unwritten}" if unwritten else ""
+
+
+def ask(registration: protocol.Register, pidfd: int) -> str:
+    """Asks the sidecar to protect the container.  Returns why it does not, or ""."""
+    try:
+        packet = registration.encode()
+    except protocol.ProtocolError as error:
+        return f"its labels are too much for the sidecar: {error}"
+    try:
+        refusal = protocol.exchange(packet, pidfd)
+    except TimeoutError:
+        return f"the sidecar did not answer within {protocol.TIMEOUT_S:g} s"
+    except OSError as error:
+        return f"no sidecar listens on {protocol.hooks_socket()} ({error.strerror})"
+    except protocol.ProtocolError as error:
+        return f"the sidecar's answer makes no sense: {error}"
+    return f"the sidecar said: {refusal}" if refusal else ""
 
 
 def starttime(pid: int) -> int:

@@ -9,9 +9,10 @@ Requests (`Register.encode()`, `Deregister.encode()`; `decode_request()` reads b
 
     {"version": 1, "op": "register", "id": ..., "name": ..., "pid": ...,
      "starttime": ..., "bundle": ..., "annotations": {...}}
-        with exactly one descriptor (SCM_RIGHTS): a pidfd of the container's
-        main process.  "pid" and "starttime" are numbers of the *hook's* PID
-        namespace, for logs only: the receiver's own may be another one.
+        (annotations: ours, which begin with "avckpt.") with exactly one
+        descriptor (SCM_RIGHTS): a pidfd of the container's main process.  "pid"
+        and "starttime" are numbers of the *hook's* PID namespace, for logs only:
+        the receiver's own may be another one.
     {"version": 1, "op": "deregister", "id": ...}
 
 Reply (`encode_reply()`, `decode_reply()`):
@@ -204,11 +205,13 @@ def receive_request(connection: socket.socket) -> tuple[Register | Deregister, i
             count = len(data) // struct.calcsize("i")
             fds.extend(struct.unpack(f"{count}i", data[: count * struct.calcsize("i")]))
     try:
-        if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+        if flags & socket.MSG_TRUNC:
             raise ProtocolError("the request is too long")
+        if flags & socket.MSG_CTRUNC and not fds:
+            raise ProtocolError("it has no descriptors left: give it more (podman run --ulimit nofile=N)")
         request = decode_request(packet)
         wanted = 1 if isinstance(request, Register) else 0
-        if len(fds) != wanted:
+        if len(fds) != wanted or flags & socket.MSG_CTRUNC:
             raise ProtocolError(f"{wanted} descriptor(s) wanted with the request, {len(fds)} came")
     except ProtocolError:
         for fd in fds:

@@ -19,12 +19,12 @@ from typing import Union
 from avckpt_hooks import protocol
 from avckpt_hooks.protocol import Deregister, Register
 
-from avckpt.errors import AvckptError
+from avckpt.errors import AvckptError, of_any
 
 log = logging.getLogger("avckpt")
 
 Handler = Callable[[Union[Register, Deregister], Union[int, None]], None]
-"""Takes a request and its pidfd (the handler's to close).  Raises AvckptError to refuse."""
+"""Takes a request and its pidfd (the handler's to close).  Raises AvckptError or OSError to refuse."""
 
 MAX_WAITING = 64
 """Connections that have not sent their request yet."""
@@ -118,10 +118,12 @@ class HookListener:
     def _answer(self, connection: socket.socket) -> str | None:
         try:
             request, pidfd = protocol.receive_request(connection)
+        except protocol.ProtocolError as error:
+            return _refused(error)
+        try:
             self._handler(request, pidfd)
-        except (AvckptError, protocol.ProtocolError) as error:
-            log.warning("refused a hook's request: %s", error)
-            return str(error)
+        except (AvckptError, OSError) as error:
+            return _refused(of_any(error))
         return None
 
     def _drop(self, connection: socket.socket) -> None:
@@ -130,3 +132,8 @@ class HookListener:
             timer.cancel()
             self._loop.remove_reader(connection)
             connection.close()
+
+
+def _refused(error: Exception) -> str:
+    log.warning("refused a hook's request: %s", error)
+    return str(error)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import select
 import signal
 import socket
@@ -134,6 +135,44 @@ def test_prestart_passes_a_refusal_on(listener: socket.socket, process: subproce
     assert "the sidecar said: too many" in said
 
 
+@pytest.mark.parametrize("key", ["com.example.blob", "avckpt.blob"])
+def test_prestart_sends_what_is_ours_and_says_when_that_is_too_long(
+    listener: socket.socket, process: subprocess.Popen[bytes], key: str
+) -> None:
+    seen: list[dict[str, str]] = []
+
+    def reply(connection: socket.socket, request: Any, pidfd: int | None) -> None:
+        seen.append(request.annotations)
+        connection.send(protocol.encode_reply())
+
+    state = state_of(process)
+    ours = dict(state["annotations"])
+    state["annotations"][key] = "x" * protocol.MAX_BYTES
+    thread = answer(listener, reply) if key.startswith("com") else None
+    said, _ = call("prestart", state)
+    if thread is not None:
+        thread.join()
+        assert (said, seen) == ("", [ours])
+    else:
+        assert "web runs unprotected: its labels are too much for the sidecar: the message is too long (131" in said
+
+
+def test_prestart_registers_also_without_a_record(
+    run_dir: Path, listener: socket.socket, process: subprocess.Popen[bytes]
+) -> None:
+    records = run_dir / "containers"
+    records.write_text("in the way")
+    thread = answer(listener, lambda c, _, __: c.send(protocol.encode_reply()))
+    said, _ = call("prestart", state_of(process))
+    thread.join()
+    why = f"{records} can not be written (File exists)"
+    assert said == f"avckpt: container web is not known to a sidecar that starts later: {why}\n"
+    listener.close()
+    said, _ = call("prestart", state_of(process))
+    assert said.startswith("avckpt: container web runs unprotected: no sidecar listens")
+    assert said.endswith(f"; and {why}\n")
+
+
 @pytest.mark.parametrize("temper", ["never accepts", "never answers", "hangs up", "talks nonsense", "full"])
 def test_a_hook_ends_soon_whatever_the_sidecar_does(
     listener: socket.socket, process: subprocess.Popen[bytes], temper: str
@@ -248,6 +287,20 @@ def test_the_receiver_refuses_and_keeps_no_descriptor(packet: bytes, fds: int, w
         with pytest.raises(protocol.ProtocolError, match=why.replace("(", r"\(").replace(")", r"\)")):
             protocol.receive_request(theirs)
     assert set(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_receiver_without_descriptors_says_so() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    request = protocol.Register(id=ID, name="web", pid=1, starttime=1, bundle="", annotations={})
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ours, theirs:
+        ours.sendmsg([request.encode()], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, struct.pack("i", 0))])
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        try:
+            with pytest.raises(protocol.ProtocolError, match="no descriptors left"):
+                protocol.receive_request(theirs)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_a_registration_needs_its_pidfd() -> None:

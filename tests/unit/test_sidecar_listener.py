@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import resource
 import socket
@@ -62,6 +63,14 @@ def test_a_refusal_reaches_the_hook() -> None:
         raise Busy("not now")
 
     assert served(handler, lambda: protocol.exchange(Deregister(id="ab" * 32).encode())) == "not now"
+
+
+def test_what_the_kernel_refuses_reaches_the_hook_too() -> None:
+    def handler(request: Register | Deregister, pidfd: int | None) -> None:
+        raise OSError(errno.EAGAIN, "as good as any")
+
+    said = served(handler, lambda: protocol.exchange(Deregister(id="ab" * 32).encode()))
+    assert said == "the kernel said no (Resource temporarily unavailable)"
 
 
 def test_nonsense_is_answered_and_the_next_one_served() -> None:
