@@ -134,7 +134,10 @@ class ApiServer:
         registry = self._backend.registry
         containers = registry.ended() if _flag(request, "all") else []
         containers += registry.live()
-        rows = [await asyncio.to_thread(_with_memory, container) for container in containers]
+        if _flag(request, "memory", "1"):
+            for container in containers:
+                await asyncio.to_thread(_look_at_memory, container)
+        rows = [container.to_json() for container in containers]
         return web.json_response({"containers": rows})
 
     async def _command(self, request: web.Request) -> web.Response:
@@ -223,15 +226,14 @@ def _since(request: web.Request) -> float | None:
     return since
 
 
-def _with_memory(container: Protected) -> dict[str, object]:
-    """With what its generations hold at this moment: looked at only when somebody asks, as it walks page tables."""
+def _look_at_memory(container: Protected) -> None:
+    """Finds out what its generations hold: only when somebody asks, as it walks page tables."""
     if container.generations:
         container.memory_bytes = held_bytes(container.app_pid, templates_of(container.init_pid))
-    return container.to_json()
 
 
-def _flag(request: web.Request, name: str) -> bool:
-    return request.query.get(name, "0").lower() not in ("0", "false", "no")
+def _flag(request: web.Request, name: str, default: str = "0") -> bool:
+    return request.query.get(name, default).lower() not in ("0", "false", "no")
 
 
 @web.middleware

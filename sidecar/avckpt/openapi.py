@@ -245,7 +245,14 @@ _PATHS: Json = {
         "get": {
             "operationId": "containers",
             "summary": "Protected containers",
-            "parameters": [_query("all", {"type": "boolean"}, "also the last few that have ended")],
+            "parameters": [
+                _query("all", {"type": "boolean"}, "also the last few that have ended"),
+                _query(
+                    "memory",
+                    {"type": "boolean", "default": True},
+                    "0: memory_bytes as somebody last saw it, 0 if nobody has; to look takes milliseconds for each GB",
+                ),
+            ],
             "responses": _answer("oldest first", _object({"containers": _array(_ref("Container"))})),
         }
     },

@@ -19,7 +19,7 @@ Say = Callable[[str], None]
 
 INSTALLABLE = frozenset({"hooks", "init", "hooks_dir"})
 """Checks of `avckpt doctor` that `avckpt install` makes good."""
-LOOK_EVERY_S = 0.2
+LOOK_EVERY_S = 0.5
 GONE = ("exited", "stopped", "dead")
 
 
@@ -104,7 +104,8 @@ def wait_protected(compose: Compose, client: Client, started: Sequence[Started],
     """Looks until nothing is left to wait for, or for `wait_s`."""
     deadline = time.monotonic() + wait_s
     while True:
-        entries = {str(entry["id"]): entry for entry in client.containers()} if any(c.wanted for c in started) else {}
+        known = client.containers(memory=False) if any(c.wanted for c in started) else []
+        entries = {str(entry["id"]): entry for entry in known}
         found = [judge(one, entries.get(one.id)) for one in started]
         if not any(one.may_change for one in found) or time.monotonic() > deadline:
             return found

@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.client import Client
 from cgroups import freezer
 from harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
 from local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, children, ended, local_sidecar
@@ -502,13 +503,26 @@ def test_an_idle_sidecar_sleeps(local: LocalSidecar) -> None:
 
 
 def test_info(local: LocalSidecar) -> None:
-    from avckpt.client import Client
-
     info = Client(local.run_dir).info()
     assert local.process is not None
     assert info["pid"] == local.process.pid
     assert info["containers"] == 0
     assert info["version"] == run([*avckpt_command(), "--version"]).stdout.split()[1]
+
+
+def test_who_does_not_ask_for_memory_does_not_have_it_looked_at(local: LocalSidecar) -> None:
+    local.protected("web", SLEEPER)
+    client = Client(local.run_dir)
+
+    def seen() -> int:
+        (row,) = client.containers(memory=False)
+        return int(row["memory_bytes"])
+
+    wait_until(lambda: client.containers(memory=False)[0]["generations"] == 2, 10, "it is protected")
+    assert seen() == 0
+    (row,) = client.containers()
+    assert row["memory_bytes"] > 0
+    assert seen() == row["memory_bytes"]
 
 
 def test_the_table_on_a_narrow_terminal(local: LocalSidecar) -> None:
