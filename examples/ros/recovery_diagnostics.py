@@ -54,6 +54,9 @@ LEVELS = {
 NO_NEWS = ("notified", "configured")
 """Kinds of events that say nothing of how a container stands."""
 
+ASIDE = ("health", "refused", "notify_failed")
+"""Kinds that are news for a while, and change nothing of how a container stands."""
+
 SHOWN = ("reason", "outcome", "generation", "age_s", "lost_s", "freeze_s", "restore_s", "attempt", "restores")
 """Fields of an event that become values of a status."""
 
@@ -72,6 +75,8 @@ class Status:
     values: dict[str, str] = field(default_factory=dict)
     until: float = 0.0
     """When it is no longer news, seconds since 1970; 0: it holds until something else happens."""
+    then: int = OK
+    """Its level when it is no longer news."""
 
 
 def status_of(event: dict[str, Any], hold_s: float = 10.0) -> Status:
@@ -112,6 +117,10 @@ class Board:
             return None
         status = status_of(event, self._hold_s)
         with self._lock:
+            before = self._statuses.get(event["container"])
+            if before is not None and event["kind"] in ASIDE:
+                then = before.then if before.until else before.level
+                status = replace(status, level=max(status.level, then), then=then)
             self._statuses[event["container"]] = status
         return status
 
@@ -128,7 +137,7 @@ class Board:
                     if status.level == STALE:
                         del self._statuses[name]
                     else:
-                        self._statuses[name] = replace(status, level=OK, until=0.0)
+                        self._statuses[name] = replace(status, level=status.then, until=0.0)
             problem, known = self._problem, sorted(self._statuses.items())
         if problem:
             sidecar = Status("avckpt: sidecar", ERROR, f"no containers are protected: {problem}", "")

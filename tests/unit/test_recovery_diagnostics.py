@@ -101,6 +101,19 @@ def test_nothing_held_is_an_error_until_there_is_something_again(node: ModuleTyp
     assert [status.level for status in board.statuses(2000.0)] == [node.OK, node.OK]
 
 
+def test_news_of_something_else_hides_no_lack_of_protection(node: ModuleType) -> None:
+    board = node.Board(hold_s=10.0)
+    board.lose("")
+    board.take(event(Kind.UNPROTECTED))
+    for at, kind in ((1000.0, Kind.HEALTH), (1005.0, Kind.NOTIFY_FAILED)):
+        board.take(event(kind, at=at))
+    assert [status.level for status in board.statuses(1006.0)] == [node.OK, node.ERROR]
+    assert [status.level for status in board.statuses(1016.0)] == [node.OK, node.ERROR]
+    board.take(event(Kind.CHECKPOINT, generations=1))
+    board.take(event(Kind.HEALTH))
+    assert [status.level for status in board.statuses(1016.0)] == [node.OK, node.OK]
+
+
 def test_it_resumes_where_it_was_when_the_sidecar_comes_back(node: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "api.sock"
     now = time.time()
