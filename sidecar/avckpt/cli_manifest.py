@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,10 @@ if TYPE_CHECKING:
     from avckpt.vehicle import Protection
 
 files_option = click.option(
-    "-f", "--file", "files", multiple=True, type=click.Path(path_type=Path), help="Compose file; default vehicle.yaml."
+    *("-f", "--file", "files"),
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Compose file; default vehicle.yaml, or what podman-compose takes.",
 )
 project_option = click.option("-p", "--project-name", "project", default="", help="As of podman-compose.")
 
@@ -30,8 +34,9 @@ project_option = click.option("-p", "--project-name", "project", default="", hel
 def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
     """Check every avckpt.* label and annotation of Compose files.
 
-    Without FILE, vehicle.yaml or compose.yaml of this folder.  Several files are
-    one manifest, later ones over earlier ones.  Prints "FILE:LINE: service NAME:
+    Without FILE, those of COMPOSE_FILE, or vehicle.yaml of this folder, or all
+    that podman-compose takes: compose.yaml, compose.override.yaml and so on.
+    Several files are one manifest, later ones over earlier ones.  Prints "FILE:LINE: service NAME:
     what is wrong" and ends with 1 if anything is wrong, with 0 if there are only
     warnings or nothing.
     """
@@ -65,7 +70,7 @@ def up(
     from avckpt.compose import Compose
 
     run_dir = Path(protocol.run_dir())
-    paths = files or (manifest.usual_file(Path()),)
+    paths = manifest.files_meant(files, os.environ)
     found = manifest.check(paths)
     print_problems(found, err=True)
     if found.errors:
@@ -95,7 +100,7 @@ def down(files: tuple[Path, ...], project: str, volumes: bool, as_json: bool, se
     from avckpt import manifest
     from avckpt.compose import Compose
 
-    compose = Compose(files or (manifest.usual_file(Path()),), project)
+    compose = Compose(manifest.files_meant(files, os.environ), project)
     before = compose.containers() if as_json else []
     compose.down(services, volumes, _say)
     if as_json:
@@ -108,7 +113,7 @@ def check_manifest(files: Sequence[Path], as_json: bool) -> ExitCode:
     """Checks Compose files that belong together.  Raises ConfigError when none is named and none is here."""
     from avckpt import manifest
 
-    found = manifest.check(files or [manifest.usual_file(Path())])
+    found = manifest.check(manifest.files_meant(files, os.environ))
     if as_json:
         click.echo(json.dumps(found.to_json(), indent=2))
     else:

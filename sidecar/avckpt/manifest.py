@@ -10,6 +10,7 @@ is known only when the file is brought up: there the hooks check it.
 from __future__ import annotations
 
 import enum
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +23,25 @@ from avckpt.errors import ConfigError
 from avckpt.yamlfile import Place, Unreadable
 
 ENABLE = f"{PREFIX}enable"
-USUAL_NAMES = ("vehicle.yaml", "compose.yaml", "compose.yml", "docker-compose.yaml", "docker-compose.yml")
-"""Looked for, in this order, when no file is named."""
+USUAL_NAME = "vehicle.yaml"
+"""Is meant, and nothing else, when no file is named."""
+COMPOSE_NAMES = (
+    "compose.yaml",
+    "compose.yml",
+    "compose.override.yaml",
+    "compose.override.yml",
+    "podman-compose.yaml",
+    "podman-compose.yml",
+    "docker-compose.yml",
+    "docker-compose.yaml",
+    "docker-compose.override.yml",
+    "docker-compose.override.yaml",
+    "container-compose.yml",
+    "container-compose.yaml",
+    "container-compose.override.yml",
+    "container-compose.override.yaml",
+)
+"""Without that, all of these that are there, later ones over earlier ones: so does podman-compose 1.6."""
 
 
 class Kind(enum.Enum):
@@ -154,12 +172,24 @@ class Manifest:
         }
 
 
-def usual_file(directory: Path) -> Path:
-    """The file that is meant when none is named.  Raises ConfigError when there is none."""
-    for name in USUAL_NAMES:
-        if (directory / name).is_file():
-            return Path(name)
-    raise ConfigError(f"no file is named, and none of {', '.join(USUAL_NAMES)} is here: name one with -f FILE")
+def files_meant(named: Sequence[Path], environ: Mapping[str, str]) -> tuple[Path, ...]:
+    """The files that are meant when these are named, or none: what podman-compose takes, and vehicle.yaml.
+
+    Raises ConfigError when there is none.
+    """
+    project = environ.get("COMPOSE_PROJECT_DIR", "")
+    directory = Path(project).resolve() if os.path.isdir(project) else Path()
+    if named:
+        return tuple(directory / path for path in named)
+    names: Sequence[str] = (USUAL_NAME,) if (directory / USUAL_NAME).exists() else COMPOSE_NAMES
+    listed = environ.get("COMPOSE_FILE", "")
+    if listed:
+        names = listed.split(environ.get("COMPOSE_PATH_SEPARATOR", os.pathsep))
+    found = tuple(directory / name for name in names if (directory / name).exists())
+    if not found:
+        looked_for = f"of COMPOSE_FILE={listed}" if listed else f"called {USUAL_NAME} or compose.yaml"
+        raise ConfigError(f"no file is named, and none {looked_for} is here: name one with -f FILE")
+    return found
 
 
 def check(files: Sequence[Path]) -> Manifest:

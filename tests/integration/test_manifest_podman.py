@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import yaml
 from avckpt.install import LIBEXEC
+from avckpt.manifest import COMPOSE_NAMES, Kind, check, files_meant
 from harness import (
     BASE_IMAGE,
     CONFIG_DIR,
@@ -135,6 +137,35 @@ def test_only_the_services_that_are_named(project: Project, sidecar: Sidecar) ->
     done = project.avckpt("up", "by-mop", check=False)
     assert done.status == 1
     assert done.stderr.startswith("avckpt: no such service: by-mop; there are by-annotation, ")
+
+
+def test_files_that_nobody_names_are_those_of_podman_compose(
+    project: Project, sidecar: Sidecar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(project.path.parent)
+    project.write(SERVICES)
+    project.path.rename("compose.yaml")
+    Path("compose.override.yaml").write_text("services: {plain: {labels: {avckpt.enable: true}}}\n")
+    up = [*avckpt_command(), "up", "--json"]
+    assert states(run([*up, "plain"], timeout_s=PATIENCE_S)) == {"plain": True}
+    run([*avckpt_command(), "down"], timeout_s=PATIENCE_S)
+    done = run([*up, "plain"], env={"COMPOSE_FILE": "compose.yaml"}, timeout_s=PATIENCE_S)
+    assert states(done) == {"plain": False}
+
+
+@pytest.mark.parametrize("listed", ["", "docker-compose.yml:gone.yaml:compose.yaml"])
+def test_they_are_merged_in_the_same_order(
+    podman: Podman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COMPOSE_FILE", listed)
+    for number, name in enumerate(COMPOSE_NAMES):
+        # Each overrides all those before it.
+        labels = {f"avckpt.{before}": name for before in COMPOSE_NAMES[: number + 1]}
+        Path(name).write_text(yaml.safe_dump({"services": {"node": {"image": "node", "labels": labels}}}))
+    merged = yaml.safe_load(run([sys.executable, "-m", "podman_compose", "config"]).stdout)
+    settings = check(files_meant((), os.environ)).services["node"].settings[Kind.LABEL]
+    assert {key: setting.value for key, setting in settings.items()} == merged["services"]["node"]["labels"]
 
 
 def test_a_wrong_label_starts_nothing(project: Project) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 from avckpt import cli
-from avckpt.manifest import Kind, Manifest, Severity, check
+from avckpt.errors import ConfigError
+from avckpt.manifest import Kind, Manifest, Severity, check, files_meant
 from avckpt_hooks.labels import LABELS
 from click.testing import CliRunner
 
@@ -233,6 +234,30 @@ def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         1,
         "gone.yaml:1: No such file or directory\n0 services, to be protected: none; 1 problem\n",
     )
+
+
+def test_files_that_nobody_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="none called vehicle.yaml or compose.yaml is here"):
+        files_meant((), {})
+    for name in ("docker-compose.yml", "compose.override.yaml", "compose.yaml", "other.yaml"):
+        Path(name).touch()
+    usual = [Path("compose.yaml"), Path("compose.override.yaml"), Path("docker-compose.yml")]
+    assert files_meant((), {}) == tuple(usual)
+    Path("vehicle.yaml").touch()
+    assert files_meant((), {}) == (Path("vehicle.yaml"),)
+    listed = {"COMPOSE_FILE": "other.yaml:gone.yaml:compose.yaml"}
+    assert files_meant((), listed) == (Path("other.yaml"), Path("compose.yaml"))
+    listed = {"COMPOSE_FILE": "other.yaml,compose.yaml", "COMPOSE_PATH_SEPARATOR": ","}
+    assert files_meant((), listed) == (Path("other.yaml"), Path("compose.yaml"))
+    with pytest.raises(ConfigError, match="none of COMPOSE_FILE=gone.yaml is here"):
+        files_meant((), {"COMPOSE_FILE": "gone.yaml"})
+    named = (Path("other.yaml"), Path("/x.yaml"))
+    assert files_meant(named, listed) == named
+    elsewhere = {"COMPOSE_PROJECT_DIR": str(tmp_path)}
+    monkeypatch.chdir("/")
+    assert files_meant((), elsewhere) == (tmp_path / "vehicle.yaml",)
+    assert files_meant(named, elsewhere) == (tmp_path / "other.yaml", Path("/x.yaml"))
 
 
 def test_the_command_for_the_sidecars_own_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
