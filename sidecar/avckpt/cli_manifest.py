@@ -15,6 +15,7 @@ import click
 from avckpt.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
+    from avckpt.compose import Compose
     from avckpt.manifest import Manifest
     from avckpt.vehicle import Protection
 
@@ -25,6 +26,12 @@ files_option = click.option(
     help="Compose file; default vehicle.yaml, or what podman-compose takes.",
 )
 project_option = click.option("-p", "--project-name", "project", default="", help="As of podman-compose.")
+profiles_option = click.option("--profile", "profiles", multiple=True, help="Also the services of this profile.")
+env_file_option = click.option(
+    "--env-file",
+    type=click.Path(exists=True, dir_okay=False, resolve_path=True, path_type=Path),
+    help="As of podman-compose; default .env.",
+)
 
 
 @click.command()
@@ -46,6 +53,8 @@ def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
 @click.command()
 @files_option
 @project_option
+@profiles_option
+@env_file_option
 @click.option("--install", "install_hooks", is_flag=True, help="Install the hooks if they are missing.")
 @click.option("--wait", "wait_s", type=click.FloatRange(min=0), default=30.0, show_default=True, help="Seconds.")
 @click.option("--json", "as_json", is_flag=True, help="The containers as JSON.")
@@ -53,6 +62,8 @@ def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
 def up(
     files: tuple[Path, ...],
     project: str,
+    profiles: tuple[str, ...],
+    env_file: Path | None,
     install_hooks: bool,
     wait_s: float,
     as_json: bool,
@@ -78,9 +89,15 @@ def up(
     unknown = [name for name in services if name not in found.services]
     if unknown:
         raise ConfigError(f"no such service: {', '.join(unknown)}; there are {', '.join(sorted(found.services))}")
+    compose = Compose(paths, project, profiles=profiles, env_file=env_file)
+    passed_over = _passed_over(found, services, compose)
+    if services and passed_over:
+        raise ConfigError("; ".join(passed_over))
+    for line in passed_over:
+        _say(line)
     if found.wants_protection:
         vehicle.prepare(run_dir, install_hooks=install_hooks, say=_say)
-    came_out = vehicle.up(Compose(paths, project), services, run_dir, wait_s, _say)
+    came_out = vehicle.up(compose, services, run_dir, wait_s, _say)
     if as_json:
         click.echo(json.dumps([one.to_json() for one in came_out], indent=2))
     else:
@@ -92,15 +109,25 @@ def up(
 @click.command()
 @files_option
 @project_option
+@profiles_option
+@env_file_option
 @click.option("-v", "--volumes", is_flag=True, help="Also remove the project's volumes.")
 @click.option("--json", "as_json", is_flag=True, help="The containers that are gone, as JSON.")
 @click.argument("services", nargs=-1)
-def down(files: tuple[Path, ...], project: str, volumes: bool, as_json: bool, services: tuple[str, ...]) -> None:
+def down(
+    files: tuple[Path, ...],
+    project: str,
+    profiles: tuple[str, ...],
+    env_file: Path | None,
+    volumes: bool,
+    as_json: bool,
+    services: tuple[str, ...],
+) -> None:
     """Stop and remove what "avckpt up" brought up.  Hooks and sidecar stay."""
     from avckpt import manifest
     from avckpt.compose import Compose
 
-    compose = Compose(manifest.files_meant(files, os.environ), project)
+    compose = Compose(manifest.files_meant(files, os.environ), project, profiles=profiles, env_file=env_file)
     before = compose.containers() if as_json else []
     compose.down(services, volumes, _say)
     if as_json:
@@ -150,7 +177,11 @@ def print_problems(found: Manifest, err: bool = False) -> None:
 
 def summary(found: Manifest) -> str:
     """One line: who is to be protected, and whether anything is wrong."""
-    wanted = [service.name for service in found.services.values() if service.enabled]
+    wanted = [
+        service.name + (f" (profile {'/'.join(service.profiles)})" if service.profiles else "")
+        for service in found.services.values()
+        if service.enabled
+    ]
     open_ones = [service.name for service in found.services.values() if service.enabled is None]
     text = f"{_count(len(found.services), 'service')}, to be protected: {', '.join(wanted) or 'none'}"
     if open_ones:
@@ -158,6 +189,20 @@ def summary(found: Manifest) -> str:
     problems = len(found.problems) - len(found.errors)
     counts = [_count(n, what) for n, what in ((len(found.errors), "problem"), (problems, "warning")) if n]
     return f"{text}; {' and '.join(counts) or 'no problems'}"
+
+
+def _passed_over(found: Manifest, named: Sequence[str], compose: Compose) -> list[str]:
+    """A line for each service whose profile nobody asks for: of those named, or else of those to be protected."""
+    meant = [one for one in found.services.values() if (one.name in named if named else one.enabled)]
+    if not any(one.profiles for one in meant):
+        return []
+    # The environment may ask for it, too.
+    there = compose.services()
+    return [
+        f"service {one.name} is not started: that takes --profile {' or '.join(one.profiles)}"
+        for one in meant
+        if one.profiles and one.name not in there
+    ]
 
 
 def _say(line: str) -> None:

@@ -60,12 +60,18 @@ class Started:
 class Compose:
     """A project: files that belong together, named as podman-compose wants them."""
 
-    def __init__(self, files: Sequence[Path], project: str = "") -> None:
+    def __init__(
+        self, files: Sequence[Path], project: str = "", *, profiles: Sequence[str] = (), env_file: Path | None = None
+    ) -> None:
         self._command = [sys.executable, "-m", "podman_compose"]
         for path in files:
             self._command += ["-f", str(path)]
         if project:
             self._command += ["-p", project]
+        for profile in profiles:
+            self._command += ["--profile", profile]
+        if env_file is not None:
+            self._command += ["--env-file", str(env_file)]
 
     def up(self, services: Sequence[str], say: Say) -> None:
         """`up -d`.  What it prints goes to `say`.
@@ -78,6 +84,10 @@ class Compose:
     def down(self, services: Sequence[str], volumes: bool, say: Say) -> None:
         """`down`.  Raises AvckptError when it fails."""
         self._run(["down", *(["--volumes"] if volumes else []), *services], say)
+
+    def services(self) -> list[str]:
+        """Those that `up` would start; not those of a profile that nobody asks for.  Raises AvckptError."""
+        return self._ask([*self._command, "config", "--services"]).split()
 
     def containers(self) -> list[Started]:
         """All containers of the project, running or not.  Raises AvckptError."""

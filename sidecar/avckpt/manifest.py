@@ -114,6 +114,8 @@ class Service:
     settings: dict[Kind, dict[str, Setting]] = field(default_factory=lambda: {kind: {} for kind in Kind})
     extends: tuple[Path, str] | None = None
     """The file and the service in it; the path is this service's own file's for one of the same project."""
+    profiles: tuple[str, ...] = ()
+    """It is started with one of these only; none: always.  Nobody inherits them by `extends`."""
 
     @property
     def enabled(self) -> bool | None:
@@ -164,6 +166,7 @@ class Manifest:
                     "file": service.place.file,
                     "line": service.place.line,
                     "protected": service.enabled,
+                    "profiles": list(service.profiles),
                     "settings": {setting.key: setting.value for _, setting in service.all_settings()},
                 }
                 for service in self.services.values()
@@ -279,7 +282,7 @@ class _Reader:
         return None
 
     def _service(self, name: str, place: Place, node: yaml.Node, path: Path) -> Service:
-        service = Service(name, place, extends=_extends(node, path))
+        service = Service(name, place, extends=_extends(node, path), profiles=_profiles(node))
         for kind, key in ((Kind.LABEL, "labels"), (Kind.ANNOTATION, "annotations")):
             for setting in self._settings(yamlfile.lookup(node, key), path, name):
                 known = service.settings[kind].get(setting.key)
@@ -331,6 +334,7 @@ class _Reader:
             for kind, settings in earlier.settings.items():
                 service.settings[kind] = {**settings, **service.settings[kind]}
             service.extends = service.extends or earlier.extends
+            service.profiles = (*earlier.profiles, *service.profiles)
         self._manifest.services[service.name] = service
 
     def _root(self, path: Path, asked_at: Place | None = None, service: str = "") -> yaml.Node | None:
@@ -358,6 +362,12 @@ def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:
     if not isinstance(file, yaml.ScalarNode):
         return path, name.value
     return None if _is_open(file.value) else (path.parent / file.value, name.value)
+
+
+def _profiles(node: yaml.Node) -> tuple[str, ...]:
+    profiles = yamlfile.lookup(node, "profiles")
+    items = profiles.value if isinstance(profiles, yaml.SequenceNode) else [profiles]
+    return tuple(item.value for item in items if isinstance(item, yaml.ScalarNode))
 
 
 def _judge(service: Service) -> Iterator[Problem]:

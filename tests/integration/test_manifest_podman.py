@@ -153,6 +153,26 @@ def test_files_that_nobody_names_are_those_of_podman_compose(
     assert states(done) == {"plain": False}
 
 
+def test_services_of_a_profile(project: Project, sidecar: Sidecar, tmp_path: Path) -> None:
+    project.write(SERVICES.replace("    annotations: {", "    profiles: [debug]\n    annotations: {"))
+    why = "service by-annotation is not started: that takes --profile debug"
+    done = project.avckpt("up", "by-map", "by-annotation", check=False)
+    assert (done.status, done.stderr) == (1, f"avckpt: {why}\n")
+    assert project.ids() == []
+    done = project.avckpt("up", "--json")
+    assert why in done.stderr
+    assert "by-annotation" not in states(done)
+    # Named as on podman-compose's own command line, and by what that reads.
+    assert states(project.avckpt("up", "--json", "--profile", "debug", "by-annotation"))["by-annotation"]
+    project.avckpt("down", "--profile", "debug")
+    assert project.ids() == []
+    env = tmp_path / "debug.env"
+    env.write_text("COMPOSE_PROFILES=debug\nINTERVAL=250ms\n")
+    done = project.avckpt("up", "--json", "--env-file", str(env), "by-annotation", "by-list")
+    assert states(done) == {"by-annotation": True, "by-list": True}
+    assert sidecar.wait_generation(project.container("by-list"))["interval_s"] == 0.25
+
+
 @pytest.mark.parametrize("listed", ["", "docker-compose.yml:gone.yaml:compose.yaml"])
 def test_they_are_merged_in_the_same_order(
     podman: Podman, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: str

@@ -236,6 +236,19 @@ def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
+def test_services_of_a_profile_are_told_as_such(path: Path) -> None:
+    over = path.with_name("over.yaml")
+    over.write_text("services: {rec: {profiles: [bench]}}\n")
+    path.write_text(
+        "services:\n  a: {labels: [avckpt.enable=true]}\n"
+        "  rec: {labels: [avckpt.enable=true], profiles: [debug]}\n  b: {extends: rec}\n"
+    )
+    status, output = avckpt("check", path, over)
+    assert (status, output) == (0, "3 services, to be protected: a, rec (profile debug/bench), b; no problems\n")
+    services = json.loads(avckpt("check", "--json", path)[1])["services"]
+    assert [service["profiles"] for service in services] == [[], ["debug"], []]
+
+
 def test_files_that_nobody_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="none called vehicle.yaml or compose.yaml is here"):
