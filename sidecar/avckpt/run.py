@@ -30,7 +30,7 @@ from avckpt.event_record import of_guard
 from avckpt.events import EventKind, GuardConfig, signal_name
 from avckpt.journal import Journal
 from avckpt.namespace import spawn_pid1
-from avckpt.policy import config_of_labels
+from avckpt.policy import settings_of
 
 NOT_FORWARDED = frozenset(
     {
@@ -62,10 +62,12 @@ def config_of_run(labels: Mapping[str, str]) -> GuardConfig:
             raise LabelsWrong(f"label {key}: avckpt run knows only avckpt.* labels")
         if key == "avckpt.group" or key.startswith("avckpt.notify"):
             raise LabelsWrong(f"label {key}: it takes containers and the sidecar, leave it out")
-    config = config_of_labels({"avckpt.enable": "true", **labels})
+    settings = settings_of({"avckpt.enable": "true", **labels})
+    if settings.policy.restore_on.unhealthy:
+        raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
     if labels.get("avckpt.enable", "true").strip().lower() in ("false", "0", "no", "off"):
         raise LabelsWrong("label avckpt.enable=false: then run the program without avckpt run")
-    return config
+    return settings.config
 
 
 def run(config: GuardConfig, argv: list[str], *, verbose: bool) -> int:

@@ -94,6 +94,12 @@ def test_a_plain_program_has_nobody_who_notifies_it(label: str) -> None:
     assert f"label {label.partition('=')[0]}: it takes containers and the sidecar, leave it out" in result.stderr
 
 
+def test_a_plain_program_has_no_health_check() -> None:
+    result = avckpt("run", "-l", "avckpt.restore.on=signal,unhealthy", "--", "true")
+    assert result.exit_code == 2
+    assert "label avckpt.restore.on: unhealthy takes a container's health check, leave it out" in result.stderr
+
+
 def test_help_documents_the_exit_statuses() -> None:
     text = avckpt("--help").stdout
     for words in ("3 the sidecar", "4 no such container", "5 the container"):
