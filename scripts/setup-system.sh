@@ -27,6 +27,7 @@ has_python_headers() {
 }
 has_runtime() { have crun || have runc; }
 has_bootstrap() { have mmdebstrap || have debootstrap; }
+has_debian_keyring() { compgen -G '/usr/share/keyrings/debian-archive-keyring.*' >/dev/null; }
 has_conmon() { have conmon || [ -x /usr/libexec/podman/conmon ] || [ -x /usr/lib/podman/conmon ]; }
 in_podman_dirs() {
 	local dir
@@ -38,6 +39,22 @@ in_podman_dirs() {
 has_netavark() { in_podman_dirs netavark; }
 has_cyclonedds() { echo "#include <dds/dds.h>" | cc -x c -fsyntax-only - 2>/dev/null; }
 has_catatonit() { have catatonit || in_podman_dirs catatonit; }
+
+# The newest of what is needed of each: PTRACE_GET_RSEQ_CONFIGURATION; `podman generate
+# spec`, by which the hooks learn a container's labels.
+LINUX_LEAST=5.13
+PODMAN_LEAST=4.3
+
+at_least() { [ "$(printf '%s\n' "$2" "$1" | sort -V | head -n 1)" = "$2" ]; }
+check_versions() {
+	local linux podman
+	linux=$(uname -r)
+	at_least "$linux" "$LINUX_LEAST" || die "Linux $linux is too old: avckpt needs $LINUX_LEAST or newer"
+	have podman || return 0
+	podman=$(podman --version | cut -d' ' -f3)
+	at_least "$podman" "$PODMAN_LEAST" ||
+		die "Podman $podman is too old: avckpt needs $PODMAN_LEAST or newer, as in Debian 12 and Ubuntu 24.04"
+}
 
 # need | Debian's package | check | what for.  "optional" is installed where apt
 # can, and its absence elsewhere is no more than a remark.
@@ -52,6 +69,7 @@ required|python3|has_python|Python 3.9 or newer
 required|python3-venv|has_venv|the virtual environment in .venv
 required|python3-dev|has_python_headers|Python.h: the engine's Python binding is a C extension
 required|mmdebstrap|has_bootstrap|makes the base image from Debian packages, without a registry
+required|debian-archive-keyring|has_debian_keyring|the keys by which those packages are checked; Debian itself has them
 required|iproute2|have ip|looks at the host's network
 optional|netavark|has_netavark|bridge networks for containers
 optional|iptables|have iptables|bridge networks for containers (Podman 4)
@@ -63,17 +81,17 @@ optional|cyclonedds-tools|have idlc|a test of ROS 2's transport
 optional|catatonit|has_catatonit|pods and 'podman run --init'
 "
 
-missing=() missing_required=()
+check_versions
+missing_required=() missing_optional=()
 while IFS='|' read -r need package check why; do
 	[ -n "$need" ] || continue
 	if ! $check; then
-		missing+=("$package")
-		if [ "$need" = required ]; then missing_required+=("$package"); fi
+		if [ "$need" = required ]; then missing_required+=("$package"); else missing_optional+=("$package"); fi
 		note "missing: $package - $why"
 	fi
 done <<<"$NEEDS"
 
-if [ ${#missing[@]} = 0 ]; then
+if [ $((${#missing_required[@]} + ${#missing_optional[@]})) = 0 ]; then
 	note "system packages: everything is there"
 	exit 0
 fi
@@ -88,12 +106,23 @@ if ! have apt-get; then
 fi
 if [ "$(id -u)" != 0 ]; then
 	[ -n "$manual" ] || exit 0
-	die "not root: run 'sudo apt-get install ${missing[*]}', then make again"
+	die "not root: run 'sudo apt-get install $manual', then make again"
 fi
 
 # A third-party source that is down must not keep us from Debian's own packages.
 step apt-update "refreshing the package lists" apt-get update ||
 	warn "some package lists could not be refreshed; going on with what there is"
-step apt-install "installing ${missing[*]}" \
-	env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=180 install -y --no-install-recommends "${missing[@]}" ||
-	die "apt-get could not install: ${missing[*]}"
+# One that it does not know would keep apt-get from installing any of the others.
+wanted=("${missing_required[@]}")
+for package in "${missing_optional[@]}"; do
+	if apt-cache show "$package" >/dev/null 2>&1; then
+		wanted+=("$package")
+	else
+		warn "this system has no package $package; going on without"
+	fi
+done
+[ ${#wanted[@]} != 0 ] || exit 0
+step apt-install "installing ${wanted[*]}" \
+	env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=180 install -y --no-install-recommends "${wanted[@]}" ||
+	die "apt-get could not install: ${wanted[*]}"
+check_versions
