@@ -103,7 +103,7 @@ class Facts:
 
 
 KERNEL_LEAST = (5, 13)  # PTRACE_GET_RSEQ_CONFIGURATION, the newest call that the engine needs
-PODMAN_LEAST = (4, 3)
+PODMAN_LEAST = (4, 3)  # `podman generate spec`, by which the precreate hook learns labels
 MACHINES = ("x86_64",)
 _CAPABILITIES = {"CAP_SYS_PTRACE": 19, "CAP_SYS_ADMIN": 21}
 
@@ -194,7 +194,8 @@ def _judge_podman(facts: Facts) -> Iterator[Check]:
         yield Check("podman", Status.FAIL, "this is a rootless Podman", "protected containers must be root's: use sudo")
     elif _numbers(podman.version) < PODMAN_LEAST:
         least = ".".join(map(str, PODMAN_LEAST))
-        yield Check("podman", Status.WARN, f"{podman.version} was never tried", f"use Podman {least} or newer")
+        detail = f"{podman.version} is too old: its hooks can not learn a container's labels"
+        yield Check("podman", Status.FAIL, detail, f"use Podman {least} or newer")
     else:
         yield Check("podman", Status.OK, podman.version)
     if podman.runtime in ("crun", "runc"):
