@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import avckpt
-from avckpt import containers_conf, install
+from avckpt import containers_conf, install, sidecar_container
+from avckpt.client import START_IT
 from avckpt.errors import AvckptError
 from avckpt.install import HOOK_PROGRAM, HOOKS_DIR, INIT_PROGRAM, Manifest
 
@@ -97,6 +98,8 @@ class Facts:
     sidecar_version: str | None
     """None: it does not answer."""
     sidecar_problem: str
+    sidecar_outdated: bool
+    """Its container was made of another image than there is now."""
     engine_problem: str
     """What the engine's own probe said; empty: it is content."""
     config: ConfigFacts
@@ -247,6 +250,9 @@ def _judge_sidecar(facts: Facts) -> Check:
             f"of version {facts.sidecar_version}, this is {avckpt.__version__}",
             "build its image again and start it anew",
         )
+    if facts.sidecar_outdated:
+        remedy = f"sudo podman rm -f {sidecar_container.NAME}; then {START_IT}"
+        return Check("sidecar", Status.WARN, sidecar_container.OUTDATED, remedy)
     return Check("sidecar", Status.OK, f"answers, version {facts.sidecar_version}")
 
 
@@ -283,6 +289,7 @@ def gather() -> Facts:
         init_problem=init_problem(INIT_PROGRAM) if installed else "",
         sidecar_version=str(info["version"]) if info else None,
         sidecar_problem=problem,
+        sidecar_outdated=_sidecar_outdated(),
         engine_problem=_engine_problem(),
         config=_config(info),
     )
@@ -374,6 +381,13 @@ def _sidecar() -> tuple[dict[str, Any], str]:
     if "version" not in info:
         return {}, "the sidecar does not say its version: start it again"
     return info, ""
+
+
+def _sidecar_outdated() -> bool:
+    try:
+        return sidecar_container.is_outdated()
+    except AvckptError:
+        return False  # no Podman here, of which more is said elsewhere
 
 
 def _config(info: dict[str, Any]) -> ConfigFacts:

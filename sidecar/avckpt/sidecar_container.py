@@ -15,6 +15,7 @@ from avckpt.errors import SidecarUnreachable
 NAME = "avckpt-sidecar"
 IMAGE = "localhost/avckpt-sidecar"
 CONFIG_DIR = Path("/etc/avckpt")
+OUTDATED = f"the container {NAME} is of another build than the image {IMAGE}"
 ANSWERS_WITHIN_S = 20.0
 
 
@@ -23,6 +24,23 @@ def ensure(run_dir: Path, say: Callable[[str], None]) -> None:
 
     Raises SidecarUnreachable with what is to be done when that can not be.
     """
+    _ensure(run_dir, say)
+    if is_outdated():
+        say(f"warning: {OUTDATED} (sudo podman rm -f {NAME}, then sudo avckpt up)")
+
+
+def is_outdated() -> bool:
+    """Its container was made of another image than there is now.
+
+    A version number does not tell: between two releases all builds have the
+    same.  Raises SidecarUnreachable.
+    """
+    runs = _podman("container", "inspect", "--format", "{{.Image}}", NAME, check=False).stdout
+    there = _podman("image", "inspect", "--format", "{{.Id}}", IMAGE, check=False).stdout
+    return bool(runs and there and runs != there)
+
+
+def _ensure(run_dir: Path, say: Callable[[str], None]) -> None:
     client = Client(run_dir)
     if answers(client):
         return

@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from avckpt import sidecar_container
+from avckpt import doctor, sidecar_container
 from avckpt.errors import SidecarUnreachable
 from harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
 
@@ -52,6 +52,25 @@ def test_a_container_lives_through_kill_and_ends_with_stop(container: ContainerF
     log = sidecar.logs()
     for words in ("registered", "protected: first checkpoint", "killed by SIGSEGV, restored in", "ended: "):
         assert f"{web.name}: {words}" in log
+
+
+def test_a_sidecar_of_another_build_is_told(
+    sidecar: Sidecar, podman: Podman, base_image: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    sidecar_container.ensure(RUN_DIR, said.append)
+    assert (said, sidecar_container.is_outdated()) == ([], False)
+    # The tag of its image is on another one now, as after `make setup`.
+    newer = f"localhost/avckpt-test-{os.getpid()}:latest"
+    podman.run("tag", base_image, newer)
+    monkeypatch.setattr(sidecar_container, "IMAGE", newer)
+    try:
+        sidecar_container.ensure(RUN_DIR, said.append)
+        [check] = [check for check in doctor.checks() if check.name == "sidecar"]
+    finally:
+        podman.run("untag", newer, newer)
+    assert said == [f"warning: {sidecar_container.OUTDATED} (sudo podman rm -f avckpt-sidecar, then sudo avckpt up)"]
+    assert (check.status, check.detail) == (doctor.Status.WARN, sidecar_container.OUTDATED)
 
 
 def test_a_paused_container_is_missed_and_goes_on(
