@@ -36,7 +36,7 @@ class LabelError(ValueError):
     """A label that can not be honoured.  The text is one line for a person."""
 
     def __init__(self, key: str, value: str | None, why: str, allowed: str) -> None:
-        shown = key if value is None else f"{key}={_shorten(value)}"
+        shown = _shorten(key) if value is None else f"{_shorten(key)}={_shorten(value)}"
         super().__init__(f"label {shown}: {why}; {allowed}")
         self.key = key
         self.value = value

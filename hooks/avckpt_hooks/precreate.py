@@ -53,7 +53,7 @@ def main() -> int:
     try:
         config = rewrite(config, parent)
     except Refused as refused:
-        line = f"avckpt: {refused}"
+        line = tell.printable(f"avckpt: {refused}")
         tell.journal(line)
         if not podman.is_service(parent):
             tell.parent(line, parent)

@@ -19,7 +19,7 @@ _SYS_PIDFD_GETFD = 438  # the same on every architecture
 
 
 def parent(line: str, pid: int | None = None) -> bool:
-    """Writes one line to the standard error of the parent (or `pid`).
+    """Writes one line, made printable, to the standard error of the parent (or `pid`).
 
     True if somebody can read it there.  Never raises, never waits longer than
     _WAIT_MS for a reader.
@@ -37,18 +37,27 @@ def parent(line: str, pid: int | None = None) -> bool:
 
 
 def journal(line: str) -> None:
-    """Hands one line to syslog (and so to journald).  Never raises, never waits."""
+    """Hands one line, made printable, to syslog (and so to journald).  Never raises, never waits."""
     import socket
     import time
 
     # Not syslog(3): while journald hangs and its queue is full, that waits for
     # ever, and the container for us.
-    packet = f"<{_DAEMON_WARNING}>{time.strftime('%b %e %T')} avckpt[{os.getpid()}]: {line[:_LINE_MAX]}"
+    packet = f"<{_DAEMON_WARNING}>{time.strftime('%b %e %T')} avckpt[{os.getpid()}]: {printable(line)[:_LINE_MAX]}"
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as log:
             log.sendto(packet.encode(errors="replace"), "/dev/log")
     except OSError:
         pass  # nobody listens, or has no time
+
+
+def printable(line: str) -> str:
+    r"""The same with escapes (`\n`, `\x1b`) for what does not print.
+
+    An image chooses the names of its labels: it must not write lines of its
+    own into root's log, or do anything to root's terminal.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 def _stderr_of(pid: int) -> int:
@@ -89,5 +98,5 @@ def _write(fd: int, line: str) -> bool:
     poll.register(fd, select.POLLOUT)
     if not stat.S_ISREG(status.st_mode) and not poll.poll(_WAIT_MS):
         return False
-    packet = (line[:_LINE_MAX] + end).encode(errors="replace")
+    packet = (printable(line)[:_LINE_MAX] + end).encode(errors="replace")
     return os.write(fd, packet) == len(packet)

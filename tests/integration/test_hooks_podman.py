@@ -321,6 +321,23 @@ def test_a_bad_label_is_refused_where_the_user_sees_it(
     assert records(run_dir) == []
 
 
+@pytest.mark.parametrize(
+    ("label", "status", "shown"),
+    [
+        ("avckpt.\x1b]0;x\x07\nfake: line", 126, "label avckpt.?]0;x??fake: line: unknown label; "),
+        ("avckpt_\x1b[2J\nfake: line", 0, r"the label avckpt_\x1b[2J\nfake: line means nothing; "),
+    ],
+)
+def test_what_a_label_is_called_does_nothing_to_the_terminal(
+    hooked: Podman, receiver: Receiver, base_image: str, name: str, label: str, status: int, shown: str
+) -> None:
+    done = foreground(hooked, name, "--network=none", "--label", f"{label}=1", image=base_image)
+    assert done[0] == status
+    line = done[2].splitlines()[0]
+    assert line.startswith(f"avckpt: container {name}: {shown}")
+    assert line.isprintable()
+
+
 def test_a_bad_label_is_refused_in_the_background_too(make: ContainerFactory) -> None:
     done = make.podman.run(
         *("run", "--detach", "--rm", "--network=none", "--pull=never", "--label", "avckpt.enabled=true"),

@@ -44,6 +44,12 @@ def test_a_line_reaches_the_journal(log: socket.socket) -> None:
     assert re.fullmatch(rb"<28>\w{3} [ \d]\d \d\d:\d\d:\d\d avckpt\[\d+\]: avckpt: all is well", log.recv(1000))
 
 
+def test_one_line_is_one_line_in_the_journal(log: socket.socket) -> None:
+    journal("avckpt: label \x1b[2J\nfake: line", log.getsockname())
+    log.settimeout(5)
+    assert log.recv(1000).endswith(rb": avckpt: label \x1b[2J\nfake: line")
+
+
 def test_a_journal_that_hangs_does_not_hold_a_hook_up(log: socket.socket) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as others, contextlib.suppress(BlockingIOError):
         others.setblocking(False)
