@@ -86,6 +86,7 @@ class Facts:
     podman: PodmanFacts | str
     """A string: why Podman does not answer."""
     hooks_dir_problems: tuple[str, ...]
+    service_problems: tuple[str, ...]
     installed_version: str | None
     """None: nothing is installed."""
     missing_files: tuple[str, ...]
@@ -233,6 +234,9 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
             yield Check("hooks_dir", Status.FAIL, what, remedy)
     else:
         yield Check("hooks_dir", Status.OK, f"Podman looks into {HOOKS_DIR}")
+    for problem in facts.service_problems:
+        what, _, remedy = problem.rpartition(": ")
+        yield Check("podman service", Status.WARN, what, remedy)
 
 
 def _few(names: Sequence[str]) -> str:
@@ -282,6 +286,7 @@ def gather() -> Facts:
         pidfd=_has_pidfd(),
         podman=_podman(),
         hooks_dir_problems=tuple(containers_conf.problems(HOOKS_DIR, environ=os.environ)),
+        service_problems=tuple(install.service_problems()),
         installed_version=installed,
         missing_files=missing,
         outdated_files=outdated,

@@ -6,7 +6,7 @@ manifest lists and nothing else.  Every file is written beside its place and
 renamed into it: running containers have avckpt-init mounted, and a hook may be
 starting at any moment.  They are renamed when all are written: a disk that is
 full leaves the installation as it was, and not one of two versions mixed, whose
-hooks could keep containers from starting.
+hooks could keep containers from starting.  What is there already stays untouched.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import stat
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+
+import psutil
 
 import avckpt
 from avckpt import artifacts, containers_conf
@@ -89,9 +92,13 @@ class _File:
             to.symlink_to(self.content.decode())
 
     def is_at(self, place: Path) -> bool:
-        """Whether that is what stands there.  Raises OSError."""
-        found = os.readlink(place).encode() if place.is_symlink() else place.read_bytes()
-        return found == self.content
+        """Whether that is what stands there."""
+        try:
+            if place.is_symlink():
+                return not self.mode and os.readlink(place).encode() == self.content
+            return place.read_bytes() == self.content and stat.S_IMODE(place.stat().st_mode) == self.mode
+        except OSError:
+            return False
 
 
 class _Writer:
@@ -115,9 +122,12 @@ class _Writer:
             self.directories.append(p)
 
     def file(self, file: _File) -> None:
-        """Writes it beside its place."""
+        """Writes it beside its place, unless it is there."""
+        self.files.append(file.path)
         self.directory(file.path.parent)
         place = under(self._root, file.path)
+        if file.is_at(place):
+            return
         temporary = place.with_name(f".{place.name}.{os.getpid()}.new")
         try:
             temporary.unlink(missing_ok=True)
@@ -126,7 +136,6 @@ class _Writer:
         except OSError as error:  # of a full disk it names no file
             raise OSError(error.errno, error.strerror, str(place)) from error
         self._written.append((temporary, place))
-        self.files.append(file.path)
 
     def put_in_place(self) -> None:
         """Renames them into their places, in order; then there is nothing to be undone."""
@@ -182,7 +191,8 @@ def install(root: Path = _HOST) -> list[str]:
         where = error.filename2 or error.filename  # of a rename, the new name
         raise ConfigError(f"{where} can not be written: {error.strerror}; {state}") from error
     environ = os.environ if root == _HOST else {}
-    return done + [f"warning: {line}" for line in containers_conf.problems(HOOKS_DIR, root, environ)]
+    problems = containers_conf.problems(HOOKS_DIR, root, environ) + (service_problems() if root == _HOST else [])
+    return done + [f"warning: {line}" for line in problems]
 
 
 def outdated(root: Path = _HOST) -> list[Path]:
@@ -190,14 +200,29 @@ def outdated(root: Path = _HOST) -> list[Path]:
 
     A version number does not tell: between two releases all builds have the same.
     """
+    return [file.path for file in _own_files(_hook_python(root)) if not file.is_at(under(root, file.path))]
+
+
+def service_problems() -> list[str]:
+    """A line with a remedy for each Podman service of root's that calls no hooks: it is older than the drop-in file.
+
+    hooks_dir is read when a Podman starts.
+    """
+    try:
+        installed_at = DROP_IN.stat().st_mtime
+    except OSError:
+        return []
     found = []
-    for file in _own_files(_hook_python(root)):
-        try:
-            same = file.is_at(under(root, file.path))
-        except OSError:
-            same = False
-        if not same:
-            found.append(file.path)
+    for process in psutil.process_iter(["cmdline", "create_time", "uids"]):
+        command = process.info["cmdline"] or [""]
+        if Path(command[0]).name != "podman" or ("system", "service") not in zip(command, command[1:]):
+            continue
+        chosen = any(word.startswith("--hooks-dir") for word in command)
+        if not chosen and process.info["uids"].real == 0 and process.info["create_time"] < installed_at:
+            found.append(
+                f"Podman's service (process {process.pid}) is older than the installation and calls no hooks: "
+                "sudo systemctl restart podman.service, or end it and start it again as you did"
+            )
     return found
 
 

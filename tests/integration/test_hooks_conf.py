@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from avckpt import containers_conf
-from avckpt.install import HOOKS_DIR
-from harness import Podman, hooks_installed
+from avckpt.install import DROP_IN, HOOKS_DIR
+from harness import Podman, avckpt_command, hooks_installed, run, wait_until
 
 INIT = "/run/avckpt-init"
 
@@ -43,6 +45,46 @@ def test_the_drop_in_is_in_force(
     monkeypatch.delenv("CONTAINERS_CONF", raising=False)
     assert containers_conf.problems(HOOKS_DIR, environ=os.environ) == []
     assert first_process(podman, name, base_image).startswith(INIT)
+
+
+def test_a_service_that_runs_already_calls_no_hooks(
+    installed: None, podman: Podman, base_image: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from podman import PodmanClient
+
+    monkeypatch.delenv("CONTAINERS_CONF", raising=False)
+    path = tmp_path / "podman.sock"
+
+    @contextlib.contextmanager
+    def running_service() -> Iterator[str]:
+        """Yields how its problem begins, if it has one."""
+        service = subprocess.Popen([*podman.command, "system", "service", "--time", "0", f"unix://{path}"])
+        try:
+            wait_until(path.exists, 10, "Podman's service")
+            yield f"Podman's service (process {service.pid}) is older than the installation"
+        finally:
+            service.terminate()
+            service.wait(timeout=10)
+            path.unlink(missing_ok=True)
+
+    def first_word() -> str:
+        with PodmanClient(base_url=f"unix://{path}") as client:
+            labels = {"avckpt.enable": "true"}
+            made = client.containers.create(base_image, ["sleep", "60"], name=name, labels=labels, network_mode="none")
+            made.start()
+        pid = podman.inspect(name)["State"]["Pid"]
+        return Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0].decode()
+
+    DROP_IN.unlink()
+    with running_service() as problem:
+        done = run([*avckpt_command(), "install"])
+        assert f"warning: {problem}" in done.stderr
+        assert first_word() == "sleep"
+        podman.remove(name)
+    with running_service() as problem:
+        done = run([*avckpt_command(), "install"])  # again: nothing new
+        assert problem not in done.stderr
+        assert first_word() == INIT
 
 
 def test_containers_conf_in_the_environment_hides_it_and_the_remedy_helps(

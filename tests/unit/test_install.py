@@ -99,8 +99,11 @@ def test_uninstall_leaves_what_others_put_there(root: Path) -> None:
 def test_again_changes_nothing_that_matters(root: Path) -> None:
     install.install(root)
     once = tree(root)
+    # That a service is older than this one means that it calls no hooks.
+    written_at = install.under(root, install.DROP_IN).stat().st_mtime_ns
     install.install(root)
     assert tree(root) == once
+    assert install.under(root, install.DROP_IN).stat().st_mtime_ns == written_at
     install.uninstall(root)
     assert not (root / "usr/local/libexec").exists()
 
@@ -194,6 +197,8 @@ def full_disk(root: Path) -> None:
     host(root)
     install.install(root)
     (root / "usr/local/libexec/avckpt/avckpt-init").write_bytes(b"of an older version")
+    for path in (root / "usr/local/libexec/avckpt/avckpt_hooks").glob("*.py"):
+        path.write_bytes(path.read_bytes() + b"# of an older version\n")
     before = tree(root)
     room = len(artifacts.init_binary().read_bytes()) + 8_000
     with (root / "full").open("wb") as file:
