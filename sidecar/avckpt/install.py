@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
+from avckpt_hooks import protocol
 
 import avckpt
 from avckpt import artifacts, containers_conf
@@ -31,7 +32,6 @@ HOOKS_DIR = SHARE / "oci-hooks.d"
 MANIFEST = SHARE / "manifest.json"
 DROP_IN = Path("/etc/containers/containers.conf.d/50-avckpt.conf")
 TMPFILES = Path("/etc/tmpfiles.d/avckpt.conf")
-RUN_DIR = Path("/run/avckpt")
 CONFIG_DIR = Path("/etc/avckpt")
 """For the user's config.yaml; made here because the sidecar's container mounts it."""
 
@@ -162,8 +162,9 @@ def install(root: Path = _HOST) -> list[str]:
         f"{HOOKS_DIR}: tells Podman when to call them",
     ]
     if under(root, TMPFILES.parent).is_dir():
-        files.append(_File(TMPFILES, b"# avckpt: where hooks and sidecar meet\nd /run/avckpt 0755 root root -\n"))
-        done.append(f"{TMPFILES}: makes {RUN_DIR} when the machine starts")
+        line = f"# avckpt: where hooks and sidecar meet\nd {_run_dir()} 0755 root root -\n"
+        files.append(_File(TMPFILES, line.encode()))
+        done.append(f"{TMPFILES}: makes {_run_dir()} when the machine starts")
     # Last: from here on Podman calls the hooks.
     directories = containers_conf.with_directory(root, HOOKS_DIR, without=DROP_IN)
     files.append(_File(DROP_IN, _drop_in(directories).encode()))
@@ -174,7 +175,7 @@ def install(root: Path = _HOST) -> list[str]:
             writer = _Writer(root, undo)
             for file in files:
                 writer.file(file)
-            for path in (RUN_DIR, CONFIG_DIR, _CACHE):
+            for path in (_run_dir(), CONFIG_DIR, _CACHE):
                 writer.directory(path)
             # It names all that is there from now on, however far we come.
             new = [path for path in writer.files if path not in before.files]
@@ -271,9 +272,23 @@ def _own_files(python: str) -> list[_File]:
         files.append(_File(_PACKAGE / source.name, content, 0o755 if executable else 0o644))
     files.append(_File(HOOK_PROGRAM, f"{_PACKAGE.name}/__main__.py".encode(), 0))
     files += [
-        _File(HOOKS_DIR / path.name, path.read_bytes()) for path in sorted(artifacts.oci_hooks_source().glob("*.json"))
+        _File(HOOKS_DIR / path.name, _hook_json(path)) for path in sorted(artifacts.oci_hooks_source().glob("*.json"))
     ]
     return files
+
+
+def _run_dir() -> Path:
+    """Where hooks and sidecar are to meet: our environment says it, as it does to the sidecar."""
+    return Path(protocol.run_dir()).absolute()
+
+
+def _hook_json(source: Path) -> bytes:
+    """A hook's description.  Podman gives a hook no environment but the one in there."""
+    if not os.environ.get("AVCKPT_RUN_DIR"):
+        return source.read_bytes()
+    data = json.loads(source.read_bytes())
+    data["hook"]["env"].append(f"AVCKPT_RUN_DIR={_run_dir()}")
+    return json.dumps(data, indent=2).encode() + b"\n"
 
 
 def _record(root: Path, files: list[Path], directories: list[Path]) -> None:

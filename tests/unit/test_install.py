@@ -254,6 +254,26 @@ def test_files_of_another_build_are_found(root: Path) -> None:
     assert [path.name for path in install.outdated(root)] == ["avckpt-init", "podman.py"]
 
 
+def test_another_run_time_directory(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install.install(root)
+    description = root / "usr/local/share/avckpt/oci-hooks.d/50-avckpt-precreate.json"
+    usual = json.loads(description.read_text())
+    monkeypatch.setenv("AVCKPT_RUN_DIR", "/run/other")
+    assert [path.name for path in install.outdated(root)] == [description.name]
+    install.install(root)
+    usual["hook"]["env"].append("AVCKPT_RUN_DIR=/run/other")
+    assert json.loads(description.read_text()) == usual
+    assert (root / "etc/tmpfiles.d/avckpt.conf").read_text().endswith("\nd /run/other 0755 root root -\n")
+    assert (root / "run/other").is_dir()
+    assert install.outdated(root) == []
+    monkeypatch.delenv("AVCKPT_RUN_DIR")
+    install.install(root)
+    assert (description.read_text(), install.outdated(root)) == (
+        (artifacts.oci_hooks_source() / description.name).read_text(),
+        [],
+    )
+
+
 def test_a_damaged_manifest_is_said(root: Path) -> None:
     install.install(root)
     (root / "usr/local/share/avckpt/manifest.json").write_text("{")
