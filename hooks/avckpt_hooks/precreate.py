@@ -217,7 +217,7 @@ def _unprotectable(data: dict[str, Any], container: str) -> str:
         return "only containers of root can be protected, and this Podman is rootless"
     process = data.get("process") or {}
     command = (process.get("args") or [""])[0]
-    if os.path.basename(command) in _ONLY_AS_PID_1 and command not in _OTHER_INITS:
+    if must_be_pid_1(command):
         return (
             f"its command is {command}, which must itself be PID 1; "
             "to protect its program, start that without it (--entrypoint)"
@@ -228,6 +228,11 @@ def _unprotectable(data: dict[str, Any], container: str) -> str:
     if not init_binary():
         return "avckpt-init is missing; run `avckpt install` again"
     return ""
+
+
+def must_be_pid_1(command: str) -> bool:
+    """Whether a program is better left without an init in front of it."""
+    return os.path.basename(command) in _ONLY_AS_PID_1 and command not in _OTHER_INITS
 
 
 def _is_ours() -> bool:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import yaml
 from avckpt_hooks.labels import LABELS, PREFIX, LabelError, meant_by, merge, parse_policy
+from avckpt_hooks.precreate import must_be_pid_1
 
 from avckpt import yamlfile
 from avckpt.errors import ConfigError
@@ -116,6 +117,8 @@ class Service:
     """The file and the service in it; the path is this service's own file's for one of the same project."""
     profiles: tuple[str, ...] = ()
     """It is started with one of these only; none: always.  Nobody inherits them by `extends`."""
+    programs: dict[str, str] = field(default_factory=dict)
+    """The first words of `entrypoint` and `command`, as far as they are given."""
 
     @property
     def enabled(self) -> bool | None:
@@ -268,6 +271,7 @@ class _Reader:
         self._resolved.add(id(service))
         for kind, settings in base.settings.items():
             service.settings[kind] = {**settings, **service.settings[kind]}
+        service.programs = {**base.programs, **service.programs}
 
     def _base(self, service: Service, path: Path, name: str) -> Service | None:
         if path == Path(service.place.file) and name in self._manifest.services:
@@ -282,7 +286,7 @@ class _Reader:
         return None
 
     def _service(self, name: str, place: Place, node: yaml.Node, path: Path) -> Service:
-        service = Service(name, place, extends=_extends(node, path), profiles=_profiles(node))
+        service = Service(name, place, extends=_extends(node, path), profiles=_profiles(node), programs=_programs(node))
         for kind, key in ((Kind.LABEL, "labels"), (Kind.ANNOTATION, "annotations")):
             for setting in self._settings(yamlfile.lookup(node, key), path, name):
                 known = service.settings[kind].get(setting.key)
@@ -335,6 +339,7 @@ class _Reader:
                 service.settings[kind] = {**settings, **service.settings[kind]}
             service.extends = service.extends or earlier.extends
             service.profiles = (*earlier.profiles, *service.profiles)
+            service.programs = {**earlier.programs, **service.programs}
         self._manifest.services[service.name] = service
 
     def _root(self, path: Path, asked_at: Place | None = None, service: str = "") -> yaml.Node | None:
@@ -366,8 +371,18 @@ def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:
 
 def _profiles(node: yaml.Node) -> tuple[str, ...]:
     profiles = yamlfile.lookup(node, "profiles")
-    items = profiles.value if isinstance(profiles, yaml.SequenceNode) else [profiles]
+    items = profiles.value if isinstance(profiles, yaml.SequenceNode) else []
     return tuple(item.value for item in items if isinstance(item, yaml.ScalarNode))
+
+
+def _programs(node: yaml.Node) -> dict[str, str]:
+    programs = {}
+    for key in ("entrypoint", "command"):
+        value = yamlfile.lookup(node, key)
+        first = next(iter(value.value), None) if isinstance(value, yaml.SequenceNode) else value
+        if isinstance(first, yaml.ScalarNode):
+            programs[key] = "".join(first.value.split()[:1])
+    return programs
 
 
 def _judge(service: Service) -> Iterator[Problem]:
@@ -402,13 +417,17 @@ def _judge_together(service: Service, settings: Mapping[str, Setting]) -> Iterat
 
 def _doubts(service: Service) -> Iterator[Problem]:
     """What can be honoured, but is hardly meant."""
-    if {"avckpt.group", "avckpt.notify"} <= set(_keys(service)):
-        return  # it hears of others
-    if service.enabled is False and not any(key == ENABLE for key in _keys(service)):
+    hears_of_others = {"avckpt.group", "avckpt.notify"} <= set(_keys(service))
+    if service.enabled is False and not hears_of_others and not any(key == ENABLE for key in _keys(service)):
         for _, setting in service.all_settings():
             message = f"{setting.key} has no effect: without {ENABLE}=true the container is not protected"
             yield Problem(setting.place, service.name, message, Severity.WARNING)
             break
+    program = service.programs.get("entrypoint") or service.programs.get("command", "")
+    if service.enabled and must_be_pid_1(program):
+        unless = "" if "entrypoint" in service.programs else ", unless its image has an entrypoint of its own"
+        message = f"{program} must itself be PID 1: this service runs unprotected{unless}"
+        yield Problem(service.place, service.name, message, Severity.WARNING)
 
 
 def _judge_key(key: str) -> None:

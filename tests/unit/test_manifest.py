@@ -236,6 +236,24 @@ def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
+def test_what_must_be_process_1_is_worth_a_warning(path: Path) -> None:
+    manifest = checked(
+        path,
+        "services:\n"
+        "  a: {labels: [avckpt.enable=true], command: /sbin/init --quiet}\n"
+        "  b: {labels: [avckpt.enable=true], entrypoint: [/init], command: [node]}\n"
+        "  c: {extends: a, entrypoint: /bin/sh -c}\n"
+        "  d: {command: /sbin/init}\n"
+        "  e: {extends: a, command: [node, /sbin/init]}\n",
+    )
+    why = "must itself be PID 1: this service runs unprotected"
+    assert [str(problem) for problem in manifest.problems] == [
+        f"{path}:2: service a: warning: /sbin/init {why}, unless its image has an entrypoint of its own",
+        f"{path}:3: service b: warning: /init {why}",
+    ]
+    assert manifest.errors == []
+
+
 def test_services_of_a_profile_are_told_as_such(path: Path) -> None:
     over = path.with_name("over.yaml")
     over.write_text("services: {rec: {profiles: [bench]}}\n")
