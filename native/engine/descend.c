@@ -41,6 +41,7 @@ struct family {
 	const struct files_table *table; /* by branch                            */
 	struct copier *copier;
 	uint64_t flush;        /* signals of children that ended (sigset_t)       */
+	pid_t last;            /* the number given out last; 0: not known          */
 	struct member first;   /* the main process                              */
 	struct member *member; /* by branch                                   */
 };
@@ -136,16 +137,19 @@ static int fork_once(struct family *family, struct member *host, const struct br
 {
 	struct inj_call *runner = &host->puppet.pad->control->runner;
 	const bool orphan = branch->parent == PARENT_INIT;
+	/* Siblings' numbers often follow each other; to ask takes two wake-ups. */
+	const bool follows = !orphan && family->last && family->last + 1 == branch->inside;
 	struct puppet from = host->puppet;
 	int result;
 
+	family->last = 0;
 	/* An orphan's parent has ended: so does one that is there for that. */
 	if (orphan &&
 	    clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
 		return -1;
 	if (copy)
 		from.pid = copy;
-	result = last_pid_set(family->helper, branch->inside - 1, err) ||
+	result = (!follows && last_pid_set(family->helper, branch->inside - 1, err)) ||
 		 clone_task(&from, runner,
 			    ((uint64_t)branch->exit_signal & CSIGNAL) |
 				    (copy ? CLONE_VM | CLONE_PARENT : 0),
@@ -187,8 +191,10 @@ static int fork_host(struct family *family, struct member *host, const struct br
 			note_end(family, branch);
 		*child = 0;
 		made = fork_once(family, host, branch, copy, chores, child, &failed) == 0;
-		if (made && proc_inside(*child) == branch->inside)
+		if (made && proc_inside(*child) == branch->inside) {
+			family->last = branch->inside;
 			return copy ? take_back(&host->puppet, copy, err) : 0;
+		}
 		if (made && !copy && !orphan) {
 			copy = *child;
 			continue;
@@ -487,6 +493,7 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	if (puppet_flush(&first->puppet, err))
 		return -1;
 	slot->placed = 1;
+	family->last = slot->pid;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (make_member(family, i, &last, err))
 			return -1;
