@@ -314,21 +314,31 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 		       : 0;
 }
 
+/* What it maps has to be there before it is filled; all else can wait for the next calls. */
 static int map_new(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
 	const struct mapping *given = NULL;
+	bool changed = false;
 
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (piece->want && !piece->kept && map_piece(r, puppet, piece, &given, err))
-			return -1;
-		if (piece->kept && protection(piece->is) != protection(piece->want) &&
-		    puppet_ask(puppet, SYS_mprotect, piece->start, piece->end - piece->start,
-			       (uint64_t)protection(piece->want), 0, 0, 0, err))
-			return -1;
+		if (piece->want && !piece->kept) {
+			changed = true;
+			if (map_piece(r, puppet, piece, &given, err))
+				return -1;
+		}
+		if (piece->kept && protection(piece->is) != protection(piece->want)) {
+			changed = true;
+			if (puppet_ask(puppet, SYS_mprotect, piece->start,
+				       piece->end - piece->start,
+				       (uint64_t)protection(piece->want), 0, 0, 0, err))
+				return -1;
+		}
 	}
-	return give_file(r, puppet, NULL, &given, err) || puppet_flush(puppet, err) ? -1 : 0;
+	return give_file(r, puppet, NULL, &given, err) || (changed && puppet_flush(puppet, err))
+		       ? -1
+		       : 0;
 }
 
 /* ---- pages -------------------------------------------------------------------------- */
@@ -436,18 +446,21 @@ static int advice_of(enum page what)
 static int fill(const struct remap *r, struct puppet *puppet, struct copier *copier,
 		struct avc_error *err)
 {
+	bool opened = false;
+
 	if (copier_open(copier, r->want->template, puppet->pid, err))
 		return -1;
 	for (uint32_t i = 0; i < r->runs; i++) {
 		const struct run *run = &r->run[i];
 		const int advice = advice_of(run->what);
 
+		opened = opened || run->what == PAGE_OPEN_COPY;
 		if (advice && puppet_ask(puppet, SYS_madvise, run->start, run->end - run->start,
 					 (uint64_t)advice, 0, 0, 0, err))
 			return -1;
 	}
 	/* Nothing can be written where a guard page still is. */
-	if (puppet_flush(puppet, err))
+	if (opened && puppet_flush(puppet, err))
 		return -1;
 	for (uint32_t i = 0; i < r->runs; i++) {
 		const struct run *run = &r->run[i];
