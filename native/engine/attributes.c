@@ -409,6 +409,19 @@ static int put_back(pid_t tid, void *arg)
 	return 0;
 }
 
+/* By the kernel's rules they have what the one had that made them (sched(7), ioprio_set(2)): whom
+ * that is right for, and that is nearly everybody, need not be looked for in /proc. */
+static bool has_all(const struct attributes *attributes, pid_t pid)
+{
+	struct scheduling is;
+
+	scheduling_read(pid, &is);
+	for (uint32_t i = 0; i < attributes->count; i++)
+		if (!same_scheduling(&attributes->thread[i].scheduling, &is))
+			return false;
+	return true;
+}
+
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice)
 {
 	struct search search = { .attributes = attributes, .notice = notice };
@@ -416,7 +429,7 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 
 	if (attributes->oom_score_adj[0])
 		oom_score_adj_set(pid, attributes->oom_score_adj);
-	if (!attributes->count)
+	if (has_all(attributes, pid))
 		return;
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	if (dirfd < 0)
