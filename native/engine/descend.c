@@ -23,6 +23,8 @@
 #define TRY_AGAIN_US 200
 #define STEP_NS (5 * NS_PER_S)
 #define FILES_SPARE 64
+/* So many children have mail of their own. */
+#define FEW 2
 
 struct member {
 	pid_t pid; /* 0: not made yet                                         */
@@ -40,6 +42,7 @@ struct family {
 	timer_t timer;
 	const struct files_table *table; /* by branch                            */
 	struct copier *copier;
+	struct mail mail;      /* of the main process's children                  */
 	uint64_t flush;        /* signals of children that ended (sigset_t)       */
 	pid_t last;            /* the number given out last; 0: not known          */
 	struct member first;   /* the main process                              */
@@ -69,6 +72,7 @@ struct family *family_new(struct target *main, struct generation *generation,
 	family->link = link;
 	family->timer = timer;
 	family->table = table;
+	family->mail = (struct mail){ -1, -1 };
 	family->first.pidfd = family->first.puppet.socket = -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		family->member[i].pidfd = family->member[i].puppet.socket = -1;
@@ -339,8 +343,10 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
 	const struct remap *plan = inherit_plan(family->generation, index, err);
+	const struct mail none = { -1, -1 };
+	const bool is_mains = inherit_host(family->generation, index) == PARENT_MAIN;
 
-	if (!plan || puppet_open_mail(puppet, err))
+	if (!plan || puppet_open_mail(puppet, is_mains ? &family->mail : &none, err))
 		return -1;
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
 	    remap(plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
@@ -349,7 +355,7 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	take_terminal(puppet, branch);
 	if (puppet_flush(puppet, err))
 		return -1;
-	close_fd(&puppet->socket);
+	puppet_close_mail(puppet, &family->mail);
 	return 0;
 }
 
@@ -494,10 +500,14 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 		return -1;
 	slot->placed = 1;
 	family->last = slot->pid;
+	if (generation->branches > FEW && puppet_share_mail(&first->puppet, &family->mail, err))
+		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (make_member(family, i, &last, err))
 			return -1;
 	if (last >= 0 && become(family, (uint32_t)last, err))
+		return -1;
+	if (puppet_unshare_mail(&first->puppet, &family->mail, err))
 		return -1;
 	if (finish_copies(family, err))
 		return -1;
@@ -617,9 +627,10 @@ void family_free(struct family *family)
 		return;
 	for (uint32_t i = 0; i < family->generation->branches; i++) {
 		close_fd(&family->member[i].pidfd);
-		close_fd(&family->member[i].puppet.socket);
+		puppet_close_mail(&family->member[i].puppet, &family->mail);
 	}
 	copier_free(family->copier);
+	close_fd(&family->mail.ours);
 	close_fd(&family->first.pidfd);
 	free(family->member);
 	free(family);

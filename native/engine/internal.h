@@ -982,9 +982,21 @@ int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t 
 void puppet_soften(struct puppet *puppet, const char *problem);
 int puppet_flush(struct puppet *puppet, struct avc_error *err) warn_unused;
 void *puppet_data(const struct puppet *puppet, avc_remote *remote);
+/* Two ends of a socket: ours, and the number of the other one there.  Both -1: there is none. */
+struct mail {
+	int ours, theirs;
+};
+
 /* Closes what it has from its parent; from here on it can be given descriptors, each to be
- * number 1 until that is closed. */
-int puppet_open_mail(struct puppet *puppet, struct avc_error *err) warn_unused;
+ * number 1 until that is closed.  By the `mail` that it has from its parent, or its own. */
+int puppet_open_mail(struct puppet *puppet, const struct mail *mail,
+		     struct avc_error *err) warn_unused;
+void puppet_close_mail(struct puppet *puppet, const struct mail *mail);
+/* Of the main process, for its children, who have it from the fork: to make one takes longer than
+ * all that comes by it.  None where there is no number left for it. */
+int puppet_share_mail(struct puppet *puppet, struct mail *mail, struct avc_error *err) warn_unused;
+int puppet_unshare_mail(struct puppet *puppet, struct mail *mail,
+			struct avc_error *err) warn_unused;
 int puppet_give(struct puppet *puppet, int fd, struct avc_error *err) warn_unused;
 /* From its parent's pad into its own. */
 int puppet_change_pad(struct puppet *puppet, const struct target *target, uint32_t slot,

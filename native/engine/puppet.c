@@ -152,25 +152,72 @@ static avc_remote write_letter(const struct puppet *puppet)
 	return remote;
 }
 
+static int fetch(const struct puppet *puppet, int fd, struct avc_error *err)
+{
+	int pidfd = proc_pidfd_open(puppet->pid);
+	const int ours = pidfd < 0 ? -1 : files_borrow(pidfd, fd);
+
+	close_fd(&pidfd);
+	if (ours < 0)
+		fail_errno(err, puppet->pid, "restore", "pidfd_getfd", "it was killed");
+	return ours;
+}
+
 /* Everything its parent had open is closed; descriptor 0 is a socket of which we have the
  * other end. */
-int puppet_open_mail(struct puppet *puppet, struct avc_error *err)
+int puppet_open_mail(struct puppet *puppet, const struct mail *mail, struct avc_error *err)
 {
 	avc_remote out;
-	int pidfd;
 
+	if (mail->ours >= 0) {
+		if (mail->theirs)
+			puppet_call(puppet, SYS_dup3, (uint64_t)mail->theirs, 0, O_CLOEXEC, 0, 0,
+				    0);
+		puppet_call(puppet, SYS_close_range, 1, ~0u, 0, 0, 0, 0);
+		puppet->socket = mail->ours;
+		return 0;
+	}
 	(void)puppet_data(puppet, &out);
 	puppet_call(puppet, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
 	puppet_call(puppet, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
 	if (puppet_flush(puppet, err))
 		return -1;
-	pidfd = proc_pidfd_open(puppet->pid);
-	puppet->socket = pidfd < 0 ? -1 : files_borrow(pidfd, 1);
-	close_fd(&pidfd);
-	if (puppet->socket < 0)
-		return fail_errno(err, puppet->pid, "restore", "pidfd_getfd", "it was killed");
+	puppet->socket = fetch(puppet, 1, err);
 	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
-	return 0;
+	return puppet->socket < 0 ? -1 : 0;
+}
+
+void puppet_close_mail(struct puppet *puppet, const struct mail *mail)
+{
+	if (puppet->socket == mail->ours)
+		puppet->socket = -1;
+	close_fd(&puppet->socket);
+}
+
+int puppet_share_mail(struct puppet *puppet, struct mail *mail, struct avc_error *err)
+{
+	avc_remote out;
+	const int *ends = puppet_data(puppet, &out);
+
+	puppet_call(puppet, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	puppet_soften(puppet, NULL);
+	if (puppet_flush(puppet, err))
+		return -1;
+	if (puppet->list[0].result)
+		return 0;
+	mail->theirs = ends[0];
+	mail->ours = fetch(puppet, ends[1], err);
+	puppet_call(puppet, SYS_close, (uint64_t)ends[1], 0, 0, 0, 0, 0);
+	return mail->ours < 0 || puppet_flush(puppet, err) ? -1 : 0;
+}
+
+int puppet_unshare_mail(struct puppet *puppet, struct mail *mail, struct avc_error *err)
+{
+	if (mail->ours < 0)
+		return 0;
+	close_fd(&mail->ours);
+	puppet_call(puppet, SYS_close, (uint64_t)mail->theirs, 0, 0, 0, 0, 0);
+	return puppet_flush(puppet, err);
 }
 
 /* It comes to the lowest number that is free, by the socket that has number `socket` there. */
