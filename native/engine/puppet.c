@@ -2,15 +2,23 @@
  *
  * A task that a restored process has forked, at rest in a pad: it makes the system calls
  * that it is given, a list at a time, and gets descriptors over a socket.
+ *
+ * It stops by itself at the end of a list, by a signal to itself that we take away.  To be woken
+ * up by it and to stop it then would be two turns instead of one, and turns are most of what a
+ * small process costs.  Who dies with us (PTRACE_O_EXITKILL) can be left to such a stop; a holder
+ * or a thread of the app's could not.
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <signal.h>
 #include <sys/mman.h>
+#include <sys/ptrace.h>
 #include <sys/syscall.h>
 
 #include "internal.h"
 
 #define SPARE 8 /* puppet_call() is used for so many in a row at most, puppet_ask() for more */
+#define NOT_MADE INT64_MIN
 
 /* The list of calls is where files_restore.c has its own, which is not in use any more;
  * what they refer to is behind it. */
@@ -31,7 +39,8 @@ void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_
 {
 	if (puppet->listed < puppet->list_max)
 		puppet->list[puppet->listed] = (struct inj_syscall){ .nr = nr,
-								     .arg = { a, b, c, d, e, f } };
+								     .arg = { a, b, c, d, e, f },
+								     .result = NOT_MADE };
 	puppet->listed++;
 }
 
@@ -41,20 +50,55 @@ void puppet_soften(struct puppet *puppet, const char *problem)
 		puppet->soft[puppet->softs++] = (struct soft){ puppet->listed - 1, problem };
 }
 
+/* At the end of its list; somebody else may have a signal for it, too. */
+static int await_end(const struct puppet *puppet, const struct inj_syscall *last,
+		     struct avc_error *err)
+{
+	for (;;) {
+		const struct stop stop = tracee_wait(puppet->pid, 0);
+		int signal = 0;
+
+		switch (stop.kind) {
+		case STOP_SIGNAL:
+			if (stop.signal != SIGSTOP)
+				signal = stop.signal;
+			else if (last->result != NOT_MADE)
+				return 0;
+			break;
+		case STOP_EXIT:
+		case STOP_DYING:
+			return fail(err, AVC_GONE, 0, puppet->pid, "run injected code", "",
+				    "it has ended");
+		case STOP_DEADLINE:
+			return fail(err, AVC_DEADLINE, 0, puppet->pid, "run injected code", "",
+				    "the task did not get to run in time");
+		default:
+			break;
+		}
+		if (ptrace(PTRACE_CONT, puppet->pid, NULL, (long)signal))
+			return fail_errno(err, puppet->pid, "run injected code", "ptrace(CONT)",
+					  "it has gone");
+	}
+}
+
 static int run(struct puppet *puppet, struct avc_error *err)
 {
 	const uint32_t listed = puppet->listed;
+	const uint64_t self = (uint64_t)puppet->inside;
 
-	puppet->listed = 0;
 	if (!listed)
 		return 0;
-	if (listed > puppet->list_max)
+	puppet_call(puppet, SYS_tgkill, self, self, SIGSTOP, 0, 0, 0);
+	puppet->listed = 0;
+	if (listed >= puppet->list_max)
 		return fail(err, AVC_UNSUPPORTED, 0, puppet->pid, "restore", "",
 			    "there is no room for so many system calls");
 	call_begin(puppet->call, INJ_AFTER_PARK);
-	call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list), listed, 0, 0, 0);
+	call_add(puppet->call, INJ_LIST, pad_remote(puppet->pad, puppet->list), listed + 1, 0, 0,
+		 0);
 	return pad_send(puppet->pad, puppet->pid, &puppet->base, puppet->call, err) ||
-			       pad_run(puppet->pid, puppet->call, err)
+			       pad_start(puppet->pid, err) ||
+			       await_end(puppet, &puppet->list[listed - 1], err)
 		       ? -1
 		       : 0;
 }
