@@ -331,8 +331,8 @@ static int map_new(const struct remap *r, struct puppet *puppet, struct avc_erro
 		if (piece->kept && protection(piece->is) != protection(piece->want)) {
 			changed = true;
 			if (puppet_ask(puppet, SYS_mprotect, piece->start,
-				       piece->end - piece->start,
-				       (uint64_t)protection(piece->want), 0, 0, 0, err))
+				       piece->end - piece->start, (uint64_t)protection(piece->want),
+				       0, 0, 0, err))
 				return -1;
 		}
 	}
