@@ -55,6 +55,8 @@ class Started:
     """Why it could not be started; often empty, also when it could not."""
     wanted: bool
     """Its labels or annotations, the image's included, ask for protection."""
+    command: str
+    """Its first process: avckpt-init, where the hooks have put it in front."""
 
 
 class Compose:
@@ -222,4 +224,5 @@ def _started(entry: dict[str, Any]) -> Started:
         exit_code=int(state["ExitCode"]),
         error=str(state.get("Error") or ""),
         wanted=wanted,
+        command=str(entry.get("Path") or ""),
     )

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from avckpt_hooks.precreate import must_be_pid_1
+
 from avckpt import doctor, install, sidecar_container
 from avckpt.client import Client, Json
 from avckpt.compose import Compose, Started
@@ -122,6 +124,9 @@ def judge(container: Started, entry: Json | None) -> Protection:
         return Protection(container, True, "")
     if not _runs(container):
         return Protection(container, False, f"it {_why_not_running(container)}")
+    if entry is None and must_be_pid_1(container.command):
+        why = f"its command is {container.command}, which must itself be PID 1; name its program as entrypoint"
+        return Protection(container, False, why)
     if entry is None:
         why = "the sidecar does not know it; was it started without the hooks? (avckpt down, then avckpt up)"
         return Protection(container, False, why, may_change=True)

@@ -213,6 +213,17 @@ def test_who_is_not_protected_is_named_with_the_reason(project: Project) -> None
     assert set(lines.values()) == {"protected"}
 
 
+def test_who_must_be_process_1_is_told_so_at_once(project: Project) -> None:
+    init = project.path.with_name("init")
+    init.write_text("#!/bin/sh\nexec sleep 60\n")
+    init.chmod(0o755)
+    service = f"image: {BASE_IMAGE}, network_mode: host, stop_grace_period: 0s, volumes: ['./init:/init:ro']"
+    project.write(f"services:\n  s6: {{{service}, entrypoint: [/init], labels: {{avckpt.enable: 'true'}}}}\n")
+    done = project.avckpt("up", "--wait", "9999", check=False)
+    assert done.status == 5
+    assert "its command is /init, which must itself be PID 1" in done.stdout + done.stderr
+
+
 def test_a_dependency_that_does_not_start_hangs_nobody(project: Project) -> None:
     text = SERVICES + "    depends_on: [by-list]\n"
     project.write(text.replace("avckpt.interval=${INTERVAL:-150ms}", "avckpt.interval=${INTERVAL}"))

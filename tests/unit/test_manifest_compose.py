@@ -93,6 +93,7 @@ def test_podman_compose_is_there_as_a_module() -> None:
 
 def container(**more: Any) -> Started:
     fields = {"id": "1", "name": "c", "service": "s", "status": "running", "exit_code": 0, "error": "", "wanted": True}
+    fields["command"] = "/usr/libexec/avckpt-init"
     return Started(**{**fields, **more})
 
 
@@ -104,6 +105,7 @@ def container(**more: Any) -> Started:
         (container(), {"state": "unprotected", "reason": "io_uring"}, False, True, "io_uring"),
         (container(), {"state": "restoring", "reason": ""}, False, True, "restoring"),
         (container(), None, False, True, "the sidecar does not know it"),
+        (container(command="/init"), None, False, False, "its command is /init, which must itself be PID 1"),
         (container(wanted=False), None, False, False, ""),
         (container(status="exited", exit_code=7), None, False, False, "it has exited with status 7"),
         (
