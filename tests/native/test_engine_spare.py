@@ -39,10 +39,22 @@ def spares(victim: Victim) -> list[int]:
 
 
 def wait_spare(victim: Victim, other_than: int = 0) -> int:
-    """Until there is one, of one template."""
-    wait_until(lambda: spares(victim) not in ([], [other_than]), 5, "a spare is made")
-    (spare,) = spares(victim)
-    return spare
+    """Until there is one, of one template: that of an older one goes before the new one comes."""
+    found: list[int] = []
+
+    def is_made() -> bool:
+        found[:] = spares(victim)
+        return len(found) == 1 and found != [other_than]
+
+    wait_until(is_made, 5, "a spare is made")
+    return found[0]
+
+
+def open_spare(victim: Victim) -> int:
+    """A pidfd of it."""
+    while True:
+        with contextlib.suppress(ProcessLookupError):  # an old one, just gone
+            return os.pidfd_open(wait_spare(victim))
 
 
 def die_and_come_back(victim: Victim, guard: GuardProcess) -> None:
@@ -87,7 +99,7 @@ def test_killed_while_it_is_used(command: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(60):
             taken = guard.command("checkpoint")
-            spare, since = os.pidfd_open(wait_spare(victim)), guard.mark()
+            spare, since = open_spare(victim), guard.mark()
             dead = os.pidfd_open(victim.app)
             after_s = rng.uniform(0, 0.002)
             victim.kill_app()
