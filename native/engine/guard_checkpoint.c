@@ -248,8 +248,9 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	struct avc_error error = { 0 };
 
 	tracee_deadline_set(guard->timer, SPARE_NS);
-	/* A template that was killed is seen to by reap_dead(). */
-	if (spare_make(&guard->target, newest, &error) && !pidfd_ended(newest->pidfd))
+	/* A template that was killed is seen to by reap_dead(), as soon as that can be seen. */
+	if (spare_make(&guard->target, newest, &error) && error.code != AVC_GONE &&
+	    !pidfd_ended(newest->pidfd))
 		lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
 	tracee_deadline_clear(guard->timer);
 }

@@ -144,6 +144,22 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
         die_and_come_back(victim, guard)
 
 
+def test_made_while_the_container_ends_it_is_no_news(tmp_path: Path) -> None:
+    """Its template has been killed with all others, and can not be seen to have ended yet."""
+    rng = random.Random(4)
+    for n in range(40):
+        (tmp_path / str(n)).mkdir()
+        with (
+            Victim("threads 4 20 --no-churn", tmp_path / str(n)) as victim,
+            GuardProcess(config(), [victim.pid]) as guard,
+        ):
+            guard.command("checkpoint")
+            time.sleep(rng.uniform(0.009, 0.014))
+            os.kill(victim.pid, signal.SIGKILL)
+            guard.wait("ended")
+            assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
 def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:
     """Its number would be theirs when the kernel has copied so much."""
     with (
