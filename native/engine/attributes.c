@@ -280,6 +280,15 @@ static bool fits_locks(const struct creds *from, const struct creds *to)
 	return !(locks & ~to->securebits) && !(locks >> 1 & changed);
 }
 
+static int refuse(const struct target *target, pid_t inside, const char *has, const char *main,
+		  struct avc_error *err)
+{
+	const char *which = target->descendant ? "process" : "thread";
+
+	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		    "%s %d has %s the main %s%s", which, inside, has, which, main);
+}
+
 /* A thread that is made by another one gets what it has not from that. */
 static int set_apart(const struct target *target, pid_t inside, const struct creds *from,
 		     const struct creds *to, struct setup *setup, struct avc_error *err)
@@ -304,22 +313,14 @@ static int set_apart(const struct target *target, pid_t inside, const struct cre
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 			    "its threads differ in their seccomp filters (thread %d)", inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "%s %d has privileges that the main %s has given up",
-			    target->descendant ? "process" : "thread", inside,
-			    target->descendant ? "process" : "thread");
+		return refuse(target, inside, "privileges that", " has given up", err);
 	if (!may_be_lowered(from, to))
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "%s %d has other capability sets (bounding, ambient, securebits) than "
-			    "the main %s, which lacks CAP_SETPCAP to give up the same",
-			    target->descendant ? "process" : "thread", inside,
-			    target->descendant ? "process" : "thread");
+		return refuse(target, inside,
+			      "other capability sets (bounding, ambient, securebits) than",
+			      ", which lacks CAP_SETPCAP to give up the same", err);
 	if (!fits_locks(from, to))
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "%s %d has another user or other securebits than the main %s, which "
-			    "has locked its own",
-			    target->descendant ? "process" : "thread", inside,
-			    target->descendant ? "process" : "thread");
+		return refuse(target, inside, "another user or other securebits than",
+			      ", which has locked its own", err);
 	lower(from, to, setup);
 	return 0;
 }
