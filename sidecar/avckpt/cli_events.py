@@ -124,7 +124,7 @@ def completion(shell: str) -> None:
 def complete_container(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     """Names of protected containers; none when there is no sidecar to ask."""
     try:
-        names = [str(row["name"] or row["id"][:12]) for row in _client().containers()]
+        names = [str(row["name"] or row["id"][:12]) for row in _client().containers(memory=False)]
     except AvckptError:
         return []
     return [name for name in names if name.startswith(incomplete)]
