@@ -52,10 +52,10 @@ def journal(line: str) -> None:
 
 
 def printable(line: str) -> str:
-    r"""The same with escapes (`\n`, `\x1b`) for what does not print.
+    r"""One line with the same visible characters: all others read as their escapes (`\n`, `\x1b`, `\u202e`).
 
-    An image chooses the names of its labels: it must not write lines of its
-    own into root's log, or do anything to root's terminal.
+    Images and applications have a say in names, labels and output: they must not
+    write lines of their own into root's log, or do anything to root's terminal.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 

@@ -44,7 +44,7 @@ struct family {
 	struct copier *copier;
 	struct mail mail;      /* of the main process's children                  */
 	uint64_t flush;        /* signals of children that ended (sigset_t)       */
-	pid_t last;            /* the number given out last; 0: not known          */
+	pid_t last_number;     /* the number given out last; 0: not known          */
 	struct member first;   /* the main process                              */
 	struct member *member; /* by branch                                   */
 };
@@ -142,11 +142,12 @@ static int fork_once(struct family *family, struct member *host, const struct br
 	struct inj_call *runner = &host->puppet.pad->control->runner;
 	const bool orphan = branch->parent == PARENT_INIT;
 	/* Siblings' numbers often follow each other; to ask takes two wake-ups. */
-	const bool follows = !orphan && family->last && family->last + 1 == branch->inside;
+	const bool follows = !orphan && family->last_number &&
+			     family->last_number + 1 == branch->inside;
 	struct puppet from = host->puppet;
 	int result;
 
-	family->last = 0;
+	family->last_number = 0;
 	/* An orphan's parent has ended: so does one that is there for that. */
 	if (orphan &&
 	    clone_task(&host->puppet, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
@@ -196,7 +197,7 @@ static int fork_host(struct family *family, struct member *host, const struct br
 		*child = 0;
 		made = fork_once(family, host, branch, copy, chores, child, &failed) == 0;
 		if (made && proc_inside(*child) == branch->inside) {
-			family->last = branch->inside;
+			family->last_number = branch->inside;
 			return copy ? take_back(&host->puppet, copy, err) : 0;
 		}
 		if (made && !copy && !orphan) {
@@ -343,10 +344,9 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	struct member *member = &family->member[index];
 	struct puppet *puppet = &member->puppet;
 	const struct remap *plan = inherit_plan(family->generation, index, err);
-	const struct mail none = { -1, -1 };
 	const bool is_mains = inherit_host(family->generation, index) == PARENT_MAIN;
 
-	if (!plan || puppet_open_mail(puppet, is_mains ? &family->mail : &none, err))
+	if (!plan || puppet_open_mail(puppet, is_mains ? &family->mail : NULL, err))
 		return -1;
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
 	    remap(plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
@@ -355,7 +355,7 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	take_terminal(puppet, branch);
 	if (puppet_flush(puppet, err))
 		return -1;
-	puppet_close_mail(puppet, &family->mail);
+	close_fd(&puppet->socket);
 	return 0;
 }
 
@@ -499,7 +499,7 @@ int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
 	if (puppet_flush(&first->puppet, err))
 		return -1;
 	slot->placed = 1;
-	family->last = slot->pid;
+	family->last_number = slot->pid;
 	if (generation->branches > FEW && puppet_share_mail(&first->puppet, &family->mail, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
@@ -627,7 +627,7 @@ void family_free(struct family *family)
 		return;
 	for (uint32_t i = 0; i < family->generation->branches; i++) {
 		close_fd(&family->member[i].pidfd);
-		puppet_close_mail(&family->member[i].puppet, &family->mail);
+		close_fd(&family->member[i].puppet.socket);
 	}
 	copier_free(family->copier);
 	close_fd(&family->mail.ours);

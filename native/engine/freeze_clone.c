@@ -254,7 +254,7 @@ static int ask_end(struct target *target, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
 	struct thread *thread = thread_find(target, target->pid);
-	struct creds was = thread->creds;
+	const struct creds was = thread->creds;
 
 	target->asked = false;
 	if (tracee_await(thread->tid, NULL, err) != STOP_TRAP) {
@@ -266,7 +266,6 @@ static int ask_end(struct target *target, struct avc_error *err)
 	timers_answer(target, call, now_ns() - target->asked_ns);
 	if (ask_answer(thread, call, &target->questions, err))
 		return -1;
-	was.future_lock = thread->creds.future_lock; /* that its holder is asked */
 	return ask_others(target, thread, &was, err) || hear_of_children(target, err) ? -1 : 0;
 }
 

@@ -182,6 +182,9 @@ int proc_open(pid_t pid, const char *name, int flags);
 /* What is mapped there (proc(5), map_files), or -1 with errno.  Needs CAP_CHECKPOINT_RESTORE or
  * CAP_SYS_ADMIN. */
 int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags);
+/* Whether that was open for writing, and not for reading alone: the link says so (fs/proc/base.c,
+ * proc_map_files_instantiate()). */
+bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 
 /* ---- threads and targets ---------------------------------------------------- */
 
@@ -988,10 +991,9 @@ struct mail {
 };
 
 /* Closes what it has from its parent; from here on it can be given descriptors, each to be
- * number 1 until that is closed.  By the `mail` that it has from its parent, or its own. */
+ * number 1 until that is closed.  By the `mail` that it has from its parent, if any, or its own. */
 int puppet_open_mail(struct puppet *puppet, const struct mail *mail,
 		     struct avc_error *err) warn_unused;
-void puppet_close_mail(struct puppet *puppet, const struct mail *mail);
 /* Of the main process, for its children, who have it from the fork: to make one takes longer than
  * all that comes by it.  None where there is no number left for it. */
 int puppet_share_mail(struct puppet *puppet, struct mail *mail, struct avc_error *err) warn_unused;

@@ -26,12 +26,29 @@ int proc_open(pid_t pid, const char *name, int flags)
 	return open(path, flags | O_CLOEXEC);
 }
 
+struct mapped_path {
+	char text[80];
+};
+
+static struct mapped_path mapped_path(pid_t pid, avc_remote start, avc_remote end)
+{
+	struct mapped_path path;
+
+	snprintf(path.text, sizeof path.text, "/proc/%d/map_files/%lx-%lx", pid,
+		 (unsigned long)start, (unsigned long)end);
+	return path;
+}
+
 int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
 {
-	char name[64];
+	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
+}
 
-	snprintf(name, sizeof name, "map_files/%lx-%lx", (unsigned long)start, (unsigned long)end);
-	return proc_open(pid, name, flags);
+bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end)
+{
+	struct stat st;
+
+	return lstat(mapped_path(pid, start, end).text, &st) == 0 && st.st_mode & S_IWUSR;
 }
 
 /* From the start, also of one that was read before; what is read is terminated. */

@@ -219,13 +219,15 @@ int puppet_open_mail(struct puppet *puppet, const struct mail *mail, struct avc_
 {
 	avc_remote out;
 
-	if (mail->ours >= 0) {
+	if (mail && mail->ours >= 0) {
 		if (mail->theirs)
 			puppet_call(puppet, SYS_dup3, (uint64_t)mail->theirs, 0, O_CLOEXEC, 0, 0,
 				    0);
 		puppet_call(puppet, SYS_close_range, 1, ~0u, 0, 0, 0, 0);
-		puppet->socket = mail->ours;
-		return 0;
+		puppet->socket = fcntl(mail->ours, F_DUPFD_CLOEXEC, 3);
+		return puppet->socket < 0 ? fail_errno(err, puppet->pid, "restore", "fcntl",
+						       "no descriptor is left for its socket")
+					  : 0;
 	}
 	(void)puppet_data(puppet, &out);
 	puppet_call(puppet, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
@@ -235,13 +237,6 @@ int puppet_open_mail(struct puppet *puppet, const struct mail *mail, struct avc_
 	puppet->socket = fetch(puppet, 1, err);
 	puppet_call(puppet, SYS_close, 1, 0, 0, 0, 0, 0);
 	return puppet->socket < 0 ? -1 : 0;
-}
-
-void puppet_close_mail(struct puppet *puppet, const struct mail *mail)
-{
-	if (puppet->socket == mail->ours)
-		puppet->socket = -1;
-	close_fd(&puppet->socket);
 }
 
 int puppet_share_mail(struct puppet *puppet, struct mail *mail, struct avc_error *err)

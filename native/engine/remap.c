@@ -196,23 +196,11 @@ static int move_special(const struct remap *r, struct puppet *puppet, struct avc
 	return 0;
 }
 
-/* Whether what is mapped was open for writing, and not for reading alone: the link says so
- * (fs/proc/base.c, proc_map_files_instantiate()). */
-static bool is_open_for_writing(pid_t template, const struct mapping *m)
-{
-	char path[64];
-	struct stat st;
-
-	snprintf(path, sizeof path, "/proc/%d/map_files/%lx-%lx", template, (unsigned long)m->start,
-		 (unsigned long)m->end);
-	return lstat(path, &st) == 0 && st.st_mode & S_IWUSR;
-}
-
 /* By a descriptor for more, what is shared could be made writable that never was; and of a file
  * in an overlay a copy would be made. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared && is_open_for_writing(template, m)
+	const int fd = m->shared && proc_mapped_for_writing(template, m->start, m->end)
 			       ? proc_open_mapped(template, m->start, m->end, O_RDWR)
 			       : -1;
 
@@ -278,7 +266,7 @@ static int attach(const struct remap *r, struct puppet *puppet, const struct pie
 		     only_mapped);
 		return 0;
 	}
-	if (!is_open_for_writing(r->want->template, m))
+	if (!proc_mapped_for_writing(r->want->template, m->start, m->end))
 		flags |= SHM_RDONLY;
 	if (puppet_ask(puppet, SYS_shmat, m->inode, m->start, (uint64_t)flags, 0, 0, 0, err))
 		return -1;
@@ -314,6 +302,12 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 		       : 0;
 }
 
+static int protect_piece(struct puppet *puppet, const struct piece *piece, struct avc_error *err)
+{
+	return puppet_ask(puppet, SYS_mprotect, piece->start, piece->end - piece->start,
+			  (uint64_t)protection(piece->want), 0, 0, 0, err);
+}
+
 /* What it maps has to be there before it is filled; all else can wait for the next calls. */
 static int map_new(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
@@ -323,18 +317,13 @@ static int map_new(const struct remap *r, struct puppet *puppet, struct avc_erro
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (piece->want && !piece->kept) {
-			changed = true;
-			if (map_piece(r, puppet, piece, &given, err))
-				return -1;
-		}
-		if (piece->kept && protection(piece->is) != protection(piece->want)) {
-			changed = true;
-			if (puppet_ask(puppet, SYS_mprotect, piece->start,
-				       piece->end - piece->start, (uint64_t)protection(piece->want),
-				       0, 0, 0, err))
-				return -1;
-		}
+		if (!piece->want ||
+		    (piece->kept && protection(piece->is) == protection(piece->want)))
+			continue;
+		changed = true;
+		if (piece->kept ? protect_piece(puppet, piece, err)
+				: map_piece(r, puppet, piece, &given, err))
+			return -1;
 	}
 	return give_file(r, puppet, NULL, &given, err) || (changed && puppet_flush(puppet, err))
 		       ? -1

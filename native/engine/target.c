@@ -446,7 +446,7 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
 	const bool is_main = thread->tid == target->pid, asked_before = thread->inside != 0;
-	struct creds was = thread->creds;
+	const struct creds was = thread->creds;
 	struct questions questions;
 
 	call_begin(call, INJ_AFTER_HOME);
@@ -456,7 +456,6 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 		return -1;
 	if (give_back(thread, err) || ask_answer(thread, call, &questions, err))
 		return -1;
-	was.future_lock = thread->creds.future_lock; /* no matter of threads */
 	return is_main && asked_before ? ask_others(target, thread, &was, err) : 0;
 }
 
@@ -498,7 +497,10 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
 	       struct avc_error *err)
 {
-	if (target->thread_count == 1 || !memcmp(was, &thread->creds, sizeof *was))
+	struct creds is = thread->creds;
+
+	is.future_lock = was->future_lock; /* of the process's memory, no matter of threads */
+	if (target->thread_count == 1 || !memcmp(was, &is, sizeof is))
 		return 0;
 	for (uint32_t i = 0; i < target->thread_count; i++)
 		target->threads[i].known &= &target->threads[i] == thread;

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Protocol
 
 from aiohttp import web
+from avckpt_hooks.tell import printable
 
 from avckpt import __version__, native
 from avckpt.config import Configuration
@@ -42,7 +43,6 @@ from avckpt.listener import bind_socket
 from avckpt.metrics import CONTENT_TYPE, Held, Metrics
 from avckpt.openapi import document
 from avckpt.pressure import held_bytes, templates_of
-from avckpt.printable import printable
 from avckpt.protected import Protected
 from avckpt.registry import Registry
 from avckpt.reload import Reloaded

@@ -24,12 +24,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from avckpt_hooks.tell import printable
+
 from avckpt.cgroup import groups_of
 from avckpt.errors import AvckptError, TargetGone, of_any
 from avckpt.event_record import EventRecord, Kind
 from avckpt.events import Command
 from avckpt.inside import Done, run_inside
-from avckpt.printable import printable
 from avckpt.process import age_s
 from avckpt.protected import Protected
 

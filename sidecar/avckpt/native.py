@@ -11,9 +11,10 @@ import threading
 from types import TracebackType
 from typing import Any
 
+from avckpt_hooks.tell import printable
+
 from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
 from avckpt.events import Command, Event, EventKind, GuardConfig, Reason
-from avckpt.printable import printable
 
 try:
     from avckpt._native import ffi, lib

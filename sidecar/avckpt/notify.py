@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Protocol
 
 from avckpt_hooks.labels import Notify
+from avckpt_hooks.tell import printable
 
 from avckpt.errors import AvckptError, Busy, TargetGone, of_any
 from avckpt.event_record import EXPECTED, EventRecord, Kind
 from avckpt.events import signal_name
 from avckpt.inside import run_inside
-from avckpt.printable import printable
 from avckpt.process import has_ended, pid_of
 from avckpt.process import status as status_of
 from avckpt.protected import Protected

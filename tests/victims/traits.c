@@ -139,6 +139,13 @@ static void set_limit(int which, rlim_t value)
 	must(!setrlimit(which, &limit), "setrlimit");
 }
 
+/* It has what it is to have, and stops itself to tell. */
+static void await_kid(void)
+{
+	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
+	must(!kill(kid, SIGCONT), "kill");
+}
+
 static void setup_limits(void)
 {
 	kid = fork();
@@ -154,8 +161,7 @@ static void setup_limits(void)
 		raise(SIGSTOP);
 		rest();
 	}
-	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
-	must(!kill(kid, SIGCONT), "kill");
+	await_kid();
 	set_limit(RLIMIT_NOFILE, 16);
 	set_limit(RLIMIT_AS, MUCH / 2);
 	set_limit(RLIMIT_FSIZE, 1 << 20);
@@ -213,8 +219,7 @@ static void setup_hard_limits(void)
 		raise(SIGSTOP);
 		rest();
 	}
-	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
-	must(!kill(kid, SIGCONT), "kill");
+	await_kid();
 	set_hard_limit(RLIMIT_NOFILE, 256);
 	set_hard_limit(RLIMIT_FSIZE, 1 << 30);
 }
