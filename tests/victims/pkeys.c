@@ -2,7 +2,8 @@
  *
  * pkeys N: N threads with rights of their own to memory under protection keys (pkeys(7)):
  * each can read what it could read, and write what it could write, and nothing else.  The
- * keys stay allocated.  Needs a CPU and a kernel with protection keys.
+ * keys stay allocated, one below them stays free, and code that can only be executed, which the
+ * kernel does by a key of its own, cannot be read.  Needs a CPU and a kernel with protection keys.
  */
 #include <pthread.h>
 #include <setjmp.h>
@@ -14,6 +15,7 @@ enum { KEYS = 3 };
 
 static int key[KEYS];
 static volatile uint64_t *page[KEYS];
+static volatile uint64_t *code;
 static __thread sigjmp_buf trap;
 
 static void on_fault(int signal)
@@ -39,36 +41,54 @@ static unsigned int right(long thread, int which)
 	return rights[(thread + which) % 3];
 }
 
+/* A handler begins with the rights of a new thread, and we have left it by a jump. */
+static void take_rights(long me)
+{
+	for (int i = 0; i < KEYS; i++)
+		must(!pkey_set(key[i], right(me, i)), "pkey_set");
+}
+
 static void *work(void *arg)
 {
 	const long me = (long)arg;
 
-	for (int i = 0; i < KEYS; i++)
-		must(!pkey_set(key[i], right(me, i)), "pkey_set");
+	take_rights(me);
 	for (;;) {
 		for (int i = 0; i < KEYS; i++) {
 			CHECK((unsigned int)pkey_get(key[i]) == right(me, i),
 			      "key %d: rights %d instead of %u", key[i], pkey_get(key[i]),
 			      right(me, i));
-			/* A handler begins with the rights of a new thread. */
 			CHECK(faults(page[i], false) == (right(me, i) == PKEY_DISABLE_ACCESS),
 			      "key %d: reading", key[i]);
-			must(!pkey_set(key[i], right(me, i)), "pkey_set");
+			take_rights(me);
 			CHECK(faults(page[i], true) == (right(me, i) != 0), "key %d: writing",
 			      key[i]);
-			must(!pkey_set(key[i], right(me, i)), "pkey_set");
+			take_rights(me);
 		}
+		CHECK(faults(code, false), "code that can only be executed was read");
+		take_rights(me);
+		((void (*)(void))code)();
 		nap_us(500);
 	}
 	return NULL;
+}
+
+static void make_code(void)
+{
+	code = mmap(NULL, 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+	must(code != MAP_FAILED, "mmap");
+	*(volatile uint8_t *)code = 0xc3; /* ret */
+	must(!mprotect((void *)code, 4096, PROT_EXEC), "mprotect");
 }
 
 int main(int argc, char **argv)
 {
 	struct sigaction action = { .sa_handler = on_fault };
 	long n;
+	int lowest;
 
 	victim_start(&argc, argv, 1, "N");
+	lowest = pkey_alloc(0, 0);
 	for (int i = 0; i < KEYS; i++) {
 		key[i] = pkey_alloc(0, 0);
 		if (key[i] < 0)
@@ -79,6 +99,8 @@ int main(int argc, char **argv)
 			     !pkey_mprotect((void *)page[i], 4096, PROT_READ | PROT_WRITE, key[i]),
 		     "pkey_mprotect");
 	}
+	make_code();
+	pkey_free(lowest);
 	sigaction(SIGSEGV, &action, NULL);
 	n = atol(argv[1]);
 	for (long i = 0; i < n; i++) {
@@ -90,8 +112,7 @@ int main(int argc, char **argv)
 	for (;;) {
 		const int one_more = pkey_alloc(0, 0);
 
-		for (int i = 0; i < KEYS; i++)
-			CHECK(one_more != key[i], "key %d is free", key[i]);
+		CHECK(one_more == lowest, "key %d is free, not %d", one_more, lowest);
 		pkey_free(one_more);
 		beat();
 		nap_us(1000);
