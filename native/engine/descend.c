@@ -349,8 +349,9 @@ static int become(struct family *family, uint32_t index, struct avc_error *err)
 	if (!plan || puppet_open_mail(puppet, is_mains ? &family->mail : NULL, err))
 		return -1;
 	if (puppet_change_pad(puppet, branch->target, branch->image->slot, err) ||
-	    remap(plan, puppet, family->copier, err) || manner_put(puppet, branch, err) ||
-	    place(member, branch, err) || puppet_put_files(puppet, &family->table[index], err))
+	    manner_take_keys(puppet, err) || remap(plan, puppet, family->copier, err) ||
+	    manner_put(puppet, branch, err) || place(member, branch, err) ||
+	    puppet_put_files(puppet, &family->table[index], err))
 		return -1;
 	take_terminal(puppet, branch);
 	if (puppet_flush(puppet, err))

@@ -140,8 +140,10 @@ enum mapping_flag {
 	MAPPING_GROWING = 1024,   /* gd: downwards                           */
 	MAPPING_SEALED = 2048,    /* sl: mseal(2)                            */
 	MAPPING_ONLY_HERE = 4096, /* no other process could map it: memory.c */
-	MAPPING_SPECIAL = 8192    /* mapping_is_special()                    */
+	MAPPING_SPECIAL = 8192,   /* mapping_is_special()                    */
+	MAPPING_KEYS = 15 << 16   /* the number of its protection key (pkeys(7)) */
 };
+#define MAPPING_KEY_ONE (1 << 16)
 
 struct mapping {
 	avc_remote start, end;
@@ -951,7 +953,7 @@ int restore(struct target *target, struct generation *generation, struct link *l
 
 /* ---- puppet.c ----------------------------------------------------------------------- */
 
-#define PUPPET_SOFTS 24
+#define PUPPET_SOFTS 64
 
 /* A task that a restored process has forked, and that is made what a template is. */
 struct puppet {
@@ -1012,6 +1014,9 @@ int puppet_put_files(struct puppet *puppet, const struct files_table *table,
 /* After the app runs again: what only the template can tell. */
 int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
 void branch_forget(struct branch *branch);
+/* All protection keys, before its memory refers to some and while the kernel must not choose one
+ * (pkeys(7), of what can only be executed).  manner_put() frees those that it did not have. */
+int manner_take_keys(struct puppet *puppet, struct avc_error *err) warn_unused;
 /* A restored process gets it, with the puppet's next flush. */
 int manner_put(struct puppet *puppet, const struct branch *branch,
 	       struct avc_error *err) warn_unused;

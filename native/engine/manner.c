@@ -22,7 +22,12 @@
 #define PR_SET_MEMORY_MERGE 67 /* since Linux 6.4 */
 #define PR_GET_MEMORY_MERGE 68
 #endif
-#define BARRIERS_REGISTERED (1 << 9) /* membarrier(2), since Linux 6.3 */
+#define KEYS 16 /* of memory, at most (pkeys(7)); the first one is everybody's    */
+/* membarrier(2).  Only since Linux 6.3 it says what is registered; but of the others each is
+ * refused that is not, and the command that registers it is the double. */
+#define BARRIERS_REGISTERED (1 << 9)
+#define BARRIER_GLOBAL (1 << 1)
+static const int barriers[] = { 1 << 3, 1 << 5, 1 << 7 };
 
 /* ---- after a checkpoint ------------------------------------------------------------ */
 
@@ -37,6 +42,7 @@ struct manner {
 	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
 	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
 	int64_t barriers;               /* membarrier(2): commands that register it          */
+	uint32_t keys;                  /* pkey_alloc(2): by number; 0: the CPU has none     */
 	uint32_t umask;
 	int64_t dumped;            /* core(5), coredump_filter; -1: the kernel does not dump  */
 	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
@@ -109,6 +115,47 @@ static int read_status(pid_t pid, struct manner *manner)
 	return 0;
 }
 
+static bool has_keys(void)
+{
+	static int has = -1;
+
+	if (__atomic_load_n(&has, __ATOMIC_RELAXED) < 0) {
+		const long key = syscall(SYS_pkey_alloc, 0, 0);
+
+		if (key >= 0)
+			syscall(SYS_pkey_free, key);
+		__atomic_store_n(&has, key >= 0, __ATOMIC_RELAXED);
+	}
+	return has;
+}
+
+/* Nobody knows those of another process.  The template takes all that are free, and what it is not
+ * given is taken.  It keeps them: it never runs, and no process is forked from it. */
+static uint32_t keys_of(const struct inj_syscall given[KEYS - 1])
+{
+	uint32_t taken = (1u << KEYS) - 2;
+
+	if (!has_keys())
+		return 0;
+	for (int i = 0; i < KEYS - 1; i++)
+		if (given[i].result > 0)
+			taken &= ~(1u << given[i].result);
+	return taken;
+}
+
+static int64_t barriers_of(const struct inj_syscall *told, const struct inj_syscall *made)
+{
+	/* Who was to be reached by all: nothing tells.  It costs next to nothing. */
+	int64_t registered = BARRIER_GLOBAL << 1;
+
+	if (told->result >= 0)
+		return told->result;
+	for (size_t i = 0; i < sizeof barriers / sizeof *barriers; i++)
+		if (made[i].result == 0)
+			registered |= barriers[i] << 1;
+	return registered;
+}
+
 int branch_learn(struct branch *branch, struct avc_error *err)
 {
 	const struct pad *pad = &branch->target->pad;
@@ -116,9 +163,10 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	struct inj_call *call = &pad_slot(pad, image->slot)->template_call;
 	uint8_t *memory = pad_files(pad, image->slot) + INJ_FILES_BYTES / 2;
 	struct inj_syscall *list = (struct inj_syscall *)memory;
-	struct action *action = (struct action *)(list + SIGNALS + 8);
+	struct action *action = (struct action *)(list + SIGNALS + 8 + KEYS);
 	const struct thread *main_thread = thread_find(branch->target, branch->target->pid);
 	struct manner *manner = calloc(1, sizeof *manner);
+	const struct inj_syscall *keys;
 	uint32_t n = 0;
 
 	branch->manner = manner;
@@ -132,6 +180,12 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_THP_DISABLE } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_MEMORY_MERGE } };
 	list[n++] = (struct inj_syscall){ .nr = SYS_membarrier, .arg = { BARRIERS_REGISTERED } };
+	for (size_t i = 0; i < sizeof barriers / sizeof *barriers; i++)
+		list[n++] = (struct inj_syscall){ .nr = SYS_membarrier,
+						  .arg = { (uint64_t)barriers[i] } };
+	keys = &list[n];
+	for (int i = 0; i < KEYS - 1; i++)
+		list[n++] = (struct inj_syscall){ .nr = SYS_pkey_alloc };
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_LIST, pad_remote(pad, list), n, 0, 0, 0);
 	if (pad_send(pad, image->template, &image->base, call, err) ||
@@ -141,7 +195,8 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	manner->brk = list[SIGNALS].result;
 	manner->no_huge_pages = list[SIGNALS + 1].result;
 	manner->merging = list[SIGNALS + 2].result;
-	manner->barriers = list[SIGNALS + 3].result;
+	manner->barriers = barriers_of(&list[SIGNALS + 3], &list[SIGNALS + 4]);
+	manner->keys = keys_of(keys);
 	/* These are no part of what its holder shares: it was asked itself, in the freeze. */
 	manner->personality = main_thread->creds.personality;
 	manner->state_permitted = main_thread->creds.state_permitted;
@@ -284,12 +339,39 @@ static void put_dumped(struct puppet *puppet, int64_t dumped)
 	close_fd(&fd);
 }
 
+int manner_take_keys(struct puppet *puppet, struct avc_error *err)
+{
+	if (!has_keys())
+		return 0;
+	for (int i = 0; i < KEYS - 1; i++) {
+		if (puppet_ask(puppet, SYS_pkey_alloc, 0, 0, 0, 0, 0, 0, err))
+			return -1;
+		puppet_soften(puppet, NULL);
+	}
+	return 0;
+}
+
+static int free_keys(struct puppet *puppet, uint32_t kept, struct avc_error *err)
+{
+	if (!has_keys())
+		return 0;
+	for (uint64_t key = 1; key < KEYS; key++) {
+		if (kept & 1u << key)
+			continue;
+		if (puppet_ask(puppet, SYS_pkey_free, key, 0, 0, 0, 0, 0, err))
+			return -1;
+		puppet_soften(puppet, NULL);
+	}
+	return 0;
+}
+
 int manner_put(struct puppet *puppet, const struct branch *branch, struct avc_error *err)
 {
 	const struct manner *manner = branch->manner;
 	struct arguments *arguments = arguments_of(puppet);
 
-	if (put_folders(puppet, branch->image->template, err))
+	if (put_folders(puppet, branch->image->template, err) ||
+	    free_keys(puppet, manner->keys, err))
 		return -1;
 	puppet_call(puppet, SYS_umask, manner->umask, 0, 0, 0, 0, 0);
 	puppet_call(puppet, SYS_personality, manner->personality, 0, 0, 0, 0, 0);

@@ -286,8 +286,11 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 	if (!maps)
 		return -1;
 	while (!result && getline(&line, &size, maps) > 0) {
-		if (smaps && !strncmp(line, "VmFlags:", 8)) {
-			m.flags = parse_flags(line + 8);
+		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
+			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
+				  MAPPING_KEYS;
+		} else if (smaps && !strncmp(line, "VmFlags:", 8)) {
+			m.flags |= parse_flags(line + 8);
 			result = fn(&m, arg);
 		} else if (!smaps || !(line[0] >= 'A' && line[0] <= 'Z')) {
 			if (parse_mapping(line, &m) && !smaps)

@@ -118,6 +118,7 @@ static const char *name_of(long nr)
 		{ SYS_mmap, "mmap" },
 		{ SYS_munmap, "munmap" },
 		{ SYS_mprotect, "mprotect" },
+		{ SYS_pkey_mprotect, "pkey_mprotect" },
 		{ SYS_mremap, "mremap" },
 		{ SYS_madvise, "madvise" },
 		{ SYS_recvmsg, "recvmsg" },

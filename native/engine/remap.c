@@ -140,6 +140,16 @@ static int protection(const struct mapping *m)
 	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
 }
 
+static uint32_t key_of(const struct mapping *m)
+{
+	return (m->flags & MAPPING_KEYS) / MAPPING_KEY_ONE;
+}
+
+static bool same_protection(const struct mapping *a, const struct mapping *b)
+{
+	return protection(a) == protection(b) && key_of(a) == key_of(b);
+}
+
 static int unmap(const struct remap *r, struct puppet *puppet, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < r->pieces; i++) {
@@ -304,8 +314,24 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 
 static int protect_piece(struct puppet *puppet, const struct piece *piece, struct avc_error *err)
 {
-	return puppet_ask(puppet, SYS_mprotect, piece->start, piece->end - piece->start,
-			  (uint64_t)protection(piece->want), 0, 0, 0, err);
+	const struct mapping *want = piece->want;
+	const uint64_t mode = (uint64_t)protection(want), bytes = piece->end - piece->start;
+	const uint32_t key = key_of(want);
+
+	/* Without keys, pkey_mprotect(2) may not know key 0 either. */
+	if (!key && (!piece->is || !key_of(piece->is)))
+		return puppet_ask(puppet, SYS_mprotect, piece->start, bytes, mode, 0, 0, 0, err);
+	/* What can only be executed has a key that the kernel took (pkeys(7)).  Where this process
+	 * has inherited such a key the first call sets it, and the second is refused; where it has
+	 * not, no key is free to be taken (manner_take_keys), and the second call sets it. */
+	if (mode == PROT_EXEC &&
+	    puppet_ask(puppet, SYS_mprotect, piece->start, bytes, mode, 0, 0, 0, err))
+		return -1;
+	if (puppet_ask(puppet, SYS_pkey_mprotect, piece->start, bytes, mode, key, 0, 0, err))
+		return -1;
+	if (mode == PROT_EXEC)
+		puppet_soften(puppet, NULL);
+	return 0;
 }
 
 /* What it maps has to be there before it is filled; all else can wait for the next calls. */
@@ -317,12 +343,12 @@ static int map_new(const struct remap *r, struct puppet *puppet, struct avc_erro
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (!piece->want ||
-		    (piece->kept && protection(piece->is) == protection(piece->want)))
+		if (!piece->want || (piece->kept && same_protection(piece->is, piece->want)))
 			continue;
 		changed = true;
-		if (piece->kept ? protect_piece(puppet, piece, err)
-				: map_piece(r, puppet, piece, &given, err))
+		if (!piece->kept && map_piece(r, puppet, piece, &given, err))
+			return -1;
+		if ((piece->kept || key_of(piece->want)) && protect_piece(puppet, piece, err))
 			return -1;
 	}
 	return give_file(r, puppet, NULL, &given, err) || (changed && puppet_flush(puppet, err))
@@ -491,7 +517,7 @@ failed:
 static bool is_stuck(const struct piece *piece)
 {
 	return piece->is && piece->is->flags & MAPPING_SEALED &&
-	       (!piece->kept || protection(piece->is) != protection(piece->want));
+	       (!piece->kept || !same_protection(piece->is, piece->want));
 }
 
 static bool is_lost(const struct piece *piece)
