@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -18,9 +19,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import pytest
 from avckpt.events import GuardConfig
 from harness import app_pid, wait_until
-from native.board import Board, Seen
+from native.board import UNAVAILABLE_STATUS, Board, Seen
 from native.init_peer import ROOT, Init, children_of, state_of
 
 PEER = Path(__file__).with_name("guard_peer.py")
@@ -185,6 +187,9 @@ class Victim(Init):
     def __enter__(self) -> Victim:
         super().__enter__()
         wait_until(lambda: self.see().ready or self.popen.poll() is not None, PATIENCE_S, f"{self.command} is ready")
+        if self.popen.poll() == UNAVAILABLE_STATUS:
+            self.__exit__(None, None, None)
+            pytest.skip(self.said.splitlines()[0])
         assert self.popen.poll() is None, self.said
         return self
 
@@ -243,6 +248,12 @@ class Victim(Init):
         assert "VIOLATION" not in self.said, self.said
         assert self.popen.poll() is None, f"avckpt-init ended with {self.popen.poll()}: {self.said}"
         assert seen.starts == 1
+
+
+def since_linux(major: int, minor: int, what: str) -> pytest.MarkDecorator:
+    """Skips on kernels before that, which have not got `what`."""
+    release = tuple(int(part) for part in re.findall(r"\d+", os.uname().release)[:2])
+    return pytest.mark.skipif(release < (major, minor), reason=f"{what}: Linux {major}.{minor}")
 
 
 def inside(pid: int) -> int:

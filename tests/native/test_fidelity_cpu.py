@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 
 import pytest
-from native.board import UNAVAILABLE_STATUS
 from native.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 
 
@@ -16,17 +14,9 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
-def skip_without(program: str) -> None:
-    """Skips with what the victim says is missing."""
-    done = subprocess.run([BUILD / program, "1", "--seconds", "0.05"], capture_output=True, text=True, check=False)
-    if done.returncode == UNAVAILABLE_STATUS:
-        pytest.skip(done.stderr.strip())
-
-
 @pytest.mark.parametrize("where", WHERE)
 def test_tiles(where: str, tmp_path: Path) -> None:
     """AMX: a restored thread has to be given room for its tiles before it can have them."""
-    skip_without("tiles")
     with Victim(f"tiles 3 {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 40, (0.01, 0.12))
         assert not victim.see().violations
@@ -35,7 +25,6 @@ def test_tiles(where: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 def test_protection_keys(where: str, tmp_path: Path) -> None:
     """Each thread has the rights that it had, and the keys are allocated."""
-    skip_without("pkeys")
     with Victim(f"pkeys 3 {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 30, (0.01, 0.12))
 

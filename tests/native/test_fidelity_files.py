@@ -17,7 +17,7 @@ import pytest
 from avckpt.events import Files, Tcp
 from harness import wait_until
 from native.family import descendants
-from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
+from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random, since_linux
 from native.meddle import get_fd
 
 KILLS = 6
@@ -348,6 +348,7 @@ def overlay(memory: Path, tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", tmp_path / "merged"], check=True)
 
 
+@since_linux(6, 6, "an overlay says what is watched")
 def test_watches_on_an_overlay(overlay: Path, memory: Path) -> None:
     """Of which no handle can be opened."""
     with (

@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import os
 import random
 import signal
 import time
 from pathlib import Path
 
 import pytest
-from native.guarded import GuardProcess, Victim, config, kill_at_random, state_of, threads
+from native.guarded import GuardProcess, Victim, config, kill_at_random, since_linux, state_of, threads
 
-pytestmark = pytest.mark.skipif(
-    tuple(int(part) for part in os.uname().release.split(".")[:2]) < (6, 9), reason="pidfds of threads: Linux 6.9"
-)
+pytestmark = since_linux(6, 9, "pidfds of threads")
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 from harness import wait_until
-from native.guarded import GuardProcess, Victim, config
+from native.guarded import GuardProcess, Victim, config, since_linux
+
+NETWORKS = since_linux(6, 11, "a namespace of a thread can be asked for")
+DISPATCH = since_linux(6, 4, "what a thread dispatches can be asked for")
 
 
 @pytest.fixture(autouse=True)
@@ -29,15 +32,15 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported groups", "other supplementary groups"),
         ("unsupported folder", "a working directory of its own"),
         ("unsupported files", "a descriptor table of its own"),
-        ("unsupported network", "a namespace of its own (network)"),
+        pytest.param("unsupported network", "a namespace of its own (network)", marks=NETWORKS),
         ("unsupported bounds", "lacks CAP_SETPCAP"),
         ("unsupported locked", "which has locked its own"),
         ("unsupported locked-child", "which has locked its own"),
         ("unsupported user", "which has locked its own"),
         ("unsupported shared-files", "shares its descriptor table"),
         ("unsupported shared-folder", "shares its working directory"),
-        ("unsupported dispatch", "Syscall User Dispatch"),
-        ("unsupported dispatch --in-child", "Syscall User Dispatch"),
+        pytest.param("unsupported dispatch", "Syscall User Dispatch", marks=DISPATCH),
+        pytest.param("unsupported dispatch --in-child", "Syscall User Dispatch", marks=DISPATCH),
         ("unsupported limited", "RLIMIT_AS"),
         ("unsupported limited --in-child", "RLIMIT_AS"),
         ("unsupported ring --in-child", "no other process can map: socket:"),
@@ -68,7 +71,9 @@ def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path
     ("kind", "why"),
     [
         *(("iouring", "io_uring"), ("aio", "AIO"), ("userfault", "userfaultfd")),
-        *(("nested", "a container in the container"), ("dispatch", "Syscall User Dispatch"), ("stuck", "mseal")),
+        ("nested", "a container in the container"),
+        pytest.param("dispatch", "Syscall User Dispatch", marks=DISPATCH),
+        pytest.param("stuck", "mseal", marks=since_linux(6, 10, "mseal")),
     ],
 )
 def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
@@ -81,6 +86,7 @@ def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
         victim.wait_beats(20)
 
 
+@NETWORKS
 def test_of_one_thread_and_not_for_long(tmp_path: Path) -> None:
     """A checkpoint is missed, and those that were held are good."""
     with Victim("unsupported network signal 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:

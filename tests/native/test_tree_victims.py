@@ -219,7 +219,11 @@ DEEDS: dict[str, tuple[str, Callable[[Victim], None], str]] = {
     "sum of laps": ("tree 8", lambda v: change_shared_memory(v, 56), "the slots hold"),
     "one slot": ("tree 8", lambda v: change_shared_memory(v, 80), "slot 0 holds|the slots hold"),
     "reaped zombie": ("tree 8", call("zombies", WAIT4, -1, 0, 0, 0), "zombie|children"),
-    "foreign child": ("tree 8", call("main", CLONE, signal.SIGCHLD, NO_STACK), "no child of mine|not my child|SIGCHLD|waitpid: child"),
+    "foreign child": (
+        "tree 8",
+        call("main", CLONE, signal.SIGCHLD, NO_STACK),
+        "no child of mine|not my child|SIGCHLD|waitpid: child",
+    ),
     "foreign clone": (
         "tree 8",
         # No signal at its end: only a wait for clones finds it.

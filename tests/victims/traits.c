@@ -66,6 +66,8 @@ static void setup_exit_signal(void)
 	signal(SIGUSR1, SIG_IGN);
 	signal(SIGUSR2, SIG_IGN);
 	untold = clone_with(NO_SIGNAL);
+	if (untold < 0 && errno == EINVAL) /* since Linux 7 */
+		untold = clone_with(0);
 	if (!untold)
 		_exit(4);
 	must(untold > 0, "clone");
