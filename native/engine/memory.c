@@ -5,7 +5,8 @@
  * - MADV_DONTFORK: missing in the clone.  A process that was found to have such
  *   areas is told MADV_DOFORK for its whole address space in the same breath as it
  *   is cloned, so there is no moment at which a new one could be missed.  Its own
- *   forks then copy those areas, too.  (Only a device's are left: those can not.)
+ *   forks then copy those areas, too.  (Only those are left that the kernel keeps so: a
+ *   device's, and on new kernels, seen on 7.3, huge pages.)
  * - MADV_WIPEONFORK: zeroes in the clone.  The app's flag must stay, for others rely on
  *   it for their safety (random number generators); so the contents are read while
  *   the app is stopped and written into the template, which gets the flag off, and the
@@ -26,6 +27,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/auxv.h>
 #include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
@@ -34,7 +36,7 @@
 #include "internal.h"
 
 #define AREAS_MAX 64
-#define HOLES_MAX 8
+#define HOLES_MAX 24
 #define MSEAL 462            /* mseal(2), since Linux 6.10; the headers may be older */
 #define WIPED_MAX (4u << 20) /* bytes copied of MADV_WIPEONFORK areas */
 #define OTHERS_NS (10 * NS_PER_S)
@@ -78,7 +80,8 @@ struct marks {
 /* What is known of a target's memory from one checkpoint to the next. */
 struct memory {
 	bool dontfork;
-	/* Where a device (or the kernel's vvar) is mapped: madvise(2) stops there. */
+	/* Where a device (or the kernel's vvar) is mapped, or what else keeps_dontfork():
+	 * madvise(2) stops there. */
 	uint32_t holes;
 	struct {
 		avc_remote start, end;
@@ -265,9 +268,29 @@ void memory_dofork(const struct memory *memory, struct inj_call *call)
 
 /* ---- mappings, from /proc ------------------------------------------------------------ */
 
+/* What drivers map, and huge pages.  Whether the kernel minds shows on our own vDSO, which is so. */
+static bool minds_fixed(void)
+{
+	static int minds = -1;
+
+	if (__atomic_load_n(&minds, __ATOMIC_RELAXED) < 0) {
+		void *vdso = (void *)getauxval(AT_SYSINFO_EHDR);
+
+		__atomic_store_n(&minds, vdso && madvise(vdso, ARCH_PAGE_BYTES, MADV_DOFORK),
+				 __ATOMIC_RELAXED);
+	}
+	return minds;
+}
+
+/* MADV_DOFORK is refused (mm/madvise.c: VM_IO; on 7.3 all of VM_SPECIAL). */
+static bool keeps_dontfork(const struct mapping *m)
+{
+	return m->flags & MAPPING_DEVICE || (m->flags & MAPPING_FIXED && minds_fixed());
+}
+
 struct dontfork {
 	struct memory *memory;
-	bool found, device;
+	bool found, kept;
 };
 
 static int find_dontfork(const struct mapping *m, void *arg)
@@ -276,12 +299,12 @@ static int find_dontfork(const struct mapping *m, void *arg)
 	struct memory *memory = look->memory;
 
 	if (m->flags & MAPPING_DONTFORK) {
-		if (m->flags & MAPPING_DEVICE)
-			look->device = true;
+		if (keeps_dontfork(m))
+			look->kept = true;
 		else
 			look->found = true;
 	}
-	if (!(m->flags & MAPPING_DEVICE) || m->start >= ARCH_USER_END)
+	if (!keeps_dontfork(m) || m->start >= ARCH_USER_END)
 		return 0;
 	if (memory->holes && memory->hole[memory->holes - 1].end == m->start) {
 		memory->hole[memory->holes - 1].end = m->end;
@@ -303,9 +326,10 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 	memory->holes = 0;
 	result = proc_mappings(target->pid, "smaps", find_dontfork, &look);
 	memory->dontfork = !result && (memory->dontfork || look.found);
-	if (look.device)
+	if (look.kept)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
-			    "it uses a device's memory, which a clone does not inherit");
+			    "it uses memory of a device, or huge pages, which a clone does not "
+			    "inherit (MADV_DONTFORK)");
 	if (!memory->dontfork)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 			    "%ld kB of its memory are not inherited by a clone",

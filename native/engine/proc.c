@@ -238,6 +238,7 @@ static const struct {
 	{ "lo", MAPPING_LOCKED },    { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
 	{ "hg", MAPPING_HUGE },      { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
 	{ "mg", MAPPING_MERGEABLE }, { "gd", MAPPING_GROWING },    { "sl", MAPPING_SEALED },
+	{ "de", MAPPING_FIXED },     { "pf", MAPPING_FIXED },      { "mm", MAPPING_FIXED },
 };
 
 static uint32_t parse_flags(const char *p)
