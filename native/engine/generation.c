@@ -197,8 +197,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 	pending_setup(target, &setup);
 	if (attributes_keep(target, generation, err))
 		return -1;
-	if (timers_setup(target, generation, &setup, err))
-		return -1;
+	timers_setup(target, &setup);
 	if (branch)
 		manner_setup_limits(branch, &setup);
 	/* A change of users takes it from the whole process, whichever thread it is. */
@@ -350,7 +349,6 @@ static void image_drop(struct generation *image)
 	if (spare_is_unknown(image))
 		tracee_end_now(); /* the kernel has made one by now, or makes none */
 	mem_image_free(image->image);
-	free(image->timers);
 	free(image->attributes);
 	files_free(image->files);
 	files_mapped_free(image->mapped);

@@ -423,7 +423,6 @@ struct generation {
 	/* The main process' group, and the one in the foreground of its terminal; inside,
 	 * 0: none that could be seen. */
 	pid_t group, tty_group;
-	struct timer_image *timers;
 	struct attributes *attributes;
 	struct mem_image *image;      /* of memory that is not in the template       */
 	struct avc_error notice;      /* what of it can not be put back              */
@@ -656,10 +655,7 @@ struct timers *timers_new(void);
 void timers_ask(struct target *target, struct inj_call *call);
 void timers_answer(struct target *target, const struct inj_call *call, uint64_t took_ns);
 /* When the app runs again. */
-int timers_setup(struct target *target, struct generation *generation, struct setup *setup,
-		 struct avc_error *err) warn_unused;
-/* Before a restore: what is left of them now. */
-void timers_advance(const struct timer_image *image, uint64_t now);
+void timers_setup(struct target *target, struct setup *setup);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 

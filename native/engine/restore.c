@@ -185,7 +185,6 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 			usleep(TRY_AGAIN_NS / 1000);
 		start = now_ns();
 		reset(&target->pad, generation->slot);
-		timers_advance(generation->timers, start);
 		if (last_pid_set(helper, slot->pid - 1, err) ||
 		    fork_template(target, generation, pid, pidfd, i > 0, sandbox, err))
 			return -1;
@@ -219,7 +218,6 @@ int restore_start(struct target *target, struct generation *image, struct last_p
 		  pid_t pid, struct sandbox **sandbox, struct avc_error *err)
 {
 	reset(&target->pad, image->slot);
-	timers_advance(image->timers, now_ns());
 	last_pid_serve(helper, pad_slot(&target->pad, image->slot));
 	return send_off(target, image, pid, sandbox, err);
 }

@@ -32,32 +32,15 @@ struct posix_timer {
 	pid_t tid; /* in our namespace; of SIGEV_THREAD_ID                      */
 };
 
-/* interval, then what is left: struct itimerval, struct itimerspec */
-struct setting {
-	int64_t interval[2], left[2];
-};
-_Static_assert(sizeof(struct setting) == INJ_TIMER_BYTES, "as the kernel writes it");
-
 struct timers {
 	uint32_t count; /* of posix[]                                           */
 	bool too_many;
 	struct posix_timer posix[POSIX_MAX];
-	struct setting setting[INJ_TIMERS_MAX];
+	struct inj_timer setting[INJ_TIMERS_MAX];
 	bool valid[INJ_TIMERS_MAX];
-	uint64_t asked_ns;
-	uint64_t took_ns; /* from the question until the pending signals were read */
+	uint64_t asked_ns; /* by the CLOCK_MONOTONIC of the process' time namespace */
+	uint64_t took_ns;  /* from the question until the pending signals were read */
 	char text[16384];
-};
-
-/* What has to be set anew at every restore. */
-struct timer_image {
-	uint64_t asked_ns;
-	uint32_t count;
-	struct {
-		struct setting *at; /* in the pad                               */
-		int64_t left_ns, interval_ns;
-		int64_t unit_ns; /* of the second word: 1, or 1000 for itimers */
-	} timer[INJ_TIMERS_MAX];
 };
 
 struct timers *timers_new(void)
@@ -113,7 +96,7 @@ void timers_ask(struct target *target, struct inj_call *call)
 	timers->too_many = false;
 	for (int which = 0; which < ITIMERS; which++)
 		call_add(call, SYS_getitimer, (uint64_t)which,
-			 out + (uint64_t)which * INJ_TIMER_BYTES, 0, 0, 0);
+			 out + (uint64_t)which * sizeof(struct inj_timer), 0, 0, 0);
 	n = pread(target->timers_fd, timers->text, sizeof timers->text - 1, 0);
 	if (n > 0) {
 		timers->text[n] = 0;
@@ -121,33 +104,23 @@ void timers_ask(struct target *target, struct inj_call *call)
 	}
 	for (uint32_t i = 0; i < timers->count; i++)
 		call_add(call, SYS_timer_gettime, (uint64_t)timers->posix[i].id,
-			 out + (ITIMERS + i) * INJ_TIMER_BYTES, 0, 0, 0);
-	/* The one clock that is the same in every time namespace. */
-	call_add(call, SYS_clock_gettime, CLOCK_REALTIME, out + CLOCK * INJ_TIMER_BYTES, 0, 0, 0);
+			 out + (ITIMERS + i) * sizeof(struct inj_timer), 0, 0, 0);
+	call_add(call, SYS_clock_gettime, CLOCK_MONOTONIC, out + CLOCK * sizeof(struct inj_timer),
+		 0, 0, 0);
 }
 
 void timers_answer(struct target *target, const struct inj_call *call, uint64_t took_ns)
 {
 	struct timers *timers = target->timers;
+	struct timespec asked;
 
 	timers->took_ns = took_ns;
 	for (uint32_t i = 0; i < ITIMERS + timers->count; i++) {
 		timers->valid[i] = call->call[i].result == 0;
-		memcpy(&timers->setting[i], target->pad.control->timer[i],
-		       sizeof timers->setting[i]);
+		timers->setting[i] = target->pad.control->timer[i];
 	}
-	timers->asked_ns = now_ns();
-	if (call->call[ITIMERS + timers->count].result == 0) {
-		struct timespec asked, now;
-		int64_t ago;
-
-		memcpy(&asked, target->pad.control->timer[CLOCK], sizeof asked);
-		clock_gettime(CLOCK_REALTIME, &now);
-		ago = (now.tv_sec - asked.tv_sec) * (int64_t)NS_PER_S + now.tv_nsec - asked.tv_nsec;
-		/* Unless that clock has been set just now. */
-		if (ago > 0 && (uint64_t)ago <= took_ns)
-			timers->asked_ns -= (uint64_t)ago;
-	}
+	memcpy(&asked, &target->pad.control->timer[CLOCK], sizeof asked);
+	timers->asked_ns = (uint64_t)asked.tv_sec * NS_PER_S + (uint64_t)asked.tv_nsec;
 }
 
 /* Of CPU time, which begins anew with the process. */
@@ -156,14 +129,14 @@ static bool counts_cpu(int32_t clock)
 	return clock < 0 || clock == CLOCK_PROCESS_CPUTIME_ID || clock == CLOCK_THREAD_CPUTIME_ID;
 }
 
-static bool runs(const struct setting *s)
+static bool runs(const struct inj_timer *s)
 {
 	return s->left[0] || s->left[1];
 }
 
 /* Expired between the two, and its signal is among the pending ones: once is enough. */
-static bool has_just_expired(const struct target *target, const struct setting *s, int64_t unit_ns,
-			     int signal, int id)
+static bool has_just_expired(const struct target *target, const struct inj_timer *s,
+			     int64_t unit_ns, int signal, int id)
 {
 	return !s->interval[0] && !s->interval[1] && !s->left[0] &&
 	       s->left[1] * unit_ns <= (int64_t)target->timers->took_ns &&
@@ -172,30 +145,29 @@ static bool has_just_expired(const struct target *target, const struct setting *
 
 /* ITIMER_REAL with its signal pending stands still until that is delivered, and
  * shows nothing left (kernel/time/itimer.c). */
-static bool ticks(const struct setting *s)
+static bool ticks(const struct inj_timer *s)
 {
 	return s->interval[0] || s->interval[1];
 }
 
-static avc_remote add_setting(struct setup *setup, struct timer_image *image,
-			      const struct setting *s, int64_t unit_ns, bool cpu)
+static void add_setting(struct setup *setup, const struct timers *timers, const char *name, long nr,
+			uint64_t timer, const struct inj_timer *s, bool cpu)
 {
 	const avc_remote at = setup_data(setup, s, sizeof *s);
+	struct inj_setup *set;
 
-	if (at && !cpu) {
-		image->timer[image->count].at =
-			(struct setting *)(setup->pad->map + (at - setup->pad->base));
-		image->timer[image->count].left_ns = s->left[0] * (int64_t)NS_PER_S +
-						     s->left[1] * unit_ns;
-		image->timer[image->count].interval_ns = s->interval[0] * (int64_t)NS_PER_S +
-							 s->interval[1] * unit_ns;
-		image->timer[image->count++].unit_ns = unit_ns;
-	}
-	return at;
+	if (!cpu)
+		set = setup_add(setup, INJ_AFTER, name, INJ_TIMER_SET, (uint64_t)nr, timer, at,
+				timers->asked_ns, 0);
+	else if (nr == SYS_setitimer)
+		set = setup_add(setup, INJ_AFTER, name, nr, timer, at, 0, 0, 0);
+	else
+		set = setup_add(setup, INJ_AFTER, name, nr, timer, 0, at, 0, 0);
+	set->flags = INJ_MAY_FAIL;
 }
 
-static void add_posix(struct target *target, const struct posix_timer *t, const struct setting *s,
-		      bool valid, struct timer_image *image, struct setup *setup)
+static void add_posix(struct target *target, const struct posix_timer *t, const struct inj_timer *s,
+		      bool valid, struct setup *setup)
 {
 	const int32_t id = t->id;
 	struct sigevent event = {
@@ -216,9 +188,8 @@ static void add_posix(struct target *target, const struct posix_timer *t, const 
 		  (uint64_t)id, 0)
 		->flags = INJ_MAY_FAIL;
 	if (valid && runs(s) && !has_just_expired(target, s, 1, t->signal, t->id))
-		setup_add(setup, INJ_AFTER, "timer_settime", SYS_timer_settime, (uint64_t)id, 0,
-			  add_setting(setup, image, s, 1, counts_cpu(t->clock)), 0, 0)
-			->flags = INJ_MAY_FAIL;
+		add_setting(setup, target->timers, "timer_settime", SYS_timer_settime, (uint64_t)id,
+			    s, counts_cpu(t->clock));
 }
 
 static int by_id(const void *a, const void *b)
@@ -228,17 +199,11 @@ static int by_id(const void *a, const void *b)
 	return ((*x)->id > (*y)->id) - ((*x)->id < (*y)->id);
 }
 
-int timers_setup(struct target *target, struct generation *generation, struct setup *setup,
-		 struct avc_error *err)
+void timers_setup(struct target *target, struct setup *setup)
 {
-	struct timers *timers = target->timers;
+	const struct timers *timers = target->timers;
 	const struct posix_timer *sorted[POSIX_MAX];
-	struct timer_image *image = calloc(1, sizeof *image);
 
-	generation->timers = image;
-	if (!image)
-		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
-	image->asked_ns = timers->asked_ns;
 	/* Ascending, for a kernel on which ids can only be counted up to. */
 	for (uint32_t i = 0; i < timers->count; i++)
 		sorted[i] = &timers->posix[i];
@@ -247,38 +212,19 @@ int timers_setup(struct target *target, struct generation *generation, struct se
 		const size_t k = (size_t)(sorted[i] - timers->posix);
 
 		add_posix(target, sorted[i], &timers->setting[ITIMERS + k],
-			  timers->valid[ITIMERS + k], image, setup);
+			  timers->valid[ITIMERS + k], setup);
 	}
 	for (int which = 0; which < ITIMERS; which++) {
-		const struct setting *s = &timers->setting[which];
+		const struct inj_timer *s = &timers->setting[which];
 		const bool real = which == ITIMER_REAL;
 
 		if (timers->valid[which] && (runs(s) || (real && ticks(s))) &&
 		    !(real && has_just_expired(target, s, 1000, SIGALRM, -1)))
-			setup_add(setup, INJ_AFTER, "setitimer", SYS_setitimer, (uint64_t)which,
-				  add_setting(setup, image, s, 1000, !real), 0, 0, 0)
-				->flags = INJ_MAY_FAIL;
+			add_setting(setup, timers, "setitimer", SYS_setitimer, (uint64_t)which, s,
+				    !real);
 	}
 	if (timers->too_many && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
 		     "it has more than %d POSIX timers; the others are lost at a restore",
 		     POSIX_MAX);
-	return 0;
-}
-
-void timers_advance(const struct timer_image *image, uint64_t now)
-{
-	for (uint32_t i = 0; image && i < image->count; i++) {
-		struct setting *s = image->timer[i].at;
-		const int64_t interval = image->timer[i].interval_ns,
-			      unit = image->timer[i].unit_ns;
-		int64_t left = image->timer[i].left_ns - (int64_t)(now - image->asked_ns);
-
-		if (left <= 0 && interval > 0)
-			left = interval - -left % interval;
-		if (left < unit)
-			left = unit; /* at once; 0 would be never */
-		s->left[0] = left / (int64_t)NS_PER_S;
-		s->left[1] = left % (int64_t)NS_PER_S / unit;
-	}
 }

@@ -204,6 +204,8 @@ static struct inj_thread *thread_of(struct inj_slot *slot, uint32_t i)
 
 #define PR_TIMER_CREATE_RESTORE_IDS_ 77 /* since Linux 6.15 */
 #define TIMER_TRIES 100000
+#define CLOCK_MONOTONIC_ 1
+#define NS_PER_S INT64_C(1000000000)
 
 /* timer_create(2) with the id *id.  An older kernel counts up: what it gives in between
  * is given back. */
@@ -224,6 +226,31 @@ static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t want
 		SYS1(__NR_timer_delete, *id);
 	}
 	return -17; /* EEXIST */
+}
+
+/* At the last moment: what is left shrinks while the process is put together. */
+static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, uint64_t asked_ns)
+{
+	const int64_t unit = nr == __NR_setitimer ? 1000 : 1;
+	const int64_t interval = was->interval[0] * NS_PER_S + was->interval[1] * unit;
+	int64_t now[2], left = was->left[0] * NS_PER_S + was->left[1] * unit;
+	struct inj_timer is;
+	long r = SYS2(__NR_clock_gettime, CLOCK_MONOTONIC_, now);
+
+	if (r)
+		return r;
+	left -= now[0] * NS_PER_S + now[1] - (int64_t)asked_ns;
+	if (left <= 0 && interval > 0)
+		left = interval - -left % interval; /* on its beat */
+	if (left < unit)
+		left = unit; /* at once; 0 would be never */
+	is.interval[0] = was->interval[0];
+	is.interval[1] = was->interval[1];
+	is.left[0] = left / NS_PER_S;
+	is.left[1] = left % NS_PER_S / unit;
+	if (nr == __NR_setitimer)
+		return SYS3(nr, timer, &is, 0);
+	return SYS4(nr, timer, 0, &is, 0);
 }
 
 static long open_pidfd(uint64_t fd, uint64_t pid, uint64_t flags, uint64_t cloexec)
@@ -256,6 +283,8 @@ static long make_call(const struct inj_syscall *s)
 
 	if (s->nr == INJ_TIMER_CREATE)
 		return make_timer(arg[0], arg[1], (int32_t *)arg[2], (int32_t)arg[3]);
+	if (s->nr == INJ_TIMER_SET)
+		return set_timer(arg[0], arg[1], (const struct inj_timer *)arg[2], arg[3]);
 	if (s->nr == INJ_PIDFD_OPEN)
 		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
 	if (s->nr == INJ_CAPS_CHANGE)

@@ -27,7 +27,6 @@
 #define INJ_CODE_BYTES 8192
 #define INJ_SLOTS_OFFSET (INJ_CODE_BYTES + 32768)
 #define INJ_TIMERS_MAX 64
-#define INJ_TIMER_BYTES 32
 #define INJ_CPU_WORDS 16 /* 1024 CPUs */
 #define INJ_CALLS_MAX 96
 #define INJ_STACK_BYTES 4096
@@ -44,6 +43,11 @@ struct inj_syscall {
 	int64_t nr;
 	uint64_t arg[6];
 	int64_t result;
+};
+
+/* As the kernel has it, struct itimerspec or itimerval: seconds, then nano- or microseconds. */
+struct inj_timer {
+	int64_t interval[2], left[2];
 };
 
 /* Instead of a number of a system call: arg[1] calls, struct inj_syscall at arg[0]. */
@@ -87,7 +91,7 @@ struct inj_control {
 	 * from where the app had them (see rewind.c): { seconds, nanoseconds }. */
 	int64_t timeout[64][2] __attribute__((aligned(64)));
 	/* What is left of the app's timers (timers.c). */
-	uint8_t timer[INJ_TIMERS_MAX][INJ_TIMER_BYTES];
+	struct inj_timer timer[INJ_TIMERS_MAX];
 };
 _Static_assert(sizeof(struct inj_control) <= INJ_SLOTS_OFFSET - INJ_CODE_BYTES, "control area");
 
@@ -112,6 +116,10 @@ struct inj_setup {
 /* Likewise: setrlimit(arg[0], arg[1]), or as much of that as a process may that has no right to a
  * higher hard limit than it has. */
 #define INJ_LIMIT (-4)
+/* Likewise: timer_settime(2) or setitimer(2) (arg[0], their number) of the timer arg[1], with what
+ * is left now of the struct inj_timer at arg[2], which it was at arg[3] ns of CLOCK_MONOTONIC,
+ * that of the process: there are time namespaces. */
+#define INJ_TIMER_SET (-5)
 
 enum inj_setup_flag {
 	INJ_MUST = 0,

@@ -130,6 +130,14 @@ __attribute__((noreturn)) static inline void unavailable(const char *what)
 	_exit(UNAVAILABLE_STATUS);
 }
 
+/* How many times later than usual things may come: tests/harness.py, SLOWNESS. */
+static inline uint64_t slowness(void)
+{
+	const char *said = getenv("AVCKPT_SLOWNESS");
+
+	return said && atof(said) > 1 ? (uint64_t)atof(said) : 1;
+}
+
 static inline void board_open(const char *path)
 {
 	int fd = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0666);
