@@ -17,6 +17,10 @@ PYTEST_ARGS ?=
 # `make test TESTS=tests/unit` takes one kind only.
 TESTS  ?= $(wildcard tests/unit tests/native tests/platform tests/integration)
 
+# `make test-kernels KERNELS=trixie KERNEL_TESTS=tests/native/test_engine_kills.py`
+KERNELS ?= jammy bookworm noble trixie backports
+KERNEL_TESTS ?= tests/native
+
 # `make test-sqlite KILLS=20`, `make soak SECONDS=600`: shorter.
 KILLS   ?= 200
 SECONDS ?= 3600
@@ -54,6 +58,16 @@ test-trees: setup ## the tests of process trees at length: more kills, 200 proce
 	@scripts/setup-trees.sh
 	@AVCKPT_LONG=1 $(VENV)/python -m pytest tests/native/test_engine_trees.py $(wildcard tests/integration/test_trees_*.py) \
 		--timeout 3000 $(PYTEST_ARGS) $(if $(T),-k "$(T)")
+
+test-kernels: ## the engine's tests on other kernels, in emulated machines (KERNELS="jammy bookworm noble trixie backports"; an hour each)
+	@scripts/setup-machine.sh $(KERNELS)
+	@for kernel in $(KERNELS); do scripts/test-machine.sh $$kernel $(KERNEL_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") || exit; done
+
+# What scripts/test-machine.sh runs in the root of a machine.
+machine-build: setup-build
+	@$(MAKE) -s -C native
+	@$(MAKE) -s -C native SANITIZE=1
+	@$(MAKE) -s -C tests/victims
 
 lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
 	@scripts/lint.sh
@@ -103,5 +117,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test test-programs test-trees test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
+.PHONY: help setup setup-build setup-images demo test test-programs test-trees test-kernels machine-build test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
 .DEFAULT_GOAL := help

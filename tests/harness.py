@@ -32,6 +32,9 @@ RUN_DIR = Path(os.environ.get("AVCKPT_RUN_DIR") or "/run/avckpt")
 CONFIG_DIR = Path("/etc/avckpt")
 LOCK = Path("/run/lock/avckpt-tests.lock")
 
+SLOWNESS = float(os.environ.get("AVCKPT_SLOWNESS", "1"))
+"""How many times slower than a machine this one is: an emulated one is (test-machine.sh). Victims look at it, too."""
+
 T = TypeVar("T")
 
 

@@ -21,13 +21,13 @@ from typing import Any
 
 import pytest
 from avckpt.events import GuardConfig
-from harness import app_pid, wait_until
+from harness import SLOWNESS, app_pid, wait_until
 from native.board import UNAVAILABLE_STATUS, Board, Seen
 from native.init_peer import ROOT, Init, children_of, state_of
 
 PEER = Path(__file__).with_name("guard_peer.py")
 BUILD = ROOT / "tests/victims/build"
-PATIENCE_S = 15.0
+PATIENCE_S = 15.0 * SLOWNESS
 
 Json = dict[str, Any]
 
@@ -43,6 +43,8 @@ def config(interval_s: float = 0.0, **changes: Any) -> GuardConfig:
         restore_max=64,
         restore_window_s=0.5,
         quiesce_s=0.0,
+        # 0: the engine's own.
+        freeze_deadline_s=0.05 * SLOWNESS if SLOWNESS > 1 else 0.0,
     )
     return dataclasses.replace(plain, **changes)
 

@@ -24,6 +24,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
+from harness import SLOWNESS
+
 ROOT = Path(__file__).resolve().parents[2]
 INIT = Path(os.environ.get("AVCKPT_TEST_INIT") or ROOT / "native/build/avckpt-init")  # another build of it
 PHOENIX = ROOT / "tests/victims/build/phoenix"
@@ -34,7 +36,7 @@ REPORT = struct.Struct("=IIiiIIQ")
 VERDICT = struct.Struct("=II")
 ARMED_OFFSET = 32
 
-PATIENCE_S = 10.0
+PATIENCE_S = 10.0 * SLOWNESS
 
 InitT = TypeVar("InitT", bound="Init")
 PageT = TypeVar("PageT", bound="Page")

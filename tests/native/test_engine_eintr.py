@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from harness import SLOWNESS
 from native.guarded import GuardProcess, Victim, config
 
 CHECKPOINTS = 10_000
@@ -46,7 +47,7 @@ def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, 
     """A relative timeout is not begun again by every checkpoint, and none ends early (the victim sees to that)."""
     # Sockets' timeouts end at a checkpoint: two intervals.  The rest is for a busy machine, and less
     # than what a wait that forgets the time it was stopped adds up to in the second case.
-    command = f"eintr all {seconds} --quiet --late {late_s}"
+    command = f"eintr all {seconds} --quiet --late {late_s * SLOWNESS}"
     with Victim(command, tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
         guard.wait("checkpoint")
         time.sleep(2.2 * seconds)

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import pytest
 from avckpt.events import Tcp
-from harness import wait_until
+from harness import SLOWNESS, wait_until
 from native.guarded import GuardProcess, Victim, config
 
+# An emulated sender is silent for longer within a message.
+AT_SPEED = pytest.mark.skipif(SLOWNESS > 1, reason="8 ms without a byte are a pause between messages")
 SHORT, LONG = b"m" * 1000, b"m" * 300_000
 SILENT_S = 0.1
 
@@ -73,6 +75,7 @@ def kill_inside_a_message(victim: Victim, guard: GuardProcess, client: socket.so
     guard.wait("restored", count=count)
 
 
+@AT_SPEED
 def test_what_is_left_of_a_message_is_read_away(tmp_path: Path) -> None:
     with (
         Victim("stream", tmp_path) as victim,
@@ -111,6 +114,7 @@ def test_between_messages_a_connection_goes_on(tmp_path: Path) -> None:
         assert victim.see().counter[3] == 0
 
 
+@AT_SPEED
 def test_a_message_cut_by_the_checkpoint_ends_the_connection(tmp_path: Path) -> None:
     """The half that the restored process has is followed by something else."""
     with (

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from harness import wait_until
+from harness import SLOWNESS, wait_until
 from native.board import VIOLATION_STATUS
 from native.family import Member, main_process, members
 from native.guarded import Victim
@@ -62,7 +62,7 @@ def test_two_hundred_processes_and_a_thousand_threads(tmp_path: Path) -> None:
     with Victim("tree 125 --threads 7 --lap-us 200000", tmp_path) as victim:
         # Some workers have one below them, some have two zombies, and some wait for one.
         assert len(members(victim)) == 1 + 125 + 18 + 2 * 18 + 17
-        victim.wait_beats(5, 30)
+        victim.wait_beats(5, 30 * SLOWNESS)
 
 
 def test_the_tree_is_what_it_says(tmp_path: Path) -> None:

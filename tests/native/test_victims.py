@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from harness import SLOWNESS
 from native.board import MAGIC, UNAVAILABLE_STATUS, VIOLATION_STATUS, Board
 from native.init_peer import eventually
 from native.meddle import set_fpu_register
@@ -98,7 +99,7 @@ def start(victims_built: Path, board: Board) -> Iterator[Start]:
 )
 def test_content_when_nothing_is_wrong(start: Start, board: Board, command: str) -> None:
     victim = start(*command.split(), "--seconds", "1")
-    out, err = victim.communicate(timeout=20)
+    out, err = victim.communicate(timeout=20 * SLOWNESS)
     if victim.returncode == UNAVAILABLE_STATUS:
         pytest.skip(f"this machine has no such thing: {err.strip()}")
     seen = board.see()
@@ -163,7 +164,7 @@ def test_foreign_memory_is_noticed(start: Start, board: Board, command: str) -> 
         for at in range(address + size // 4, address + size * 3 // 4, 8192):
             memory.seek(at)
             memory.write(b"\x5a" * 4096)
-    _, err = victim.communicate(timeout=20)
+    _, err = victim.communicate(timeout=20 * SLOWNESS)
     assert victim.returncode == VIOLATION_STATUS
     assert err.startswith("VIOLATION: ")
     assert board.see().violations > 0
@@ -176,7 +177,7 @@ def meddle_until_noticed(victim: subprocess.Popen[str], deed: Callable[[], objec
         with contextlib.suppress(subprocess.TimeoutExpired):
             victim.wait(0.5)
             break
-    _, err = victim.communicate(timeout=10)
+    _, err = victim.communicate(timeout=10 * SLOWNESS)
     assert victim.returncode == VIOLATION_STATUS, err
     return err
 
