@@ -14,6 +14,7 @@ KERNEL=$1
 shift
 MACHINE=$BUILD/machine
 WORLD=$MACHINE/root
+CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 LIMIT=${LIMIT:-3h}
 [ $# -gt 0 ] || set -- tests/native
 
@@ -28,6 +29,11 @@ install_checkout() {
 	install -D -m 644 "$MACHINE/arguments" "$there/build/machine-arguments" || return
 	for file in /etc/resolv.conf /etc/hosts /etc/ssl/certs/ca-certificates.crt /etc/pip.conf; do
 		[ ! -e "$file" ] || cp -L "$file" "$WORLD$file" || return
+	done
+	# Images that were made here need not be made there.
+	mkdir -p "$WORLD/root/.cache/avckpt" || return
+	for file in "$CACHE"/base-*.tar "$CACHE"/trees-*.tar; do
+		[ ! -e "$file" ] || cp -u "$file" "$WORLD/root/.cache/avckpt/" || return
 	done
 	# shellcheck disable=SC2016 # the words are for that shell
 	unshare --mount bash -c '
