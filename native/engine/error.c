@@ -50,10 +50,11 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 	enum avc_code code = AVC_KERNEL;
 	va_list args;
 
+	/* Of one that has just been reaped, Yama (ptrace_scope 1, as on Ubuntu) says EPERM. */
 	if (errnum == ESRCH || errnum == ENOENT)
 		code = AVC_GONE;
 	else if (errnum == EPERM || errnum == EACCES)
-		code = AVC_DENIED;
+		code = pid > 0 && proc_is_exiting(pid) ? AVC_GONE : AVC_DENIED;
 	va_start(args, detail);
 	vfail(err, code, errnum, pid, operation, syscall, detail, args);
 	va_end(args);
