@@ -245,8 +245,9 @@ static int clone_missing(struct tree *tree, struct generation *generation, struc
 {
 	struct thread *main_thread = thread_find(tree->main, tree->main->pid);
 
-	if (await_app_clone(tree->main, main_thread, generation, err) ||
-	    rest_app(main_thread, err) || hear_all(tree, err) || make_holders_missing(tree, err))
+	/* First who waits in its pad for us: how long the main process takes is not known yet. */
+	if (hear_all(tree, err) || await_app_clone(tree->main, main_thread, generation, err) ||
+	    rest_app(main_thread, err) || make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		struct target *target = tree->kin[i].target;

@@ -21,6 +21,9 @@
 #define CLONES_AHEAD_NS (5 * NS_PER_MS)
 #define CLONE_PROCESS_NS 100000
 #define CLONE_PAGE_NS 90
+#define CLONES_MAX_NS NS_PER_S
+/* Times as long as that, they may take. */
+#define PATIENCE 4
 
 /* ---- what is read ----------------------------------------------------------------------- */
 
@@ -222,12 +225,17 @@ int await_clone(struct target *target, pid_t *template, struct avc_error *err)
 
 /* Timers only the process itself can tell of.  And young processes change what they are
  * all the time: a name, a user.  All are asked at the same time. */
-static int ask_begin(struct target *target, struct avc_error *err)
+static int ask_begin(struct target *target, uint64_t takes_ns, struct avc_error *err)
 {
 	struct inj_call *call = &target->pad.control->runner;
 	struct thread *thread = thread_find(target, target->pid);
 
 	call_begin(call, INJ_AFTER_HOME);
+	/* It is heard only when the main process is cloned, and the holders take the CPUs from us
+	 * meanwhile; if it went home before, the image would be of two instants. */
+	call->park_ms += (uint32_t)(PATIENCE *
+				    (takes_ns < CLONES_MAX_NS ? takes_ns : CLONES_MAX_NS) /
+				    NS_PER_MS);
 	timers_ask(target, call);
 	target->children = ask_for_children(call);
 	ask_add(target, false, call, &target->questions);
@@ -289,7 +297,7 @@ int hear_all(struct tree *tree, struct avc_error *err)
 
 /* It stands still: its clone begins, if it has a holder for that, and it answers meanwhile what
  * it is asked, which changes nothing of its memory. */
-static int begin(struct target *target, uint32_t slot, struct avc_error *err)
+static int begin(struct target *target, uint32_t slot, uint64_t takes_ns, struct avc_error *err)
 {
 	struct thread *thread = thread_find(target, target->pid);
 
@@ -299,7 +307,7 @@ static int begin(struct target *target, uint32_t slot, struct avc_error *err)
 	target->begun = true;
 	return read_all(target, slot, err) || vet(target, thread, err) ||
 			       (target->holder && start_clone(target, err)) ||
-			       ask_begin(target, err)
+			       ask_begin(target, takes_ns, err)
 		       ? -1
 		       : 0;
 }
@@ -313,14 +321,31 @@ static bool has_strangers(const struct target *target)
 	return false;
 }
 
-/* About, of a process that has had so many pages of its own at the last checkpoint. */
-static uint64_t clone_time_ns(const struct target *target)
+/* About, of a process that has so many pages of its own. */
+static uint64_t clone_time_ns(long anon_pages)
 {
-	return CLONE_PROCESS_NS + (uint64_t)target->anon_pages * CLONE_PAGE_NS;
+	return CLONE_PROCESS_NS + (uint64_t)anon_pages * CLONE_PAGE_NS;
+}
+
+/* All of them, those that have no template yet as well. */
+static uint64_t clones_time_ns(const struct tree *tree)
+{
+	uint64_t takes_ns = 0;
+
+	for (uint32_t i = 0; i < tree->count; i++) {
+		const struct target *target = tree->kin[i].target;
+		long pages = target ? target->anon_pages : 0;
+
+		if (target && !pages)
+			proc_vm_pages(target->statm_fd, &pages);
+		takes_ns += clone_time_ns(pages);
+	}
+	return takes_ns;
 }
 
 int begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
+	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
 	uint64_t takes_ns = 0;
 
 	if (!has_strangers(tree->main) && begin_app(tree->main, generation, err))
@@ -331,10 +356,10 @@ int begin_known(struct tree *tree, struct generation *generation, struct avc_err
 		if (!target || !target->frozen || !target->holder || !target->anon_pages ||
 		    target->pid != target->leader || has_strangers(target))
 			continue;
-		takes_ns += clone_time_ns(target);
+		takes_ns += clone_time_ns(target->anon_pages);
 		if (takes_ns > CLONES_AHEAD_NS)
 			break;
-		if (begin(target, generation->slot, err))
+		if (begin(target, generation->slot, all_ns, err))
 			return -1;
 	}
 	return 0;
@@ -342,12 +367,14 @@ int begin_known(struct tree *tree, struct generation *generation, struct avc_err
 
 int begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
+	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
+
 	if (!tree->main->begun && begin_app(tree->main, generation, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct target *target = generation->branch[i].target;
 
-		if (target && !target->begun && begin(target, generation->slot, err))
+		if (target && !target->begun && begin(target, generation->slot, all_ns, err))
 			return -1;
 	}
 	return 0;

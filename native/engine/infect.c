@@ -143,6 +143,7 @@ static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const u
 	if (arch_regs_set(tid, &regs) || ptrace(PTRACE_SETSIGMASK, tid, sizeof all, &all))
 		return fail_errno(err, tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
+	thread->borrowed_for = NULL;
 	/* Entry and exit.  Other stops may come in between: job control, or SIGSTOP,
 	 * which can not be blocked. */
 	for (int stops = 0, signal = 0; stops < 2;) {

@@ -247,11 +247,12 @@ struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
 	bool attached, stopped;
-	int stop_signal;       /* the process is stopped by job control           */
-	int block;             /* of the slot, main thread 0; -1: not in the image */
-	bool borrowed;         /* sent into the pad; regs and sigmask are its own  */
-	bool vetted;           /* vet() has been at this stop                      */
-	struct arch_regs regs; /* as of the stop, EINTR already mended          */
+	int stop_signal;                /* the process is stopped by job control           */
+	int block;                      /* of the slot, main thread 0; -1: not in the image */
+	bool borrowed;                  /* sent into the pad; regs and sigmask are its own  */
+	const struct pad *borrowed_for; /* NULL: not yet a pad (infect.c)         */
+	bool vetted;                    /* vet() has been at this stop                      */
+	struct arch_regs regs;          /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
 	uint64_t rseq;

@@ -130,6 +130,7 @@ void call_begin(struct inj_call *call, enum inj_after after)
 	call->pause = INJ_PAUSE_NONE;
 	call->count = 0;
 	call->after = after;
+	call->park_ms = INJ_PARK_MS;
 }
 
 struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
@@ -372,6 +373,7 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 	    pad_send(&target->pad, thread->tid, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
+	thread->borrowed_for = &target->pad;
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
 				  "it has gone");
@@ -380,6 +382,17 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 
 int give_back(struct thread *thread, struct avc_error *err)
 {
+	struct arch_regs now;
+
+	if (arch_regs_get(thread->tid, &now))
+		return fail_errno(err, thread->tid, "give back", "ptrace(GETREGS)", "it has gone");
+	/* Of a guard that did not get a CPU for so long (park_ms) it thinks that it has died: it
+	 * has gone home by itself, and its registers are newer than those that we know. */
+	if (thread->borrowed_for && !pad_contains(thread->borrowed_for, arch_pc(&now))) {
+		thread->borrowed = false;
+		return fail(err, AVC_DEADLINE, EAGAIN, thread->tid, "give back", "",
+			    "it has gone on by itself, for the guard came too late");
+	}
 	/* The mask first, for the same reason. */
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))

@@ -164,7 +164,7 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 	/* The tracer now stops this task and sends it back.  If there is no
 	 * tracer any more, a thread of the app finds home by itself. */
 	if (call->after == INJ_AFTER_HOME) {
-		park(INJ_PARK_MS);
+		park(call->park_ms);
 		inj_go_home();
 	}
 	for (;;)

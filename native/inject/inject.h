@@ -35,7 +35,7 @@
  * that a template makes (INJ_LIST). */
 #define INJ_FILES_BYTES (2 * INJ_SETUP_BYTES)
 
-/* How long code that found no tracer waits for one before it helps itself. */
+/* How long code that found no tracer waits for one before it helps itself, if no more is said. */
 #define INJ_PARK_MS 100
 #define INJ_GO_S 10
 
@@ -74,7 +74,8 @@ struct inj_call {
 	uint32_t done;  /* futex: 1 when all calls were made                    */
 	uint32_t pause; /* futex: enum inj_pause                                */
 	uint32_t count;
-	uint32_t after; /* enum inj_after                                      */
+	uint32_t after;   /* enum inj_after                                      */
+	uint32_t park_ms; /* INJ_AFTER_HOME: how long it waits for the tracer    */
 	struct inj_syscall call[INJ_CALLS_MAX];
 	uint8_t out[512]; /* where calls may leave results                      */
 	uint8_t stack[INJ_STACK_BYTES] __attribute__((aligned(64)));
