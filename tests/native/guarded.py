@@ -188,7 +188,13 @@ class Victim(Init):
 
     def __enter__(self) -> Victim:
         super().__enter__()
-        wait_until(lambda: self.see().ready or self.popen.poll() is not None, PATIENCE_S, f"{self.command} is ready")
+        try:
+            wait_until(
+                lambda: self.see().ready or self.popen.poll() is not None, PATIENCE_S, f"{self.command} is ready"
+            )
+        except TimeoutError:
+            self.__exit__(None, None, None)  # nobody else would
+            raise
         if self.popen.poll() == UNAVAILABLE_STATUS:
             self.__exit__(None, None, None)
             pytest.skip(self.said.splitlines()[0])
