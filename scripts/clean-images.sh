@@ -13,4 +13,4 @@ for repository in localhost/avckpt-programs localhost/avckpt-programs-build loca
 	podman images --format '{{.Repository}}:{{.Tag}}' --filter "reference=$repository" |
 		while read -r image; do podman rmi "$image" || warn "$image is in use and stays"; done
 done
-rm -rf "${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt"
+rm -rf "${CACHE:?}"

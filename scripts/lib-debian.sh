@@ -12,7 +12,6 @@
 
 SUITE=${AVCKPT_SUITE:-bookworm}
 MIRROR=${AVCKPT_MIRROR:-http://deb.debian.org/debian}
-CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 
 # What may be left out of packages, beside documentation; a command for the new
 # root ($1) before they are unpacked; what is removed from it where there is only
@@ -51,7 +50,7 @@ debian_image() {
 	local name=$1 title=$2 PACKAGES=$3 image=localhost/avckpt-$1 key tarball
 	# The recipe itself is part of the key.
 	key=$(content_key -- "$SUITE" "$MIRROR" "$PACKAGES" "${EXCLUDES[@]}" "$ESSENTIAL_HOOK" "$(declare -f bootstrap import)")
-	tarball=$CACHE/$name-$SUITE-$key.tar
+	cached "$name" "$SUITE-$key"
 	# The very first podman command on a machine complains about network plugins that
 	# are not used; what matters is said by the import.
 	if podman image exists "$image:$key" 2>/dev/null; then
@@ -60,13 +59,11 @@ debian_image() {
 		note "$title: $image is there"
 		return 0
 	fi
-	mkdir -p "$CACHE"
-	rm -f "$CACHE/$name"-*.tar.new.*
 	if [ ! -f "$tarball" ]; then
 		step "$name" "making a small Debian ($SUITE): $title" bootstrap ||
 			die "no $title: $SUITE could not be fetched from $MIRROR (AVCKPT_MIRROR names another mirror)"
 	fi
 	step "$name-import" "importing it as $image" import || die "podman could not import $tarball"
 	remove_other_tags "$key" "$image"
-	find "$CACHE" -name "$name-*.tar" ! -name "$(basename "$tarball")" -delete
+	drop_older "$name"
 }

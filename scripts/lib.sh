@@ -9,6 +9,8 @@ set -euo pipefail
 ROOT=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 BUILD=$ROOT/build
 LOGS=$BUILD/logs
+# What was fetched or takes long to make: kept for the next checkout, too.
+CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 mkdir -p "$LOGS"
 
 if [ -t 1 ] && [ -z "${NO_COLOR:-}" ]; then
@@ -95,6 +97,17 @@ content_key() {
 		done)
 	} | sha256sum | cut -c 1-16
 }
+
+# cached NAME KEY: sets `tarball` to where a thing of that name is kept that was made from what the
+# key stands for, and removes what an interrupted run has left of another.
+cached() {
+	mkdir -p "$CACHE"
+	rm -f "$CACHE/$1"-*.tar.new.*
+	tarball=$CACHE/$1-$2.tar
+}
+
+# drop_older NAME: the same thing made from something else.
+drop_older() { find "$CACHE" -name "$1-*.tar" ! -name "$(basename "$tarball")" -delete; }
 
 # remove_other_tags KEY REPOSITORY...: removes images of earlier keys; those that
 # a container still uses stay.

@@ -13,7 +13,6 @@ cd "$ROOT"
 MACHINE=$BUILD/machine
 WORLD=$MACHINE/root
 KEYRING=$MACHINE/ubuntu.gpg
-CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 DEBIAN=${AVCKPT_MIRROR:-http://deb.debian.org/debian}
 UBUNTU=${AVCKPT_UBUNTU_MIRROR:-http://archive.ubuntu.com/ubuntu}
 PACKAGES=systemd,systemd-sysv,dbus,udev,kmod,initramfs-tools,zstd,iproute2,procps,ca-certificates
@@ -110,12 +109,11 @@ if ! have qemu-system-x86_64 || ! have mke2fs || ! have mmdebstrap || ! have zst
 	have apt-get || die "needed: qemu-system-x86_64, mke2fs, mmdebstrap, zstd"
 	step machine-qemu "installing QEMU" install_qemu || die "QEMU could not be installed"
 fi
-mkdir -p "$MACHINE" "$CACHE"
+mkdir -p "$MACHINE"
 key=$(content_key scripts/setup-machine.sh scripts/machine.service)
-tarball=$CACHE/machine-bookworm-$(content_key -- "$DEBIAN" "$PACKAGES" "$(declare -f make_world)").tar
-rm -f "$CACHE"/machine-*.tar.new.*
+cached machine "bookworm-$(content_key -- "$DEBIAN" "$PACKAGES" "$(declare -f make_world)")"
 [ -f "$tarball" ] || step machine-world "making a Debian 12 to boot" make_world || die "no machine: bookworm could not be fetched from $DEBIAN"
-find "$CACHE" -name "machine-*.tar" ! -name "$(basename "$tarball")" -delete
+drop_older machine
 if [ "$(cat "$MACHINE/world" 2>/dev/null)" != "$key" ]; then
 	rm -rf "${MACHINE:?}"/*
 	step machine-unpack "unpacking it" unpack_world || die "no machine: $tarball could not be unpacked"

@@ -16,7 +16,6 @@ cd "$ROOT"
 SUITE=trixie
 NEXT=forky
 MIRROR=${AVCKPT_MIRROR:-http://deb.debian.org/debian}
-CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 PACKAGES=podman,crun,runc,criu,libcriu2,conmon,netavark,catatonit,iptables,nftables,iproute2,procps
 
 # From the next Debian, if there is one: CRIU and what it links that is too old in this one.
@@ -43,14 +42,12 @@ bootstrap() {
 }
 
 have mmdebstrap || die "mmdebstrap is needed to make the peers' Debian (debootstrap can not mix two releases)"
-mkdir -p "$CACHE"
 key=$(content_key -- "$SUITE" "$NEXT" "$MIRROR" "$PACKAGES" "$PREFER" "$(declare -f bootstrap)")
-tarball=$CACHE/peers-$SUITE-$key.tar
-rm -f "$CACHE"/peers-*.tar.new.*
+cached peers "$SUITE-$key"
 if [ -f "$tarball" ]; then
 	note "the peers' Debian: $tarball is there"
 else
 	step peers "making a Debian ($SUITE) with Podman and CRIU to compare with" bootstrap ||
 		die "no peers: $SUITE could not be fetched from $MIRROR (AVCKPT_MIRROR names another mirror)"
 fi
-find "$CACHE" -name "peers-*.tar" ! -name "$(basename "$tarball")" -delete
+drop_older peers

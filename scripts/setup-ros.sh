@@ -15,7 +15,6 @@
 cd "$ROOT"
 SUITE=bookworm # the last Debian with ROS 1
 MIRROR=${AVCKPT_MIRROR:-http://deb.debian.org/debian}
-CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 NODES=$ROOT/examples/ros/src
 BAGS=$CACHE/ros-drive
 
@@ -28,31 +27,31 @@ BUILD_PACKAGES+=,libpcl-filters1.13,libpcl-registration1.13,libeigen3-dev,libfla
 # Headers only: libpcl-dev depends on VTK, OpenNI and 400 packages more.
 HEADERS="libpcl-dev libpcl-conversions-dev libpcl-msgs-dev"
 
-# bootstrap NAME PACKAGES [HOOK]: a Debian with these packages, as NAME.tar in the cache.
+# bootstrap PACKAGES [HOOK]: a Debian with these packages, as $tarball.
 bootstrap() {
 	local slim=(path-exclude=/usr/share/doc/* path-exclude=/usr/share/man/* path-exclude=/usr/share/locale/*)
-	local new=$CACHE/$1.tar.new.$$ hook=()
-	if [ $# -gt 2 ]; then hook=("--customize-hook=$3"); fi
-	mmdebstrap --format=tar --variant=apt --include="$2" "${slim[@]/#/--dpkgopt=}" "${hook[@]}" \
+	local new=$tarball.new.$$ hook=()
+	if [ $# -gt 1 ]; then hook=("--customize-hook=$2"); fi
+	mmdebstrap --format=tar --variant=apt --include="$1" "${slim[@]/#/--dpkgopt=}" "${hook[@]}" \
 		"$SUITE" "$new" "$MIRROR" || return
-	mv "$new" "$CACHE/$1.tar"
+	mv "$new" "$tarball"
 }
 
 import() {
 	podman import --change 'ENV PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin' \
-		--change 'CMD ["/bin/sh"]' "$CACHE/$1.tar" "$2" || return
+		--change 'CMD ["/bin/sh"]' "$tarball" "$1" || return
 }
 
 # image REPOSITORY KEY PACKAGES [HOOK]
 image() {
-	local name=${1#localhost/} key=$2
+	local name=${1#localhost/} key=$2 tarball
 	if podman image exists "$1:$key" 2>/dev/null; then return 0; fi
-	[ -f "$CACHE/$name-$key.tar" ] ||
-		step "$name" "fetching Debian's packages for $name" bootstrap "$name-$key" "${@:3}" ||
+	cached "$name" "$key"
+	[ -f "$tarball" ] || step "$name" "fetching Debian's packages for $name" bootstrap "${@:3}" ||
 		die "$name: $SUITE could not be fetched from $MIRROR (AVCKPT_MIRROR names another mirror)"
-	step "$name-import" "importing it as $1" import "$name-$key" "$1:$key" || die "podman could not import $name"
+	step "$name-import" "importing it as $1" import "$1:$key" || die "podman could not import $name"
 	remove_other_tags "$key" "$1"
-	find "$CACHE" -name "$name-*.tar" ! -name "$name-$key.tar" -delete
+	drop_older "$name"
 }
 
 compile() {
@@ -77,8 +76,6 @@ record() {
 }
 
 have mmdebstrap || die "mmdebstrap is missing: make setup installs it"
-mkdir -p "$CACHE"
-rm -f "$CACHE"/avckpt-ros*.tar.new.*
 allowed_limits
 
 # shellcheck disable=SC2016 # $1, the new root, is mmdebstrap's to fill in

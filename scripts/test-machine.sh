@@ -14,7 +14,6 @@ KERNEL=$1
 shift
 MACHINE=$BUILD/machine
 WORLD=$MACHINE/root
-CACHE=${XDG_CACHE_HOME:-${HOME:-/root}/.cache}/avckpt
 LIMIT=${LIMIT:-3h}
 [ $# -gt 0 ] || set -- tests/native
 
