@@ -10,6 +10,9 @@ export HOME=/root LANG=C.UTF-8 AVCKPT_SLOWNESS=10
 mapfile -t arguments <build/machine-arguments
 printf 'Linux %s, %s, %s\n' "$(uname -r)" "$(podman --version)" "$(stat -f -c %T /sys/fs/cgroup)"
 case "${arguments[*]}" in
-*tests/integration* | *tests/platform*) make setup-images | cat ;;
+*tests/integration* | *tests/platform*)
+	if [ -f build/images.tar ]; then podman load -q -i build/images.tar; fi
+	make setup-images | cat
+	;;
 esac && .venv/bin/python -m pytest -p no:cacheprovider --timeout 900 --color=no "${arguments[@]}"
 printf 'machine: ended with %s\n' $?

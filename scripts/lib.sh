@@ -78,7 +78,7 @@ have() { command -v "$1" >/dev/null 2>&1; }
 list_sources() {
 	git ls-files -z --cached --others --exclude-standard -- "$@" 2>/dev/null ||
 		find "$@" \( -name build -o -name build-san -o -name __pycache__ -o -name '*.egg-info' \) -prune \
-			-o -type f ! -name '*.so' ! -name '_native.c' -print0 2>/dev/null || true
+			-o \( -type f -o -type l \) ! -name '*.so' ! -name '_native.c' -print0 2>/dev/null || true
 }
 
 # One short key for the content of files (and any words given after `--`).

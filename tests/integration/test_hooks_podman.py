@@ -23,7 +23,8 @@ from avckpt_hooks import protocol
 from harness import ROOT, Container, ContainerFactory, Podman, hooks_installed, wait_until
 
 INIT = "/run/avckpt-init --wait-ms 2000 --stop-signal"
-SHOW_PID_1 = "tr '\\0' ' ' </proc/1/cmdline"
+# With the newline that journald waits for.
+SHOW_PID_1 = "tr '\\0' ' ' </proc/1/cmdline; echo"
 
 
 @pytest.fixture
@@ -471,7 +472,7 @@ def test_podmans_own_restarts_keep_the_hooks(machine: None, podman: Podman, base
         options = ["--label", "avckpt.enable=true", "--label", "avckpt.restore.on=signal", "--restart=on-failure:2"]
         podman.run(
             *("run", "--detach", "--pull=never", "--name", name, "--network=none", *options),
-            *(base_image, "sh", "-c", f"{SHOW_PID_1}; echo; exit 3"),
+            *(base_image, "sh", "-c", f"{SHOW_PID_1}; exit 3"),
         )
         container = Container(podman, name, "")
         container.wait_for_log(INIT, count=3)

@@ -416,6 +416,10 @@ def test_children_wait_as_long_as_a_big_process_takes(tmp_path: Path, monkeypatc
         for _ in range(4):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
             victim.wait_beats(20)
+        since = guard.mark()
+        kill_main(victim)
+        guard.wait("restored", since=since, timeout_s=60.0)
+        victim.wait_beats(20)
 
 
 @pytest.mark.skipif(not LONG, reason="long: `make test-trees`")
