@@ -257,7 +257,9 @@ void limit_lift(pid_t pid, int which, uint64_t least)
 	if (prlimit(pid, which, NULL, &now))
 		return;
 	lifted.rlim_cur = lifted.rlim_max = now.rlim_max > least ? now.rlim_max : least;
-	if (prlimit(pid, which, &lifted, NULL) == 0)
+	/* That there is nothing to lift is the rule. */
+	if ((lifted.rlim_cur == now.rlim_cur && lifted.rlim_max == now.rlim_max) ||
+	    prlimit(pid, which, &lifted, NULL) == 0)
 		return;
 	/* We may not; but up to there everybody may. */
 	now.rlim_cur = now.rlim_max;
