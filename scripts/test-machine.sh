@@ -19,7 +19,8 @@ LIMIT=${LIMIT:-3h}
 
 save_images() {
 	local images
-	have podman || return 0
+	# Where they can not be made here, they are made there.
+	{ have podman && make -s setup-images; } || return 0
 	mapfile -t images < <(podman images --format '{{.Repository}}:{{.Tag}}' --filter 'reference=localhost/avckpt-*' |
 		grep -v -e '-build:' -e '-ros' -e '-programs')
 	[ ${#images[@]} = 0 ] || podman save -q -m -o "$1" "${images[@]}"

@@ -245,6 +245,22 @@ static void read_model(void)
 		read_filters();
 }
 
+/* Only the user namespace that we come from has the right to a higher hard limit; the command,
+ * in the container's, only ever lowers what it has. */
+static void raise_limits(void)
+{
+	for (int i = 0; i < RLIM_NLIMITS; i++) {
+		struct rlimit own;
+
+		must(getrlimit((__rlimit_resource_t)i, &own) == 0, "getrlimit");
+		if (own.rlim_max >= job.limits[i].rlim_max)
+			continue;
+		own.rlim_max = job.limits[i].rlim_max;
+		if (setrlimit((__rlimit_resource_t)i, &own))
+			errno = 0; /* we may not: ours stays */
+	}
+}
+
 /* ---- the command ------------------------------------------------------------------ */
 
 static void set_capabilities(unsigned long long inheritable, unsigned long long permitted,
@@ -313,7 +329,7 @@ static _Noreturn void become_command(int gate)
 		close(job.cgroup_fds[i]);
 	for (int i = 0; i < RLIM_NLIMITS; i++)
 		if (setrlimit((__rlimit_resource_t)i, &job.limits[i]))
-			errno = 0; /* higher than ours, and we may not: ours stays */
+			errno = 0; /* raise_limits() could not */
 	umask(022);
 	must(close_range(3, ~0U, CLOSE_RANGE_CLOEXEC) == 0, "close_range");
 	drop_privileges();
@@ -376,6 +392,7 @@ int main(int argc, char **argv)
 	sigemptyset(&wanted);
 	sigprocmask(SIG_SETMASK, &wanted, NULL);
 	read_model();
+	raise_limits();
 	must(socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, gate) == 0, "socketpair");
 	if (other_user_namespace())
 		namespaces |= CLONE_NEWUSER;

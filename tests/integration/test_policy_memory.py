@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, wait_until
+from harness import SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
 from integration.protected import ProtectedVictim, ours, start_victim
 from integration.test_policy_health import told
 from integration.test_policy_labels import checkpoint
@@ -42,6 +42,7 @@ def held(sidecar: Sidecar, container: Container) -> dict[str, Any]:
     return entry
 
 
+@pytest.mark.skipif(SLOWNESS > 1, reason="the sidecar is quicker there than the kernel's OOM killer")
 def test_the_oom_killer_takes_templates_first(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
     victim = start(sidecar, container, tmp_path, 60, 160)
     app = victim.app
