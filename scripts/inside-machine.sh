@@ -12,7 +12,7 @@ printf 'Linux %s, %s, %s\n' "$(uname -r)" "$(podman --version)" "$(stat -f -c %T
 case "${arguments[*]}" in
 *tests/integration* | *tests/platform*)
 	if [ -f build/images.tar ]; then podman load -q -i build/images.tar; fi
-	make setup-images | cat
+	{ make setup-images && scripts/setup-trees.sh; } | cat
 	;;
 esac && .venv/bin/python -m pytest -p no:cacheprovider --timeout 900 --color=no "${arguments[@]}"
 printf 'machine: ended with %s\n' $?

@@ -20,7 +20,7 @@ LIMIT=${LIMIT:-3h}
 save_images() {
 	local images
 	# Where they can not be made here, they are made there.
-	{ have podman && make -s setup-images; } || return 0
+	{ have podman && make -s setup-images && scripts/setup-trees.sh; } || return 0
 	mapfile -t images < <(podman images --format '{{.Repository}}:{{.Tag}}' --filter 'reference=localhost/avckpt-*' |
 		grep -v -e '-build:' -e '-ros' -e '-programs')
 	[ ${#images[@]} = 0 ] || podman save -q -m -o "$1" "${images[@]}"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import ContainerFactory, Sidecar, wait_until
+from harness import SLOWNESS, ContainerFactory, Sidecar, wait_until
 from integration.protected import ProtectedVictim, start_victim
 from integration.test_policy_labels import checkpoint, ended
 
@@ -35,7 +35,7 @@ def events(victim: ProtectedVictim, *kinds: str) -> list[dict[str, Any]]:
 
 
 def test_a_poisoned_generation_is_left_for_an_older_one(poison: Any) -> None:
-    victim = poison(300, {"interval": "1h", "restore.max": "4/60s"})
+    victim = poison(int(300 * SLOWNESS), {"interval": "1h", "restore.max": "4/60s"})
     checkpoint(victim)
     os.kill(victim.app, signal.SIGUSR1)
     checkpoint(victim)  # before it crashes: this image is poisoned

@@ -10,10 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import SIDECAR_NAME, Container, ContainerFactory, Sidecar, wait_until
+from harness import SIDECAR_NAME, SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
 
 QUICK = {"interval": "100ms"}
-STOP_S = 3.0
+# Much less than the 20 s after which Podman kills it.
+STOP_S = min(3.0 * SLOWNESS, 15.0)
 
 
 def stop(made: Container) -> float:
