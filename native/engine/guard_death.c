@@ -76,6 +76,8 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	drop_all(guard);
 	unhold(&guard->target);
 	target_close(&guard->target);
+	/* Init ends now, and why is what was told last. */
+	guard->next_ns = UINT64_MAX;
 }
 
 /* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
@@ -276,11 +278,12 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 		give_up(guard, report, AVC_REASON_EMPTY, &error);
 	} else if (!bring_back(guard, report, reason, had, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
-	} else if (guard->target.pid) {
-		hold_all(guard);
+	} else {
+		if (guard->target.pid)
+			hold_all(guard);
+		guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
+							   : UINT64_MAX;
 	}
-	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
-						   : UINT64_MAX;
 out:
 	urgent_end();
 	guard->restore_asked = AVC_REASON_NONE;

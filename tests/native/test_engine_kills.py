@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from harness import wait_until
-from native.family import children_of, look
+from native.family import children_of, kill_main, look
 from native.guarded import GuardProcess, Victim, config, kill_at_random
 
 KILLS = 12
@@ -82,3 +82,15 @@ def test_templates_that_go_with_their_container_are_no_news(command: str, tmp_pa
         os.kill(victim.pid, signal.SIGKILL)
         guard.wait("ended", since=since)
         assert not [event for event in guard.events[since:] if event.get("kind") == "dropped"]
+
+
+def test_why_it_ended_is_what_is_told_last(tmp_path: Path) -> None:
+    """A checkpoint that is due while init ends is not a missed one."""
+    often = config(0.001, restore_on_signal=False)
+    with Victim("tree 8", tmp_path) as victim, GuardProcess(often, [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        since = guard.mark()
+        kill_main(victim)
+        guard.wait("ended", since=since)
+        kinds = [event["kind"] for event in guard.events[since:]]
+        assert kinds[kinds.index("gave_up") :] == ["gave_up", "ended"]
