@@ -25,6 +25,7 @@ from avckpt_hooks import protocol
 import avckpt
 from avckpt import artifacts, containers_conf
 from avckpt.errors import ConfigError, Denied
+from avckpt.records import Records
 
 LIBEXEC = Path("/usr/local/libexec/avckpt")
 SHARE = Path("/usr/local/share/avckpt")
@@ -230,7 +231,11 @@ def service_problems() -> list[str]:
 def uninstall(root: Path = _HOST) -> list[str]:
     """Removes exactly what `install()` put in place.
 
-    Returns what was done, a line each.  Containers that run go on.  Raises
+    Returns what was done, a line each.  Containers that run go on, and are not
+    protected any more when they are started again.  Those that run with our
+    hooks call them once more, when they end: until then the program stays, for
+    crun can die of one that is not there (SIGPIPE: it writes to the hook without
+    knowing whether that could be started), and `podman stop` fails.  Raises
     ConfigError.
     """
     if os.geteuid() != 0:
@@ -238,12 +243,23 @@ def uninstall(root: Path = _HOST) -> list[str]:
     manifest = Manifest.read(root)
     if manifest is None:
         return ["nothing is installed"]
+    callers = _callers(root)
+    kept = [path for path in manifest.files if callers and (path == HOOK_PROGRAM or _PACKAGE in path.parents)]
+    in_use = {folder for path in kept for folder in path.parents}
     done = []
     # Backwards: Podman forgets the hooks before they are gone.
-    for path in (*reversed(manifest.files), MANIFEST):
-        if _remove(under(root, path)):
+    for path in (*reversed(manifest.files), *([] if kept else [MANIFEST])):
+        if path not in kept and _remove(under(root, path)):
             done.append(f"removed {path}")
+    if kept:
+        in_use.update(MANIFEST.parents)
+        _record(root, kept, list(manifest.directories))
+        done.append(
+            f"left {HOOK_PROGRAM}: {', '.join(callers)} will call it when ended; run avckpt uninstall again then"
+        )
     for path in reversed(manifest.directories):
+        if path in in_use:
+            continue
         try:
             under(root, path).rmdir()
         except FileNotFoundError:
@@ -253,6 +269,15 @@ def uninstall(root: Path = _HOST) -> list[str]:
         else:
             done.append(f"removed {path}")
     return done
+
+
+def _callers(root: Path) -> list[str]:
+    """The names of running containers that were started with our hooks."""
+    names = []
+    for container, pidfd in Records(under(root, Path(protocol.records_dir()).absolute())).adoptable(lambda _: False):
+        os.close(pidfd)
+        names.append(container.name or container.id[:12])
+    return names
 
 
 def under(root: Path, path: Path) -> Path:

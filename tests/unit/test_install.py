@@ -18,6 +18,9 @@ import avckpt_hooks
 import pytest
 from avckpt import artifacts, install
 from avckpt.errors import ConfigError
+from avckpt.process import start_time
+from avckpt_hooks import protocol
+from avckpt_hooks.protocol import Register
 
 if os.geteuid() != 0:
     pytest.skip("avckpt install needs root", allow_module_level=True)
@@ -94,6 +97,34 @@ def test_uninstall_leaves_what_others_put_there(root: Path) -> None:
     assert [path.read_text() for path in kept] == ["mine", "mine"]
     assert "left /run/avckpt: it holds other files" in done
     assert not (root / "usr/local/libexec").exists()
+
+
+def test_uninstall_leaves_the_program_that_running_containers_will_call(root: Path) -> None:
+    before = tree(root)
+    install.install(root)
+    with subprocess.Popen(["sleep", "100"]) as container:
+        record = Register(
+            id="a" * 64, name="lidar", pid=container.pid, starttime=start_time(container.pid), bundle="", annotations={}
+        )
+        folder = install.under(root, Path(protocol.records_dir()))
+        folder.mkdir()
+        (folder / f"{record.id}.json").write_text(json.dumps(record.record()))
+        done = install.uninstall(root)
+        assert (
+            "left /usr/local/libexec/avckpt/avckpt-hook: lidar will call it when ended; run avckpt uninstall again then"
+        ) in done
+        assert not (root / "etc/containers/containers.conf.d/50-avckpt.conf").exists()
+        assert not (root / "usr/local/libexec/avckpt/avckpt-init").exists()
+        hook = [root / "usr/local/libexec/avckpt/avckpt-hook"]
+        assert "give one of" in subprocess.run(hook, capture_output=True, text=True, check=False).stderr
+        assert install.uninstall(root)  # still
+        assert hook[0].exists()
+        container.kill()
+    install.uninstall(root)
+    folder.rmdir()
+    folder.parent.rmdir()
+    assert tree(root) == before
+    assert install.uninstall(root) == ["nothing is installed"]
 
 
 def test_again_changes_nothing_that_matters(root: Path) -> None:
