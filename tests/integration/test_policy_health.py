@@ -90,7 +90,9 @@ def test_a_check_that_hangs_has_failed(sidecar: Sidecar, container: ContainerFac
     def left() -> str:
         return victim.container.exec("pgrep", "-f", "sleep 1000", check=False).stdout
 
-    wait_until(lambda: left() == "", 5, "nothing of the checks is left")
+    # With systemd, Podman checks as well, and leaves behind what hangs.
+    if not os.path.isdir("/run/systemd/system"):
+        wait_until(lambda: left() == "", 5, "nothing of the checks is left")
     wait_told(sidecar, victim.container, "health", "passes again")
     victim.wait_beats()
 
