@@ -272,8 +272,9 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		if (guard->tree.member[i]->pid)
 			target_kill(guard->tree.member[i]);
-	link_kill_leftovers(&guard->link, is_ours, reap_tracees, guard);
-	if (!guard->count) {
+	if (link_kill_leftovers(&guard->link, is_ours, reap_tracees, guard, &error)) {
+		give_up(guard, report, AVC_REASON_FAILED, &error);
+	} else if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
 		give_up(guard, report, AVC_REASON_EMPTY, &error);
 	} else if (!bring_back(guard, report, reason, had, &error)) {

@@ -1232,9 +1232,9 @@ void link_working(struct link *link);
 void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),
 		    const void *arg);
 /* Kills what the dead app left behind: children of init, but those to keep.  tend() is called
- * while it waits for their end. */
-void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
-			 void (*tend)(void *arg), void *arg);
+ * while it waits for their end.  0: none of them runs any more; AVC_DEADLINE: one does. */
+int link_kill_leftovers(struct link *link, bool (*keep)(pid_t pid, const void *arg),
+			void (*tend)(void *arg), void *arg, struct avc_error *err) warn_unused;
 
 /* ---- engine.c --------------------------------------------------------------------------- */
 

@@ -18,7 +18,11 @@
 #include "internal.h"
 
 #define LEFTOVERS_NS (100 * NS_PER_MS)
+/* On a busy machine it may take long until a killed process gets a CPU to end on.  Until then it
+ * can take what is put back into a pipe: a read(2) that finds something does not look for signals. */
+#define LEFTOVERS_ALIVE_NS (10 * NS_PER_S)
 #define LEFTOVERS_US 100
+#define LEFTOVERS_LONG_US 1000
 #define WORKING_NS (100 * NS_PER_MS)
 
 void link_init(struct link *link)
@@ -227,17 +231,27 @@ void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void
 	} while (any);
 }
 
-void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const void *arg),
-			 void (*tend)(void *arg), void *arg)
+/* What can still touch what the app shares with others: not yet on its way out, or one of its
+ * threads is not. */
+static bool may_run(const struct proc_stat *stat)
 {
-	const uint64_t end = now_ns() + LEFTOVERS_NS;
+	return (stat->state != 'Z' && stat->state != 'X') || stat->threads > 1;
+}
+
+int link_kill_leftovers(struct link *link, bool (*keep)(pid_t pid, const void *arg),
+			void (*tend)(void *arg), void *arg, struct avc_error *err)
+{
+	const uint64_t start = now_ns();
+	pid_t alive;
 
 	/* What a killed process leaves becomes init's child in its turn. */
-	do {
+	for (;;) {
 		pid_t children[CHILDREN_MAX];
 		const int count = proc_children(link->init, children, CHILDREN_MAX);
+		const uint64_t took_ns = now_ns() - start;
 		bool any = false;
 
+		alive = 0;
 		for (int i = 0; i < count; i++) {
 			struct proc_stat stat;
 
@@ -245,12 +259,19 @@ void link_kill_leftovers(const struct link *link, bool (*keep)(pid_t pid, const 
 			    stat.parent != link->init)
 				continue;
 			any = true; /* its number is not free before init has waited for it */
-			if (stat.state != 'Z')
-				kill(children[i], SIGKILL);
+			if (!may_run(&stat))
+				continue;
+			alive = children[i];
+			kill(alive, SIGKILL);
 		}
-		if (!any)
-			return;
+		/* A zombie's number may be needed, and may be not: that shows soon enough. */
+		if (!any || (!alive && took_ns > LEFTOVERS_NS))
+			return 0;
+		if (took_ns > LEFTOVERS_ALIVE_NS)
+			return fail(err, AVC_DEADLINE, 0, alive, "restore", "",
+				    "a process that was killed does not end");
+		link_working(link);
 		tend(arg);
-		usleep(LEFTOVERS_US);
-	} while (now_ns() < end);
+		usleep(took_ns < LEFTOVERS_NS ? LEFTOVERS_US : LEFTOVERS_LONG_US);
+	}
 }

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from harness import wait_until
+from native.family import children_of, kill_main
 from native.guarded import GuardProcess, Victim, config
 
 ENOUGH = 6
@@ -121,3 +122,40 @@ def test_restored_while_starved(cpus: tuple[int, int], tmp_path: Path) -> None:
                 restored = guard.wait("restored", since=since)
                 assert restored["generation"] == 2, (n, restored)
         victim.wait_beats(20)
+
+
+# Nobody else gets the CPU for a while that is less than what real-time tasks may have of a second.
+ALL_OF_IT = """
+import os, time
+os.sched_setaffinity(0, {int(os.sys.argv[1])})
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+print("ready", flush=True)
+end = time.monotonic() + 0.6
+while time.monotonic() < end:
+    pass
+"""
+
+
+def test_who_was_killed_and_has_yet_to_die_takes_nothing(cpus: tuple[int, int], tmp_path: Path) -> None:
+    """A child that waits at a pipe would read what the restore puts back, and its number is still its own."""
+    with Victim("errands", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        [child] = children_of(victim.app)
+        wait_until(lambda: victim.see().counter[0] == 1, 5, "an errand is in the pipe")
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert victim.see().counter[0] == 1
+        wait_until(lambda: victim.see().counter[0] == 2, 5, "the child waits for one")
+        time.sleep(0.05)
+        put_on(cpus[0], child)
+        for pid in (victim.pid, victim.app, guard.pid):
+            put_on(cpus[1], pid)
+        since = guard.mark()
+        with subprocess.Popen([sys.executable, "-c", ALL_OF_IT, str(cpus[0])], stdout=subprocess.PIPE) as starver:
+            assert starver.stdout is not None
+            if starver.stdout.readline() != b"ready\n":
+                pytest.skip("no real-time scheduling here, so nobody can be starved")
+            kill_main(victim)
+            assert starver.wait() == 0
+        guard.wait("restored", since=since)
+        done = victim.see().counter[1]
+        wait_until(lambda: victim.see().counter[1] > done + 3 or victim.see().violations, 10, "errands are run")
+        assert not victim.see().violations, victim.said
