@@ -458,19 +458,18 @@ def test_a_slow_machine_does_not_keep_a_container_from_running(
 def test_uninstalled_while_a_container_runs(machine: None, podman: Podman, name: str) -> None:
     """It ends as it was to end, in order, and only then the last of the hooks is gone."""
     factory = ContainerFactory(podman, name)
-    try:
-        with hooks_installed():
-            container = factory.protected("sh", "-c", f"{SHOW_PID_1}; sleep 300", options=["--network=none"])
-            container.wait_for_log(INIT)
-            said = run([*avckpt_command(), "uninstall"]).stdout
-            assert f"left /usr/local/libexec/avckpt/avckpt-hook: {container.name} will call it when ended" in said
-            container.stop(timeout_s=3)
-            assert container.status == "exited"
-            assert not os.path.exists(protocol.record_path(container.id))
-            assert "avckpt-hook" in run([*avckpt_command(), "uninstall"]).stdout
-            assert not os.path.exists("/usr/local/libexec/avckpt")
-    finally:
-        factory.close()
+    with hooks_installed(), contextlib.ExitStack() as undo:
+        undo.callback(run, [*avckpt_command(), "install"])  # others may count on them
+        undo.callback(factory.close)
+        container = factory.protected("sh", "-c", f"{SHOW_PID_1}; sleep 300", options=["--network=none"])
+        container.wait_for_log(INIT)
+        said = run([*avckpt_command(), "uninstall"]).stdout
+        assert f"left /usr/local/libexec/avckpt/avckpt-hook: {container.name} will call it when ended" in said
+        container.stop(timeout_s=3)
+        assert container.status == "exited"
+        assert not os.path.exists(protocol.record_path(container.id))
+        assert "avckpt-hook" in run([*avckpt_command(), "uninstall"]).stdout
+        assert not os.path.exists("/usr/local/libexec/avckpt")
 
 
 @pytest.mark.skipif(
