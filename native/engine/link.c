@@ -242,13 +242,14 @@ int link_kill_leftovers(struct link *link, bool (*keep)(pid_t pid, const void *a
 			void (*tend)(void *arg), void *arg, struct avc_error *err)
 {
 	const uint64_t start = now_ns();
+	uint64_t alive_ns = start;
 	pid_t alive;
 
 	/* What a killed process leaves becomes init's child in its turn. */
 	for (;;) {
 		pid_t children[CHILDREN_MAX];
 		const int count = proc_children(link->init, children, CHILDREN_MAX);
-		const uint64_t took_ns = now_ns() - start;
+		const uint64_t now = now_ns();
 		bool any = false;
 
 		alive = 0;
@@ -262,16 +263,17 @@ int link_kill_leftovers(struct link *link, bool (*keep)(pid_t pid, const void *a
 			if (!may_run(&stat))
 				continue;
 			alive = children[i];
+			alive_ns = now;
 			kill(alive, SIGKILL);
 		}
 		/* A zombie's number may be needed, and may be not: that shows soon enough. */
-		if (!any || (!alive && took_ns > LEFTOVERS_NS))
+		if (!any || now - alive_ns > LEFTOVERS_NS)
 			return 0;
-		if (took_ns > LEFTOVERS_ALIVE_NS)
+		if (alive && now - start > LEFTOVERS_ALIVE_NS)
 			return fail(err, AVC_DEADLINE, 0, alive, "restore", "",
 				    "a process that was killed does not end");
 		link_working(link);
 		tend(arg);
-		usleep(took_ns < LEFTOVERS_NS ? LEFTOVERS_US : LEFTOVERS_LONG_US);
+		usleep(now - start < LEFTOVERS_NS ? LEFTOVERS_US : LEFTOVERS_LONG_US);
 	}
 }

@@ -253,7 +253,10 @@ def uninstall(root: Path = _HOST) -> list[str]:
             done.append(f"removed {path}")
     if kept:
         in_use.update(MANIFEST.parents)
-        _record(root, kept, list(manifest.directories))
+        try:
+            _record(root, kept, list(manifest.directories))
+        except OSError as error:
+            raise ConfigError(f"{MANIFEST} can not be written: {error.strerror}; run avckpt uninstall again") from error
         done.append(
             f"left {HOOK_PROGRAM}: {', '.join(callers)} will call it when ended; run avckpt uninstall again then"
         )
