@@ -16,6 +16,7 @@ import json
 import os
 import stat
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from avckpt_hooks import protocol
 
 import avckpt
 from avckpt import artifacts, containers_conf
-from avckpt.errors import ConfigError, Denied
+from avckpt.errors import ConfigError, Denied, TargetGone
+from avckpt.process import age_s
 from avckpt.records import Records
 
 LIBEXEC = Path("/usr/local/libexec/avckpt")
@@ -215,17 +217,24 @@ def service_problems() -> list[str]:
     except OSError:
         return []
     found = []
-    for process in psutil.process_iter(["cmdline", "create_time", "uids"]):
+    for process in psutil.process_iter(["cmdline", "uids"]):
         command = process.info["cmdline"] or [""]
         if Path(command[0]).name != "podman" or ("system", "service") not in zip(command, command[1:]):
             continue
         chosen = any(word.startswith("--hooks-dir") for word in command)
-        if not chosen and process.info["uids"].real == 0 and process.info["create_time"] < installed_at:
+        if not chosen and process.info["uids"].real == 0 and _is_older(process.pid, installed_at):
             found.append(
                 f"Podman's service (process {process.pid}) is older than the installation and calls no hooks: "
                 "sudo systemctl restart podman.service, or end it and start it again as you did"
             )
     return found
+
+
+def _is_older(pid: int, than: float) -> bool:
+    """psutil's create_time() is up to a second early: the kernel tells when it booted in whole seconds."""
+    with contextlib.suppress(TargetGone):
+        return age_s(pid) > time.time() - than
+    return False
 
 
 def uninstall(root: Path = _HOST) -> list[str]:
