@@ -254,14 +254,13 @@ def uninstall(root: Path = _HOST) -> list[str]:
         return ["nothing is installed"]
     callers = _callers(root)
     kept = [path for path in manifest.files if callers and (path == HOOK_PROGRAM or _PACKAGE in path.parents)]
-    in_use = {folder for path in kept for folder in path.parents}
+    left = [*kept, MANIFEST] if kept else []
     done = []
     # Backwards: Podman forgets the hooks before they are gone.
-    for path in (*reversed(manifest.files), *([] if kept else [MANIFEST])):
-        if path not in kept and _remove(under(root, path)):
+    for path in (*reversed(manifest.files), MANIFEST):
+        if path not in left and _remove(under(root, path)):
             done.append(f"removed {path}")
     if kept:
-        in_use.update(MANIFEST.parents)
         try:
             _record(root, kept, list(manifest.directories))
         except OSError as error:
@@ -269,6 +268,7 @@ def uninstall(root: Path = _HOST) -> list[str]:
         done.append(
             f"left {HOOK_PROGRAM}: {', '.join(callers)} will call it when ended; run avckpt uninstall again then"
         )
+    in_use = {folder for path in left for folder in path.parents}
     for path in reversed(manifest.directories):
         if path in in_use:
             continue
