@@ -208,8 +208,7 @@ static void attach(struct avc_guard *guard)
 		}
 		guard->attached = true;
 		guard->unprotected = false;
-		guard->next_ns = guard->config.interval_ns ? now + guard->config.interval_ns
-							   : UINT64_MAX;
+		guard->next_ns = interval_end(guard);
 		{
 			const struct avc_event event = event_new(guard, AVC_EVENT_ATTACHED);
 

@@ -83,6 +83,8 @@ uint32_t all_stragglers(struct avc_guard *guard);
 /* ---- guard_configure.c ----------------------------------------------------- */
 
 int config_check(const struct avc_config *config, struct avc_error *err);
+/* When the next checkpoint is due, an interval from now; UINT64_MAX: on command only. */
+uint64_t interval_end(const struct avc_guard *guard);
 void config_set(struct avc_guard *guard, const struct avc_config *config);
 void take_config(struct avc_guard *guard);
 

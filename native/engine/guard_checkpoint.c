@@ -371,8 +371,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 	struct avc_error error = { 0 };
 	bool hopeless;
 
-	guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
-						   : UINT64_MAX;
+	guard->next_ns = interval_end(guard);
 	if (link_stop_asked(&guard->link)) {
 		if (ticket)
 			refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");

@@ -20,6 +20,13 @@ int config_check(const struct avc_config *config, struct avc_error *err)
 	return 0;
 }
 
+uint64_t interval_end(const struct avc_guard *guard)
+{
+	const uint64_t interval_ns = guard->config.interval_ns;
+
+	return interval_ns ? now_ns() + interval_ns : UINT64_MAX;
+}
+
 void config_set(struct avc_guard *guard, const struct avc_config *config)
 {
 	guard->config = *config;
@@ -56,7 +63,7 @@ void take_config(struct avc_guard *guard)
 		drop_generation(guard, dispensable(guard, false));
 	if (!guard->attached)
 		return;
-	next = config.interval_ns ? now_ns() + config.interval_ns : UINT64_MAX;
+	next = interval_end(guard);
 	if (next < guard->next_ns || !config.interval_ns)
 		guard->next_ns = next;
 }

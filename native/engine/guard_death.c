@@ -282,8 +282,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	} else {
 		if (guard->target.pid)
 			hold_all(guard);
-		guard->next_ns = guard->config.interval_ns ? now_ns() + guard->config.interval_ns
-							   : UINT64_MAX;
+		guard->next_ns = interval_end(guard);
 	}
 out:
 	urgent_end();
