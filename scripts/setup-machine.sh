@@ -23,7 +23,9 @@ PACKAGES=$PACKAGES,strace,gdb,psmisc,cyclonedds-dev,cyclonedds-tools
 # source_of KERNEL: the package, and where it comes from (sources.list(5), one line each).
 source_of() {
 	case $1 in
-	bookworm | trixie) printf '%s\n' linux-image-cloud-amd64 "deb $DEBIAN $1 main" ;;
+	bookworm) printf '%s\n' linux-image-cloud-amd64 "deb $DEBIAN $1 main" ;;
+	# Not the cloud's: the one with all drivers, for the tests of a vehicle's devices.
+	trixie) printf '%s\n' linux-image-amd64 "deb $DEBIAN $1 main" ;;
 	backports) printf '%s\n' linux-image-cloud-amd64/trixie-backports "deb $DEBIAN trixie main" \
 		"deb $DEBIAN trixie-backports main" ;;
 	jammy | noble) printf '%s\n' linux-image-virtual "deb [signed-by=$KEYRING] $UBUNTU $1 main" \
