@@ -367,7 +367,7 @@ class Sidecar:
         done = self.podman.run("inspect", "--format", "{{.State.Running}}", SIDECAR_NAME, check=False)
         return done.stdout.strip() == "true"
 
-    def start(self, timeout_s: float = 20.0) -> None:
+    def start(self, timeout_s: float = 20.0 * SLOWNESS) -> None:
         """Starts the container and waits until the daemon answers."""
         RUN_DIR.mkdir(mode=0o755, exist_ok=True)
         # Made by `avckpt install`; an older installation has none.

@@ -303,8 +303,9 @@ def test_a_container_registers_and_deregisters(
     assert records(run_dir) == [f"{container.id}.json"]
 
     podman.run("kill", "--signal", "KILL", container.name)
+    # The record goes first, and `podman kill` waits for neither.
     wait_until(lambda: records(run_dir) == [], 5, "record removed after podman kill")
-    assert receiver.deregistered == [container.id] * 2
+    wait_until(lambda: receiver.deregistered == [container.id] * 2, 5, "deregistered after podman kill")
 
 
 def test_a_container_removed_by_force_deregisters(make: ContainerFactory, receiver: Receiver, run_dir: Path) -> None:
