@@ -11,6 +11,7 @@ import signal
 import subprocess
 from collections.abc import Callable, Generator, Iterator
 
+import devices
 import harness
 import pytest
 from harness import CommandFailed, ContainerFactory, Podman, Sidecar
@@ -136,3 +137,17 @@ def sidecar(session_sidecar: Sidecar) -> Sidecar:
 def free_port() -> Callable[[], int]:
     """Gives a free TCP port at each call."""
     return harness.free_port
+
+
+@pytest.fixture
+def bus() -> Iterator[None]:
+    """A CAN interface."""
+    with devices.can_bus():
+        yield
+
+
+@pytest.fixture
+def camera() -> Iterator[None]:
+    """/dev/video0."""
+    with devices.video_camera():
+        yield

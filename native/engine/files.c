@@ -10,6 +10,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/kcmp.h>
+#include <linux/videodev2.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -65,6 +66,7 @@ void files_free(struct files *files)
 		free(f->content);
 	}
 	free(files->file);
+	free(files->area);
 	free(files);
 }
 
@@ -287,6 +289,7 @@ static bool look_at_inherited(const struct look *look, int number, struct file *
 		.bytes = is->bytes,
 		.modified = is->modified,
 		.changed = is->changed,
+		.video = is->video,
 		.inherited = is,
 	};
 	return take_known(look, f);
@@ -318,6 +321,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	const struct file *known;
 	const struct file_socket *socket;
 	uint32_t locks;
+	bool silent;
 	int fd;
 
 	if (files->count == files->room) {
@@ -396,6 +400,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	socket = known && look->depth == FILES_NOW ? known->socket : f->socket;
 	if (f->kind == FILE_SOCKET && (look->depth == FILES_NOW || look->files->with_tcp))
 		file_look_at_tcp(fd, f, socket);
+	silent = look->depth != FILES_NOW && file_is_video(f) && file_look_at_video(fd, &f->video);
 	if (look->depth == FILES_FROZEN && is_channel(f) && look->ours < OURS_MAX) {
 		f->ours = fd; /* until keep_contents() */
 		look->ours++;
@@ -403,6 +408,12 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		close(fd);
 	}
 	files->count++;
+	if (silent)
+		return fail(err, AVC_DEADLINE, 0, look->pid, "look at descriptors", "ioctl",
+			    "%s does not answer", f->name);
+	if (f->video.memory == V4L2_MEMORY_USERPTR)
+		return fail(err, AVC_UNSUPPORTED, 0, look->pid, "look at descriptors", "",
+			    "%s fills memory of the program's own (V4L2_MEMORY_USERPTR)", f->name);
 	return 0;
 }
 
@@ -686,6 +697,7 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	if (depth == FILES_FROZEN) {
 		check_shared(files, pid);
 		files_find_peers(files, pid); /* of pairs that are quite new */
+		files_find_areas(files, pid);
 		keep_contents(&look);
 	} else {
 		find_shared(files, pid);

@@ -12,6 +12,7 @@
  *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
  *   files_watches.c inotify
+ *   files_video.c   buffers of cameras
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *   files_mapped.c  the same of files that are mapped
  *   files_written.c the same of files that are not open any more
@@ -65,6 +66,19 @@ struct file_mark { /* of inotify                                               *
 	uint8_t handle[128]; /* open_by_handle_at(2)                           */
 };
 
+/* A camera with buffers, of V4L2.                                              */
+struct file_video {
+	uint32_t type, memory, count; /* 0: it has none                           */
+	uint64_t held; /* those that the program has, by index; the others are the driver's */
+};
+
+/* Where a camera's buffers are mapped.                                        */
+struct file_area {
+	avc_remote start;
+	uint64_t bytes, offset;
+	int protection, fd;
+};
+
 struct file_socket {
 	int domain, type, protocol;
 	bool listening, connected;
@@ -72,10 +86,10 @@ struct file_socket {
 	int backlog; /* -1: not asked yet                                         */
 	/* Of those that can be made again: file_socket_is_alone()                 */
 	uint32_t uid, gid;
-	uint32_t option_count;
 	struct file_option *option; /* files_options.c, allocated               */
-	struct file_node *node;     /* files_unix.c, allocated, NULL: none or not known */
-	uint64_t peer;              /* inode of the other end of a Unix socket, 0: not known    */
+	size_t option_bytes;
+	struct file_node *node; /* files_unix.c, allocated, NULL: none or not known */
+	uint64_t peer;          /* inode of the other end of a Unix socket, 0: not known    */
 	socklen_t local_bytes, remote_bytes;
 	struct sockaddr_storage local, remote;
 };
@@ -134,16 +148,19 @@ struct file {
 	bool content_lost; /* there was something that can not be put back          */
 	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
+	struct file_video video;
 	/* The same open file description in `kin` of files_look(); NULL: not known to be */
 	const struct file *inherited;
 };
 
 struct files {
 	uint32_t count, room;
-	bool several;      /* other processes may have the other ends of pipes        */
-	bool with_tcp;     /* count the bytes of connections, during a freeze, too      */
-	uint64_t taken_ns; /* CLOCK_REALTIME                                       */
-	struct file *file; /* by fd, ascending                                     */
+	bool several;           /* other processes may have the other ends of pipes        */
+	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
+	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */
+	struct file *file;      /* by fd, ascending                                     */
+	struct file_area *area; /* allocated                                       */
+	uint32_t areas;
 	/* During a freeze: a table that has just been looked at.  What this one has in common
 	 * with it, as children have with their parents, is not looked at again. */
 	const struct files *kin;
@@ -241,6 +258,16 @@ const char *file_put_stream(int fd, const struct file *want, const struct file *
 /* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is
  * (NULL: fresh).  Returns NULL or why not all of them. */
 const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init);
+
+/* files_video.c */
+bool file_is_video(const struct file *file);
+/* Only who streams has buffers: not who has the same camera open beside him.  -1: it does not
+ * answer before the guard's deadline. */
+int file_look_at_video(int fd, struct file_video *video) warn_unused;
+/* May wait until the camera has filled what was given back to it since.  Returns NULL or
+ * what failed. */
+const char *file_put_video(int fd, const struct file_video *want);
+void files_find_areas(struct files *files, pid_t pid);
 
 /* files_make.c */
 /* Of a pseudoterminal, the side that programs run on. */

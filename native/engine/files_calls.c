@@ -7,6 +7,7 @@
 #include <fcntl.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/mman.h>
 #include <sys/resource.h>
 #include <sys/syscall.h>
 
@@ -156,6 +157,17 @@ static void list_listen(const struct files_work *work, struct setup *setup, cons
 			->flags = INJ_MAY_FAIL;
 }
 
+/* The template has let go of them (files_video.c). */
+static void list_area(struct setup *setup, const struct file_area *area)
+{
+	struct inj_setup *map = setup_add(setup, INJ_DESCRIPTORS, "mmap", SYS_mmap, area->start,
+					  area->bytes, (uint64_t)area->protection,
+					  MAP_SHARED | MAP_FIXED, (uint64_t)area->fd);
+
+	map->call.arg[5] = area->offset;
+	map->flags = INJ_MAY_FAIL;
+}
+
 void files_list_calls(struct files_work *work)
 {
 	struct inj_slot *slot = pad_slot(&work->target->pad, work->generation->slot);
@@ -170,6 +182,8 @@ void files_list_calls(struct files_work *work)
 	};
 	slot->setup[INJ_DESCRIPTORS] = 0;
 	slot->setup[INJ_OWNERS] = 0;
+	for (uint32_t i = 0; i < work->want->areas; i++)
+		list_area(setup, &work->want->area[i]);
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->want->file[i].pid_inside)
 			list_pidfd(setup, &work->want->file[i]);
@@ -202,5 +216,5 @@ void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struc
 	if (failed)
 		fail(notes, AVC_KERNEL, (int)-failed->call.result, inside, "restore descriptors",
 		     failed->name, "descriptor %d is not quite as it was",
-		     (int)failed->call.arg[0]);
+		     (int)failed->call.arg[failed->call.nr == SYS_mmap ? 4 : 0]);
 }

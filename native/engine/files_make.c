@@ -150,6 +150,8 @@ static int make_named(const struct file *want, pid_t template, pid_t init, const
 	return fd >= 0 ? fd : open_empty(want);
 }
 
+static const char not_again[] = "it was closed since the checkpoint and can not be made again";
+
 /* In the app's network namespace, or it would get a way into ours. */
 static int socket_of(pid_t template, int domain, int type, int protocol)
 {
@@ -205,7 +207,7 @@ int file_make_dead(const struct file *want, pid_t template)
 	return ends[0];
 }
 
-static int bind_inet(int fd, const struct file_socket *s, const char **why)
+static int bind_socket(int fd, const struct file_socket *s, const char **why)
 {
 	const int yes = 1;
 
@@ -233,8 +235,12 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 	const char *problem;
 	int fd;
 
-	if (!s || !file_socket_is_alone(s))
+	if (!s || !file_socket_is_alone(s)) {
+		/* A connection that was closed is nothing to tell. */
+		if (s && s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6)
+			*why = not_again;
 		return file_make_dead(want, template);
+	}
 	fd = socket_of(template, s->domain, s->type, s->protocol);
 	if (fd < 0)
 		return file_make_dead(want, template);
@@ -243,7 +249,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 		*why = "it does not belong to its user any more";
 	file_put_options(fd, s);
 	if (s->domain == AF_UNIX ? file_bind_unix(fd, s, template, init, why)
-				 : bind_inet(fd, s, why)) {
+				 : bind_socket(fd, s, why)) {
 		close(fd);
 		return file_make_dead(want, template);
 	}
@@ -325,7 +331,7 @@ int file_make(const struct file *want, pid_t template, pid_t init, const char **
 	case FILE_OTHER:
 		break;
 	}
-	*why = "it was closed since the checkpoint and can not be made again";
+	*why = not_again;
 	return open_empty(want);
 }
 

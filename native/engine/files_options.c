@@ -4,6 +4,8 @@
  * option that a new socket has anyway is not set, so that nothing is asked of the kernel that
  * the app had not asked for.
  */
+#include <linux/can/isotp.h>
+#include <linux/can/raw.h>
 #include <linux/netlink.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -107,46 +109,94 @@ static const struct {
 	{ SOL_NETLINK, NETLINK_CAP_ACK, 0 },
 	{ SOL_NETLINK, NETLINK_EXT_ACK, 0 },
 	{ SOL_NETLINK, NETLINK_GET_STRICT_CHK, 0 },
+	{ SOL_CAN_RAW, CAN_RAW_FILTER, 0 },
+	{ SOL_CAN_RAW, CAN_RAW_ERR_FILTER, 0 },
+	{ SOL_CAN_RAW, CAN_RAW_LOOPBACK, 0 },
+	{ SOL_CAN_RAW, CAN_RAW_RECV_OWN_MSGS, 0 },
+	{ SOL_CAN_RAW, CAN_RAW_FD_FRAMES, 0 },
+	{ SOL_CAN_RAW, CAN_RAW_JOIN_FILTERS, 0 },
+	{ SOL_CAN_ISOTP, CAN_ISOTP_OPTS, 0 },
+	{ SOL_CAN_ISOTP, CAN_ISOTP_RECV_FC, 0 },
+	{ SOL_CAN_ISOTP, CAN_ISOTP_TX_STMIN, 0 },
+	{ SOL_CAN_ISOTP, CAN_ISOTP_RX_STMIN, 0 },
+	{ SOL_CAN_ISOTP, CAN_ISOTP_LL_OPTS, 0 },
 };
 
 #define OPTIONS (sizeof options / sizeof *options)
 
+/* The longest there is: as many filters as a CAN socket can have. */
+#define VALUE_MAX (CAN_RAW_FILTER_MAX * sizeof(struct can_filter))
+
 struct file_option {
-	uint8_t which; /* of options[]                                           */
-	uint8_t bytes;
-	uint8_t value[16]; /* the longest: a struct timeval, a name                 */
+	uint32_t which; /* of options[]                                          */
+	uint32_t bytes;
+	uint8_t value[];
 };
 
-static bool read_option(int fd, size_t which, struct file_option *option)
-{
-	socklen_t bytes = sizeof option->value;
+union any_option {
+	struct file_option option;
+	uint8_t room[sizeof(struct file_option) + VALUE_MAX];
+};
 
-	*option = (struct file_option){ .which = (uint8_t)which };
+static bool read_option(int fd, uint32_t which, struct file_option *option)
+{
+	socklen_t bytes = VALUE_MAX;
+
 	if (getsockopt(fd, options[which].level, options[which].name, option->value, &bytes))
 		return false;
-	option->bytes = (uint8_t)bytes;
+	option->which = which;
+	option->bytes = bytes;
 	return true;
+}
+
+/* They stand one behind the other. */
+static size_t size_of(const struct file_option *option)
+{
+	return (sizeof *option + option->bytes + 3) & ~(size_t)3;
+}
+
+static const struct file_option *first_option(const struct file_socket *s)
+{
+	return s->option_bytes ? s->option : NULL;
+}
+
+static const struct file_option *next_option(const struct file_socket *s,
+					     const struct file_option *option)
+{
+	const uint8_t *next = (const uint8_t *)option + size_of(option);
+
+	return next < (const uint8_t *)s->option + s->option_bytes
+		       ? (const struct file_option *)(const void *)next
+		       : NULL;
 }
 
 static void read_options(int fd, struct file_socket *s)
 {
-	struct file_option all[OPTIONS];
-	uint32_t count = 0;
+	union any_option one;
 
-	for (size_t i = 0; i < OPTIONS; i++)
-		count += read_option(fd, i, &all[count]);
-	s->option = calloc(count + 1, sizeof *s->option);
-	if (!s->option)
-		return;
-	memcpy(s->option, all, count * sizeof *s->option);
-	s->option_count = count;
+	free(s->option);
+	s->option = NULL;
+	s->option_bytes = 0;
+	for (uint32_t i = 0; i < OPTIONS; i++) {
+		uint8_t *more;
+
+		if (!read_option(fd, i, &one.option))
+			continue;
+		more = realloc(s->option, s->option_bytes + size_of(&one.option));
+		if (!more)
+			return;
+		memcpy(more + s->option_bytes, &one, size_of(&one.option));
+		s->option = (struct file_option *)(void *)more;
+		s->option_bytes += size_of(&one.option);
+	}
 }
 
 static bool same_option(int fd, const struct file_option *option)
 {
-	struct file_option now;
+	union any_option now;
 
-	return read_option(fd, option->which, &now) && !memcmp(&now, option, sizeof now);
+	return read_option(fd, option->which, &now.option) && now.option.bytes == option->bytes &&
+	       !memcmp(now.option.value, option->value, option->bytes);
 }
 
 static void set_option(int fd, const struct file_option *option)
@@ -169,11 +219,11 @@ const char *file_put_options(int fd, const struct file_socket *s)
 {
 	const char *problem = NULL;
 
-	for (uint32_t i = 0; i < s->option_count; i++) {
-		if (same_option(fd, &s->option[i]))
+	for (const struct file_option *o = first_option(s); o; o = next_option(s, o)) {
+		if (same_option(fd, o))
 			continue;
-		set_option(fd, &s->option[i]);
-		if (!same_option(fd, &s->option[i]))
+		set_option(fd, o);
+		if (!same_option(fd, o))
 			problem = "not all of its options could be put back";
 	}
 	return problem;
@@ -194,6 +244,8 @@ bool file_socket_is_alone(const struct file_socket *s)
 		return true;
 	if (s->domain == AF_UNIX)
 		return file_unix_is_alone(s);
+	if (s->domain == AF_CAN)
+		return s->protocol == CAN_RAW || s->protocol == CAN_ISOTP;
 	return (s->domain == AF_INET || s->domain == AF_INET6 || s->domain == AF_NETLINK) &&
 	       (s->type != SOCK_STREAM || s->listening);
 }

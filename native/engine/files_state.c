@@ -5,6 +5,7 @@
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/can/isotp.h>
 #include <linux/netlink.h>
 #include <linux/sock_diag.h>
 #include <linux/sockios.h>
@@ -57,6 +58,17 @@ static bool is_idle(int fd, const struct file_socket *s)
 	return s->type == SOCK_DGRAM || state.revents & POLLHUP;
 }
 
+/* net/can/af_can.c does not remember it: 0, if it can not be told from another one. */
+static int can_protocol(int fd, int type)
+{
+	struct can_isotp_options options;
+	socklen_t bytes = sizeof options;
+
+	if (type == SOCK_RAW)
+		return CAN_RAW;
+	return getsockopt(fd, SOL_CAN_ISOTP, CAN_ISOTP_OPTS, &options, &bytes) ? 0 : CAN_ISOTP;
+}
+
 void file_look_at_socket(int fd, struct file *file)
 {
 	struct file_socket *s = calloc(1, sizeof *s);
@@ -65,7 +77,8 @@ void file_look_at_socket(int fd, struct file *file)
 		return;
 	s->domain = option(fd, SOL_SOCKET, SO_DOMAIN);
 	s->type = option(fd, SOL_SOCKET, SO_TYPE);
-	s->protocol = option(fd, SOL_SOCKET, SO_PROTOCOL);
+	s->protocol = s->domain == AF_CAN ? can_protocol(fd, s->type)
+					  : option(fd, SOL_SOCKET, SO_PROTOCOL);
 	s->listening = option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0;
 	s->local_bytes = sizeof s->local;
 	if (getsockname(fd, (struct sockaddr *)&s->local, &s->local_bytes))
@@ -569,6 +582,13 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 	case FILE_TIMERFD:
 		other = put_timer(fd, want);
 		problem = problem ? problem : other;
+		break;
+	case FILE_DEVICE:
+		/* One that was opened anew has lost more, and that is told. */
+		if (now && file_is_video(want)) {
+			other = file_put_video(fd, &want->video);
+			problem = problem ? problem : other;
+		}
 		break;
 	case FILE_SIGNALFD:
 		if ((!now || now->mask != want->mask) &&

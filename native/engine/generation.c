@@ -295,7 +295,15 @@ int generation_finish(struct target *target, struct generation *generation, stru
 		return -1;
 	if (again.code)
 		*err = again;
-	return again.code || inherit_check(generation, err) ? -1 : 0;
+	if (again.code || inherit_check(generation, err))
+		return -1;
+	/* Not before its size was compared with the app's. */
+	files_unmap_areas(target, generation);
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target)
+			files_unmap_areas(generation->branch[i].target,
+					  generation->branch[i].image);
+	return 0;
 }
 
 void generation_close_files(struct target *target, struct generation *image)

@@ -477,6 +477,7 @@ struct link {
 int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
 void tracee_deadline_set(timer_t timer, uint64_t ns);
 void tracee_deadline_clear(timer_t timer);
+bool tracee_deadline_passed(void);
 
 enum stop_kind {
 	STOP_TRAP,  /* our PTRACE_INTERRUPT, or a new tracee's first stop     */
@@ -832,6 +833,8 @@ int files_capture(struct target *target, struct generation *generation, bool sev
 		  struct avc_error *err);
 /* After it. */
 void files_settle(struct target *target, struct generation *generation);
+/* Of cameras, in the template (files_video.c). */
+void files_unmap_areas(struct target *target, const struct generation *generation);
 /* The same for all processes: what they share of open files, and who of them is named.
  * `before`: the checkpoint before, or NULL. */
 void files_settle_family(const struct target *main, struct generation *generation,

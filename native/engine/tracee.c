@@ -88,6 +88,11 @@ void tracee_deadline_clear(timer_t timer)
 	deadline_ns = 0;
 }
 
+bool tracee_deadline_passed(void)
+{
+	return deadline_ns && now_ns() >= deadline_ns;
+}
+
 /* A killed leader is not reported as long as there are threads of it that were not
  * waited for, and those are waited for one after the other: by us. */
 static bool is_dying(pid_t tid)
@@ -107,7 +112,7 @@ struct stop tracee_wait(pid_t tid, int options)
 		r = waitpid(tid, &stop.status, __WALL | __WNOTHREAD | options);
 		if (r < 0 && errno == EINTR) {
 			stop.kind = is_dying(tid) ? STOP_DYING : STOP_DEADLINE;
-			if (stop.kind == STOP_DYING || (deadline_ns && now_ns() >= deadline_ns) ||
+			if (stop.kind == STOP_DYING || tracee_deadline_passed() ||
 			    (watched && __atomic_load_n(watched, __ATOMIC_ACQUIRE)))
 				return stop;
 			r = -2;

@@ -17,56 +17,14 @@ import pytest
 from avckpt.events import Files, Tcp
 from harness import wait_until
 from native.family import descendants
-from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random, since_linux
+from native.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, since_linux
 from native.meddle import get_fd
-
-KILLS = 6
+from native.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
 
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
-
-
-def checkpoint(guard: GuardProcess) -> Json:
-    """Takes one, once the guard has found the victim."""
-    guard.wait("attached")
-    return guard.command("checkpoint")
-
-
-def disturb(victim: Victim) -> None:
-    """Makes the victim change its descriptors, and waits until it has."""
-    before = victim.see().counter[2]
-    victim.kill_app(signal.SIGUSR1)
-    wait_until(lambda: victim.see().counter[2] > before or victim.see().violations, 5, "it has", 0.001)
-
-
-def wait_looked(victim: Victim, before: int) -> None:
-    """Until it has looked at its descriptors more often than `before`, and found nothing wrong."""
-    wait_until(lambda: victim.see().counter[1] > before or victim.see().violations, 5, "it has looked", 0.001)
-    victim.check()
-
-
-def restored(victim: Victim, guard: GuardProcess, *, looks: bool = True) -> Json:
-    """Kills it, and waits until it is there again, and has looked at its descriptors."""
-    before = victim.see().counter[1]
-    since = guard.mark()
-    victim.kill_app()
-    event = guard.wait("restored", since=since)
-    if looks:
-        wait_looked(victim, before)
-    victim.check()
-    return event
-
-
-def disturb_and_restore(victim: Victim, guard: GuardProcess) -> None:
-    """Again and again from each of two checkpoints: everything is put back, with nothing to be told."""
-    for _ in range(2):
-        checkpoint(guard)
-        for _kill in range(KILLS):
-            disturb(victim)
-            event = restored(victim, guard)
-            assert "error" not in event, event
 
 
 @pytest.mark.parametrize("where", WHERE)

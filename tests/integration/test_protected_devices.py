@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Protected containers that have devices of a vehicle: a CAN bus, a camera.
+
+make test-kernels KERNELS=trixie KERNEL_TESTS=tests/integration/test_protected_devices.py
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+from harness import ContainerFactory, Sidecar, take_checkpoint
+from integration.protected import QUICK, ProtectedVictim, start_victim
+from native.scenario import disturb_app
+
+KILLS = 6
+
+
+def crash_while_in_use(sidecar: Sidecar, victim: ProtectedVictim) -> None:
+    """After each restore the program tries its device, and nothing is missing that would be told."""
+    take_checkpoint(sidecar.avckpt, victim.container.name)
+    for n in range(1, KILLS + 1):
+        disturb_app(victim.app, victim.see)
+        entry = victim.kill(signal.SIGKILL)
+        assert (entry["state"], entry["restores"]) == ("protected", n)
+    lines = sidecar.avckpt("events", "--json").stdout.splitlines()
+    events = [event for event in map(json.loads, lines) if event["container"] == victim.container.name]
+    told = [event.get("error") for event in events if event["kind"] == "restored"]
+    assert told == [None] * KILLS
+
+
+ON_COMMAND = {**QUICK, "interval": "1h"}
+
+
+@pytest.mark.usefixtures("camera")
+def test_a_camera(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    options = ["--device=/dev/video0", "--cap-drop=all"]
+    victim = start_victim(
+        sidecar, container, tmp_path, "devices camera /board", labels=ON_COMMAND, options=options, generation=0
+    )
+    crash_while_in_use(sidecar, victim)
+
+
+@pytest.mark.parametrize("scenario", ["can", "buses"])
+@pytest.mark.usefixtures("bus")
+def test_a_bus(scenario: str, sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    options = ["--network=host", "--cap-drop=all"]
+    victim = start_victim(
+        sidecar, container, tmp_path, f"devices {scenario} /board", labels=ON_COMMAND, options=options, generation=0
+    )
+    crash_while_in_use(sidecar, victim)

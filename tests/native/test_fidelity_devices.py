@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Devices of a vehicle after a restore: a CAN bus, a camera, an input device.
+
+make test-kernels KERNELS=trixie KERNEL_TESTS=tests/native/test_fidelity_devices.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from devices import load_driver
+from native.guarded import WHERE, GuardProcess, Victim, config
+from native.scenario import checkpoint, disturb, disturb_and_restore, restored
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.usefixtures("bus")
+def test_a_bus(where: str, tmp_path: Path) -> None:
+    """Its sockets hear what they had asked for, and say in a cycle what they had been told."""
+    with (
+        Victim(f"devices can {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        disturb_and_restore(victim, guard)
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.usefixtures("bus")
+def test_a_bus_that_was_left(where: str, tmp_path: Path) -> None:
+    """Bound again, with their filters."""
+    with (
+        Victim(f"devices buses {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        disturb_and_restore(victim, guard)
+
+
+@pytest.mark.usefixtures("bus")
+def test_what_was_said_in_a_cycle_is_lost_with_its_socket(tmp_path: Path) -> None:
+    with Victim(f"devices cycle {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        assert "can not be made again" in restored(victim, guard)["error"]["detail"]
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("scenario", ["camera", "holding", "stopped", "unused", "again"])
+@pytest.mark.usefixtures("camera")
+def test_a_camera(scenario: str, where: str, tmp_path: Path) -> None:
+    """It films on, into all of its buffers, also after deaths with one of them in hand."""
+    with (
+        Victim(f"devices {scenario} {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        disturb_and_restore(victim, guard)
+
+
+@pytest.mark.usefixtures("camera")
+def test_a_camera_with_other_buffers_is_told(tmp_path: Path) -> None:
+    with Victim(f"devices changed {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        disturb(victim)
+        assert "its buffers are others now" in restored(victim, guard)["error"]["detail"]
+
+
+@pytest.mark.usefixtures("camera")
+def test_a_camera_that_fills_the_programs_memory_is_refused(tmp_path: Path) -> None:
+    """A restored program has other memory."""
+    with (
+        Victim(f"devices own {tmp_path}", tmp_path) as victim,
+        GuardProcess(config(0.02), [victim.pid]) as guard,
+    ):
+        told = guard.wait("unprotected")
+        assert told["error"]["kind"] == "unsupported"
+        assert "V4L2_MEMORY_USERPTR" in told["error"]["message"]
+        victim.wait_beats(20)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_an_input_device(where: str, tmp_path: Path) -> None:
+    load_driver("uinput")
+    with (
+        Victim(f"devices input {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        disturb_and_restore(victim, guard)
