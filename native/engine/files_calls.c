@@ -157,15 +157,21 @@ static void list_listen(const struct files_work *work, struct setup *setup, cons
 			->flags = INJ_MAY_FAIL;
 }
 
-/* The template has let go of them (files_video.c). */
+/* The template has let go of it (files_video.c).  A mapping that fails in its place would leave
+ * nothing there (mmap(2), MAP_FIXED), so it is made elsewhere first. */
 static void list_area(struct setup *setup, const struct file_area *area)
 {
-	struct inj_setup *map = setup_add(setup, INJ_DESCRIPTORS, "mmap", SYS_mmap, area->start,
-					  area->bytes, (uint64_t)area->protection,
-					  MAP_SHARED | MAP_FIXED, (uint64_t)area->fd);
+	struct inj_setup *map, *move;
 
+	map = setup_add(setup, INJ_DESCRIPTORS, "mmap", SYS_mmap, 0, area->bytes,
+			(uint64_t)area->protection, MAP_SHARED, (uint64_t)area->fd);
 	map->call.arg[5] = area->offset;
 	map->flags = INJ_MAY_FAIL;
+	move = setup_add(setup, INJ_DESCRIPTORS, "", SYS_mremap, 0, area->bytes, area->bytes,
+			 MREMAP_MAYMOVE | MREMAP_FIXED, area->start);
+	move->flags = INJ_MAY_FAIL;
+	if (!setup->full)
+		map->store = pad_remote(setup->pad, &move->call.arg[0]);
 }
 
 void files_list_calls(struct files_work *work)

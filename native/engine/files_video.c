@@ -207,6 +207,8 @@ void files_find_areas(struct files *files, pid_t pid)
 		}
 }
 
+/* Something else is mapped in their place: nothing must come to be there, and where a camera is
+ * lost for good, old pictures are black instead of deadly. */
 void files_unmap_areas(struct target *target, const struct generation *generation)
 {
 	struct inj_call *call = &pad_slot(&target->pad, generation->slot)->template_call;
@@ -215,11 +217,10 @@ void files_unmap_areas(struct target *target, const struct generation *generatio
 
 	for (uint32_t i = 0; i < files->areas;) {
 		call_begin(call, INJ_AFTER_PARK);
-		while (i < files->areas && call->count < INJ_CALLS_MAX) {
-			call_add(call, SYS_munmap, files->area[i].start, files->area[i].bytes, 0, 0,
-				 0);
-			i++;
-		}
+		for (uint32_t n = 0; i < files->areas && n < INJ_CALLS_MAX; n++, i++)
+			call_add(call, SYS_mmap, files->area[i].start, files->area[i].bytes,
+				 (uint64_t)files->area[i].protection,
+				 MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED | MAP_NORESERVE, ~0u);
 		if (pad_send(&target->pad, generation->template, &generation->base, call,
 			     &ignored) ||
 		    pad_run(generation->template, call, &ignored))

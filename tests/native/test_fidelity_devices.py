@@ -61,12 +61,18 @@ def test_a_camera(scenario: str, where: str, tmp_path: Path) -> None:
         disturb_and_restore(victim, guard)
 
 
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize(("scenario", "what"), [("changed", "its buffers are others now"), ("left", "opened anew")])
 @pytest.mark.usefixtures("camera")
-def test_a_camera_with_other_buffers_is_told(tmp_path: Path) -> None:
-    with Victim(f"devices changed {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+def test_a_camera_that_is_not_as_it_was_is_told(scenario: str, what: str, where: str, tmp_path: Path) -> None:
+    """And no worse: what looks like its pictures can be read."""
+    with (
+        Victim(f"devices {scenario} {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
         checkpoint(guard)
         disturb(victim)
-        assert "its buffers are others now" in restored(victim, guard)["error"]["detail"]
+        assert what in restored(victim, guard)["error"]["detail"]
 
 
 @pytest.mark.usefixtures("camera")

@@ -14,6 +14,7 @@
  *   stopped         the camera is stopped after the checkpoint
  *   unused          it is only used after the checkpoint
  *   changed         it is used with other buffers after the checkpoint
+ *   left            it is closed after the checkpoint
  *   again           it is closed, and used anew, after the checkpoint
  *   own             it fills memory of the program's own (V4L2_MEMORY_USERPTR)
  *   input           an input device of its own (uinput), and a reader who has it for himself
@@ -349,12 +350,27 @@ static void changed_disturb(void)
 	request(BUFFERS + 2);
 }
 
-static void again_disturb(void)
+static void left_disturb(void)
 {
 	order(VIDIOC_STREAMOFF);
 	for (int i = 0; i < BUFFERS; i++)
 		munmap(picture[i].at, picture[i].bytes);
 	close(fd[0]);
+}
+
+/* It has no buffers, but a program may look at what it thinks are pictures. */
+static void left_verify(void)
+{
+	struct v4l2_buffer b = buffer(0);
+
+	for (int i = 0; i < BUFFERS; i++)
+		CHECK(!memchr(picture[i].at, 1, picture[i].bytes), "a picture that was filled");
+	CHECK(!xioctl(VIDIOC_DQBUF, &b), "a camera without buffers has filled one");
+}
+
+static void again_disturb(void)
+{
+	left_disturb();
 	fd[0] = open_camera();
 	start();
 }
@@ -455,6 +471,7 @@ static const struct scenario scenarios[] = {
 	{ "stopped", camera_setup, stopped_disturb, stopped_verify },
 	{ "unused", unused_setup, start, unused_verify },
 	{ "changed", camera_setup, changed_disturb, nothing },
+	{ "left", camera_setup, left_disturb, left_verify },
 	{ "again", camera_setup, again_disturb, stopped_verify },
 	{ "own", own_setup, nothing, nothing },
 	{ "input", input_setup, press, press },
