@@ -20,22 +20,12 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("scenario", ["can", "buses"])
 @pytest.mark.usefixtures("bus")
-def test_a_bus(where: str, tmp_path: Path) -> None:
-    """Its sockets hear what they had asked for, and say in a cycle what they had been told."""
+def test_a_bus(scenario: str, where: str, tmp_path: Path) -> None:
+    """Its sockets hear what they had asked for, also those that were closed; what is said in a cycle goes on."""
     with (
-        Victim(f"devices can {tmp_path} {where}", tmp_path) as victim,
-        GuardProcess(config(), [victim.pid]) as guard,
-    ):
-        disturb_and_restore(victim, guard)
-
-
-@pytest.mark.parametrize("where", WHERE)
-@pytest.mark.usefixtures("bus")
-def test_a_bus_that_was_left(where: str, tmp_path: Path) -> None:
-    """Bound again, with their filters."""
-    with (
-        Victim(f"devices buses {tmp_path} {where}", tmp_path) as victim,
+        Victim(f"devices {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         disturb_and_restore(victim, guard)
