@@ -31,6 +31,8 @@
 /* As long as a slow camera (five pictures a second) takes to fill its buffers; init waits 2 s. */
 #define TAKE_NS (1500 * NS_PER_MS)
 
+#define BUFFERS_MAX 64 /* as many as can be told apart; drivers have 32, most of them        */
+
 static const uint32_t types[] = { V4L2_BUF_TYPE_VIDEO_CAPTURE, V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE };
 
 struct buffer {
@@ -75,20 +77,26 @@ static bool is_anothers(int fd, uint32_t type)
 	return command(fd, VIDIOC_QBUF, &b, type, UINT32_MAX) && errno == EBUSY;
 }
 
-int file_look_at_video(int fd, struct file_video *video)
+static void look_at_buffers(int fd, uint32_t type, struct file_video *video)
 {
 	struct buffer b;
 
+	for (uint32_t i = 0; i < BUFFERS_MAX; i++) {
+		if (command(fd, VIDIOC_QUERYBUF, &b, type, i))
+			return;
+		video->type = type;
+		video->memory = b.v4l2.memory;
+		video->count = i + 1;
+		if (!(b.v4l2.flags & (V4L2_BUF_FLAG_QUEUED | V4L2_BUF_FLAG_DONE)))
+			video->held |= UINT64_C(1) << i;
+	}
+}
+
+int file_look_at_video(int fd, struct file_video *video)
+{
 	*video = (struct file_video){ 0 };
 	for (size_t i = 0; i < sizeof types / sizeof *types && !video->count; i++)
-		for (uint32_t k = 0; k < 64 && command(fd, VIDIOC_QUERYBUF, &b, types[i], k) == 0;
-		     k++) {
-			video->type = types[i];
-			video->memory = b.v4l2.memory;
-			video->count = k + 1;
-			if (!(b.v4l2.flags & (V4L2_BUF_FLAG_QUEUED | V4L2_BUF_FLAG_DONE)))
-				video->held |= UINT64_C(1) << k;
-		}
+		look_at_buffers(fd, types[i], video);
 	if (video->count && is_anothers(fd, video->type))
 		*video = (struct file_video){ 0 };
 	return tracee_deadline_passed() ? -1 : 0;
@@ -109,7 +117,7 @@ static const char *give(int fd, uint32_t type, uint64_t buffers)
 	const char *problem = NULL;
 	struct buffer b;
 
-	for (uint32_t i = 0; buffers >> i; i++)
+	for (uint32_t i = 0; i < BUFFERS_MAX; i++)
 		if (buffers >> i & 1 &&
 		    (command(fd, VIDIOC_QUERYBUF, &b, type, i) || tell(fd, VIDIOC_QBUF, &b.v4l2)))
 			problem = "not all of its buffers could be given back to the driver";
