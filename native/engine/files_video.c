@@ -197,8 +197,7 @@ static int note_area(const struct mapping *m, void *arg)
 			.start = m->start,
 			.bytes = m->end - m->start,
 			.offset = m->offset,
-			.protection = (m->mode[0] == 'r' ? PROT_READ : 0) |
-				      (m->mode[1] == 'w' ? PROT_WRITE : 0),
+			.protection = mapping_protection(m),
 			.fd = f->fd,
 		};
 		return 0;

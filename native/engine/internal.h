@@ -162,6 +162,8 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 
 /* The vDSO, or what belongs to it. */
 bool mapping_is_special(const struct mapping *m);
+/* As mmap(2) has it. */
+int mapping_protection(const struct mapping *m);
 
 /* /proc/PID/limits, as getrlimit(2) numbers them; ~0: no limit.  0 or -1. */
 #define LIMITS 16

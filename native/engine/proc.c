@@ -10,6 +10,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/mman.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
@@ -303,6 +304,12 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 	free(line);
 	fclose(maps);
 	return result < 0 ? -1 : 0;
+}
+
+int mapping_protection(const struct mapping *m)
+{
+	return (m->mode[0] == 'r' ? PROT_READ : 0) | (m->mode[1] == 'w' ? PROT_WRITE : 0) |
+	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
 }
 
 bool mapping_is_special(const struct mapping *m)

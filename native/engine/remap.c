@@ -134,12 +134,6 @@ static int cut(struct remap *r, struct avc_error *err)
 	}
 }
 
-static int protection(const struct mapping *m)
-{
-	return (m->mode[0] == 'r' ? PROT_READ : 0) | (m->mode[1] == 'w' ? PROT_WRITE : 0) |
-	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
-}
-
 static uint32_t key_of(const struct mapping *m)
 {
 	return (m->flags & MAPPING_KEYS) / MAPPING_KEY_ONE;
@@ -147,7 +141,7 @@ static uint32_t key_of(const struct mapping *m)
 
 static bool same_protection(const struct mapping *a, const struct mapping *b)
 {
-	return protection(a) == protection(b) && key_of(a) == key_of(b);
+	return mapping_protection(a) == mapping_protection(b) && key_of(a) == key_of(b);
 }
 
 static int unmap(const struct remap *r, struct puppet *puppet, struct avc_error *err)
@@ -282,7 +276,7 @@ static int attach(const struct remap *r, struct puppet *puppet, const struct pie
 		return -1;
 	puppet_soften(puppet, only_mapped);
 	return puppet_ask(puppet, SYS_mprotect, m->start, m->end - m->start,
-			  (uint64_t)protection(m), 0, 0, 0, err) ||
+			  (uint64_t)mapping_protection(m), 0, 0, 0, err) ||
 			       puppet_flush(puppet, err)
 		       ? -1
 		       : 0;
@@ -292,7 +286,7 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 		     const struct mapping **given, struct avc_error *err)
 {
 	const struct mapping *m = piece->want;
-	const uint64_t bytes = piece->end - piece->start, prot = (uint64_t)protection(m);
+	const uint64_t bytes = piece->end - piece->start, prot = (uint64_t)mapping_protection(m);
 	const int flags = MAP_FIXED |
 			  (m->shared                      ? MAP_SHARED
 			   : m->flags & MAPPING_DROPPABLE ? DROPPABLE
@@ -315,7 +309,7 @@ static int map_piece(const struct remap *r, struct puppet *puppet, const struct 
 static int protect_piece(struct puppet *puppet, const struct piece *piece, struct avc_error *err)
 {
 	const struct mapping *want = piece->want;
-	const uint64_t mode = (uint64_t)protection(want), bytes = piece->end - piece->start;
+	const uint64_t mode = (uint64_t)mapping_protection(want), bytes = piece->end - piece->start;
 	const uint32_t key = key_of(want);
 
 	/* Without keys, pkey_mprotect(2) may not know key 0 either. */

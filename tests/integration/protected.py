@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -45,6 +46,11 @@ class ProtectedVictim:
         wanted = self.see().beats + n
         wait_until(lambda: self.see().beats >= wanted, timeout_s, f"{n} beats of {self.container.name}")
         assert self.see().violations == 0, self.container.logs()
+
+    def events(self, *kinds: str) -> list[dict[str, Any]]:
+        """What `avckpt events` tells of it, of these kinds."""
+        told = map(json.loads, self.sidecar.avckpt("events", "--json").stdout.splitlines())
+        return [event for event in told if event["id"] == self.container.id and event["kind"] in kinds]
 
     def kill(self, signum: int) -> dict[str, Any]:
         """Kills the victim as it is now, and waits for the restore; the entry of `avckpt ps` after it."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -28,12 +27,6 @@ def poison(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Any
     return start
 
 
-def events(victim: ProtectedVictim, *kinds: str) -> list[dict[str, Any]]:
-    lines = victim.sidecar.avckpt("events", "--json").stdout.splitlines()
-    told = [json.loads(line) for line in lines]
-    return [event for event in told if event["id"] == victim.container.id and event["kind"] in kinds]
-
-
 def test_a_poisoned_generation_is_left_for_an_older_one(poison: Any) -> None:
     victim = poison(int(300 * SLOWNESS), {"interval": "1h", "restore.max": "4/60s"})
     checkpoint(victim)
@@ -47,9 +40,9 @@ def test_a_poisoned_generation_is_left_for_an_older_one(poison: Any) -> None:
     victim.wait_beats(600, timeout_s=15)
     assert victim.sidecar.find(victim.container)["restores"] == 3
     assert victim.see().starts == 1
-    dropped = events(victim, "dropped")
+    dropped = victim.events("dropped")
     assert [(event["generation"], event["attempt"]) for event in dropped] == [(2, 2)]
-    assert [event["generation"] for event in events(victim, "restored")] == [2, 2, 1]
+    assert [event["generation"] for event in victim.events("restored")] == [2, 2, 1]
 
 
 def test_checkpoints_in_between_do_not_keep_a_crash_loop_alive(poison: Any) -> None:
@@ -60,10 +53,10 @@ def test_checkpoints_in_between_do_not_keep_a_crash_loop_alive(poison: Any) -> N
     victim.wait_beats()
     reason = ended(victim.sidecar, victim.container)
     assert reason.startswith("killed by SIGABRT; the restores of avckpt.restore.max are used up")
-    restored = events(victim, "restored")
+    restored = victim.events("restored")
     # The four, and one more if there was a generation that had not been tried.
     assert len(restored) in (4, 5), restored
-    assert [event["outcome"] for event in events(victim, "gave_up")] == ["limit"]
+    assert [event["outcome"] for event in victim.events("gave_up")] == ["limit"]
     victim.sidecar.wait_generation(victim.container)  # and the new run is protected
 
 

@@ -6,7 +6,6 @@ make test-kernels KERNELS=trixie KERNEL_TESTS=tests/integration/test_protected_d
 
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
 
@@ -25,10 +24,7 @@ def crash_while_in_use(sidecar: Sidecar, victim: ProtectedVictim) -> None:
         disturb_app(victim.app, victim.see)
         entry = victim.kill(signal.SIGKILL)
         assert (entry["state"], entry["restores"]) == ("protected", n)
-    lines = sidecar.avckpt("events", "--json").stdout.splitlines()
-    events = [event for event in map(json.loads, lines) if event["container"] == victim.container.name]
-    told = [event.get("error") for event in events if event["kind"] == "restored"]
-    assert told == [None] * KILLS
+    assert [event.get("error") for event in victim.events("restored")] == [None] * KILLS
 
 
 ON_COMMAND = {**QUICK, "interval": "1h"}
