@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from avckpt.events import GuardConfig
 from harness import wait_until
-from native.guarded import PEER, GuardProcess, Victim, config, pads, threads
+from native.guarded import PEER, GuardProcess, Victim, config, parasites, threads
 
 KILLS = 500
 NEVER_RESTARTED = {"epoll_wait", "epoll_pwait", "epoll_pwait2", "semop", "semtimedop", "sigtimedwait"}
@@ -105,5 +105,5 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
         storm(config(0.002), 200, 12, 3, victim)  # many of them while they map theirs
         with GuardProcess(config(0.02), [victim.pid]) as guard:
             guard.wait("checkpoint", count=6)
-            wait_until(lambda: pads(victim.app) <= 2, 5, "old pads go")
+            wait_until(lambda: parasites(victim.app) <= 2, 5, "old parasites go")
         victim.wait_beats(20)
