@@ -52,7 +52,7 @@ class BuildPy(build_py):
 def data_files(build_lib: Path) -> list[tuple[Path, Path]]:
     """Where each data file comes from and where in the wheel it goes."""
     package = build_lib / "avckpt"
-    programs = ("avckpt-init", "avckpt-inside")
+    programs = ("avckpt-init", "avckpt-exec")
     pairs = [(ROOT / "native" / "build" / name, package / "libexec" / name) for name in programs]
     pairs += [(path, package / "oci-hooks.d" / path.name) for path in sorted((ROOT / "oci-hooks.d").glob("*.json"))]
     return pairs

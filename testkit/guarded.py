@@ -266,7 +266,7 @@ def since_linux(major: int, minor: int, what: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(release < (major, minor), reason=f"{what}: Linux {major}.{minor}")
 
 
-def pads(pid: int) -> int:
+def parasites(pid: int) -> int:
     """Mappings of ours in a process."""
     return Path(f"/proc/{pid}/maps").read_text().count("/dev/zero (deleted)")
 

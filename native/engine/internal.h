@@ -4,16 +4,16 @@
  * unless said otherwise; one guard is one tracer thread.
  *
  *   guard.c      the thread: waits, obeys, tells; guard_*.c: see guard.h
- *   link.c       to avckpt-init: control page, reports, verdicts
+ *   init_channel.c       to avckpt-init: control page, reports, verdicts
  *   freeze.c     one checkpoint: stop everything, read it, clone it, let go; see freeze.h
  *   restore.c    templates become the app again
- *   descend.c    a restored process makes its children
+ *   restore_tree.c    a restored process makes its children
  *   remap.c      ... and their memory
- *   inherit.c    ... of which they have some from their parents
+ *   restore_plan.c    ... of which they have some from their parents
  *   copier.c     ... which a second thread helps to copy
  *   snapshot.c   mappings and pages of a template
- *   manner.c     ... and what else they have
- *   puppet.c     a process that is being made
+ *   process_attrs.c     ... and what else they have
+ *   syscall_batch.c     a process that is being made
  *   tree.c       the processes of an app
  *   generation.c templates kept
  *   pending.c    signals that have not been delivered
@@ -21,16 +21,16 @@
  *   attributes.c scheduling, credentials, prctl settings
  *   sandbox.c    restoring an app that has a seccomp filter of its own
  *   memory.c     memory that a clone does not carry as it is
- *   infect.c     pad and holder brought into a live app
+ *   infect.c     parasite and holder brought into a live app
  *   target.c     the app's process and its threads
  *   setup.c      lists of calls that a restored process makes
  *   files*.c     descriptors: looked at, put back
- *   pad.c        the pad as the engine sees it, code run in a target
+ *   parasite.c        the parasite as the engine sees it, code run in a target
  *   tracee.c     ptrace: seize, stop, wait, release
  *   rewind.c     interrupted system calls
  *   support.c    what can not be protected; quiescence
- *   lastpid.c    the next PID of another PID namespace
- *   urgent.c     a CPU at once while an app waits for us
+ *   last_pid.c    the next PID of another PID namespace
+ *   rt_priority.c     a CPU at once while an app waits for us
  *   proc.c       /proc
  */
 #ifndef AVCKPT_INTERNAL_H
@@ -45,12 +45,12 @@
 #include "arch.h"
 #include "avckpt/ctl.h"
 #include "avckpt/engine.h"
-#include "inject.h"
+#include "parasite.h"
 
 #define NS_PER_MS UINT64_C(1000000)
 #define NS_PER_S UINT64_C(1000000000)
 #define THREADS_MAX 4096
-#define OLD_PADS_MAX 128
+#define OLD_PARASITES_MAX 128
 #define SOCKETS_MAX 64
 #define PROCESSES_MAX 512 /* of one app                                     */
 #define CHILDREN_MAX 4096 /* of init: orphans, holders and templates, too   */
@@ -249,12 +249,12 @@ struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
 	bool attached, stopped;
-	int stop_signal;                /* the process is stopped by job control           */
-	int block;                      /* of the slot, main thread 0; -1: not in the image */
-	bool borrowed;                  /* sent into the pad; regs and sigmask are its own  */
-	const struct pad *borrowed_for; /* NULL: not yet a pad (infect.c)         */
-	bool vetted;                    /* vet() has been at this stop                      */
-	struct arch_regs regs;          /* as of the stop, EINTR already mended          */
+	int stop_signal; /* the process is stopped by job control           */
+	int block;       /* of the slot, main thread 0; -1: not in the image */
+	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
+	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
+	bool vetted;                         /* vet() has been at this stop                      */
+	struct arch_regs regs;               /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
 	uint64_t rseq;
@@ -281,7 +281,7 @@ struct thread {
 	bool signalled; /* was just about to run a handler                  */
 };
 
-struct pad {
+struct parasite {
 	avc_remote base; /* 0: none                                          */
 	size_t bytes;
 	uint8_t *map; /* our view of the same pages                       */
@@ -291,9 +291,9 @@ struct pad {
 	int fd; /* of those pages                                              */
 };
 /* How it is mapped in two parts. */
-#define PAD_CODE_PROT (PROT_READ | PROT_EXEC)
-#define PAD_DATA_PROT (PROT_READ | PROT_WRITE)
-#define PAD_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
+#define PARASITE_CODE_PROT (PROT_READ | PROT_EXEC)
+#define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
+#define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
 
 struct files;
 struct last_pid;
@@ -308,23 +308,23 @@ struct target {
 	pid_t inside; /* the same in its own namespace                       */
 	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd;
 	int leader_pidfd; /* when pidfd is of another thread: of the process    */
-	struct pad pad;
-	bool infected; /* the pad is known to be in this process           */
+	struct parasite parasite;
+	bool infected; /* the parasite is known to be in this process           */
 	pid_t holder;  /* 0: none                                          */
 	int holder_pidfd;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
 	uint64_t cells_used; /* bit mask over inj_control.timeout               */
 	uint64_t nonce;
-	/* Pads that a guard which died left behind; they go with the second
+	/* Parasites that a guard which died left behind; they go with the second
 	 * checkpoint, when no thread can be in them any more. */
 	struct {
 		avc_remote base;
 		size_t bytes;
-	} old_pad[OLD_PADS_MAX];
-	uint32_t old_pads, checkpoints;
+	} old_parasite[OLD_PARASITES_MAX];
+	uint32_t old_parasites, checkpoints;
 	/* A thread died while it may have been cloning: there may be a tracee that
-	 * nobody knows (link_kill_lost). */
+	 * nobody knows (init_channel_kill_lost). */
 	bool lost;
 	bool childless;                     /* it had no child process at the last checkpoint   */
 	const struct inj_syscall *children; /* the question whether it has, in a freeze */
@@ -373,17 +373,17 @@ struct branch {
 	struct generation *image; /* of this process alone                   */
 	int parent;               /* index of its parent's branch, or ...    */
 	pid_t inside;
-	pid_t session, group;  /* inside; 0: outside of the app           */
-	struct manner *manner; /* manner.c                                */
-	pid_t pid;             /* as of the freeze; then as restored last */
-	int exit_signal;       /* struct proc_stat                       */
-	int status;            /* of one that had ended, as from wait(2)  */
-	char name[16];         /* the same                                */
+	pid_t session, group;        /* inside; 0: outside of the app           */
+	struct process_attrs *attrs; /* process_attrs.c                                */
+	pid_t pid;                   /* as of the freeze; then as restored last */
+	int exit_signal;             /* struct proc_stat                       */
+	int status;                  /* of one that had ended, as from wait(2)  */
+	char name[16];               /* the same                                */
 };
 #define PARENT_MAIN (-1)
 #define PARENT_INIT (-2)
 
-struct inheritance;
+struct restore_plan;
 
 /* A fork of a template, for the next restore (spare.c). */
 struct spare {
@@ -436,7 +436,7 @@ struct generation {
 	char written[FILES_NAME];    /* a file that was written since; "": none         */
 	struct branch *branch;       /* the other processes, parents first        */
 	uint32_t branches;
-	struct inheritance *inheritance; /* inherit.c; NULL: not begun                */
+	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                */
 };
 
 /* One process of the app, as it was found. */
@@ -453,7 +453,7 @@ struct kin {
 struct tree {
 	struct target *main;
 	pid_t init;
-	uint32_t slots;  /* of a pad                                         */
+	uint32_t slots;  /* of a parasite                                         */
 	struct kin *kin; /* parents before children                        */
 	uint32_t count;
 	struct target **member; /* of those that are not the main process; those
@@ -464,7 +464,7 @@ struct tree {
 	const void *arg;
 };
 
-struct link {
+struct init_channel {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
@@ -541,62 +541,62 @@ bool tracee_is_ours(pid_t tid);
 #define TRACE_OPTIONS_APP \
 	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
 
-/* ---- pad.c ------------------------------------------------------------------- */
+/* ---- parasite.c ------------------------------------------------------------------- */
 
 /* Maps the pages at `base` of process `pid` here and fills in code and control. */
-int pad_open(struct pad *pad, pid_t pid, avc_remote base, size_t bytes, uint64_t nonce,
-	     struct avc_error *err) warn_unused;
-size_t pad_layout(struct pad *pad, uint32_t slots, uint32_t threads_max);
-void pad_close(struct pad *pad);
-struct inj_slot *pad_slot(const struct pad *pad, uint32_t slot);
-avc_remote pad_remote(const struct pad *pad, const void *local);
-bool pad_contains(const struct pad *pad, avc_remote address);
+int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
+		  uint64_t nonce, struct avc_error *err) warn_unused;
+size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max);
+void parasite_close(struct parasite *parasite);
+struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot);
+avc_remote parasite_remote(const struct parasite *parasite, const void *local);
+bool parasite_contains(const struct parasite *parasite, avc_remote address);
 /* Block of thread `i` in a slot, its signal frame, the top of its stack. */
-struct inj_thread *pad_thread(const struct pad *pad, uint32_t slot, uint32_t i);
-void *pad_frame(const struct pad *pad, uint32_t slot, uint32_t i);
-void *pad_stack(const struct pad *pad, uint32_t slot, uint32_t i);
+struct inj_thread *parasite_thread(const struct parasite *parasite, uint32_t slot, uint32_t i);
+void *parasite_frame(const struct parasite *parasite, uint32_t slot, uint32_t i);
+void *parasite_stack(const struct parasite *parasite, uint32_t slot, uint32_t i);
 
-uint8_t *pad_setup(const struct pad *pad, uint32_t slot); /* INJ_SETUP_BYTES */
-uint8_t *pad_files(const struct pad *pad, uint32_t slot); /* INJ_FILES_BYTES */
+uint8_t *parasite_setup(const struct parasite *parasite, uint32_t slot); /* INJ_SETUP_BYTES */
+uint8_t *parasite_files(const struct parasite *parasite, uint32_t slot); /* INJ_FILES_BYTES */
 
 /* Prepares a list of calls; returns the next call to fill in. */
 void call_begin(struct inj_call *call, enum inj_after after);
 struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
 			     uint64_t d, uint64_t e);
-/* Sends a stopped task into the pad to make the calls.  `base` is a user context
+/* Sends a stopped task into the parasite to make the calls.  `base` is a user context
  * of the task.  For a thread of the app use borrow(). */
-int pad_send(const struct pad *pad, pid_t tid, const struct arch_regs *base, struct inj_call *call,
-	     struct avc_error *err) warn_unused;
+int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
+		  struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until all calls were made; it is in a plain trap stop then. */
-int pad_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it pauses (INJ_PAUSE), and from there. */
-int pad_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
-int pad_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
  * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
-int pad_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
-		  struct avc_error *err) warn_unused;
-/* The same in parts, for several at a time.  pad_halt() waits until it is done and
- * interrupts it; its stop is still to come, for which pad_finish() waits, too. */
-int pad_start(pid_t tid, struct avc_error *err) warn_unused;
-int pad_halt(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
-int pad_finish(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
-int pad_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
-		    struct avc_error *err) warn_unused;
+int parasite_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+		       struct avc_error *err) warn_unused;
+/* The same in parts, for several at a time.  parasite_halt() waits until it is done and
+ * interrupts it; its stop is still to come, for which parasite_finish() waits, too. */
+int parasite_start(pid_t tid, struct avc_error *err) warn_unused;
+int parasite_halt(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_finish(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+			 struct avc_error *err) warn_unused;
 /* The same; `meanwhile` is called once while the kernel clones. */
-int pad_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
-			void *arg, pid_t *child, struct avc_error *err) warn_unused;
-/* exec puts another program in its place, at any moment, and the pad is gone: whether it
+int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* exec puts another program in its place, at any moment, and the parasite is gone: whether it
  * is there, in a stopped thread.  If not, the target is not infected any more. */
-int pad_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
+int parasite_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
-bool in_old_pad(const struct target *target, avc_remote address);
+bool in_old_parasite(const struct target *target, avc_remote address);
 /* Until it is let go: it runs only what is ours meanwhile. */
 int suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
 /* May this stopped thread be borrowed?  What of that is to be read in its memory. */
 int vet(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
-/* The same as pad_run* for a stopped thread of the app, which gets home by itself if we die:
- * borrow, pad_run*, give_back.  give_back() needs a plain trap stop. */
+/* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:
+ * borrow, parasite_run*, give_back.  give_back() needs a plain trap stop. */
 int borrow(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 int give_back(struct thread *thread, struct avc_error *err);
 
@@ -606,7 +606,7 @@ int give_back(struct thread *thread, struct avc_error *err);
  * generation_finish() and what it calls, in this order: setup_begin(), any number
  * of the others, setup_end(). */
 struct setup {
-	const struct pad *pad;
+	const struct parasite *parasite;
 	struct inj_slot *slot;
 	uint8_t *memory;
 	size_t used;
@@ -617,7 +617,7 @@ struct setup {
 	struct inj_setup spare;  /* written to when there is no room         */
 };
 
-void setup_begin(struct setup *setup, const struct pad *pad, uint32_t slot);
+void setup_begin(struct setup *setup, const struct parasite *parasite, uint32_t slot);
 /* One more call for a stage or (after setup_thread()) for a thread; `name` is for
  * messages.  To be filled in further: call.arg[5], store, flags. */
 struct inj_setup *setup_add(struct setup *setup, enum inj_stage stage, const char *name, long nr,
@@ -630,12 +630,12 @@ avc_remote setup_data(struct setup *setup, const void *data, size_t bytes);
 /* -1 if there was not enough room for it all. */
 int setup_end(const struct setup *setup, pid_t pid, struct avc_error *err) warn_unused;
 /* After a restore: the first call of the slot that was allowed to fail, and did. */
-const struct inj_setup *setup_failed(const struct pad *pad, uint32_t slot);
+const struct inj_setup *setup_failed(const struct parasite *parasite, uint32_t slot);
 /* The same for one stage; calls without a name do not count. */
-const struct inj_setup *setup_failed_stage(const struct pad *pad, uint32_t slot,
+const struct inj_setup *setup_failed_stage(const struct parasite *parasite, uint32_t slot,
 					   enum inj_stage stage);
 /* The name of a call by the target's address of it. */
-const char *setup_name(const struct pad *pad, avc_remote address);
+const char *setup_name(const struct parasite *parasite, avc_remote address);
 
 /* ---- pending.c ------------------------------------------------------------------ */
 
@@ -690,7 +690,8 @@ bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
 /* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where
  * they stop (job control), 0: go on. */
 void sandbox_end(struct sandbox *sandbox);
-void sandbox_go(struct sandbox *sandbox, const struct pad *pad, uint32_t slot, int stop_signal);
+void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32_t slot,
+		int stop_signal);
 
 /* ---- memory.c ------------------------------------------------------------------ */
 
@@ -733,7 +734,7 @@ int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
-/* Brings the pad into the app, through its main thread.  The other threads run. */
+/* Brings the parasite into the app, through its main thread.  The other threads run. */
 int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 	   struct avc_error *err) warn_unused;
 /* The same while everything is stopped. */
@@ -778,7 +779,7 @@ int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error
 int target_follow(struct target *target, struct avc_error *err) warn_unused;
 /* All of it, whichever of its threads have ended meanwhile. */
 void target_kill(const struct target *target);
-/* Forgets the process (the pad stays mapped here: templates live in it). */
+/* Forgets the process (the parasite stays mapped here: templates live in it). */
 void target_close(struct target *target);
 /* The entry for a tid; NULL when there is no room. */
 struct thread *thread_find(struct target *target, pid_t tid);
@@ -866,7 +867,7 @@ void files_table_free(struct files_table *table);
 int files_find_device(const struct files *files, uint32_t rdev);
 /* A duplicate of a descriptor of another process, or -1. */
 int files_borrow(int pidfd, int fd);
-/* In a pad: what recvmsg(2) needs for one descriptor, `remote` there; the header is first. */
+/* In a parasite: what recvmsg(2) needs for one descriptor, `remote` there; the header is first. */
 struct files_letter {
 	struct msghdr head;
 	struct iovec io;
@@ -877,7 +878,8 @@ void files_letter_write(struct files_letter *letter, avc_remote remote);
 /* One descriptor over a socket (unix(7), SCM_RIGHTS). */
 int files_send(int socket, int fd);
 /* Whether the restored process could do it all. */
-void files_check_calls(const struct pad *pad, uint32_t slot, pid_t inside, struct avc_error *notes);
+void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t inside,
+		       struct avc_error *notes);
 /* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
  * that has the table as it is now, `holder` one that has the memory. */
 int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
@@ -948,108 +950,112 @@ struct restore_times {
 /* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
  * there, before anything runs: it sends the verdict.  On success *pid is the new
  * main process. */
-int restore(struct target *target, struct generation *generation, struct link *link,
+int restore(struct target *target, struct generation *generation, struct init_channel *channel,
 	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
 	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
 	    struct restore_times *times, struct avc_error *notes,
 	    struct avc_error *err) warn_unused;
 
-/* ---- puppet.c ----------------------------------------------------------------------- */
+/* ---- syscall_batch.c ----------------------------------------------------------------------- */
 
-#define PUPPET_SOFTS 64
+#define BATCH_SOFTS 64
 
 /* A task that a restored process has forked, and that is made what a template is. */
-struct puppet {
+struct syscall_batch {
 	pid_t pid;
-	const struct pad *pad; /* the one it runs in                              */
+	const struct parasite *parasite; /* the one it runs in                              */
 	struct inj_call *call;
 	struct arch_regs base;
-	struct inj_syscall *list; /* in the pad: calls not made yet                  */
+	struct inj_syscall *list; /* in the parasite: calls not made yet                  */
 	uint32_t listed, list_max;
-	uint8_t *data; /* in the pad: for what the calls refer to             */
+	uint8_t *data; /* in the parasite: for what the calls refer to             */
 	struct soft {
 		uint32_t index;
 		const char *problem;
-	} soft[PUPPET_SOFTS]; /* of the calls, those that may fail                  */
+	} soft[BATCH_SOFTS]; /* of the calls, those that may fail                  */
 	uint32_t softs;
 	pid_t inside; /* for notes: what did fail                            */
 	struct avc_error *notes;
 	int socket; /* ours, through which it gets descriptors; -1     */
 };
 
-/* From now on it runs in that pad. */
-void puppet_enter(struct puppet *puppet, const struct pad *pad, uint32_t slot);
-/* One more call.  All of them are made by puppet_flush(), which leaves the results in
- * puppet->list and tells the first that failed. */
-void puppet_call(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
-		 uint64_t e, uint64_t f);
+/* From now on it runs in that parasite. */
+void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *parasite,
+			 uint32_t slot);
+/* One more call.  All of them are made by syscall_batch_flush(), which leaves the results in
+ * batch->list and tells the first that failed. */
+void syscall_batch_add(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
+		       uint64_t d, uint64_t e, uint64_t f);
 /* The same, for any number: those before it are made when there is no more room. */
-int puppet_ask(struct puppet *puppet, long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
-	       uint64_t e, uint64_t f, struct avc_error *err) warn_unused;
+int syscall_batch_ask(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
+		      uint64_t d, uint64_t e, uint64_t f, struct avc_error *err) warn_unused;
 /* The last one may fail: then `problem`, if any, is noted. */
-void puppet_soften(struct puppet *puppet, const char *problem);
-int puppet_flush(struct puppet *puppet, struct avc_error *err) warn_unused;
-void *puppet_data(const struct puppet *puppet, avc_remote *remote);
+void syscall_batch_soften(struct syscall_batch *batch, const char *problem);
+int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+void *syscall_batch_data(const struct syscall_batch *batch, avc_remote *remote);
 /* Two ends of a socket: ours, and the number of the other one there.  Both -1: there is none. */
-struct mail {
+struct fd_channel {
 	int ours, theirs;
 };
 
 /* Closes what it has from its parent; from here on it can be given descriptors, each to be
- * number 1 until that is closed.  By the `mail` that it has from its parent, if any, or its own. */
-int puppet_open_mail(struct puppet *puppet, const struct mail *mail,
-		     struct avc_error *err) warn_unused;
+ * number 1 until that is closed.  By the `fd_channel` that it has from its parent, if any, or its own. */
+int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
+				  struct avc_error *err) warn_unused;
 /* Of the main process, for its children, who have it from the fork: to make one takes longer than
  * all that comes by it.  None where there is no number left for it. */
-int puppet_share_mail(struct puppet *puppet, struct mail *mail, struct avc_error *err) warn_unused;
-int puppet_unshare_mail(struct puppet *puppet, struct mail *mail,
-			struct avc_error *err) warn_unused;
-int puppet_give(struct puppet *puppet, int fd, struct avc_error *err) warn_unused;
-/* From its parent's pad into its own. */
-int puppet_change_pad(struct puppet *puppet, const struct target *target, uint32_t slot,
-		      struct avc_error *err) warn_unused;
+int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
+				   struct avc_error *err) warn_unused;
+int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
+				     struct avc_error *err) warn_unused;
+int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err) warn_unused;
+/* From its parent's parasite into its own. */
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct target *target,
+				  uint32_t slot, struct avc_error *err) warn_unused;
 /* Its descriptors; it gets no more after that. */
-int puppet_put_files(struct puppet *puppet, const struct files_table *table,
-		     struct avc_error *err) warn_unused;
+int syscall_batch_put_files(struct syscall_batch *batch, const struct files_table *table,
+			    struct avc_error *err) warn_unused;
 
-/* ---- manner.c ------------------------------------------------------------------------ */
+/* ---- process_attrs.c ------------------------------------------------------------------------ */
 
 /* After the app runs again: what only the template can tell. */
 int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
 void branch_forget(struct branch *branch);
 /* All protection keys, before its memory refers to some and while the kernel must not choose one
- * (pkeys(7), of what can only be executed).  manner_put() frees those that it did not have. */
-int manner_take_keys(struct puppet *puppet, struct avc_error *err) warn_unused;
-/* A restored process gets it, with the puppet's next flush. */
-int manner_put(struct puppet *puppet, const struct branch *branch,
-	       struct avc_error *err) warn_unused;
+ * (pkeys(7), of what can only be executed).  process_attrs_put() frees those that it did not have. */
+int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+/* A restored process gets it, with the batch's next flush. */
+int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
+		      struct avc_error *err) warn_unused;
 /* Until then nothing is limited: it may have more than it may have now, and its parent may have
  * lowered its own limits since.  Its descriptors are below `files`. */
-void manner_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
+void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
 /* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
  * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
 void limit_lift(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
-void manner_setup_limits(const struct branch *branch, struct setup *setup);
+void process_attrs_setup_limits(const struct branch *branch, struct setup *setup);
 
-/* ---- descend.c ------------------------------------------------------------------------- */
+/* ---- restore_tree.c ------------------------------------------------------------------------- */
 
 /* All processes of a generation, of which the main one is there; each is stopped.
  * `table`: of each branch. */
-struct family;
-struct family *family_new(struct target *main, struct generation *generation,
-			  struct last_pid *helper, struct link *link, timer_t timer,
-			  const struct files_table *table, struct avc_error *err);
+struct restore_tree;
+struct restore_tree *restore_tree_new(struct target *main, struct generation *generation,
+				      struct last_pid *helper, struct init_channel *channel,
+				      timer_t timer, const struct files_table *table,
+				      struct avc_error *err);
 /* The main process (a stopped tracee) brings forth the others. */
-int family_make(struct family *family, pid_t main_pid, struct avc_error *notes,
-		struct avc_error *err) warn_unused;
+int restore_tree_make(struct restore_tree *tree, pid_t main_pid, struct avc_error *notes,
+		      struct avc_error *err) warn_unused;
 /* They put themselves together, but for the main one. */
-int family_start(struct family *family, struct avc_error *notes, struct avc_error *err) warn_unused;
-void family_go(struct family *family);
-void family_kill(struct family *family);
-void family_free(struct family *family);
+int restore_tree_start(struct restore_tree *tree, struct avc_error *notes,
+		       struct avc_error *err) warn_unused;
+void restore_tree_go(struct restore_tree *tree);
+void restore_tree_kill(struct restore_tree *tree);
+void restore_tree_free(struct restore_tree *tree);
 /* PID of a branch's process, when all of it is there. */
-pid_t family_pid(const struct family *family, uint32_t branch);
+pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t branch);
 
 /* ---- snapshot.c --------------------------------------------------------------------- */
 
@@ -1118,28 +1124,28 @@ struct remap *remap_plan(const struct target *target, struct snapshot *want, str
  * only who has them can give them to others, and only by a fork. */
 int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
 		struct avc_error *err) warn_unused;
-/* Does it, with a puppet that is in the pad of the plan's target already; but the copier
+/* Does it, with a batch that is in the parasite of the plan's target already; but the copier
  * may not have finished. */
-int remap(const struct remap *plan, struct puppet *puppet, struct copier *copier,
+int remap(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
 	  struct avc_error *err) warn_unused;
 void remap_free(struct remap *plan);
 
-/* ---- inherit.c --------------------------------------------------------------------- */
+/* ---- restore_plan.c --------------------------------------------------------------------- */
 
-/* Of a generation that is whole; once is enough.  `ahead_ns`: CPU time that inherit_next() may
+/* Of a generation that is whole; once is enough.  `ahead_ns`: CPU time that restore_plan_next() may
  * spend on it, about. */
-int inherit_begin(struct generation *generation, uint64_t ahead_ns,
-		  struct avc_error *err) warn_unused;
+int restore_plan_begin(struct generation *generation, uint64_t ahead_ns,
+		       struct avc_error *err) warn_unused;
 /* Who is to fork a branch's process: another branch, or PARENT_MAIN. */
-int inherit_host(const struct generation *generation, uint32_t index);
+int restore_plan_host(const struct generation *generation, uint32_t index);
 /* How it is made of that fork; NULL on error. */
-const struct remap *inherit_plan(struct generation *generation, uint32_t index,
-				 struct avc_error *err);
+const struct remap *restore_plan_of(struct generation *generation, uint32_t index,
+				    struct avc_error *err);
 /* Of a checkpoint: whether the processes can be made of their parents at all. */
-int inherit_check(const struct generation *generation, struct avc_error *err) warn_unused;
+int restore_plan_check(const struct generation *generation, struct avc_error *err) warn_unused;
 /* Finds out about one more of them, so that a restore need not; false: that is all. */
-bool inherit_next(struct generation *generation);
-void inherit_free(struct inheritance *inheritance);
+bool restore_plan_next(struct generation *generation);
+void restore_plan_free(struct restore_plan *plan);
 
 /* ---- spare.c ------------------------------------------------------------------------ */
 
@@ -1155,7 +1161,7 @@ int spare_make_now(struct target *target, struct generation *generation,
 int spare_await(struct target *target, struct generation *generation,
 		struct avc_error *err) warn_unused;
 bool spare_is_there(struct generation *generation);
-/* There may be one that only the kernel knows of (link_kill_lost). */
+/* There may be one that only the kernel knows of (init_channel_kill_lost). */
 bool spare_is_unknown(const struct generation *generation);
 void spare_drop(struct generation *generation);
 
@@ -1171,14 +1177,14 @@ void restore_note(struct target *target, struct generation *image, pid_t pid,
 		  struct avc_error *notes);
 void restore_go(struct target *target, struct generation *image, struct sandbox *sandbox);
 
-/* ---- urgent.c -------------------------------------------------------------------- */
+/* ---- rt_priority.c -------------------------------------------------------------------- */
 
 /* The calling thread gets a CPU before others from here to the other; best effort.
  * May be nested. */
-void urgent_begin(void);
-void urgent_end(void);
+void rt_priority_begin(void);
+void rt_priority_end(void);
 
-/* ---- lastpid.c ------------------------------------------------------------------- */
+/* ---- last_pid.c ------------------------------------------------------------------- */
 
 /* Starts a helper task inside the PID namespace; it serves the slot's requests
  * until last_pid_stop().  last_pid_set() is the engine's own request. */
@@ -1213,33 +1219,35 @@ bool has_executed(const struct target *target);
 /* True if this looks like a moment at which nobody is in the middle of anything. */
 bool quiescent(const struct target *target);
 
-/* ---- link.c -------------------------------------------------------------------------- */
+/* ---- init_channel.c -------------------------------------------------------------------------- */
 
-void link_init(struct link *link);
+void init_channel_init(struct init_channel *channel);
 /* True once the app's main process runs a program of its own. */
-bool link_app_started(const struct link *link, pid_t app);
+bool init_channel_app_started(const struct init_channel *channel, pid_t app);
 /* 1: connected, 0: init is not ready yet, -1: error. */
-int link_open(struct link *link, struct avc_error *err) warn_unused;
-void link_close(struct link *link);
+int init_channel_open(struct init_channel *channel, struct avc_error *err) warn_unused;
+void init_channel_close(struct init_channel *channel);
 /* The app's main process in our namespace, 0 if it is not there (yet). */
-pid_t link_app(const struct link *link);
-void link_arm(struct link *link, bool armed);
-bool link_stop_asked(const struct link *link);
-int link_report(struct link *link, struct avc_report *report);
-/* Of the last death.  init waits for only so long, and anew from each link_working() on,
+pid_t init_channel_app(const struct init_channel *channel);
+void init_channel_arm(struct init_channel *channel, bool armed);
+bool init_channel_stop_asked(const struct init_channel *channel);
+int init_channel_report(struct init_channel *channel, struct avc_report *report);
+/* Of the last death.  init waits for only so long, and anew from each init_channel_working() on,
  * which may be called as often as there is progress. */
-int link_verdict(const struct link *link, enum avc_verdict_kind kind, struct avc_error *err);
-void link_working(struct link *link);
+int init_channel_verdict(const struct init_channel *channel, enum avc_verdict_kind kind,
+			 struct avc_error *err);
+void init_channel_working(struct init_channel *channel);
 /* Kills and reaps the children of init that are tracees of ours but not known:
  * clones of which we never heard, because the thread that made them was killed before
  * it could tell.  They would keep the app's number (as a process group's) and, as
  * zombies, the container from ending. */
-void link_kill_lost(const struct link *link, bool (*known)(pid_t pid, const void *arg),
-		    const void *arg);
+void init_channel_kill_lost(const struct init_channel *channel,
+			    bool (*known)(pid_t pid, const void *arg), const void *arg);
 /* Kills what the dead app left behind: children of init, but those to keep.  tend() is called
  * while it waits for their end.  0: none of them runs any more; AVC_DEADLINE: one does. */
-int link_kill_leftovers(struct link *link, bool (*keep)(pid_t pid, const void *arg),
-			void (*tend)(void *arg), void *arg, struct avc_error *err) warn_unused;
+int init_channel_kill_leftovers(struct init_channel *channel,
+				bool (*keep)(pid_t pid, const void *arg), void (*tend)(void *arg),
+				void *arg, struct avc_error *err) warn_unused;
 
 /* ---- engine.c --------------------------------------------------------------------------- */
 

@@ -23,8 +23,8 @@ def init_binary() -> Path:
 
 
 def inside_binary() -> Path:
-    """The static program avckpt-inside (`inside.py`).  Raises ConfigError when it is nowhere."""
-    return _program("avckpt-inside")
+    """The static program avckpt-exec (`inside.py`).  Raises ConfigError when it is nowhere."""
+    return _program("avckpt-exec")
 
 
 def hooks_source() -> Path:

@@ -118,9 +118,9 @@ def test_nothing_of_ours_can_be_written_to_in_there(container: ContainerFactory)
         (helper,) = [
             int(pid)
             for pid in Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
-            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"avckpt-inside\0")
+            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"avckpt-exec\0")
         ]
-        assert Path(f"/proc/{helper}/exe").readlink() == Path("/memfd:avckpt-inside (deleted)")
+        assert Path(f"/proc/{helper}/exe").readlink() == Path("/memfd:avckpt-exec (deleted)")
         await task
         with (
             open(f"/proc/self/fd/{_sealed_program()}", "rb+", buffering=0) as program,
@@ -152,7 +152,7 @@ def test_a_container_can_hold_only_what_has_no_privileges(container: ContainerFa
         task = asyncio.create_task(run_inside(pidfd, ["true"], timeout_s=30))
         await asyncio.sleep(1)
         try:
-            held = Path("/proc", str(child_of(child_of(os.getpid(), b"avckpt-inside\0"), b"")))
+            held = Path("/proc", str(child_of(child_of(os.getpid(), b"avckpt-exec\0"), b"")))
             assert (held / "cgroup").read_text() == Path(f"/proc/{made.pid}/cgroup").read_text()
             status = dict(line.split(":\t", 1) for line in (held / "status").read_text().splitlines())
             assert {status["Uid"], status["Gid"]} == {"1000\t1000\t1000\t1000"}

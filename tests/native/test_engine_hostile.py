@@ -20,14 +20,14 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def test_what_the_application_writes_is_not_believed(tmp_path: Path) -> None:
-    """The count of calls is in memory that it has, too; a guard that believes it writes past the end of the pad."""
+    """The count of calls is in memory that it has, too; a guard that believed it would write past the parasite."""
     with (
         Victim("scribble", tmp_path) as hostile,
         Victim("idle 1 1", tmp_path) as peaceful,
         GuardProcess(config(0.02), [hostile.pid, peaceful.pid]) as guard,
     ):
         guard.wait("checkpoint", cookie=2)
-        wait_until(lambda: hostile.see().counter[0], 15, "the application has found the pad")
+        wait_until(lambda: hostile.see().counter[0], 15, "the application has found the parasite")
         time.sleep(SCRIBBLED_S)
         assert guard.process.poll() is None
         guard.wait("checkpoint", cookie=2, since=guard.mark(), count=3)

@@ -20,7 +20,7 @@ from testkit.harness import wait_until
 from testkit.procfs import children_of
 
 ENOUGH = 6
-"""Threads that were sent into the pad and did not get there in time."""
+"""Threads that were sent into the parasite and did not get there in time."""
 
 # More important than the application, and awake nearly all the time.
 HOG = """
@@ -78,7 +78,7 @@ def cpus() -> tuple[int, int]:
 
 
 def test_a_starved_application_is_let_go(cpus: tuple[int, int], tmp_path: Path) -> None:
-    """A thread that gets into the pad too late finds home, and what it does next is its own affair."""
+    """A thread that gets into the parasite too late finds home, and what it does next is its own affair."""
     with Victim("threads 6 1", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         guard.wait("checkpoint", count=3)
         put_on(cpus[0], victim.app)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config, pads, storm
+from testkit.guarded import GuardProcess, Victim, config, parasites, storm
 from testkit.harness import wait_until
 from testkit.procfs import threads
 
@@ -80,5 +80,5 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
         storm(config(0.002), 200, 12, 3, victim)  # many of them while they map theirs
         with GuardProcess(config(0.02), [victim.pid]) as guard:
             guard.wait("checkpoint", count=6)
-            wait_until(lambda: pads(victim.app) <= 2, 5, "old pads go")
+            wait_until(lambda: parasites(victim.app) <= 2, 5, "old parasites go")
         victim.wait_beats(20)

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * scribble: looks for avckpt's pad in its own memory, and goes on writing there how many calls
+ * scribble: looks for avckpt's parasite in its own memory, and goes on writing there how many calls
  * a thread of its is to make: far more than there is room for.  Other threads come and go, so
  * that there is always one that the guard has to ask while the rest of the process runs.
  *
@@ -8,14 +8,14 @@
  */
 #include <pthread.h>
 
-#include "inject.h"
+#include "parasite.h"
 #include "victim.h"
 
 #define FIRST_PAD (UINT64_C(32) << 40)
 #define FAR_TOO_MANY 0x00ffffff
 
 /* NULL: there is none yet. */
-static struct inj_control *find_pad(void)
+static struct inj_control *find_parasite(void)
 {
 	struct inj_control *found = NULL;
 	FILE *maps = fopen("/proc/self/maps", "re");
@@ -35,7 +35,7 @@ static void *scribble(void *unused)
 {
 	struct inj_control *control;
 
-	while (!(control = find_pad()) || control->magic != INJ_MAGIC)
+	while (!(control = find_parasite()) || control->magic != INJ_MAGIC)
 		usleep(1000);
 	count(0, 1);
 	for (;;)

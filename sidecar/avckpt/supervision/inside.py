@@ -6,7 +6,7 @@ namespaces and control groups, with the user, groups, capabilities, resource
 limits, seccomp filters, environment and working directory of the container's
 main process.  It has a session of its own and is nobody's child in there, so
 that neither the application nor a checkpoint of it notices.  What the program
-`avckpt-inside` does is in native/inside/inside.c; here it is started and waited
+`avckpt-exec` does is in native/exec/exec.c; here it is started and waited
 for, without a thread.
 
 AppArmor profiles and SELinux labels of the container are not taken on.
@@ -83,7 +83,7 @@ async def run_inside(
         failure, failure_end = _pipe(undo)
         program = _sealed_program()
         argv = [
-            *("avckpt-inside", str(init_pidfd), str(pid), str(max(int(timeout_s * 1000), 1))),
+            *("avckpt-exec", str(init_pidfd), str(pid), str(max(int(timeout_s * 1000), 1))),
             *(str(failure_end), str(env_fd), credentials, str(len(groups)), *groups),
             *(str(len(procs)), *procs, *command),
         ]
@@ -103,7 +103,7 @@ async def run_inside(
                 pass_fds=(init_pidfd, failure_end, env_fd, program),
             )
         except OSError as error:
-            raise KernelError("avckpt-inside can not be started", syscall="execve", errno=error.errno or 0) from error
+            raise KernelError("avckpt-exec can not be started", syscall="execve", errno=error.errno or 0) from error
         os.close(output_end)
         os.close(failure_end)
         kept = await _wait(process, output, timeout_s + GRACE_S)
@@ -154,7 +154,7 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
 
 
 def _credentials(pid: int) -> tuple[str, list[str]]:
-    """What avckpt-inside wants of /proc/PID/status: UID:GID:capabilities:NNP, and the groups.
+    """What avckpt-exec wants of /proc/PID/status: UID:GID:capabilities:NNP, and the groups.
 
     The numbers are those of the container's user namespace, in which they are
     asked for: /proc gives them as we have them.
@@ -226,8 +226,8 @@ def _readable(fd: int) -> bool:
 
 @functools.cache
 def _sealed_program() -> int:
-    """avckpt-inside in memory that nobody can write to, also not through /proc/PID/exe in a container."""
-    fd = os.memfd_create("avckpt-inside", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    """avckpt-exec in memory that nobody can write to, also not through /proc/PID/exe in a container."""
+    fd = os.memfd_create("avckpt-exec", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         content = inside_binary().read_bytes()
         while content:

@@ -1,0 +1,109 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+#include <errno.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+/* No byte more is read than there is room for: names come out of the parasite, too, where the end
+ * of one may just be overwritten. */
+static void copy(char *to, size_t size, const char *from)
+{
+	snprintf(to, size, "%.*s", (int)size - 1, from ? from : "");
+}
+
+static int vfail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid,
+		 const char *operation, const char *syscall, const char *detail, va_list args)
+{
+	if (err->code) {
+		err->undo_failures++;
+		return -1;
+	}
+	err->code = code;
+	err->errnum = errnum;
+	err->pid = pid;
+	copy(err->operation, sizeof err->operation, operation);
+	copy(err->syscall, sizeof err->syscall, syscall);
+	vsnprintf(err->detail, sizeof err->detail, detail, args);
+	return -1;
+}
+
+int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const char *operation,
+	 const char *syscall, const char *detail, ...)
+{
+	va_list args;
+
+	va_start(args, detail);
+	vfail(err, code, errnum, pid, operation, syscall, detail, args);
+	va_end(args);
+	return -1;
+}
+
+int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
+	       const char *detail, ...)
+{
+	const int errnum = errno;
+	enum avc_code code = AVC_KERNEL;
+	va_list args;
+
+	/* Of one that has just been reaped, Yama (ptrace_scope 1, as on Ubuntu) says EPERM. */
+	if (errnum == ESRCH || errnum == ENOENT)
+		code = AVC_GONE;
+	else if (errnum == EPERM || errnum == EACCES)
+		code = pid > 0 && proc_is_exiting(pid) ? AVC_GONE : AVC_DENIED;
+	va_start(args, detail);
+	vfail(err, code, errnum, pid, operation, syscall, detail, args);
+	va_end(args);
+	return -1;
+}
+
+uint64_t now_ns(void)
+{
+	struct timespec t;
+
+	clock_gettime(CLOCK_MONOTONIC, &t);
+	return (uint64_t)t.tv_sec * NS_PER_S + (uint64_t)t.tv_nsec;
+}
+
+void close_fd(int *fd)
+{
+	if (*fd >= 0)
+		close(*fd);
+	*fd = -1;
+}
+
+ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at)
+{
+	size_t done = 0;
+
+	while (done < bytes) {
+		const ssize_t n = pread(fd, to + done, bytes - done, at + (off_t)done);
+
+		if (n < 0)
+			return -1;
+		if (n == 0)
+			break;
+		done += (size_t)n;
+	}
+	return (ssize_t)done;
+}
+
+bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes)
+{
+	void *before, *more;
+	const uint32_t wanted = *room ? 2 * *room : 16;
+
+	if (count < *room)
+		return true;
+	memcpy(&before, array, sizeof before);
+	more = realloc(before, wanted * bytes);
+	if (!more)
+		return false;
+	memcpy(array, &more, sizeof more);
+	*room = wanted;
+	return true;
+}

@@ -1,0 +1,38 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Out of turn.  While an app is stopped, or dead, it waits for its guard; on a busy
+ * machine the guard must not wait for its own turn in between, nor lose the CPU to
+ * each thread that it wakes.  So it becomes a real-time thread for those moments.
+ *
+ * The rule that comes with it: between rt_priority_begin() and rt_priority_end() nobody may
+ * spin on what another task has to do; it may need this very CPU.
+ */
+#include <sched.h>
+
+#include "internal.h"
+
+static __thread struct {
+	int depth, policy;
+	struct sched_param param;
+	bool changed;
+} before;
+
+void rt_priority_begin(void)
+{
+	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_FIFO) };
+
+	if (before.depth++)
+		return;
+	before.policy = sched_getscheduler(0);
+	/* Somebody who gave us a real-time policy meant it.  Without CAP_SYS_NICE, or
+	 * in a cgroup without real-time budget, it goes on as it was, only slower. */
+	before.changed = before.policy != SCHED_FIFO && before.policy != SCHED_RR &&
+			 before.policy != SCHED_DEADLINE && sched_getparam(0, &before.param) == 0 &&
+			 sched_setscheduler(0, SCHED_FIFO, &lowest) == 0;
+}
+
+void rt_priority_end(void)
+{
+	if (--before.depth == 0 && before.changed)
+		sched_setscheduler(0, before.policy, &before.param);
+}

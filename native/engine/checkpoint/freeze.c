@@ -1,0 +1,354 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * One checkpoint.  Every thread of every process that is known is stopped; then, and only
+ * then, the processes are cloned: the main one by its main thread, the others by their
+ * holders, which share their memory (infect.c).  While the kernel does that, everything is
+ * read that is of this instant.  Then everything goes on.  What can wait, waits until then
+ * (generation.c).
+ */
+#include <errno.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "freeze.h"
+
+#define CLONE_NS (10 * NS_PER_S)
+
+/* ---- who there is ------------------------------------------------------------------------- */
+
+/* One that was found while everything was stopped has nothing of ours yet. */
+static int prepare_stopped(struct tree *tree, struct target *target, struct avc_error *err)
+{
+	if (target->pid != target->leader)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
+			    "the main thread of process %d has ended", target->inside);
+	if (!target->infected && infect_stopped(target, tree->slots, err))
+		return -1;
+	return target->files_image ? 0 : files_prepare(target, err);
+}
+
+/* Of the leader of a session or group, as the app knows it; 0: it is none of the app's,
+ * or gone. */
+static pid_t number_inside(const struct tree *tree, pid_t pid)
+{
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->kin[i].pid == pid)
+			return tree->kin[i].target ? tree->kin[i].target->inside : proc_inside(pid);
+	return 0;
+}
+
+/* Of a group whose leader is outside of the app, too, if it is to be seen. */
+static pid_t group_inside(const struct tree *tree, pid_t group)
+{
+	const pid_t inside = group > 0 ? number_inside(tree, group) : 0;
+
+	return inside || group <= 0 ? inside : proc_inside(group);
+}
+
+/* Now, while all stand still: right after, it may be in another group, or who leads its
+ * group may be gone, and nobody know what number that one had inside. */
+static void keep_place(const struct tree *tree, const struct proc_stat *stat,
+		       struct generation *image)
+{
+	image->stat = *stat;
+	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
+}
+
+static int keep_place_of_main(const struct tree *tree, struct generation *generation,
+			      struct avc_error *err)
+{
+	struct proc_stat stat;
+
+	if (proc_stat_of(tree->main->stat_fd, &stat))
+		return fail_errno(err, tree->main->pid, "freeze", "read(stat)", "it has ended");
+	keep_place(tree, &stat, generation);
+	generation->group = group_inside(tree, stat.group);
+	return 0;
+}
+
+/* The kin that were there are the branches, in the same order. */
+static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	int index[PROCESSES_MAX];
+
+	index[0] = PARENT_MAIN;
+	generation->branch = calloc(tree->count, sizeof *generation->branch);
+	if (!generation->branch)
+		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+	for (uint32_t i = 1; i < tree->count; i++) {
+		const struct kin *kin = &tree->kin[i];
+		struct branch *branch = &generation->branch[generation->branches];
+
+		index[i] = (int)generation->branches;
+		if (!kin->pid)
+			continue;
+		branch->parent = kin->parent == PARENT_INIT ? PARENT_INIT : index[kin->parent];
+		branch->pid = kin->pid;
+		branch->inside = kin->ended ? proc_inside(kin->pid) : kin->target->inside;
+		branch->target = kin->target;
+		branch->session = number_inside(tree, kin->stat.session);
+		branch->group = number_inside(tree, kin->stat.group);
+		branch->exit_signal = kin->stat.exit_signal;
+		if (kin->ended) {
+			if (branch->parent == PARENT_INIT || branch->inside <= 0)
+				continue; /* init is just about to wait for it */
+			branch->status = kin->stat.exit_status;
+			memcpy(branch->name, kin->stat.name, sizeof branch->name);
+		} else {
+			branch->image = calloc(1, sizeof *branch->image);
+			if (!branch->image)
+				return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+			branch->image->pidfd = -1;
+			branch->image->slot = generation->slot;
+			keep_place(tree, &kin->stat, branch->image);
+			kin->target->images++;
+		}
+		generation->branches++;
+	}
+	return 0;
+}
+
+static int find_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	if (tree->count <= 1)
+		return 0;
+	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
+	for (uint32_t i = 1; i < tree->count; i++)
+		if (tree->kin[i].target && !tree->kin[i].target->infected &&
+		    tree_shares_memory(tree, i))
+			return fail(err, AVC_UNSUPPORTED, 0, tree->kin[i].pid, "check", "",
+				    "a child process has its parent's memory (CLONE_VM)");
+	if (make_branches(tree, generation, err))
+		return -1;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target &&
+		    prepare_stopped(tree, generation->branch[i].target, err))
+			return -1;
+	return 0;
+}
+
+/* ---- what is read of them all ------------------------------------------------------------- */
+
+static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen,
+		       struct avc_error *err)
+{
+	struct target *target = branch->target;
+
+	if (strict)
+		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+	if (memory_prepare(target->memory, &branch->image->image, seen, err))
+		return -1;
+	branch->image->threads = target->blocks;
+	/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */
+	memory_copy_own(target, branch->image->image);
+	memory_copy_shared(target, branch->image->image);
+	files_mapped_copy(branch->image->mapped);
+	return 0;
+}
+
+static int keep_branches(struct generation *generation, struct mem_seen *seen,
+			 struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target &&
+		    keep_branch(&generation->branch[i], generation->mapped != NULL, seen, err))
+			return -1;
+	return 0;
+}
+
+/* The tables do not change while the kernel clones: nobody runs. */
+static void capture_files(struct target *target, struct generation *generation)
+{
+	struct scratch scratch = { -1, -1, 0 };
+
+	files_capture(target, generation, generation->branches > 0, NULL, 0, &scratch,
+		      &generation->files_error);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+		const struct branch *parent = branch->parent >= 0
+						      ? &generation->branch[branch->parent]
+						      : NULL;
+
+		if (branch->target)
+			files_capture(branch->target, branch->image, true,
+				      parent ? parent->image->files : generation->files,
+				      parent ? parent->target->pid : target->pid, &scratch,
+				      &branch->image->files_error);
+	}
+	scratch_close(&scratch);
+}
+
+/* Whoever is killed has no descriptors any more, which looks like a table with nothing in it.
+ * Of those that are still at what they were asked it will be seen then. */
+static int see_alive(const struct tree *tree, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->count; i++) {
+		const struct target *target = tree->kin[i].target;
+		struct arch_regs ignored;
+
+		if (target && !target->asked && !(i == 0 && target->cloning) &&
+		    arch_regs_get(target->pid, &ignored))
+			return fail_errno(err, target->pid, "freeze", "ptrace(GETREGS)",
+					  "it has ended");
+	}
+	return 0;
+}
+
+/* ---- clones ------------------------------------------------------------------------------- */
+
+static bool has_all_holders(const struct tree *tree)
+{
+	for (uint32_t i = 1; i < tree->count; i++)
+		if (tree->kin[i].target && !tree->kin[i].target->holder)
+			return false;
+	return true;
+}
+
+/* What a process above it adopts would be a child that it never had; it itself sees to that
+ * (hold_stopped()). */
+static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *err)
+{
+	for (int k = tree->kin[i].parent; k >= 0; k = tree->kin[k].parent) {
+		struct target *above = tree->kin[k].target;
+		struct thread *thread = above ? thread_find(above, above->pid) : NULL;
+
+		if (!thread)
+			continue;
+		if (!above->paused && !above->descendant && ask(above, thread, err))
+			return -1; /* the others were asked just now */
+		if (thread->creds.subreaper && adopt_no_more(above, err))
+			return -1;
+	}
+	return hold_stopped(tree->kin[i].target, tree->init, err);
+}
+
+/* Parents come before their children. */
+static int make_holders_missing(struct tree *tree, struct avc_error *err)
+{
+	struct avc_error failed = { 0 };
+	int result = 0;
+
+	for (uint32_t i = 1; !result && i < tree->count; i++)
+		if (tree->kin[i].target && !tree->kin[i].target->holder)
+			result = make_holder_missing(tree, i, err);
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->kin[i].target && adopt_again(tree->kin[i].target, &failed) && !result) {
+			*err = failed;
+			result = -1;
+		}
+	return result;
+}
+
+/* Their main threads make the holders, and have to be at rest for that, as well as those of
+ * the processes above them. */
+static int clone_missing(struct tree *tree, struct generation *generation, struct avc_error *err)
+{
+	struct thread *main_thread = thread_find(tree->main, tree->main->pid);
+
+	/* First who waits in its parasite for us: how long the main process takes is not known yet. */
+	if (hear_all(tree, err) || await_app_clone(tree->main, main_thread, generation, err) ||
+	    rest_app(main_thread, err) || make_holders_missing(tree, err))
+		return -1;
+	for (uint32_t i = 1; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+
+		if (target && !target->cloning && start_clone(target, err))
+			return -1;
+	}
+	return 0;
+}
+
+static int await_clones(struct generation *generation, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		if (!branch->target)
+			continue;
+		if (await_clone(branch->target, &branch->image->template, err))
+			return -1;
+		branch->image->vm_pages = branch->target->clone_pages;
+		branch->image->taken_ns = generation->taken_ns;
+	}
+	return 0;
+}
+
+/* ---- all of it ------------------------------------------------------------------------------ */
+
+int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
+	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err)
+{
+	struct target *target = tree->main;
+	struct avc_error failed = { 0 };
+	struct thread *main_thread;
+	bool cloned;
+	uint64_t start;
+	int result;
+
+	*times = (struct freeze_times){ 0 };
+	generation->template = 0;
+	generation->pidfd = -1;
+	rt_priority_begin();
+	tracee_deadline_set(timer, deadline_ns);
+	start = now_ns();
+	result = stop_known(tree, err);
+	generation->taken_ns = now_ns();
+	times->stop_ns = generation->taken_ns - start;
+	if (!result)
+		result = begin_known(tree, generation, err) || stop_others(tree, err) ? -1 : 0;
+	/* The deadline is for getting things stopped; the clone of a big process takes its
+	 * time. */
+	tracee_deadline_set(timer, CLONE_NS);
+	if (!result) {
+		memory_copy_shared(target, generation->image);
+		files_mapped_copy(generation->mapped);
+		result = keep_place_of_main(tree, generation, err) ||
+					 find_branches(tree, generation, err) ||
+					 begin_others(tree, generation, err) ||
+					 keep_branches(generation, seen, err)
+				 ? -1
+				 : 0;
+	}
+	if (!result && !has_all_holders(tree))
+		result = clone_missing(tree, generation, err);
+	if (!result) {
+		capture_files(target, generation);
+		result = see_alive(tree, err);
+	}
+	/* Also what was begun before something failed. */
+	main_thread = thread_find(target, target->pid);
+	if (target->cloning &&
+	    await_app_clone(target, main_thread, generation, result ? &failed : err))
+		result = -1;
+	cloned = generation->template != 0;
+	if (hear_all(tree, result ? &failed : err))
+		result = -1;
+	if (!result)
+		result = await_clones(generation, err);
+	drop_clones(tree);
+	times->clone_ns = now_ns() - generation->taken_ns;
+	/* The image is whole.  The main thread first: it would have to share the CPUs with
+	 * everybody else. */
+	if (main_thread) {
+		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
+		if (cloned && main_thread->borrowed)
+			(void)rest_app(main_thread, &failed); /* or it is killed just now */
+		let_go_thread(target, main_thread);
+	}
+	let_go_process(target);
+	for (uint32_t i = 0; i < tree->members; i++)
+		let_go_process(tree->member[i]);
+	times->freeze_ns = now_ns() - start;
+	tracee_deadline_clear(timer);
+	rt_priority_end();
+	if (!cloned || result)
+		return -1;
+	target->checkpoints++;
+	if (pending_deadly(target->pending))
+		return fail(err, AVC_GONE, 0, target->pid, "freeze", "",
+			    "it is just being ended by signal %d", pending_deadly(target->pending));
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target)
+			generation->branch[i].target->checkpoints++;
+	return 0;
+}

@@ -1,0 +1,407 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A template once the app runs again: made to lie still, and prepared so that a
+ * restore finds everything ready in its slot of the parasite.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+/* In template_call.out: what the template had got by fork(2). */
+#define TEMPLATE_NAME 16
+#define TEMPLATE_ALTSTACK 32
+#define TEMPLATE_ATTRIBUTES 64
+#define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
+
+/* The OOM killer is to take templates first; undone in what is restored. */
+void oom_score_adj_set(pid_t pid, const char *value)
+{
+	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);
+
+	if (fd < 0)
+		return;
+	if (write(fd, value, strlen(value)) < 0)
+		errno = 0; /* best effort */
+	close(fd);
+}
+
+/* A fork of the main thread has what that had at that instant, but for what fork(2) resets. */
+static int hear_template(struct target *target, struct thread *cloned, const struct inj_call *call,
+			 const struct inj_syscall *attributes, struct avc_error *err)
+{
+	const struct creds was = cloned->creds;
+
+	attributes_answer(attributes, call->out + TEMPLATE_ATTRIBUTES, &cloned->creds);
+	cloned->creds.death_signal = was.death_signal;
+	cloned->creds.subreaper = was.subreaper;
+	cloned->creds.slack_ns = was.slack_ns;
+	cloned->creds.filters = was.filters;
+	cloned->creds.future_lock = was.future_lock;
+	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
+	return ask_others(target, cloned, &was, err);
+}
+
+static int quieten(struct target *target, struct generation *generation,
+		   const struct branch *branch, struct avc_error *err)
+{
+	struct thread *cloned = branch ? NULL : thread_find(target, target->pid);
+	struct inj_slot *slot = parasite_slot(&target->parasite, generation->slot);
+	struct inj_call *call = &slot->template_call;
+	const struct inj_syscall *rseq = NULL, *dumpable, *attributes = NULL;
+	const pid_t pid = generation->template;
+
+	if (tracee_await(pid, NULL, err) != STOP_TRAP)
+		return -1;
+	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
+		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
+			  PTRACE_O_SUSPEND_SECCOMP)) ||
+	    arch_regs_get(pid, &generation->base))
+		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
+	memset(call->out, 0, sizeof call->out);
+	memcpy(call->out, "avckpt-tmpl", 12);
+	call_begin(call, INJ_AFTER_PARK);
+	/* Out of the app's session or process group, or the number stays taken. */
+	if (branch || generation->stat.session == target->leader)
+		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
+	else
+		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_NAME,
+		 parasite_remote(&target->parasite, call->out + TEMPLATE_NAME), 0, 0, 0);
+	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(&target->parasite, call->out), 0, 0,
+		 0);
+	dumpable = call_add(call, SYS_prctl, PR_GET_DUMPABLE, 0, 0, 0, 0);
+	if (cloned) {
+		call_add(call, SYS_sigaltstack, 0,
+			 parasite_remote(&target->parasite, call->out + TEMPLATE_ALTSTACK), 0, 0,
+			 0);
+		attributes = attributes_ask(call, call->out + TEMPLATE_ATTRIBUTES,
+					    parasite_remote(&target->parasite,
+							    call->out + TEMPLATE_ATTRIBUTES));
+	}
+	/* Or the kernel would write to its memory each time it runs, and to what is made of
+	 * that.  A holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
+	if (cloned && cloned->rseq)
+		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
+				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
+	if (parasite_send(&target->parasite, pid, &generation->base, call, err) ||
+	    parasite_run(pid, call, err))
+		return -1;
+	if (rseq && rseq->result)
+		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
+			    "refused");
+	generation->dumpable = dumpable->result;
+	oom_score_adj_set(pid, "1000");
+	return attributes ? hear_template(target, cloned, call, attributes, err) : 0;
+}
+
+/* A main thread that has ended while others go on: it is there again until they are,
+ * and ends again. */
+static void fill_ended(struct target *target, struct generation *generation)
+{
+	struct inj_thread *block = parasite_thread(&target->parasite, generation->slot, 0);
+
+	*block = (struct inj_thread){
+		.stack = parasite_remote(&target->parasite,
+					 parasite_stack(&target->parasite, generation->slot, 0)) -
+			 16,
+		.tid = target->inside,
+	};
+	if (proc_read(target->leader, "comm", block->name, sizeof block->name) > 0)
+		block->name[strcspn(block->name, "\n")] = 0;
+}
+
+/* Fills the slot in from what freeze() has read: one block per thread. */
+static int fill_slot(struct target *target, struct generation *generation,
+		     const struct branch *branch, struct avc_error *err)
+{
+	const struct parasite *parasite = &target->parasite;
+	struct inj_slot *slot = parasite_slot(parasite, generation->slot);
+	const struct thread *main_thread = thread_find(target, target->pid);
+	const struct proc_stat *stat = &generation->stat;
+	struct proc_status status;
+	struct setup setup;
+	int mem_fd = proc_open(generation->template, "mem", O_RDONLY);
+
+	if (mem_fd < 0)
+		return fail_errno(err, generation->template, "keep template", "open(mem)",
+				  "it was killed");
+	if (proc_status(target->pid, &status) &&
+	    (!branch || proc_status(generation->template, &status))) {
+		close(mem_fd);
+		return fail_errno(err, target->pid, "keep template", "open(status)",
+				  "it has ended");
+	}
+	generation->headless = target->pid != target->leader;
+	generation->stop_signal = main_thread->stop_signal;
+	setup_begin(&setup, parasite, generation->slot);
+	for (uint32_t i = 0; i < target->thread_count; i++) {
+		struct thread t = target->threads[i];
+		const uint32_t b = (uint32_t)t.block;
+		struct inj_thread *block;
+		uint8_t *frame;
+
+		if (t.block < 0)
+			continue;
+		block = parasite_thread(parasite, generation->slot, b);
+		frame = parasite_frame(parasite, generation->slot, b);
+
+		/* The borrowed thread's was seen to when it was borrowed; its own
+		 * memory has been run on since. */
+		if (t.tid != target->pid)
+			rseq_fixup(mem_fd, &t);
+		rewind_original(&t, &t.regs);
+		arch_rewind(&t.regs);
+		*block = (struct inj_thread){
+			.frame = arch_frame_build(frame, parasite_remote(parasite, frame), &t.regs,
+						  t.sigmask, t.altstack),
+			.stack = parasite_remote(parasite,
+						 parasite_stack(parasite, generation->slot, b)) -
+				 16,
+			.tls = arch_tls(&t.regs),
+			.clear_tid = t.clear_tid,
+			.robust_list = t.robust_list,
+			.robust_bytes = t.robust_bytes,
+			.rseq = t.rseq,
+			.rseq_bytes = t.rseq_bytes,
+			.rseq_signature = t.rseq_signature,
+			.other_base = arch_other_base(&t.regs),
+			.large_state =
+				arch_frame_needs_room(frame) ? parasite_remote(parasite, frame) : 0,
+			.tid = t.inside,
+			.affinity_bytes = t.affinity_bytes,
+		};
+		memcpy(block->affinity, t.affinity, sizeof block->affinity);
+		/* Of the one that was cloned, as it was then. */
+		memcpy(block->name,
+		       !branch && t.tid == target->pid
+			       ? (char *)slot->template_call.out + TEMPLATE_NAME
+			       : t.name,
+		       sizeof block->name);
+		setup_thread(&setup, block);
+		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
+					    err)) {
+			close(mem_fd);
+			return -1;
+		}
+		pending_setup_thread(target, &t, &setup);
+	}
+	close(mem_fd);
+	if (generation->headless)
+		fill_ended(target, generation);
+	generation->sandboxed = status.seccomp == 1 ||
+				status.seccomp_filters > target->plain_filters;
+	if (memory_finish(target, generation, status.locked_kb, &setup, err))
+		return -1;
+	pending_setup(target, &setup);
+	if (attributes_keep(target, generation, err))
+		return -1;
+	timers_setup(target, &setup);
+	if (branch)
+		process_attrs_setup_limits(branch, &setup);
+	/* A change of users takes it from the whole process, whichever thread it is. */
+	if (generation->dumpable == 0 || generation->dumpable == 1)
+		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
+			  (uint64_t)generation->dumpable, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
+	if (setup.notice.code)
+		generation->notice = setup.notice;
+	slot->threads = generation->threads;
+	slot->pid = target->inside;
+	/* Nothing but the app's own group, or one whose leader is visible, can be
+	 * put back. */
+	slot->group = generation->group > 0 ? generation->group : target->inside;
+	slot->session_leader = stat->session == target->leader;
+	slot->placed = target->descendant;
+	/* Of several processes: restore_tree.c. */
+	slot->tty_fd = !branch && stat->tty && stat->tty_group == stat->group
+			       ? files_find_device(generation->files, stat->tty)
+			       : -1;
+	return setup_end(&setup, target->pid, err);
+}
+
+/* What has to be known before anything is filled in: what the others are made from. */
+static int begin_template(struct target *target, struct generation *generation,
+			  const struct branch *branch, struct avc_error *err)
+{
+	generation->pidfd = proc_pidfd_open(generation->template);
+	if (generation->pidfd < 0)
+		return fail_errno(err, generation->template, "keep template", "pidfd_open",
+				  "it was killed");
+	return quieten(target, generation, branch, err);
+}
+
+static int finish(struct target *target, struct generation *generation, struct branch *branch,
+		  struct avc_error *err)
+{
+	int statm_fd;
+	long pages;
+
+	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
+	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
+	target->anon_pages = generation->anon_pages;
+	close_fd(&statm_fd);
+	if (pages >= 0 && pages != generation->vm_pages)
+		return memory_learn(target, generation->vm_pages - pages, err);
+	if (branch && branch_learn(branch, err))
+		return -1;
+	return fill_slot(target, generation, branch, err);
+}
+
+/* What only a process that makes another one its child has to know.  This one may have
+ * ended meanwhile: a shell's children live for milliseconds. */
+static int finish_branch(struct branch *branch, struct avc_error *err)
+{
+	struct target *target = branch->target;
+
+	/* The holder rests again. */
+	return tracee_settle(target->holder, err) ||
+			       begin_template(target, branch->image, branch, err) ||
+			       finish(target, branch->image, branch, err)
+		       ? -1
+		       : 0;
+}
+
+int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	const struct thread *main_thread = thread_find(target, target->pid);
+	struct avc_error again = { 0 };
+
+	if (generation->branches && !main_thread)
+		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
+	if (begin_template(target, generation, NULL, err))
+		return -1;
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+		struct avc_error failed = { 0 };
+
+		if (!branch->target)
+			continue;
+		branch->target->forebear = &main_thread->creds;
+		if (finish_branch(branch, &failed)) {
+			/* What was not as it was known is known now: of all of them. */
+			if (failed.code != AVC_DEADLINE || failed.errnum != EAGAIN) {
+				*err = failed;
+				return -1;
+			}
+			again = failed;
+			continue;
+		}
+		if (branch->image->notice.code && !generation->notice.code)
+			generation->notice = branch->image->notice;
+	}
+	if (finish(target, generation, NULL, err))
+		return -1;
+	if (again.code)
+		*err = again;
+	if (again.code || restore_plan_check(generation, err))
+		return -1;
+	/* Not before its size was compared with the app's. */
+	files_unmap_areas(target, generation);
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target)
+			files_unmap_areas(generation->branch[i].target,
+					  generation->branch[i].image);
+	return 0;
+}
+
+void generation_close_files(struct target *target, struct generation *image)
+{
+	struct inj_call *call = &parasite_slot(&target->parasite, image->slot)->template_call;
+	struct avc_error ignored = { 0 };
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	if (parasite_send(&target->parasite, image->template, &image->base, call, &ignored) ||
+	    parasite_run(image->template, call, &ignored))
+		return; /* it was killed, and has nothing open any more */
+}
+
+static bool start_closing(struct target *target)
+{
+	struct inj_call *call = &target->parasite.control->holder;
+	struct avc_error gone = { 0 };
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	return parasite_send(&target->parasite, target->holder, &target->holder_base, call,
+			     &gone) == 0 &&
+	       parasite_start(target->holder, &gone) == 0;
+}
+
+void generation_close_tables(const struct generation *generation)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct target *target = generation->branch[i].target;
+
+		if (target)
+			target->closing = target->holder && start_closing(target);
+	}
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct target *target = generation->branch[i].target;
+		struct avc_error gone = { 0 };
+
+		if (target && target->closing &&
+		    parasite_finish(target->holder, &target->parasite.control->holder, &gone))
+			continue; /* it was killed, and has nothing open any more */
+	}
+}
+
+static void image_drop(struct generation *image)
+{
+	spare_drop(image);
+	if (image->template)
+		tracee_end(image->template, image->pidfd);
+	else
+		close_fd(&image->pidfd);
+	if (spare_is_unknown(image))
+		tracee_end_now(); /* the kernel has made one by now, or makes none */
+	mem_image_free(image->image);
+	free(image->attributes);
+	files_free(image->files);
+	files_mapped_free(image->mapped);
+}
+
+void generation_drop(struct generation *generation)
+{
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		struct branch *branch = &generation->branch[i];
+
+		branch_forget(branch);
+		if (!branch->image)
+			continue;
+		image_drop(branch->image);
+		free(branch->image);
+		if (branch->target)
+			branch->target->images--;
+	}
+	restore_plan_free(generation->plan);
+	free(generation->branch);
+	image_drop(generation);
+	*generation = (struct generation){ .pidfd = -1 };
+}
+
+struct branch *generation_branch(const struct generation *generation, const struct target *target)
+{
+	for (uint32_t i = 0; generation && i < generation->branches; i++)
+		if (generation->branch[i].target == target)
+			return &generation->branch[i];
+	return NULL;
+}
+
+uint32_t generation_threads(const struct generation *generation)
+{
+	uint32_t threads = generation->threads;
+
+	for (uint32_t i = 0; i < generation->branches; i++)
+		threads += generation->branch[i].image ? generation->branch[i].image->threads : 0;
+	return threads;
+}

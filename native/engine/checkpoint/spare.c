@@ -1,0 +1,166 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A fork of a template, made while the app runs.  What a restore takes longest for is the
+ * kernel's copying of page tables.  With a spare they are copied already: the process that
+ * takes the app's place is made with the spare's memory (clone(2), CLONE_VM), and has it for
+ * itself when the spare has ended.  The template keeps its own, for the next time.
+ */
+#include <errno.h>
+#include <sched.h>
+#include <signal.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+/* struct sched_attr, sched_setattr(2) */
+static uint32_t policy_of(const struct scheduling *s)
+{
+	uint32_t policy;
+
+	memcpy(&policy, s->attr + 4, sizeof policy);
+	return policy;
+}
+
+/* What is made in advance must not keep the app from running: not on a CPU that it has
+ * chosen (each thread chooses again, set_up() in parasite.c), and not at its priority. */
+static bool step_aside(pid_t template, struct scheduling *was)
+{
+	const struct sched_param none = { 0 };
+	unsigned long all[1024 / (8 * sizeof(unsigned long))];
+
+	memset(all, 0xff, sizeof all);
+	(void)syscall(SYS_sched_setaffinity, template, sizeof all, all);
+	scheduling_read(template, was);
+	return (policy_of(was) == SCHED_FIFO || policy_of(was) == SCHED_RR) &&
+	       sched_setscheduler(template, SCHED_OTHER, &none) == 0;
+}
+
+static int step_back(pid_t pid, const struct scheduling *was)
+{
+	return (int)syscall(SYS_sched_setattr, pid, was->attr, 0);
+}
+
+static struct inj_call *call_of(const struct target *target, const struct generation *generation)
+{
+	return &parasite_slot(&target->parasite, generation->slot)->template_call;
+}
+
+static int begin_fork(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	const struct parasite *parasite = &target->parasite;
+	struct inj_call *call = call_of(target, generation);
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	if (parasite_send(parasite, generation->template, &generation->base, call, err) ||
+	    parasite_start(generation->template, err))
+		return -1;
+	generation->spare.work = SPARE_FORK;
+	return 0;
+}
+
+static int end_fork(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct spare *spare = &generation->spare;
+
+	if (parasite_await_clone(generation->template, call_of(target, generation), &spare->pid,
+				 err)) {
+		target->lost |= err->code != AVC_KERNEL && err->code != AVC_DEADLINE;
+		return -1;
+	}
+	if (!tracee_is_ours(spare->pid)) {
+		/* The template was killed before it could tell, or init_channel_kill_lost() did not
+		 * know of the spare. */
+		spare->pid = 0;
+		target->lost = true;
+	}
+	spare->pidfd = proc_pidfd_open(spare->pid);
+	spare->work = SPARE_REST;
+	return 0;
+}
+
+static bool name_spare(const struct target *target, const struct generation *generation)
+{
+	const struct parasite *parasite = &target->parasite;
+	struct inj_call *call = call_of(target, generation);
+	const pid_t spare = generation->spare.pid;
+	struct avc_error gone = { 0 };
+
+	memcpy(call->out, "avckpt-spare", 13);
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(parasite, call->out), 0, 0, 0);
+	return generation->spare.pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
+	       parasite_send(parasite, spare, &generation->base, call, &gone) == 0 &&
+	       parasite_run(spare, call, &gone) == 0;
+}
+
+static int make(struct target *target, struct generation *generation, bool aside,
+		struct avc_error *err)
+{
+	generation->spare.tried = true;
+	generation->spare.aside = aside;
+	return begin_fork(target, generation, err) || spare_await(target, generation, err) ? -1 : 0;
+}
+
+int spare_make(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct spare *spare = &generation->spare;
+
+	if (make(target, generation, step_aside(generation->template, &spare->scheduling), err) ==
+	    0)
+		return 0;
+	/* A frozen cgroup, or others have the CPUs; spare_await() goes on with it. */
+	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
+}
+
+int spare_make_now(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	return make(target, generation, false, err);
+}
+
+int spare_await(struct target *target, struct generation *generation, struct avc_error *err)
+{
+	struct spare *spare = &generation->spare;
+	struct avc_error refused = { 0 };
+
+	if (!spare->work)
+		return 0;
+	if (spare->work == SPARE_FORK && end_fork(target, generation, &refused) &&
+	    refused.code != AVC_KERNEL) {
+		*err = refused;
+		return -1;
+	}
+	if (spare->work == SPARE_REST && tracee_halt(generation->template, err))
+		return -1;
+	spare->work = SPARE_NO_WORK;
+	if (spare->pid && (!name_spare(target, generation) ||
+			   (spare->aside && step_back(spare->pid, &spare->scheduling))))
+		spare_drop(generation);
+	if (spare->aside && step_back(generation->template, &spare->scheduling))
+		return fail_errno(err, generation->template, "make spare", "sched_setattr",
+				  "its scheduling can not be put back");
+	return 0;
+}
+
+bool spare_is_there(struct generation *generation)
+{
+	if (generation->spare.pid && pidfd_ended(generation->spare.pidfd))
+		spare_drop(generation);
+	return generation->spare.pid != 0;
+}
+
+bool spare_is_unknown(const struct generation *generation)
+{
+	return generation->spare.work == SPARE_FORK;
+}
+
+void spare_drop(struct generation *generation)
+{
+	if (generation->spare.pid)
+		tracee_end(generation->spare.pid, generation->spare.pidfd);
+	generation->spare.pid = 0;
+	generation->spare.pidfd = -1;
+}

@@ -1,0 +1,227 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the restored process has to do itself for its descriptors to be as they were
+ * (files.h), as a list of calls in its slot: epoll and signalfd are bound to the process
+ * that registers, owners and POSIX locks are its number.
+ */
+#include <fcntl.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <sys/mman.h>
+#include <sys/resource.h>
+#include <sys/syscall.h>
+
+#include "files.h"
+
+const struct file_watch *files_find_watch(const struct file *epoll, int fd)
+{
+	for (uint32_t i = 0; epoll && i < epoll->watch_count; i++)
+		if (epoll->watch[i].fd == fd)
+			return &epoll->watch[i];
+	return NULL;
+}
+
+/* Has to be registered again?  An edge that came since the checkpoint is gone, and a
+ * signalfd is bound to the process that registered it. */
+static bool renew(const struct files_work *work, const struct file *n,
+		  const struct file_watch *watch)
+{
+	const struct file *of = files_find(work->want, watch->fd);
+	const struct file_watch *is = files_find_watch(n, watch->fd);
+
+	return !is || is->events != watch->events || is->data != watch->data ||
+	       work->lost[files_index(work->want, of)] || of->kind == FILE_SIGNALFD ||
+	       of->kind == FILE_EPOLL || watch->events & (EPOLLET | EPOLLONESHOT);
+}
+
+/* What it watches since has been forgotten (files_restore.c). */
+static void list_epoll(const struct files_work *work, struct setup *setup, const struct file *w,
+		       const struct file *n)
+{
+	for (uint32_t i = 0; i < w->watch_count; i++) {
+		const struct file_watch *watch = &w->watch[i];
+		const struct file *of = files_find(work->want, watch->fd);
+		struct epoll_event event = { .events = watch->events };
+		enum inj_stage stage;
+
+		if (!of || !renew(work, n, watch))
+			continue;
+		event.data.u64 = watch->data;
+		stage = of->pid_inside ? INJ_OWNERS : INJ_DESCRIPTORS; /* when it is there */
+		setup_add(setup, stage, "", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_DEL,
+			  (uint64_t)watch->fd, 0, 0)
+			->flags = INJ_MAY_FAIL;
+		setup_add(setup, stage, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_ADD,
+			  (uint64_t)watch->fd, setup_data(setup, &event, sizeof event), 0)
+			->flags = INJ_MAY_FAIL;
+	}
+}
+
+static void list_lock(struct setup *setup, const struct file *w, const struct file_lock *lock,
+		      short type)
+{
+	const struct flock l = {
+		.l_type = type,
+		.l_whence = SEEK_SET,
+		.l_start = lock->start,
+		.l_len = lock->end < 0 ? 0 : lock->end - lock->start + 1,
+	};
+
+	setup_add(setup, INJ_DESCRIPTORS, type == F_UNLCK ? "" : "fcntl(F_SETLK)", SYS_fcntl,
+		  (uint64_t)w->fd, F_SETLK, setup_data(setup, &l, sizeof l), 0, 0)
+		->flags = INJ_MAY_FAIL;
+}
+
+static bool has_lock(const struct file *f, const struct file_lock *lock)
+{
+	for (uint32_t i = 0; i < f->lock_count; i++)
+		if (!memcmp(&f->lock[i], lock, sizeof *lock))
+			return true;
+	return false;
+}
+
+/* POSIX locks belong to the table, so they outlive the app; but whoever closes any
+ * descriptor of the file loses them, and we may have. */
+static void list_locks(struct setup *setup, const struct file *w, const struct file *n)
+{
+	for (uint32_t i = 0; n && i < n->lock_count; i++)
+		if (n->lock[i].kind == LOCK_POSIX_ && !has_lock(w, &n->lock[i]))
+			list_lock(setup, w, &n->lock[i], F_UNLCK);
+	for (uint32_t i = 0; i < w->lock_count; i++)
+		if (w->lock[i].kind == LOCK_POSIX_)
+			list_lock(setup, w, &w->lock[i], w->lock[i].exclusive ? F_WRLCK : F_RDLCK);
+}
+
+/* A thread can be an owner, so all of them have to be there. */
+static void list_owner(struct setup *setup, const struct file *w)
+{
+	struct f_owner_ex owner = { .type = (int)w->owner_type, .pid = w->owner_inside };
+
+	setup_add(setup, INJ_OWNERS, "fcntl(F_SETOWN)", SYS_fcntl, (uint64_t)w->fd, F_SETOWN_EX,
+		  setup_data(setup, &owner, sizeof owner), 0, 0)
+		->flags = INJ_MAY_FAIL;
+	setup_add(setup, INJ_OWNERS, "fcntl(F_SETSIG)", SYS_fcntl, (uint64_t)w->fd, F_SETSIG,
+		  (uint64_t)w->owner_signal, 0, 0)
+		->flags = INJ_MAY_FAIL;
+	setup_add(setup, INJ_OWNERS, "fcntl(F_SETFL)", SYS_fcntl, (uint64_t)w->fd, F_SETFL,
+		  (uint64_t)w->flags, 0, 0)
+		->flags = INJ_MAY_FAIL;
+}
+
+/* What was open is a dead process's. */
+static void list_pidfd(struct setup *setup, const struct file *w)
+{
+	setup_add(setup, INJ_OWNERS, "pidfd_open", INJ_PIDFD_OPEN, (uint64_t)w->fd,
+		  (uint64_t)w->pid_inside, (uint64_t)w->flags & (O_NONBLOCK | O_EXCL),
+		  w->cloexec ? O_CLOEXEC : 0, 0)
+		->flags = INJ_MAY_FAIL;
+}
+
+static bool has_pidfds(const struct files *files)
+{
+	for (uint32_t i = 0; i < files->count; i++)
+		if (files->file[i].pid_inside)
+			return true;
+	return false;
+}
+
+void files_lift_limit(const struct files *want, pid_t pid)
+{
+	if (has_pidfds(want))
+		limit_lift(pid, RLIMIT_NOFILE, (uint64_t)want->file[want->count - 1].fd + 2);
+}
+
+/* Of the main process; the others put all of theirs back (process_attrs.c). */
+static void list_limit(const struct files_work *work, struct setup *setup)
+{
+	uint64_t limit[LIMITS][2];
+
+	if (proc_limits(work->generation->template, limit) == 0)
+		setup_add(setup, INJ_OWNERS, "", INJ_LIMIT, RLIMIT_NOFILE,
+			  setup_data(setup, limit[RLIMIT_NOFILE], sizeof limit[RLIMIT_NOFILE]), 0,
+			  0, 0)
+			->flags = INJ_MAY_FAIL;
+}
+
+/* Made again, and bound (files_make.c).  Whoever connects is told who listens (unix(7),
+ * SO_PEERCRED), so the process must have its own user by then. */
+static void list_listen(const struct files_work *work, struct setup *setup, const struct file *w,
+			const struct file *n)
+{
+	const struct file_socket *s = w->socket;
+
+	if (!n && s && s->domain == AF_UNIX && s->listening && (!w->family || w->family == w) &&
+	    work->lost[files_index(work->want, w)])
+		setup_add(setup, INJ_OWNERS, "listen", SYS_listen, (uint64_t)w->fd,
+			  (uint64_t)s->backlog, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
+}
+
+/* The template has let go of it (files_video.c).  A mapping that fails in its place would leave
+ * nothing there (mmap(2), MAP_FIXED), so it is made elsewhere first. */
+static void list_area(struct setup *setup, const struct file_area *area)
+{
+	struct inj_setup *map, *move;
+
+	map = setup_add(setup, INJ_DESCRIPTORS, "mmap", SYS_mmap, 0, area->bytes,
+			(uint64_t)area->protection, MAP_SHARED, (uint64_t)area->fd);
+	map->call.arg[5] = area->offset;
+	map->flags = INJ_MAY_FAIL;
+	move = setup_add(setup, INJ_DESCRIPTORS, "", SYS_mremap, 0, area->bytes, area->bytes,
+			 MREMAP_MAYMOVE | MREMAP_FIXED, area->start);
+	move->flags = INJ_MAY_FAIL;
+	if (!setup->full)
+		map->store = parasite_remote(setup->parasite, &move->call.arg[0]);
+}
+
+void files_list_calls(struct files_work *work)
+{
+	struct inj_slot *slot = parasite_slot(&work->target->parasite, work->generation->slot);
+	struct setup list, *setup = &list;
+
+	*setup = (struct setup){
+		.parasite = &work->target->parasite,
+		.slot = slot,
+		.memory = parasite_files(&work->target->parasite, work->generation->slot),
+		.tail[INJ_DESCRIPTORS] = &slot->setup[INJ_DESCRIPTORS],
+		.tail[INJ_OWNERS] = &slot->setup[INJ_OWNERS],
+	};
+	slot->setup[INJ_DESCRIPTORS] = 0;
+	slot->setup[INJ_OWNERS] = 0;
+	for (uint32_t i = 0; i < work->want->areas; i++)
+		list_area(setup, &work->want->area[i]);
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->want->file[i].pid_inside)
+			list_pidfd(setup, &work->want->file[i]);
+	if (!work->target->descendant && has_pidfds(work->want))
+		list_limit(work, setup);
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
+
+		if (files_leader(work->want, w) != i)
+			continue;
+		list_listen(work, setup, w, n);
+		if (w->kind == FILE_EPOLL)
+			list_epoll(work, setup, w, n);
+		if (w->kind == FILE_REGULAR && (w->lock_count || (n && n->lock_count)))
+			list_locks(setup, w, n);
+		if (w->owner_inside)
+			list_owner(setup, w);
+	}
+	if (setup->full && !work->problems++)
+		fail(work->notes, AVC_UNSUPPORTED, 0, work->target->inside, "restore descriptors",
+		     "", "too many descriptors are watched by epoll; some are not any more");
+}
+
+void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t inside,
+		       struct avc_error *notes)
+{
+	const struct inj_setup *failed = setup_failed_stage(parasite, slot, INJ_DESCRIPTORS);
+
+	if (!failed)
+		failed = setup_failed_stage(parasite, slot, INJ_OWNERS);
+	if (failed)
+		fail(notes, AVC_KERNEL, (int)-failed->call.result, inside, "restore descriptors",
+		     failed->name, "descriptor %d is not quite as it was",
+		     (int)failed->call.arg[failed->call.nr == SYS_mmap ? 4 : 0]);
+}

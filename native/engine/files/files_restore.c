@@ -1,0 +1,836 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Makes the table of descriptors the checkpoint's again (files.h).
+ *
+ * The dead app's table lives on in its template and its holder.  The engine gets or makes
+ * what is missing, and the template, by injected calls, takes it over a socket and puts it
+ * in its place: nobody else runs with this table meanwhile.  What depends on the process
+ * (epoll and signalfd, owners, POSIX locks) is left to the restored process itself, as a
+ * list of calls in its slot.
+ *
+ * Only the main process gets this table.  The others are forked by their parents and get
+ * theirs anew, out of what is gathered here (files_work_table()): of the old one, which the
+ * holder has, only that is closed which is new, until they are all there.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <netinet/in.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <sys/ioctl.h>
+#include <sys/resource.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <termios.h>
+#include <unistd.h>
+
+#include "files.h"
+
+#define NAME_SHOWN 48
+
+void files_note(struct files_work *work, const struct file *f, const char *problem)
+{
+	if (!problem)
+		return;
+	if (!work->problems++) {
+		const size_t bytes = strlen(f->name);
+		const bool cut = bytes > NAME_SHOWN;
+
+		fail(work->notes, AVC_UNSUPPORTED, 0, work->target->inside, "restore descriptors",
+		     "", "descriptor %d (%s%s): %s", f->fd, cut ? "..." : "",
+		     f->name + (cut ? bytes - NAME_SHOWN : 0), problem);
+	}
+}
+
+uint32_t files_index(const struct files *files, const struct file *f)
+{
+	return (uint32_t)(f - files->file);
+}
+
+/* Index of the first descriptor of the same open file description. */
+uint32_t files_leader(const struct files *files, const struct file *f)
+{
+	const struct file *l = files_find(files, f->shared);
+
+	return files_index(files, l ? l : f);
+}
+
+/* ---- what stays, and where the rest comes from ---------------------------------- */
+
+/* By number: whoever comes first claims the open file description. */
+static void find_staying(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i], *n = files_find(work->now, w->fd);
+		const uint32_t group = files_leader(work->want, w);
+		uint32_t description;
+
+		work->lost[i] = true;
+		if (!n || !files_same_object(w, n))
+			continue;
+		description = files_leader(work->now, n);
+		if (work->claimed_by[description] < 0 && work->source[group] < 0) {
+			work->claimed_by[description] = (int)group;
+			work->source[group] = (int)description;
+		}
+		work->lost[i] = work->source[group] != (int)description;
+	}
+}
+
+/* A pair of which an end was closed is no pair any more: both are made again. */
+static void break_pairs(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const struct file *other;
+
+		if (w->kind != FILE_SOCKET || work->source[files_leader(work->want, w)] >= 0)
+			continue;
+		other = files_other_end(work->want, w);
+		if (other)
+			work->source[files_leader(work->want, other)] = -1;
+	}
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->source[files_leader(work->want, &work->want->file[i])] < 0)
+			work->lost[i] = true;
+}
+
+/* A terminal whose session's leader has died is hung up: what was open of it stays dead
+ * (drivers/tty/tty_io.c, __tty_hangup()), and has to be opened again. */
+static bool is_hung_up(int fd, const struct file *w)
+{
+	struct termios settings;
+
+	(void)w;
+	return tcgetattr(fd, &settings) && errno == EIO;
+}
+
+static bool has_the_last(const struct file *w)
+{
+	return w->kind == FILE_SOCKET && w->ended && w->content;
+}
+
+/* Nobody can send again what was read since from a socket that has no other end. */
+static bool was_read(int fd, const struct file *w)
+{
+	int bytes = 0;
+
+	return ioctl(fd, FIONREAD, &bytes) || (uint32_t)bytes != w->content_bytes;
+}
+
+static bool has_node(const struct file *w)
+{
+	return w->socket && w->socket->node;
+}
+
+/* Nobody finds a Unix socket any more whose file was deleted since: made again, it has one. */
+static bool is_deleted(int fd, const struct file *w)
+{
+	return file_unix_is_deleted(fd, w->socket);
+}
+
+static bool was_idle(const struct file *w)
+{
+	return w->socket && w->socket->idle;
+}
+
+/* Who was about to give it a name, or to connect it, will do so again, and the kernel lets
+ * nobody do that twice (bind(2): EINVAL, connect(2): EISCONN). */
+static bool was_used(int fd, const struct file *w)
+{
+	return file_socket_was_used(fd, w->socket);
+}
+
+/* It is there still, and of no use: another one is made. */
+static void give_up_useless(struct files_work *work)
+{
+	static const struct {
+		bool (*concerns)(const struct file *w);
+		bool (*is_useless)(int fd, const struct file *w);
+	} doubts[] = {
+		{ file_is_pts, is_hung_up },
+		{ has_the_last, was_read },
+		{ has_node, is_deleted },
+		{ was_idle, was_used },
+	};
+
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		for (size_t k = 0; k < sizeof doubts / sizeof *doubts; k++) {
+			int fd = -1;
+
+			if (work->source[i] >= 0 && doubts[k].concerns(w))
+				fd = files_borrow(work->table_pidfd,
+						  work->now->file[work->source[i]].fd);
+			if (fd >= 0 && doubts[k].is_useless(fd, w))
+				work->source[i] = -1;
+			close_fd(&fd);
+		}
+	}
+}
+
+/* Of a process of the app's, it is of a dead one. */
+static void give_up_pidfds(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (!w->pid_inside)
+			continue;
+		work->source[files_leader(work->want, w)] = -1;
+		work->lost[i] = true;
+	}
+}
+
+/* Somewhere else in the table, perhaps: the app may have moved it. */
+static void find_moved(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (files_leader(work->want, w) != i || work->source[i] >= 0 ||
+		    (!(w->mode & S_IFMT) && !w->id))
+			continue;
+		for (uint32_t k = 0; k < work->now->count && work->source[i] < 0; k++)
+			if (work->claimed_by[k] < 0 &&
+			    files_leader(work->now, &work->now->file[k]) == k &&
+			    files_same_object(w, &work->now->file[k])) {
+				work->claimed_by[k] = (int)i;
+				work->source[i] = (int)k;
+			}
+	}
+}
+
+static void make_pair(struct files_work *work, const struct file *w)
+{
+	const struct file *other = files_other_end(work->want, w);
+	int ends[2];
+	uint32_t a, b;
+
+	if (!other)
+		return;
+	a = files_leader(work->want, w);
+	b = files_leader(work->want, other);
+	if (a == b || work->local[a] >= 0 || work->local[b] >= 0 || work->source[a] >= 0 ||
+	    work->source[b] >= 0 || file_make_pair(w, other, ends))
+		return;
+	work->local[a] = ends[0];
+	work->local[b] = ends[1];
+}
+
+static const struct file *pipe_in_table(const struct files_work *work, const struct file *w)
+{
+	for (uint32_t k = 0; w->kind == FILE_PIPE && k < work->now->count; k++)
+		if (work->now->file[k].kind == FILE_PIPE && work->now->file[k].ino == w->ino)
+			return &work->now->file[k];
+	return NULL;
+}
+
+/* An end of a pipe of which another end is still open, anywhere in the table. */
+static int reopen_pipe(const struct files_work *work, const struct file *w)
+{
+	const struct file *n = pipe_in_table(work, w);
+	char path[48];
+
+	if (!n)
+		return -1;
+	snprintf(path, sizeof path, "/proc/%d/fd/%d", work->table, n->fd);
+	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
+	return open(path, (w->flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
+}
+
+/* Connections that a lost listening socket had accepted keep its port, and without
+ * SO_REUSEADDR (socket(7)) to themselves. */
+static void share_port(const struct files_work *work, const struct file *w)
+{
+	const struct sockaddr_in *wanted;
+	const int yes = 1;
+
+	if (!w->socket || !w->socket->listening || w->socket->domain == AF_UNIX)
+		return;
+	wanted = (const struct sockaddr_in *)&w->socket->local;
+	for (uint32_t k = 0; k < work->now->count; k++) {
+		struct sockaddr_storage address = { 0 };
+		const struct sockaddr_in *is = (const struct sockaddr_in *)&address;
+		socklen_t bytes = sizeof address;
+		int fd;
+
+		if (work->now->file[k].kind != FILE_SOCKET)
+			continue;
+		/* The port is at the same place in an IPv6 address. */
+		fd = files_borrow(work->table_pidfd, work->now->file[k].fd);
+		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
+		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
+			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
+		close_fd(&fd);
+	}
+}
+
+/* What is in the table somewhere, as long as it is: one descriptor of ours for every open
+ * file description that has to be put in place. */
+static void gather(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const uint32_t group = files_leader(work->want, w);
+
+		if (!work->lost[i] || work->local[group] >= 0)
+			continue;
+		if (work->source[group] >= 0)
+			work->local[group] = files_borrow(work->table_pidfd,
+							  work->now->file[work->source[group]].fd);
+		if (work->local[group] < 0)
+			work->local[group] = reopen_pipe(work, w);
+		if (work->local[group] < 0)
+			share_port(work, w);
+	}
+}
+
+/* The rest, when what the app has opened since is closed, and its ports are free. */
+static void make_lost(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->lost[i] && !pipe_in_table(work, &work->want->file[i]))
+			make_pair(work, &work->want->file[i]);
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const uint32_t group = files_leader(work->want, w);
+		const char *why = NULL;
+
+		if (!work->lost[i] || work->local[group] >= 0)
+			continue;
+		work->local[group] = file_make(w, work->generation->template, work->init, &why);
+		files_note(work, w, why);
+		if (work->local[group] < 0)
+			files_note(work, w, "it can not be made again");
+	}
+}
+
+/* Whether the calls that were listed have to be made at once: locks of what is to be closed
+ * would be in the way of others. */
+static bool is_urgent(const struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->lost[i] || work->want->file[i].lock_count)
+			return true;
+	return false;
+}
+
+/* ---- in the table ------------------------------------------------------------------ */
+
+/* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
+static struct files_letter *mail_of(const struct files_work *work)
+{
+	return (struct files_letter *)(parasite_files(&work->target->parasite,
+						      work->generation->slot) +
+				       INJ_FILES_BYTES / 2);
+}
+
+static struct inj_syscall *list_of(const struct files_work *work)
+{
+	return (struct inj_syscall *)(mail_of(work) + 1);
+}
+
+#define LISTED_MAX \
+	((INJ_FILES_BYTES / 2 - sizeof(struct files_letter)) / sizeof(struct inj_syscall))
+
+/* Of the task that has the table. */
+static struct inj_call *call_of(const struct files_work *work)
+{
+	return work->target->descendant
+		       ? &work->target->parasite.control->holder
+		       : &parasite_slot(&work->target->parasite, work->generation->slot)
+				  ->template_call;
+}
+
+/* What was listed becomes the task's next call. */
+static void close_list(struct files_work *work)
+{
+	if (work->listed)
+		call_add(call_of(work), INJ_LIST,
+			 parasite_remote(&work->target->parasite, list_of(work)), work->listed, 0,
+			 0, 0);
+	work->listed = 0;
+}
+
+/* What came of the calls that were made last. */
+static void note_refused(struct files_work *work, uint32_t count)
+{
+	for (uint32_t i = 0; i < count; i++) {
+		const struct inj_syscall *s = &list_of(work)[i];
+		const struct file *w = s->nr == SYS_dup3 && s->result < 0
+					       ? files_find(work->want, (int)s->arg[1])
+					       : NULL;
+
+		if (w)
+			files_note(work, w, "it could not be put in its place");
+	}
+}
+
+static int flush(struct files_work *work, struct avc_error *err)
+{
+	const struct target *target = work->target;
+	struct inj_call *call = call_of(work);
+	const uint32_t listed = work->listed;
+	int result = 0;
+
+	close_list(work);
+	if (call->count)
+		result = parasite_send(&target->parasite, work->table,
+				       target->descendant ? &target->holder_base
+							  : &work->generation->base,
+				       call, err) ||
+			 parasite_run(work->table, call, err);
+	if (!result)
+		note_refused(work, listed);
+	call_begin(call, INJ_AFTER_PARK);
+	return result ? -1 : 0;
+}
+
+static int inject(struct files_work *work, struct avc_error *err, long nr, uint64_t a, uint64_t b,
+		  uint64_t c)
+{
+	if (work->listed == LISTED_MAX && flush(work, err))
+		return -1;
+	list_of(work)[work->listed++] = (struct inj_syscall){ .nr = nr, .arg = { a, b, c } };
+	return 0;
+}
+
+/* Has somebody watched by this epoll set what is not watched by it in the checkpoint? */
+static bool is_watched_since(const struct files_work *work, const struct file *want,
+			     const struct file_watch *watch)
+{
+	const struct file *w = files_find(work->want, watch->fd);
+
+	return !files_find_watch(want, watch->fd) || !w || work->lost[files_index(work->want, w)];
+}
+
+/* A set watches a number and an open file description, and lets go of them when nobody has
+ * the description open any more (epoll(7), Questions and answers): a process outside of the
+ * app may have it still, and of a table that is made anew the old one stays for a while.  Under
+ * the same number something else is watched then as well.  Only in the table where the two
+ * belong together can they be forgotten. */
+static int forget_watches(struct files_work *work, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const struct file *n = w->kind == FILE_EPOLL ? files_now_of(work, i) : NULL;
+
+		if (!n || files_leader(work->want, w) != i)
+			continue;
+		for (uint32_t k = 0; k < n->watch_count; k++)
+			if (is_watched_since(work, w, &n->watch[k]) &&
+			    inject(work, err, SYS_epoll_ctl, (uint64_t)n->fd, EPOLL_CTL_DEL,
+				   (uint64_t)n->watch[k].fd))
+				return -1;
+	}
+	return 0;
+}
+
+/* POSIX locks are the table's (fcntl(2)), and the one that is made anew has to get them. */
+static int unlock_all(struct files_work *work, struct avc_error *err)
+{
+	struct flock *all = (struct flock *)mail_of(work);
+
+	*all = (struct flock){ .l_type = F_UNLCK, .l_whence = SEEK_SET };
+	for (uint32_t i = 0; i < work->now->count; i++)
+		if (work->now->file[i].lock_count &&
+		    inject(work, err, SYS_fcntl, (uint64_t)work->now->file[i].fd, F_SETLK,
+			   parasite_remote(&work->target->parasite, all)))
+			return -1;
+	return 0;
+}
+
+/* Nothing, or something else, was there at the checkpoint. */
+static bool is_new(const struct files_work *work, const struct file *n)
+{
+	const struct file *w = files_find(work->want, n->fd);
+
+	return !w || work->lost[files_index(work->want, w)];
+}
+
+/* In ranges: a program may have opened thousands since. */
+static int close_new(struct files_work *work, struct avc_error *err)
+{
+	const struct files *now = work->now;
+
+	for (uint32_t i = 0; i < now->count; i++) {
+		const uint32_t first = i;
+
+		if (!is_new(work, &now->file[i]))
+			continue;
+		work->closed[i] = true;
+		while (i + 1 < now->count && now->file[i + 1].fd == now->file[i].fd + 1 &&
+		       is_new(work, &now->file[i + 1]))
+			work->closed[++i] = true;
+		if (inject(work, err, SYS_close_range, (uint64_t)now->file[first].fd,
+			   (uint64_t)now->file[i].fd, 0))
+			return -1;
+	}
+	return 0;
+}
+
+/* Cheaper set than looked at; and by the template, for which a filter of system calls
+ * that the app has made for itself is suspended. */
+static int set_cloexec(struct files_work *work, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (!work->lost[i] && inject(work, err, SYS_fcntl, (uint64_t)w->fd, F_SETFD,
+					     w->cloexec ? FD_CLOEXEC : 0))
+			return -1;
+	}
+	return 0;
+}
+
+/* Which numbers are taken, so that it is known which one the kernel gives next. */
+struct numbers {
+	uint8_t *taken;
+	int room;
+};
+
+static int lowest_free(const struct numbers *numbers, const struct files *avoid)
+{
+	for (int fd = 0; fd < numbers->room; fd++)
+		if (!numbers->taken[fd] && !(avoid && files_find(avoid, fd)))
+			return fd;
+	return -1;
+}
+
+int files_send(int socket, int fd)
+{
+	uint8_t byte = 0, control[CMSG_SPACE(sizeof fd)] __attribute__((aligned(8))) = { 0 };
+	struct iovec io = { &byte, 1 };
+	struct msghdr head = { .msg_iov = &io,
+			       .msg_iovlen = 1,
+			       .msg_control = control,
+			       .msg_controllen = sizeof control };
+	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
+
+	c->cmsg_level = SOL_SOCKET;
+	c->cmsg_type = SCM_RIGHTS;
+	c->cmsg_len = CMSG_LEN(sizeof fd);
+	memcpy(CMSG_DATA(c), &fd, sizeof fd);
+	return sendmsg(socket, &head, MSG_DONTWAIT | MSG_NOSIGNAL) == 1 ? 0 : -1;
+}
+
+void files_letter_write(struct files_letter *letter, avc_remote remote)
+{
+	*letter = (struct files_letter){ 0 };
+	letter->io = (struct iovec){ (void *)(remote + offsetof(struct files_letter, byte)), 1 };
+	letter->head = (struct msghdr){
+		.msg_iov = (void *)(remote + offsetof(struct files_letter, io)),
+		.msg_iovlen = 1,
+		.msg_control = (void *)(remote + offsetof(struct files_letter, control)),
+		.msg_controllen = sizeof letter->control,
+	};
+}
+
+static avc_remote lay_out_mail(const struct files_work *work)
+{
+	struct files_letter *letter = mail_of(work);
+	const avc_remote remote = parasite_remote(&work->target->parasite, letter);
+
+	files_letter_write(letter, remote);
+	return remote;
+}
+
+/* One letter for all: recvmsg(2) leaves the header as it was, for it is just as long. */
+static int receive(struct files_work *work, struct numbers *numbers, int ours, int theirs,
+		   struct avc_error *err)
+{
+	const avc_remote mail = lay_out_mail(work);
+
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const int from = work->local[files_leader(work->want, w)];
+		int to;
+
+		if (!work->lost[i] || from < 0)
+			continue;
+		to = lowest_free(numbers, NULL);
+		if (files_send(ours, from)) {
+			files_note(work, w, "it could not be handed over");
+			continue;
+		}
+		if (inject(work, err, SYS_recvmsg, (uint64_t)theirs, mail,
+			   MSG_CMSG_CLOEXEC | MSG_DONTWAIT))
+			return -1;
+		if (to != w->fd) {
+			if (inject(work, err, SYS_dup3, (uint64_t)to, (uint64_t)w->fd,
+				   w->cloexec ? O_CLOEXEC : 0) ||
+			    inject(work, err, SYS_close, (uint64_t)to, 0, 0))
+				return -1;
+		} else if (!w->cloexec && inject(work, err, SYS_fcntl, (uint64_t)to, F_SETFD, 0)) {
+			return -1;
+		}
+		numbers->taken[w->fd] = 1;
+	}
+	return 0;
+}
+
+static int put_lost(struct files_work *work, struct avc_error *err)
+{
+	struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
+	const struct parasite *parasite = &work->target->parasite;
+	struct inj_call *call = call_of(work);
+	struct numbers numbers = { .room = 16 };
+	int32_t ends[2];
+	int ours, theirs, result = -1;
+	bool any = false;
+
+	for (uint32_t i = 0; i < work->want->count; i++)
+		any |= work->lost[i] &&
+		       work->local[files_leader(work->want, &work->want->file[i])] >= 0;
+	if (!any)
+		return 0;
+	numbers.room += work->want->count ? work->want->file[work->want->count - 1].fd : 0;
+	numbers.taken = calloc((size_t)numbers.room, 1);
+	if (!numbers.taken)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->now->count; i++)
+		if (!work->closed[i])
+			numbers.taken[work->now->file[i].fd] = 1;
+	if (flush(work, err))
+		goto out;
+	/* To hand descriptors over takes some more, and there may be one with a number that was
+	 * allowed once. */
+	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
+	    limit.rlim_cur < (rlim_t)numbers.room)
+		limit_lift(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
+	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
+		 parasite_remote(parasite, call->out), 0);
+	if (flush(work, err))
+		goto out;
+	memcpy(ends, call->out, sizeof ends);
+	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers.room || ends[1] < 0 ||
+	    ends[1] >= numbers.room) {
+		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->target->inside,
+		     "restore descriptors", "socketpair", "descriptors could not be handed over");
+		goto out;
+	}
+	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
+	theirs = lowest_free(&numbers, work->want);
+	ours = files_borrow(work->generation->pidfd, ends[1]);
+	if (ours < 0) {
+		fail_errno(err, work->generation->template, "restore descriptors", "pidfd_getfd",
+			   "descriptors could not be handed over");
+		goto out;
+	}
+	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 0;
+	numbers.taken[theirs] = 1;
+	if (inject(work, err, SYS_fcntl, (uint64_t)ends[0], F_DUPFD_CLOEXEC, (uint64_t)theirs) ||
+	    inject(work, err, SYS_close, (uint64_t)ends[0], 0, 0) ||
+	    inject(work, err, SYS_close, (uint64_t)ends[1], 0, 0) ||
+	    receive(work, &numbers, ours, theirs, err) ||
+	    inject(work, err, SYS_close, (uint64_t)theirs, 0, 0) || flush(work, err))
+		result = -1;
+	else
+		result = 0;
+	close(ours);
+out:
+	if (limit.rlim_cur < (rlim_t)numbers.room)
+		prlimit(work->table, RLIMIT_NOFILE, &limit, NULL);
+	free(numbers.taken);
+	return result;
+}
+
+/* ---- what is behind them ------------------------------------------------------------ */
+
+const struct file *files_now_of(const struct files_work *work, uint32_t i)
+{
+	const int source = work->source[files_leader(work->want, &work->want->file[i])];
+
+	return source < 0 ? NULL : &work->now->file[source];
+}
+
+/* A duplicate of what is at this place of the table now. */
+int files_borrow_placed(const struct files_work *work, const struct file *w)
+{
+	const int local = work->local[files_leader(work->want, w)];
+
+	return local >= 0 ? fcntl(local, F_DUPFD_CLOEXEC, 0)
+			  : files_borrow(work->table_pidfd, w->fd);
+}
+
+static void put_states(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
+		int fd;
+
+		if (files_leader(work->want, w) != i)
+			continue;
+		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
+		    !n->lock_count && !w->lock_count)
+			continue;
+		fd = files_borrow_placed(work, w);
+		if (fd < 0) {
+			files_note(work, w, "it could not be put in its place");
+			continue;
+		}
+		files_note(work, w,
+			   file_put_state(fd, w, n, work->config->files != AVC_FILES_KEEP));
+		if (w->kind == FILE_INOTIFY)
+			files_note(work, w, file_put_marks(fd, w, n, work->init));
+		if (n && n->tcp_state && n->tcp_state != 7 /* TCP_CLOSE */ &&
+		    (work->config->tcp == AVC_TCP_RESET ||
+		     (work->config->tcp == AVC_TCP_RESET_MOVED && file_tcp_moved(w, n))))
+			files_note(work, w, file_reset_tcp(fd));
+		else if (n && n->tcp_state == 1 /* TCP_ESTABLISHED */ &&
+			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
+			files_note(work, w, file_put_stream(fd, w, n));
+		close(fd);
+	}
+}
+
+/* ---- all of it ------------------------------------------------------------------------------ */
+
+static void *filled(uint32_t count, int value)
+{
+	int *array = malloc((count + 1) * sizeof *array);
+
+	for (uint32_t i = 0; array && i < count; i++)
+		array[i] = value;
+	return array;
+}
+
+int files_work_begin(struct files_work *work, struct avc_error *err)
+{
+	work->now = files_new(work->want->count + 64);
+	work->local = filled(work->want->count, -1);
+	work->source = filled(work->want->count, -1);
+	work->lost = calloc(work->want->count + 1, sizeof *work->lost);
+	if (!work->now || !work->local || !work->source || !work->lost)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	/* The app died while it was cloning (guard_checkpoint.c, abandon()). */
+	if (work->table && work->target->descendant && work->target->doubtful &&
+	    tracee_halt(work->table, err))
+		return -1;
+	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
+				      work->want, work->init, err))
+		return -1;
+	if (work->config->tcp == AVC_TCP_MESSAGES) {
+		files_find_going(work->want);
+		files_find_going(work->now);
+	}
+	work->claimed_by = filled(work->now->count, -1);
+	work->closed = calloc(work->now->count + 1, sizeof *work->closed);
+	if (!work->claimed_by || !work->closed)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	find_staying(work);
+	find_moved(work);
+	give_up_useless(work);
+	give_up_pidfds(work);
+	break_pairs(work);
+	return 0;
+}
+
+void files_work_end(struct files_work *work)
+{
+	if (work->problems > 1) {
+		char rest[32];
+
+		snprintf(rest, sizeof rest, " (and %u more)", work->problems - 1);
+		strncat(work->notes->detail, rest,
+			sizeof work->notes->detail - strlen(work->notes->detail) - 1);
+	}
+	for (uint32_t i = 0; work->local && i < work->want->count; i++)
+		close_fd(&work->local[i]);
+	free(work->local);
+	free(work->source);
+	free(work->lost);
+	free(work->claimed_by);
+	free(work->closed);
+	files_free(work->now);
+}
+
+/* All other processes have a table that is made anew. */
+static int gather_anew(struct files_work *work, struct avc_error *err)
+{
+	if (unlock_all(work, err) || flush(work, err))
+		return -1;
+	for (uint32_t i = 0; i < work->want->count; i++)
+		work->lost[i] = true;
+	gather(work);
+	return 0;
+}
+
+int files_work_gather(struct files_work *work, struct avc_error *err)
+{
+	gather(work);
+	call_begin(call_of(work), INJ_AFTER_PARK);
+	if (forget_watches(work, err) || close_new(work, err))
+		return -1;
+	if (work->target->descendant)
+		return gather_anew(work, err);
+	/* What is left on the list is made just before the fork (restore.c). */
+	return set_cloexec(work, err) || (is_urgent(work) && flush(work, err)) ? -1 : 0;
+}
+
+int files_work_place(struct files_work *work, struct avc_error *err)
+{
+	make_lost(work);
+	if (!work->target->descendant && put_lost(work, err))
+		return -1;
+	put_states(work);
+	return 0;
+}
+
+/* What was made again is what the generation has from now on: the next restore finds it,
+ * also where other processes share it. */
+static void remember_made(struct files_work *work)
+{
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		struct file *w = &work->want->file[i];
+		const int fd = work->local[files_leader(work->want, w)];
+		struct stat st;
+
+		/* And not what stands for it, because its name was taken. */
+		if (fd >= 0 && !files_now_of(work, i) && w->socket &&
+		    file_socket_is_alone(w->socket) && file_socket_has_name(fd, w->socket) &&
+		    fstat(fd, &st) == 0)
+			w->ino = st.st_ino;
+	}
+}
+
+void files_work_finish(struct files_work *work)
+{
+	files_connect_again(work);
+	remember_made(work);
+	files_list_calls(work);
+	if (!work->target->descendant)
+		close_list(work);
+}
+
+int files_work_table(const struct files_work *work, struct files_table *table,
+		     struct avc_error *err)
+{
+	table->entry = calloc(work->want->count + 1, sizeof *table->entry);
+	if (!table->entry)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+		const int local = work->local[files_leader(work->want, w)];
+
+		if (local < 0)
+			continue; /* told already */
+		table->entry[table->count].fd = w->fd;
+		table->entry[table->count].cloexec = w->cloexec;
+		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
+	}
+	return 0;
+}
+
+void files_table_free(struct files_table *table)
+{
+	for (uint32_t i = 0; i < table->count; i++)
+		close_fd(&table->entry[i].ours);
+	free(table->entry);
+	*table = (struct files_table){ 0 };
+}

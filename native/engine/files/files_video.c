@@ -1,0 +1,236 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Cameras (V4L2).  Of the buffers that a program has mapped, some are the driver's, to be
+ * filled (VIDIOC_QBUF), and the others the program's (VIDIOC_DQBUF).  The driver does not go
+ * back to a checkpoint: a buffer that died in the program's hands would never be filled
+ * again, and one that the program holds by its memory, but has given back since, would be
+ * refused (EINVAL).
+ *
+ * As long as one of its buffers is mapped anywhere a camera is in use, also when it was closed,
+ * and whoever opens it anew is told so (EBUSY).  So templates do not keep them mapped, and the
+ * restored process maps them again.
+ *
+ * Which are whose: linux/videodev2.h, V4L2_BUF_FLAG_QUEUED and V4L2_BUF_FLAG_DONE;
+ * drivers/media/common/videobuf2/videobuf2-v4l2.c.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/videodev2.h>
+#include <poll.h>
+#include <stdlib.h>
+#include <sys/ioctl.h>
+#include <sys/mman.h>
+#include <sys/syscall.h>
+#include <sys/sysmacros.h>
+#include <unistd.h>
+
+#include "files.h"
+
+#define VIDEO4LINUX_MAJOR 81 /* Documentation/admin-guide/devices.txt */
+
+/* As long as a slow camera (five pictures a second) takes to fill its buffers; init waits 2 s. */
+#define TAKE_NS (1500 * NS_PER_MS)
+
+#define BUFFERS_MAX 64 /* as many as can be told apart; drivers have 32, most of them        */
+
+static const uint32_t types[] = { V4L2_BUF_TYPE_VIDEO_CAPTURE, V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE };
+
+struct buffer {
+	struct v4l2_buffer v4l2;
+	struct v4l2_plane plane[VIDEO_MAX_PLANES];
+};
+
+/* The ticks of the guard's deadline interrupt it. */
+static int tell(int fd, unsigned long request, void *argument)
+{
+	int result;
+
+	while ((result = ioctl(fd, request, argument)) && errno == EINTR &&
+	       !tracee_deadline_passed())
+		;
+	return result;
+}
+
+static int command(int fd, unsigned long request, struct buffer *b, uint32_t type, uint32_t index)
+{
+	*b = (struct buffer){ .v4l2 = {
+				      .type = type, .index = index, .memory = V4L2_MEMORY_MMAP } };
+	if (V4L2_TYPE_IS_MULTIPLANAR(type)) {
+		b->v4l2.m.planes = b->plane;
+		b->v4l2.length = VIDEO_MAX_PLANES;
+	}
+	return tell(fd, request, &b->v4l2);
+}
+
+bool file_is_video(const struct file *f)
+{
+	return f->kind == FILE_DEVICE && major(f->rdev) == VIDEO4LINUX_MAJOR &&
+	       !(f->flags & O_PATH);
+}
+
+/* Anybody may ask (VIDIOC_QUERYBUF); but to others than whose they are no command is allowed,
+ * and that is said before there is no such buffer. */
+static bool is_anothers(int fd, uint32_t type)
+{
+	struct buffer b;
+
+	return command(fd, VIDIOC_QBUF, &b, type, UINT32_MAX) && errno == EBUSY;
+}
+
+static void look_at_buffers(int fd, uint32_t type, struct file_video *video)
+{
+	struct buffer b;
+
+	for (uint32_t i = 0; i < BUFFERS_MAX; i++) {
+		if (command(fd, VIDIOC_QUERYBUF, &b, type, i))
+			return;
+		video->type = type;
+		video->memory = b.v4l2.memory;
+		video->count = i + 1;
+		if (!(b.v4l2.flags & (V4L2_BUF_FLAG_QUEUED | V4L2_BUF_FLAG_DONE)))
+			video->held |= UINT64_C(1) << i;
+	}
+}
+
+int file_look_at_video(int fd, struct file_video *video)
+{
+	*video = (struct file_video){ 0 };
+	for (size_t i = 0; i < sizeof types / sizeof *types && !video->count; i++)
+		look_at_buffers(fd, types[i], video);
+	if (video->count && is_anothers(fd, video->type))
+		*video = (struct file_video){ 0 };
+	return tracee_deadline_passed() ? -1 : 0;
+}
+
+static const char *free_buffers(int fd, const struct file_video *now)
+{
+	struct v4l2_requestbuffers none = { .type = now->type, .memory = now->memory };
+	int type = (int)now->type;
+
+	return tell(fd, VIDIOC_STREAMOFF, &type) || tell(fd, VIDIOC_REQBUFS, &none)
+		       ? "its buffers could not be freed"
+		       : NULL;
+}
+
+static const char *give(int fd, uint32_t type, uint64_t buffers)
+{
+	const char *problem = NULL;
+	struct buffer b;
+
+	for (uint32_t i = 0; i < BUFFERS_MAX; i++)
+		if (buffers >> i & 1 &&
+		    (command(fd, VIDIOC_QUERYBUF, &b, type, i) || tell(fd, VIDIOC_QBUF, &b.v4l2)))
+			problem = "not all of its buffers could be given back to the driver";
+	return problem;
+}
+
+/* Whether there is a picture.  Where the driver is just busy when a tick comes, poll(2) answers
+ * POLLERR (vb2_fop_poll()), as it does where there will never be one. */
+static bool wait_filled(int fd, uint64_t end_ns)
+{
+	for (uint64_t ns; (ns = now_ns()) < end_ns;) {
+		struct pollfd p = { .fd = fd, .events = POLLIN };
+		const int n = poll(&p, 1, (int)((end_ns - ns) / NS_PER_MS) + 1);
+
+		if (n > 0 && p.revents & POLLIN)
+			return true;
+		if (n > 0)
+			usleep(1000);
+	}
+	return false;
+}
+
+/* They come in the order in which they are filled: others that come are given back. */
+static const char *take(int fd, uint32_t type, uint64_t buffers)
+{
+	const uint64_t end_ns = now_ns() + TAKE_NS;
+	struct buffer b;
+
+	while (buffers) {
+		if (!wait_filled(fd, end_ns) || command(fd, VIDIOC_DQBUF, &b, type, 0))
+			return "a buffer that it holds is the driver's now";
+		if (buffers >> b.v4l2.index & 1)
+			buffers &= ~(UINT64_C(1) << b.v4l2.index);
+		else if (give(fd, type, UINT64_C(1) << b.v4l2.index))
+			return "a picture could not be given back to the driver";
+	}
+	return NULL;
+}
+
+const char *file_put_video(int fd, const struct file_video *want)
+{
+	const char *problem;
+	struct file_video now;
+	int type;
+
+	if (file_look_at_video(fd, &now))
+		return "it does not say which buffers are whose";
+	if (!want->count)
+		return now.count ? free_buffers(fd, &now) : NULL;
+	if (now.type != want->type || now.count != want->count)
+		return "its buffers are others now";
+	problem = give(fd, want->type, now.held & ~want->held);
+	/* It had been stopped (VIDIOC_STREAMOFF), which leaves the driver with none. */
+	type = (int)want->type;
+	if (now.held != want->held && now.held == (UINT64_C(2) << (now.count - 1)) - 1 &&
+	    tell(fd, VIDIOC_STREAMON, &type))
+		problem = "it could not be started again";
+	return problem ? problem : take(fd, want->type, want->held & ~now.held);
+}
+
+static int note_area(const struct mapping *m, void *arg)
+{
+	struct files *files = arg;
+	struct file_area *more;
+
+	for (uint32_t i = 0; m->shared && i < files->count; i++) {
+		const struct file *f = &files->file[i];
+
+		if (!f->video.count || m->inode != f->ino ||
+		    m->device != ((uint64_t)major(f->dev) << 32 | minor(f->dev)))
+			continue;
+		more = realloc(files->area, (files->areas + 1) * sizeof *more);
+		if (!more)
+			return -1;
+		files->area = more;
+		files->area[files->areas++] = (struct file_area){
+			.start = m->start,
+			.bytes = m->end - m->start,
+			.offset = m->offset,
+			.protection = mapping_protection(m),
+			.fd = f->fd,
+		};
+		return 0;
+	}
+	return 0;
+}
+
+void files_find_areas(struct files *files, pid_t pid)
+{
+	for (uint32_t i = 0; i < files->count; i++)
+		if (files->file[i].video.count) {
+			(void)proc_mappings(pid, "maps", note_area, files);
+			return;
+		}
+}
+
+/* Something else is mapped in their place: nothing must come to be there, and where a camera is
+ * lost for good, old pictures are black instead of deadly. */
+void files_unmap_areas(struct target *target, const struct generation *generation)
+{
+	struct inj_call *call = &parasite_slot(&target->parasite, generation->slot)->template_call;
+	const struct files *files = generation->files;
+	struct avc_error ignored = { 0 };
+
+	for (uint32_t i = 0; i < files->areas;) {
+		call_begin(call, INJ_AFTER_PARK);
+		for (uint32_t n = 0; i < files->areas && n < INJ_CALLS_MAX; n++, i++)
+			call_add(call, SYS_mmap, files->area[i].start, files->area[i].bytes,
+				 (uint64_t)files->area[i].protection,
+				 MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED | MAP_NORESERVE, ~0u);
+		if (parasite_send(&target->parasite, generation->template, &generation->base, call,
+				  &ignored) ||
+		    parasite_run(generation->template, call, &ignored))
+			return; /* it was killed, or they are mapped for some time more */
+	}
+}

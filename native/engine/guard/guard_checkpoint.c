@@ -1,0 +1,423 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * When a checkpoint is taken, and what is said when none can be.
+ */
+#include <errno.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+#define SPARE_NS (NS_PER_S / 2)
+#define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
+#define QUIESCE_STEP_NS (1 * NS_PER_MS)
+#define TAKE_TRIES 4
+/* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
+#define INHERIT_SHARE 100
+#define SPARE_SHARE 20
+#define MISSES_UNTIL_UNPROTECTED 3
+
+/* ---- checkpoint --------------------------------------------------------------- */
+
+/* The app as it can not be protected: says so once, and gives everything up. */
+void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
+{
+	drop_all(guard);
+	unhold(&guard->target);
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		unhold(guard->tree.member[i]);
+	if (!guard->unprotected || ticket)
+		emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
+	guard->unprotected = true;
+}
+
+int find_app(struct avc_guard *guard, struct avc_error *err)
+{
+	struct proc_status init;
+	pid_t app;
+
+	if (guard->target.pid)
+		return 0;
+	app = init_channel_app(&guard->channel);
+	if (!app || !init_channel_app_started(&guard->channel, app))
+		return fail(err, AVC_DEADLINE, 0, 0, "attach", "",
+			    "the application has not been started yet");
+	guard->target.init = guard->channel.init;
+	if (proc_status(guard->channel.init, &init) == 0)
+		guard->target.plain_filters = init.seccomp_filters;
+	return target_open(&guard->target, app, proc_inside(app), err);
+}
+
+static void wait_quiescent(struct avc_guard *guard, bool *found)
+{
+	const uint64_t end = now_ns() + guard->config.quiesce_ns;
+
+	*found = false;
+	if (!guard->config.quiesce_ns)
+		return;
+	while (!(*found = quiescent(&guard->target)) && now_ns() < end)
+		usleep(QUIESCE_STEP_NS / 1000);
+}
+
+/* The first touch of a page costs a fault: not while the app is stopped. */
+static void touch_slot(const struct parasite *parasite, uint32_t slot, uint32_t threads)
+{
+	for (uint32_t i = 0; i < threads && i < parasite->threads_max; i++) {
+		volatile uint8_t *frame = parasite_frame(parasite, slot, i);
+
+		for (size_t at = 0; at < arch_frame_bytes(); at += ARCH_PAGE_BYTES)
+			frame[at] = 0;
+		frame[arch_frame_bytes() - 1] = 0;
+		*(volatile uint64_t *)parasite_thread(parasite, slot, i) = 0;
+	}
+}
+
+/* Templates of another parasite are of another program, or too small. */
+static void drop_images(struct avc_guard *guard, const struct target *target)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (generation_branch(&guard->generations[i], target))
+			drop_generation(guard, i);
+}
+
+static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_error *err)
+{
+	struct target *target = guard->tree.kin[kin].target;
+	const uint64_t deadline = guard->config.freeze_deadline_ns;
+
+	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
+		return -1;
+	if (target->infected && (target->thread_count > target->parasite.threads_max ||
+				 guard->config.keep >= target->parasite.slots))
+		target->infected = false;
+	if (!target->infected) {
+		if (target->descendant)
+			drop_images(guard, target);
+		else
+			drop_all(guard);
+		unhold(target);
+		for (uint32_t i = 0; i < target->thread_count; i++)
+			target->threads[i].known = false;
+		if (infect(target, guard->config.keep + 1, guard->timer, deadline, err))
+			return -1;
+	}
+	if (acquaint(target, guard->timer, deadline, err))
+		return -1;
+	target->adopts = target->descendant && tree_has_reaper(&guard->tree, kin);
+	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
+	if (!target->holder && !target->adopts && hold(target, guard->timer, deadline, err))
+		return -1;
+	return 0;
+}
+
+static int renew_holders(struct avc_guard *guard, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		if (!target->doubtful)
+			continue;
+		if (proc_is_exiting(guard->target.pid))
+			return fail(err, AVC_GONE, 0, guard->target.pid, "attach", "",
+				    "it has ended");
+		unhold(target);
+	}
+	return 0;
+}
+
+static int prepare(struct avc_guard *guard, struct avc_error *err)
+{
+	struct tree *tree = &guard->tree;
+
+	if (find_app(guard, err) || renew_holders(guard, err))
+		return -1;
+	tree->init = guard->channel.init;
+	tree->slots = guard->config.keep + 1;
+	let_executed_go(guard, true);
+	if (tree_look(tree, err))
+		return -1;
+	for (uint32_t i = 0; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+		struct avc_error failed = { 0 };
+
+		if (!target || (!target->infected && tree_shares_memory(tree, i)))
+			continue;
+		target->shm_bytes = guard->target.shm_bytes;
+		target->tcp_moved = guard->target.tcp_moved;
+		if (prepare_process(guard, i, &failed) == 0)
+			continue;
+		/* One that is ending is seen to by the freeze. */
+		if (i == 0 || failed.code != AVC_GONE) {
+			*err = failed;
+			return -1;
+		}
+	}
+	return 0;
+}
+
+/* What is known of the descriptors while the app runs makes the freeze shorter. */
+static int prepare_files(struct avc_guard *guard, struct avc_error *err)
+{
+	struct tree *tree = &guard->tree;
+
+	for (uint32_t i = 0; i < tree->count; i++) {
+		struct target *target = tree->kin[i].target;
+		struct avc_error failed = { 0 };
+
+		if (target && files_prepare(target, &failed) &&
+		    (i == 0 || failed.code != AVC_GONE)) {
+			*err = failed;
+			return -1;
+		}
+	}
+	return 0;
+}
+
+/* A checkpoint that came to nothing: holders that were cloning are not to be relied on for
+ * another one.  But if it was because the app died, they have what its processes had open. */
+static void abandon(struct avc_guard *guard, struct generation *fresh)
+{
+	generation_drop(fresh);
+	tracee_end_now(); /* they have the tables of processes that are in no generation yet */
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		guard->tree.member[i]->doubtful |= guard->tree.member[i]->lost;
+	if (guard->tree.members)
+		kill_lost(guard);
+	let_ended_go(guard);
+}
+
+static int files_errors(const struct generation *generation, struct avc_error *err)
+{
+	if (generation->files_error.code) {
+		*err = generation->files_error;
+		return -1;
+	}
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].target && files_errors(generation->branch[i].image, err))
+			return -1;
+	return 0;
+}
+
+/* avckpt.files=strict: from here on, nothing is written that is not seen. */
+static void watch_files(struct avc_guard *guard, struct generation *fresh)
+{
+	struct target *target = &guard->target;
+
+	if (!guard->written)
+		guard->written = files_written_new();
+	if (guard->written)
+		files_written_watch(guard->written, target->pid, &fresh->notice);
+	fresh->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+}
+
+/* What a restore can be spared of it is found out when nothing else is to be done. */
+static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
+{
+	const uint64_t interval_ns = guard->config.interval_ns;
+	struct avc_error later = { 0 };
+
+	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
+	if (fresh->branches &&
+	    restore_plan_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX,
+			       &later))
+		guard->ahead_ns = UINT64_MAX; /* there is no memory for it */
+}
+
+/* Of those before the newest; there is one at most. */
+static bool drop_old_spare(struct avc_guard *guard)
+{
+	bool any = false;
+
+	for (uint32_t i = 0; i + 1 < guard->count; i++) {
+		any |= guard->generations[i].spare.pid != 0;
+		spare_drop(&guard->generations[i]);
+	}
+	tracee_end_now();
+	return any;
+}
+
+static bool wants_spare(const struct avc_guard *guard, struct generation *newest)
+{
+	const uint64_t interval_ns = guard->config.interval_ns;
+
+	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
+	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
+}
+
+static void make_spare(struct avc_guard *guard, struct generation *newest)
+{
+	struct avc_error error = { 0 };
+
+	tracee_deadline_set(guard->timer, SPARE_NS);
+	/* A template that was killed is seen to by reap_dead(), as soon as that can be seen. */
+	if (spare_make(&guard->target, newest, &error) && error.code != AVC_GONE &&
+	    !pidfd_ended(newest->pidfd))
+		lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
+	tracee_deadline_clear(guard->timer);
+}
+
+void work_ahead(struct avc_guard *guard)
+{
+	struct generation *newest;
+	bool more = true;
+
+	guard->ahead_ns = UINT64_MAX;
+	if (!guard->count)
+		return;
+	newest = &guard->generations[guard->count - 1];
+	if (drop_old_spare(guard))
+		; /* which has to end first */
+	else if (wants_spare(guard, newest))
+		make_spare(guard, newest);
+	else
+		more = !newest->spare.work &&
+		       restore_plan_next(newest); /* which reads its memory */
+	if (more)
+		guard->ahead_ns = now_ns();
+}
+
+static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	struct target *target = &guard->target;
+	struct generation fresh = { .pidfd = -1, .slot = free_slot(guard) };
+	struct mem_seen seen = { 0 };
+	struct freeze_times times;
+	int result;
+
+	if (prepare_files(guard, err) || memory_prepare(target->memory, &fresh.image, &seen, err)) {
+		generation_drop(&fresh);
+		return -1;
+	}
+	if (guard->config.files == AVC_FILES_STRICT)
+		watch_files(guard, &fresh);
+	touch_slot(&target->parasite, fresh.slot, target->thread_count);
+	for (uint32_t i = 1; i < guard->tree.count; i++)
+		if (guard->tree.kin[i].target && guard->tree.kin[i].target->infected)
+			touch_slot(&guard->tree.kin[i].target->parasite, fresh.slot,
+				   guard->tree.kin[i].target->thread_count);
+	wait_quiescent(guard, &fresh.quiescent);
+	/* What is written between here and the freeze counts as written after it. */
+	note_written(guard);
+	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh, &seen,
+			&times, err);
+	event->freeze_ns = times.freeze_ns;
+	event->stop_ns = times.stop_ns;
+	event->clone_ns = times.clone_ns;
+	event->threads = generation_threads(&fresh);
+	if (!result)
+		result = files_errors(&fresh, err);
+	if (!result) {
+		tracee_deadline_set(guard->timer, NS_PER_S);
+		result = generation_finish(target, &fresh, err);
+		tracee_deadline_clear(guard->timer);
+	}
+	if (result) {
+		abandon(guard, &fresh);
+		return -1;
+	}
+	event->error = fresh.notice;
+	files_settle(target, &fresh);
+	for (uint32_t i = 0; i < fresh.branches; i++)
+		if (fresh.branch[i].target)
+			files_settle(fresh.branch[i].target, fresh.branch[i].image);
+	if (fresh.branches)
+		files_settle_family(target, &fresh,
+				    guard->count ? &guard->generations[guard->count - 1] : NULL);
+	fresh.number = ++guard->number;
+	fresh.clone_ns = times.clone_ns;
+	begin_ahead(guard, &fresh);
+	keep_generation(guard, &fresh);
+	init_channel_arm(&guard->channel, true);
+	event->generation = fresh.number;
+	event->generations = guard->count;
+	event->quiescent = fresh.quiescent;
+	tend_tree(guard);
+	return 0;
+}
+
+/* A limit of processes, or of memory, leaves no room for a template: spares have to go, and
+ * those that were to go a little later. */
+static bool make_way(struct avc_guard *guard, const struct avc_error *err)
+{
+	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
+		return false;
+	await_spares(guard);
+	for (uint32_t i = 0; i < guard->count; i++) {
+		guard->cramped |= guard->generations[i].spare.pid != 0;
+		spare_drop(&guard->generations[i]);
+	}
+	if (tracee_ending_pidfd(0) < 0)
+		return false;
+	wait_ended();
+	usleep(INIT_REAPS_US);
+	return true;
+}
+
+/* EAGAIN means that something was not as it was known to be, and is known now: memory
+ * that has to be copied aside, or a process. */
+static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	for (int tries = 1;; tries++) {
+		*err = (struct avc_error){ 0 };
+		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
+			return 0;
+		if (tries == TAKE_TRIES ||
+		    (!make_way(guard, err) && (err->code != AVC_DEADLINE || err->errnum != EAGAIN)))
+			return -1;
+	}
+}
+
+void checkpoint(struct avc_guard *guard, uint64_t ticket)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_CHECKPOINT);
+	struct avc_error error = { 0 };
+	bool hopeless;
+
+	guard->next_ns = interval_end(guard);
+	if (init_channel_stop_asked(&guard->channel)) {
+		if (ticket)
+			refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+		return;
+	}
+	if (!guard->room) {
+		if (ticket)
+			refuse(guard, ticket, AVC_BUSY,
+			       "memory is short, so no generation is held");
+		return;
+	}
+	if (take(guard, &event, &error) == 0) {
+		guard->misses = 0;
+		guard->unprotected = false;
+		event.ticket = ticket;
+		event.app_pid = guard->target.leader;
+		event.app_pid_inside = guard->target.inside;
+		emit(guard, &event);
+		return;
+	}
+	if (error.code == AVC_GONE)
+		guard->dying_until_ns = now_ns() + DYING_NS;
+	/* Of a dying app init's report tells; this is for one that is only away. */
+	if (error.code == AVC_GONE && guard->target.pid && pidfd_ended(guard->target.pidfd)) {
+		if (ticket)
+			emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
+	/* A child process may be gone at the next look: the generations there are
+	 * stay good for a while. */
+	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
+		   error.code == AVC_BUSY;
+	if (hopeless && error.pid != guard->target.pid && guard->count &&
+	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
+		emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
+	if (hopeless) {
+		unprotect(guard, ticket, &error);
+		return;
+	}
+	event.kind = AVC_EVENT_MISSED;
+	event.generations = guard->count; /* another parasite may have cost them all */
+	event.ticket = ticket;
+	event.error = error;
+	emit(guard, &event);
+}

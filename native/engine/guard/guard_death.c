@@ -1,0 +1,292 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What follows a death: a restore, or init being told to end.
+ */
+#include <errno.h>
+#include <signal.h>
+#include <string.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+/* ---- death and restore --------------------------------------------------------- */
+
+static int say_restored(void *arg, struct avc_error *err)
+{
+	struct avc_guard *guard = arg;
+
+	return init_channel_verdict(&guard->channel, AVC_VERDICT_RESTORED, err);
+}
+
+static uint32_t restores_within(const struct avc_guard *guard, uint64_t now)
+{
+	uint32_t n = 0;
+
+	for (uint32_t i = 0; i < RESTORES_MAX; i++)
+		n += guard->restored_at[i] &&
+		     now - guard->restored_at[i] < guard->config.restore_window_ns;
+	return n;
+}
+
+/* Whether this death is to be followed by a restore; else why not. */
+static bool is_abnormal(const struct avc_guard *guard, const struct avc_report *report,
+			enum avc_reason *reason)
+{
+	const struct avc_config *config = &guard->config;
+	const int status = report->status;
+
+	if (report->flags & AVC_REPORT_STOP_ASKED) {
+		*reason = AVC_REASON_STOPPED;
+		return false;
+	}
+	if (guard->restore_asked) {
+		*reason = guard->restore_asked;
+		return true;
+	}
+	if (WIFSIGNALED(status)) {
+		*reason = config->restore_on_signal ? AVC_REASON_SIGNAL : AVC_REASON_POLICY;
+		return config->restore_on_signal;
+	}
+	if (WEXITSTATUS(status) == 0) {
+		*reason = AVC_REASON_CLEAN_EXIT;
+		return false;
+	}
+	if (config->restore_on_exit || config->restore_on_status[WEXITSTATUS(status)]) {
+		*reason = AVC_REASON_EXIT;
+		return true;
+	}
+	*reason = AVC_REASON_POLICY;
+	return false;
+}
+
+static void give_up(struct avc_guard *guard, const struct avc_report *report,
+		    enum avc_reason reason, const struct avc_error *error)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_GAVE_UP);
+	struct avc_error ignored = { 0 };
+
+	(void)init_channel_verdict(&guard->channel, AVC_VERDICT_GIVE_UP, &ignored);
+	event.reason = reason;
+	event.wait_status = report->status;
+	event.died_ns = report->reaped_ns;
+	event.error = *error;
+	event.ticket = guard->restore_ticket;
+	emit(guard, &event);
+	drop_all(guard);
+	unhold(&guard->target);
+	target_close(&guard->target);
+	/* Init ends now, and why is what was told last. */
+	guard->next_ns = UINT64_MAX;
+}
+
+/* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
+static void release_new(struct avc_guard *guard, const struct generation *generation)
+{
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->holder &&
+		    !generation_branch(generation, guard->tree.member[i]))
+			release(guard, guard->tree.member[i]);
+}
+
+/* The other processes are those of the generation now; of what they had before they died
+ * nothing is open any more (generation_close_tables()). */
+static void adopt_family(struct avc_guard *guard, const struct generation *generation)
+{
+	struct tree *tree = &guard->tree;
+
+	for (uint32_t i = 0; i < tree->members; i++)
+		tree_let_go(tree->member[i]);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct branch *branch = &generation->branch[i];
+		struct avc_error gone = { 0 };
+		struct proc_stat stat;
+
+		if (!branch->target)
+			continue;
+		/* One that has died again already is seen to by the next checkpoint. */
+		if (proc_stat(branch->pid, &stat) == 0 &&
+		    target_open(branch->target, branch->pid, branch->inside, &gone) == 0) {
+			branch->target->infected = true;
+			branch->target->start = stat.start;
+		}
+	}
+	tree->count = 0;
+	guard->target.childless = !generation->branches;
+}
+
+/* The newest generation; when restores are used up, the one before it.  There were `had`
+ * when the app died. */
+static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
+		       enum avc_reason reason, uint32_t had, struct avc_error *error)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_RESTORED);
+	struct target *target = &guard->target;
+	const struct avc_config *config = &guard->config;
+	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
+	bool ending = guard->count < had, again = false;
+
+	event.ticket = guard->restore_ticket;
+	while (guard->count) {
+		struct generation *generation = &guard->generations[guard->count - 1];
+		struct restore_times times;
+		pid_t pid;
+
+		struct avc_error failed = { 0 }, notes = { 0 };
+
+		/* What was written since the newest was written since all others, also
+		 * where that can not be seen any more. */
+		if (check_strict(guard, generation, generation->template, generation->pidfd,
+				 &failed)) {
+			*error = failed;
+			drop_all(guard);
+			break;
+		}
+		release_new(guard, generation);
+		/* Nor do templates of one that was lost by this death: theirs are the same
+		 * tables.  And they count where processes are limited, as a spare does. */
+		if (ending)
+			wait_ended();
+		if (restore(target, generation, &guard->channel, config, guard->timer,
+			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
+			    &failed)) {
+			/* Perhaps because the spare was killed when it was needed, or was one
+			 * process too many.  The template is as good as before. */
+			if (generation->spare.pid && !again) {
+				spare_drop(generation);
+				generation->spare.unwanted = failed.errnum == EAGAIN;
+				again = true;
+			} else {
+				if (!error->code)
+					*error = failed;
+				drop_generation(guard, guard->count - 1);
+				again = false;
+			}
+			ending = true;
+			kill_lost(guard);
+			continue;
+		}
+		/* If this fails it has died already: the next report tells. */
+		target->infected =
+			target_open(target, pid,
+				    parasite_slot(&target->parasite, generation->slot)->pid,
+				    &failed) == 0;
+		adopt_family(guard, generation);
+		generation->spare.tried = false; /* that one is used up */
+		guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
+		guard->restores++;
+		guard->lineage = generation->lineage;
+		guard->restored_from = generation->number;
+		guard->proved = false;
+		if (reason != AVC_REASON_COMMAND) {
+			guard->restored_ns = now_ns();
+			guard->restored_at[guard->crash_restores++ % RESTORES_MAX] =
+				guard->restored_ns;
+		}
+		event.reason = reason;
+		event.app_pid = pid;
+		event.app_pid_inside = target->inside;
+		event.wait_status = report->status;
+		event.died_ns = report->reaped_ns;
+		event.restore_ns = times.restore_ns;
+		event.fork_ns = times.fork_ns;
+		event.threads_ns = times.threads_ns;
+		event.threads = generation_threads(generation);
+		event.generation = generation->number;
+		event.generations = guard->count;
+		event.attempt = attempt;
+		event.restores = guard->restores;
+		/* Of a newer generation that would not; or what is not as it was. */
+		event.error = error->code ? *error : notes;
+		event.age_ns = report->reaped_ns - generation->taken_ns;
+		event.at_ns = now_ns();
+		emit(guard, &event);
+		break;
+	}
+	/* It has the dead app's memory, and what was open is the restored one's. */
+	unhold_soon(target);
+	return guard->count > 0;
+}
+
+/* A death in quick succession should be as cheap as the first; and of the processes that
+ * are not the main one only the holder keeps what they have open. */
+static void hold_all(struct avc_guard *guard)
+{
+	struct avc_error ignored = { 0 };
+
+	/* The next checkpoint tries again, and tells. */
+	if (hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+		guard->dying_until_ns = now_ns() + DYING_NS;
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		ignored = (struct avc_error){ 0 };
+		if (target->pid && !target->adopts &&
+		    hold(target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+			guard->dying_until_ns = now_ns() + DYING_NS;
+	}
+}
+
+/* Killed in the middle of a checkpoint: init can not wait for a process before we have waited
+ * for those of its threads that are our tracees. */
+static void reap_tracees(void *arg)
+{
+	struct avc_guard *guard = arg;
+
+	(void)all_stragglers(guard);
+	reap_unknown(guard);
+}
+
+void died(struct avc_guard *guard, const struct avc_report *report)
+{
+	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
+	const uint32_t had = guard->count;
+	struct avc_error error = { 0 };
+	enum avc_reason reason;
+
+	rt_priority_begin();
+	guard->channel.death = report->seq;
+	guard->channel.working_ns = now_ns();
+	event.wait_status = report->status;
+	event.died_ns = report->reaped_ns;
+	emit(guard, &event);
+	target_close(&guard->target);
+	kill_lost(guard);
+	if (!is_abnormal(guard, report, &reason)) {
+		give_up(guard, report, reason, &error);
+		goto out;
+	}
+	if (reason != AVC_REASON_COMMAND && guard->count) {
+		const uint32_t restores = restores_within(guard, now_ns());
+
+		count_crash(guard, reason == AVC_REASON_UNHEALTHY);
+		if (reason == AVC_REASON_UNHEALTHY)
+			drop_unhealthy(guard);
+		choose(guard, restores >= guard->config.restore_max);
+		if (!guard->count) {
+			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
+			     "it was restored %u time(s) already", guard->restores);
+			give_up(guard, report, AVC_REASON_LIMIT, &error);
+			goto out;
+		}
+	}
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->pid)
+			target_kill(guard->tree.member[i]);
+	if (init_channel_kill_leftovers(&guard->channel, is_ours, reap_tracees, guard, &error)) {
+		give_up(guard, report, AVC_REASON_FAILED, &error);
+	} else if (!guard->count) {
+		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
+		give_up(guard, report, AVC_REASON_EMPTY, &error);
+	} else if (!bring_back(guard, report, reason, had, &error)) {
+		give_up(guard, report, AVC_REASON_FAILED, &error);
+	} else {
+		if (guard->target.pid)
+			hold_all(guard);
+		guard->next_ns = interval_end(guard);
+	}
+out:
+	rt_priority_end();
+	guard->restore_asked = AVC_REASON_NONE;
+	guard->restore_ticket = 0;
+}

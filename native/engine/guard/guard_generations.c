@@ -1,0 +1,453 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Which generations are held, and what has become of those that were.
+ */
+#include <poll.h>
+#include <string.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+#define CONTAINER_END_MS 20
+#define LATE_SPARE_NS (1 * NS_PER_MS)
+#define ENDED_NS (50 * NS_PER_MS)
+#define ENDED_STEP_US 200
+
+/* ---- generations ------------------------------------------------------------ */
+
+void drop_generation(struct avc_guard *guard, uint32_t i)
+{
+	/* Disarmed first: a death in between is then final at once. */
+	if (guard->count == 1 && guard->channel.ctl)
+		init_channel_arm(&guard->channel, false);
+	guard->target.lost |= spare_is_unknown(&guard->generations[i]);
+	generation_drop(&guard->generations[i]);
+	guard->count--;
+	memmove(&guard->generations[i], &guard->generations[i + 1],
+		(guard->count - i) * sizeof *guard->generations);
+}
+
+void drop_all(struct avc_guard *guard)
+{
+	while (guard->count)
+		drop_generation(guard, 0);
+}
+
+uint32_t free_slot(const struct avc_guard *guard)
+{
+	for (uint32_t slot = 0;; slot++) {
+		bool used = false;
+
+		for (uint32_t i = 0; i < guard->count; i++)
+			used |= guard->generations[i].slot == slot;
+		if (!used)
+			return slot;
+	}
+}
+
+/* Given up before its time; the event is to be emitted. */
+static struct avc_event lost_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason)
+{
+	const struct generation lost = guard->generations[i];
+	struct avc_event event;
+
+	drop_generation(guard, i);
+	event = event_new(guard, AVC_EVENT_DROPPED);
+	event.reason = reason;
+	event.generation = lost.number;
+	event.age_ns = event.at_ns - lost.taken_ns;
+	event.attempt = lost.crashes > lost.lost ? lost.crashes : lost.lost;
+	return event;
+}
+
+void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason, uint64_t ticket)
+{
+	struct avc_event event = lost_generation(guard, i, reason);
+
+	event.ticket = ticket;
+	emit(guard, &event);
+}
+
+bool is_ours(pid_t pid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	if (pid == guard->target.holder || tracee_is_ending(pid))
+		return true;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->holder == pid)
+			return true;
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const struct generation *generation = &guard->generations[i];
+
+		if (generation->template == pid || generation->spare.pid == pid)
+			return true;
+		for (uint32_t k = 0; k < generation->branches; k++)
+			if (generation->branch[k].image &&
+			    generation->branch[k].image->template == pid)
+				return true;
+	}
+	return false;
+}
+
+bool is_known_process(pid_t pid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	if (pid == guard->target.leader)
+		return true;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (guard->tree.member[i]->leader == pid)
+			return true;
+	return is_ours(pid, guard);
+}
+
+void wait_ended(void)
+{
+	const uint64_t end = now_ns() + ENDED_NS;
+
+	tracee_end_now();
+	while (tracee_reap_ending() && now_ns() < end)
+		usleep(ENDED_STEP_US);
+}
+
+/* Of those that were late (spare_make), whichever has been made by now. */
+void await_spares(struct avc_guard *guard)
+{
+	for (uint32_t i = 0; i < guard->count; i++) {
+		struct avc_error late = { 0 };
+
+		if (!guard->generations[i].spare.work)
+			continue;
+		tracee_deadline_set(guard->timer, LATE_SPARE_NS);
+		/* Or it is still on its way; who was killed is seen to by reap_dead(). */
+		if (spare_await(&guard->target, &guard->generations[i], &late))
+			guard->target.lost |= late.code != AVC_DEADLINE;
+		tracee_deadline_clear(guard->timer);
+	}
+}
+
+void kill_lost(struct avc_guard *guard)
+{
+	await_spares(guard);
+	init_channel_kill_lost(&guard->channel, is_known_process, guard);
+	guard->target.lost = false;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		guard->tree.member[i]->lost = false;
+}
+
+static bool has_thread(const struct target *target, pid_t tid)
+{
+	for (uint32_t i = 0; i < target->thread_count; i++)
+		if (target->threads[i].tid == tid && target->threads[i].attached)
+			return true;
+	return false;
+}
+
+static bool is_known(pid_t tid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	if (is_ours(tid, guard) || has_thread(&guard->target, tid))
+		return true;
+	for (uint32_t i = 0; i < guard->tree.members; i++)
+		if (has_thread(guard->tree.member[i], tid))
+			return true;
+	return false;
+}
+
+void release(struct avc_guard *guard, struct target *target)
+{
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const struct branch *branch = generation_branch(&guard->generations[i], target);
+
+		if (branch)
+			generation_close_files(target, branch->image);
+	}
+	tree_let_go(target);
+}
+
+#define EXEC_CHECK_NS (1 * NS_PER_MS)
+#define EXEC_CHECK_LONG_NS (200 * NS_PER_MS)
+
+static bool found_executed(struct target *target, uint64_t now)
+{
+	uint64_t pause = (now - target->held_ns) / 8;
+
+	if (pause < EXEC_CHECK_NS)
+		pause = EXEC_CHECK_NS;
+	if (pause > EXEC_CHECK_LONG_NS)
+		pause = EXEC_CHECK_LONG_NS;
+	target->exec_check_ns = now + pause;
+	return has_executed(target);
+}
+
+/* One that executes another program closes what it has marked for that (O_CLOEXEC), and
+ * somebody may be waiting for just that.  The kernel does not tell, so it is looked at: often
+ * at first, for most do it at once if they do it at all. */
+void let_executed_go(struct avc_guard *guard, bool all)
+{
+	struct target *main = &guard->target;
+	const uint64_t now = now_ns();
+
+	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
+		while (guard->count)
+			lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
+		tracee_end_now(); /* they have the table that exec(2) has left */
+		unhold(main);
+		main->infected = false; /* what was mapped there went with its memory */
+	}
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		if (target->pid && target->infected && (all || now >= target->exec_check_ns) &&
+		    found_executed(target, now))
+			release(guard, target);
+	}
+}
+
+uint64_t exec_check_due(const struct avc_guard *guard)
+{
+	uint64_t due = guard->target.holder ? guard->target.exec_check_ns : UINT64_MAX;
+
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		const struct target *target = guard->tree.member[i];
+
+		if (target->pid && target->infected && target->exec_check_ns < due)
+			due = target->exec_check_ns;
+	}
+	return due;
+}
+
+/* When the main process goes, the others go with it, and all of it comes back with what
+ * the holders have.  Some end by themselves, as soon as it has closed what it has open:
+ * before its own end can be seen.  So that is looked for last. */
+void let_ended_go(struct avc_guard *guard)
+{
+	const struct target *main = &guard->target;
+
+	for (uint32_t i = 0; i < guard->tree.members; i++) {
+		struct target *target = guard->tree.member[i];
+
+		if (!target->pid || !pidfd_ended(target->pidfd))
+			continue;
+		if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
+			return;
+		release(guard, target);
+	}
+	tree_sweep(&guard->tree);
+}
+
+void tend_tree(struct avc_guard *guard)
+{
+	let_executed_go(guard, false);
+	let_ended_go(guard);
+}
+
+/* An app that is killed while its threads are being stopped may leave a thread that
+ * was just being made: attached to us, unheard of, and in the way of its leader's end. */
+void reap_unknown(const struct avc_guard *guard)
+{
+	/* The first that is known hides the others. */
+	(void)tracee_reap_ending();
+	while (tracee_reap_unknown(is_known, guard))
+		;
+}
+
+static bool has_ended(const struct generation *generation)
+{
+	if (pidfd_ended(generation->pidfd))
+		return true;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].image && pidfd_ended(generation->branch[i].image->pidfd))
+			return true;
+	return false;
+}
+
+/* Templates that were killed: by us, from inside the container or by the OOM killer. */
+void reap_dead(struct avc_guard *guard)
+{
+	struct avc_event events[AVC_KEEP_MAX];
+	struct pollfd news[] = {
+		{ .fd = guard->channel.init_pidfd, .events = POLLIN },
+		{ .fd = guard->channel.report_fd, .events = POLLIN },
+	};
+	uint32_t count = 0;
+
+	/* With its PID namespace everything dies, and init last, once we have
+	 * reaped what is ours: then it is no news.  A death does not wait. */
+	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
+		(void)tracee_reap_ending();
+		for (uint32_t i = 0; i < guard->count; i++)
+			(void)spare_is_there(&guard->generations[i]);
+		for (uint32_t i = guard->count; i-- > 0;)
+			if (has_ended(&guard->generations[i]))
+				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
+		if (guard->target.holder && pidfd_ended(guard->target.holder_pidfd))
+			unhold(&guard->target);
+		for (uint32_t i = 0; i < guard->tree.members; i++)
+			if (guard->tree.member[i]->holder &&
+			    pidfd_ended(guard->tree.member[i]->holder_pidfd))
+				unhold(guard->tree.member[i]);
+		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
+			return;
+		if (news[1].revents & POLLIN)
+			break;
+		if (news[1].revents)
+			news[1].fd = -1; /* init is just ending */
+	}
+	for (uint32_t i = 0; i < count; i++)
+		emit(guard, &events[i]);
+}
+
+/* ---- which generations are worth keeping ------------------------------------------
+ *
+ * A bug that is in the state and not in the moment comes back with every restore, and
+ * with every checkpoint taken after one.  So for restore_window_ns after a restore the
+ * process is on probation: checkpoints of it are of the same lineage as the generation
+ * it came from, carry that one's crashes, and take the place of their own kind, so that
+ * what is older is still there to go back to.
+ */
+
+static bool on_probation(const struct avc_guard *guard)
+{
+	return guard->restored_ns &&
+	       now_ns() - guard->restored_ns < guard->config.restore_window_ns;
+}
+
+static int newest_vouched(const struct avc_guard *guard)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (guard->generations[i].vouched)
+			return (int)i;
+	return -1;
+}
+
+static int newest_seen(const struct avc_guard *guard)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (guard->generations[i].seen && !guard->generations[i].vouched)
+			return (int)i;
+	return -1;
+}
+
+/* Which one goes next, if one must. */
+uint32_t dispensable(const struct avc_guard *guard, bool probation)
+{
+	const int vouched = newest_vouched(guard), seen = newest_seen(guard);
+
+	if (probation)
+		for (uint32_t i = guard->count; i-- > 0;)
+			if (guard->generations[i].lineage == guard->lineage && (int)i != vouched &&
+			    (int)i != seen)
+				return i;
+	for (uint32_t i = 0; i < guard->count; i++)
+		if ((int)i != vouched && (int)i != seen)
+			return i;
+	return vouched == 0 && guard->count > 1 ? 1 : 0;
+}
+
+/* Takes in a new generation, its lineage known. */
+void keep_generation(struct avc_guard *guard, struct generation *fresh)
+{
+	const bool probation = on_probation(guard);
+
+	if (!probation) {
+		guard->restored_ns = 0;
+		guard->lineage = ++guard->lineages;
+	}
+	fresh->lineage = guard->lineage;
+	for (uint32_t i = 0; i < guard->count; i++)
+		if (guard->generations[i].lineage == guard->lineage &&
+		    guard->generations[i].crashes > fresh->crashes)
+			fresh->crashes = guard->generations[i].crashes;
+	while (guard->count >= guard->room)
+		drop_generation(guard, dispensable(guard, probation));
+	guard->generations[guard->count++] = *fresh;
+	/* Only a health check can say that a process does not hang. */
+	if (!guard->vouching)
+		guard->proved = true;
+}
+
+/* The process that ran is gone, and nobody wanted that: what it came from is suspect.
+ * A hang takes its time to be noticed, so that a hung one is on probation until it was
+ * healthy once. */
+void count_crash(struct avc_guard *guard, bool hung)
+{
+	const bool probation = on_probation(guard) ||
+			       (hung && guard->restored_from && !guard->proved);
+
+	for (uint32_t i = 0; i < guard->count; i++) {
+		struct generation *generation = &guard->generations[i];
+
+		if (generation->lineage == guard->lineage)
+			generation->crashes = probation ? generation->crashes + 1 : 0;
+		if (generation->number == guard->restored_from)
+			generation->lost = probation && !guard->proved ? generation->lost + 1 : 0;
+	}
+}
+
+/* Of a hung process, checkpoints may have been taken for as long as nobody noticed. */
+void drop_unhealthy(struct avc_guard *guard)
+{
+	const int vouched = newest_vouched(guard);
+	const uint32_t good = vouched < 0 ? 0 : (uint32_t)vouched;
+
+	while (guard->count > good + 1)
+		lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
+}
+
+/* Leaves the generation to restore from as the newest, or none. */
+void choose(struct avc_guard *guard, bool used_up)
+{
+	const uint32_t max = guard->config.restore_max;
+
+	while (guard->count) {
+		const struct generation *newest = &guard->generations[guard->count - 1];
+		const uint32_t tries = guard->count > 1 ? (max + 1) / 2 : max;
+
+		if (!(used_up && (newest->crashes || newest->lost)) &&
+		    newest->lost < (tries ? tries : 1))
+			break;
+		lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
+	}
+}
+
+/* ---- avckpt.files=strict ----------------------------------------------------- */
+
+/* Before the next generation is taken, and before one is restored: no generation is
+ * good any more after a file was written. */
+void note_written(struct avc_guard *guard)
+{
+	const struct files *known = guard->count ? guard->generations[guard->count - 1].files
+						 : NULL;
+	char name[FILES_NAME];
+
+	if (!guard->written || !files_written_since(guard->written, known, name))
+		return;
+	for (uint32_t i = 0; i < guard->count; i++)
+		memcpy(guard->generations[i].written, name, sizeof name);
+}
+
+/* Whether it may be restored, in a container that is strict.  A process that has the
+ * table of descriptors as it is now. */
+int check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid, int pidfd,
+		 struct avc_error *err)
+{
+	if (guard->config.files != AVC_FILES_STRICT)
+		return 0;
+	note_written(guard);
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct target *target = generation->branch[i].target;
+
+		/* What one that has ended before has written, note_written() knows. */
+		if (target && target->holder &&
+		    files_check_strict(generation->branch[i].image, target->holder,
+				       target->holder_pidfd, guard->channel.init, target->holder,
+				       err))
+			return -1;
+	}
+	return files_check_strict(generation, pid, pidfd, guard->channel.init, guard->target.holder,
+				  err);
+}

@@ -1,0 +1,252 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What can not be protected, found while the app runs; and whether this is a
+ * good moment.
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/ptrace.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "files.h"
+
+static const struct {
+	const char *prefix, *reason;
+} unsupported_fds[] = {
+	{ "anon_inode:[io_uring]", "it uses io_uring" },
+	{ "anon_inode:[userfaultfd]", "it uses userfaultfd" },
+	{ "anon_inode:[perf_event]", "it has performance counters open" },
+	{ "/dev/nvidia", "it has a GPU device open" },
+	{ "/dev/dri/", "it has a GPU device open" },
+	{ "/dev/kfd", "it has a GPU device open" },
+	{ "/dev/kvm", "it runs virtual machines" },
+};
+
+static int check_descriptors(struct target *target, struct avc_error *err)
+{
+	char path[64], link[128];
+	struct dirent *entry;
+	int result = 0;
+	DIR *dir;
+
+	snprintf(path, sizeof path, "/proc/%d/fd", target->pid);
+	dir = opendir(path);
+	if (!dir)
+		return fail_errno(err, target->pid, "check", "open(fd)", "it has ended");
+	target->socket_count = 0;
+	while (!result && (entry = readdir(dir))) {
+		ssize_t n = readlinkat(dirfd(dir), entry->d_name, link, sizeof link - 1);
+
+		if (n <= 0)
+			continue;
+		link[n] = 0;
+		if (!strncmp(link, "socket:", 7) && target->socket_count < SOCKETS_MAX)
+			target->sockets[target->socket_count++] = atoi(entry->d_name);
+		for (size_t i = 0; i < sizeof unsupported_fds / sizeof *unsupported_fds; i++)
+			if (!strncmp(link, unsupported_fds[i].prefix,
+				     strlen(unsupported_fds[i].prefix)))
+				result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+					      "%s", unsupported_fds[i].reason);
+	}
+	closedir(dir);
+	return result;
+}
+
+/* Only when its size has changed: the file is long. */
+static int check_mappings(struct target *target, struct avc_error *err)
+{
+	const long pages = proc_vm_pages(target->statm_fd, NULL);
+	char path[64], line[512];
+	int result = 0;
+	FILE *maps;
+
+	if (pages == target->surveyed_pages)
+		return 0;
+	snprintf(path, sizeof path, "/proc/%d/maps", target->pid);
+	maps = fopen(path, "re");
+	if (!maps)
+		return fail_errno(err, target->pid, "check", "open(maps)", "it has ended");
+	while (!result && fgets(line, sizeof line, maps)) {
+		if (strstr(line, " /[aio]"))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				      "it uses kernel AIO");
+		/* Those of files are found in the first clone. */
+		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
+			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				      private_huge_pages);
+	}
+	fclose(maps);
+	target->surveyed_pages = result ? -1 : pages;
+	return result;
+}
+
+/* Of one that is just ending they are gone, or EACCES is the answer. */
+static int not_seen(pid_t pid, struct avc_error *err)
+{
+	const int errnum = errno;
+
+	if (proc_is_exiting(pid))
+		return fail(err, AVC_GONE, ESRCH, pid, "check", "stat(ns)", "it has ended");
+	errno = errnum;
+	return fail_errno(err, pid, "check", "stat(ns)", "its namespaces can not be seen");
+}
+
+/* Its children are made by their parents, which have to have what their children have. */
+static int check_descendant(const struct target *target, struct avc_error *err)
+{
+	static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "user", "cgroup", "pid" };
+	struct proc_status status;
+
+	for (size_t i = 0; i < sizeof spaces / sizeof *spaces; i++) {
+		char path[64];
+		struct stat own, inits;
+
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->pid, spaces[i]);
+		if (stat(path, &own))
+			return not_seen(target->pid, err);
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->init, spaces[i]);
+		if (stat(path, &inits) || own.st_ino != inits.st_ino)
+			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				    "process %d has a %s namespace of its own", target->inside,
+				    spaces[i]);
+	}
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.seccomp == 1 || status.seccomp_filters > target->plain_filters)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			    "process %d is not the main one and has a seccomp filter of its own",
+			    target->inside);
+	return 0;
+}
+
+/* A thread's second stack would not know of what it was made to do in the parasite, and return
+ * to the wrong place: so before that.  A program has it from its start, or not at all. */
+static int check_shadow_stack(struct target *target, struct avc_error *err)
+{
+	struct proc_status status;
+
+	if (target->infected)
+		return 0;
+	if (proc_status(target->pid, &status))
+		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (status.shadow_stack)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			    "it has shadow stacks (CET), which can not be put back; "
+			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
+	return 0;
+}
+
+/* unshare(2) and setns(2): its next child is the first process of another namespace.  A
+ * clone of ours would be that, and the namespace would end with it. */
+static int check_namespaces(struct target *target, struct avc_error *err)
+{
+	static const struct {
+		const char *own, *of_children, *reason;
+	} kinds[] = {
+		{ "ns/pid", "ns/pid_for_children",
+		  "its children get a PID namespace of their own (a container in the container)" },
+		{ "ns/time", "ns/time_for_children",
+		  "its children get a time namespace of their own" },
+	};
+
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++) {
+		char path[64], own[64] = "", theirs[64] = "";
+
+		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].own);
+		if (readlink(path, own, sizeof own - 1) < 0)
+			continue; /* the kernel has none of these; or it has ended */
+		/* Of a namespace in which there was no process yet nothing is told. */
+		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].of_children);
+		if (readlink(path, theirs, sizeof theirs - 1) < 0) {
+			char other[64];
+
+			if (errno != ENOENT)
+				continue;
+			/* Nor of any of one that is just ending (kernel/exit.c,
+			 * exit_task_namespaces()). */
+			snprintf(path, sizeof path, "/proc/%d/ns/uts", target->pid);
+			if (readlink(path, other, sizeof other) < 0)
+				return fail(err, AVC_GONE, ESRCH, target->pid, "check", "readlink",
+					    "it has ended");
+		}
+		/* Behind the kind: "pid:[4026531836]". */
+		if (strcmp(own + strcspn(own, "["), theirs + strcspn(theirs, "[")) != 0)
+			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+				    kinds[i].reason);
+	}
+	return 0;
+}
+
+/* Since Linux 6.4; the headers may be older. */
+#define GET_DISPATCH 0x4211 /* PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG */
+
+/* Asked before a thread runs anything of ours: while its selector says so, every system call that
+ * is not made where it has them made is a SIGSYS (Documentation/admin-guide/
+ * syscall-user-dispatch.rst), which is the app's end when all signals are blocked. */
+int support_check_thread(pid_t tid, struct avc_error *err)
+{
+	struct {
+		uint64_t mode, selector, offset, bytes;
+	} dispatch = { 0 };
+
+	if (ptrace(GET_DISPATCH, tid, sizeof dispatch, &dispatch) == 0 && dispatch.mode)
+		return fail(err, AVC_UNSUPPORTED, 0, tid, "check", "",
+			    "it dispatches system calls by itself (Syscall User Dispatch, as Wine "
+			    "does)");
+	return 0;
+}
+
+int support_check(struct target *target, struct avc_error *err)
+{
+	if (check_shadow_stack(target, err) || check_namespaces(target, err) ||
+	    check_descriptors(target, err) || check_mappings(target, err))
+		return -1;
+	return target->descendant ? check_descendant(target, err) : 0;
+}
+
+/* By way of the process: a second entry for each thread in the kernel's memory of
+ * /proc would make its end longer (see ask()). */
+static int is_awake(pid_t tid, void *arg)
+{
+	const pid_t pid = *(const pid_t *)arg;
+	char name[48], buf[512], *p;
+
+	snprintf(name, sizeof name, "task/%d/stat", tid);
+	if (proc_read(pid, name, buf, sizeof buf) <= 0)
+		return 0;
+	p = strrchr(buf, ')');
+	return p && p[1] == ' ' && p[2] == 'R' ? -1 : 0;
+}
+
+static bool unread_bytes(const struct target *target)
+{
+	for (uint32_t i = 0; i < target->socket_count; i++) {
+		int fd = (int)syscall(SYS_pidfd_getfd, target->pidfd, target->sockets[i], 0),
+		    bytes = 0;
+
+		if (fd < 0)
+			continue; /* closed since */
+		if (ioctl(fd, FIONREAD, &bytes))
+			bytes = 0; /* not one that bytes come from */
+		if (target->tcp_messages && file_is_coming(fd))
+			bytes = 1;
+		close(fd);
+		if (bytes)
+			return true;
+	}
+	return false;
+}
+
+bool quiescent(const struct target *target)
+{
+	pid_t pid = target->pid;
+
+	return proc_tasks(target->task_dirfd, is_awake, &pid) == 0 && !unread_bytes(target);
+}

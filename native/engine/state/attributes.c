@@ -1,0 +1,440 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What a thread is to the kernel: scheduling, I/O priority, credentials, prctl(2)
+ * settings.
+ *
+ * A restored process has what its template has, which is a fork of the main thread:
+ * most of it is right by itself.  What is left is
+ *   - what fork(2) resets: parent-death signal, child subreaper;
+ *   - threads that differ from the main thread: they set themselves up again, but for
+ *     scheduling, which a process may be allowed to have and not to set: that is done
+ *     from outside.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/capability.h>
+#include <linux/securebits.h>
+#include <sched.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define IOPRIO_WHO_PROCESS 1
+#define CAPABILITY_VERSION_3 0x20080522
+#define NODE_BITS (64 * NODE_WORDS)
+#define FILTER_MAX 4096   /* instructions (linux/bpf_common.h, BPF_MAXINSNS) */
+#define LOCKS 0xaaaaaaaau /* securebits: each locks the one below it (linux/securebits.h) */
+
+struct attributes {
+	char oom_score_adj[16];
+	uint32_t count;
+	struct {
+		pid_t inside;
+		struct scheduling scheduling;
+	} thread[]; /* those to be set from outside                            */
+};
+
+/* What the kernel writes where; the rest are results. */
+struct answers {
+	uint32_t uid[3], gid[3];
+	uint32_t caps[6];
+	uint32_t death_signal, subreaper;
+	uint32_t header[2];
+	int32_t memory_policy;
+	uint32_t group[GROUPS_KEPT];
+	uint64_t nodes[NODE_WORDS];
+	uint64_t state_permitted;
+};
+
+enum {
+	FSUID,
+	FSGID,
+	SECUREBITS,
+	NO_NEW_PRIVS,
+	SLACK,
+	SECCOMP,
+	GROUP_COUNT,
+	POLICY,
+	PERSONALITY,
+	CAPS,
+	BOUNDING,
+	AMBIENT
+};
+
+void scheduling_read(pid_t tid, struct scheduling *s)
+{
+	memset(s, 0, sizeof *s);
+	if (syscall(SYS_sched_getattr, tid, s->attr, sizeof s->attr, 0))
+		memset(s->attr, 0, sizeof s->attr);
+	s->io_priority = (int32_t)syscall(SYS_ioprio_get, IOPRIO_WHO_PROCESS, tid);
+}
+
+/* `out`, `remote`: room for ATTRIBUTES_ASK_BYTES. */
+const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote)
+{
+	struct answers *a = out;
+	const struct inj_syscall *first;
+
+	a->header[0] = CAPABILITY_VERSION_3;
+	a->header[1] = 0;
+#define AT(field) (remote + offsetof(struct answers, field))
+	first = call_add(call, SYS_setfsuid, (uint64_t)-1, 0, 0, 0, 0); /* changes nothing */
+	call_add(call, SYS_setfsgid, (uint64_t)-1, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_SECUREBITS, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_NO_NEW_PRIVS, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_TIMERSLACK, 0, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_SECCOMP, 0, 0, 0, 0);
+	call_add(call, SYS_getgroups, 0, 0, 0, 0, 0);
+	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS, 0, 0);
+	call_add(call, SYS_personality, 0xffffffff, 0, 0, 0, 0);
+	call_add(call, SYS_capget, AT(header), AT(caps), 0, 0, 0);
+	call_add(call, INJ_CAPS, PR_CAPBSET_READ, 0, 0, 0, 0);
+	call_add(call, INJ_CAPS, PR_CAP_AMBIENT, AT(caps), 0, 0, 0);
+	call_add(call, ARCH_STATE_CALL, ARCH_STATE_PERMITTED, AT(state_permitted), 0, 0, 0);
+	call_add(call, SYS_getgroups, GROUPS_KEPT, AT(group), 0, 0, 0);
+	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8, 0, 0);
+	call_add(call, SYS_getresgid, AT(gid), AT(gid) + 4, AT(gid) + 8, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_PDEATHSIG, AT(death_signal), 0, 0, 0);
+	call_add(call, SYS_prctl, PR_GET_CHILD_SUBREAPER, AT(subreaper), 0, 0, 0);
+#undef AT
+	return first;
+}
+
+void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *c)
+{
+	const struct answers *a = out;
+
+	_Static_assert(sizeof *a <= ATTRIBUTES_ASK_BYTES, "room for the answers");
+	memset(c, 0, sizeof *c); /* compared with memcmp() */
+	memcpy(c->uid, a->uid, sizeof a->uid);
+	memcpy(c->gid, a->gid, sizeof a->gid);
+	memcpy(c->caps, a->caps, sizeof c->caps);
+	c->bounding = (uint64_t)first[BOUNDING].result;
+	c->ambient = (uint64_t)first[AMBIENT].result;
+	c->personality = (uint32_t)first[PERSONALITY].result;
+	c->state_permitted = a->state_permitted;
+	c->fsuid = (uint32_t)first[FSUID].result;
+	c->fsgid = (uint32_t)first[FSGID].result;
+	c->securebits = (uint32_t)first[SECUREBITS].result;
+	c->no_new_privs = first[NO_NEW_PRIVS].result == 1;
+	c->seccomp = (int32_t)first[SECCOMP].result;
+	c->group_count = (int32_t)first[GROUP_COUNT].result;
+	if (c->group_count > 0 && c->group_count <= GROUPS_KEPT)
+		memcpy(c->group, a->group, (size_t)c->group_count * sizeof *c->group);
+	c->memory_policy = first[POLICY].result ? -1 : a->memory_policy;
+	if (!first[POLICY].result)
+		memcpy(c->nodes, a->nodes, sizeof c->nodes);
+	c->slack_ns = (uint64_t)first[SLACK].result;
+	c->death_signal = a->death_signal;
+	c->subreaper = a->subreaper;
+}
+
+uint64_t filters_read(pid_t tid)
+{
+	uint64_t program[FILTER_MAX], sum = 0; /* of struct sock_filter */
+
+	for (long i = 0;; i++) {
+		const long n = ptrace(PTRACE_SECCOMP_GET_FILTER, tid, i, program);
+
+		if (n <= 0)
+			return sum; /* that was the last one; or it has none */
+		for (long k = 0; k < n && k < FILTER_MAX; k++)
+			sum = (sum ^ program[k]) * UINT64_C(0x100000001b3);
+		sum = sum * 31 + (uint64_t)n;
+	}
+}
+
+/* ---- when the app runs again ------------------------------------------------------------ */
+
+static bool differ_in_groups(const struct creds *a, const struct creds *b)
+{
+	return a->group_count != b->group_count || memcmp(a->group, b->group, sizeof a->group);
+}
+
+enum { EFFECTIVE, PERMITTED, INHERITABLE };
+
+static uint64_t caps_of(const struct creds *c, int set)
+{
+	return c->caps[set] | (uint64_t)c->caps[set + 3] << 32;
+}
+
+static void add_capset(struct setup *setup, uint64_t effective, uint64_t permitted,
+		       uint64_t inheritable)
+{
+	const struct {
+		uint32_t header[2], caps[6];
+	} data = {
+		.header = { CAPABILITY_VERSION_3, 0 },
+		.caps = { (uint32_t)effective, (uint32_t)permitted, (uint32_t)inheritable,
+			  (uint32_t)(effective >> 32), (uint32_t)(permitted >> 32),
+			  (uint32_t)(inheritable >> 32) },
+	};
+	const avc_remote at = setup_data(setup, &data, sizeof data);
+
+	setup_add_thread(setup, "capset", SYS_capset, at, at + sizeof data.header, 0, 0, 0);
+}
+
+static bool differ_in_securebits(const struct creds *from, const struct creds *to)
+{
+	return ((from->securebits ^ to->securebits) & ~(uint32_t)SECBIT_KEEP_CAPS) != 0;
+}
+
+static bool raises_ambient(const struct creds *from, const struct creds *to)
+{
+	/* Another user has none. */
+	return to->ambient &&
+	       (to->ambient != from->ambient || memcmp(from->uid, to->uid, sizeof to->uid));
+}
+
+/* A thread that has fewer rights than the main thread, or other ones.  To go on with
+ * more than it had would be wrong: these must succeed. */
+static void lower(const struct creds *from, const struct creds *to, struct setup *setup)
+{
+	const bool uids = memcmp(from->uid, to->uid, sizeof to->uid) != 0;
+	const bool caps = uids || memcmp(from->caps, to->caps, sizeof to->caps) ||
+			  from->bounding != to->bounding || from->ambient != to->ambient ||
+			  differ_in_securebits(from, to) ||
+			  /* The file system's user takes capabilities along, too. */
+			  from->fsuid != to->fsuid;
+	uint32_t bits = from->securebits;
+
+	if (differ_in_groups(from, to))
+		setup_add_thread(setup, "setgroups", SYS_setgroups, (uint64_t)to->group_count,
+				 setup_data(setup, to->group, sizeof to->group), 0, 0, 0);
+	if (memcmp(from->gid, to->gid, sizeof to->gid))
+		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
+				 to->gid[2], 0, 0);
+	/* Or the capabilities would go with the user. */
+	if (uids && !(bits & SECBIT_KEEP_CAPS)) {
+		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1, 0, 0, 0);
+		bits |= SECBIT_KEEP_CAPS;
+	}
+	if (uids)
+		setup_add_thread(setup, "setresuid", SYS_setresuid, to->uid[0], to->uid[1],
+				 to->uid[2], 0, 0);
+	if ((bits ^ to->securebits) & SECBIT_KEEP_CAPS)
+		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS,
+				 (to->securebits & SECBIT_KEEP_CAPS) != 0, 0, 0, 0);
+	/* Those that were effective have gone all the same, and are needed once more. */
+	if (caps)
+		add_capset(setup, caps_of(from, PERMITTED), caps_of(from, PERMITTED),
+			   caps_of(to, INHERITABLE));
+	if (from->fsgid != to->fsgid || to->fsgid != to->gid[1])
+		setup_add_thread(setup, "setfsgid", SYS_setfsgid, to->fsgid, 0, 0, 0, 0);
+	if (from->fsuid != to->fsuid || to->fsuid != to->uid[1])
+		setup_add_thread(setup, "setfsuid", SYS_setfsuid, to->fsuid, 0, 0, 0, 0);
+	/* After what is inheritable, of which nothing may be out of bounds. */
+	if (from->bounding != to->bounding)
+		setup_add_thread(setup, "prctl(CAPBSET_DROP)", INJ_CAPS_CHANGE, PR_CAPBSET_DROP,
+				 from->bounding & ~to->bounding, 0, 0, 0);
+	if (from->ambient & ~to->ambient)
+		setup_add_thread(setup, "prctl(CAP_AMBIENT)", SYS_prctl, PR_CAP_AMBIENT,
+				 PR_CAP_AMBIENT_CLEAR_ALL, 0, 0, 0);
+	if (raises_ambient(from, to))
+		setup_add_thread(setup, "prctl(CAP_AMBIENT)", INJ_CAPS_CHANGE, PR_CAP_AMBIENT,
+				 to->ambient, 0, 0, 0);
+	if (differ_in_securebits(from, to))
+		setup_add_thread(setup, "prctl(SECUREBITS)", SYS_prctl, PR_SET_SECUREBITS,
+				 to->securebits, 0, 0, 0);
+	if (caps)
+		add_capset(setup, caps_of(to, EFFECTIVE), caps_of(to, PERMITTED),
+			   caps_of(to, INHERITABLE));
+	if (to->no_new_privs && !from->no_new_privs)
+		setup_add_thread(setup, "prctl(NO_NEW_PRIVS)", SYS_prctl, PR_SET_NO_NEW_PRIVS, 1, 0,
+				 0, 0);
+}
+
+/* Each set of capabilities of `to` within what `from` may have? */
+static bool has_less(const struct creds *from, const struct creds *to)
+{
+	return !(caps_of(to, PERMITTED) & ~caps_of(from, PERMITTED)) &&
+	       !(to->bounding & ~from->bounding) &&
+	       !(caps_of(to, INHERITABLE) &
+		 ~(caps_of(from, INHERITABLE) | (caps_of(from, PERMITTED) & from->bounding)));
+}
+
+/* What a thread may do without takes a right to do without it. */
+static bool may_be_lowered(const struct creds *from, const struct creds *to)
+{
+	const bool may = caps_of(from, PERMITTED) >> CAP_SETPCAP & 1;
+
+	return (may || (from->bounding == to->bounding && !differ_in_securebits(from, to))) &&
+	       !(from->securebits & SECBIT_NO_CAP_AMBIENT_RAISE && raises_ambient(from, to));
+}
+
+/* What is locked in `from` is locked and as it is in `to`, too, and lower() has no need to change
+ * it on the way: nobody may (prctl(2), PR_SET_SECUREBITS and PR_SET_KEEPCAPS). */
+static bool fits_locks(const struct creds *from, const struct creds *to)
+{
+	const uint32_t locks = from->securebits & LOCKS;
+	uint32_t changed = from->securebits ^ to->securebits;
+
+	if (memcmp(from->uid, to->uid, sizeof to->uid) && !(from->securebits & SECBIT_KEEP_CAPS))
+		changed |= SECBIT_KEEP_CAPS;
+	return !(locks & ~to->securebits) && !(locks >> 1 & changed);
+}
+
+static int refuse(const struct target *target, pid_t inside, const char *has, const char *main,
+		  struct avc_error *err)
+{
+	const char *which = target->descendant ? "process" : "thread";
+
+	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		    "%s %d has %s the main %s%s", which, inside, has, which, main);
+}
+
+/* A thread that is made by another one gets what it has not from that. */
+static int set_apart(const struct target *target, pid_t inside, const struct creds *from,
+		     const struct creds *to, struct setup *setup, struct avc_error *err)
+{
+	if (to->slack_ns && to->slack_ns != from->slack_ns)
+		setup_add_thread(setup, "prctl(TIMERSLACK)", SYS_prctl, PR_SET_TIMERSLACK,
+				 to->slack_ns, 0, 0, 0)
+			->flags = INJ_MAY_FAIL;
+	if (to->memory_policy >= 0 && (to->memory_policy != from->memory_policy ||
+				       memcmp(to->nodes, from->nodes, sizeof to->nodes)))
+		setup_add_thread(setup, "set_mempolicy", SYS_set_mempolicy,
+				 (uint64_t)to->memory_policy,
+				 setup_data(setup, to->nodes, sizeof to->nodes), NODE_BITS, 0, 0)
+			->flags = INJ_MAY_FAIL;
+	if (differ_in_groups(from, to) &&
+	    (!(from->caps[0] >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "thread %d has other supplementary groups than the main thread, which "
+			    "can not be put back",
+			    inside);
+	if (to->seccomp != from->seccomp || to->filters != from->filters)
+		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+			    "its threads differ in their seccomp filters (thread %d)", inside);
+	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
+		return refuse(target, inside, "privileges that", " has given up", err);
+	if (!may_be_lowered(from, to))
+		return refuse(target, inside,
+			      "other capability sets (bounding, ambient, securebits) than",
+			      ", which lacks CAP_SETPCAP to give up the same", err);
+	if (!fits_locks(from, to))
+		return refuse(target, inside, "another user or other securebits than",
+			      ", which has locked its own", err);
+	lower(from, to, setup);
+	return 0;
+}
+
+int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
+			    const struct thread *t, struct setup *setup, struct avc_error *err)
+{
+	/* One that is not the main process is made from that, as are its threads. */
+	const struct creds *from = target->descendant ? target->forebear : &main_thread->creds;
+	const struct creds *to = &t->creds;
+
+	if (t == main_thread && to->subreaper)
+		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
+				 0, 0);
+	if ((t != main_thread || target->descendant) &&
+	    set_apart(target, t->inside, from, to, setup, err))
+		return -1;
+	/* A process that is made gets its own with what else it has (process_attrs.c). */
+	if (to->personality != main_thread->creds.personality)
+		setup_add_thread(setup, "personality", SYS_personality, to->personality, 0, 0, 0,
+				 0);
+	/* After a change of users, which takes it away. */
+	if (to->death_signal)
+		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
+				 to->death_signal, 0, 0, 0);
+	return 0;
+}
+
+static bool same_scheduling(const struct scheduling *a, const struct scheduling *b)
+{
+	return !memcmp(a, b, sizeof *a);
+}
+
+int attributes_keep(const struct target *target, struct generation *generation,
+		    struct avc_error *err)
+{
+	struct attributes *kept =
+		calloc(1, sizeof *kept + generation->threads * sizeof kept->thread[0]);
+	struct scheduling inherited;
+
+	generation->attributes = kept;
+	if (!kept)
+		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
+	if (proc_read(target->pid, "oom_score_adj", kept->oom_score_adj,
+		      sizeof kept->oom_score_adj) <= 0 &&
+	    !target->descendant) /* else it has its parent's */
+		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
+	scheduling_read(generation->template, &inherited);
+	for (uint32_t i = 0; i < target->thread_count; i++) {
+		const struct thread *t = &target->threads[i];
+
+		if (t->block < 0 ||
+		    (!target->descendant && same_scheduling(&t->scheduling, &inherited)))
+			continue;
+		kept->thread[kept->count].inside = t->inside;
+		kept->thread[kept->count++].scheduling = t->scheduling;
+	}
+	return 0;
+}
+
+/* ---- at a restore, from outside ------------------------------------------------------------ */
+
+struct search {
+	const struct attributes *attributes;
+	struct avc_error *notice;
+};
+
+static int put_back(pid_t tid, void *arg)
+{
+	const struct search *search = arg;
+	const pid_t inside = proc_inside(tid);
+
+	for (uint32_t i = 0; i < search->attributes->count; i++) {
+		const struct scheduling *s = &search->attributes->thread[i].scheduling;
+
+		if (search->attributes->thread[i].inside != inside)
+			continue;
+		if (syscall(SYS_sched_setattr, tid, s->attr, 0))
+			fail_errno(search->notice, tid, "restore", "sched_setattr",
+				   "its scheduling can not be put back");
+		if (s->io_priority >= 0 &&
+		    syscall(SYS_ioprio_set, IOPRIO_WHO_PROCESS, tid, s->io_priority))
+			fail_errno(search->notice, tid, "restore", "ioprio_set",
+				   "its I/O priority can not be put back");
+	}
+	return 0;
+}
+
+/* By the kernel's rules they have what the one had that made them (sched(7), ioprio_set(2)): whom
+ * that is right for, and that is nearly everybody, need not be looked for in /proc. */
+static bool has_all(const struct attributes *attributes, pid_t pid)
+{
+	struct scheduling is;
+
+	scheduling_read(pid, &is);
+	for (uint32_t i = 0; i < attributes->count; i++)
+		if (!same_scheduling(&attributes->thread[i].scheduling, &is))
+			return false;
+	return true;
+}
+
+void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice)
+{
+	struct search search = { .attributes = attributes, .notice = notice };
+	int dirfd;
+
+	if (attributes->oom_score_adj[0])
+		oom_score_adj_set(pid, attributes->oom_score_adj);
+	if (has_all(attributes, pid))
+		return;
+	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	if (dirfd < 0)
+		return; /* it has been killed again already */
+	(void)proc_tasks(dirfd, put_back, &search);
+	close(dirfd);
+}

@@ -1,0 +1,411 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What a process that is not the main one has besides memory and descriptors: signal
+ * handlers, root and working directory, limits, groups, and what the kernel knows of its layout.
+ */
+#include <fcntl.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/resource.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define SIGNALS 64
+#define AUXV_BYTES 1024
+#ifndef PR_SET_MEMORY_MERGE
+#define PR_SET_MEMORY_MERGE 67 /* since Linux 6.4 */
+#define PR_GET_MEMORY_MERGE 68
+#endif
+#define KEYS 16 /* of memory, at most (pkeys(7)); the first one is everybody's    */
+/* membarrier(2).  Only since Linux 6.3 it says what is registered; but of the others each is
+ * refused that is not, and the command that registers it is the double. */
+#define BARRIERS_REGISTERED (1 << 9)
+#define BARRIER_GLOBAL (1 << 1)
+static const int barriers[] = { 1 << 3, 1 << 5, 1 << 7 };
+
+/* ---- after a checkpoint ------------------------------------------------------------ */
+
+struct action { /* struct sigaction as the kernel has it                          */
+	uint64_t handler, flags, restorer, mask;
+};
+
+struct process_attrs {
+	struct action action[SIGNALS];
+	int64_t brk;
+	uint32_t personality;
+	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
+	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
+	int64_t barriers;               /* membarrier(2): commands that register it          */
+	uint32_t keys;                  /* pkey_alloc(2): by number; 0: the CPU has none     */
+	uint32_t umask;
+	int64_t dumped;            /* core(5), coredump_filter; -1: the kernel does not dump  */
+	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
+	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
+	uint32_t auxv_bytes;
+	uint8_t auxv[AUXV_BYTES];
+};
+
+enum {
+	START_CODE,
+	END_CODE,
+	START_DATA,
+	END_DATA,
+	START_BRK,
+	BRK,
+	START_STACK,
+	ARG_START,
+	ARG_END,
+	ENV_START,
+	ENV_END
+};
+
+static int read_mm(pid_t pid, struct process_attrs *attrs)
+{
+	/* Fields of /proc/PID/stat after the name, counted from `state` as 3. */
+	static const struct {
+		int field, to;
+	} fields[] = { { 26, START_CODE }, { 27, END_CODE }, { 28, START_STACK },
+		       { 45, START_DATA }, { 46, END_DATA }, { 47, START_BRK },
+		       { 48, ARG_START },  { 49, ARG_END },  { 50, ENV_START },
+		       { 51, ENV_END } };
+	char buf[1024], *p;
+	ssize_t n;
+	int fd;
+
+	if (proc_read(pid, "stat", buf, sizeof buf) <= 0 || !(p = strrchr(buf, ')')))
+		return -1;
+	p++;
+	for (int field = 3; *p; field++) {
+		char *next;
+
+		while (*p == ' ')
+			p++;
+		for (size_t i = 0; i < sizeof fields / sizeof *fields; i++)
+			if (fields[i].field == field)
+				attrs->mm[fields[i].to] = strtoull(p, NULL, 10);
+		next = strchr(p, ' ');
+		if (!next)
+			break;
+		p = next;
+	}
+	fd = proc_open(pid, "auxv", O_RDONLY);
+	n = fd < 0 ? -1 : read(fd, attrs->auxv, sizeof attrs->auxv);
+	close_fd(&fd);
+	attrs->auxv_bytes = n > 0 ? (uint32_t)n : 0;
+	return 0;
+}
+
+static int read_status(pid_t pid, struct process_attrs *attrs)
+{
+	char buf[8192], *line;
+
+	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
+		return -1;
+	line = strstr(buf, "\nUmask:");
+	attrs->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
+	attrs->dumped = proc_read(pid, "coredump_filter", buf, sizeof buf) > 0
+				? (int64_t)strtoul(buf, NULL, 16)
+				: -1;
+	return 0;
+}
+
+static bool has_keys(void)
+{
+	static int has = -1;
+
+	if (__atomic_load_n(&has, __ATOMIC_RELAXED) < 0) {
+		const long key = syscall(SYS_pkey_alloc, 0, 0);
+
+		if (key >= 0)
+			syscall(SYS_pkey_free, key);
+		__atomic_store_n(&has, key >= 0, __ATOMIC_RELAXED);
+	}
+	return has;
+}
+
+/* Nobody knows those of another process.  The template takes all that are free, and what it is not
+ * given is taken.  It keeps them: it never runs, and no process is forked from it. */
+static uint32_t keys_of(const struct inj_syscall given[KEYS - 1])
+{
+	uint32_t taken = (1u << KEYS) - 2;
+
+	if (!has_keys())
+		return 0;
+	for (int i = 0; i < KEYS - 1; i++)
+		if (given[i].result > 0)
+			taken &= ~(1u << given[i].result);
+	return taken;
+}
+
+static int64_t barriers_of(const struct inj_syscall *told, const struct inj_syscall *made)
+{
+	/* Who was to be reached by all: nothing tells.  It costs next to nothing. */
+	int64_t registered = BARRIER_GLOBAL << 1;
+
+	if (told->result >= 0)
+		return told->result;
+	for (size_t i = 0; i < sizeof barriers / sizeof *barriers; i++)
+		if (made[i].result == 0)
+			registered |= barriers[i] << 1;
+	return registered;
+}
+
+int branch_learn(struct branch *branch, struct avc_error *err)
+{
+	const struct parasite *parasite = &branch->target->parasite;
+	struct generation *image = branch->image;
+	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
+	uint8_t *memory = parasite_files(parasite, image->slot) + INJ_FILES_BYTES / 2;
+	struct inj_syscall *list = (struct inj_syscall *)memory;
+	struct action *action = (struct action *)(list + SIGNALS + 8 + KEYS);
+	const struct thread *main_thread = thread_find(branch->target, branch->target->pid);
+	struct process_attrs *attrs = calloc(1, sizeof *attrs);
+	const struct inj_syscall *keys;
+	uint32_t n = 0;
+
+	branch->attrs = attrs;
+	if (!attrs)
+		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+	for (int i = 0; i < SIGNALS; i++)
+		list[n++] = (struct inj_syscall){
+			.nr = SYS_rt_sigaction,
+			.arg = { (uint64_t)i + 1, 0, parasite_remote(parasite, &action[i]), 8 }
+		};
+	list[n++] = (struct inj_syscall){ .nr = SYS_brk };
+	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_THP_DISABLE } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_MEMORY_MERGE } };
+	list[n++] = (struct inj_syscall){ .nr = SYS_membarrier, .arg = { BARRIERS_REGISTERED } };
+	for (size_t i = 0; i < sizeof barriers / sizeof *barriers; i++)
+		list[n++] = (struct inj_syscall){ .nr = SYS_membarrier,
+						  .arg = { (uint64_t)barriers[i] } };
+	keys = &list[n];
+	for (int i = 0; i < KEYS - 1; i++)
+		list[n++] = (struct inj_syscall){ .nr = SYS_pkey_alloc };
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, INJ_LIST, parasite_remote(parasite, list), n, 0, 0, 0);
+	if (parasite_send(parasite, image->template, &image->base, call, err) ||
+	    parasite_run(image->template, call, err))
+		return -1;
+	memcpy(attrs->action, action, sizeof attrs->action);
+	attrs->brk = list[SIGNALS].result;
+	attrs->no_huge_pages = list[SIGNALS + 1].result;
+	attrs->merging = list[SIGNALS + 2].result;
+	attrs->barriers = barriers_of(&list[SIGNALS + 3], &list[SIGNALS + 4]);
+	attrs->keys = keys_of(keys);
+	/* These are no part of what its holder shares: it was asked itself, in the freeze. */
+	attrs->personality = main_thread->creds.personality;
+	attrs->state_permitted = main_thread->creds.state_permitted;
+	/* The template has limits of the time when the holder was made. */
+	if (read_mm(image->template, attrs) || read_status(image->template, attrs) ||
+	    (proc_limits(branch->target->pid, attrs->limit) &&
+	     proc_limits(image->template, attrs->limit)))
+		return fail_errno(err, image->template, "keep template", "open(/proc)",
+				  "it was killed");
+	return 0;
+}
+
+void branch_forget(struct branch *branch)
+{
+	free(branch->attrs);
+	branch->attrs = NULL;
+}
+
+/* ---- a restore ------------------------------------------------------------------------ */
+
+/* What the calls refer to, in the batch's memory. */
+struct arguments {
+	struct action action[SIGNALS];
+	struct { /* struct prctl_mm_map                                     */
+		uint64_t mm[11];
+		uint64_t auxv;
+		uint32_t auxv_bytes, exe_fd;
+	} map;
+	uint8_t auxv[AUXV_BYTES];
+	char here[8];
+};
+
+static struct arguments *arguments_of(const struct syscall_batch *batch)
+{
+	return (struct arguments *)batch->data;
+}
+
+/* Only what `ps` shows, and where its heap may grow. */
+static void put_mm(struct syscall_batch *batch, const struct process_attrs *attrs)
+{
+	struct arguments *arguments = arguments_of(batch);
+
+	memcpy(arguments->map.mm, attrs->mm, sizeof attrs->mm);
+	memcpy(arguments->auxv, attrs->auxv, attrs->auxv_bytes);
+	arguments->map.mm[BRK] = (uint64_t)attrs->brk;
+	arguments->map.auxv = attrs->auxv_bytes ? parasite_remote(batch->parasite, arguments->auxv)
+						: 0;
+	arguments->map.auxv_bytes = attrs->auxv_bytes;
+	arguments->map.exe_fd = ~0u;
+	syscall_batch_add(batch, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP,
+			  parasite_remote(batch->parasite, &arguments->map), sizeof arguments->map,
+			  0, 0);
+	syscall_batch_soften(batch,
+			     "what it knows of its heap and arguments could not be put back");
+}
+
+void limit_lift(pid_t pid, int which, uint64_t least)
+{
+	struct rlimit now, lifted;
+
+	if (prlimit(pid, which, NULL, &now))
+		return;
+	lifted.rlim_cur = lifted.rlim_max = now.rlim_max > least ? now.rlim_max : least;
+	/* That there is nothing to lift is the rule. */
+	if ((lifted.rlim_cur == now.rlim_cur && lifted.rlim_max == now.rlim_max) ||
+	    prlimit(pid, which, &lifted, NULL) == 0)
+		return;
+	/* We may not; but up to there everybody may. */
+	now.rlim_cur = now.rlim_max;
+	(void)prlimit(pid, which, &now, NULL);
+}
+
+void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files)
+{
+	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
+	for (int i = 0; i < LIMITS; i++)
+		limit_lift(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
+	limit_lift(pid, RLIMIT_NOFILE, branch->attrs->limit[RLIMIT_NOFILE][1]);
+}
+
+void process_attrs_setup_limits(const struct branch *branch, struct setup *setup)
+{
+	for (uint64_t i = 0; i < LIMITS; i++)
+		setup_add(setup, INJ_AFTER, "prlimit", INJ_LIMIT, i,
+			  setup_data(setup, branch->attrs->limit[i],
+				     sizeof branch->attrs->limit[i]),
+			  0, 0, 0)
+			->flags = INJ_MAY_FAIL;
+}
+
+static bool same_root(pid_t a, pid_t b)
+{
+	char path_a[32], path_b[32];
+	struct stat is, other;
+
+	snprintf(path_a, sizeof path_a, "/proc/%d/root", a);
+	snprintf(path_b, sizeof path_b, "/proc/%d/root", b);
+	return stat(path_a, &is) == 0 && stat(path_b, &other) == 0 && is.st_dev == other.st_dev &&
+	       is.st_ino == other.st_ino;
+}
+
+/* Goes into a folder of the template's. */
+static int enter(struct syscall_batch *batch, pid_t template, const char *name,
+		 struct avc_error *err)
+{
+	int folder = proc_open(template, name, O_PATH | O_DIRECTORY);
+
+	if (folder < 0)
+		return fail_errno(err, batch->pid, "restore", "open", "its %s directory is gone",
+				  name);
+	if (syscall_batch_give(batch, folder, err)) {
+		close(folder);
+		return -1;
+	}
+	close(folder);
+	syscall_batch_add(batch, SYS_fchdir, 1, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	return 0;
+}
+
+/* It has its parent's, and the right to have another one only if that still has it. */
+static int put_folders(struct syscall_batch *batch, pid_t template, struct avc_error *err)
+{
+	struct arguments *arguments = arguments_of(batch);
+
+	if (!same_root(template, batch->pid)) {
+		if (enter(batch, template, "root", err))
+			return -1;
+		strcpy(arguments->here, ".");
+		syscall_batch_add(batch, SYS_chroot,
+				  parasite_remote(batch->parasite, arguments->here), 0, 0, 0, 0, 0);
+	}
+	return enter(batch, template, "cwd", err);
+}
+
+static void put_dumped(struct syscall_batch *batch, int64_t dumped)
+{
+	int fd;
+
+	if (dumped < 0)
+		return;
+	fd = proc_open(batch->pid, "coredump_filter", O_WRONLY);
+	if (fd < 0 || dprintf(fd, "0x%x", (unsigned int)dumped) < 0)
+		fail_errno(batch->notes, batch->inside, "restore", "write(coredump_filter)",
+			   "what of it is dumped could not be put back");
+	close_fd(&fd);
+}
+
+int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err)
+{
+	if (!has_keys())
+		return 0;
+	for (int i = 0; i < KEYS - 1; i++) {
+		if (syscall_batch_ask(batch, SYS_pkey_alloc, 0, 0, 0, 0, 0, 0, err))
+			return -1;
+		syscall_batch_soften(batch, NULL);
+	}
+	return 0;
+}
+
+static int free_keys(struct syscall_batch *batch, uint32_t kept, struct avc_error *err)
+{
+	if (!has_keys())
+		return 0;
+	for (uint64_t key = 1; key < KEYS; key++) {
+		if (kept & 1u << key)
+			continue;
+		if (syscall_batch_ask(batch, SYS_pkey_free, key, 0, 0, 0, 0, 0, err))
+			return -1;
+		syscall_batch_soften(batch, NULL);
+	}
+	return 0;
+}
+
+int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
+		      struct avc_error *err)
+{
+	const struct process_attrs *attrs = branch->attrs;
+	struct arguments *arguments = arguments_of(batch);
+
+	if (put_folders(batch, branch->image->template, err) || free_keys(batch, attrs->keys, err))
+		return -1;
+	syscall_batch_add(batch, SYS_umask, attrs->umask, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_personality, attrs->personality, 0, 0, 0, 0, 0);
+	memcpy(arguments->action, attrs->action, sizeof arguments->action);
+	for (int i = 0; i < SIGNALS; i++)
+		if (i + 1 != SIGKILL && i + 1 != SIGSTOP &&
+		    syscall_batch_ask(batch, SYS_rt_sigaction, (uint64_t)i + 1,
+				      parasite_remote(batch->parasite, &arguments->action[i]), 0, 8,
+				      0, 0, err))
+			return -1;
+	for (int64_t left = attrs->barriers; left > 0; left &= left - 1)
+		syscall_batch_add(batch, SYS_membarrier, (uint64_t)(left & -left), 0, 0, 0, 0, 0);
+	put_mm(batch, attrs);
+	put_dumped(batch, attrs->dumped);
+	if (attrs->state_permitted >> ARCH_STATE_NUMBER & 1)
+		syscall_batch_add(batch, ARCH_STATE_CALL, ARCH_STATE_ASK, ARCH_STATE_NUMBER, 0, 0,
+				  0, 0);
+	/* Since Linux 6.18 what is answered has the flags in it, which are asked for apart. */
+	if (attrs->no_huge_pages >= 0)
+		syscall_batch_add(batch, SYS_prctl, PR_SET_THP_DISABLE,
+				  (uint64_t)attrs->no_huge_pages & 1,
+				  (uint64_t)attrs->no_huge_pages & ~UINT64_C(1), 0, 0, 0);
+	if (attrs->merging >= 0) {
+		syscall_batch_add(batch, SYS_prctl, PR_SET_MEMORY_MERGE, (uint64_t)attrs->merging,
+				  0, 0, 0, 0);
+		syscall_batch_soften(batch,
+				     "what it says of pages to be merged could not be put back");
+	}
+	return 0;
+}

@@ -1,0 +1,282 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The guard's end of the protocol in avckpt/ctl.h.
+ */
+#include <dirent.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/file.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "internal.h"
+
+#define LEFTOVERS_NS (100 * NS_PER_MS)
+/* On a busy machine it may take long until a killed process gets a CPU to end on.  Until then it
+ * can take what is put back into a pipe: a read(2) that finds something does not look for signals. */
+#define LEFTOVERS_ALIVE_NS (10 * NS_PER_S)
+#define LEFTOVERS_US 100
+#define LEFTOVERS_LONG_US 1000
+#define WORKING_NS (100 * NS_PER_MS)
+
+void init_channel_init(struct init_channel *channel)
+{
+	*channel = (struct init_channel){
+		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .pidns_fd = -1
+	};
+}
+
+/* init's descriptor number of the control page, or -1. */
+static int find_ctl(pid_t init)
+{
+	char path[64], target[64];
+	struct dirent *entry;
+	int found = -1;
+	DIR *dir;
+
+	snprintf(path, sizeof path, "/proc/%d/fd", init);
+	dir = opendir(path);
+	if (!dir)
+		return -1;
+	while (found < 0 && (entry = readdir(dir))) {
+		ssize_t n = readlinkat(dirfd(dir), entry->d_name, target, sizeof target - 1);
+
+		if (n <= 0)
+			continue;
+		target[n] = 0;
+		if (!strcmp(target, "/memfd:" AVC_CTL_NAME " (deleted)"))
+			found = atoi(entry->d_name);
+	}
+	closedir(dir);
+	return found;
+}
+
+static int open_fd_of(pid_t init, int number, int flags, bool pipe)
+{
+	char name[32];
+	struct stat st;
+	int fd;
+
+	snprintf(name, sizeof name, "fd/%d", number);
+	fd = proc_open(init, name, flags | O_NONBLOCK);
+	if (fd >= 0 && pipe && (fstat(fd, &st) || !S_ISFIFO(st.st_mode))) {
+		close(fd);
+		errno = EPROTO;
+		return -1;
+	}
+	return fd;
+}
+
+static int connect_all(struct init_channel *channel, int number, struct avc_error *err)
+{
+	const struct avc_ctl *ctl;
+	struct stat st;
+
+	channel->ctl_fd = open_fd_of(channel->init, number, O_RDWR, false);
+	if (channel->ctl_fd < 0)
+		return fail_errno(err, channel->init, "attach", "open(fd)",
+				  "its control page can not be opened");
+	if (flock(channel->ctl_fd, LOCK_EX | LOCK_NB))
+		return fail(err, AVC_BUSY, errno, channel->init, "attach", "flock",
+			    "another avckpt guards it already");
+	if (fstat(channel->ctl_fd, &st) || st.st_size < (off_t)sizeof *ctl)
+		return fail(err, AVC_PROTOCOL, 0, channel->init, "attach", "",
+			    "its control page is too small");
+	channel->ctl = mmap(NULL, sizeof *ctl, PROT_READ | PROT_WRITE, MAP_SHARED, channel->ctl_fd,
+			    0);
+	if (channel->ctl == MAP_FAILED) {
+		channel->ctl = NULL;
+		return fail_errno(err, channel->init, "attach", "mmap",
+				  "its control page can not be mapped");
+	}
+	ctl = channel->ctl;
+	if (ctl->version != AVC_CTL_VERSION)
+		return fail(
+			err, AVC_PROTOCOL, 0, channel->init, "attach", "",
+			"avckpt-init speaks version %u, this is version %u: restart the container",
+			ctl->version, (unsigned int)AVC_CTL_VERSION);
+	channel->report_fd = open_fd_of(channel->init, ctl->report_fd, O_RDONLY, true);
+	channel->verdict_fd = open_fd_of(channel->init, ctl->verdict_fd, O_WRONLY, true);
+	channel->pidns_fd = proc_open(channel->init, "ns/pid", O_RDONLY);
+	if (channel->report_fd < 0 || channel->verdict_fd < 0 || channel->pidns_fd < 0)
+		return fail_errno(err, channel->init, "attach", "open(fd)",
+				  "its pipes can not be opened");
+	channel->init_inside = ctl->init_pid;
+	return 0;
+}
+
+int init_channel_open(struct init_channel *channel, struct avc_error *err)
+{
+	int number, pidfd = channel->init_pidfd;
+	uint64_t magic = 0;
+
+	channel->init = proc_pidfd_pid(pidfd);
+	if (channel->init <= 0)
+		return fail(err, AVC_GONE, ESRCH, 0, "attach", "",
+			    "the container's main process has ended");
+	number = find_ctl(channel->init);
+	if (number < 0 || pidfd_ended(pidfd))
+		return 0;
+	/* The magic is written last: before that the page is not to be trusted. */
+	channel->ctl_fd = open_fd_of(channel->init, number, O_RDONLY, false);
+	if (channel->ctl_fd >= 0 && pread(channel->ctl_fd, &magic, sizeof magic, 0) < 0)
+		magic = 0;
+	close_fd(&channel->ctl_fd);
+	if (magic != AVC_CTL_MAGIC)
+		return 0;
+	if (connect_all(channel, number, err) == 0)
+		return 1;
+	init_channel_close(channel);
+	channel->init_pidfd = pidfd;
+	return -1;
+}
+
+/* Everything but the pidfd, which is the guard's. */
+void init_channel_close(struct init_channel *channel)
+{
+	if (channel->ctl)
+		munmap(channel->ctl, sizeof *channel->ctl);
+	channel->ctl = NULL;
+	close_fd(&channel->ctl_fd); /* lets the lock go */
+	close_fd(&channel->report_fd);
+	close_fd(&channel->verdict_fd);
+	close_fd(&channel->pidns_fd);
+}
+
+pid_t init_channel_app(const struct init_channel *channel)
+{
+	const int32_t inside = __atomic_load_n(&channel->ctl->app_pid, __ATOMIC_ACQUIRE);
+	pid_t children[CHILDREN_MAX];
+	int count = proc_children(channel->init, children, CHILDREN_MAX);
+
+	for (int i = 0; inside > 0 && i < count; i++)
+		if (proc_inside(children[i]) == inside)
+			return children[i];
+	return 0;
+}
+
+bool init_channel_app_started(const struct init_channel *channel, pid_t app)
+{
+	char path[64];
+	struct stat own, theirs;
+
+	snprintf(path, sizeof path, "/proc/%d/exe", channel->init);
+	if (stat(path, &own))
+		return false;
+	snprintf(path, sizeof path, "/proc/%d/exe", proc_live_thread(app));
+	if (stat(path, &theirs))
+		return false;
+	return own.st_dev != theirs.st_dev || own.st_ino != theirs.st_ino;
+}
+
+void init_channel_arm(struct init_channel *channel, bool armed)
+{
+	__atomic_store_n(&channel->ctl->armed, armed, __ATOMIC_RELEASE);
+}
+
+bool init_channel_stop_asked(const struct init_channel *channel)
+{
+	const uint64_t asked = __atomic_load_n(&channel->ctl->stop_asked_ns, __ATOMIC_ACQUIRE);
+
+	return asked && now_ns() - asked < AVC_CTL_STOP_MS * NS_PER_MS;
+}
+
+int init_channel_report(struct init_channel *channel, struct avc_report *report)
+{
+	return read(channel->report_fd, report, sizeof *report) == sizeof *report ? 1 : 0;
+}
+
+int init_channel_verdict(const struct init_channel *channel, enum avc_verdict_kind kind,
+			 struct avc_error *err)
+{
+	const struct avc_verdict verdict = { .seq = channel->death, .kind = kind };
+
+	/* A reader that is gone raises SIGPIPE, which this thread has blocked. */
+	if (write(channel->verdict_fd, &verdict, sizeof verdict) != sizeof verdict)
+		return fail_errno(err, channel->init, "tell init", "write", "init does not listen");
+	return 0;
+}
+
+void init_channel_working(struct init_channel *channel)
+{
+	const uint64_t now = now_ns();
+	struct avc_error ignored = { 0 };
+
+	if (now - channel->working_ns < WORKING_NS)
+		return;
+	channel->working_ns = now;
+	(void)init_channel_verdict(channel, AVC_VERDICT_WORKING, &ignored);
+}
+
+void init_channel_kill_lost(const struct init_channel *channel,
+			    bool (*known)(pid_t pid, const void *arg), const void *arg)
+{
+	pid_t children[CHILDREN_MAX];
+	bool any;
+
+	/* One that was just cloning, or was the parent of another, leaves that behind. */
+	do {
+		const int count = proc_children(channel->init, children, CHILDREN_MAX);
+
+		any = false;
+		for (int i = 0; i < count; i++)
+			if (!known(children[i], arg) && tracee_is_ours(children[i])) {
+				tracee_kill(children[i]);
+				any = true;
+			}
+	} while (any);
+}
+
+/* What can still touch what the app shares with others: not yet on its way out, or one of its
+ * threads is not. */
+static bool may_run(const struct proc_stat *stat)
+{
+	return (stat->state != 'Z' && stat->state != 'X') || stat->threads > 1;
+}
+
+int init_channel_kill_leftovers(struct init_channel *channel,
+				bool (*keep)(pid_t pid, const void *arg), void (*tend)(void *arg),
+				void *arg, struct avc_error *err)
+{
+	const uint64_t start = now_ns();
+	uint64_t alive_ns = start;
+	pid_t alive;
+
+	/* What a killed process leaves becomes init's child in its turn. */
+	for (;;) {
+		pid_t children[CHILDREN_MAX];
+		const int count = proc_children(channel->init, children, CHILDREN_MAX);
+		const uint64_t now = now_ns();
+		bool any = false;
+
+		alive = 0;
+		for (int i = 0; i < count; i++) {
+			struct proc_stat stat;
+
+			if (keep(children[i], arg) || proc_stat(children[i], &stat) ||
+			    stat.parent != channel->init)
+				continue;
+			any = true; /* its number is not free before init has waited for it */
+			if (!may_run(&stat))
+				continue;
+			alive = children[i];
+			alive_ns = now;
+			kill(alive, SIGKILL);
+		}
+		/* A zombie's number may be needed, and may be not: that shows soon enough. */
+		if (!any || now - alive_ns > LEFTOVERS_NS)
+			return 0;
+		if (alive && now - start > LEFTOVERS_ALIVE_NS)
+			return fail(err, AVC_DEADLINE, 0, alive, "restore", "",
+				    "a process that was killed does not end");
+		init_channel_working(channel);
+		tend(arg);
+		usleep(now - start < LEFTOVERS_NS ? LEFTOVERS_US : LEFTOVERS_LONG_US);
+	}
+}

@@ -1,0 +1,407 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The parasite as the engine sees it (parasite/parasite.h says what it is), and code run
+ * in a stopped task on it.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/futex.h>
+#include <signal.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "internal.h"
+#include "parasite_blob.h"
+
+#define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
+#define PARKED_NS NS_PER_S
+
+static size_t page_up(size_t n)
+{
+	return (n + ARCH_PAGE_BYTES - 1) & ~(size_t)(ARCH_PAGE_BYTES - 1);
+}
+
+/* A block: struct inj_thread, stack (growing down), signal frame.  With AVX-512
+ * it all fits one page, with AMX three. */
+static size_t block_stack_top(void)
+{
+	return 896;
+}
+_Static_assert(sizeof(struct inj_thread) <= 320, "leave most of it to the stack");
+
+size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max)
+{
+	parasite->slots = slots;
+	parasite->threads_max = threads_max;
+	parasite->block_bytes = page_up(block_stack_top() + arch_frame_bytes());
+	parasite->slot_bytes = page_up(sizeof(struct inj_slot)) + INJ_SETUP_BYTES +
+			       INJ_FILES_BYTES + threads_max * parasite->block_bytes;
+	parasite->bytes = INJ_SLOTS_OFFSET + slots * parasite->slot_bytes;
+	return parasite->bytes;
+}
+
+int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
+		  uint64_t nonce, struct avc_error *err)
+{
+	void *map;
+	int fd;
+
+	fd = proc_open_mapped(pid, base, base + bytes, O_RDWR);
+	if (fd < 0)
+		return fail_errno(err, pid, "infect", "open(map_files)",
+				  "the parasite can not be reached");
+	map = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	if (map == MAP_FAILED) {
+		close(fd);
+		return fail_errno(err, pid, "infect", "mmap", "the parasite can not be mapped");
+	}
+	parasite->fd = fd;
+	parasite->base = base;
+	parasite->map = map;
+	parasite->control = (struct inj_control *)(parasite->map + INJ_CODE_BYTES);
+	memcpy(parasite->map, parasite_blob, sizeof parasite_blob);
+	parasite->control->nonce = nonce;
+	parasite->control->magic = INJ_MAGIC;
+	return 0;
+}
+
+void parasite_close(struct parasite *parasite)
+{
+	if (parasite->map) {
+		munmap(parasite->map, parasite->bytes);
+		close(parasite->fd);
+	}
+	*parasite = (struct parasite){ 0 };
+}
+
+struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot)
+{
+	return (struct inj_slot *)(parasite->map + INJ_SLOTS_OFFSET + slot * parasite->slot_bytes);
+}
+
+avc_remote parasite_remote(const struct parasite *parasite, const void *local)
+{
+	return parasite->base + (avc_remote)((const uint8_t *)local - parasite->map);
+}
+
+bool parasite_contains(const struct parasite *parasite, avc_remote address)
+{
+	return parasite->base && address >= parasite->base &&
+	       address < parasite->base + parasite->bytes;
+}
+
+uint8_t *parasite_setup(const struct parasite *parasite, uint32_t slot)
+{
+	return (uint8_t *)parasite_slot(parasite, slot) + page_up(sizeof(struct inj_slot));
+}
+
+uint8_t *parasite_files(const struct parasite *parasite, uint32_t slot)
+{
+	return parasite_setup(parasite, slot) + INJ_SETUP_BYTES;
+}
+
+static uint8_t *block(const struct parasite *parasite, uint32_t slot, uint32_t i)
+{
+	return parasite_files(parasite, slot) + INJ_FILES_BYTES + i * parasite->block_bytes;
+}
+
+struct inj_thread *parasite_thread(const struct parasite *parasite, uint32_t slot, uint32_t i)
+{
+	return (struct inj_thread *)block(parasite, slot, i);
+}
+
+void *parasite_stack(const struct parasite *parasite, uint32_t slot, uint32_t i)
+{
+	return block(parasite, slot, i) + block_stack_top();
+}
+
+void *parasite_frame(const struct parasite *parasite, uint32_t slot, uint32_t i)
+{
+	return block(parasite, slot, i) + block_stack_top();
+}
+
+void call_begin(struct inj_call *call, enum inj_after after)
+{
+	call->done = 0;
+	call->pause = INJ_PAUSE_NONE;
+	call->count = 0;
+	call->after = after;
+	call->park_ms = INJ_PARK_MS;
+}
+
+struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
+			     uint64_t d, uint64_t e)
+{
+	/* The parasite is the app's to scribble on, and its other threads run while one of them is
+	 * asked: not even a number that was written just now is believed. */
+	const uint32_t count = __atomic_load_n(&call->count, __ATOMIC_RELAXED);
+	const uint32_t i = count < INJ_CALLS_MAX ? count : INJ_CALLS_MAX - 1;
+	struct inj_syscall *s = &call->call[i];
+
+	call->count = i + 1;
+	*s = (struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, 0 }, .result = -ENOSYS };
+	return s;
+}
+
+/* A thread of the app has others waiting for it, and goes home after INJ_PARK_MS.
+ * Templates and holders stay, and a template that waits for a CPU is no reason to
+ * restore an older one.
+ *
+ * A task that is killed never gets done: to be noticed at once, for its process
+ * can not be reaped before we have. */
+static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct avc_error *err)
+{
+	const struct timespec slice = { .tv_nsec = 500000 };
+	const uint64_t end = now_ns() + (call->after == INJ_AFTER_PARK ? PARKED_NS : HOMEWARD_NS);
+
+	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
+		struct stop stop;
+
+		syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
+		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
+			break;
+		stop = tracee_wait(tid, WNOHANG);
+		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
+			return fail(err, AVC_GONE, 0, tid, "run injected code", "", "it has ended");
+		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP)
+			ptrace(PTRACE_CONT, tid, NULL,
+			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+		if (now_ns() > end)
+			return fail(err, AVC_DEADLINE, 0, tid, "run injected code", "",
+				    "the task did not get to run in time");
+	}
+	return 0;
+}
+
+int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
+		  struct inj_call *call, struct avc_error *err)
+{
+	struct arch_regs regs;
+
+	arch_call(&regs, base, parasite->base + INJ_RUN_OFFSET,
+		  parasite_remote(parasite, call->stack + sizeof call->stack),
+		  parasite_remote(parasite, call));
+	if (arch_regs_set(tid, &regs))
+		return fail_errno(err, tid, "run injected code", "ptrace(SETREGS)", "it has gone");
+	return 0;
+}
+
+int parasite_start(pid_t tid, struct avc_error *err)
+{
+	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
+	return 0;
+}
+
+int parasite_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	return parasite_start(tid, err) ? -1 : wait_word(call, &call->pause, tid, err);
+}
+
+int parasite_halt(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	if (wait_word(call, &call->done, tid, err)) {
+		/* Without a stop of its own it would go home and stay a tracee for ever;
+		 * now it stops as soon as it gets to run, and straggle() sends it home. */
+		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		return -1;
+	}
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+		return fail_errno(err, tid, "run injected code", "ptrace(INTERRUPT)",
+				  "it has gone");
+	return 0;
+}
+
+int parasite_finish(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	if (parasite_halt(tid, call, err))
+		return -1;
+	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
+int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	__atomic_store_n(&call->pause, INJ_PAUSE_OVER, __ATOMIC_RELEASE);
+	syscall(SYS_futex, &call->pause, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+	return parasite_finish(tid, call, err);
+}
+
+int parasite_run(pid_t tid, struct inj_call *call, struct avc_error *err)
+{
+	return parasite_start(tid, err) ? -1 : parasite_finish(tid, call, err);
+}
+
+/* It has made all its calls and not stopped: a limit of processes, or of memory. */
+static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_error *err)
+{
+	int64_t result = 0;
+
+	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++)
+		if (call->call[i].nr == SYS_clone)
+			result = call->call[i].result;
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
+	if (tracee_await(tid, NULL, err) != STOP_TRAP)
+		return -1;
+	return fail(err, AVC_KERNEL, (int)-result, tid, "clone", "clone",
+		    "it may not have another process: %s", strerror((int)-result));
+}
+
+int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+			 struct avc_error *err)
+{
+	for (;;) {
+		struct stop stop;
+
+		tracee_watch(&call->done);
+		stop = tracee_wait(tid, 0);
+		tracee_watch(NULL);
+		switch (stop.kind) {
+		case STOP_FORK:
+			*child = stop.message;
+			return 0;
+		case STOP_EXIT:
+		case STOP_DYING:
+			return fail(err, AVC_GONE, 0, tid, "clone", "", "it has ended");
+		case STOP_DEADLINE:
+			if (!__atomic_load_n(&call->done, __ATOMIC_ACQUIRE))
+				return fail(err, AVC_DEADLINE, 0, tid, "clone", "clone",
+					    "not done in time");
+			return clone_refused(tid, call, err);
+		default:
+			/* SIGSTOP, SIGCONT and job control make stops of their own
+			 * (ptrace(2), PTRACE_EVENT_STOP). */
+			if (ptrace(PTRACE_CONT, tid, NULL,
+				   (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
+				return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
+		}
+	}
+}
+
+int parasite_run_clone(pid_t tid, const struct inj_call *call, pid_t *child, struct avc_error *err)
+{
+	return parasite_run_clone_while(tid, call, NULL, NULL, child, err);
+}
+
+int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			     void *arg, pid_t *child, struct avc_error *err)
+{
+	if (parasite_start(tid, err))
+		return -1;
+	if (meanwhile)
+		meanwhile(arg);
+	return parasite_await_clone(tid, call, child, err);
+}
+
+bool in_old_parasite(const struct target *target, avc_remote address)
+{
+	for (uint32_t i = 0; i < target->old_parasites; i++)
+		if (address - target->old_parasite[i].base < target->old_parasite[i].bytes)
+			return true;
+	return false;
+}
+
+int suspend_seccomp(const struct thread *thread, struct avc_error *err)
+{
+	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL,
+		   (long)(TRACE_OPTIONS_APP | PTRACE_O_SUSPEND_SECCOMP)))
+		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",
+				  "it has gone");
+	return 0;
+}
+
+int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
+{
+	const avc_remote at = target->parasite.base + INJ_CODE_BYTES +
+			      offsetof(struct inj_control, nonce);
+	long nonce;
+
+	errno = 0;
+	nonce = ptrace(PTRACE_PEEKDATA, tid, (void *)at, NULL);
+	if (errno == ESRCH)
+		return fail_errno(err, tid, "stop", "ptrace(PEEKDATA)", "it has ended");
+	if (errno || (uint64_t)nonce != target->nonce) {
+		target->infected = false;
+		return fail(err, AVC_DEADLINE, 0, tid, "stop", "",
+			    "it has executed another program");
+	}
+	return 0;
+}
+
+/* A holder has the memory of the program that it was made in. */
+static bool has_memory_of_holder(const struct target *target)
+{
+	return target->holder && proc_same_memory(target->pid, target->holder);
+}
+
+int vet(struct target *target, struct thread *thread, struct avc_error *err)
+{
+	if (support_check_thread(thread->tid, err))
+		return -1;
+	if (!has_memory_of_holder(target) && parasite_check(target, thread->tid, err))
+		return -1;
+	/* Homes are places of the app's, never of a parasite that will be taken away. */
+	if (in_old_parasite(target, arch_pc(&thread->regs)))
+		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
+			    "still on its way home from a guard that died");
+	/* The kernel forgets a restartable sequence as soon as the thread is
+	 * seen elsewhere: it has to go on where the kernel would send it.  There
+	 * are no system calls in one. */
+	if (thread->call.nr < 0)
+		rseq_fixup(target->mem_fd, thread);
+	thread->vetted = true;
+	return 0;
+}
+
+int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+{
+	const uint64_t all = ~UINT64_C(0);
+	struct inj_control *control = target->parasite.control;
+	struct arch_regs home;
+
+	if (!thread->vetted && vet(target, thread, err))
+		return -1;
+	home = thread->regs;
+	arch_resume(&home);
+	arch_home_set(&control->home, &home, thread->sigmask);
+	/* Registers first: if we die between the two, the thread is in the parasite
+	 * with its own mask and goes home with it.  The other way round it would
+	 * be in the app with every signal blocked, for ever. */
+	if (suspend_seccomp(thread, err) ||
+	    parasite_send(&target->parasite, thread->tid, &thread->regs, &control->runner, err))
+		return -1;
+	thread->borrowed = true;
+	thread->borrowed_for = &target->parasite;
+	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
+		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
+				  "it has gone");
+	return 0;
+}
+
+int give_back(struct thread *thread, struct avc_error *err)
+{
+	struct arch_regs now;
+
+	if (arch_regs_get(thread->tid, &now))
+		return fail_errno(err, thread->tid, "give back", "ptrace(GETREGS)", "it has gone");
+	/* Of a guard that did not get a CPU for so long (park_ms) it thinks that it has died: it
+	 * has gone home by itself, and its registers are newer than those that we know. */
+	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
+		thread->borrowed = false;
+		return fail(err, AVC_DEADLINE, EAGAIN, thread->tid, "give back", "",
+			    "it has gone on by itself, for the guard came too late");
+	}
+	/* The mask first, for the same reason. */
+	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
+	    arch_regs_set(thread->tid, &thread->regs))
+		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
+	/* Its own seccomp filters are in force again when it is let go: nothing else
+	 * comes in between. */
+	thread->borrowed = false;
+	return 0;
+}

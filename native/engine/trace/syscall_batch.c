@@ -1,0 +1,348 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A task that a restored process has forked, at rest in a parasite: it makes the system calls
+ * that it is given, a list at a time, and gets descriptors over a socket.
+ *
+ * It stops by itself at the end of a list, by a signal to itself that we take away.  To be woken
+ * up by it and to stop it then would be two turns instead of one, and turns are most of what a
+ * small process costs.  Who dies with us (PTRACE_O_EXITKILL) can be left to such a stop; a holder
+ * or a thread of the app's could not.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <sys/mman.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+
+#include "internal.h"
+
+#define SPARE \
+	8 /* syscall_batch_add() is used for so many in a row at most, syscall_batch_ask() for more */
+#define NOT_MADE INT64_MIN
+
+/* The list of calls is where files_restore.c has its own, which is not in use any more;
+ * what they refer to is behind it. */
+void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *parasite,
+			 uint32_t slot)
+{
+	uint8_t *memory = parasite_files(parasite, slot) + INJ_FILES_BYTES / 2;
+
+	batch->parasite = parasite;
+	batch->call = &parasite->control->holder;
+	batch->list = (struct inj_syscall *)memory;
+	batch->list_max = INJ_FILES_BYTES / 4 / sizeof *batch->list;
+	batch->data = memory + INJ_FILES_BYTES / 4;
+	batch->listed = batch->softs = 0;
+}
+
+void syscall_batch_add(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
+		       uint64_t d, uint64_t e, uint64_t f)
+{
+	if (batch->listed < batch->list_max)
+		batch->list[batch->listed] = (struct inj_syscall){ .nr = nr,
+								   .arg = { a, b, c, d, e, f },
+								   .result = NOT_MADE };
+	batch->listed++;
+}
+
+void syscall_batch_soften(struct syscall_batch *batch, const char *problem)
+{
+	if (batch->softs < BATCH_SOFTS)
+		batch->soft[batch->softs++] = (struct soft){ batch->listed - 1, problem };
+}
+
+/* At the end of its list; somebody else may have a signal for it, too. */
+static int await_end(const struct syscall_batch *batch, const struct inj_syscall *last,
+		     struct avc_error *err)
+{
+	for (;;) {
+		struct stop stop;
+		int signal = 0;
+
+		tracee_watch(&batch->call->done);
+		stop = tracee_wait(batch->pid, 0);
+		tracee_watch(NULL);
+		switch (stop.kind) {
+		case STOP_SIGNAL:
+			if (stop.signal != SIGSTOP)
+				signal = stop.signal;
+			else if (last->result != NOT_MADE)
+				return 0;
+			break;
+		case STOP_EXIT:
+		case STOP_DYING:
+			return fail(err, AVC_GONE, 0, batch->pid, "run injected code", "",
+				    "it has ended");
+		case STOP_DEADLINE:
+			/* Some security modules let nobody send signals (LSM, task_kill). */
+			if (__atomic_load_n(&batch->call->done, __ATOMIC_ACQUIRE))
+				return parasite_finish(batch->pid, batch->call, err);
+			return fail(err, AVC_DEADLINE, 0, batch->pid, "run injected code", "",
+				    "the task did not get to run in time");
+		default:
+			break;
+		}
+		if (ptrace(PTRACE_CONT, batch->pid, NULL, (long)signal))
+			return fail_errno(err, batch->pid, "run injected code", "ptrace(CONT)",
+					  "it has gone");
+	}
+}
+
+static int run(struct syscall_batch *batch, struct avc_error *err)
+{
+	const uint32_t listed = batch->listed;
+	const uint64_t self = (uint64_t)batch->inside;
+
+	if (!listed)
+		return 0;
+	syscall_batch_add(batch, SYS_tgkill, self, self, SIGSTOP, 0, 0, 0);
+	batch->listed = 0;
+	if (listed >= batch->list_max)
+		return fail(err, AVC_UNSUPPORTED, 0, batch->pid, "restore", "",
+			    "there is no room for so many system calls");
+	call_begin(batch->call, INJ_AFTER_PARK);
+	call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list), listed + 1,
+		 0, 0, 0);
+	return parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err) ||
+			       parasite_start(batch->pid, err) ||
+			       await_end(batch, &batch->list[listed - 1], err)
+		       ? -1
+		       : 0;
+}
+
+static const char *name_of(long nr)
+{
+	static const struct {
+		long nr;
+		const char *name;
+	} names[] = {
+		{ SYS_mmap, "mmap" },
+		{ SYS_munmap, "munmap" },
+		{ SYS_mprotect, "mprotect" },
+		{ SYS_pkey_mprotect, "pkey_mprotect" },
+		{ SYS_mremap, "mremap" },
+		{ SYS_madvise, "madvise" },
+		{ SYS_recvmsg, "recvmsg" },
+		{ SYS_dup3, "dup3" },
+		{ SYS_fcntl, "fcntl" },
+		{ SYS_fchdir, "fchdir" },
+		{ SYS_rt_sigaction, "rt_sigaction" },
+		{ SYS_prctl, "prctl" },
+		{ SYS_setsid, "setsid" },
+		{ SYS_setpgid, "setpgid" },
+		{ SYS_ioctl, "ioctl" },
+		{ SYS_socketpair, "socketpair" },
+		{ SYS_chroot, "chroot" },
+		{ SYS_membarrier, "membarrier" },
+		{ SYS_shmat, "shmat" },
+	};
+
+	for (size_t i = 0; i < sizeof names / sizeof *names; i++)
+		if (names[i].nr == nr)
+			return names[i].name;
+	return "";
+}
+
+static const struct soft *soft_of(const struct syscall_batch *batch, uint32_t index)
+{
+	for (uint32_t i = 0; i < batch->softs; i++)
+		if (batch->soft[i].index == index)
+			return &batch->soft[i];
+	return NULL;
+}
+
+int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err)
+{
+	const uint32_t listed = batch->listed;
+	int result = run(batch, err);
+
+	for (uint32_t i = 0; !result && i < listed; i++) {
+		const struct inj_syscall *s = &batch->list[i];
+		const struct soft *soft;
+
+		if (s->result >= 0 || s->result <= -4096)
+			continue;
+		soft = soft_of(batch, i);
+		if (!soft)
+			result = fail(err, AVC_KERNEL, (int)-s->result, batch->pid, "restore",
+				      name_of(s->nr), "call %u of %u at %lx", i + 1, listed,
+				      (unsigned long)s->arg[0]);
+		else if (soft->problem)
+			fail(batch->notes, AVC_KERNEL, (int)-s->result, batch->inside, "restore",
+			     name_of(s->nr), "%s", soft->problem);
+	}
+	batch->softs = 0;
+	return result;
+}
+
+/* One of any number; those before it are made when there is no more room. */
+int syscall_batch_ask(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
+		      uint64_t d, uint64_t e, uint64_t f, struct avc_error *err)
+{
+	if (batch->listed + SPARE > batch->list_max && syscall_batch_flush(batch, err))
+		return -1;
+	syscall_batch_add(batch, nr, a, b, c, d, e, f);
+	return 0;
+}
+
+/* A little room for arguments, until the next flush. */
+void *syscall_batch_data(const struct syscall_batch *batch, avc_remote *remote)
+{
+	void *data = batch->call->out;
+
+	*remote = parasite_remote(batch->parasite, data);
+	return data;
+}
+
+static avc_remote write_letter(const struct syscall_batch *batch)
+{
+	avc_remote remote;
+	struct files_letter *letter = syscall_batch_data(batch, &remote);
+
+	_Static_assert(sizeof *letter <= sizeof batch->call->out, "room for a letter");
+	files_letter_write(letter, remote);
+	return remote;
+}
+
+static int fetch(const struct syscall_batch *batch, int fd, struct avc_error *err)
+{
+	int pidfd = proc_pidfd_open(batch->pid);
+	const int ours = pidfd < 0 ? -1 : files_borrow(pidfd, fd);
+
+	close_fd(&pidfd);
+	if (ours < 0)
+		fail_errno(err, batch->pid, "restore", "pidfd_getfd", "it was killed");
+	return ours;
+}
+
+/* Everything its parent had open is closed; descriptor 0 is a socket of which we have the
+ * other end. */
+int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
+				  struct avc_error *err)
+{
+	avc_remote out;
+
+	if (fd_channel && fd_channel->ours >= 0) {
+		if (fd_channel->theirs)
+			syscall_batch_add(batch, SYS_dup3, (uint64_t)fd_channel->theirs, 0,
+					  O_CLOEXEC, 0, 0, 0);
+		syscall_batch_add(batch, SYS_close_range, 1, ~0u, 0, 0, 0, 0);
+		batch->socket = fcntl(fd_channel->ours, F_DUPFD_CLOEXEC, 3);
+		return batch->socket < 0 ? fail_errno(err, batch->pid, "restore", "fcntl",
+						      "no descriptor is left for its socket")
+					 : 0;
+	}
+	(void)syscall_batch_data(batch, &out);
+	syscall_batch_add(batch, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	if (syscall_batch_flush(batch, err))
+		return -1;
+	batch->socket = fetch(batch, 1, err);
+	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	return batch->socket < 0 ? -1 : 0;
+}
+
+int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
+				   struct avc_error *err)
+{
+	avc_remote out;
+	const int *ends = syscall_batch_data(batch, &out);
+
+	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	syscall_batch_soften(batch, NULL);
+	if (syscall_batch_flush(batch, err))
+		return -1;
+	if (batch->list[0].result)
+		return 0;
+	fd_channel->theirs = ends[0];
+	fd_channel->ours = fetch(batch, ends[1], err);
+	syscall_batch_add(batch, SYS_close, (uint64_t)ends[1], 0, 0, 0, 0, 0);
+	return fd_channel->ours < 0 || syscall_batch_flush(batch, err) ? -1 : 0;
+}
+
+int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
+				     struct avc_error *err)
+{
+	if (fd_channel->ours < 0)
+		return 0;
+	close_fd(&fd_channel->ours);
+	syscall_batch_add(batch, SYS_close, (uint64_t)fd_channel->theirs, 0, 0, 0, 0, 0);
+	return syscall_batch_flush(batch, err);
+}
+
+/* It comes to the lowest number that is free, by the socket that has number `socket` there. */
+static int hand_over(struct syscall_batch *batch, int socket, int fd, struct avc_error *err)
+{
+	/* What is not received yet waits in the socket. */
+	if (files_send(batch->socket, fd) &&
+	    (errno != EAGAIN || syscall_batch_flush(batch, err) || files_send(batch->socket, fd)))
+		return fail_errno(err, batch->pid, "restore", "sendmsg",
+				  "a descriptor could not be handed over");
+	return syscall_batch_ask(batch, SYS_recvmsg, (uint64_t)socket, write_letter(batch),
+				 MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0, err);
+}
+
+int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err)
+{
+	return hand_over(batch, 0, fd, err);
+}
+
+/* From its parent's parasite into its own. */
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct target *target,
+				  uint32_t slot, struct avc_error *err)
+{
+	const struct parasite *parasite = &target->parasite;
+
+	if (syscall_batch_give(batch, parasite->fd, err))
+		return -1;
+	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
+			  PARASITE_FLAGS, 1, 0);
+	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
+			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1,
+			  INJ_CODE_BYTES);
+	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (syscall_batch_flush(batch, err))
+		return -1;
+	syscall_batch_enter(batch, parasite, slot);
+	return 0;
+}
+
+/* In order; what is received comes to the lowest number that is free.  The last of the calls
+ * are made with what comes next. */
+int syscall_batch_put_files(struct syscall_batch *batch, const struct files_table *table,
+			    struct avc_error *err)
+{
+	int socket = 0, lowest = 0;
+
+	/* Out of the way, between or behind those that are wanted. */
+	for (uint32_t i = 0; i < table->count; i++)
+		socket += table->entry[i].fd == socket;
+	if (socket) {
+		syscall_batch_add(batch, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket, 0, 0, 0);
+		syscall_batch_add(batch, SYS_close, 0, 0, 0, 0, 0, 0);
+	}
+	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
+		const int fd = table->entry[i].fd;
+
+		/* The lowest number that is free; of those that are taken `placed` is the
+		 * first that is not below it. */
+		for (;; lowest++) {
+			while (placed < i && table->entry[placed].fd < lowest)
+				placed++;
+			if (lowest != socket && !(placed < i && table->entry[placed].fd == lowest))
+				break;
+		}
+		if (hand_over(batch, socket, table->entry[i].ours, err))
+			return -1;
+		if (lowest != fd) {
+			syscall_batch_add(batch, SYS_dup3, (uint64_t)lowest, (uint64_t)fd,
+					  table->entry[i].cloexec ? O_CLOEXEC : 0, 0, 0, 0);
+			syscall_batch_add(batch, SYS_close, (uint64_t)lowest, 0, 0, 0, 0, 0);
+		} else if (!table->entry[i].cloexec) {
+			syscall_batch_add(batch, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
+		}
+	}
+	syscall_batch_add(batch, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
+	return 0;
+}
