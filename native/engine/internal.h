@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The engine's own declarations.  Everything here runs in the guard's thread
- * unless said otherwise; one guard is one tracer thread.
+ * The engine's own declarations.  Everything here runs in the guard's main thread
+ * unless said otherwise: a process can only be traced by one thread.
  *
  *   guard.c      the thread: waits, obeys, tells; guard_*.c: see guard.h
  *   init_channel.c       to avckpt-init: control page, reports, verdicts
@@ -75,6 +75,19 @@ ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 /* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
  * and nothing has changed. */
 bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
+
+/* ---- heartbeat.c ------------------------------------------------------------ */
+
+/* Takes the memory for it, and closes the descriptor.  0 or -1. */
+int heartbeat_open(int fd) warn_unused;
+/* We get on: the daemon kills a guard of which it has not heard for seconds. */
+void heartbeat(void);
+
+/* ---- config.c -------------------------------------------------------------- */
+
+#define RESTORES_MAX 64
+
+int config_check(const struct avc_config *config, struct avc_error *err) warn_unused;
 
 /* ---- proc.c ---------------------------------------------------------------- */
 
@@ -1248,9 +1261,5 @@ void init_channel_kill_lost(const struct init_channel *channel,
 int init_channel_kill_leftovers(struct init_channel *channel,
 				bool (*keep)(pid_t pid, const void *arg), void (*tend)(void *arg),
 				void *arg, struct avc_error *err) warn_unused;
-
-/* ---- engine.c --------------------------------------------------------------------------- */
-
-void engine_emit(struct avc_engine *engine, const struct avc_event *event);
 
 #endif
