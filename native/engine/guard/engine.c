@@ -7,7 +7,7 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "guard.h"
 
 #define QUEUE_MAX 4096
 

@@ -14,7 +14,8 @@
 
 #include <poll.h>
 
-#include "internal.h"
+#include "avckpt/engine.h"
+#include "restore.h"
 
 #define COMMANDS_MAX 64
 #define RESTORES_MAX 64
@@ -68,6 +69,10 @@ struct avc_guard {
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	struct files_written *written; /* avckpt.files=strict; NULL: not yet        */
 };
+
+/* ---- engine.c --------------------------------------------------------------------------- */
+
+void engine_emit(struct avc_engine *engine, const struct avc_event *event);
 
 /* ---- guard.c: what is told ------------------------------------------------- */
 

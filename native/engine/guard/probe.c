@@ -14,7 +14,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "guard.h"
 
 static int probe_child(pid_t child, struct avc_error *err)
 {
