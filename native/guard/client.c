@@ -20,7 +20,7 @@
 #include <unistd.h>
 
 #include "avckpt/guard.h"
-#include "internal.h"
+#include "base.h"
 
 #define QUEUE_MAX 4096
 #define STOP_MS 15000     /* a guard may be in the middle of a restore                    */

@@ -5,7 +5,7 @@
  */
 #include <errno.h>
 
-#include "internal.h"
+#include "base.h"
 
 int config_check(const struct avc_config *config, struct avc_error *err)
 {

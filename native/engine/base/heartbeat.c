@@ -6,7 +6,7 @@
 #include <sys/stat.h>
 
 #include "avckpt/guard.h"
-#include "internal.h"
+#include "base.h"
 
 static struct avc_heartbeat *shared;
 

@@ -14,7 +14,7 @@
 #include <poll.h>
 
 #include "avckpt/guard.h"
-#include "internal.h"
+#include "restore.h"
 
 #define OUTBOX_MAX 64 /* events that the daemon has not taken yet                */
 #define DYING_NS NS_PER_S

@@ -15,7 +15,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 /* On a busy machine it may take long until a killed process gets a CPU to end on.  Until then it
