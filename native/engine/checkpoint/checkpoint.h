@@ -23,8 +23,9 @@ struct freeze_times {
 /* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
  * shared memory that is prepared for already.
  * On return the app runs, whatever happened. */
-int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
-	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err) warn_unused;
+int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
+		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
+		struct avc_error *err) warn_unused;
 
 /* ---- generation.c -------------------------------------------------------------- */
 

@@ -22,7 +22,7 @@ static int prepare_stopped(struct tree *tree, struct target *target, struct avc_
 	if (target->pid != target->leader)
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
 			    "the main thread of process %d has ended", target->inside);
-	if (!target->infected && infect_stopped(target, tree->slots, err))
+	if (!target->infected && process_infect_stopped(target, tree->slots, err))
 		return -1;
 	return target->files_image ? 0 : files_prepare(target, err);
 }
@@ -205,7 +205,7 @@ static bool has_all_holders(const struct tree *tree)
 }
 
 /* What a process above it adopts would be a child that it never had; it itself sees to that
- * (hold_stopped()). */
+ * (process_hold_stopped()). */
 static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *err)
 {
 	for (int k = tree->kin[i].parent; k >= 0; k = tree->kin[k].parent) {
@@ -214,12 +214,12 @@ static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *
 
 		if (!thread)
 			continue;
-		if (!above->paused && !above->descendant && ask(above, thread, err))
+		if (!above->paused && !above->descendant && thread_ask(above, thread, err))
 			return -1; /* the others were asked just now */
-		if (thread->creds.subreaper && adopt_no_more(above, err))
+		if (thread->creds.subreaper && process_adopt_no_more(above, err))
 			return -1;
 	}
-	return hold_stopped(tree->kin[i].target, tree->init, err);
+	return process_hold_stopped(tree->kin[i].target, tree->init, err);
 }
 
 /* Parents come before their children. */
@@ -232,7 +232,8 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 		if (tree->kin[i].target && !tree->kin[i].target->holder)
 			result = make_holder_missing(tree, i, err);
 	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->kin[i].target && adopt_again(tree->kin[i].target, &failed) && !result) {
+		if (tree->kin[i].target && process_adopt_again(tree->kin[i].target, &failed) &&
+		    !result) {
 			*err = failed;
 			result = -1;
 		}
@@ -246,13 +247,14 @@ static int clone_missing(struct tree *tree, struct generation *generation, struc
 	struct thread *main_thread = thread_find(tree->main, tree->main->pid);
 
 	/* First who waits in its parasite for us: how long the main process takes is not known yet. */
-	if (hear_all(tree, err) || await_app_clone(tree->main, main_thread, generation, err) ||
-	    rest_app(main_thread, err) || make_holders_missing(tree, err))
+	if (freeze_hear_all(tree, err) ||
+	    freeze_await_app_clone(tree->main, main_thread, generation, err) ||
+	    freeze_rest_app(main_thread, err) || make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		struct target *target = tree->kin[i].target;
 
-		if (target && !target->cloning && start_clone(target, err))
+		if (target && !target->cloning && freeze_start_clone(target, err))
 			return -1;
 	}
 	return 0;
@@ -265,7 +267,7 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 
 		if (!branch->target)
 			continue;
-		if (await_clone(branch->target, &branch->image->template, err))
+		if (freeze_await_clone(branch->target, &branch->image->template, err))
 			return -1;
 		branch->image->vm_pages = branch->target->clone_pages;
 		branch->image->taken_ns = generation->taken_ns;
@@ -275,8 +277,9 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 
 /* ---- all of it ------------------------------------------------------------------------------ */
 
-int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
-	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err)
+int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
+		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
+		struct avc_error *err)
 {
 	struct target *target = tree->main;
 	struct avc_error failed = { 0 };
@@ -291,11 +294,13 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	start = now_ns();
-	result = stop_known(tree, err);
+	result = freeze_stop_known(tree, err);
 	generation->taken_ns = now_ns();
 	times->stop_ns = generation->taken_ns - start;
 	if (!result)
-		result = begin_known(tree, generation, err) || stop_others(tree, err) ? -1 : 0;
+		result = freeze_begin_known(tree, generation, err) || freeze_stop_others(tree, err)
+				 ? -1
+				 : 0;
 	/* The deadline is for getting things stopped; the clone of a big process takes its
 	 * time. */
 	tracee_deadline_set(timer, CLONE_NS);
@@ -304,7 +309,7 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 		files_mapped_copy(generation->mapped);
 		result = keep_place_of_main(tree, generation, err) ||
 					 find_branches(tree, generation, err) ||
-					 begin_others(tree, generation, err) ||
+					 freeze_begin_others(tree, generation, err) ||
 					 keep_branches(generation, seen, err)
 				 ? -1
 				 : 0;
@@ -318,21 +323,21 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	/* Also what was begun before something failed. */
 	main_thread = thread_find(target, target->pid);
 	if (target->cloning &&
-	    await_app_clone(target, main_thread, generation, result ? &failed : err))
+	    freeze_await_app_clone(target, main_thread, generation, result ? &failed : err))
 		result = -1;
 	cloned = generation->template != 0;
-	if (hear_all(tree, result ? &failed : err))
+	if (freeze_hear_all(tree, result ? &failed : err))
 		result = -1;
 	if (!result)
 		result = await_clones(generation, err);
-	drop_clones(tree);
+	freeze_drop_clones(tree);
 	times->clone_ns = now_ns() - generation->taken_ns;
 	/* The image is whole.  The main thread first: it would have to share the CPUs with
 	 * everybody else. */
 	if (main_thread) {
 		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
 		if (cloned && main_thread->borrowed)
-			(void)rest_app(main_thread, &failed); /* or it is killed just now */
+			(void)freeze_rest_app(main_thread, &failed); /* or it is killed just now */
 		thread_let_go(target, main_thread);
 	}
 	process_let_go(target);

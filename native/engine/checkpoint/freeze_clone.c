@@ -58,7 +58,7 @@ static int read_all(struct target *target, uint32_t slot, struct avc_error *err)
 		if (parasite_contains(&target->parasite, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in the parasite");
-		if (in_old_parasite(target, arch_pc(&t->regs)))
+		if (parasite_is_old(target, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old parasite");
 		t->block = t->tid == target->leader ? 0 : (int)next++;
@@ -69,7 +69,7 @@ static int read_all(struct target *target, uint32_t slot, struct avc_error *err)
 			return fail_errno(err, t->tid, "freeze", "ptrace(GETREGSET)",
 					  "its state can not be read");
 		if ((!t->known || t->known_tls != arch_tls(&t->regs) || may_be_disarmed(t)) &&
-		    ask(target, t, err))
+		    thread_ask(target, t, err))
 			return -1;
 	}
 	target->blocks = next;
@@ -141,14 +141,14 @@ static int start_app_clone(struct target *target, struct thread *main_thread, lo
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
 	target->asked_ns = now_ns();
-	if (borrow(target, main_thread, err) || parasite_start(main_thread->tid, err))
+	if (thread_borrow(target, main_thread, err) || parasite_start(main_thread->tid, err))
 		return -1;
 	target->cloning = true;
 	return 0;
 }
 
-int await_app_clone(struct target *target, struct thread *main_thread,
-		    struct generation *generation, struct avc_error *err)
+int freeze_await_app_clone(struct target *target, struct thread *main_thread,
+			   struct generation *generation, struct avc_error *err)
 {
 	struct inj_call *call = &target->parasite.control->runner;
 
@@ -165,9 +165,9 @@ int await_app_clone(struct target *target, struct thread *main_thread,
 	return hear_of_children(target, err);
 }
 
-int rest_app(struct thread *main_thread, struct avc_error *err)
+int freeze_rest_app(struct thread *main_thread, struct avc_error *err)
 {
-	if (tracee_settle(main_thread->tid, err) == 0 && give_back(main_thread, err) == 0)
+	if (tracee_settle(main_thread->tid, err) == 0 && thread_give_back(main_thread, err) == 0)
 		return 0;
 	main_thread->stopped = false;
 	return -1;
@@ -190,7 +190,7 @@ static int begin_app(struct target *target, struct generation *generation, struc
 
 /* ---- the others ------------------------------------------------------------------------- */
 
-int start_clone(struct target *target, struct avc_error *err)
+int freeze_start_clone(struct target *target, struct avc_error *err)
 {
 	struct inj_call *call = &target->parasite.control->holder;
 
@@ -209,7 +209,7 @@ int start_clone(struct target *target, struct avc_error *err)
 	return 0;
 }
 
-int await_clone(struct target *target, pid_t *template, struct avc_error *err)
+int freeze_await_clone(struct target *target, pid_t *template, struct avc_error *err)
 {
 	const struct inj_call *call = &target->parasite.control->holder;
 	struct thread *thread = thread_find(target, target->pid);
@@ -238,9 +238,9 @@ static int ask_begin(struct target *target, uint64_t takes_ns, struct avc_error 
 				    NS_PER_MS);
 	timers_ask(target, call);
 	target->children = ask_for_children(call);
-	ask_add(target, false, call, &target->questions);
+	thread_ask_add(target, false, call, &target->questions);
 	target->asked_ns = now_ns();
-	if (borrow(target, thread, err) || parasite_start(thread->tid, err))
+	if (thread_borrow(target, thread, err) || parasite_start(thread->tid, err))
 		return -1;
 	target->asked = true;
 	return 0;
@@ -269,15 +269,16 @@ static int ask_end(struct target *target, struct avc_error *err)
 		thread_runs_on(thread, err);
 		return -1;
 	}
-	if (give_back(thread, err) || pending_read(target, err))
+	if (thread_give_back(thread, err) || pending_read(target, err))
 		return -1;
 	timers_answer(target, call, now_ns() - target->asked_ns);
-	if (ask_answer(thread, call, &target->questions, err))
+	if (thread_ask_answer(thread, call, &target->questions, err))
 		return -1;
-	return ask_others(target, thread, &was, err) || hear_of_children(target, err) ? -1 : 0;
+	return thread_ask_others(target, thread, &was, err) || hear_of_children(target, err) ? -1
+											     : 0;
 }
 
-int hear_all(struct tree *tree, struct avc_error *err)
+int freeze_hear_all(struct tree *tree, struct avc_error *err)
 {
 	int (*const step[])(struct target *, struct avc_error *) = { ask_halt, ask_end };
 	int result = 0;
@@ -305,8 +306,8 @@ static int begin(struct target *target, uint32_t slot, uint64_t takes_ns, struct
 		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
 			    "its main thread has ended");
 	target->begun = true;
-	return read_all(target, slot, err) || vet(target, thread, err) ||
-			       (target->holder && start_clone(target, err)) ||
+	return read_all(target, slot, err) || thread_vet(target, thread, err) ||
+			       (target->holder && freeze_start_clone(target, err)) ||
 			       ask_begin(target, takes_ns, err)
 		       ? -1
 		       : 0;
@@ -343,7 +344,7 @@ static uint64_t clones_time_ns(const struct tree *tree)
 	return takes_ns;
 }
 
-int begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
+int freeze_begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
 	uint64_t takes_ns = 0;
@@ -365,7 +366,7 @@ int begin_known(struct tree *tree, struct generation *generation, struct avc_err
 	return 0;
 }
 
-int begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
+int freeze_begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
 
@@ -380,14 +381,14 @@ int begin_others(struct tree *tree, struct generation *generation, struct avc_er
 	return 0;
 }
 
-void drop_clones(struct tree *tree)
+void freeze_drop_clones(struct tree *tree)
 {
 	for (uint32_t i = 0; i < tree->members; i++) {
 		struct target *target = tree->member[i];
 		struct avc_error ignored = { 0 };
 		pid_t template;
 
-		if (!target->cloning || await_clone(target, &template, &ignored))
+		if (!target->cloning || freeze_await_clone(target, &template, &ignored))
 			continue;
 		tracee_kill(template);
 		target->lost = tracee_settle(target->holder, &ignored) != 0;

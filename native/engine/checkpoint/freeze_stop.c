@@ -12,7 +12,7 @@
 #define LOOKS 64
 #define LOOK_US 100
 
-int stop_known(struct tree *tree, struct avc_error *err)
+int freeze_stop_known(struct tree *tree, struct avc_error *err)
 {
 	process_stop_begin(tree->main);
 	for (uint32_t i = 0; i < tree->members; i++)
@@ -38,7 +38,7 @@ int stop_known(struct tree *tree, struct avc_error *err)
 	return 0;
 }
 
-int stop_others(struct tree *tree, struct avc_error *err)
+int freeze_stop_others(struct tree *tree, struct avc_error *err)
 {
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */

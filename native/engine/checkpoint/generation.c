@@ -35,7 +35,7 @@ static int hear_template(struct target *target, struct thread *cloned, const str
 	cloned->creds.filters = was.filters;
 	cloned->creds.future_lock = was.future_lock;
 	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
-	return ask_others(target, cloned, &was, err);
+	return thread_ask_others(target, cloned, &was, err);
 }
 
 static int quieten(struct target *target, struct generation *generation,
@@ -107,7 +107,7 @@ static void fill_ended(struct target *target, struct generation *generation)
 		block->name[strcspn(block->name, "\n")] = 0;
 }
 
-/* Fills the slot in from what freeze() has read: one block per thread. */
+/* Fills the slot in from what freeze_tree() has read: one block per thread. */
 static int fill_slot(struct target *target, struct generation *generation,
 		     const struct branch *branch, struct avc_error *err)
 {
@@ -145,7 +145,7 @@ static int fill_slot(struct target *target, struct generation *generation,
 		/* The borrowed thread's was seen to when it was borrowed; its own
 		 * memory has been run on since. */
 		if (t.tid != target->pid)
-			rseq_fixup(mem_fd, &t);
+			thread_fix_rseq(mem_fd, &t);
 		rewind_original(&t, &t.regs);
 		arch_rewind(&t.regs);
 		*block = (struct inj_thread){
@@ -239,7 +239,7 @@ static int finish(struct target *target, struct generation *generation, struct b
 	close_fd(&statm_fd);
 	if (pages >= 0 && pages != generation->vm_pages)
 		return memory_learn(target, generation->vm_pages - pages, err);
-	if (branch && branch_learn(branch, err))
+	if (branch && process_attrs_learn(branch, err))
 		return -1;
 	return fill_slot(target, generation, branch, err);
 }
@@ -363,7 +363,7 @@ void generation_drop(struct generation *generation)
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
-		branch_forget(branch);
+		process_attrs_forget(branch);
 		if (!branch->image)
 			continue;
 		image_drop(branch->image);

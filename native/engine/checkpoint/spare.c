@@ -33,7 +33,7 @@ static bool step_aside(pid_t template, struct scheduling *was)
 
 	memset(all, 0xff, sizeof all);
 	(void)syscall(SYS_sched_setaffinity, template, sizeof all, all);
-	scheduling_read(template, was);
+	attributes_read_scheduling(template, was);
 	return (policy_of(was) == SCHED_FIFO || policy_of(was) == SCHED_RR) &&
 	       sched_setscheduler(template, SCHED_OTHER, &none) == 0;
 }

@@ -128,7 +128,8 @@ static bool has_pidfds(const struct files *files)
 void files_lift_limit(const struct files *want, pid_t pid)
 {
 	if (has_pidfds(want))
-		limit_lift(pid, RLIMIT_NOFILE, (uint64_t)want->file[want->count - 1].fd + 2);
+		process_attrs_lift_limit(pid, RLIMIT_NOFILE,
+					 (uint64_t)want->file[want->count - 1].fd + 2);
 }
 
 /* Of the main process; the others put all of theirs back (process_attrs.c). */

@@ -572,7 +572,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	 * allowed once. */
 	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
 	    limit.rlim_cur < (rlim_t)numbers.room)
-		limit_lift(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
+		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
 		 parasite_remote(parasite, call->out), 0);
 	if (flush(work, err))

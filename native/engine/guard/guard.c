@@ -23,7 +23,7 @@
 
 /* ---- telling ---------------------------------------------------------------- */
 
-struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind kind)
+struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind kind)
 {
 	return (struct avc_event){
 		.kind = kind,
@@ -36,27 +36,27 @@ struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind ki
 	};
 }
 
-void emit(struct avc_guard *guard, const struct avc_event *event)
+void guard_emit(struct avc_guard *guard, const struct avc_event *event)
 {
 	engine_emit(guard->engine, event);
 }
 
-void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
-		const struct avc_error *error)
+void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
+		      const struct avc_error *error)
 {
-	struct avc_event event = event_new(guard, kind);
+	struct avc_event event = guard_event(guard, kind);
 
 	event.ticket = ticket;
 	event.error = *error;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 }
 
-void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
+void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
 {
 	struct avc_error error = { 0 };
 
 	fail(&error, code, 0, guard->target.pid, "command", "", "%s", why);
-	emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+	guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 }
 
 /* ---- commands -------------------------------------------------------------------- */
@@ -65,11 +65,11 @@ static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
 {
 	if (!guard->count) {
 		guard->room = 0;
-		refuse(guard, ticket, AVC_EMPTY, "no generation is held");
+		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held");
 		return;
 	}
 	guard->room = guard->count - 1;
-	lose_generation(guard, dispensable(guard, false), AVC_REASON_MEMORY, ticket);
+	guard_lose_generation(guard, guard_dispensable(guard, false), AVC_REASON_MEMORY, ticket);
 }
 
 static void refill(struct avc_guard *guard)
@@ -105,18 +105,18 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	struct avc_error error = { 0 };
 
 	if (!guard->count || !guard->target.pid) {
-		refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
+		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
 		return;
 	}
 	if (init_channel_stop_asked(&guard->channel)) {
-		refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
-	    check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
-			 guard->target.pidfd, &error)) {
-		emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
+			       guard->target.pidfd, &error)) {
+		guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
 	guard->restore_asked = reason;
@@ -144,7 +144,7 @@ static void obey(struct avc_guard *guard, const struct command *command)
 {
 	switch (command->command) {
 	case AVC_COMMAND_CHECKPOINT:
-		checkpoint(guard, command->ticket);
+		guard_checkpoint(guard, command->ticket);
 		break;
 	case AVC_COMMAND_RESTORE:
 		roll_back(guard, command->ticket, AVC_REASON_COMMAND);
@@ -173,10 +173,11 @@ static void carry_out(struct avc_guard *guard)
 	eventfd_t ignored;
 
 	(void)eventfd_read(guard->wake_fd, &ignored);
-	take_config(guard);
+	guard_take_config(guard);
 	while (take_command(guard, &command)) {
 		if (!guard->attached)
-			refuse(guard, command.ticket, AVC_EMPTY, "avckpt-init has not started yet");
+			guard_refuse(guard, command.ticket, AVC_EMPTY,
+				     "avckpt-init has not started yet");
 		else
 			obey(guard, &command);
 	}
@@ -202,21 +203,21 @@ static void attach(struct avc_guard *guard)
 
 	switch (init_channel_open(&guard->channel, &error)) {
 	case 1:
-		if (find_app(guard, &error)) {
+		if (guard_find_app(guard, &error)) {
 			init_channel_close(&guard->channel);
 			break;
 		}
 		guard->attached = true;
 		guard->unprotected = false;
-		guard->next_ns = interval_end(guard);
+		guard->next_ns = guard_interval_end(guard);
 		{
-			const struct avc_event event = event_new(guard, AVC_EVENT_ATTACHED);
+			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);
 
-			emit(guard, &event);
+			guard_emit(guard, &event);
 		}
 		return;
 	case -1:
-		unprotect(guard, 0, &error);
+		guard_unprotect(guard, 0, &error);
 	}
 	guard->next_ns = now +
 			 (now - guard->started_ns < LOOK_OFTEN_NS ? LOOK_AGAIN_NS : LOOK_SELDOM_NS);
@@ -235,12 +236,12 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 	guard->fds[(*n)++] = (struct pollfd){ .fd = fd, .events = POLLIN };
 }
 
-uint32_t all_stragglers(struct avc_guard *guard)
+uint32_t guard_tend_stragglers(struct avc_guard *guard)
 {
-	uint32_t left = stragglers(&guard->target);
+	uint32_t left = threads_tend_stragglers(&guard->target);
 
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		left += stragglers(guard->tree.member[i]);
+		left += threads_tend_stragglers(guard->tree.member[i]);
 	return left;
 }
 
@@ -256,7 +257,7 @@ static bool any_lost(const struct avc_guard *guard)
 static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	const uint64_t now = now_ns();
-	const uint64_t check_ns = exec_check_due(guard);
+	const uint64_t check_ns = guard_exec_check_due(guard);
 	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
 							     : tracee_ending_due();
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
@@ -306,7 +307,7 @@ static void tell_straggling(struct avc_guard *guard)
 	guard->told_stragglers_ns = now;
 	fail(&error, AVC_DEADLINE, 0, guard->target.pid, "stop", "",
 	     "a thread that was to stop has not done so for a second");
-	emit_error(guard, AVC_EVENT_MISSED, 0, &error);
+	guard_emit_error(guard, AVC_EVENT_MISSED, 0, &error);
 }
 
 static void let_go(struct avc_guard *guard)
@@ -315,13 +316,13 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
-	drop_all(guard);
-	unhold(&guard->target);
+	guard_drop_all(guard);
+	process_unhold(&guard->target);
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		unhold(guard->tree.member[i]);
+		process_unhold(guard->tree.member[i]);
 	/* The end of this thread detaches what is left. */
 	tracee_end_now();
-	while (((guard->target.threads && all_stragglers(guard)) || tracee_reap_ending()) &&
+	while (((guard->target.threads && guard_tend_stragglers(guard)) || tracee_reap_ending()) &&
 	       now_ns() < end)
 		usleep(200);
 	tree_free(&guard->tree);
@@ -339,11 +340,11 @@ static void *guard_main(void *arg)
 
 	prctl(PR_SET_NAME, "avckpt-guard");
 	if (tracee_timer_new(&guard->timer, &error)) {
-		emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 		ended = true;
 	}
 	while (!ended && !must_stop(guard)) {
-		const uint32_t straggling = all_stragglers(guard);
+		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
@@ -352,31 +353,31 @@ static void *guard_main(void *arg)
 		if (!straggling)
 			guard->told_stragglers_ns = now_ns(); /* there are none */
 		if (any_lost(guard))
-			kill_lost(guard);
+			guard_kill_lost(guard);
 		if (dying)
-			reap_unknown(guard);
+			guard_reap_unknown(guard);
 		wait_for_news(guard, straggling || dying);
 		if (guard->attached && init_channel_report(&guard->channel, &report)) {
-			died(guard, &report);
+			guard_app_died(guard, &report);
 			continue;
 		}
-		reap_dead(guard);
-		tend_tree(guard);
+		guard_reap_dead(guard);
+		guard_tend_tree(guard);
 		if (pidfd_ended(guard->channel.init_pidfd)) {
 			ended = true;
 			break;
 		}
 		carry_out(guard);
 		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
-			work_ahead(guard);
+			guard_work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;
 		if (!guard->attached)
 			attach(guard);
-		else if (all_stragglers(guard))
+		else if (guard_tend_stragglers(guard))
 			tell_straggling(guard);
 		else
-			checkpoint(guard, 0);
+			guard_checkpoint(guard, 0);
 	}
 	let_go(guard);
 	timer_delete(guard->timer);
@@ -384,9 +385,9 @@ static void *guard_main(void *arg)
 	guard->ended = true;
 	pthread_mutex_unlock(&guard->lock);
 	if (ended) {
-		const struct avc_event event = event_new(guard, AVC_EVENT_ENDED);
+		const struct avc_event event = guard_event(guard, AVC_EVENT_ENDED);
 
-		emit(guard, &event);
+		guard_emit(guard, &event);
 	}
 	return NULL;
 }
@@ -400,7 +401,7 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	int result;
 
 	*err = (struct avc_error){ 0 };
-	if (config_check(config, err))
+	if (guard_check_config(config, err))
 		return NULL;
 	guard = calloc(1, sizeof *guard);
 	if (!guard) {
@@ -419,10 +420,10 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 		.slots = config->keep + 1,
 		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),
 		.member = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.member),
-		.is_ours = is_ours,
+		.is_ours = guard_owns,
 		.arg = guard,
 	};
-	config_set(guard, config);
+	guard_set_config(guard, config);
 	guard->channel.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 3);
 	guard->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
 	if (!target_make_room(&guard->target) || !guard->tree.kin || !guard->tree.member ||

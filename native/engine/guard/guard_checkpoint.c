@@ -20,18 +20,18 @@
 /* ---- checkpoint --------------------------------------------------------------- */
 
 /* The app as it can not be protected: says so once, and gives everything up. */
-void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
+void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
 {
-	drop_all(guard);
-	unhold(&guard->target);
+	guard_drop_all(guard);
+	process_unhold(&guard->target);
 	for (uint32_t i = 0; i < guard->tree.members; i++)
-		unhold(guard->tree.member[i]);
+		process_unhold(guard->tree.member[i]);
 	if (!guard->unprotected || ticket)
-		emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
 	guard->unprotected = true;
 }
 
-int find_app(struct avc_guard *guard, struct avc_error *err)
+int guard_find_app(struct avc_guard *guard, struct avc_error *err)
 {
 	struct proc_status init;
 	pid_t app;
@@ -55,7 +55,7 @@ static void wait_quiescent(struct avc_guard *guard, bool *found)
 	*found = false;
 	if (!guard->config.quiesce_ns)
 		return;
-	while (!(*found = quiescent(&guard->target)) && now_ns() < end)
+	while (!(*found = process_is_quiescent(&guard->target)) && now_ns() < end)
 		usleep(QUIESCE_STEP_NS / 1000);
 }
 
@@ -77,7 +77,7 @@ static void drop_images(struct avc_guard *guard, const struct target *target)
 {
 	for (uint32_t i = guard->count; i-- > 0;)
 		if (generation_branch(&guard->generations[i], target))
-			drop_generation(guard, i);
+			guard_drop_generation(guard, i);
 }
 
 static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_error *err)
@@ -85,7 +85,8 @@ static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_err
 	struct target *target = guard->tree.kin[kin].target;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
+	if (target_follow(target, err) || support_check(target, err) ||
+	    process_take_stock(target, err))
 		return -1;
 	if (target->infected && (target->thread_count > target->parasite.threads_max ||
 				 guard->config.keep >= target->parasite.slots))
@@ -94,18 +95,18 @@ static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_err
 		if (target->descendant)
 			drop_images(guard, target);
 		else
-			drop_all(guard);
-		unhold(target);
+			guard_drop_all(guard);
+		process_unhold(target);
 		for (uint32_t i = 0; i < target->thread_count; i++)
 			target->threads[i].known = false;
-		if (infect(target, guard->config.keep + 1, guard->timer, deadline, err))
+		if (process_infect(target, guard->config.keep + 1, guard->timer, deadline, err))
 			return -1;
 	}
-	if (acquaint(target, guard->timer, deadline, err))
+	if (process_acquaint(target, guard->timer, deadline, err))
 		return -1;
 	target->adopts = target->descendant && tree_has_reaper(&guard->tree, kin);
 	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
-	if (!target->holder && !target->adopts && hold(target, guard->timer, deadline, err))
+	if (!target->holder && !target->adopts && process_hold(target, guard->timer, deadline, err))
 		return -1;
 	return 0;
 }
@@ -120,7 +121,7 @@ static int renew_holders(struct avc_guard *guard, struct avc_error *err)
 		if (proc_is_exiting(guard->target.pid))
 			return fail(err, AVC_GONE, 0, guard->target.pid, "attach", "",
 				    "it has ended");
-		unhold(target);
+		process_unhold(target);
 	}
 	return 0;
 }
@@ -129,11 +130,11 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
 
-	if (find_app(guard, err) || renew_holders(guard, err))
+	if (guard_find_app(guard, err) || renew_holders(guard, err))
 		return -1;
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
-	let_executed_go(guard, true);
+	guard_let_executed_go(guard, true);
 	if (tree_look(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
@@ -182,8 +183,8 @@ static void abandon(struct avc_guard *guard, struct generation *fresh)
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		guard->tree.member[i]->doubtful |= guard->tree.member[i]->lost;
 	if (guard->tree.members)
-		kill_lost(guard);
-	let_ended_go(guard);
+		guard_kill_lost(guard);
+	guard_let_ended_go(guard);
 }
 
 static int files_errors(const struct generation *generation, struct avc_error *err)
@@ -249,14 +250,14 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	struct avc_error error = { 0 };
 
 	tracee_deadline_set(guard->timer, SPARE_NS);
-	/* A template that was killed is seen to by reap_dead(), as soon as that can be seen. */
+	/* A template that was killed is seen to by guard_reap_dead(), as soon as that can be seen. */
 	if (spare_make(&guard->target, newest, &error) && error.code != AVC_GONE &&
 	    !pidfd_ended(newest->pidfd))
-		lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
+		guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
 	tracee_deadline_clear(guard->timer);
 }
 
-void work_ahead(struct avc_guard *guard)
+void guard_work_ahead(struct avc_guard *guard)
 {
 	struct generation *newest;
 	bool more = true;
@@ -279,7 +280,7 @@ void work_ahead(struct avc_guard *guard)
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	struct target *target = &guard->target;
-	struct generation fresh = { .pidfd = -1, .slot = free_slot(guard) };
+	struct generation fresh = { .pidfd = -1, .slot = guard_free_slot(guard) };
 	struct mem_seen seen = { 0 };
 	struct freeze_times times;
 	int result;
@@ -297,9 +298,9 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 				   guard->tree.kin[i].target->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
 	/* What is written between here and the freeze counts as written after it. */
-	note_written(guard);
-	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh, &seen,
-			&times, err);
+	guard_note_written(guard);
+	result = freeze_tree(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
+			     &seen, &times, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
@@ -326,12 +327,12 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	fresh.number = ++guard->number;
 	fresh.clone_ns = times.clone_ns;
 	begin_ahead(guard, &fresh);
-	keep_generation(guard, &fresh);
+	guard_keep_generation(guard, &fresh);
 	init_channel_arm(&guard->channel, true);
 	event->generation = fresh.number;
 	event->generations = guard->count;
 	event->quiescent = fresh.quiescent;
-	tend_tree(guard);
+	guard_tend_tree(guard);
 	return 0;
 }
 
@@ -341,14 +342,14 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
 	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
 		return false;
-	await_spares(guard);
+	guard_await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
 		guard->cramped |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);
 	}
 	if (tracee_ending_pidfd(0) < 0)
 		return false;
-	wait_ended();
+	guard_wait_ended();
 	usleep(INIT_REAPS_US);
 	return true;
 }
@@ -367,22 +368,23 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
-void checkpoint(struct avc_guard *guard, uint64_t ticket)
+void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_CHECKPOINT);
+	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
 	bool hopeless;
 
-	guard->next_ns = interval_end(guard);
+	guard->next_ns = guard_interval_end(guard);
 	if (init_channel_stop_asked(&guard->channel)) {
 		if (ticket)
-			refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+			guard_refuse(guard, ticket, AVC_GONE,
+				     "the application has been asked to stop");
 		return;
 	}
 	if (!guard->room) {
 		if (ticket)
-			refuse(guard, ticket, AVC_BUSY,
-			       "memory is short, so no generation is held");
+			guard_refuse(guard, ticket, AVC_BUSY,
+				     "memory is short, so no generation is held");
 		return;
 	}
 	if (take(guard, &event, &error) == 0) {
@@ -391,7 +393,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 		event.ticket = ticket;
 		event.app_pid = guard->target.leader;
 		event.app_pid_inside = guard->target.inside;
-		emit(guard, &event);
+		guard_emit(guard, &event);
 		return;
 	}
 	if (error.code == AVC_GONE)
@@ -399,7 +401,7 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 	/* Of a dying app init's report tells; this is for one that is only away. */
 	if (error.code == AVC_GONE && guard->target.pid && pidfd_ended(guard->target.pidfd)) {
 		if (ticket)
-			emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
 	/* A child process may be gone at the next look: the generations there are
@@ -408,16 +410,16 @@ void checkpoint(struct avc_guard *guard, uint64_t ticket)
 		   error.code == AVC_BUSY;
 	if (hopeless && error.pid != guard->target.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
-		emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
 	if (hopeless) {
-		unprotect(guard, ticket, &error);
+		guard_unprotect(guard, ticket, &error);
 		return;
 	}
 	event.kind = AVC_EVENT_MISSED;
 	event.generations = guard->count; /* another parasite may have cost them all */
 	event.ticket = ticket;
 	event.error = error;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 }

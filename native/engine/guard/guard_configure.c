@@ -9,7 +9,7 @@
 
 #define FREEZE_DEADLINE_NS (50 * NS_PER_MS)
 
-int config_check(const struct avc_config *config, struct avc_error *err)
+int guard_check_config(const struct avc_config *config, struct avc_error *err)
 {
 	if (config->keep < 1 || config->keep > AVC_KEEP_MAX)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
@@ -20,14 +20,14 @@ int config_check(const struct avc_config *config, struct avc_error *err)
 	return 0;
 }
 
-uint64_t interval_end(const struct avc_guard *guard)
+uint64_t guard_interval_end(const struct avc_guard *guard)
 {
 	const uint64_t interval_ns = guard->config.interval_ns;
 
 	return interval_ns ? now_ns() + interval_ns : UINT64_MAX;
 }
 
-void config_set(struct avc_guard *guard, const struct avc_config *config)
+void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	guard->config = *config;
 	if (!guard->config.freeze_deadline_ns)
@@ -41,7 +41,7 @@ void config_set(struct avc_guard *guard, const struct avc_config *config)
 
 /* What is held stays, unless there are more than are wanted now.  A death that comes
  * next is judged by the new settings. */
-void take_config(struct avc_guard *guard)
+void guard_take_config(struct avc_guard *guard)
 {
 	const uint32_t keep = guard->config.keep;
 	struct avc_config config;
@@ -55,15 +55,15 @@ void take_config(struct avc_guard *guard)
 	pthread_mutex_unlock(&guard->lock);
 	if (!waiting)
 		return;
-	config_set(guard, &config);
+	guard_set_config(guard, &config);
 	/* Who gave generations up because memory is short goes on without them. */
 	if (guard->room == keep || guard->room > config.keep)
 		guard->room = config.keep;
 	while (guard->count > guard->room)
-		drop_generation(guard, dispensable(guard, false));
+		guard_drop_generation(guard, guard_dispensable(guard, false));
 	if (!guard->attached)
 		return;
-	next = interval_end(guard);
+	next = guard_interval_end(guard);
 	if (next < guard->next_ns || !config.interval_ns)
 		guard->next_ns = next;
 }
@@ -74,7 +74,7 @@ int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config
 	int result = 0;
 
 	*err = (struct avc_error){ 0 };
-	if (config_check(config, err))
+	if (guard_check_config(config, err))
 		return -1;
 	pthread_mutex_lock(&guard->lock);
 	if (guard->ended) {

@@ -63,7 +63,7 @@ static bool is_abnormal(const struct avc_guard *guard, const struct avc_report *
 static void give_up(struct avc_guard *guard, const struct avc_report *report,
 		    enum avc_reason reason, const struct avc_error *error)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_GAVE_UP);
+	struct avc_event event = guard_event(guard, AVC_EVENT_GAVE_UP);
 	struct avc_error ignored = { 0 };
 
 	(void)init_channel_verdict(&guard->channel, AVC_VERDICT_GIVE_UP, &ignored);
@@ -72,9 +72,9 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	event.died_ns = report->reaped_ns;
 	event.error = *error;
 	event.ticket = guard->restore_ticket;
-	emit(guard, &event);
-	drop_all(guard);
-	unhold(&guard->target);
+	guard_emit(guard, &event);
+	guard_drop_all(guard);
+	process_unhold(&guard->target);
 	target_close(&guard->target);
 	/* Init ends now, and why is what was told last. */
 	guard->next_ns = UINT64_MAX;
@@ -86,7 +86,7 @@ static void release_new(struct avc_guard *guard, const struct generation *genera
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		if (guard->tree.member[i]->holder &&
 		    !generation_branch(generation, guard->tree.member[i]))
-			release(guard, guard->tree.member[i]);
+			guard_release(guard, guard->tree.member[i]);
 }
 
 /* The other processes are those of the generation now; of what they had before they died
@@ -120,7 +120,7 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		       enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_RESTORED);
+	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
 	struct target *target = &guard->target;
 	const struct avc_config *config = &guard->config;
 	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
@@ -136,20 +136,20 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 
 		/* What was written since the newest was written since all others, also
 		 * where that can not be seen any more. */
-		if (check_strict(guard, generation, generation->template, generation->pidfd,
-				 &failed)) {
+		if (guard_check_strict(guard, generation, generation->template, generation->pidfd,
+				       &failed)) {
 			*error = failed;
-			drop_all(guard);
+			guard_drop_all(guard);
 			break;
 		}
 		release_new(guard, generation);
 		/* Nor do templates of one that was lost by this death: theirs are the same
 		 * tables.  And they count where processes are limited, as a spare does. */
 		if (ending)
-			wait_ended();
-		if (restore(target, generation, &guard->channel, config, guard->timer,
-			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
-			    &failed)) {
+			guard_wait_ended();
+		if (restore_app(target, generation, &guard->channel, config, guard->timer,
+				report->reaped_ns, say_restored, guard, &pid, &times, &notes,
+				&failed)) {
 			/* Perhaps because the spare was killed when it was needed, or was one
 			 * process too many.  The template is as good as before. */
 			if (generation->spare.pid && !again) {
@@ -159,11 +159,11 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			} else {
 				if (!error->code)
 					*error = failed;
-				drop_generation(guard, guard->count - 1);
+				guard_drop_generation(guard, guard->count - 1);
 				again = false;
 			}
 			ending = true;
-			kill_lost(guard);
+			guard_kill_lost(guard);
 			continue;
 		}
 		/* If this fails it has died already: the next report tells. */
@@ -200,11 +200,11 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		event.error = error->code ? *error : notes;
 		event.age_ns = report->reaped_ns - generation->taken_ns;
 		event.at_ns = now_ns();
-		emit(guard, &event);
+		guard_emit(guard, &event);
 		break;
 	}
 	/* It has the dead app's memory, and what was open is the restored one's. */
-	unhold_soon(target);
+	process_unhold_soon(target);
 	return guard->count > 0;
 }
 
@@ -215,14 +215,14 @@ static void hold_all(struct avc_guard *guard)
 	struct avc_error ignored = { 0 };
 
 	/* The next checkpoint tries again, and tells. */
-	if (hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+	if (process_hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 		guard->dying_until_ns = now_ns() + DYING_NS;
 	for (uint32_t i = 0; i < guard->tree.members; i++) {
 		struct target *target = guard->tree.member[i];
 
 		ignored = (struct avc_error){ 0 };
 		if (target->pid && !target->adopts &&
-		    hold(target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+		    process_hold(target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;
 	}
 }
@@ -233,13 +233,13 @@ static void reap_tracees(void *arg)
 {
 	struct avc_guard *guard = arg;
 
-	(void)all_stragglers(guard);
-	reap_unknown(guard);
+	(void)guard_tend_stragglers(guard);
+	guard_reap_unknown(guard);
 }
 
-void died(struct avc_guard *guard, const struct avc_report *report)
+void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
+	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
 	const uint32_t had = guard->count;
 	struct avc_error error = { 0 };
 	enum avc_reason reason;
@@ -249,9 +249,9 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	guard->channel.working_ns = now_ns();
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 	target_close(&guard->target);
-	kill_lost(guard);
+	guard_kill_lost(guard);
 	if (!is_abnormal(guard, report, &reason)) {
 		give_up(guard, report, reason, &error);
 		goto out;
@@ -259,10 +259,10 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	if (reason != AVC_REASON_COMMAND && guard->count) {
 		const uint32_t restores = restores_within(guard, now_ns());
 
-		count_crash(guard, reason == AVC_REASON_UNHEALTHY);
+		guard_count_crash(guard, reason == AVC_REASON_UNHEALTHY);
 		if (reason == AVC_REASON_UNHEALTHY)
-			drop_unhealthy(guard);
-		choose(guard, restores >= guard->config.restore_max);
+			guard_drop_unhealthy(guard);
+		guard_choose_generation(guard, restores >= guard->config.restore_max);
 		if (!guard->count) {
 			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
 			     "it was restored %u time(s) already", guard->restores);
@@ -273,7 +273,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	for (uint32_t i = 0; i < guard->tree.members; i++)
 		if (guard->tree.member[i]->pid)
 			target_kill(guard->tree.member[i]);
-	if (init_channel_kill_leftovers(&guard->channel, is_ours, reap_tracees, guard, &error)) {
+	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
@@ -283,7 +283,7 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	} else {
 		if (guard->target.pid)
 			hold_all(guard);
-		guard->next_ns = interval_end(guard);
+		guard->next_ns = guard_interval_end(guard);
 	}
 out:
 	rt_priority_end();

@@ -119,7 +119,7 @@ static int survey(struct target *target, avc_remote pc, avc_remote *cave, struct
 			*cave = end - CAVE_BYTES;
 	}
 	fclose(maps);
-	if (in_stub || in_old_parasite(target, pc))
+	if (in_stub || parasite_is_old(target, pc))
 		return fail(err, AVC_DEADLINE, 0, target->pid, "infect", "",
 			    "still on its way home from a guard that died");
 	if (!*cave)
@@ -138,7 +138,7 @@ static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const u
 	struct arch_regs regs;
 
 	arch_stub_call(&regs, &thread->regs, cave, nr, arg);
-	if (suspend_seccomp(thread, err))
+	if (thread_suspend_seccomp(thread, err))
 		return -1;
 	if (arch_regs_set(tid, &regs) || ptrace(PTRACE_SETSIGMASK, tid, sizeof all, &all))
 		return fail_errno(err, tid, "infect", "ptrace(SETREGS)", "it has gone");
@@ -281,7 +281,7 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 	if (thread_check_dispatch(thread->tid, err) || check_task(target, thread, err) ||
 	    survey(target, arch_pc(&thread->regs), &cave, err))
 		return -1;
-	rseq_fixup(target->mem_fd, thread);
+	thread_fix_rseq(target->mem_fd, thread);
 	home = thread->regs;
 	arch_resume(&home);
 	bytes = arch_stub_build(stub, &home, thread->sigmask);
@@ -290,7 +290,7 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 				  "its code can not be written");
 	result = make_pad(target, thread, cave, slots, threads_max, err);
 	/* Nobody is in the stub any more: leave no trace. */
-	if (thread->stopped && (!thread->borrowed || give_back(thread, err) == 0)) {
+	if (thread->stopped && (!thread->borrowed || thread_give_back(thread, err) == 0)) {
 		if (pwrite(target->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
 			err->undo_failures++;
 	}
@@ -301,8 +301,8 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 	return result;
 }
 
-int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
-	   struct avc_error *err)
+int process_infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+		   struct avc_error *err)
 {
 	struct thread *thread;
 	int result;
@@ -319,7 +319,7 @@ int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadli
 	return result;
 }
 
-int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err)
+int process_infect_stopped(struct target *target, uint32_t slots, struct avc_error *err)
 {
 	struct thread *thread = thread_find(target, target->pid);
 
@@ -332,7 +332,7 @@ int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err)
 }
 
 /* ESRCH is of one that is ending: exec(2) has memory, but not this. */
-bool has_executed(const struct target *target)
+bool process_has_executed(const struct target *target)
 {
 	uint64_t nonce = 0;
 	struct iovec here = { &nonce, sizeof nonce };
@@ -368,7 +368,7 @@ static int make_holder(struct target *target, pid_t holder, const struct arch_re
 		       : 0;
 }
 
-int adopt_no_more(struct target *target, struct avc_error *err)
+int process_adopt_no_more(struct target *target, struct avc_error *err)
 {
 	struct inj_call *call = &target->parasite.control->runner;
 	struct thread *thread = thread_find(target, target->pid);
@@ -379,7 +379,7 @@ int adopt_no_more(struct target *target, struct avc_error *err)
 	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0);
 	call_add(call, INJ_PAUSE, 0, 0, 0, 0, 0);
 	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
-	if (borrow(target, thread, err))
+	if (thread_borrow(target, thread, err))
 		return -1;
 	target->paused = true;
 	if (parasite_run_to_pause(thread->tid, call, err)) {
@@ -390,7 +390,7 @@ int adopt_no_more(struct target *target, struct avc_error *err)
 	return 0;
 }
 
-int adopt_again(struct target *target, struct avc_error *err)
+int process_adopt_again(struct target *target, struct avc_error *err)
 {
 	struct thread *thread = thread_find(target, target->pid);
 
@@ -401,7 +401,7 @@ int adopt_again(struct target *target, struct avc_error *err)
 		thread->stopped = false;
 		return -1;
 	}
-	return give_back(thread, err);
+	return thread_give_back(thread, err);
 }
 
 static int keep_holder(struct target *target, pid_t holder, int result, struct avc_error *err)
@@ -414,7 +414,7 @@ static int keep_holder(struct target *target, pid_t holder, int result, struct a
 		return 0;
 	if (!err->code)
 		fail_errno(err, holder, "make holder", "pidfd_open", "it was killed");
-	unhold(target);
+	process_unhold(target);
 	return -1;
 }
 
@@ -432,14 +432,15 @@ static int hold_descendant(struct target *target, timer_t timer, uint64_t deadli
 	if (!result && (!thread || !thread->stopped))
 		result = fail(err, AVC_GONE, 0, target->pid, "make holder", "", "it has ended");
 	if (!result)
-		result = thread_read(thread, err) || hold_stopped(target, target->init, err);
+		result = thread_read(thread, err) ||
+			 process_hold_stopped(target, target->init, err);
 	process_let_go(target);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	return result;
 }
 
-int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
+int process_hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
 {
 	struct inj_call *call = &target->parasite.control->runner;
 	struct thread *thread;
@@ -459,7 +460,7 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	}
 	call_begin(call, INJ_AFTER_HOME);
 	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	result = borrow(target, thread, err);
+	result = thread_borrow(target, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
 		target->lost = target->lost || (result && err->code != AVC_KERNEL);
@@ -469,7 +470,7 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	else if (err->code == AVC_DEADLINE && thread->borrowed)
 		thread->stopped = false; /* on its way through the parasite, and home */
 	if (!result)
-		result = give_back(thread, err);
+		result = thread_give_back(thread, err);
 	thread_release(thread);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
@@ -513,7 +514,7 @@ static int clone_by(struct target *target, pid_t tid, const struct arch_regs *ba
  *
  * This holder also makes the templates.  They have its signal handlers and working
  * directory, which are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
-int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
+int process_hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 {
 	struct inj_call *call = &target->parasite.control->runner;
 	struct thread *thread = thread_find(target, target->pid);
@@ -531,7 +532,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	call_add(call, INJ_WAIT, 0, 0, 0, 0, 0);
 	if (thread->creds.subreaper)
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
-	if (borrow(target, thread, err))
+	if (thread_borrow(target, thread, err))
 		return -1;
 	target->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
@@ -565,7 +566,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 		return -1;
 	}
 	target->waiting = false;
-	return give_back(thread, err) || result ? -1 : 0;
+	return thread_give_back(thread, err) || result ? -1 : 0;
 }
 
 static void forget_holder(struct target *target)
@@ -575,7 +576,7 @@ static void forget_holder(struct target *target)
 	target->holder_pidfd = -1;
 }
 
-void unhold(struct target *target)
+void process_unhold(struct target *target)
 {
 	if (target->holder)
 		tracee_kill(target->holder);
@@ -583,7 +584,7 @@ void unhold(struct target *target)
 	forget_holder(target);
 }
 
-void unhold_soon(struct target *target)
+void process_unhold_soon(struct target *target)
 {
 	if (target->holder)
 		tracee_end(target->holder, target->holder_pidfd);

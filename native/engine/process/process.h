@@ -59,21 +59,21 @@ int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
 /* What only a thread itself can tell (clear_child_tid, sigaltstack, credentials): added to
  * calls that it makes anyway, and what came of it.  `with_locks`: of its process, what is to
  * be locked in memory; there is a mapping more while that is found out. */
-void ask_add(const struct target *target, bool with_locks, struct inj_call *call,
-	     struct questions *questions);
-int ask_answer(struct thread *thread, const struct inj_call *call,
-	       const struct questions *questions, struct avc_error *err) warn_unused;
-/* Asks a stopped thread just that; if it is the main thread, ask_others(). */
-int ask(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+void thread_ask_add(const struct target *target, bool with_locks, struct inj_call *call,
+		    struct questions *questions);
+int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+		      const struct questions *questions, struct avc_error *err) warn_unused;
+/* Asks a stopped thread just that; if it is the main thread, thread_ask_others(). */
+int thread_ask(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 /* The main thread was asked, and had other credentials before: a change may be one of all
  * threads (nptl(7), setuid(3)), so these are to be asked again, too (EAGAIN). */
-int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
-	       struct avc_error *err) warn_unused;
+int thread_ask_others(struct target *target, const struct thread *thread, const struct creds *was,
+		      struct avc_error *err) warn_unused;
 /* The threads there are now; those that ended are forgotten. */
-int take_stock(struct target *target, struct avc_error *err) warn_unused;
+int process_take_stock(struct target *target, struct avc_error *err) warn_unused;
 /* Gets known every thread that is not yet, one at a time, before a freeze. */
-int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns,
-	     struct avc_error *err) warn_unused;
+int process_acquaint(struct target *target, timer_t timer, uint64_t deadline_ns,
+		     struct avc_error *err) warn_unused;
 
 /* ---- stop.c --------------------------------------------------------------------- */
 
@@ -89,22 +89,23 @@ void process_let_go(struct target *target);
 /* ---- infect.c ----------------------------------------------------------------- */
 
 /* Brings the parasite into the app, through its main thread.  The other threads run. */
-int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
-	   struct avc_error *err) warn_unused;
+int process_infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+		   struct avc_error *err) warn_unused;
 /* The same while everything is stopped. */
-int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err) warn_unused;
+int process_infect_stopped(struct target *target, uint32_t slots,
+			   struct avc_error *err) warn_unused;
 /* The holder of one that is not the main process, by its stopped main thread. */
-int hold_stopped(struct target *target, pid_t init, struct avc_error *err) warn_unused;
+int process_hold_stopped(struct target *target, pid_t init, struct avc_error *err) warn_unused;
 /* A stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) does not for a while: they
  * are init's.  If we die meanwhile it does again all by itself. */
-int adopt_no_more(struct target *target, struct avc_error *err) warn_unused;
-int adopt_again(struct target *target, struct avc_error *err) warn_unused;
-/* Makes the holder; unhold() drops it.  unhold_soon() does not wait until what it has open is
+int process_adopt_no_more(struct target *target, struct avc_error *err) warn_unused;
+int process_adopt_again(struct target *target, struct avc_error *err) warn_unused;
+/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until what it has open is
  * closed and its memory gone. */
-int hold(struct target *target, timer_t timer, uint64_t deadline_ns,
-	 struct avc_error *err) warn_unused;
-void unhold(struct target *target);
-void unhold_soon(struct target *target);
+int process_hold(struct target *target, timer_t timer, uint64_t deadline_ns,
+		 struct avc_error *err) warn_unused;
+void process_unhold(struct target *target);
+void process_unhold_soon(struct target *target);
 
 /* ---- support.c --------------------------------------------------------------------- */
 
@@ -113,9 +114,9 @@ void unhold_soon(struct target *target);
 int support_check(struct target *target, struct avc_error *err) warn_unused;
 /* Whether the (running, infected) process has another program: what was brought into it
  * is gone. */
-bool has_executed(const struct target *target);
+bool process_has_executed(const struct target *target);
 /* True if this looks like a moment at which nobody is in the middle of anything. */
-bool quiescent(const struct target *target);
+bool process_is_quiescent(const struct target *target);
 
 /* ---- tree.c --------------------------------------------------------------------- */
 

@@ -80,7 +80,7 @@ static int check_mappings(struct target *target, struct avc_error *err)
 		/* Those of files are found in the first clone. */
 		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
 			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
-				      private_huge_pages);
+				      memory_private_huge_pages);
 	}
 	fclose(maps);
 	target->surveyed_pages = result ? -1 : pages;
@@ -193,7 +193,7 @@ int support_check(struct target *target, struct avc_error *err)
 }
 
 /* By way of the process: a second entry for each thread in the kernel's memory of
- * /proc would make its end longer (see ask()). */
+ * /proc would make its end longer (see thread_ask()). */
 static int is_awake(pid_t tid, void *arg)
 {
 	const pid_t pid = *(const pid_t *)arg;
@@ -225,7 +225,7 @@ static bool unread_bytes(const struct target *target)
 	return false;
 }
 
-bool quiescent(const struct target *target)
+bool process_is_quiescent(const struct target *target)
 {
 	pid_t pid = target->pid;
 

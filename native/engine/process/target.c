@@ -166,7 +166,7 @@ int thread_read(struct thread *thread, struct avc_error *err)
 		return fail_errno(err, thread->tid, "read state", "get_robust_list",
 				  "it has ended");
 	/* As the kernel has it: bytes that were written, 0 on failure. */
-	scheduling_read(thread->tid, &thread->scheduling);
+	attributes_read_scheduling(thread->tid, &thread->scheduling);
 	thread->affinity_bytes = 0;
 	affinity = syscall(SYS_sched_getaffinity, thread->tid, sizeof thread->affinity,
 			   thread->affinity);
@@ -175,8 +175,8 @@ int thread_read(struct thread *thread, struct avc_error *err)
 	return 0;
 }
 
-void ask_add(const struct target *target, bool with_locks, struct inj_call *call,
-	     struct questions *questions)
+void thread_ask_add(const struct target *target, bool with_locks, struct inj_call *call,
+		    struct questions *questions)
 {
 	const avc_remote out = parasite_remote(&target->parasite, call->out);
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
@@ -194,7 +194,7 @@ void ask_add(const struct target *target, bool with_locks, struct inj_call *call
 	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
 }
 
-int ask(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_ask(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	struct inj_call *call = &target->parasite.control->runner;
 	const bool is_main = thread->tid == target->pid, asked_before = thread->inside != 0;
@@ -202,17 +202,17 @@ int ask(struct target *target, struct thread *thread, struct avc_error *err)
 	struct questions questions;
 
 	call_begin(call, INJ_AFTER_HOME);
-	ask_add(target, is_main, call, &questions);
-	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
+	thread_ask_add(target, is_main, call, &questions);
+	if (read_signal_state(thread, err) || thread_borrow(target, thread, err) ||
 	    parasite_run(thread->tid, call, err))
 		return -1;
-	if (give_back(thread, err) || ask_answer(thread, call, &questions, err))
+	if (thread_give_back(thread, err) || thread_ask_answer(thread, call, &questions, err))
 		return -1;
-	return is_main && asked_before ? ask_others(target, thread, &was, err) : 0;
+	return is_main && asked_before ? thread_ask_others(target, thread, &was, err) : 0;
 }
 
-int ask_answer(struct thread *thread, const struct inj_call *call,
-	       const struct questions *questions, struct avc_error *err)
+int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+		      const struct questions *questions, struct avc_error *err)
 {
 	const struct inj_syscall *altstack = questions->altstack, *inside = questions->inside,
 				 *name = questions->name, *locks = questions->locks;
@@ -238,7 +238,7 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
-	thread->creds.filters = filters_read(thread->tid);
+	thread->creds.filters = attributes_read_filters(thread->tid);
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->young = !thread->known;
 	thread->known = true;
@@ -246,8 +246,8 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 	return 0;
 }
 
-int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
-	       struct avc_error *err)
+int thread_ask_others(struct target *target, const struct thread *thread, const struct creds *was,
+		      struct avc_error *err)
 {
 	struct creds is = thread->creds;
 
@@ -282,7 +282,7 @@ static int count_task(pid_t tid, void *arg)
 	return 0;
 }
 
-int take_stock(struct target *target, struct avc_error *err)
+int process_take_stock(struct target *target, struct avc_error *err)
 {
 	struct walk walk = { .target = target, .err = err };
 
@@ -348,7 +348,7 @@ static uint64_t space_of(int pidfd, unsigned int kind)
 }
 
 /* Those that it can have without a working directory of its own.  Not from /proc: see
- * ask_add(). */
+ * thread_ask_add(). */
 static int check_spaces(const struct target *target, const struct thread *t, struct avc_error *err)
 {
 	static const struct {
@@ -373,7 +373,8 @@ static int check_spaces(const struct target *target, const struct thread *t, str
 	return result;
 }
 
-int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
+int process_acquaint(struct target *target, timer_t timer, uint64_t deadline_ns,
+		     struct avc_error *err)
 {
 	uint32_t again = 0;
 
@@ -394,7 +395,7 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 		}
 		tracee_deadline_set(timer, deadline_ns);
 		if (thread_stop(target, t, &gone) || thread_await(target, t, &gone) ||
-		    check_unshared(target, t, &gone) || ask(target, t, &gone))
+		    check_unshared(target, t, &gone) || thread_ask(target, t, &gone))
 			t->known = false;
 		thread_release(t);
 		tracee_deadline_clear(timer);

@@ -129,7 +129,7 @@ static struct target *target_new(const struct tree *tree)
 
 static void target_free(struct target *target)
 {
-	unhold(target);
+	process_unhold(target);
 	target_close(target);
 	parasite_close(&target->parasite);
 	target_free_room(target);
@@ -289,7 +289,7 @@ bool tree_shares_memory(const struct tree *tree, uint32_t i)
 
 void tree_let_go(struct target *target)
 {
-	unhold(target);
+	process_unhold(target);
 	target_close(target);
 }
 

@@ -268,8 +268,8 @@ static int fill(const struct remap *r, struct syscall_batch *batch, struct copie
 	return 0;
 }
 
-int remap(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
-	  struct avc_error *err)
+int remap_apply(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
+		struct avc_error *err)
 {
 	return unmap(r, batch, err) || move_special(r, batch, err) || map_new(r, batch, err) ||
 			       fill(r, batch, copier, err)

@@ -270,10 +270,10 @@ void restore_note(struct target *target, struct generation *image, pid_t pid,
 	attributes_put_back(image->attributes, pid, notes);
 }
 
-int restore(struct target *target, struct generation *generation, struct init_channel *channel,
-	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
-	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
-	    struct restore_times *times, struct avc_error *notes, struct avc_error *err)
+int restore_app(struct target *target, struct generation *generation, struct init_channel *channel,
+		const struct avc_config *config, timer_t timer, uint64_t died_ns,
+		int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
+		struct restore_times *times, struct avc_error *notes, struct avc_error *err)
 {
 	struct inj_slot *slot = parasite_slot(&target->parasite, generation->slot);
 	struct last_pid *helper = last_pid_start(channel->pidns_fd, slot, err);

@@ -26,11 +26,11 @@ struct restore_times {
 /* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
  * there, before anything runs: it sends the verdict.  On success *pid is the new
  * main process. */
-int restore(struct target *target, struct generation *generation, struct init_channel *channel,
-	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
-	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
-	    struct restore_times *times, struct avc_error *notes,
-	    struct avc_error *err) warn_unused;
+int restore_app(struct target *target, struct generation *generation, struct init_channel *channel,
+		const struct avc_config *config, timer_t timer, uint64_t died_ns,
+		int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
+		struct restore_times *times, struct avc_error *notes,
+		struct avc_error *err) warn_unused;
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 
@@ -71,8 +71,8 @@ struct copier;
 
 /* Does it, with a batch that is in the parasite of the plan's target already; but the copier
  * may not have finished. */
-int remap(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
-	  struct avc_error *err) warn_unused;
+int remap_apply(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
+		struct avc_error *err) warn_unused;
 
 /* ---- copier.c ----------------------------------------------------------------------- */
 

@@ -355,7 +355,8 @@ static int become(struct restore_tree *restored, uint32_t index, struct avc_erro
 	    syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL, err))
 		return -1;
 	if (syscall_batch_change_parasite(batch, branch->target, branch->image->slot, err) ||
-	    process_attrs_take_keys(batch, err) || remap(plan, batch, restored->copier, err) ||
+	    process_attrs_take_keys(batch, err) ||
+	    remap_apply(plan, batch, restored->copier, err) ||
 	    process_attrs_put(batch, branch, err) || place(member, branch, err) ||
 	    syscall_batch_put_files(batch, &restored->table[index], err))
 		return -1;

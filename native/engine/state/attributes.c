@@ -67,7 +67,7 @@ enum {
 	AMBIENT
 };
 
-void scheduling_read(pid_t tid, struct scheduling *s)
+void attributes_read_scheduling(pid_t tid, struct scheduling *s)
 {
 	memset(s, 0, sizeof *s);
 	if (syscall(SYS_sched_getattr, tid, s->attr, sizeof s->attr, 0))
@@ -135,7 +135,7 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	c->subreaper = a->subreaper;
 }
 
-uint64_t filters_read(pid_t tid)
+uint64_t attributes_read_filters(pid_t tid)
 {
 	uint64_t program[FILTER_MAX], sum = 0; /* of struct sock_filter */
 
@@ -369,7 +369,7 @@ int attributes_keep(const struct target *target, struct generation *generation,
 		      sizeof kept->oom_score_adj) <= 0 &&
 	    !target->descendant) /* else it has its parent's */
 		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
-	scheduling_read(generation->template, &inherited);
+	attributes_read_scheduling(generation->template, &inherited);
 	for (uint32_t i = 0; i < target->thread_count; i++) {
 		const struct thread *t = &target->threads[i];
 
@@ -416,7 +416,7 @@ static bool has_all(const struct attributes *attributes, pid_t pid)
 {
 	struct scheduling is;
 
-	scheduling_read(pid, &is);
+	attributes_read_scheduling(pid, &is);
 	for (uint32_t i = 0; i < attributes->count; i++)
 		if (!same_scheduling(&attributes->thread[i].scheduling, &is))
 			return false;

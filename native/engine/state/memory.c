@@ -42,7 +42,7 @@
 #define OTHERS_NS (10 * NS_PER_S)
 #define SMAPS_SHARE 50 /* the long file is read in at most 1/50 of the time */
 
-const char private_huge_pages[] =
+const char memory_private_huge_pages[] =
 	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
 	"killed for want of another when it writes to one";
 
@@ -676,7 +676,7 @@ static int check_areas(struct target *target, const struct generation *generatio
 	memory->others_bytes = survey.others_bytes;
 	if (!result && survey.private_huge)
 		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "", "%s",
-			      private_huge_pages);
+			      memory_private_huge_pages);
 	if (!result && !same_areas(found, copied)) {
 		result = remember(target, generation->template, found, err);
 		if (!result)

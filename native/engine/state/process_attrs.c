@@ -156,7 +156,7 @@ static int64_t barriers_of(const struct inj_syscall *told, const struct inj_sysc
 	return registered;
 }
 
-int branch_learn(struct branch *branch, struct avc_error *err)
+int process_attrs_learn(struct branch *branch, struct avc_error *err)
 {
 	const struct parasite *parasite = &branch->target->parasite;
 	struct generation *image = branch->image;
@@ -210,7 +210,7 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	return 0;
 }
 
-void branch_forget(struct branch *branch)
+void process_attrs_forget(struct branch *branch)
 {
 	free(branch->attrs);
 	branch->attrs = NULL;
@@ -254,7 +254,7 @@ static void put_mm(struct syscall_batch *batch, const struct process_attrs *attr
 			     "what it knows of its heap and arguments could not be put back");
 }
 
-void limit_lift(pid_t pid, int which, uint64_t least)
+void process_attrs_lift_limit(pid_t pid, int which, uint64_t least)
 {
 	struct rlimit now, lifted;
 
@@ -274,8 +274,8 @@ void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t 
 {
 	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
 	for (int i = 0; i < LIMITS; i++)
-		limit_lift(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
-	limit_lift(pid, RLIMIT_NOFILE, branch->attrs->limit[RLIMIT_NOFILE][1]);
+		process_attrs_lift_limit(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
+	process_attrs_lift_limit(pid, RLIMIT_NOFILE, branch->attrs->limit[RLIMIT_NOFILE][1]);
 }
 
 void process_attrs_setup_limits(const struct branch *branch, struct setup *setup)

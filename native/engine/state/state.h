@@ -123,7 +123,7 @@ void timers_setup(struct target *target, struct setup *setup);
 
 #define ATTRIBUTES_ASK_BYTES 376
 /* While it is stopped, from outside. */
-void scheduling_read(pid_t tid, struct scheduling *scheduling);
+void attributes_read_scheduling(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
  * leave them.  Returns the first of the calls. */
 const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
@@ -133,7 +133,7 @@ int attributes_setup_thread(const struct target *target, const struct thread *ma
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
 /* Of a stopped thread: its seccomp filters, whatever they say. */
-uint64_t filters_read(pid_t tid);
+uint64_t attributes_read_filters(pid_t tid);
 int attributes_keep(const struct target *target, struct generation *generation,
 		    struct avc_error *err) warn_unused;
 /* Before the restored threads go: what can be done from outside only. */
@@ -142,8 +142,8 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 /* ---- process_attrs.c ------------------------------------------------------------------------ */
 
 /* After the app runs again: what only the template can tell. */
-int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
-void branch_forget(struct branch *branch);
+int process_attrs_learn(struct branch *branch, struct avc_error *err) warn_unused;
+void process_attrs_forget(struct branch *branch);
 /* All protection keys, before its memory refers to some and while the kernel must not choose one
  * (pkeys(7), of what can only be executed).  process_attrs_put() frees those that it did not have. */
 int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err) warn_unused;
@@ -155,7 +155,7 @@ int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
 void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
 /* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
  * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
-void limit_lift(pid_t pid, int which, uint64_t least);
+void process_attrs_lift_limit(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
 void process_attrs_setup_limits(const struct branch *branch, struct setup *setup);
 
@@ -203,7 +203,7 @@ int memory_learn(struct target *target, long missing_pages, struct avc_error *er
 /* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
 /* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
  * pages is small, and whoever writes to a shared one when it is empty is killed. */
-extern const char private_huge_pages[];
+extern const char memory_private_huge_pages[];
 int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
 /* At a restore, before anything runs; *notes: what can not be written. */

@@ -298,7 +298,7 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 	return parasite_await_clone(tid, call, child, err);
 }
 
-bool in_old_parasite(const struct target *target, avc_remote address)
+bool parasite_is_old(const struct target *target, avc_remote address)
 {
 	for (uint32_t i = 0; i < target->old_parasites; i++)
 		if (address - target->old_parasite[i].base < target->old_parasite[i].bytes)
@@ -306,7 +306,7 @@ bool in_old_parasite(const struct target *target, avc_remote address)
 	return false;
 }
 
-int suspend_seccomp(const struct thread *thread, struct avc_error *err)
+int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err)
 {
 	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL,
 		   (long)(TRACE_OPTIONS_APP | PTRACE_O_SUSPEND_SECCOMP)))
@@ -339,32 +339,32 @@ static bool has_memory_of_holder(const struct target *target)
 	return target->holder && proc_same_memory(target->pid, target->holder);
 }
 
-int vet(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_vet(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	if (thread_check_dispatch(thread->tid, err))
 		return -1;
 	if (!has_memory_of_holder(target) && parasite_check(target, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a parasite that will be taken away. */
-	if (in_old_parasite(target, arch_pc(&thread->regs)))
+	if (parasite_is_old(target, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
 			    "still on its way home from a guard that died");
 	/* The kernel forgets a restartable sequence as soon as the thread is
 	 * seen elsewhere: it has to go on where the kernel would send it.  There
 	 * are no system calls in one. */
 	if (thread->call.nr < 0)
-		rseq_fixup(target->mem_fd, thread);
+		thread_fix_rseq(target->mem_fd, thread);
 	thread->vetted = true;
 	return 0;
 }
 
-int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_borrow(struct target *target, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
 	struct inj_control *control = target->parasite.control;
 	struct arch_regs home;
 
-	if (!thread->vetted && vet(target, thread, err))
+	if (!thread->vetted && thread_vet(target, thread, err))
 		return -1;
 	home = thread->regs;
 	arch_resume(&home);
@@ -372,7 +372,7 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 	/* Registers first: if we die between the two, the thread is in the parasite
 	 * with its own mask and goes home with it.  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
-	if (suspend_seccomp(thread, err) ||
+	if (thread_suspend_seccomp(thread, err) ||
 	    parasite_send(&target->parasite, thread->tid, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
@@ -383,7 +383,7 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 	return 0;
 }
 
-int give_back(struct thread *thread, struct avc_error *err)
+int thread_give_back(struct thread *thread, struct avc_error *err)
 {
 	struct arch_regs now;
 

@@ -113,7 +113,7 @@ int thread_await(struct target *target, struct thread *thread, struct avc_error 
 	const enum stop_kind kind = tracee_await(thread->tid, &child, err);
 
 	/* Whatever came of it: its new threads are found by the next walk, attached
-	 * already; new processes are not, which is how freeze() tells them. */
+	 * already; new processes are not, which is how freeze_tree() tells them. */
 	if (child && !adopt(target, child, err))
 		return -1;
 	switch (kind) {
@@ -149,7 +149,7 @@ void thread_release(struct thread *thread)
 	if (!thread->attached || !thread->stopped)
 		return;
 	if (thread->borrowed)
-		give_back(thread, &ignored);
+		thread_give_back(thread, &ignored);
 	if (ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) == 0) {
 		thread->attached = false;
 		thread->stopped = false;
@@ -222,7 +222,7 @@ static bool straggle(struct target *target, struct thread *thread)
 			return true;
 		}
 		if (thread->borrowed && parasite_contains(&target->parasite, arch_pc(&now))) {
-			give_back(thread, &ignored);
+			thread_give_back(thread, &ignored);
 		} else {
 			thread->borrowed = false;
 			thread->regs = now;
@@ -235,7 +235,7 @@ static bool straggle(struct target *target, struct thread *thread)
 	return false;
 }
 
-uint32_t stragglers(struct target *target)
+uint32_t threads_tend_stragglers(struct target *target)
 {
 	uint32_t left = 0;
 
@@ -250,7 +250,7 @@ struct rseq_cs {
 	uint64_t start, length, abort;
 };
 
-void rseq_fixup(int mem_fd, struct thread *thread)
+void thread_fix_rseq(int mem_fd, struct thread *thread)
 {
 	struct rseq_cs cs;
 	uint64_t pointer;

@@ -89,8 +89,8 @@ struct thread {
 	int block;       /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
 	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
-	bool vetted;                         /* vet() has been at this stop                      */
-	struct arch_regs regs;               /* as of the stop, EINTR already mended          */
+	bool vetted;           /* thread_vet() has been at this stop                      */
+	struct arch_regs regs; /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
 	uint64_t rseq;
@@ -179,20 +179,20 @@ struct target {
 	bool tcp_messages; /* quiescent is only who is between two messages    */
 	/* Of a process that is not the main one (tree.c). */
 	bool descendant;
-	uint64_t start;                  /* when it began; tells it from one with its number */
-	uint32_t images;                 /* generations that have one of it                  */
-	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
-	bool cloning;                    /* by its holder, the main one by itself: freeze()  */
-	long clone_pages;                /* its size when that began                         */
-	long anon_pages;                 /* of its last template; 0: none yet                */
-	bool closing;                    /* by its holder: generation_close_tables()      */
-	bool doubtful;                   /* it was cloning when a checkpoint came to nothing */
-	bool waiting;                    /* its main thread is to wait for a task of ours       */
-	const struct creds *forebear;    /* what a process that is made from the main one has */
-	bool frozen;                     /* stopped in this freeze                            */
-	bool begun;                      /* and read, and asked                               */
-	bool adopts;                     /* it or one above it adopts orphans, or may do so    */
-	bool paused;                     /* between adopt_no_more() and adopt_again()         */
+	uint64_t start;               /* when it began; tells it from one with its number */
+	uint32_t images;              /* generations that have one of it                  */
+	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
+	long clone_pages;             /* its size when that began                         */
+	long anon_pages;              /* of its last template; 0: none yet                */
+	bool closing;                 /* by its holder: generation_close_tables()      */
+	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
+	bool waiting;                 /* its main thread is to wait for a task of ours       */
+	const struct creds *forebear; /* what a process that is made from the main one has */
+	bool frozen;                  /* stopped in this freeze                            */
+	bool begun;                   /* and read, and asked                               */
+	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
+	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */
 };
@@ -212,7 +212,7 @@ enum stop_kind {
 	STOP_SYSCALL,
 	STOP_SIGNAL,   /* about to receive `signal`                              */
 	STOP_EXIT,     /* gone; reaped                                           */
-	STOP_DYING,    /* killed, to be reaped later (stragglers())              */
+	STOP_DYING,    /* killed, to be reaped later (threads_tend_stragglers())              */
 	STOP_DEADLINE, /* did not stop in time                                   */
 	STOP_NONE,     /* WNOHANG: nothing new                                   */
 	STOP_OTHER
@@ -283,9 +283,9 @@ void thread_release(struct thread *thread);
 /* The same after a freeze: what that has taken is no time of a call that it was waiting in. */
 void thread_let_go(const struct target *target, struct thread *thread);
 /* Looks after stragglers without waiting; returns how many are left. */
-uint32_t stragglers(struct target *target);
+uint32_t threads_tend_stragglers(struct target *target);
 /* Where a thread inside a restartable sequence has to go on (rseq(2)). */
-void rseq_fixup(int mem_fd, struct thread *thread);
+void thread_fix_rseq(int mem_fd, struct thread *thread);
 /* Of a stopped thread: whether it can be made to run something of ours. */
 int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 
@@ -324,7 +324,7 @@ void call_begin(struct inj_call *call, enum inj_after after);
 struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
 			     uint64_t d, uint64_t e);
 /* Sends a stopped task into the parasite to make the calls.  `base` is a user context
- * of the task.  For a thread of the app use borrow(). */
+ * of the task.  For a thread of the app use thread_borrow(). */
 int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
 		  struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until all calls were made; it is in a plain trap stop then. */
@@ -350,15 +350,15 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
  * is there, in a stopped thread.  If not, the target is not infected any more. */
 int parasite_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
-bool in_old_parasite(const struct target *target, avc_remote address);
+bool parasite_is_old(const struct target *target, avc_remote address);
 /* Until it is let go: it runs only what is ours meanwhile. */
-int suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
+int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
 /* May this stopped thread be borrowed?  What of that is to be read in its memory. */
-int vet(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_vet(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
 /* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:
- * borrow, parasite_run*, give_back.  give_back() needs a plain trap stop. */
-int borrow(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
-int give_back(struct thread *thread, struct avc_error *err);
+ * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
+int thread_borrow(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_give_back(struct thread *thread, struct avc_error *err);
 
 /* ---- setup.c ------------------------------------------------------------------- */
 
