@@ -3,11 +3,13 @@
  * The lowest of the engine's layers: errors, /proc, and a CPU at once.  It knows nothing of
  * applications.
  *
- * Everything in the engine runs in the guard's thread unless said otherwise; one guard is one
- * tracer thread.  A layer's header includes those below it, and no layer calls one above
+ * Everything in the engine runs in the guard's main thread unless said otherwise: a process can
+ * only be traced by one thread.  A layer's header includes those below it, and no layer calls one above
  * (native/layers.py).
  *
  *   error.c         what went wrong
+ *   config.c        whether settings make sense
+ *   heartbeat.c     the guard's sign of life
  *   proc.c          /proc
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
@@ -22,6 +24,7 @@
 #include <sys/types.h>
 
 #include "arch.h"
+#include "avckpt/engine.h"
 #include "avckpt/error.h"
 
 #define NS_PER_MS UINT64_C(1000000)
@@ -45,6 +48,19 @@ ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 /* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
  * and nothing has changed. */
 bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
+
+/* ---- heartbeat.c ------------------------------------------------------------ */
+
+/* Takes the memory for it, and closes the descriptor.  0 or -1. */
+int heartbeat_open(int fd) warn_unused;
+/* We get on: the daemon kills a guard of which it has not heard for seconds. */
+void heartbeat(void);
+
+/* ---- config.c -------------------------------------------------------------- */
+
+#define RESTORES_MAX 64
+
+int config_check(const struct avc_config *config, struct avc_error *err) warn_unused;
 
 /* ---- proc.c ---------------------------------------------------------------- */
 

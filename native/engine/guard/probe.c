@@ -38,7 +38,7 @@ static int probe_child(pid_t child, struct avc_error *err)
 	return 0;
 }
 
-int avc_engine_probe(struct avc_error *err)
+int guard_probe(struct avc_error *err)
 {
 	void *page;
 	pid_t child;

@@ -208,6 +208,7 @@ void init_channel_working(struct init_channel *channel)
 	const uint64_t now = now_ns();
 	struct avc_error ignored = { 0 };
 
+	heartbeat();
 	if (now - channel->working_ns < WORKING_NS)
 		return;
 	channel->working_ns = now;

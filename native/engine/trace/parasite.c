@@ -162,6 +162,7 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
 		struct stop stop;
 
+		heartbeat();
 		syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
 		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
 			break;
