@@ -32,13 +32,13 @@ int freeze_begin_known(struct tree *tree, struct generation *generation,
 int freeze_begin_others(struct tree *tree, struct generation *generation,
 			struct avc_error *err) warn_unused;
 /* The clone of the main process, begun by now. */
-int freeze_await_app_clone(struct target *target, struct thread *main_thread,
+int freeze_await_app_clone(struct process *process, struct thread *main_thread,
 			   struct generation *generation, struct avc_error *err) warn_unused;
 /* After that its main thread has a few steps to go before it can be let go. */
 int freeze_rest_app(struct thread *main_thread, struct avc_error *err);
 /* The clone of another process: its holder shares the process' memory and descriptors. */
-int freeze_start_clone(struct target *target, struct avc_error *err) warn_unused;
-int freeze_await_clone(struct target *target, pid_t *template, struct avc_error *err) warn_unused;
+int freeze_start_clone(struct process *process, struct avc_error *err) warn_unused;
+int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err) warn_unused;
 /* The answers of all others, also of those that were asked before one failed. */
 int freeze_hear_all(struct tree *tree, struct avc_error *err) warn_unused;
 /* Clones that nobody waits for any more: of a process that was killed meanwhile, and all of

@@ -32,8 +32,8 @@ struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind 
 		.kind = kind,
 		.cookie = guard->cookie,
 		.at_ns = now_ns(),
-		.app_pid = guard->target.leader,
-		.app_pid_inside = guard->target.inside,
+		.app_pid = guard->main.leader,
+		.app_pid_inside = guard->main.inside,
 		.generations = guard->count,
 		.restores = guard->restores,
 	};
@@ -77,7 +77,7 @@ void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, 
 {
 	struct avc_error error = { 0 };
 
-	fail(&error, code, 0, guard->target.pid, "command", "", "%s", why);
+	fail(&error, code, 0, guard->main.pid, "command", "", "%s", why);
 	guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 }
 
@@ -126,7 +126,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 {
 	struct avc_error error = { 0 };
 
-	if (!guard->count || !guard->target.pid) {
+	if (!guard->count || !guard->main.pid) {
 		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
 		return;
 	}
@@ -136,15 +136,15 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	}
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
-	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
-			       guard->target.pidfd, &error)) {
+	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
+			       guard->main.pidfd, &error)) {
 		guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	target_kill(&guard->target);
+	process_kill(&guard->main);
 }
 
 static void obey(struct avc_guard *guard, enum avc_command command, uint64_t ticket)
@@ -252,19 +252,19 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 
 uint32_t guard_tend_stragglers(struct avc_guard *guard)
 {
-	uint32_t left = threads_tend_stragglers(&guard->target);
+	uint32_t left = threads_tend_stragglers(&guard->main);
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		left += threads_tend_stragglers(guard->tree.member[i]);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		left += threads_tend_stragglers(guard->tree.process[i]);
 	return left;
 }
 
 static bool any_lost(const struct avc_guard *guard)
 {
-	bool lost = guard->target.lost;
+	bool lost = guard->main.lost;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		lost |= guard->tree.member[i]->lost;
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		lost |= guard->tree.process[i]->lost;
 	return lost;
 }
 
@@ -285,10 +285,10 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
-	watch(guard, &n, guard->target.holder_pidfd);
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		watch(guard, &n, guard->tree.member[i]->pidfd);
-		watch(guard, &n, guard->tree.member[i]->holder_pidfd);
+	watch(guard, &n, guard->main.holder_pidfd);
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		watch(guard, &n, guard->tree.process[i]->pidfd);
+		watch(guard, &n, guard->tree.process[i]->holder_pidfd);
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		watch(guard, &n, guard->generations[i].pidfd);
@@ -323,7 +323,7 @@ static void tell_straggling(struct avc_guard *guard)
 	if (now - guard->told_stragglers_ns < NS_PER_S)
 		return;
 	guard->told_stragglers_ns = now;
-	fail(&error, AVC_DEADLINE, 0, guard->target.pid, "stop", "",
+	fail(&error, AVC_DEADLINE, 0, guard->main.pid, "stop", "",
 	     "a thread that was to stop has not done so for a second");
 	guard_emit_error(guard, AVC_EVENT_MISSED, 0, &error);
 }
@@ -335,17 +335,17 @@ static void let_go(struct avc_guard *guard)
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
 	guard_drop_all(guard);
-	process_unhold(&guard->target);
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		process_unhold(guard->tree.member[i]);
+	process_unhold(&guard->main);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		process_unhold(guard->tree.process[i]);
 	/* The end of this process detaches what is left. */
 	tracee_end_now();
-	while (((guard->target.threads && guard_tend_stragglers(guard)) || tracee_reap_ending()) &&
+	while (((guard->main.threads && guard_tend_stragglers(guard)) || tracee_reap_ending()) &&
 	       now_ns() < end)
 		usleep(200);
 	tree_free(&guard->tree);
-	target_close(&guard->target);
-	parasite_close(&guard->target.parasite);
+	process_close(&guard->main);
+	parasite_close(&guard->main.parasite);
 	init_channel_close(&guard->channel);
 	close_fd(&guard->channel.init_pidfd);
 }
@@ -445,12 +445,12 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	guard->room = start->config.keep;
 	guard->started_ns = now_ns();
 	init_channel_init(&guard->channel);
-	target_init(&guard->target);
+	process_init(&guard->main);
 	guard->tree = (struct tree){
-		.main = &guard->target,
+		.main = &guard->main,
 		.slots = start->config.keep + 1,
-		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),
-		.member = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.member),
+		.entry = calloc(PROCESSES_MAX, sizeof *guard->tree.entry),
+		.process = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.process),
 		.is_ours = guard_owns,
 		.arg = guard,
 	};
@@ -462,7 +462,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 static void guard_free(struct avc_guard *guard)
 {
 	files_written_free(guard->written);
-	target_free_room(&guard->target);
+	process_free_room(&guard->main);
 	tree_free(&guard->tree);
 	free(guard->fds);
 	free(guard);
@@ -492,7 +492,7 @@ int guard_run(int socket)
 	guard = guard_new(socket, &start, init_pidfd);
 	if (!guard)
 		return GUARD_UNTOLD;
-	if (!target_make_room(&guard->target) || !guard->tree.kin || !guard->tree.member) {
+	if (!process_make_room(&guard->main) || !guard->tree.entry || !guard->tree.process) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {

@@ -30,9 +30,9 @@ struct avc_guard {
 	timer_t timer;
 	struct init_channel channel;
 	bool attached, unprotected;
-	struct target target; /* the app's main process                         */
-	struct tree tree;     /* and the others                                 */
-	struct pollfd *fds;   /* room for wait_for_news()                       */
+	struct process main; /* the app's main process                         */
+	struct tree tree;    /* and the others                                 */
+	struct pollfd *fds;  /* room for wait_for_news()                       */
 	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
 	uint32_t count;
@@ -88,7 +88,7 @@ bool guard_owns(pid_t pid, const void *guard);
 bool guard_knows_process(pid_t pid, const void *guard);
 /* Gives up a process that is gone.  What it had open must not stay open by us: somebody may
  * be reading a pipe to its end. */
-void guard_release(struct avc_guard *guard, struct target *target);
+void guard_release(struct avc_guard *guard, struct process *process);
 /* Processes of the app that have ended, or are another program now. */
 void guard_let_ended_go(struct avc_guard *guard);
 void guard_tend_tree(struct avc_guard *guard);

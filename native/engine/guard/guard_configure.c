@@ -18,11 +18,11 @@ void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 	guard->config = *config;
 	if (!guard->config.freeze_deadline_ns)
 		guard->config.freeze_deadline_ns = FREEZE_DEADLINE_NS;
-	guard->target.shm_bytes = config->shm_bytes;
+	guard->main.shm_bytes = config->shm_bytes;
 	/* A generation whose bytes were not counted has none: its connections all moved. */
-	guard->target.tcp_messages = config->tcp == AVC_TCP_MESSAGES;
-	guard->target.tcp_moved = config->tcp == AVC_TCP_RESET_MOVED ||
-				  config->tcp == AVC_TCP_MESSAGES;
+	guard->main.tcp_messages = config->tcp == AVC_TCP_MESSAGES;
+	guard->main.tcp_moved = config->tcp == AVC_TCP_RESET_MOVED ||
+				config->tcp == AVC_TCP_MESSAGES;
 }
 
 /* A death that comes next is judged by the new settings. */

@@ -74,8 +74,8 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	event.ticket = guard->restore_ticket;
 	guard_emit(guard, &event);
 	guard_drop_all(guard);
-	process_unhold(&guard->target);
-	target_close(&guard->target);
+	process_unhold(&guard->main);
+	process_close(&guard->main);
 	/* Init ends now, and why is what was told last. */
 	guard->next_ns = UINT64_MAX;
 }
@@ -83,10 +83,10 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 /* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
 static void release_new(struct avc_guard *guard, const struct generation *generation)
 {
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->holder &&
-		    !generation_branch(generation, guard->tree.member[i]))
-			guard_release(guard, guard->tree.member[i]);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->holder &&
+		    !generation_branch(generation, guard->tree.process[i]))
+			guard_release(guard, guard->tree.process[i]);
 }
 
 /* The other processes are those of the generation now; of what they had before they died
@@ -95,24 +95,24 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 {
 	struct tree *tree = &guard->tree;
 
-	for (uint32_t i = 0; i < tree->members; i++)
-		tree_let_go(tree->member[i]);
+	for (uint32_t i = 0; i < tree->processes; i++)
+		tree_let_go(tree->process[i]);
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		const struct branch *branch = &generation->branch[i];
 		struct avc_error gone = { 0 };
 		struct proc_stat stat;
 
-		if (!branch->target)
+		if (!branch->process)
 			continue;
 		/* One that has died again already is seen to by the next checkpoint. */
 		if (proc_stat(branch->pid, &stat) == 0 &&
-		    target_open(branch->target, branch->pid, branch->inside, &gone) == 0) {
-			branch->target->infected = true;
-			branch->target->start = stat.start;
+		    process_open(branch->process, branch->pid, branch->inside, &gone) == 0) {
+			branch->process->infected = true;
+			branch->process->start = stat.start;
 		}
 	}
 	tree->count = 0;
-	guard->target.childless = !generation->branches;
+	guard->main.childless = !generation->branches;
 }
 
 /* The newest generation; when restores are used up, the one before it.  There were `had`
@@ -121,7 +121,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		       enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
-	struct target *target = &guard->target;
+	struct process *process = &guard->main;
 	const struct avc_config *config = &guard->config;
 	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
 	bool ending = guard->count < had, again = false;
@@ -147,7 +147,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		 * tables.  And they count where processes are limited, as a spare does. */
 		if (ending)
 			guard_wait_ended();
-		if (restore_app(target, generation, &guard->channel, config, guard->timer,
+		if (restore_app(process, generation, &guard->channel, config, guard->timer,
 				report->reaped_ns, say_restored, guard, &pid, &times, &notes,
 				&failed)) {
 			/* Perhaps because the spare was killed when it was needed, or was one
@@ -167,10 +167,10 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			continue;
 		}
 		/* If this fails it has died already: the next report tells. */
-		target->infected =
-			target_open(target, pid,
-				    parasite_slot(&target->parasite, generation->slot)->pid,
-				    &failed) == 0;
+		process->infected =
+			process_open(process, pid,
+				     parasite_slot(&process->parasite, generation->slot)->pid,
+				     &failed) == 0;
 		adopt_family(guard, generation);
 		generation->spare.tried = false; /* that one is used up */
 		guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
@@ -185,7 +185,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		}
 		event.reason = reason;
 		event.app_pid = pid;
-		event.app_pid_inside = target->inside;
+		event.app_pid_inside = process->inside;
 		event.wait_status = report->status;
 		event.died_ns = report->reaped_ns;
 		event.restore_ns = times.restore_ns;
@@ -204,7 +204,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		break;
 	}
 	/* It has the dead app's memory, and what was open is the restored one's. */
-	process_unhold_soon(target);
+	process_unhold_soon(process);
 	return guard->count > 0;
 }
 
@@ -215,14 +215,14 @@ static void hold_all(struct avc_guard *guard)
 	struct avc_error ignored = { 0 };
 
 	/* The next checkpoint tries again, and tells. */
-	if (process_hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+	if (process_hold(&guard->main, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 		guard->dying_until_ns = now_ns() + DYING_NS;
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
 		ignored = (struct avc_error){ 0 };
-		if (target->pid && !target->adopts &&
-		    process_hold(target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+		if (process->pid && !process->adopts &&
+		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;
 	}
 }
@@ -250,7 +250,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
 	guard_emit(guard, &event);
-	target_close(&guard->target);
+	process_close(&guard->main);
 	guard_kill_lost(guard);
 	if (!is_abnormal(guard, report, &reason)) {
 		give_up(guard, report, reason, &error);
@@ -270,9 +270,9 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 			goto out;
 		}
 	}
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->pid)
-			target_kill(guard->tree.member[i]);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->pid)
+			process_kill(guard->tree.process[i]);
 	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (!guard->count) {
@@ -281,7 +281,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	} else if (!bring_back(guard, report, reason, had, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else {
-		if (guard->target.pid)
+		if (guard->main.pid)
 			hold_all(guard);
 		guard->next_ns = guard_interval_end(guard);
 	}

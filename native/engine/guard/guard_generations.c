@@ -21,7 +21,7 @@ void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 	/* Disarmed first: a death in between is then final at once. */
 	if (guard->count == 1 && guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
-	guard->target.lost |= spare_is_unknown(&guard->generations[i]);
+	guard->main.lost |= spare_is_unknown(&guard->generations[i]);
 	generation_drop(&guard->generations[i]);
 	guard->count--;
 	memmove(&guard->generations[i], &guard->generations[i + 1],
@@ -74,10 +74,10 @@ bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->target.holder || tracee_is_ending(pid))
+	if (pid == guard->main.holder || tracee_is_ending(pid))
 		return true;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->holder == pid)
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->holder == pid)
 			return true;
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct generation *generation = &guard->generations[i];
@@ -96,10 +96,10 @@ bool guard_knows_process(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->target.leader)
+	if (pid == guard->main.leader)
 		return true;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->leader == pid)
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->leader == pid)
 			return true;
 	return guard_owns(pid, guard);
 }
@@ -123,8 +123,8 @@ void guard_await_spares(struct avc_guard *guard)
 			continue;
 		tracee_deadline_set(guard->timer, LATE_SPARE_NS);
 		/* Or it is still on its way; who was killed is seen to by guard_reap_dead(). */
-		if (spare_await(&guard->target, &guard->generations[i], &late))
-			guard->target.lost |= late.code != AVC_DEADLINE;
+		if (spare_await(&guard->main, &guard->generations[i], &late))
+			guard->main.lost |= late.code != AVC_DEADLINE;
 		tracee_deadline_clear(guard->timer);
 	}
 }
@@ -133,15 +133,15 @@ void guard_kill_lost(struct avc_guard *guard)
 {
 	guard_await_spares(guard);
 	init_channel_kill_lost(&guard->channel, guard_knows_process, guard);
-	guard->target.lost = false;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		guard->tree.member[i]->lost = false;
+	guard->main.lost = false;
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		guard->tree.process[i]->lost = false;
 }
 
-static bool has_thread(const struct target *target, pid_t tid)
+static bool has_thread(const struct process *process, pid_t tid)
 {
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].tid == tid && target->threads[i].attached)
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].tid == tid && process->threads[i].attached)
 			return true;
 	return false;
 }
@@ -150,38 +150,38 @@ static bool is_known(pid_t tid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (guard_owns(tid, guard) || has_thread(&guard->target, tid))
+	if (guard_owns(tid, guard) || has_thread(&guard->main, tid))
 		return true;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (has_thread(guard->tree.member[i], tid))
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (has_thread(guard->tree.process[i], tid))
 			return true;
 	return false;
 }
 
-void guard_release(struct avc_guard *guard, struct target *target)
+void guard_release(struct avc_guard *guard, struct process *process)
 {
 	for (uint32_t i = 0; i < guard->count; i++) {
-		const struct branch *branch = generation_branch(&guard->generations[i], target);
+		const struct branch *branch = generation_branch(&guard->generations[i], process);
 
 		if (branch)
-			generation_close_files(target, branch->image);
+			generation_close_files(process, branch->image);
 	}
-	tree_let_go(target);
+	tree_let_go(process);
 }
 
 #define EXEC_CHECK_NS (1 * NS_PER_MS)
 #define EXEC_CHECK_LONG_NS (200 * NS_PER_MS)
 
-static bool found_executed(struct target *target, uint64_t now)
+static bool found_executed(struct process *process, uint64_t now)
 {
-	uint64_t pause = (now - target->held_ns) / 8;
+	uint64_t pause = (now - process->held_ns) / 8;
 
 	if (pause < EXEC_CHECK_NS)
 		pause = EXEC_CHECK_NS;
 	if (pause > EXEC_CHECK_LONG_NS)
 		pause = EXEC_CHECK_LONG_NS;
-	target->exec_check_ns = now + pause;
-	return process_has_executed(target);
+	process->exec_check_ns = now + pause;
+	return process_has_executed(process);
 }
 
 /* One that executes another program closes what it has marked for that (O_CLOEXEC), and
@@ -189,7 +189,7 @@ static bool found_executed(struct target *target, uint64_t now)
  * at first, for most do it at once if they do it at all. */
 void guard_let_executed_go(struct avc_guard *guard, bool all)
 {
-	struct target *main = &guard->target;
+	struct process *main = &guard->main;
 	const uint64_t now = now_ns();
 
 	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
@@ -199,24 +199,24 @@ void guard_let_executed_go(struct avc_guard *guard, bool all)
 		process_unhold(main);
 		main->infected = false; /* what was mapped there went with its memory */
 	}
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
-		if (target->pid && target->infected && (all || now >= target->exec_check_ns) &&
-		    found_executed(target, now))
-			guard_release(guard, target);
+		if (process->pid && process->infected && (all || now >= process->exec_check_ns) &&
+		    found_executed(process, now))
+			guard_release(guard, process);
 	}
 }
 
 uint64_t guard_exec_check_due(const struct avc_guard *guard)
 {
-	uint64_t due = guard->target.holder ? guard->target.exec_check_ns : UINT64_MAX;
+	uint64_t due = guard->main.holder ? guard->main.exec_check_ns : UINT64_MAX;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		const struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		const struct process *process = guard->tree.process[i];
 
-		if (target->pid && target->infected && target->exec_check_ns < due)
-			due = target->exec_check_ns;
+		if (process->pid && process->infected && process->exec_check_ns < due)
+			due = process->exec_check_ns;
 	}
 	return due;
 }
@@ -226,16 +226,16 @@ uint64_t guard_exec_check_due(const struct avc_guard *guard)
  * before its own end can be seen.  So that is looked for last. */
 void guard_let_ended_go(struct avc_guard *guard)
 {
-	const struct target *main = &guard->target;
+	const struct process *main = &guard->main;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
-		if (!target->pid || !pidfd_ended(target->pidfd))
+		if (!process->pid || !pidfd_ended(process->pidfd))
 			continue;
 		if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
 			return;
-		guard_release(guard, target);
+		guard_release(guard, process);
 	}
 	tree_sweep(&guard->tree);
 }
@@ -285,12 +285,12 @@ void guard_reap_dead(struct avc_guard *guard)
 		for (uint32_t i = guard->count; i-- > 0;)
 			if (has_ended(&guard->generations[i]))
 				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
-		if (guard->target.holder && pidfd_ended(guard->target.holder_pidfd))
-			process_unhold(&guard->target);
-		for (uint32_t i = 0; i < guard->tree.members; i++)
-			if (guard->tree.member[i]->holder &&
-			    pidfd_ended(guard->tree.member[i]->holder_pidfd))
-				process_unhold(guard->tree.member[i]);
+		if (guard->main.holder && pidfd_ended(guard->main.holder_pidfd))
+			process_unhold(&guard->main);
+		for (uint32_t i = 0; i < guard->tree.processes; i++)
+			if (guard->tree.process[i]->holder &&
+			    pidfd_ended(guard->tree.process[i]->holder_pidfd))
+				process_unhold(guard->tree.process[i]);
 		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
 			return;
 		if (news[1].revents & POLLIN)
@@ -440,15 +440,15 @@ int guard_check_strict(struct avc_guard *guard, const struct generation *generat
 		return 0;
 	guard_note_written(guard);
 	for (uint32_t i = 0; i < generation->branches; i++) {
-		const struct target *target = generation->branch[i].target;
+		const struct process *process = generation->branch[i].process;
 
 		/* What one that has ended before has written, guard_note_written() knows. */
-		if (target && target->holder &&
-		    files_check_strict(generation->branch[i].image, target->holder,
-				       target->holder_pidfd, guard->channel.init, target->holder,
+		if (process && process->holder &&
+		    files_check_strict(generation->branch[i].image, process->holder,
+				       process->holder_pidfd, guard->channel.init, process->holder,
 				       err))
 			return -1;
 	}
-	return files_check_strict(generation, pid, pidfd, guard->channel.init, guard->target.holder,
+	return files_check_strict(generation, pid, pidfd, guard->channel.init, guard->main.holder,
 				  err);
 }

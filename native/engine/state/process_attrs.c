@@ -158,13 +158,13 @@ static int64_t barriers_of(const struct inj_syscall *told, const struct inj_sysc
 
 int process_attrs_learn(struct branch *branch, struct avc_error *err)
 {
-	const struct parasite *parasite = &branch->target->parasite;
+	const struct parasite *parasite = &branch->process->parasite;
 	struct generation *image = branch->image;
 	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 	uint8_t *memory = parasite_files(parasite, image->slot) + INJ_FILES_BYTES / 2;
 	struct inj_syscall *list = (struct inj_syscall *)memory;
 	struct action *action = (struct action *)(list + SIGNALS + 8 + KEYS);
-	const struct thread *main_thread = thread_find(branch->target, branch->target->pid);
+	const struct thread *main_thread = thread_find(branch->process, branch->process->pid);
 	struct process_attrs *attrs = calloc(1, sizeof *attrs);
 	const struct inj_syscall *keys;
 	uint32_t n = 0;
@@ -203,7 +203,7 @@ int process_attrs_learn(struct branch *branch, struct avc_error *err)
 	attrs->state_permitted = main_thread->creds.state_permitted;
 	/* The template has limits of the time when the holder was made. */
 	if (read_mm(image->template, attrs) || read_status(image->template, attrs) ||
-	    (proc_limits(branch->target->pid, attrs->limit) &&
+	    (proc_limits(branch->process->pid, attrs->limit) &&
 	     proc_limits(image->template, attrs->limit)))
 		return fail_errno(err, image->template, "keep template", "open(/proc)",
 				  "it was killed");

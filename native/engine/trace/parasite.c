@@ -299,10 +299,10 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 	return parasite_await_clone(tid, call, child, err);
 }
 
-bool parasite_is_old(const struct target *target, avc_remote address)
+bool parasite_is_old(const struct process *process, avc_remote address)
 {
-	for (uint32_t i = 0; i < target->old_parasites; i++)
-		if (address - target->old_parasite[i].base < target->old_parasite[i].bytes)
+	for (uint32_t i = 0; i < process->old_parasites; i++)
+		if (address - process->old_parasite[i].base < process->old_parasite[i].bytes)
 			return true;
 	return false;
 }
@@ -316,9 +316,9 @@ int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err)
 	return 0;
 }
 
-int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
+int parasite_check(struct process *process, pid_t tid, struct avc_error *err)
 {
-	const avc_remote at = target->parasite.base + INJ_CODE_BYTES +
+	const avc_remote at = process->parasite.base + INJ_CODE_BYTES +
 			      offsetof(struct inj_control, nonce);
 	long nonce;
 
@@ -326,8 +326,8 @@ int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
 	nonce = ptrace(PTRACE_PEEKDATA, tid, (void *)at, NULL);
 	if (errno == ESRCH)
 		return fail_errno(err, tid, "stop", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
+	if (errno || (uint64_t)nonce != process->nonce) {
+		process->infected = false;
 		return fail(err, AVC_DEADLINE, 0, tid, "stop", "",
 			    "it has executed another program");
 	}
@@ -335,37 +335,37 @@ int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
 }
 
 /* A holder has the memory of the program that it was made in. */
-static bool has_memory_of_holder(const struct target *target)
+static bool has_memory_of_holder(const struct process *process)
 {
-	return target->holder && proc_same_memory(target->pid, target->holder);
+	return process->holder && proc_same_memory(process->pid, process->holder);
 }
 
-int thread_vet(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_vet(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	if (thread_check_dispatch(thread->tid, err))
 		return -1;
-	if (!has_memory_of_holder(target) && parasite_check(target, thread->tid, err))
+	if (!has_memory_of_holder(process) && parasite_check(process, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a parasite that will be taken away. */
-	if (parasite_is_old(target, arch_pc(&thread->regs)))
+	if (parasite_is_old(process, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
 			    "still on its way home from a guard that died");
 	/* The kernel forgets a restartable sequence as soon as the thread is
 	 * seen elsewhere: it has to go on where the kernel would send it.  There
 	 * are no system calls in one. */
 	if (thread->call.nr < 0)
-		thread_fix_rseq(target->mem_fd, thread);
+		thread_fix_rseq(process->mem_fd, thread);
 	thread->vetted = true;
 	return 0;
 }
 
-int thread_borrow(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_borrow(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
-	struct inj_control *control = target->parasite.control;
+	struct inj_control *control = process->parasite.control;
 	struct arch_regs home;
 
-	if (!thread->vetted && thread_vet(target, thread, err))
+	if (!thread->vetted && thread_vet(process, thread, err))
 		return -1;
 	home = thread->regs;
 	arch_resume(&home);
@@ -374,10 +374,10 @@ int thread_borrow(struct target *target, struct thread *thread, struct avc_error
 	 * with its own mask and goes home with it.  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
 	if (thread_suspend_seccomp(thread, err) ||
-	    parasite_send(&target->parasite, thread->tid, &thread->regs, &control->runner, err))
+	    parasite_send(&process->parasite, thread->tid, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
-	thread->borrowed_for = &target->parasite;
+	thread->borrowed_for = &process->parasite;
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
 				  "it has gone");
