@@ -43,7 +43,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 		struct thread *t = &process->threads[i];
 
 		if (t->attached && !t->seen)
-			return fail(err, AVC_DEADLINE, EAGAIN, t->tid, "freeze", "",
+			return fail(err, AVC_RETRY, 0, t->tid, "freeze", "",
 				    "it is just starting a process");
 		if (!t->stopped)
 			continue;
@@ -104,7 +104,7 @@ static int hear_of_children(struct process *process, struct avc_error *err)
 
 	process->childless = process->children->result == -ECHILD;
 	return was_childless && !process->childless
-		       ? fail(err, AVC_DEADLINE, EAGAIN, process->pid, "freeze", "",
+		       ? fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
 			      "it has just started another process")
 		       : 0;
 }
@@ -155,7 +155,7 @@ int freeze_await_app_clone(struct process *process, struct thread *main_thread,
 
 	process->cloning = false;
 	if (parasite_await_clone(main_thread->tid, call, &generation->template, err)) {
-		process->lost |= err->code != AVC_KERNEL;
+		process->lost |= err->code != AVC_LIMIT;
 		thread_runs_on(main_thread, err);
 		return -1;
 	}

@@ -72,6 +72,6 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 		if (all)
 			return 0;
 	}
-	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",
+	return fail(err, AVC_RETRY, 0, tree->main->pid, "freeze", "",
 		    "its processes come and go too fast");
 }

@@ -278,7 +278,7 @@ int generation_finish(struct process *process, struct generation *generation, st
 		branch->process->forebear = &main_thread->creds;
 		if (finish_branch(branch, &failed)) {
 			/* What was not as it was known is known now: of all of them. */
-			if (failed.code != AVC_DEADLINE || failed.errnum != EAGAIN) {
+			if (failed.code != AVC_RETRY) {
 				*err = failed;
 				return -1;
 			}

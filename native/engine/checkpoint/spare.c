@@ -68,7 +68,7 @@ static int end_fork(struct process *process, struct generation *generation, stru
 
 	if (parasite_await_clone(generation->template, call_of(process, generation), &spare->pid,
 				 err)) {
-		process->lost |= err->code != AVC_KERNEL && err->code != AVC_DEADLINE;
+		process->lost |= err->code != AVC_LIMIT && err->code != AVC_DEADLINE;
 		return -1;
 	}
 	if (!tracee_is_ours(spare->pid)) {
@@ -130,7 +130,7 @@ int spare_await(struct process *process, struct generation *generation, struct a
 	if (!spare->work)
 		return 0;
 	if (spare->work == SPARE_FORK && end_fork(process, generation, &refused) &&
-	    refused.code != AVC_KERNEL) {
+	    refused.code != AVC_LIMIT) {
 		*err = refused;
 		return -1;
 	}

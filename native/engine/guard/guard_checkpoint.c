@@ -342,7 +342,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
  * those that were to go a little later. */
 static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
-	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
+	if (err->code != AVC_LIMIT)
 		return false;
 	guard_await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
@@ -356,17 +356,17 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	return true;
 }
 
-/* EAGAIN means that something was not as it was known to be, and is known now: memory
- * that has to be copied aside, or a process. */
 static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
-		if (tries == TAKE_TRIES ||
-		    (!make_way(guard, err) && (err->code != AVC_DEADLINE || err->errnum != EAGAIN)))
-			return -1;
+		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))
+			continue;
+		if (err->code == AVC_RETRY)
+			err->code = AVC_DEADLINE;
+		return -1;
 	}
 }
 

@@ -465,7 +465,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
-		process->lost = process->lost || (result && err->code != AVC_KERNEL);
+		process->lost = process->lost || (result && err->code != AVC_LIMIT);
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
@@ -539,7 +539,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
-		process->lost = process->lost || err->code != AVC_KERNEL;
+		process->lost = process->lost || err->code != AVC_LIMIT;
 		thread_runs_on(thread, err);
 		return -1;
 	}
@@ -559,7 +559,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	if (!result && proc_stat(holder, &stat))
 		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
 	if (!result && stat.parent != init)
-		result = fail(err, AVC_DEADLINE, EAGAIN, process->pid, "make holder", "",
+		result = fail(err, AVC_RETRY, 0, process->pid, "make holder", "",
 			      "a process above it adopts orphans now (PR_SET_CHILD_SUBREAPER)");
 	if (holder && keep_holder(process, holder, result, err))
 		result = -1;

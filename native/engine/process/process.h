@@ -67,7 +67,7 @@ int thread_ask_answer(struct thread *thread, const struct inj_call *call,
 /* Asks a stopped thread just that; if it is the main thread, thread_ask_others(). */
 int thread_ask(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 /* The main thread was asked, and had other credentials before: a change may be one of all
- * threads (nptl(7), setuid(3)), so these are to be asked again, too (EAGAIN). */
+ * threads (nptl(7), setuid(3)), so these are to be asked again, too (AVC_RETRY). */
 int thread_ask_others(struct process *process, const struct thread *thread, const struct creds *was,
 		      struct avc_error *err) warn_unused;
 /* The threads there are now; those that ended are forgotten. */

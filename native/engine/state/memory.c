@@ -336,7 +336,7 @@ int memory_learn(struct process *process, long missing_pages, struct avc_error *
 			    missing_pages * ARCH_PAGE_BYTES / 1024);
 	/* Known before, it should not be missing again; but a device may have been
 	 * mapped since, at which the call stopped. */
-	return fail(err, AVC_DEADLINE, EAGAIN, process->pid, "keep template", "",
+	return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
 		    missing_pages * ARCH_PAGE_BYTES / 1024);
 }
@@ -680,7 +680,7 @@ static int check_areas(struct process *process, const struct generation *generat
 	if (!result && !same_areas(found, copied)) {
 		result = remember(process, generation->template, found, err);
 		if (!result)
-			result = fail(err, AVC_DEADLINE, EAGAIN, process->pid, "keep memory", "",
+			result = fail(err, AVC_RETRY, 0, process->pid, "keep memory", "",
 				      "it has new shared or MADV_WIPEONFORK memory");
 	}
 	memory->layout = result ? 0 : survey.layout;

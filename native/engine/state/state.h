@@ -198,10 +198,10 @@ bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
 void memory_copy_own(const struct process *process, struct mem_image *image);
 void memory_copy_shared(const struct process *process, struct mem_image *image);
 void memory_dofork(const struct memory *memory, struct inj_call *call);
-/* The template is smaller than the app: always fails, with EAGAIN if the next
+/* The template is smaller than the app: always fails, with AVC_RETRY if the next
  * attempt will be better. */
 int memory_learn(struct process *process, long missing_pages, struct avc_error *err);
-/* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
+/* When the app runs again.  Fails with AVC_RETRY if what had to be copied was not. */
 /* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
  * pages is small, and whoever writes to a shared one when it is empty is killed. */
 extern const char memory_private_huge_pages[];

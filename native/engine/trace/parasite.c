@@ -249,7 +249,7 @@ static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_erro
 		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
 	if (tracee_await(tid, NULL, err) != STOP_TRAP)
 		return -1;
-	return fail(err, AVC_KERNEL, (int)-result, tid, "clone", "clone",
+	return fail(err, AVC_LIMIT, (int)-result, tid, "clone", "clone",
 		    "it may not have another process: %s", strerror((int)-result));
 }
 
@@ -394,7 +394,7 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 	 * has gone home by itself, and its registers are newer than those that we know. */
 	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
 		thread->borrowed = false;
-		return fail(err, AVC_DEADLINE, EAGAIN, thread->tid, "give back", "",
+		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}
 	/* The mask first, for the same reason. */

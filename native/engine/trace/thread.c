@@ -138,7 +138,7 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 
 void thread_runs_on(struct thread *thread, const struct avc_error *err)
 {
-	if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
+	if (err->code == AVC_DEADLINE || err->code == AVC_RETRY || err->code == AVC_GONE)
 		thread->stopped = false;
 }
 

@@ -333,7 +333,7 @@ int parasite_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_u
 int parasite_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
- * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
+ * not let it, fails with AVC_LIMIT, and it is in a plain trap stop. */
 int parasite_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		       struct avc_error *err) warn_unused;
 /* The same in parts, for several at a time.  parasite_halt() waits until it is done and
