@@ -35,7 +35,7 @@ void init_channel_init(struct init_channel *channel)
 /* init's descriptor number of the control page, or -1. */
 static int find_ctl(pid_t init)
 {
-	char path[64], target[64];
+	char path[64], process[64];
 	struct dirent *entry;
 	int found = -1;
 	DIR *dir;
@@ -45,12 +45,12 @@ static int find_ctl(pid_t init)
 	if (!dir)
 		return -1;
 	while (found < 0 && (entry = readdir(dir))) {
-		ssize_t n = readlinkat(dirfd(dir), entry->d_name, target, sizeof target - 1);
+		ssize_t n = readlinkat(dirfd(dir), entry->d_name, process, sizeof process - 1);
 
 		if (n <= 0)
 			continue;
-		target[n] = 0;
-		if (!strcmp(target, "/memfd:" AVC_CTL_NAME " (deleted)"))
+		process[n] = 0;
+		if (!strcmp(process, "/memfd:" AVC_CTL_NAME " (deleted)"))
 			found = atoi(entry->d_name);
 	}
 	closedir(dir);

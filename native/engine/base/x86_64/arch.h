@@ -22,7 +22,7 @@ struct arch_regs {
 	struct user_regs_struct r;
 };
 
-/* An address in a target, never to be dereferenced here. */
+/* An address in a process, never to be dereferenced here. */
 typedef uint64_t avc_remote;
 
 int arch_regs_get(pid_t tid, struct arch_regs *regs);
@@ -111,7 +111,7 @@ size_t arch_xstate_bytes(void);
 /* Room one thread's signal frame takes, and how it is built: first, while the
  * thread is stopped, the extended state is read straight into the frame; later
  * the rest is filled in.  `frame` is where the engine sees it (aligned to 64),
- * `remote` where the target will.  Returns the stack pointer for
+ * `remote` where the process will.  Returns the stack pointer for
  * inj_sigreturn(). */
 size_t arch_frame_bytes(void);
 int arch_frame_read_xstate(pid_t tid, void *frame);
