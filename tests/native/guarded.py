@@ -283,7 +283,7 @@ def threads(pid: int) -> dict[int, str]:
 
 def pads(pid: int) -> int:
     """Mappings of ours in a process."""
-    return Path(f"/proc/{pid}/maps").read_text().count("/dev/zero (deleted)")
+    return Path(f"/proc/{pid}/maps").read_text().count("/memfd:avckpt-parasite (deleted)")
 
 
 def kill_at_random(
