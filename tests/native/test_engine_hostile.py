@@ -13,11 +13,18 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.guarded import BUILD, GuardProcess, Victim, config
-from native.fake_init import FOLLY
+
+from testkit.fake_init import FOLLY, FAKE_INIT
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import wait_until
 
 SCRIBBLED_S = 3.0
+
+
+def lost(guard: GuardProcess) -> list[dict[str, object]]:
+    """Guards that have died."""
+    assert guard.process.poll() is None
+    return [event for event in guard.events if event["kind"] == "guard_lost"]
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +33,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def test_what_the_application_writes_is_not_believed(tmp_path: Path) -> None:
-    """The count of calls is in memory that it has, too; a guard that believes it writes past the end of the parasite."""
+    """The count of calls is in memory that it has, too; a guard that believes it writes behind the parasite."""
     with (
         Victim("scribble", tmp_path) as hostile,
         Victim("idle 1 1", tmp_path) as peaceful,
@@ -35,7 +42,7 @@ def test_what_the_application_writes_is_not_believed(tmp_path: Path) -> None:
         guard.wait("checkpoint", cookie=2)
         wait_until(lambda: hostile.see().counter[0], 15, "the application has found the parasite")
         time.sleep(SCRIBBLED_S)
-        assert guard.process.poll() is None
+        assert not lost(guard)
         guard.wait("checkpoint", cookie=2, since=guard.mark(), count=3)
         peaceful.wait_beats(3)
 
@@ -67,7 +74,7 @@ def test_the_parasite_is_replaced_by_a_file(tmp_path: Path, kind: str) -> None:
                         lambda: hostile.see().counter[2] or hostile.popen.poll() is not None, 15, "it was replaced"
                     )
                     guard.wait("checkpoint", cookie=2, since=guard.mark(), count=3)
-                    assert guard.process.poll() is None
+                    assert not lost(guard)
                 swaps += hostile.see().counter[2]
         peaceful.wait_beats(3)
     assert swaps > 0
@@ -84,9 +91,6 @@ def test_the_code_can_not_be_written(tmp_path: Path) -> None:
         assert remove == errno.EACCES
         guard.wait("checkpoint", since=guard.mark(), count=3)
         hostile.wait_beats(3)
-
-
-FAKE_INIT = Path(__file__).with_name("fake_init.py")
 
 
 @pytest.mark.parametrize("kind", FOLLY)
@@ -111,7 +115,7 @@ def test_what_init_shows_is_looked_at_first(tmp_path: Path, kind: str) -> None:
             init.stdin.flush()
             unchanged = init.stdout.readline() == b"done True\n"
             guard.wait("checkpoint", cookie=2, since=guard.mark(), count=3)
-            assert guard.process.poll() is None
+            assert not lost(guard)
             attached = any(event["kind"] == "attached" and event.get("cookie") == 1 for event in guard.events)
             assert attached == honest
         assert unchanged == (not honest and kind != "unsealed")

@@ -16,7 +16,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 /* On a busy machine it may take long until a killed process gets a CPU to end on.  Until then it
@@ -86,7 +86,7 @@ static int reject(int *theirs)
  * which the container may have been given to read only. */
 static int open_pipe_of(const struct init_channel *channel, int number, int flags)
 {
-	int theirs = files_borrow(channel->init_pidfd, number);
+	int theirs = proc_borrow_fd(channel->init_pidfd, number);
 	struct statfs fs;
 	struct stat st;
 
@@ -102,7 +102,7 @@ static int open_pipe_of(const struct init_channel *channel, int number, int flag
  * may be none (SIGBUS).  Files of a tmpfs have seals, too, but never these. */
 static int open_ctl_of(const struct init_channel *channel, int number)
 {
-	int theirs = files_borrow(channel->init_pidfd, number), seals;
+	int theirs = proc_borrow_fd(channel->init_pidfd, number), seals;
 	struct statfs fs;
 	struct stat st;
 
@@ -167,7 +167,7 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 	if (number < 0 || pidfd_ended(pidfd))
 		return 0;
 	/* The magic is written last: before that the page is not to be trusted. */
-	theirs = files_borrow(pidfd, number);
+	theirs = proc_borrow_fd(pidfd, number);
 	if (theirs < 0)
 		return 0;
 	if (fcntl(theirs, F_GET_SEALS) >= 0 && pread(theirs, &magic, sizeof magic, 0) >= 0 &&
@@ -254,6 +254,7 @@ void init_channel_working(struct init_channel *channel)
 	const uint64_t now = now_ns();
 	struct avc_error ignored = { 0 };
 
+	heartbeat();
 	if (now - channel->working_ns < WORKING_NS)
 		return;
 	channel->working_ns = now;
