@@ -325,6 +325,6 @@ def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *vict
         cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr + "".join(victim.said for victim in victims)
-    assert done.stderr == ""
+    assert done.stderr == "", done.stderr
     said: dict[str, object] = json.loads(done.stdout)
     return said
