@@ -280,7 +280,7 @@ def since_linux(major: int, minor: int, what: str) -> pytest.MarkDecorator:
 
 def parasites(pid: int) -> int:
     """Mappings of ours in a process."""
-    return Path(f"/proc/{pid}/maps").read_text().count("/dev/zero (deleted)")
+    return Path(f"/proc/{pid}/maps").read_text().count("/memfd:avckpt-parasite (deleted)")
 
 
 def kill_at_random(
@@ -337,6 +337,6 @@ def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *vict
         cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr + "".join(victim.said for victim in victims)
-    assert done.stderr == ""
+    assert done.stderr == "", done.stderr
     said: dict[str, object] = json.loads(done.stdout)
     return said

@@ -69,9 +69,7 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
  * in an overlay a copy would be made. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared && proc_mapped_for_writing(template, m->start, m->end)
-			       ? proc_open_mapped(template, m->start, m->end, O_RDWR)
-			       : -1;
+	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
 
 	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }

@@ -6,6 +6,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/futex.h>
+#include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
@@ -20,6 +21,7 @@
 
 #define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
 #define PARKED_NS NS_PER_S
+#define MFD_NOEXEC_SEAL_ 8U /* linux/memfd.h, since Linux 6.3: not to be executed by a path */
 
 static size_t page_up(size_t n)
 {
@@ -45,26 +47,69 @@ size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threa
 	return parasite->bytes;
 }
 
-int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
-		  uint64_t nonce, struct avc_error *err)
+/* Memory of ours, and of nobody else, until it is handed out: it can neither be taken away from
+ * under us (SIGBUS) nor grow. */
+static int make_memory(size_t bytes)
 {
-	void *map;
-	int fd;
+	int fd = memfd_create(PARASITE_NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING | MFD_NOEXEC_SEAL_);
 
-	fd = proc_open_mapped(pid, base, base + bytes, O_RDWR);
-	if (fd < 0)
-		return fail_errno(err, pid, "infect", "open(map_files)",
-				  "the parasite can not be reached");
-	map = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-	if (map == MAP_FAILED) {
-		close(fd);
-		return fail_errno(err, pid, "infect", "mmap", "the parasite can not be mapped");
+	if (fd < 0 && errno == EINVAL) /* before Linux 6.3 */
+		fd = memfd_create(PARASITE_NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING);
+	if (fd >= 0 &&
+	    (ftruncate(fd, (off_t)bytes) || fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW)))
+		close_fd(&fd);
+	return fd;
+}
+
+/* Read-only: who has it like this can not map it for writing; kernels before 6.7 let nobody map
+ * by any other descriptor what is sealed for good. */
+static int open_read_only(int fd)
+{
+	char path[32];
+
+	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
+	return open(path, O_RDONLY | O_CLOEXEC);
+}
+
+/* The code is the same in every process, and nobody can write it: one for all. */
+static pthread_once_t code_once = PTHREAD_ONCE_INIT;
+static int code_fd = -1;
+
+static void make_code(void)
+{
+	int fd = make_memory(INJ_CODE_BYTES);
+
+	if (fd >= 0 &&
+	    pwrite(fd, parasite_blob, sizeof parasite_blob, 0) == (ssize_t)sizeof parasite_blob &&
+	    fcntl(fd, F_ADD_SEALS, F_SEAL_WRITE | F_SEAL_SEAL) == 0)
+		code_fd = open_read_only(fd);
+	close_fd(&fd);
+}
+
+int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err)
+{
+	int fd;
+	uint8_t *map;
+
+	pthread_once(&code_once, make_code);
+	fd = make_memory(parasite->bytes - INJ_CODE_BYTES);
+	if (code_fd < 0 || fd < 0 || fcntl(fd, F_ADD_SEALS, F_SEAL_SEAL)) {
+		close_fd(&fd);
+		return fail_errno(err, 0, "infect", "memfd_create", "no memory for the parasite");
 	}
-	parasite->fd = fd;
-	parasite->base = base;
+	map = mmap(NULL, parasite->bytes, PROT_READ, MAP_SHARED, code_fd, 0);
+	if (map == MAP_FAILED ||
+	    mmap(map + INJ_CODE_BYTES, parasite->bytes - INJ_CODE_BYTES, PROT_READ | PROT_WRITE,
+		 MAP_SHARED | MAP_FIXED, fd, 0) == MAP_FAILED) {
+		if (map != MAP_FAILED)
+			munmap(map, parasite->bytes);
+		close(fd);
+		return fail_errno(err, 0, "infect", "mmap", "the parasite can not be mapped");
+	}
+	parasite->code_fd = code_fd;
+	parasite->data_fd = fd;
 	parasite->map = map;
 	parasite->control = (struct inj_control *)(parasite->map + INJ_CODE_BYTES);
-	memcpy(parasite->map, parasite_blob, sizeof parasite_blob);
 	parasite->control->nonce = nonce;
 	parasite->control->magic = INJ_MAGIC;
 	return 0;
@@ -74,7 +119,7 @@ void parasite_close(struct parasite *parasite)
 {
 	if (parasite->map) {
 		munmap(parasite->map, parasite->bytes);
-		close(parasite->fd);
+		close(parasite->data_fd);
 	}
 	*parasite = (struct parasite){ 0 };
 }

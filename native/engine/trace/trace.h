@@ -124,12 +124,16 @@ struct parasite {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
-	int fd; /* of those pages                                              */
+	/* The guard's own memory, not the app's: the code, sealed, so that nobody can write it; and
+	 * the rest, which the app can write as well. */
+	int code_fd, data_fd;
 };
+#define PARASITE_NAME "avckpt-parasite"
 /* How it is mapped in two parts. */
 #define PARASITE_CODE_PROT (PROT_READ | PROT_EXEC)
 #define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
 #define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
+#define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
 
 /* A live process of the app. */
 struct process {
@@ -258,6 +262,8 @@ void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
 /* Of the i-th of them, to be watched; -1: there are no more. */
 int tracee_ending_pidfd(uint32_t i);
+/* Whether STOP_SYSCALL is of one that enters a system call, and not of one that leaves it. */
+bool tracee_enters_call(pid_t tid);
 /* Is this thread the one that traces it? */
 bool tracee_is_ours(pid_t tid);
 /* Holders, and processes that are being made: never to run on without us. */
@@ -303,9 +309,8 @@ void rewind_forget(struct process *process, struct thread *thread);
 
 /* ---- parasite.c ------------------------------------------------------------------- */
 
-/* Maps the pages at `base` of process `pid` here and fills in code and control. */
-int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
-		  uint64_t nonce, struct avc_error *err) warn_unused;
+/* Makes the memory for a layout, with code and control filled in; it is in no process yet. */
+int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err) warn_unused;
 size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max);
 void parasite_close(struct parasite *parasite);
 struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot);
