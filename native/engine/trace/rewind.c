@@ -25,7 +25,7 @@
 #include <sys/time.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define ERESTARTNOHAND 514 /* include/linux/errno.h */
 #define ERESTART_RESTARTBLOCK 516
@@ -119,16 +119,16 @@ static void milliseconds(struct thread *t, int argument, uint64_t now)
 	replace(t, argument, MARK << 32 | (uint32_t)left, same, at);
 }
 
-static int take_cell(struct target *target, struct thread *t)
+static int take_cell(struct process *process, struct thread *t)
 {
-	if (t->timeout_cell < 0 && ~target->cells_used) {
-		t->timeout_cell = __builtin_ctzll(~target->cells_used);
-		target->cells_used |= UINT64_C(1) << t->timeout_cell;
+	if (t->timeout_cell < 0 && ~process->cells_used) {
+		t->timeout_cell = __builtin_ctzll(~process->cells_used);
+		process->cells_used |= UINT64_C(1) << t->timeout_cell;
 	}
 	return t->timeout_cell;
 }
 
-static void timespec(struct target *target, struct thread *t, int argument, uint64_t now)
+static void timespec(struct process *process, struct thread *t, int argument, uint64_t now)
 {
 	const uint64_t pointer = arch_syscall_arg(&t->regs, (unsigned int)argument);
 	const bool same = same_call(t, pointer);
@@ -137,29 +137,29 @@ static void timespec(struct target *target, struct thread *t, int argument, uint
 	int64_t ns;
 
 	/* Without a parasite, or with all cells taken, it begins again in full. */
-	if (!pointer || !target->infected || parasite_check(target, t->tid, &gone) ||
-	    take_cell(target, t) < 0)
+	if (!pointer || !process->infected || parasite_check(process, t->tid, &gone) ||
+	    take_cell(process, t) < 0)
 		return;
-	cell = target->parasite.control->timeout[t->timeout_cell];
+	cell = process->parasite.control->timeout[t->timeout_cell];
 	if (same) {
 		ns = cell[0] * (int64_t)NS_PER_S + cell[1] - (int64_t)(now - t->rewound.at_ns);
 		left[0] = ns > 0 ? ns / (int64_t)NS_PER_S : 0;
 		left[1] = ns > 0 ? ns % (int64_t)NS_PER_S : 0;
-	} else if (pread(target->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left) {
+	} else if (pread(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left) {
 		return;
 	}
 	if (left[0] > INT32_MAX)
 		return; /* for practical purposes for ever */
 	memcpy(cell, left, sizeof left);
-	replace(t, argument, parasite_remote(&target->parasite, cell), same, now);
+	replace(t, argument, parasite_remote(&process->parasite, cell), same, now);
 }
 
 /* What a socket of the app's allows a call to take; 0: for ever, or no socket. */
-static uint64_t socket_timeout(const struct target *target, int app_fd, enum timeout kind)
+static uint64_t socket_timeout(const struct process *process, int app_fd, enum timeout kind)
 {
 	struct timeval tv = { 0 };
 	socklen_t bytes = sizeof tv;
-	int fd = (int)syscall(SYS_pidfd_getfd, target->pidfd, app_fd, 0);
+	int fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, app_fd, 0);
 
 	if (fd < 0)
 		return 0;
@@ -170,7 +170,7 @@ static uint64_t socket_timeout(const struct target *target, int app_fd, enum tim
 }
 
 /* False: its time is up, it is not to be made again. */
-static bool socket_wait(const struct target *target, struct thread *t, enum timeout kind,
+static bool socket_wait(const struct process *process, struct thread *t, enum timeout kind,
 			uint64_t now)
 {
 	const uint64_t fd = arch_syscall_arg(&t->regs, 0);
@@ -182,7 +182,7 @@ static bool socket_wait(const struct target *target, struct thread *t, enum time
 		arch_syscall_arg_set(&t->regs, 0, t->rewound.original);
 		return false;
 	}
-	limit = socket_timeout(target, (int)fd, kind);
+	limit = socket_timeout(process, (int)fd, kind);
 	if (limit) {
 		replace(t, 0, MARK << 32 | (uint32_t)fd, false, now);
 		t->rewound.limit_ns = limit;
@@ -195,7 +195,7 @@ static bool socket_wait(const struct target *target, struct thread *t, enum time
  * there the call itself has to be made again, and its number is no longer in the
  * registers.  Normally we have seen it before.  If not (a guard that came later),
  * the code in front of the system call or the arguments tell. */
-static long guess_call(const struct target *target, const struct arch_regs *regs, avc_remote pc)
+static long guess_call(const struct process *process, const struct arch_regs *regs, avc_remote pc)
 {
 	const uint64_t a = arch_syscall_arg(regs, 0), b = arch_syscall_arg(regs, 1),
 		       c = arch_syscall_arg(regs, 2), d = arch_syscall_arg(regs, 3);
@@ -203,7 +203,7 @@ static long guess_call(const struct target *target, const struct arch_regs *regs
 	uint8_t code[ARCH_CODE_BYTES];
 	long nr;
 
-	if (pread(target->mem_fd, code, sizeof code, (off_t)(pc - sizeof code)) == sizeof code) {
+	if (pread(process->mem_fd, code, sizeof code, (off_t)(pc - sizeof code)) == sizeof code) {
 		nr = arch_syscall_nr_before(code);
 		if (nr >= 0)
 			return nr;
@@ -219,16 +219,16 @@ static long guess_call(const struct target *target, const struct arch_regs *regs
 
 /* Let go a moment ago, and stopped again before it was back in its call: the kernel
  * has sent it back to the instruction, with the number of restart_syscall(2). */
-static bool is_about_to_restart(const struct target *target, const struct arch_regs *regs)
+static bool is_about_to_restart(const struct process *process, const struct arch_regs *regs)
 {
 	uint8_t code[ARCH_SYSCALL_BYTES];
 
 	return arch_syscall_result(regs) == SYS_restart_syscall &&
-	       pread(target->mem_fd, code, sizeof code, (off_t)arch_pc(regs)) == sizeof code &&
+	       pread(process->mem_fd, code, sizeof code, (off_t)arch_pc(regs)) == sizeof code &&
 	       arch_is_syscall(code);
 }
 
-static void note_call(const struct target *target, struct thread *t)
+static void note_call(const struct process *process, struct thread *t)
 {
 	struct call now = { .nr = arch_syscall_nr(&t->regs),
 			    .pc = arch_pc(&t->regs),
@@ -236,25 +236,25 @@ static void note_call(const struct target *target, struct thread *t)
 
 	for (unsigned int n = 0; n < 3; n++)
 		now.arg[n] = arch_syscall_arg(&t->regs, n);
-	if (is_about_to_restart(target, &t->regs)) {
+	if (is_about_to_restart(process, &t->regs)) {
 		now.nr = SYS_restart_syscall;
 		now.pc += ARCH_SYSCALL_BYTES;
 	}
 	if (now.nr == SYS_restart_syscall) {
 		now.nr = t->call.nr;
 		if (now.nr < 0 || memcmp(&now, &t->call, sizeof now) != 0)
-			now.nr = guess_call(target, &t->regs, now.pc);
+			now.nr = guess_call(process, &t->regs, now.pc);
 	}
 	t->call = now;
 }
 
-void rewind_call(struct target *target, struct thread *thread)
+void rewind_call(struct process *process, struct thread *thread)
 {
 	const struct rewindable *call;
 	const uint64_t now = now_ns();
 
 	thread->stopped_ns = now;
-	note_call(target, thread);
+	note_call(process, thread);
 	if (arch_syscall_nr(&thread->regs) < 0 || arch_syscall_result(&thread->regs) != -EINTR)
 		return;
 	call = lookup(arch_syscall_nr(&thread->regs));
@@ -268,10 +268,10 @@ void rewind_call(struct target *target, struct thread *thread)
 	if (call->timeout == MILLISECONDS)
 		milliseconds(thread, call->argument, now);
 	else if (call->timeout == TIMESPEC)
-		timespec(target, thread, call->argument, now);
+		timespec(process, thread, call->argument, now);
 	else if (call->timeout == NO_TIMEOUT)
 		return;
-	else if (!socket_wait(target, thread, call->timeout, now))
+	else if (!socket_wait(process, thread, call->timeout, now))
 		arch_result_note(&thread->regs, call->nr == SYS_connect ? -EINPROGRESS : -EAGAIN);
 	(void)arch_regs_set(thread->tid, &thread->regs); /* it was killed: no matter */
 }
@@ -279,7 +279,7 @@ void rewind_call(struct target *target, struct thread *thread)
 /* ppoll, pselect and select write what is left of their timeout to the app's memory
  * when they are interrupted, and are made again with that: what they do not count
  * is the time they were stopped. */
-void rewind_count_stop(const struct target *target, const struct thread *thread)
+void rewind_count_stop(const struct process *process, const struct thread *thread)
 {
 	const struct arch_regs *regs = &thread->regs;
 	const long nr = arch_syscall_nr(regs);
@@ -291,14 +291,14 @@ void rewind_count_stop(const struct target *target, const struct thread *thread)
 	    arch_syscall_result(regs) != -ERESTARTNOHAND)
 		return;
 	pointer = arch_syscall_arg(regs, nr == SYS_ppoll ? 2 : 4);
-	if (!pointer || pread(target->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left ||
+	if (!pointer || pread(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left ||
 	    left[0] > INT32_MAX)
 		return;
 	ns = left[0] * (int64_t)NS_PER_S + left[1] * unit_ns -
 	     (int64_t)(now_ns() - thread->stopped_ns);
 	left[0] = ns > 0 ? ns / (int64_t)NS_PER_S : 0;
 	left[1] = ns > 0 ? ns % (int64_t)NS_PER_S / unit_ns : 0;
-	if (pwrite(target->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left)
+	if (pwrite(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left)
 		return; /* a little late, then */
 }
 
@@ -328,9 +328,9 @@ void rewind_original(const struct thread *thread, struct arch_regs *regs)
 		arch_result_note(regs, -EINTR);
 }
 
-void rewind_forget(struct target *target, struct thread *thread)
+void rewind_forget(struct process *process, struct thread *thread)
 {
 	if (thread->timeout_cell >= 0)
-		target->cells_used &= ~(UINT64_C(1) << thread->timeout_cell);
+		process->cells_used &= ~(UINT64_C(1) << thread->timeout_cell);
 	thread->timeout_cell = -1;
 }
