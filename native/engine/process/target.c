@@ -32,7 +32,8 @@ void target_init(struct target *target)
 				   .timers_fd = -1,
 				   .stat_fd = -1,
 				   .statm_fd = -1,
-				   .holder_pidfd = -1 };
+				   .holder_pidfd = -1,
+				   .due_ns = UINT64_MAX };
 }
 
 bool target_make_room(struct target *target)
@@ -156,8 +157,6 @@ struct thread *thread_add(struct target *target, pid_t tid, struct avc_error *er
 	t = &target->threads[target->thread_count++];
 	*t = (struct thread){ .tid = tid,
 			      .call.nr = -1,
-			      .rewound = { .nr = -1, .argument = -1 },
-			      .timeout_cell = -1,
 			      .block = -1 };
 	return t;
 }
@@ -169,8 +168,6 @@ void threads_forget_unseen(struct target *target)
 	for (uint32_t i = 0; i < target->thread_count; i++)
 		if (target->threads[i].seen || target->threads[i].attached)
 			target->threads[kept++] = target->threads[i];
-		else
-			rewind_forget(target, &target->threads[i]);
 	target->thread_count = kept;
 }
 
