@@ -22,6 +22,7 @@ check "ruff check" .venv/bin/ruff check .
 check "ruff format" .venv/bin/ruff format --check --diff .
 mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests bench 2>/dev/null)
 check "mypy --strict" .venv/bin/mypy "${typed[@]}"
+check "layers of the engine" make -s -C native layers
 if have shellcheck; then
 	check "shellcheck" shellcheck -x "${shell[@]}"
 else

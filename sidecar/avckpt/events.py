@@ -28,6 +28,7 @@ class EventKind(enum.IntEnum):
     ENDED = 8
     REFUSED = 9
     DROPPED = 10
+    GUARD_LOST = 11
 
 
 class Reason(enum.IntEnum):

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine (`avckpt/engine.h`) for Python: the only module that touches cffi.
 
-Thin on purpose: it converts, and decides nothing.  Every call may be made
-from any thread; cffi lets go of the GIL while it is in C.
+Thin on purpose: it starts guard processes (avckpt-guard) and converts what they are told
+and tell, and decides nothing.  Every call may be made from any thread; cffi lets go of the
+GIL while it is in C.
 """
 
 from __future__ import annotations
 
+import os
 import threading
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from avckpt_hooks.tell import printable
 
+from avckpt.artifacts import guard_binary
 from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
 from avckpt.events import Command, Event, EventKind, GuardConfig, Reason
 
@@ -31,17 +35,17 @@ def version() -> str:
 
 
 def probe() -> None:
-    """Can this machine and this process do it at all?
+    """Can this machine and a guard that we start do it at all?
 
     Raises Unsupported, Denied or KernelError with the reason.
     """
     err = ffi.new("struct avc_error *")
-    if lib.avc_engine_probe(err) != 0:
+    if lib.avc_engine_probe(_path(guard_binary()), err) != 0:
         raise _error(err)
 
 
 class Guard:
-    """One protected container.  Made by `Engine.start_guard()`; `stop()` it before the engine is closed."""
+    """The process that protects one container.  Made by `Engine.start_guard()`; `stop()` it before the engine is closed."""
 
     def __init__(self, guard: Any, engine: Engine) -> None:
         self._guard = guard
@@ -75,8 +79,23 @@ class Guard:
             if lib.avc_guard_configure(self._guard, _config(-1, config), err) != 0:
                 raise _error(err)
 
+    @property
+    def pid(self) -> int:
+        """Its process, 0 when that has ended."""
+        with self._lock:
+            return 0 if self._guard is None else int(lib.avc_guard_pid(self._guard))
+
+    def check(self, patience_s: float) -> None:
+        """Kills it when it has given no sign of life for so long; an event GUARD_LOST follows.
+
+        It is given ten times as long while it only waits for a CPU.
+        """
+        with self._lock:
+            if self._guard is not None:
+                lib.avc_guard_check(self._guard, _ns("patience", patience_s))
+
     def stop(self) -> None:
-        """Lets the app run on unprotected and gives up every generation.
+        """Lets the app run on unprotected, gives up every generation and ends the process.
 
         Blocks for as long as a checkpoint or restore that is under way.
         A second call does nothing.
@@ -91,12 +110,13 @@ class Guard:
 class Engine:
     """A queue of events and the guards that fill it.  A context manager; leaving it stops every guard.
 
-    Raises KernelError when the kernel has no descriptors left for it.
+    Raises KernelError when the kernel has no descriptors left for it, ConfigError when
+    the program avckpt-guard is nowhere.
     """
 
     def __init__(self) -> None:
         err = ffi.new("struct avc_error *")
-        engine = lib.avc_engine_new(err)
+        engine = lib.avc_engine_new(_path(guard_binary()), err)
         if engine == ffi.NULL:
             raise _error(err)
         self._engine: Any = engine
@@ -213,6 +233,10 @@ def _error(err: Any) -> AvckptError:
         pid=err.pid,
         undo_failures=err.undo_failures,
     )
+
+
+def _path(path: Path) -> Any:
+    return ffi.new("char[]", os.fsencode(path))
 
 
 def _text(chars: Any) -> str:

@@ -281,7 +281,7 @@ def threads(pid: int) -> dict[int, str]:
     return found
 
 
-def pads(pid: int) -> int:
+def parasites(pid: int) -> int:
     """Mappings of ours in a process."""
     return Path(f"/proc/{pid}/maps").read_text().count("/dev/zero (deleted)")
 
@@ -333,7 +333,7 @@ __all__ = [
     "config",
     "inside",
     "kill_at_random",
-    "pads",
+    "parasites",
     "state_of",
     "threads",
 ]

@@ -19,7 +19,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def test_what_the_application_writes_is_not_believed(tmp_path: Path) -> None:
-    """The count of calls is in memory that it has, too; a guard that believes it writes past the end of the parasite."""
+    """The count of calls is in memory that it has, too; a guard that believes it writes behind the parasite."""
     with (
         Victim("scribble", tmp_path) as hostile,
         Victim("idle 1 1", tmp_path) as peaceful,

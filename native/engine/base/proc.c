@@ -15,7 +15,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "base.h"
 
 #define PF_EXITING 4 /* include/linux/sched.h; not for user space otherwise */
 
@@ -482,4 +482,20 @@ bool pidfd_ended(int pidfd)
 	struct pollfd p = { .fd = pidfd, .events = POLLIN };
 
 	return poll(&p, 1, 0) == 1;
+}
+
+int proc_borrow_fd(int pidfd, int fd)
+{
+	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
+}
+
+void proc_set_oom_score_adj(pid_t pid, const char *value)
+{
+	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);
+
+	if (fd < 0)
+		return;
+	if (write(fd, value, strlen(value)) < 0)
+		errno = 0; /* best effort */
+	close(fd);
 }

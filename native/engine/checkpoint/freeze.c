@@ -333,11 +333,11 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
 		if (cloned && main_thread->borrowed)
 			(void)rest_app(main_thread, &failed); /* or it is killed just now */
-		let_go_thread(target, main_thread);
+		thread_let_go(target, main_thread);
 	}
-	let_go_process(target);
+	process_let_go(target);
 	for (uint32_t i = 0; i < tree->members; i++)
-		let_go_process(tree->member[i]);
+		process_let_go(tree->member[i]);
 	times->freeze_ns = now_ns() - start;
 	tracee_deadline_clear(timer);
 	rt_priority_end();

@@ -9,7 +9,7 @@
 #ifndef AVCKPT_FREEZE_H
 #define AVCKPT_FREEZE_H
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* ---- freeze_stop.c ------------------------------------------------------------------------ */
 
@@ -19,7 +19,6 @@ int stop_known(struct tree *tree, struct avc_error *err) warn_unused;
 /* Until a look at the whole tree finds nobody who is not stopped: processes create
  * processes while we look. */
 int stop_others(struct tree *tree, struct avc_error *err) warn_unused;
-void let_go_thread(const struct target *target, struct thread *thread);
 
 /* ---- freeze_clone.c ----------------------------------------------------------------------- */
 

@@ -14,25 +14,13 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* In template_call.out: what the template had got by fork(2). */
 #define TEMPLATE_NAME 16
 #define TEMPLATE_ALTSTACK 32
 #define TEMPLATE_ATTRIBUTES 64
 #define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
-
-/* The OOM killer is to take templates first; undone in what is restored. */
-void oom_score_adj_set(pid_t pid, const char *value)
-{
-	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);
-
-	if (fd < 0)
-		return;
-	if (write(fd, value, strlen(value)) < 0)
-		errno = 0; /* best effort */
-	close(fd);
-}
 
 /* A fork of the main thread has what that had at that instant, but for what fork(2) resets. */
 static int hear_template(struct target *target, struct thread *cloned, const struct inj_call *call,
@@ -99,7 +87,7 @@ static int quieten(struct target *target, struct generation *generation,
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	generation->dumpable = dumpable->result;
-	oom_score_adj_set(pid, "1000");
+	proc_set_oom_score_adj(pid, "1000");
 	return attributes ? hear_template(target, cloned, call, attributes, err) : 0;
 }
 
@@ -387,14 +375,6 @@ void generation_drop(struct generation *generation)
 	free(generation->branch);
 	image_drop(generation);
 	*generation = (struct generation){ .pidfd = -1 };
-}
-
-struct branch *generation_branch(const struct generation *generation, const struct target *target)
-{
-	for (uint32_t i = 0; generation && i < generation->branches; i++)
-		if (generation->branch[i].target == target)
-			return &generation->branch[i];
-	return NULL;
 }
 
 uint32_t generation_threads(const struct generation *generation)

@@ -10,7 +10,7 @@
  */
 #include <stdlib.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* Fewer pages are compared in no time. */
 #define WORTH_PAGES 1024

@@ -12,7 +12,7 @@
 #include <sys/ioctl.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 /* Runtimes reserve terabytes of which they use little: those are not read page by page. */

@@ -13,7 +13,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* struct sched_attr, sched_setattr(2) */
 static uint32_t policy_of(const struct scheduling *s)

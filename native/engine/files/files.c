@@ -87,11 +87,6 @@ struct file *files_find(const struct files *files, int fd)
 	return NULL;
 }
 
-int files_borrow(int pidfd, int fd)
-{
-	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
-}
-
 /* The same file, socket, pipe...; of anonymous inodes only eventfds say who they are. */
 bool files_same_object(const struct file *a, const struct file *b)
 {
@@ -345,7 +340,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		files->count++;
 		return 0;
 	}
-	fd = files_borrow(look->pidfd, number);
+	fd = proc_borrow_fd(look->pidfd, number);
 	if (fd < 0) {
 		if (errno == EBADF)
 			return 0; /* closed meanwhile */
@@ -606,7 +601,7 @@ static void keep_content(const struct look *look, struct file *f)
 		return;
 	}
 	if (f->ours <= 0)
-		f->ours = files_borrow(look->pidfd, f->fd);
+		f->ours = proc_borrow_fd(look->pidfd, f->fd);
 	end.fd = f->ours;
 	if (f->ours < 0 || poll(&end, 1, 0) != 1)
 		return;

@@ -343,7 +343,7 @@ static void put_contents(const struct tables *tables)
 }
 
 int files_restore(struct target *target, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct files_table *table,
+		  const struct avc_config *config, pid_t init, struct fd_table *table,
 		  struct avc_error *notes, struct avc_error *err)
 {
 	struct tables tables = { .work = calloc(generation->branches + 1, sizeof *tables.work) };

@@ -164,8 +164,8 @@ static void give_up_useless(struct files_work *work)
 			int fd = -1;
 
 			if (work->source[i] >= 0 && doubts[k].concerns(w))
-				fd = files_borrow(work->table_pidfd,
-						  work->now->file[work->source[i]].fd);
+				fd = proc_borrow_fd(work->table_pidfd,
+						    work->now->file[work->source[i]].fd);
 			if (fd >= 0 && doubts[k].is_useless(fd, w))
 				work->source[i] = -1;
 			close_fd(&fd);
@@ -262,7 +262,7 @@ static void share_port(const struct files_work *work, const struct file *w)
 		if (work->now->file[k].kind != FILE_SOCKET)
 			continue;
 		/* The port is at the same place in an IPv6 address. */
-		fd = files_borrow(work->table_pidfd, work->now->file[k].fd);
+		fd = proc_borrow_fd(work->table_pidfd, work->now->file[k].fd);
 		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
 		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
 			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
@@ -281,8 +281,8 @@ static void gather(struct files_work *work)
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
 		if (work->source[group] >= 0)
-			work->local[group] = files_borrow(work->table_pidfd,
-							  work->now->file[work->source[group]].fd);
+			work->local[group] = proc_borrow_fd(
+				work->table_pidfd, work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
 		if (work->local[group] < 0)
@@ -323,11 +323,11 @@ static bool is_urgent(const struct files_work *work)
 /* ---- in the table ------------------------------------------------------------------ */
 
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
-static struct files_letter *mail_of(const struct files_work *work)
+static struct fd_letter *mail_of(const struct files_work *work)
 {
-	return (struct files_letter *)(parasite_files(&work->target->parasite,
-						      work->generation->slot) +
-				       INJ_FILES_BYTES / 2);
+	return (struct fd_letter *)(parasite_files(&work->target->parasite,
+						   work->generation->slot) +
+				    INJ_FILES_BYTES / 2);
 }
 
 static struct inj_syscall *list_of(const struct files_work *work)
@@ -335,8 +335,7 @@ static struct inj_syscall *list_of(const struct files_work *work)
 	return (struct inj_syscall *)(mail_of(work) + 1);
 }
 
-#define LISTED_MAX \
-	((INJ_FILES_BYTES / 2 - sizeof(struct files_letter)) / sizeof(struct inj_syscall))
+#define LISTED_MAX ((INJ_FILES_BYTES / 2 - sizeof(struct fd_letter)) / sizeof(struct inj_syscall))
 
 /* Of the task that has the table. */
 static struct inj_call *call_of(const struct files_work *work)
@@ -502,41 +501,12 @@ static int lowest_free(const struct numbers *numbers, const struct files *avoid)
 	return -1;
 }
 
-int files_send(int socket, int fd)
-{
-	uint8_t byte = 0, control[CMSG_SPACE(sizeof fd)] __attribute__((aligned(8))) = { 0 };
-	struct iovec io = { &byte, 1 };
-	struct msghdr head = { .msg_iov = &io,
-			       .msg_iovlen = 1,
-			       .msg_control = control,
-			       .msg_controllen = sizeof control };
-	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
-
-	c->cmsg_level = SOL_SOCKET;
-	c->cmsg_type = SCM_RIGHTS;
-	c->cmsg_len = CMSG_LEN(sizeof fd);
-	memcpy(CMSG_DATA(c), &fd, sizeof fd);
-	return sendmsg(socket, &head, MSG_DONTWAIT | MSG_NOSIGNAL) == 1 ? 0 : -1;
-}
-
-void files_letter_write(struct files_letter *letter, avc_remote remote)
-{
-	*letter = (struct files_letter){ 0 };
-	letter->io = (struct iovec){ (void *)(remote + offsetof(struct files_letter, byte)), 1 };
-	letter->head = (struct msghdr){
-		.msg_iov = (void *)(remote + offsetof(struct files_letter, io)),
-		.msg_iovlen = 1,
-		.msg_control = (void *)(remote + offsetof(struct files_letter, control)),
-		.msg_controllen = sizeof letter->control,
-	};
-}
-
 static avc_remote lay_out_mail(const struct files_work *work)
 {
-	struct files_letter *letter = mail_of(work);
+	struct fd_letter *letter = mail_of(work);
 	const avc_remote remote = parasite_remote(&work->target->parasite, letter);
 
-	files_letter_write(letter, remote);
+	fd_letter_write(letter, remote);
 	return remote;
 }
 
@@ -554,7 +524,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		to = lowest_free(numbers, NULL);
-		if (files_send(ours, from)) {
+		if (fd_send(ours, from)) {
 			files_note(work, w, "it could not be handed over");
 			continue;
 		}
@@ -616,7 +586,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	}
 	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
 	theirs = lowest_free(&numbers, work->want);
-	ours = files_borrow(work->generation->pidfd, ends[1]);
+	ours = proc_borrow_fd(work->generation->pidfd, ends[1]);
 	if (ours < 0) {
 		fail_errno(err, work->generation->template, "restore descriptors", "pidfd_getfd",
 			   "descriptors could not be handed over");
@@ -655,7 +625,7 @@ int files_borrow_placed(const struct files_work *work, const struct file *w)
 	const int local = work->local[files_leader(work->want, w)];
 
 	return local >= 0 ? fcntl(local, F_DUPFD_CLOEXEC, 0)
-			  : files_borrow(work->table_pidfd, w->fd);
+			  : proc_borrow_fd(work->table_pidfd, w->fd);
 }
 
 static void put_states(struct files_work *work)
@@ -808,8 +778,7 @@ void files_work_finish(struct files_work *work)
 		close_list(work);
 }
 
-int files_work_table(const struct files_work *work, struct files_table *table,
-		     struct avc_error *err)
+int files_work_table(const struct files_work *work, struct fd_table *table, struct avc_error *err)
 {
 	table->entry = calloc(work->want->count + 1, sizeof *table->entry);
 	if (!table->entry)
@@ -825,12 +794,4 @@ int files_work_table(const struct files_work *work, struct files_table *table,
 		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
 	}
 	return 0;
-}
-
-void files_table_free(struct files_table *table)
-{
-	for (uint32_t i = 0; i < table->count; i++)
-		close_fd(&table->entry[i].ours);
-	free(table->entry);
-	*table = (struct files_table){ 0 };
 }

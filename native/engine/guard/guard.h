@@ -1,9 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The guard's own state, and what its files give each other.  Only the guard's
- * thread runs any of it.
+ * The guard's own state, and what its files give each other.
  *
- *   guard.c             waits, obeys, tells; the public interface
+ *   guard.c             waits, obeys, tells
  *   guard_configure.c   what it is told to do
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
@@ -14,32 +13,20 @@
 
 #include <poll.h>
 
-#include "internal.h"
+#include "avckpt/guard.h"
+#include "restore.h"
 
-#define COMMANDS_MAX 64
-#define RESTORES_MAX 64
+#define OUTBOX_MAX 64 /* events that the daemon has not taken yet                */
 #define DYING_NS NS_PER_S
 #define AHEAD_AFTER_NS (20 * NS_PER_MS) /* the app has been held up, and goes first          */
 
-struct command {
-	enum avc_command command;
-	uint64_t ticket;
-};
-
 struct avc_guard {
-	struct avc_engine *engine;
 	struct avc_config config;
 	uint64_t cookie;
-	pthread_t thread;
-	int wake_fd;
-	/* Shared with callers, under the lock. */
-	pthread_mutex_t lock;
-	struct command commands[COMMANDS_MAX];
-	uint32_t command_count;
-	struct avc_config next_config; /* to be taken over, if one waits         */
-	bool config_waiting;
-	bool stop, ended;
-	/* The thread's own. */
+	int socket; /* to the daemon (avckpt/guard.h)                   */
+	bool stop;  /* the daemon wants it to, or is gone               */
+	struct avc_event outbox[OUTBOX_MAX];
+	uint32_t outbox_count;
 	timer_t timer;
 	struct init_channel channel;
 	bool attached, unprotected;
@@ -82,11 +69,11 @@ uint32_t all_stragglers(struct avc_guard *guard);
 
 /* ---- guard_configure.c ----------------------------------------------------- */
 
-int config_check(const struct avc_config *config, struct avc_error *err);
 /* When the next checkpoint is due, an interval from now; UINT64_MAX: on command only. */
 uint64_t interval_end(const struct avc_guard *guard);
 void config_set(struct avc_guard *guard, const struct avc_config *config);
-void take_config(struct avc_guard *guard);
+/* What is held stays, unless there are more than are wanted now. */
+void take_config(struct avc_guard *guard, const struct avc_config *config);
 
 /* ---- guard_generations.c --------------------------------------------------- */
 
@@ -135,5 +122,16 @@ void work_ahead(struct avc_guard *guard);
 /* ---- guard_death.c --------------------------------------------------------- */
 
 void died(struct avc_guard *guard, const struct avc_report *report);
+
+/* ---- guard.c ---------------------------------------------------------------- */
+
+/* One guard, from its AVC_REQUEST_START on `socket` to its end.  Returns the exit status:
+ * 0, unless it could not start. */
+int guard_run(int socket);
+
+/* ---- probe.c ---------------------------------------------------------------- */
+
+/* Can this machine and this process do it?  Touches no process but a child of its own. */
+int guard_probe(struct avc_error *err);
 
 #endif

@@ -14,7 +14,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "guard.h"
 
 static int probe_child(pid_t child, struct avc_error *err)
 {
@@ -38,7 +38,7 @@ static int probe_child(pid_t child, struct avc_error *err)
 	return 0;
 }
 
-int avc_engine_probe(struct avc_error *err)
+int guard_probe(struct avc_error *err)
 {
 	void *page;
 	pid_t child;

@@ -25,7 +25,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "process.h"
 
 #define CAVE_BYTES 256
 #define PADS_START UINT64_C(0x200000000000)
@@ -278,7 +278,7 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
 	if (target->mem_fd < 0)
 		return fail_errno(err, target->pid, "infect", "open(mem)", "it has ended");
-	if (support_check_thread(thread->tid, err) || check_task(target, thread, err) ||
+	if (thread_check_dispatch(thread->tid, err) || check_task(target, thread, err) ||
 	    survey(target, arch_pc(&thread->regs), &cave, err))
 		return -1;
 	rseq_fixup(target->mem_fd, thread);
@@ -427,13 +427,13 @@ static int hold_descendant(struct target *target, timer_t timer, uint64_t deadli
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	/* All of it: another thread may be waiting for children, of any kind (__WALL). */
-	result = stop_process(target, err);
+	result = process_stop(target, err);
 	thread = thread_find(target, target->pid);
 	if (!result && (!thread || !thread->stopped))
 		result = fail(err, AVC_GONE, 0, target->pid, "make holder", "", "it has ended");
 	if (!result)
 		result = thread_read(thread, err) || hold_stopped(target, target->init, err);
-	let_go_process(target);
+	process_let_go(target);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	return result;

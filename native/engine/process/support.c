@@ -15,7 +15,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "files.h"
+#include "process.h"
 
 static const struct {
 	const char *prefix, *reason;
@@ -181,25 +181,6 @@ static int check_namespaces(struct target *target, struct avc_error *err)
 			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
 				    kinds[i].reason);
 	}
-	return 0;
-}
-
-/* Since Linux 6.4; the headers may be older. */
-#define GET_DISPATCH 0x4211 /* PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG */
-
-/* Asked before a thread runs anything of ours: while its selector says so, every system call that
- * is not made where it has them made is a SIGSYS (Documentation/admin-guide/
- * syscall-user-dispatch.rst), which is the app's end when all signals are blocked. */
-int support_check_thread(pid_t tid, struct avc_error *err)
-{
-	struct {
-		uint64_t mode, selector, offset, bytes;
-	} dispatch = { 0 };
-
-	if (ptrace(GET_DISPATCH, tid, sizeof dispatch, &dispatch) == 0 && dispatch.mode)
-		return fail(err, AVC_UNSUPPORTED, 0, tid, "check", "",
-			    "it dispatches system calls by itself (Syscall User Dispatch, as Wine "
-			    "does)");
 	return 0;
 }
 

@@ -11,7 +11,7 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "process.h"
 
 /* ---- who there is --------------------------------------------------------------- */
 
@@ -145,7 +145,7 @@ static struct target *find_member(const struct tree *tree, pid_t pid, uint64_t s
 }
 
 /* A thread of ours that forked while it was being stopped has brought it forth as our
- * tracee, and it was taken for one more thread (target.c, adopt()). */
+ * tracee, and it was taken for one more thread (trace/thread.c, adopt()). */
 static void forget_thread(struct target *target, pid_t tid)
 {
 	struct thread *t = thread_find(target, tid);

@@ -15,8 +15,8 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
 #include "parasite_blob.h"
+#include "restore.h"
 
 #define TRIES 8 /* at once */
 #define TRY_NS NS_PER_S
@@ -279,7 +279,7 @@ int restore(struct target *target, struct generation *generation, struct init_ch
 	struct last_pid *helper = last_pid_start(channel->pidns_fd, slot, err);
 	struct sandbox *sandbox = NULL;
 	struct restore_tree *others = NULL;
-	struct files_table *tables = calloc(generation->branches + 1, sizeof *tables);
+	struct fd_table *tables = calloc(generation->branches + 1, sizeof *tables);
 	int result, pidfd = -1;
 	uint64_t start, spare_ns;
 
@@ -316,7 +316,7 @@ int restore(struct target *target, struct generation *generation, struct init_ch
 	tracee_deadline_clear(timer);
 	last_pid_stop(helper);
 	for (uint32_t i = 0; i < generation->branches; i++)
-		files_table_free(&tables[i]);
+		fd_table_free(&tables[i]);
 	free(tables);
 	if (!result)
 		restore_note(target, generation, *pid, notes);

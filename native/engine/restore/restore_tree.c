@@ -17,7 +17,7 @@
 #include <sys/syscall.h>
 #include <sys/wait.h>
 
-#include "internal.h"
+#include "restore.h"
 
 #define TRIES 64
 #define TRY_AGAIN_US 200
@@ -40,7 +40,7 @@ struct restore_tree {
 	struct last_pid *helper;
 	struct init_channel *channel;
 	timer_t timer;
-	const struct files_table *table; /* by branch                            */
+	const struct fd_table *table; /* by branch                            */
 	struct copier *copier;
 	struct fd_channel fd_channel; /* of the main process's children                  */
 	uint64_t flush;               /* signals of children that ended (sigset_t)       */
@@ -51,7 +51,7 @@ struct restore_tree {
 
 struct restore_tree *restore_tree_new(struct target *main, struct generation *generation,
 				      struct last_pid *helper, struct init_channel *channel,
-				      timer_t timer, const struct files_table *table,
+				      timer_t timer, const struct fd_table *table,
 				      struct avc_error *err)
 {
 	struct restore_tree *restored = calloc(1, sizeof *restored);
@@ -398,7 +398,7 @@ static int finish_copies(struct restore_tree *restored, struct avc_error *err)
 /* What it has open is below that, with some for those that are only on their way. */
 static uint32_t files_of(const struct restore_tree *restored, uint32_t index)
 {
-	const struct files_table *table = &restored->table[index];
+	const struct fd_table *table = &restored->table[index];
 
 	return (table->count ? (uint32_t)table->entry[table->count - 1].fd : 0) + FILES_SPARE;
 }

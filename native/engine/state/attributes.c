@@ -23,7 +23,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define IOPRIO_WHO_PROCESS 1
 #define CAPABILITY_VERSION_3 0x20080522
@@ -429,7 +429,7 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 	int dirfd;
 
 	if (attributes->oom_score_adj[0])
-		oom_score_adj_set(pid, attributes->oom_score_adj);
+		proc_set_oom_score_adj(pid, attributes->oom_score_adj);
 	if (has_all(attributes, pid))
 		return;
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);

@@ -11,7 +11,7 @@
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define PENDING_MAX 1024
 #define AT_ONCE 32

@@ -14,7 +14,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define SIGNALS 64
 #define AUXV_BYTES 1024

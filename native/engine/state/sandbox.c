@@ -13,8 +13,8 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
 #include "parasite_blob.h"
+#include "state.h"
 
 #define LOOK_US 50
 #define END_NS NS_PER_S

@@ -20,7 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define ITIMERS 3                  /* ITIMER_REAL, ITIMER_VIRTUAL, ITIMER_PROF */
 #define CLOCK (INJ_TIMERS_MAX - 1) /* where the time of the question goes */

@@ -15,7 +15,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 /* On a busy machine it may take long until a killed process gets a CPU to end on.  Until then it
@@ -208,6 +208,7 @@ void init_channel_working(struct init_channel *channel)
 	const uint64_t now = now_ns();
 	struct avc_error ignored = { 0 };
 
+	heartbeat();
 	if (now - channel->working_ns < WORKING_NS)
 		return;
 	channel->working_ns = now;

@@ -19,8 +19,8 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
 #include "syscall.h"
+#include "trace.h"
 
 #define STACK_BYTES 16384
 /* Requests come in quick succession, for a restore is a matter of microseconds:

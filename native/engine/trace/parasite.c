@@ -15,8 +15,8 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
 #include "parasite_blob.h"
+#include "trace.h"
 
 #define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
 #define PARKED_NS NS_PER_S
@@ -162,6 +162,7 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
 		struct stop stop;
 
+		heartbeat();
 		syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
 		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
 			break;
@@ -341,7 +342,7 @@ static bool has_memory_of_holder(const struct target *target)
 
 int vet(struct target *target, struct thread *thread, struct avc_error *err)
 {
-	if (support_check_thread(thread->tid, err))
+	if (thread_check_dispatch(thread->tid, err))
 		return -1;
 	if (!has_memory_of_holder(target) && parasite_check(target, thread->tid, err))
 		return -1;

@@ -25,7 +25,7 @@
 #include <sys/time.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define ERESTARTNOHAND 514 /* include/linux/errno.h */
 #define ERESTART_RESTARTBLOCK 516

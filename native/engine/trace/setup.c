@@ -6,7 +6,7 @@
  */
 #include <string.h>
 
-#include "internal.h"
+#include "trace.h"
 
 void setup_begin(struct setup *setup, const struct parasite *parasite, uint32_t slot)
 {

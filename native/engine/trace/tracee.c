@@ -17,7 +17,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define TICK_NS (2 * (long)NS_PER_MS)
 
