@@ -136,7 +136,7 @@ static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen
 
 	if (strict)
 		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
-	if (memory_prepare(target->memory, &branch->image->image, seen, err))
+	if (memory_prepare(target, &branch->image->image, seen, err))
 		return -1;
 	branch->image->threads = target->blocks;
 	/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */

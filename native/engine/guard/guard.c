@@ -464,6 +464,7 @@ static void guard_free(struct avc_guard *guard)
 	files_written_free(guard->written);
 	target_free_room(&guard->target);
 	tree_free(&guard->tree);
+	mem_others_free(guard->target.others);
 	free(guard->fds);
 	free(guard);
 }
@@ -492,7 +493,9 @@ int guard_run(int socket)
 	guard = guard_new(socket, &start, init_pidfd);
 	if (!guard)
 		return GUARD_UNTOLD;
-	if (!target_make_room(&guard->target) || !guard->tree.kin || !guard->tree.member) {
+	guard->target.others = mem_others_new();
+	if (!target_make_room(&guard->target) || !guard->target.others || !guard->tree.kin ||
+	    !guard->tree.member) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
 		emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {

@@ -116,6 +116,7 @@ static struct target *target_new(const struct tree *tree)
 	target_init(target);
 	target->descendant = true;
 	target->shm_bytes = main->shm_bytes;
+	target->others = main->others;
 	target->tcp_moved = main->tcp_moved;
 	target->plain_filters = main->plain_filters;
 	target->init = main->init;

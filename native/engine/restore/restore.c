@@ -321,7 +321,7 @@ int restore(struct target *target, struct generation *generation, struct init_ch
 	if (!result)
 		restore_note(target, generation, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, *pid, notes, err);
+		result = memory_put_back(target, generation, *pid, notes, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {

@@ -562,7 +562,7 @@ static int await_member(struct restore_tree *restored, uint32_t index, struct av
 	if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
 		return -1;
 	restore_note(branch->target, branch->image, member->pid, notes);
-	return memory_put_back(branch->image->image, member->pid, notes, err);
+	return memory_put_back(branch->target, branch->image, member->pid, notes, err);
 }
 
 /* It asks nothing of us while it puts itself together: no numbers for threads, no

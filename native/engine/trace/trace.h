@@ -170,6 +170,7 @@ struct target {
 	struct pending *pending;
 	struct timers *timers;
 	struct memory *memory;
+	struct mem_others *others; /* of the main one, and so of all             */
 	uint64_t shm_bytes;     /* shared memory that is rolled back, at most       */
 	uint32_t plain_filters; /* seccomp filters of init: the container's        */
 	pid_t init;             /* avckpt-init                                      */
