@@ -16,7 +16,8 @@ import json
 import os
 import time
 
-from avckpt_hooks import podman, protocol, tell
+from avckpt_hooks import podman
+from avckpt_hooks.shared import protocol, tell
 
 TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import json
 import os
 import sys
 
-from avckpt_hooks import protocol, tell
+from avckpt_hooks.shared import protocol, tell
 
 TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import yaml
-from avckpt_hooks.labels import LABELS, PREFIX, LabelError, parse_policy
+from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, parse_policy
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, create_model
 
 from avckpt import yamlfile

@@ -23,13 +23,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avckpt_hooks.labels import Notify
-from avckpt_hooks.protocol import Deregister, Register
+from avckpt_hooks.shared.labels import Notify
+from avckpt_hooks.shared.protocol import Deregister, Register
 
-from avckpt import __version__, cgroup, native
-from avckpt.api import ApiServer
-from avckpt.caretaker import Caretaker
+from avckpt import __version__
+from avckpt.api.server import ApiServer
 from avckpt.config import Configuration
+from avckpt.containers import cgroup
+from avckpt.containers.listener import HookListener
+from avckpt.containers.process import has_ended, is_foreign, pid_of
+from avckpt.containers.protected import Protected
+from avckpt.containers.records import NOT_SEEN, Records
+from avckpt.containers.registry import Registry
+from avckpt.engine import Engine, Guard, probe
 from avckpt.errors import (
     AvckptError,
     Busy,
@@ -41,20 +47,16 @@ from avckpt.errors import (
     TargetGone,
     Unprotected,
 )
-from avckpt.event_record import Cause, EventRecord, Kind, of_guard
-from avckpt.events import Command, Event, EventKind, why_not_restored
-from avckpt.feed import Feed
-from avckpt.history import History
-from avckpt.journal import Journal
-from avckpt.listener import HookListener
-from avckpt.metrics import Metrics
-from avckpt.notify import Notifier
-from avckpt.policy import Settings, changes, settings_of
-from avckpt.process import has_ended, is_foreign, pid_of
-from avckpt.protected import Protected
-from avckpt.records import NOT_SEEN, Records
-from avckpt.registry import Registry
-from avckpt.reload import Reloaded
+from avckpt.events.feed import Feed
+from avckpt.events.history import History
+from avckpt.events.journal import Journal
+from avckpt.events.metrics import Metrics
+from avckpt.events.record import Cause, EventRecord, Kind, of_guard
+from avckpt.events.vocabulary import Event, EventKind, why_not_restored
+from avckpt.guard import Command
+from avckpt.policy import Reloaded, Settings, changes, settings_of
+from avckpt.supervision.caretaker import Caretaker
+from avckpt.supervision.notify import Notifier
 
 log = logging.getLogger("avckpt")
 
@@ -77,7 +79,7 @@ class Watch:
     freezes_s: dict[int, float] = field(default_factory=dict)
     """Freeze times of the generations that may still be held, by number."""
     journal: Journal = field(default_factory=Journal)
-    guard: native.Guard | None = None
+    guard: Guard | None = None
 
     @property
     def notify(self) -> Notify | None:
@@ -104,7 +106,7 @@ class Daemon:
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
         self.started_at = time.time()
-        self._engine = native.Engine()
+        self._engine = Engine()
         self._watches: dict[int, Watch] = {}
         self._cookies = itertools.count(1)
         self._tickets = itertools.count(1)
@@ -375,7 +377,7 @@ class Daemon:
             if answer is not None and not answer.done():
                 answer.set_result((event, record))
 
-    def _lose_guard(self, watch: Watch, guard: native.Guard) -> None:
+    def _lose_guard(self, watch: Watch, guard: Guard) -> None:
         """It could not do its work, and said why; the next one may."""
         self.caretaker.end(watch)
         guard.stop()  # its thread has ended
@@ -482,7 +484,7 @@ def serve(run_dir: Path, config_path: Path) -> None:
     Raises Denied or Unsupported when this process or machine can not do it,
     Busy when there is a sidecar already.
     """
-    native.probe()
+    probe()
     cgroup.see_whole_tree()
     raise_descriptor_limit()
     try:

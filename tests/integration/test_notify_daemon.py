@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avckpt.client import Client
-from harness import wait_until
-from local_sidecar import QUICK, Container, LocalSidecar, children, ended, local_sidecar
+from avckpt.cli.client import Client
+
+from testkit.harness import wait_until
+from testkit.local_sidecar import QUICK, Container, LocalSidecar, ended, local_sidecar
+from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
 # Says READY, then a line for every SIGUSR1.
@@ -180,7 +182,7 @@ def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_p
     )
     friend = listener(local, "friend", {**IN_GROUP, "avckpt.notify": "signal:USR1"})
     web = protected(local, "web", IN_GROUP)
-    before = len(children(stuck.init_pid))
+    before = len(children_of(stuck.init_pid))
     crash(local, web)
     wait_until(pids.exists, 5, "the command runs")
     # While it is stuck: others are told, its own container is checkpointed and restored, web again.
@@ -198,7 +200,7 @@ def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_p
     assert "killed after 5 s" in told(local, "notify_failed")[0]["message"]
     wait_until(lambda: pids.read_text().count("x") == 2, 3, "the one that waited has its turn")
     assert local.stop() == 0
-    wait_until(lambda: len(children(stuck.init_pid)) <= before, 5, "nothing of ours is left inside")
+    wait_until(lambda: len(children_of(stuck.init_pid)) <= before, 5, "nothing of ours is left inside")
     assert not [p for p in Path("/proc").iterdir() if p.name.isdigit() and _is_left(p)]
     assert not ended(stuck)
 

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.cgroup import groups_of
+from avckpt.containers.cgroup import groups_of
 from avckpt.errors import TargetGone
-from avckpt.inside import OUTPUT_BYTES, Done, _sealed_program, run_inside
-from harness import Container, ContainerFactory, Podman, wait_until
+from avckpt.supervision.inside import OUTPUT_BYTES, Done, _sealed_program, run_inside
+
+from testkit.harness import Container, ContainerFactory, Podman, wait_until
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root")
 

@@ -7,8 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS
-from native.guarded import GuardProcess, Victim, config
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import SLOWNESS
 
 CHECKPOINTS = 10_000
 KINDS_AT = 8

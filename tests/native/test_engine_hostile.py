@@ -7,8 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.guarded import GuardProcess, Victim, config
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import wait_until
 
 SCRIBBLED_S = 3.0
 

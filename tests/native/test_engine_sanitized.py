@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.family import kill_main
-from native.guarded import Victim
-from native.init_peer import ROOT
+
+from testkit.family import kill_main
+from testkit.guarded import Victim
+from testkit.harness import ROOT, wait_until
 
 SOURCE = Path(__file__).with_name("sanitized_guard.c")
 FLAGS = [

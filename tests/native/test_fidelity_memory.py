@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
+
+from testkit.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
+from testkit.harness import wait_until
 
 
 @pytest.fixture(autouse=True)

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.family import look
-from native.guarded import GuardProcess, Victim, children_of, config, inside, parasites, state_of, threads
+
+from testkit.family import look
+from testkit.guarded import GuardProcess, Victim, config, parasites
+from testkit.harness import wait_until
+from testkit.procfs import children_of, inside, state_of, threads
 
 
 @pytest.fixture(autouse=True)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from avckpt import caretaker
-from avckpt.caretaker import Caretaker
-from avckpt.native import Guard
+from avckpt.containers.protected import Protected
+from avckpt.engine import Guard
 from avckpt.policy import settings_of
-from avckpt.protected import Protected
+from avckpt.supervision import caretaker
+from avckpt.supervision.caretaker import Caretaker
 
 SLOW_S = 0.5
 

@@ -9,7 +9,7 @@ import pytest
 from avckpt.config import Configuration, Defaults, examine, read
 from avckpt.errors import ConfigError, LabelsWrong
 from avckpt.policy import changes, config_of_labels, settings_of
-from avckpt_hooks.labels import LABELS
+from avckpt_hooks.shared.labels import LABELS
 
 ENABLED = {"avckpt.enable": "true"}
 GOOD = """\

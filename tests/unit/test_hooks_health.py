@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 
 import pytest
-from avckpt_hooks import health, protocol
+from avckpt_hooks import health
+from avckpt_hooks.shared import protocol
 
 ID = "d" * 64
 CHECK = {"Test": ["CMD-SHELL", "true"], "Interval": 30_000_000_000}

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avckpt_hooks import protocol
+from avckpt_hooks.shared import protocol
 
 HOOK = Path(__file__).resolve().parents[2] / "hooks" / "avckpt-hook"
 ID = "ab" * 32

@@ -10,7 +10,7 @@ import string
 from pathlib import Path
 
 import pytest
-from avckpt_hooks.labels import LABELS, RESTORES_MAX, LabelError, Notify, Policy, RestoreOn, merge, parse_policy
+from avckpt_hooks.shared.labels import LABELS, RESTORES_MAX, LabelError, Notify, Policy, RestoreOn, merge, parse_policy
 
 ON = {"avckpt.enable": "true"}
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 from avckpt import cli
+from avckpt.cli.compose.manifest import Kind, Manifest, Severity, check, files_meant
 from avckpt.errors import ConfigError
-from avckpt.manifest import Kind, Manifest, Severity, check, files_meant
-from avckpt_hooks.labels import LABELS
+from avckpt_hooks.shared.labels import LABELS
 from click.testing import CliRunner
 
 SHARED = """\

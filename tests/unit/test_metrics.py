@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+from avckpt.containers.protected import State
 from avckpt.errors import DeadlineMissed
-from avckpt.event_record import Cause, EventRecord, Kind, Outcome
-from avckpt.metrics import Held, Metrics
-from avckpt.protected import State
+from avckpt.events.metrics import Held, Metrics
+from avckpt.events.record import Cause, EventRecord, Kind, Outcome
 from prometheus_client.parser import text_string_to_metric_families
 
 

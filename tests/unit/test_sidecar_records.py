@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.containers.process import has_ended, open_pidfd, pid_of, start_time
+from avckpt.containers.records import NOT_SEEN, Records, remove_if
 from avckpt.errors import TargetGone
-from avckpt.process import has_ended, open_pidfd, pid_of, start_time
-from avckpt.records import NOT_SEEN, Records, remove_if
-from avckpt_hooks.protocol import Register
+from avckpt_hooks.shared.protocol import Register
 
 
 @pytest.fixture
