@@ -482,6 +482,7 @@ static void guard_free(struct avc_guard *guard)
 	files_written_free(guard->written);
 	process_free_room(&guard->main);
 	tree_free(&guard->tree);
+	mem_others_free(guard->main.others);
 	free(guard->fds);
 	free(guard);
 }
@@ -510,7 +511,9 @@ int guard_run(int socket)
 	guard = guard_new(socket, &start, init_pidfd);
 	if (!guard)
 		return GUARD_UNTOLD;
-	if (!process_make_room(&guard->main) || !guard->tree.entry || !guard->tree.process) {
+	guard->main.others = mem_others_new();
+	if (!process_make_room(&guard->main) || !guard->main.others || !guard->tree.entry ||
+	    !guard->tree.process) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {

@@ -322,7 +322,7 @@ int restore_app(struct process *process, struct generation *generation,
 	if (!result)
 		restore_note(process, generation, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, *pid, notes, err);
+		result = memory_put_back(process, generation, *pid, notes, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {

@@ -171,9 +171,10 @@ struct process {
 	struct pending *pending;
 	struct timers *timers;
 	struct memory *memory;
-	uint64_t shm_bytes;     /* shared memory that is rolled back, at most       */
-	uint32_t plain_filters; /* seccomp filters of init: the container's        */
-	pid_t init;             /* avckpt-init                                      */
+	struct mem_others *others; /* of the main one, and so of all             */
+	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
+	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
+	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool tcp_moved;    /* bytes of connections are to be counted           */
