@@ -334,6 +334,7 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
+	last_pid_forget();
 	drop_all(guard);
 	unhold(&guard->target);
 	for (uint32_t i = 0; i < guard->tree.members; i++)
