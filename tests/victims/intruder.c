@@ -158,7 +158,7 @@ static void look_at_memory(int pid)
 		if (mode[3] == 'p' && !strstr(line, "[v"))
 		private += end - start;
 		if (!commands && strchr(line, '/') && !strstr(line, "/memfd:avckpt-pid") &&
-		    !strstr(line, "/dev/zero (deleted)"))
+		    !strstr(line, "/memfd:avckpt-parasite"))
 			gain("mapped: %s", strchr(line, '/'));
 	}
 	if (!commands && private > 512 << 10)

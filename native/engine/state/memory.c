@@ -42,7 +42,7 @@
 #define OTHERS_NS (10 * NS_PER_S)
 #define SMAPS_SHARE 50 /* the long file is read in at most 1/50 of the time */
 
-const char private_huge_pages[] =
+const char memory_private_huge_pages[] =
 	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
 	"killed for want of another when it writes to one";
 
@@ -77,7 +77,7 @@ struct marks {
 	} area[AREAS_MAX];
 };
 
-/* What is known of a target's memory from one checkpoint to the next. */
+/* What is known of a process's memory from one checkpoint to the next. */
 struct memory {
 	bool dontfork;
 	/* Where a device (or the kernel's vvar) is mapped, or what else keeps_dontfork():
@@ -219,7 +219,7 @@ int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_s
 	return 0;
 }
 
-static void copy_areas(const struct target *target, struct mem_image *image, bool wiped)
+static void copy_areas(const struct process *process, struct mem_image *image, bool wiped)
 {
 	uint8_t *next = image ? image->data : NULL;
 
@@ -232,7 +232,7 @@ static void copy_areas(const struct target *target, struct mem_image *image, boo
 		if (a->wiped != wiped)
 			continue;
 		if (wiped)
-			n = read_whole(target->mem_fd, to, area_bytes(a), (off_t)a->start);
+			n = read_whole(process->mem_fd, to, area_bytes(a), (off_t)a->start);
 		else if (!a->again)
 			n = read_whole(a->fd, to, area_bytes(a), (off_t)a->offset);
 		a->kept = n > 0 ? (size_t)n : 0;
@@ -240,14 +240,14 @@ static void copy_areas(const struct target *target, struct mem_image *image, boo
 	}
 }
 
-void memory_copy_own(const struct target *target, struct mem_image *image)
+void memory_copy_own(const struct process *process, struct mem_image *image)
 {
-	copy_areas(target, image, true);
+	copy_areas(process, image, true);
 }
 
-void memory_copy_shared(const struct target *target, struct mem_image *image)
+void memory_copy_shared(const struct process *process, struct mem_image *image)
 {
-	copy_areas(target, image, false);
+	copy_areas(process, image, false);
 }
 
 /* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
@@ -317,32 +317,32 @@ static int find_dontfork(const struct mapping *m, void *arg)
 	return 0;
 }
 
-int memory_learn(struct target *target, long missing_pages, struct avc_error *err)
+int memory_learn(struct process *process, long missing_pages, struct avc_error *err)
 {
-	struct memory *memory = target->memory;
+	struct memory *memory = process->memory;
 	struct dontfork look = { .memory = memory };
 	int result;
 
 	memory->holes = 0;
-	result = proc_mappings(target->pid, "smaps", find_dontfork, &look);
+	result = proc_mappings(process->pid, "smaps", find_dontfork, &look);
 	memory->dontfork = !result && (memory->dontfork || look.found);
 	if (look.kept)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "it uses memory of a device, or huge pages, which a clone does not "
 			    "inherit (MADV_DONTFORK)");
 	if (!memory->dontfork)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "%ld kB of its memory are not inherited by a clone",
 			    missing_pages * ARCH_PAGE_BYTES / 1024);
 	/* Known before, it should not be missing again; but a device may have been
 	 * mapped since, at which the call stopped. */
-	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep template", "",
+	return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
 		    missing_pages * ARCH_PAGE_BYTES / 1024);
 }
 
 struct survey {
-	const struct target *target;
+	const struct process *process;
 	pid_t template;
 	struct memory *memory;
 	struct areas *areas;
@@ -357,12 +357,12 @@ static uint64_t hash(uint64_t h, uint64_t value)
 	return h ^ h >> 29;
 }
 
-static bool is_pad(const struct target *target, avc_remote at)
+static bool is_pad(const struct process *process, avc_remote at)
 {
-	if (parasite_contains(&target->parasite, at))
+	if (parasite_contains(&process->parasite, at))
 		return true;
-	for (uint32_t i = 0; i < target->old_parasites; i++)
-		if (at - target->old_parasite[i].base < target->old_parasite[i].bytes)
+	for (uint32_t i = 0; i < process->old_parasites; i++)
+		if (at - process->old_parasite[i].base < process->old_parasite[i].bytes)
 			return true;
 	return false;
 }
@@ -395,7 +395,7 @@ static int is_it(const struct mapping *m, void *arg)
 
 /* Does a process outside of the app's PID namespace map it?  Those inside are the app, and
  * whoever was sent in to look after it. */
-static bool look_for_others(const struct target *target, const struct mapping *m)
+static bool look_for_others(const struct process *process, const struct mapping *m)
 {
 	struct mapping wanted = *m;
 	char inside[64] = "", its[64];
@@ -403,7 +403,7 @@ static bool look_for_others(const struct target *target, const struct mapping *m
 	struct dirent *entry;
 	bool others = false;
 
-	(void)proc_link(target->init, "ns/pid", inside, sizeof inside);
+	(void)proc_link(process->init, "ns/pid", inside, sizeof inside);
 	while (proc && !others && (entry = readdir(proc))) {
 		const pid_t pid = (pid_t)atoi(entry->d_name);
 
@@ -418,7 +418,7 @@ static bool look_for_others(const struct target *target, const struct mapping *m
 	return others;
 }
 
-static bool is_others(struct memory *memory, const struct target *target, const struct mapping *m)
+static bool is_others(struct memory *memory, const struct process *process, const struct mapping *m)
 {
 	struct named *named = NULL;
 	uint64_t now = now_ns();
@@ -435,7 +435,7 @@ static bool is_others(struct memory *memory, const struct target *target, const 
 	*named = (struct named){
 		.device = m->device,
 		.inode = m->inode,
-		.others = look_for_others(target, m),
+		.others = look_for_others(process, m),
 	};
 	named->checked_ns = now_ns();
 	memory->look_ns = named->checked_ns - now;
@@ -527,7 +527,7 @@ static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
 
 	if (kind && mapping_is_special(m))
 		return kind | MAPPING_SPECIAL;
-	return survey->target->descendant && is_only_here(survey->template, m)
+	return survey->process->descendant && is_only_here(survey->template, m)
 		       ? kind | MAPPING_ONLY_HERE
 		       : kind;
 }
@@ -542,13 +542,13 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
-	if (!is_pad(survey->target, m->start)) {
+	if (!is_pad(survey->process, m->start)) {
 		mark(&survey->memory->kinds, m, kind_of(survey, m));
-		if (survey->target->descendant)
+		if (survey->process->descendant)
 			mark(&survey->memory->advised, m, advice_of(m));
 	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
-	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->target, m->start))
+	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->process, m->start))
 		return 0;
 	if (!wiped) {
 		/* One that is too large does not keep small ones from being rolled back. */
@@ -556,7 +556,7 @@ static int find_area(const struct mapping *m, void *arg)
 			survey->left_bytes += m->end - m->start;
 			return 0;
 		}
-		if (has_name(m) && is_others(survey->memory, survey->target, m)) {
+		if (has_name(m) && is_others(survey->memory, survey->process, m)) {
 			survey->others_bytes += m->end - m->start;
 			return 0;
 		}
@@ -606,16 +606,16 @@ static int open_area(pid_t template, struct area *a, struct avc_error *err)
 }
 
 /* Takes `found` for what is there from now on. */
-static int remember(struct target *target, pid_t template, struct areas *found,
+static int remember(struct process *process, pid_t template, struct areas *found,
 		    struct avc_error *err)
 {
-	struct memory *memory = target->memory;
+	struct memory *memory = process->memory;
 	uint64_t wiped = 0;
 
 	areas_close(&memory->areas);
 	memory->areas.count = 0;
 	if (found->too_many)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			    "it has more than %d areas of shared or MADV_WIPEONFORK memory",
 			    AREAS_MAX);
 	for (uint32_t i = 0; i < found->count; i++) {
@@ -629,7 +629,7 @@ static int remember(struct target *target, pid_t template, struct areas *found,
 	if (wiped > WIPED_MAX) {
 		areas_close(&memory->areas);
 		return fail(
-			err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			"%llu kB of its memory are wiped in a clone (MADV_WIPEONFORK), which is too much to copy",
 			(unsigned long long)wiped / 1024);
 	}
@@ -638,13 +638,13 @@ static int remember(struct target *target, pid_t template, struct areas *found,
 
 /* Were the areas that were copied those that there are?  Of the long file only as
  * often as it is worth it, and when the layout has changed. */
-static int check_areas(struct target *target, const struct generation *generation,
+static int check_areas(struct process *process, const struct generation *generation,
 		       struct avc_error *err)
 {
 	static const struct areas none;
-	struct memory *memory = target->memory;
+	struct memory *memory = process->memory;
 	const struct areas *copied = generation->image ? &generation->image->areas : &none;
-	struct survey survey = { .target = target, .limit = target->shm_bytes };
+	struct survey survey = { .process = process, .limit = process->shm_bytes };
 	struct areas *found;
 	uint64_t start = now_ns();
 	int result = 0;
@@ -660,10 +660,10 @@ static int check_areas(struct target *target, const struct generation *generatio
 		return fail_errno(err, 0, "keep memory", "calloc", "out of memory");
 	start = now_ns();
 	survey = (struct survey){
-		.target = target,
+		.process = process,
 		.template = generation->template,
 		.memory = memory,
-		.limit = target->shm_bytes,
+		.limit = process->shm_bytes,
 		.areas = found,
 	};
 	memory->advised.count = memory->kinds.count = 0;
@@ -675,12 +675,12 @@ static int check_areas(struct target *target, const struct generation *generatio
 	memory->left_bytes = survey.left_bytes;
 	memory->others_bytes = survey.others_bytes;
 	if (!result && survey.private_huge)
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "", "%s",
-			      private_huge_pages);
+		result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "", "%s",
+			      memory_private_huge_pages);
 	if (!result && !same_areas(found, copied)) {
-		result = remember(target, generation->template, found, err);
+		result = remember(process, generation->template, found, err);
 		if (!result)
-			result = fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep memory", "",
+			result = fail(err, AVC_RETRY, 0, process->pid, "keep memory", "",
 				      "it has new shared or MADV_WIPEONFORK memory");
 	}
 	memory->layout = result ? 0 : survey.layout;
@@ -689,7 +689,7 @@ out:
 	if (generation->image)
 		generation->image->kinds = memory->kinds;
 	if (!result && generation->image && !generation->image->whole)
-		result = fail(err, AVC_DEADLINE, 0, target->pid, "keep memory", "",
+		result = fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
 			      "its shared memory can not be read");
 	return result;
 }
@@ -697,7 +697,7 @@ out:
 /* ---- when the app runs again ------------------------------------------------------------- */
 
 /* Puts the wiped areas into the template, which is stopped. */
-static int fill_wiped(struct target *target, struct generation *generation, struct setup *setup,
+static int fill_wiped(struct process *process, struct generation *generation, struct setup *setup,
 		      struct avc_error *err)
 {
 	struct inj_call *call = &setup->slot->template_call;
@@ -721,7 +721,7 @@ static int fill_wiped(struct target *target, struct generation *generation, stru
 				  area_bytes(a), MADV_WIPEONFORK, 0, 0);
 		}
 		if (call->count >= INJ_CALLS_MAX || (call->count && i + 1 == image->areas.count)) {
-			if (parasite_send(&target->parasite, generation->template,
+			if (parasite_send(&process->parasite, generation->template,
 					  &generation->base, call, err) ||
 			    parasite_run(generation->template, call, err))
 				result = -1;
@@ -741,9 +741,9 @@ static int find_locked(const struct mapping *m, void *arg)
 
 /* Pages become locked as they are touched (MLOCK_ONFAULT): to bring them all in at once
  * would make a copy of all that memory before the process may run. */
-static void lock_again(struct target *target, int64_t locked_kb, struct setup *setup)
+static void lock_again(struct process *process, int64_t locked_kb, struct setup *setup)
 {
-	struct memory *memory = target->memory;
+	struct memory *memory = process->memory;
 	const uint64_t start = now_ns();
 
 	if (locked_kb == 0)
@@ -755,7 +755,7 @@ static void lock_again(struct target *target, int64_t locked_kb, struct setup *s
 
 		/* Of one that has just died there is nothing to be seen any more; what
 		 * was known of it is right, as a rule. */
-		if (proc_mappings(target->pid, "smaps", find_locked, &found) == 0 && found.count) {
+		if (proc_mappings(process->pid, "smaps", find_locked, &found) == 0 && found.count) {
 			memory->locked = found;
 			memory->locked_kb = locked_kb;
 			memory->locked_layout = memory->layout;
@@ -795,29 +795,29 @@ static void seal_again(const struct memory *memory, struct setup *setup)
 				->flags = INJ_MAY_FAIL;
 }
 
-int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
+int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
-	const struct thread *main_thread = thread_find(target, target->pid);
+	const struct thread *main_thread = thread_find(process, process->pid);
 
-	if (check_areas(target, generation, err) || fill_wiped(target, generation, setup, err))
+	if (check_areas(process, generation, err) || fill_wiped(process, generation, setup, err))
 		return -1;
-	lock_again(target, locked_kb, setup);
-	advise_again(target->memory, setup);
-	if (target->descendant)
-		seal_again(target->memory, setup);
+	lock_again(process, locked_kb, setup);
+	advise_again(process->memory, setup);
+	if (process->descendant)
+		seal_again(process->memory, setup);
 	if (main_thread && main_thread->creds.future_lock)
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
 			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)
 			->flags = INJ_MAY_FAIL;
-	if (target->memory->left_bytes && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+	if (process->memory->left_bytes && !setup->notice.code)
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
-		     (unsigned long long)target->memory->left_bytes / 1024);
-	if (target->memory->others_bytes && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		     (unsigned long long)process->memory->left_bytes / 1024);
+	if (process->memory->others_bytes && !setup->notice.code)
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 		     "%llu kB of shared memory are also others', outside of the container, and are not rolled back",
-		     (unsigned long long)target->memory->others_bytes / 1024);
+		     (unsigned long long)process->memory->others_bytes / 1024);
 	return 0;
 }
 
