@@ -352,6 +352,7 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
+	last_pid_forget();
 	guard_drop_all(guard);
 	process_unhold(&guard->main);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)

@@ -266,6 +266,7 @@ void guard_work_ahead(struct avc_guard *guard)
 	guard->ahead_ns = UINT64_MAX;
 	if (!guard->count)
 		return;
+	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
 	if (drop_old_spare(guard))
 		; /* which has to end first */

@@ -484,11 +484,21 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 
 /* ---- last_pid.c ------------------------------------------------------------------- */
 
-/* Starts a helper task inside the PID namespace; it serves the slot's requests
- * until last_pid_stop().  last_pid_set() is the engine's own request. */
-struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
+/* A slot whose requests the helper serves. */
+struct last_pid_slot {
+	const struct parasite *parasite;
+	uint32_t number;
+};
+/* Starts the helper of the next restore, which waits for it; best effort. */
+void last_pid_prepare(int init_pidfd);
+void last_pid_forget(void);
+/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as the process that
+ * is restored in the first slot asks, or in that of last_pid_serve().  last_pid_set() is the
+ * engine's own request. */
+struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
+				struct avc_error *err);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
-/* From now on those of another slot. */
+/* From now on those of another one of the slots. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 
@@ -498,7 +508,6 @@ struct init_channel {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
-	int pidns_fd;        /* of the container                                 */
 	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
 	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
 };
