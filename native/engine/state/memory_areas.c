@@ -304,7 +304,7 @@ static int remember(struct survey *survey, struct avc_error *err)
 	areas_free(&memory->areas);
 	memory->areas = survey->areas;
 	survey->areas = (struct areas){ 0 };
-	return fail(err, AVC_DEADLINE, EAGAIN, survey->process->pid, "keep memory", "",
+	return fail(err, AVC_RETRY, 0, survey->process->pid, "keep memory", "",
 		    "it has new shared or MADV_WIPEONFORK memory");
 }
 
