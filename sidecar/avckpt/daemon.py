@@ -32,9 +32,10 @@ from avckpt.api.server import ApiServer
 from avckpt.config import Configuration
 from avckpt.containers import cgroup
 from avckpt.containers.listener import HookListener
+from avckpt.containers.looks import in_own_thread
 from avckpt.containers.process import has_ended, is_foreign, pid_of
 from avckpt.containers.protected import Protected
-from avckpt.containers.records import NOT_SEEN, Records
+from avckpt.containers.records import NOT_SEEN, Records, keep_private
 from avckpt.containers.registry import Registry
 from avckpt.engine import Engine, Guard, probe
 from avckpt.errors import (
@@ -441,7 +442,7 @@ class Daemon:
         container = watch.container
         if watch.guard is not None:
             # Blocks for as long as a checkpoint that is under way.
-            await asyncio.get_running_loop().run_in_executor(None, watch.guard.stop)
+            await in_own_thread(watch.guard.stop)
             self._take_events()  # it may just have said how the container ended
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)
@@ -523,6 +524,8 @@ def serve(run_dir: Path, config_path: Path) -> None:
     try:
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
         with only_one(run_dir):
+            for name in ("containers", "health"):
+                keep_private(run_dir / name)
             asyncio.run(Daemon(run_dir, config_path).run())
     except OSError as error:
         kind = Denied if isinstance(error, PermissionError) else AvckptError
