@@ -266,6 +266,7 @@ void guard_work_ahead(struct avc_guard *guard)
 	guard->ahead_ns = UINT64_MAX;
 	if (!guard->count)
 		return;
+	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
 	if (drop_old_spare(guard))
 		; /* which has to end first */
@@ -278,16 +279,15 @@ void guard_work_ahead(struct avc_guard *guard)
 		guard->ahead_ns = now_ns();
 }
 
-static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+static int take_seen(struct avc_guard *guard, struct mem_seen *seen, struct avc_event *event,
+		     struct avc_error *err)
 {
 	struct process *process = &guard->main;
 	struct generation fresh = { .pidfd = -1, .slot = guard_free_slot(guard) };
-	struct mem_seen seen = { 0 };
 	struct freeze_times times;
 	int result;
 
-	if (prepare_files(guard, err) ||
-	    memory_prepare(process->memory, &fresh.image, &seen, err)) {
+	if (prepare_files(guard, err) || memory_prepare(process, &fresh.image, seen, err)) {
 		generation_drop(&fresh);
 		return -1;
 	}
@@ -302,7 +302,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);
 	result = freeze_tree(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
-			     &seen, &times, err);
+			     seen, &times, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
@@ -336,6 +336,15 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	event->quiescent = fresh.quiescent;
 	guard_tend_tree(guard);
 	return 0;
+}
+
+static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	struct mem_seen seen = { 0 };
+	const int result = take_seen(guard, &seen, event, err);
+
+	mem_seen_free(&seen);
+	return result;
 }
 
 /* A limit of processes, or of memory, leaves no room for a template: spares have to go, and

@@ -738,7 +738,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	if (!result && proc_stat(holder, &stat))
 		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
 	if (!result && stat.parent != init)
-		result = fail(err, AVC_DEADLINE, EAGAIN, process->pid, "make holder", "",
+		result = fail(err, AVC_RETRY, 0, process->pid, "make holder", "",
 			      "a process above it adopts orphans now (PR_SET_CHILD_SUBREAPER)");
 	if (holder && keep_holder(process, holder, result, err))
 		result = -1;

@@ -32,7 +32,8 @@ void process_init(struct process *process)
 				     .timers_fd = -1,
 				     .stat_fd = -1,
 				     .statm_fd = -1,
-				     .holder_pidfd = -1 };
+				     .holder_pidfd = -1,
+				     .due_ns = UINT64_MAX };
 }
 
 bool process_make_room(struct process *process)

@@ -6,6 +6,7 @@
  *   stop.c          ... stopped, let go
  *   infect.c        parasite and holder brought into it
  *   support.c       what can not be protected; quiescence
+ *   waits.c         calls that are to be ended
  *   tree.c          all of them
  */
 #ifndef AVCKPT_PROCESS_H
@@ -133,5 +134,11 @@ void tree_sweep(struct tree *tree);
 /* It is gone, or another program: what it had open must not stay open by us. */
 void tree_let_go(struct process *process);
 void tree_free(struct tree *tree);
+
+/* ---- waits.c ---------------------------------------------------------------------- */
+
+/* Ends the calls that were rewound and whose time is up; the next one's is at
+ * process->due_ns (UINT64_MAX: none). */
+void waits_end(struct process *process, timer_t timer);
 
 #endif

@@ -270,6 +270,32 @@ void restore_note(struct process *process, struct generation *image, pid_t pid,
 	attributes_put_back(image->attributes, pid, notes);
 }
 
+/* It serves all processes that ask for numbers: those that are no zombies. */
+static struct last_pid *start_helper(const struct process *process,
+				     const struct generation *generation,
+				     const struct init_channel *channel, struct avc_error *err)
+{
+	struct last_pid_slot *slot = calloc(generation->branches + 1, sizeof *slot);
+	struct last_pid *helper = NULL;
+	uint32_t count = 0;
+
+	if (!slot) {
+		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		return NULL;
+	}
+	slot[count++] = (struct last_pid_slot){ &process->parasite, generation->slot };
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct branch *branch = &generation->branch[i];
+
+		if (branch->process)
+			slot[count++] = (struct last_pid_slot){ &branch->process->parasite,
+								branch->image->slot };
+	}
+	helper = last_pid_start(channel->init_pidfd, slot, count, err);
+	free(slot);
+	return helper;
+}
+
 int restore_app(struct process *process, struct generation *generation,
 		struct init_channel *channel, const struct avc_config *config, timer_t timer,
 		uint64_t died_ns, int (*ready)(void *arg, struct avc_error *err), void *arg,
@@ -277,7 +303,7 @@ int restore_app(struct process *process, struct generation *generation,
 		struct avc_error *err)
 {
 	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
-	struct last_pid *helper = last_pid_start(channel->pidns_fd, slot, err);
+	struct last_pid *helper = start_helper(process, generation, channel, err);
 	struct sandbox *sandbox = NULL;
 	struct restore_tree *others = NULL;
 	struct fd_table *tables = calloc(generation->branches + 1, sizeof *tables);
@@ -322,7 +348,7 @@ int restore_app(struct process *process, struct generation *generation,
 	if (!result)
 		restore_note(process, generation, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, *pid, notes, err);
+		result = memory_put_back(process, generation, *pid, notes, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {

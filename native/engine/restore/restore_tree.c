@@ -563,7 +563,7 @@ static int await_member(struct restore_tree *restored, uint32_t index, struct av
 	if (restore_await(branch->process, branch->image, forked->pid, forked->sandbox, err))
 		return -1;
 	restore_note(branch->process, branch->image, forked->pid, notes);
-	return memory_put_back(branch->image->image, forked->pid, notes, err);
+	return memory_put_back(branch->process, branch->image, forked->pid, notes, err);
 }
 
 /* It asks nothing of us while it puts itself together: no numbers for threads, no

@@ -29,7 +29,7 @@
 void init_channel_init(struct init_channel *channel)
 {
 	*channel = (struct init_channel){
-		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .pidns_fd = -1
+		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1
 	};
 }
 
@@ -146,8 +146,7 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 			ctl->version, (unsigned int)AVC_CTL_VERSION);
 	channel->report_fd = open_pipe_of(channel, ctl->report_fd, O_RDONLY);
 	channel->verdict_fd = open_pipe_of(channel, ctl->verdict_fd, O_WRONLY);
-	channel->pidns_fd = proc_open(channel->init, "ns/pid", O_RDONLY);
-	if (channel->report_fd < 0 || channel->verdict_fd < 0 || channel->pidns_fd < 0)
+	if (channel->report_fd < 0 || channel->verdict_fd < 0)
 		return fail_errno(err, channel->init, "attach", "open(fd)",
 				  "its pipes can not be opened");
 	channel->init_inside = ctl->init_pid;
@@ -192,7 +191,6 @@ void init_channel_close(struct init_channel *channel)
 	close_fd(&channel->ctl_fd); /* lets the lock go */
 	close_fd(&channel->report_fd);
 	close_fd(&channel->verdict_fd);
-	close_fd(&channel->pidns_fd);
 }
 
 pid_t init_channel_app(const struct init_channel *channel)

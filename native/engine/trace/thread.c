@@ -27,11 +27,7 @@ struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *
 		return NULL;
 	}
 	t = &process->threads[process->thread_count++];
-	*t = (struct thread){ .tid = tid,
-			      .call.nr = -1,
-			      .rewound = { .nr = -1, .argument = -1 },
-			      .timeout_cell = -1,
-			      .block = -1 };
+	*t = (struct thread){ .tid = tid, .call.nr = -1, .block = -1 };
 	return t;
 }
 
@@ -42,8 +38,6 @@ void threads_forget_unseen(struct process *process)
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (process->threads[i].seen || process->threads[i].attached)
 			process->threads[kept++] = process->threads[i];
-		else
-			rewind_forget(process, &process->threads[i]);
 	process->thread_count = kept;
 }
 

@@ -36,15 +36,13 @@ struct call {
 	uint64_t arg[3];
 };
 
-/* What is remembered of an interrupted call between two stops (rewind.c). */
+/* What is remembered of a call that was rewound (rewind.c). */
 struct rewound {
-	long nr; /* -1: nothing                                      */
-	avc_remote pc, sp;
-	int argument;      /* which one is the timeout, -1: none was changed   */
-	uint64_t original; /* that argument as the app passed it               */
-	uint64_t value;    /* and as we left it                                */
-	uint64_t at_ns;
-	uint64_t limit_ns; /* of a socket: how long the call may take          */
+	uint32_t mark; /* of that call; 0: none                            */
+	int answer;    /* when its time is up                              */
+	uint64_t due_ns;
+	uint64_t runs;            /* how often the thread had run when it was waiting again */
+	bool runs_known, waiting; /* waits.c                                        */
 };
 
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
@@ -110,7 +108,6 @@ struct thread {
 	char name[16];
 	struct creds creds;
 	struct scheduling scheduling; /* at this freeze                         */
-	int timeout_cell;             /* of inj_control.timeout, -1: none                 */
 	struct call call;
 	struct rewound rewound;
 	uint64_t stopped_ns;
@@ -150,7 +147,7 @@ struct process {
 	int holder_pidfd;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
-	uint64_t cells_used; /* bit mask over inj_control.timeout               */
+	uint64_t due_ns; /* when the first of its calls is to be ended (waits.c)   */
 	uint64_t nonce;
 	/* Parasites that a guard which died left behind; they go with the second
 	 * checkpoint, when no thread can be in them any more. */
@@ -174,9 +171,10 @@ struct process {
 	struct pending *pending;
 	struct timers *timers;
 	struct memory *memory;
-	uint64_t shm_bytes;     /* shared memory that is rolled back, at most       */
-	uint32_t plain_filters; /* seccomp filters of init: the container's        */
-	pid_t init;             /* avckpt-init                                      */
+	struct mem_others *others; /* of the main one, and so of all             */
+	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
+	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
+	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool tcp_moved;    /* bytes of connections are to be counted           */
@@ -298,14 +296,13 @@ int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 /* ---- rewind.c --------------------------------------------------------------------- */
 
 /* A thread that just stopped: remembers which call it is in.  If that was only interrupted
- * by us, the thread is set to make it again, with what is left of its timeout. */
+ * by us, the thread is set to make it again, or, when the call's time is up, to answer that. */
 void rewind_call(struct process *process, struct thread *thread);
 /* Just before it goes on: takes off what the stop has added to a wait. */
 void rewind_count_stop(const struct process *process, const struct thread *thread);
-/* Registers as the app had them, before rewind_call() changed a timeout or the
- * kernel made restart_syscall(2) of the call. */
+/* Registers as the app had them, before rewind_call() marked the call or the kernel made
+ * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
-void rewind_forget(struct process *process, struct thread *thread);
 
 /* ---- parasite.c ------------------------------------------------------------------- */
 
@@ -487,11 +484,21 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 
 /* ---- last_pid.c ------------------------------------------------------------------- */
 
-/* Starts a helper task inside the PID namespace; it serves the slot's requests
- * until last_pid_stop().  last_pid_set() is the engine's own request. */
-struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
+/* A slot whose requests the helper serves. */
+struct last_pid_slot {
+	const struct parasite *parasite;
+	uint32_t number;
+};
+/* Starts the helper of the next restore, which waits for it; best effort. */
+void last_pid_prepare(int init_pidfd);
+void last_pid_forget(void);
+/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as the process that
+ * is restored in the first slot asks, or in that of last_pid_serve().  last_pid_set() is the
+ * engine's own request. */
+struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
+				struct avc_error *err);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
-/* From now on those of another slot. */
+/* From now on those of another one of the slots. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 
@@ -501,7 +508,6 @@ struct init_channel {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
-	int pidns_fd;        /* of the container                                 */
 	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
 	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
 };
