@@ -7,8 +7,10 @@ import os
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS
-from native.guarded import GuardProcess, Victim, children_of, config
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import SLOWNESS
+from testkit.procfs import children_of
 
 CHILDREN = 40
 PATIENCE_S = 30.0 * SLOWNESS
