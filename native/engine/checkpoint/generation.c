@@ -49,9 +49,7 @@ static int quieten(struct target *target, struct generation *generation,
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
-			  PTRACE_O_SUSPEND_SECCOMP)) ||
+	if (parasite_own(&target->parasite, pid) ||
 	    arch_regs_get(pid, &generation->base))
 		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
 	memset(call->out, 0, sizeof call->out);
@@ -187,6 +185,8 @@ static int fill_slot(struct target *target, struct generation *generation,
 		fill_ended(target, generation);
 	generation->sandboxed = status.seccomp == 1 ||
 				status.seccomp_filters > target->plain_filters;
+	if (status.seccomp == 1)
+		target->parasite.seccomp = SECCOMP_SUPERVISED;
 	if (memory_finish(target, generation, status.locked_kb, &setup, err))
 		return -1;
 	pending_setup(target, &setup);

@@ -147,25 +147,23 @@ static int step_failed(const struct stop *stop, pid_t tid, struct avc_error *err
  * between: job control, or SIGSTOP, which can not be blocked. */
 static int step(pid_t tid, struct stop *stop, struct avc_error *err)
 {
-	*stop = (struct stop){ .kind = STOP_NONE };
-	while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK) {
-		if (ptrace(PTRACE_SYSCALL, tid, NULL,
-			   (long)(stop->kind == STOP_SIGNAL ? stop->signal : 0)))
+	do {
+		if (seccomp_go_on(tid, stop))
 			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
 		*stop = tracee_wait(tid, 0);
 		if (stop->kind == STOP_EXIT || stop->kind == STOP_DYING ||
 		    stop->kind == STOP_DEADLINE)
 			return step_failed(stop, tid, err);
-	}
+	} while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK);
 	return 0;
 }
 
-/* To the exit from a call `nr` that will not be made again.  1: on the way it has brought forth
- * *child. */
+/* From stop to stop, to the exit from a call `nr` that will not be made again.  1: on the way it
+ * has brought forth *child. */
 static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_error *err)
 {
+	struct stop stop = { .kind = STOP_OTHER };
 	struct arch_regs regs;
-	struct stop stop;
 
 	for (;;) {
 		if (step(tid, &stop, err))
@@ -205,9 +203,8 @@ static int make_porter(struct target *target, struct thread *thread, struct port
 	int born;
 
 	arch_stub_call(&regs, &thread->regs, porter->cave, SYS_clone, arg);
-	if (suspend_seccomp(thread, err))
-		return -1;
-	if (arch_regs_set(thread->tid, &regs) ||
+	if (seccomp_supervise(thread->tid, target->inside, (long)TRACE_OPTIONS_APP) ||
+	    arch_regs_set(thread->tid, &regs) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
@@ -228,7 +225,8 @@ static int make_porter(struct target *target, struct thread *thread, struct port
 	}
 	if (tracee_await(porter->pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS))
+	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    seccomp_supervise(porter->pid, 0, (long)TRACE_OPTIONS_OURS))
 		return fail_errno(err, porter->pid, "infect", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -401,6 +399,7 @@ static int make_pad(struct target *target, struct thread *thread, avc_remote cav
 		result = bring_parasite(target, &porter, err);
 	if (porter.pid) {
 		tracee_kill(porter.pid);
+		seccomp_let_be(porter.pid);
 		if (leave_stub(thread, err))
 			result = -1;
 	}
@@ -448,6 +447,7 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 	while (threads_max < threads)
 		threads_max *= 2;
 	parasite_close(&target->parasite);
+	target->parasite.inside = target->inside;
 	memory_forget(target->memory);
 	if (getrandom(&target->nonce, sizeof target->nonce, 0) < 0)
 		return fail_errno(err, 0, "infect", "getrandom", "no random number");
@@ -657,8 +657,7 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(holder, &base))
+	if (parasite_own(&target->parasite, holder) || arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
@@ -678,7 +677,7 @@ static int clone_by(struct target *target, pid_t tid, const struct arch_regs *ba
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(&target->parasite, *child))
 		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -719,7 +718,7 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||
-	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    parasite_own(&target->parasite, between) ||
 	    arch_regs_get(between, &target->holder_base))
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
