@@ -12,7 +12,6 @@
  * for the first checkpoint, and supervised from then on.
  */
 #include <errno.h>
-#include <linux/audit.h>
 #include <linux/filter.h>
 #include <linux/seccomp.h>
 #include <sched.h>
@@ -101,7 +100,6 @@ static const struct kind wanted[] = {
 	{ SYS_dup3, ANY },
 	{ SYS_fcntl, ANY },
 	{ SYS_epoll_ctl, ANY },
-	{ SYS_signalfd4, ANY },
 	{ SYS_pidfd_open, ANY },
 	{ SYS_socketpair, ANY },
 	{ SYS_recvmsg, ANY },
@@ -135,6 +133,15 @@ static const struct kind wanted_to_restore[] = {
 	{ SYS_timer_create, ANY },
 	{ SYS_timer_settime, ANY },
 	{ SYS_timer_delete, ANY },
+	{ SYS_mlock2, ANY },
+	{ SYS_listen, ANY },
+	{ SYS_ioctl, ANY }, /* TIOCSPGRP, TIOCSCTTY                            */
+	{ SYS_umask, ANY },
+	{ SYS_fchdir, ANY },
+	{ SYS_rt_sigtimedwait, ANY },
+	{ SYS_pkey_alloc, ANY },
+	{ SYS_pkey_free, ANY },
+	{ SYS_pkey_mprotect, ANY },
 };
 
 #define COUNT(array) (sizeof(array) / sizeof *(array))
@@ -155,7 +162,7 @@ static bool load(uint32_t at, long nr, uint64_t arg, uint32_t *value)
 	if (at == offsetof(struct seccomp_data, nr))
 		*value = (uint32_t)nr;
 	else if (at == offsetof(struct seccomp_data, arch))
-		*value = AUDIT_ARCH_X86_64;
+		*value = ARCH_AUDIT;
 	else if (arg != ANY && at == offsetof(struct seccomp_data, args))
 		*value = (uint32_t)arg;
 	else if (arg != ANY && at == offsetof(struct seccomp_data, args) + 4)
@@ -306,9 +313,13 @@ int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_w
 			*way = SECCOMP_SUPERVISED;
 			return 0;
 		}
+	if (errno != ENOENT && errno != EINVAL && errno != EMEDIUMTYPE)
+		return -1;
 	*known = i;
-	*way = i ? SECCOMP_IN_FORCE : SECCOMP_NONE;
-	return errno == ENOENT || errno == EINVAL ? 0 : -1;
+	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it can not be read */
+	       : i                  ? SECCOMP_IN_FORCE
+				    : SECCOMP_NONE;
+	return 0;
 }
 
 /* ---- supervision ---------------------------------------------------------------------------- */
@@ -380,7 +391,11 @@ static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 	    !is_among(wanted_to_restore, COUNT(wanted_to_restore), nr, arg))
 		return false;
 	switch (nr) {
+	case SYS_ioctl:
+		return arch_syscall_arg(regs, 1) == TIOCSPGRP ||
+		       arch_syscall_arg(regs, 1) == TIOCSCTTY;
 	case SYS_mmap:
+	case SYS_pkey_mprotect:
 	case SYS_mprotect: /* new code is for the porter to bring (infect.c) */
 		return !inside || !(arch_syscall_arg(regs, 2) & PROT_EXEC);
 	case SYS_rt_sigqueueinfo:
