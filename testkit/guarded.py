@@ -9,6 +9,7 @@ import json
 import os
 import random
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -69,7 +70,7 @@ class GuardProcess:
         self._tickets = 0
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.wait("started")
+        self.guards: list[int] = self.wait("started")["guards"]
 
     def __enter__(self) -> GuardProcess:
         return self
@@ -86,10 +87,21 @@ class GuardProcess:
 
     @property
     def pid(self) -> int:
-        return self.process.pid
+        """The (first) guard."""
+        return self.guards[0]
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """SIGKILL for the guards, then for the process that started them; returns when they are gone."""
+        pidfds = []
+        for pid in self.guards:
+            with contextlib.suppress(ProcessLookupError):
+                pidfds.append(os.pidfd_open(pid))
+        for pidfd in pidfds:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+        for pidfd in pidfds:
+            select.select([pidfd], [], [], PATIENCE_S)
+            os.close(pidfd)
         self.process.kill()
         self.process.wait()
 

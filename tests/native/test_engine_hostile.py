@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.fake_init import FOLLY, FAKE_INIT
+from testkit.fake_init import FAKE_INIT, FOLLY
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import wait_until
 
@@ -122,7 +122,8 @@ def test_what_init_shows_is_looked_at_first(tmp_path: Path, kind: str) -> None:
         subprocess.Popen([sys.executable, FAKE_INIT, kind], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as init,
         Victim("idle 1 1", tmp_path) as peaceful,
     ):
-        assert init.stdin and init.stdout
+        assert init.stdin is not None
+        assert init.stdout is not None
         assert init.stdout.readline() == b"ready\n"
         with GuardProcess(config(0.02), [init.pid, peaceful.pid]) as guard:
             honest = kind == "honest"

@@ -11,6 +11,7 @@
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
  *   proc.c          /proc
+ *   pagemap.c       which pages of a process are there
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
  */
@@ -182,6 +183,26 @@ bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
+
+/* ---- pagemap.c ------------------------------------------------------------------------ */
+
+/* An entry, of one page. */
+#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
+#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
+#define PAGEMAP_FILE (UINT64_C(1) << 61)
+#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
+#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
+/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE (Linux 6.13); the headers may be older. */
+#define GUARD_INSTALL 102
+#define GUARD_REMOVE 103
+
+/* A guard page without a mapping of its own (madvise(2)); one of the process's own. */
+bool page_is_guard(uint64_t entry);
+bool page_is_own(uint64_t entry);
+/* Calls fn for every stretch in which there are pages of no file, or guard pages; for all of it
+ * if the kernel cannot tell (before Linux 6.7).  Stops when fn does not return 0.  0 or -1. */
+int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
+		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
 
 /* ---- rt_priority.c -------------------------------------------------------------------- */
 

@@ -38,7 +38,7 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 /* What stays where it is whatever happens; where our parasite is nothing else is touched. */
 static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
 {
-	return mapping_is_special(m) || parasite_contains(&r->target->parasite, address);
+	return mapping_is_special(m) || parasite_contains(&r->process->parasite, address);
 }
 
 static const struct mapping *at(const struct mappings *maps, uint32_t *next, avc_remote address)
@@ -103,38 +103,16 @@ const struct mapping *mappings_find(const struct mappings *maps, const char *nam
 
 /* ---- pages -------------------------------------------------------------------------- */
 
-#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
-#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
-#define PAGEMAP_FILE (UINT64_C(1) << 61)
-#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
-#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
-/* Where it stands in the page table: a swap entry of the last type, which is none, with
- * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
-#define GUARD_MARKER (UINT64_C(4) << 5 | 31)
-
-/* A guard page without a mapping of its own (madvise(2), Linux 6.13). */
-static bool is_guard(uint64_t frame)
-{
-	return frame & PAGEMAP_GUARD ||
-	       (frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED | PAGEMAP_FRAME)) ==
-		       (PAGEMAP_SWAPPED | GUARD_MARKER);
-}
-
-static bool is_own(uint64_t frame)
-{
-	return frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(frame & PAGEMAP_FILE);
-}
-
 /* Of a private mapping.  What is of a file is there by itself. */
 static enum page compare(uint64_t want, uint64_t is)
 {
-	if (is_guard(want))
-		return is_guard(is) ? PAGE_SAME : PAGE_GUARD;
-	if (is_guard(is))
-		return is_own(want) ? PAGE_OPEN_COPY : PAGE_OPEN;
-	if (!is_own(want))
-		return is_own(is) ? PAGE_DROP : PAGE_SAME;
-	if (is_own(is) && want & PAGEMAP_FRAME &&
+	if (page_is_guard(want))
+		return page_is_guard(is) ? PAGE_SAME : PAGE_GUARD;
+	if (page_is_guard(is))
+		return page_is_own(want) ? PAGE_OPEN_COPY : PAGE_OPEN;
+	if (!page_is_own(want))
+		return page_is_own(is) ? PAGE_DROP : PAGE_SAME;
+	if (page_is_own(is) && want & PAGEMAP_FRAME &&
 	    !((want ^ is) & (PAGEMAP_FRAME | PAGEMAP_PRESENT | PAGEMAP_SWAPPED)))
 		return PAGE_SAME;
 	return PAGE_COPY;
@@ -187,7 +165,7 @@ static int compare_piece(struct remap *r, const struct piece *piece, struct avc_
 
 /* ---- all of it ----------------------------------------------------------------------- */
 
-struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
+struct remap *remap_plan(const struct process *process, struct snapshot *want, struct snapshot *is,
 			 struct avc_error *err)
 {
 	struct remap *r = calloc(1, sizeof *r);
@@ -196,7 +174,7 @@ struct remap *remap_plan(const struct target *target, struct snapshot *want, str
 		fail_errno(err, 0, "restore memory", "calloc", "out of memory");
 		return NULL;
 	}
-	*r = (struct remap){ .target = target, .want = want, .is = is };
+	*r = (struct remap){ .process = process, .want = want, .is = is };
 	if (cut(r, err))
 		goto failed;
 	for (uint32_t i = 0; i < r->pieces; i++) {
@@ -223,29 +201,29 @@ static bool is_lost(const struct piece *piece)
 	return piece->want && piece->want->flags & MAPPING_ONLY_HERE && !piece->kept;
 }
 
-int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
+int remap_check(const struct process *process, struct snapshot *want, struct snapshot *is,
 		struct avc_error *err)
 {
-	struct remap r = { .target = target, .want = want, .is = is };
+	struct remap r = { .process = process, .want = want, .is = is };
 	const struct mapping *a = mappings_find(&is->maps, "[vdso]");
 	const struct mapping *b = mappings_find(&want->maps, "[vdso]");
 	int result = cut(&r, err);
 
 	if (!result && a && b && a->flags & MAPPING_SEALED && a->start != b->start)
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			      "process %d has executed another program, and the kernel seals its "
 			      "vDSO (mseal(2))",
-			      target->inside);
+			      process->inside);
 	for (uint32_t i = 0; !result && i < r.pieces; i++) {
 		if (is_lost(&r.piece[i]))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 				      "process %d has mapped what no other process can map: %s",
-				      target->inside, r.piece[i].want->name);
+				      process->inside, r.piece[i].want->name);
 		else if (is_stuck(&r.piece[i]))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 				      "process %d has other memory than its parent where that has "
 				      "sealed it (mseal(2))",
-				      target->inside);
+				      process->inside);
 	}
 	free(r.piece);
 	return result;

@@ -29,14 +29,14 @@
 void init_channel_init(struct init_channel *channel)
 {
 	*channel = (struct init_channel){
-		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .pidns_fd = -1
+		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1
 	};
 }
 
 /* init's descriptor number of the control page, or -1. */
 static int find_ctl(pid_t init)
 {
-	char path[64], target[64];
+	char path[64], process[64];
 	struct dirent *entry;
 	int found = -1;
 	DIR *dir;
@@ -46,12 +46,12 @@ static int find_ctl(pid_t init)
 	if (!dir)
 		return -1;
 	while (found < 0 && (entry = readdir(dir))) {
-		ssize_t n = readlinkat(dirfd(dir), entry->d_name, target, sizeof target - 1);
+		ssize_t n = readlinkat(dirfd(dir), entry->d_name, process, sizeof process - 1);
 
 		if (n <= 0)
 			continue;
-		target[n] = 0;
-		if (!strcmp(target, "/memfd:" AVC_CTL_NAME " (deleted)"))
+		process[n] = 0;
+		if (!strcmp(process, "/memfd:" AVC_CTL_NAME " (deleted)"))
 			found = atoi(entry->d_name);
 	}
 	closedir(dir);
@@ -146,8 +146,7 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 			ctl->version, (unsigned int)AVC_CTL_VERSION);
 	channel->report_fd = open_pipe_of(channel, ctl->report_fd, O_RDONLY);
 	channel->verdict_fd = open_pipe_of(channel, ctl->verdict_fd, O_WRONLY);
-	channel->pidns_fd = proc_open(channel->init, "ns/pid", O_RDONLY);
-	if (channel->report_fd < 0 || channel->verdict_fd < 0 || channel->pidns_fd < 0)
+	if (channel->report_fd < 0 || channel->verdict_fd < 0)
 		return fail_errno(err, channel->init, "attach", "open(fd)",
 				  "its pipes can not be opened");
 	channel->init_inside = ctl->init_pid;
@@ -192,7 +191,6 @@ void init_channel_close(struct init_channel *channel)
 	close_fd(&channel->ctl_fd); /* lets the lock go */
 	close_fd(&channel->report_fd);
 	close_fd(&channel->verdict_fd);
-	close_fd(&channel->pidns_fd);
 }
 
 pid_t init_channel_app(const struct init_channel *channel)

@@ -312,7 +312,7 @@ static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_erro
 		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
 	if (tracee_await(tid, NULL, err) != STOP_TRAP)
 		return -1;
-	return fail(err, AVC_KERNEL, (int)-result, tid, "clone", "clone",
+	return fail(err, AVC_LIMIT, (int)-result, tid, "clone", "clone",
 		    "it may not have another process: %s", strerror((int)-result));
 }
 
@@ -361,10 +361,10 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 	return parasite_await_clone(tid, call, child, err);
 }
 
-bool in_old_parasite(const struct target *target, avc_remote address)
+bool parasite_is_old(const struct process *process, avc_remote address)
 {
-	for (uint32_t i = 0; i < target->old_parasites; i++)
-		if (address - target->old_parasite[i].base < target->old_parasite[i].bytes)
+	for (uint32_t i = 0; i < process->old_parasites; i++)
+		if (address - process->old_parasite[i].base < process->old_parasite[i].bytes)
 			return true;
 	return false;
 }
@@ -381,13 +381,13 @@ int parasite_own(const struct parasite *parasite, pid_t tid)
 }
 
 /* How the thread is going to be let run: it is borrowed next. */
-static int look_at_seccomp(struct target *target, struct thread *thread, struct avc_error *err)
+static int look_at_seccomp(struct process *process, struct thread *thread, struct avc_error *err)
 {
-	struct parasite *parasite = &target->parasite;
+	struct parasite *parasite = &process->parasite;
 
 	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as a checkpoint has found */
 		thread->seccomp = SECCOMP_SUPERVISED;
-	if (seccomp_look(thread->tid, target->plain_filters, &thread->filters_known,
+	if (seccomp_look(thread->tid, process->plain_filters, &thread->filters_known,
 			 &thread->seccomp))
 		return fail_errno(err, thread->tid, "run injected code",
 				  "ptrace(SECCOMP_GET_FILTER)", "its filters can not be read");
@@ -398,9 +398,9 @@ static int look_at_seccomp(struct target *target, struct thread *thread, struct 
 	return 0;
 }
 
-int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
+int parasite_check(struct process *process, pid_t tid, struct avc_error *err)
 {
-	const avc_remote at = target->parasite.base + INJ_CODE_BYTES +
+	const avc_remote at = process->parasite.base + INJ_CODE_BYTES +
 			      offsetof(struct inj_control, nonce);
 	long nonce;
 
@@ -408,8 +408,8 @@ int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
 	nonce = ptrace(PTRACE_PEEKDATA, tid, (void *)at, NULL);
 	if (errno == ESRCH)
 		return fail_errno(err, tid, "stop", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
+	if (errno || (uint64_t)nonce != process->nonce) {
+		process->infected = false;
 		return fail(err, AVC_DEADLINE, 0, tid, "stop", "",
 			    "it has executed another program");
 	}
@@ -417,37 +417,37 @@ int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
 }
 
 /* A holder has the memory of the program that it was made in. */
-static bool has_memory_of_holder(const struct target *target)
+static bool has_memory_of_holder(const struct process *process)
 {
-	return target->holder && proc_same_memory(target->pid, target->holder);
+	return process->holder && proc_same_memory(process->pid, process->holder);
 }
 
-int vet(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_vet(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	if (thread_check_dispatch(thread->tid, err))
 		return -1;
-	if (!has_memory_of_holder(target) && parasite_check(target, thread->tid, err))
+	if (!has_memory_of_holder(process) && parasite_check(process, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a parasite that will be taken away. */
-	if (in_old_parasite(target, arch_pc(&thread->regs)))
+	if (parasite_is_old(process, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
 			    "still on its way home from a guard that died");
 	/* The kernel forgets a restartable sequence as soon as the thread is
 	 * seen elsewhere: it has to go on where the kernel would send it.  There
 	 * are no system calls in one. */
 	if (thread->call.nr < 0)
-		rseq_fixup(target->mem_fd, thread);
+		thread_fix_rseq(process->mem_fd, thread);
 	thread->vetted = true;
 	return 0;
 }
 
-int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_borrow(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
-	struct inj_control *control = target->parasite.control;
+	struct inj_control *control = process->parasite.control;
 	struct arch_regs home;
 
-	if (!thread->vetted && vet(target, thread, err))
+	if (!thread->vetted && thread_vet(process, thread, err))
 		return -1;
 	home = thread->regs;
 	arch_resume(&home);
@@ -455,18 +455,18 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 	/* Registers first: if we die between the two, the thread is in the parasite
 	 * with its own mask and goes home with it.  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
-	if (look_at_seccomp(target, thread, err) ||
-	    send_in(&target->parasite, thread->tid, false, &thread->regs, &control->runner, err))
+	if (look_at_seccomp(process, thread, err) ||
+	    send_in(&process->parasite, thread->tid, false, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
-	thread->borrowed_for = &target->parasite;
+	thread->borrowed_for = &process->parasite;
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
 				  "it has gone");
 	return 0;
 }
 
-int give_back(struct thread *thread, struct avc_error *err)
+int thread_give_back(struct thread *thread, struct avc_error *err)
 {
 	struct arch_regs now;
 
@@ -476,7 +476,7 @@ int give_back(struct thread *thread, struct avc_error *err)
 	 * has gone home by itself, and its registers are newer than those that we know. */
 	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
 		thread->borrowed = false;
-		return fail(err, AVC_DEADLINE, EAGAIN, thread->tid, "give back", "",
+		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}
 	/* The mask first, for the same reason. */

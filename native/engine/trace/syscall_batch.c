@@ -291,10 +291,10 @@ int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *er
 }
 
 /* From its parent's parasite into its own. */
-int syscall_batch_change_parasite(struct syscall_batch *batch, const struct target *target,
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
 				  uint32_t slot, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
+	const struct parasite *parasite = &process->parasite;
 
 	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;

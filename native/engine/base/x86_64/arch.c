@@ -43,6 +43,15 @@ int arch_result_set(pid_t tid, long result)
 	return r == -1 ? -1 : 0;
 }
 
+int arch_call_mark_set(pid_t tid, struct arch_regs *regs, uint32_t mark)
+{
+	regs->r.orig_rax = (uint64_t)mark << 32 | (uint32_t)regs->r.orig_rax;
+	return ptrace(PTRACE_POKEUSER, tid, offsetof(struct user, regs.orig_rax),
+		      regs->r.orig_rax) == -1
+		       ? -1
+		       : 0;
+}
+
 uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned int n)
 {
 	const struct user_regs_struct *r = &regs->r;
