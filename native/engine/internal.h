@@ -170,6 +170,15 @@ int mapping_protection(const struct mapping *m);
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
+
 /* What is of interest in /proc/PID/status. */
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
@@ -208,6 +217,12 @@ struct rewound {
 	uint64_t due_ns;
 	uint64_t runs; /* how often the thread had run when it was waiting again */
 	bool runs_known, waiting; /* waits.c                                        */
+};
+
+/* A thread that slept, as far as one can tell from outside, just before it was stopped. */
+struct sleeper {
+	bool known;
+	struct proc_sched sched;
 };
 
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
@@ -275,6 +290,7 @@ struct thread {
 	struct scheduling scheduling; /* at this freeze                         */
 	struct call call;
 	struct rewound rewound;
+	struct sleeper sleeper;
 	uint64_t stopped_ns;
 	bool signalled; /* was just about to run a handler                  */
 };
@@ -1203,8 +1219,14 @@ void rewind_count_stop(const struct target *target, const struct thread *thread)
  * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
 
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
+
 /* ---- waits.c ---------------------------------------------------------------------- */
 
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct target *target);
 /* Ends the calls that were rewound and whose time is up; the next one's is at
  * target->due_ns (UINT64_MAX: none). */
 void waits_end(struct target *target, timer_t timer);

@@ -296,6 +296,10 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 			touch_slot(&guard->tree.kin[i].target->parasite, fresh.slot,
 				   guard->tree.kin[i].target->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
+	waits_prepare(target);
+	for (uint32_t i = 1; i < guard->tree.count; i++)
+		if (guard->tree.kin[i].target)
+			waits_prepare(guard->tree.kin[i].target);
 	/* What is written between here and the freeze counts as written after it. */
 	note_written(guard);
 	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh, &seen,

@@ -242,6 +242,7 @@ static struct thread *stop_main(struct target *target, struct avc_error *err)
 		return NULL;
 	}
 	t->seen = true;
+	rewind_prepare(t);
 	if (thread_stop(target, t, err) || thread_await(target, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;

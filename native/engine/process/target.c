@@ -638,6 +638,7 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 			again += !t->young;
 		}
 		tracee_deadline_set(timer, deadline_ns);
+		rewind_prepare(t);
 		if (thread_stop(target, t, &gone) || thread_await(target, t, &gone) ||
 		    check_unshared(target, t, &gone) || ask(target, t, &gone))
 			t->known = false;
