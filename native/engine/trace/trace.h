@@ -45,6 +45,12 @@ struct rewound {
 	bool runs_known, waiting; /* waits.c                                        */
 };
 
+/* A thread that slept, as far as one can tell from outside, just before it was stopped. */
+struct sleeper {
+	bool known;
+	struct proc_sched sched;
+};
+
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
 struct scheduling {
 	uint8_t attr[48] __attribute__((aligned(8)));
@@ -119,6 +125,7 @@ struct thread {
 	struct scheduling scheduling; /* at this freeze                         */
 	struct call call;
 	struct rewound rewound;
+	struct sleeper sleeper;
 	uint64_t stopped_ns;
 	bool signalled; /* was just about to run a handler                  */
 };
@@ -314,6 +321,9 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 /* Registers as the app had them, before rewind_call() marked the call or the kernel made
  * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
 
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
