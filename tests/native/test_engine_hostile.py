@@ -93,6 +93,28 @@ def test_the_code_can_not_be_written(tmp_path: Path) -> None:
         hostile.wait_beats(3)
 
 
+@pytest.mark.parametrize("filters", ["", "--little"])
+@pytest.mark.parametrize("where", ["lists", "code", "setup"])
+def test_a_seccomp_filter_holds_for_what_runs_in_it(tmp_path: Path, where: str, filters: str) -> None:
+    """Code of ours that the application changes makes no call that the application's own filter refuses."""
+    folder = tmp_path / "smuggled"
+    with (
+        Victim(f"smuggle {where} {folder} {filters}", tmp_path) as hostile,
+        Victim("idle 1 1", tmp_path) as peaceful,
+        GuardProcess(config(0.02), [hostile.pid, peaceful.pid]) as guard,
+    ):
+        wait_until(lambda: hostile.see().counter[0], 15, "the application has found the parasite")
+        if where == "setup":
+            guard.wait("checkpoint", cookie=1, since=guard.mark(), count=4)
+            hostile.kill_app()
+            guard.wait("restored", cookie=1)
+        wait_until(lambda: hostile.see().counter[1] or folder.exists(), 15, "the call was made, and refused")
+        assert not folder.exists()
+        assert not lost(guard)
+        guard.wait("checkpoint", cookie=2, since=guard.mark(), count=3)
+        peaceful.wait_beats(3)
+
+
 @pytest.mark.parametrize("kind", FOLLY)
 def test_what_init_shows_is_looked_at_first(tmp_path: Path, kind: str) -> None:
     """Whoever runs in init's place has the guard open and map what it may open and map itself, and nothing else."""

@@ -137,6 +137,8 @@ void tree_free(struct tree *tree);
 
 /* ---- waits.c ---------------------------------------------------------------------- */
 
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct process *process);
 /* Ends the calls that were rewound and whose time is up; the next one's is at
  * process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);
