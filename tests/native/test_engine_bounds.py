@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS
-from native.guarded import GuardProcess, Victim, children_of, config
+
+from testkit.guarded import GuardProcess, Victim, children_of, config
+from testkit.harness import SLOWNESS
 
 CHILDREN = 40
 PATIENCE_S = 30.0 * SLOWNESS

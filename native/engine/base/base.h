@@ -157,12 +157,15 @@ int mapping_protection(const struct mapping *m);
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
 /* What is of interest in /proc/PID/status. */
+#define STATUS_GROUPS 64
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
 	pid_t tracer;            /* a thread, in our namespace; 0: none              */
 	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
+	int group_count;         /* supplementary; those beyond are not known   */
+	uint32_t groups[STATUS_GROUPS];
 	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
