@@ -46,7 +46,7 @@ def probe() -> None:
 
 
 class Guard:
-    """The process that protects one container.  Made by `Engine.start_guard()`; `stop()` it before the engine is closed."""
+    """The process that protects one container.  Made by `Engine.start_guard()`, ended by `stop()`."""
 
     def __init__(self, guard: Any, engine: Engine) -> None:
         self._guard = guard

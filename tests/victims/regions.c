@@ -417,8 +417,8 @@ static void wiped_verify(void)
 	for (int i = 0; i < GUARDED_PAGES; i++) {
 		const bool guard = i >= GUARD && i < GUARD + GUARDS;
 
-		CHECK(is_readable(at + i * PAGE) == !guard, "page %d is a guard no more, or is one now",
-		      i);
+		CHECK(is_readable(at + i * PAGE) == !guard,
+		      "page %d is a guard no more, or is one now", i);
 		CHECK(guard || at[i * PAGE] == 7, "page %d holds %d", i, at[i * PAGE]);
 	}
 	must(!mprotect(at, PAGE, PROT_NONE), "mprotect");

@@ -175,7 +175,9 @@ int proc_status(pid_t tid, struct proc_status *status);
 /* "/proc/PID/NAME" opened, or -1 with errno. */
 int proc_open(pid_t pid, const char *name, int flags);
 /* What is mapped there (proc(5), map_files), or -1 with errno.  Needs CAP_CHECKPOINT_RESTORE or
- * CAP_SYS_ADMIN. */
+ * CAP_SYS_ADMIN.  For writing only of who stands still, with all that share its memory (a template):
+ * another could map something else meanwhile, which it may only read; and only if it was open for
+ * writing there, too. */
 int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags);
 /* Whether that was open for writing, and not for reading alone: the link says so (fs/proc/base.c,
  * proc_map_files_instantiate()). */

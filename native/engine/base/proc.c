@@ -40,16 +40,20 @@ static struct mapped_path mapped_path(pid_t pid, avc_remote start, avc_remote en
 	return path;
 }
 
-int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
-{
-	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
-}
-
 bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end)
 {
 	struct stat st;
 
 	return lstat(mapped_path(pid, start, end).text, &st) == 0 && st.st_mode & S_IWUSR;
+}
+
+int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
+{
+	if ((flags & O_ACCMODE) != O_RDONLY && !proc_mapped_for_writing(pid, start, end)) {
+		errno = EACCES;
+		return -1;
+	}
+	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
 }
 
 /* From the start, also of one that was read before; what is read is terminated. */

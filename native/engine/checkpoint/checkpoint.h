@@ -23,19 +23,20 @@ struct freeze_times {
 /* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
  * shared memory that is prepared for already.
  * On return the app runs, whatever happened. */
-int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
-	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err) warn_unused;
+int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
+		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
+		struct avc_error *err) warn_unused;
 
 /* ---- generation.c -------------------------------------------------------------- */
 
 /* After the app runs again: finishes the template and its slot. */
-int generation_finish(struct target *target, struct generation *generation,
+int generation_finish(struct process *process, struct generation *generation,
 		      struct avc_error *err) warn_unused;
 void generation_drop(struct generation *generation);
 /* Of all its processes. */
 uint32_t generation_threads(const struct generation *generation);
 /* Closes what the template of a process that has ended still has open. */
-void generation_close_files(struct target *target, struct generation *image);
+void generation_close_files(struct process *process, struct generation *image);
 /* The same of all processes but the main one, once they are restored and have tables of
  * their own: before they go on, for what they close is to be closed. */
 void generation_close_tables(const struct generation *generation);
@@ -44,14 +45,14 @@ void generation_close_tables(const struct generation *generation);
 
 /* Makes one for a generation that is whole, if the kernel lets it, and if it comes to that
  * before the deadline.  -1: nothing can be restored from the generation any more. */
-int spare_make(struct target *target, struct generation *generation,
+int spare_make(struct process *process, struct generation *generation,
 	       struct avc_error *err) warn_unused;
 /* While the app is dead: at the template's own priority, and until it is there or refused. */
-int spare_make_now(struct target *target, struct generation *generation,
+int spare_make_now(struct process *process, struct generation *generation,
 		   struct avc_error *err) warn_unused;
 /* Before the template is used for anything else: waits until it has done what it had not at
  * the deadline of spare_make().  -1: it has not, AVC_DEADLINE, or as above. */
-int spare_await(struct target *target, struct generation *generation,
+int spare_await(struct process *process, struct generation *generation,
 		struct avc_error *err) warn_unused;
 bool spare_is_there(struct generation *generation);
 /* There may be one that only the kernel knows of (init_channel_kill_lost). */
@@ -103,11 +104,11 @@ struct remap;
 
 /* What makes the memory of a fork of `is` that of `want`.  Both snapshots have to stay.
  * NULL on error. */
-struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
+struct remap *remap_plan(const struct process *process, struct snapshot *want, struct snapshot *is,
 			 struct avc_error *err);
 /* Whether there is a way from the one to the other, while it is not needed yet: of some mappings
  * only who has them can give them to others, and only by a fork. */
-int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
+int remap_check(const struct process *process, struct snapshot *want, struct snapshot *is,
 		struct avc_error *err) warn_unused;
 void remap_free(struct remap *plan);
 

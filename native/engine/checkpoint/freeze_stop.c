@@ -12,25 +12,25 @@
 #define LOOKS 64
 #define LOOK_US 100
 
-int stop_known(struct tree *tree, struct avc_error *err)
+int freeze_stop_known(struct tree *tree, struct avc_error *err)
 {
 	process_stop_begin(tree->main);
-	for (uint32_t i = 0; i < tree->members; i++)
-		process_stop_begin(tree->member[i]);
+	for (uint32_t i = 0; i < tree->processes; i++)
+		process_stop_begin(tree->process[i]);
 	/* So that they stop at the same time, and not one after the other. */
 	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->kin[i].target && tree->kin[i].target->infected)
-			process_interrupt(tree->kin[i].target);
+		if (tree->entry[i].process && tree->entry[i].process->infected)
+			process_interrupt(tree->entry[i].process);
 	if (process_stop_all(tree->main, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
+		struct process *process = tree->entry[i].process;
 		struct avc_error failed = { 0 };
 
-		if (!target || !target->infected)
+		if (!process || !process->infected)
 			continue;
-		target->frozen = process_stop_all(target, &failed) == 0;
-		if (!target->frozen && failed.code != AVC_GONE) {
+		process->frozen = process_stop_all(process, &failed) == 0;
+		if (!process->frozen && failed.code != AVC_GONE) {
 			*err = failed;
 			return -1;
 		}
@@ -38,7 +38,7 @@ int stop_known(struct tree *tree, struct avc_error *err)
 	return 0;
 }
 
-int stop_others(struct tree *tree, struct avc_error *err)
+int freeze_stop_others(struct tree *tree, struct avc_error *err)
 {
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */
@@ -50,10 +50,10 @@ int stop_others(struct tree *tree, struct avc_error *err)
 		if (tree_look(tree, err))
 			return -1;
 		for (uint32_t i = 1; i < tree->count; i++) {
-			struct target *t = tree->kin[i].target;
+			struct process *t = tree->entry[i].process;
 			struct avc_error failed = { 0 };
 
-			if (tree->kin[i].ending) {
+			if (tree->entry[i].ending) {
 				all = false;
 				usleep(LOOK_US);
 			}
@@ -72,6 +72,6 @@ int stop_others(struct tree *tree, struct avc_error *err)
 		if (all)
 			return 0;
 	}
-	return fail(err, AVC_DEADLINE, EAGAIN, tree->main->pid, "freeze", "",
+	return fail(err, AVC_RETRY, 0, tree->main->pid, "freeze", "",
 		    "its processes come and go too fast");
 }

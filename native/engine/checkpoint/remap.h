@@ -35,7 +35,7 @@ struct run {
 };
 
 struct remap {
-	const struct target *target;
+	const struct process *process;
 	struct snapshot *is, *want;
 	struct piece *piece;
 	uint32_t pieces;

@@ -38,7 +38,7 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 /* What stays where it is whatever happens; where our parasite is nothing else is touched. */
 static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
 {
-	return mapping_is_special(m) || parasite_contains(&r->target->parasite, address);
+	return mapping_is_special(m) || parasite_contains(&r->process->parasite, address);
 }
 
 static const struct mapping *at(const struct mappings *maps, uint32_t *next, avc_remote address)
@@ -165,7 +165,7 @@ static int compare_piece(struct remap *r, const struct piece *piece, struct avc_
 
 /* ---- all of it ----------------------------------------------------------------------- */
 
-struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
+struct remap *remap_plan(const struct process *process, struct snapshot *want, struct snapshot *is,
 			 struct avc_error *err)
 {
 	struct remap *r = calloc(1, sizeof *r);
@@ -174,7 +174,7 @@ struct remap *remap_plan(const struct target *target, struct snapshot *want, str
 		fail_errno(err, 0, "restore memory", "calloc", "out of memory");
 		return NULL;
 	}
-	*r = (struct remap){ .target = target, .want = want, .is = is };
+	*r = (struct remap){ .process = process, .want = want, .is = is };
 	if (cut(r, err))
 		goto failed;
 	for (uint32_t i = 0; i < r->pieces; i++) {
@@ -201,29 +201,29 @@ static bool is_lost(const struct piece *piece)
 	return piece->want && piece->want->flags & MAPPING_ONLY_HERE && !piece->kept;
 }
 
-int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
+int remap_check(const struct process *process, struct snapshot *want, struct snapshot *is,
 		struct avc_error *err)
 {
-	struct remap r = { .target = target, .want = want, .is = is };
+	struct remap r = { .process = process, .want = want, .is = is };
 	const struct mapping *a = mappings_find(&is->maps, "[vdso]");
 	const struct mapping *b = mappings_find(&want->maps, "[vdso]");
 	int result = cut(&r, err);
 
 	if (!result && a && b && a->flags & MAPPING_SEALED && a->start != b->start)
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			      "process %d has executed another program, and the kernel seals its "
 			      "vDSO (mseal(2))",
-			      target->inside);
+			      process->inside);
 	for (uint32_t i = 0; !result && i < r.pieces; i++) {
 		if (is_lost(&r.piece[i]))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 				      "process %d has mapped what no other process can map: %s",
-				      target->inside, r.piece[i].want->name);
+				      process->inside, r.piece[i].want->name);
 		else if (is_stuck(&r.piece[i]))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 				      "process %d has other memory than its parent where that has "
 				      "sealed it (mseal(2))",
-				      target->inside);
+				      process->inside);
 	}
 	free(r.piece);
 	return result;

@@ -33,33 +33,33 @@
 /* ---- for the layers above ------------------------------------------------------- */
 
 /* Before a freeze: what can be known of the app's descriptors while it runs. */
-int files_prepare(struct target *target, struct avc_error *err) warn_unused;
+int files_prepare(struct process *process, struct avc_error *err) warn_unused;
 /* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
 struct scratch {
 	int in, out, bytes;
 };
 void scratch_close(struct scratch *scratch);
 /* During it: what is of this instant.  `several`: the app has other processes, which may
- * have the other ends of pipes.  `kin`: what process `kin_pid` has, of the same freeze, or
+ * have the other ends of pipes.  `parent`: what process `parent_pid` has, of the same freeze, or
  * NULL. */
-int files_capture(struct target *target, struct generation *generation, bool several,
-		  const struct files *kin, pid_t kin_pid, struct scratch *scratch,
+int files_capture(struct process *process, struct generation *generation, bool several,
+		  const struct files *parent, pid_t parent_pid, struct scratch *scratch,
 		  struct avc_error *err);
 /* After it. */
-void files_settle(struct target *target, struct generation *generation);
+void files_settle(struct process *process, struct generation *generation);
 /* Of cameras, in the template (files_video.c). */
-void files_unmap_areas(struct target *target, const struct generation *generation);
+void files_unmap_areas(struct process *process, const struct generation *generation);
 /* The same for all processes: what they share of open files, and who of them is named.
  * `before`: the checkpoint before, or NULL. */
-void files_settle_family(const struct target *main, struct generation *generation,
+void files_settle_family(const struct process *main, struct generation *generation,
 			 const struct generation *before);
-void files_forget(struct target *target);
+void files_forget(struct process *process);
 void files_free(struct files *files);
 /* Makes the tables of a dead app the generation's again: that of the main process, which
  * its templates hold, at once; of the others (table[], by branch) what is to be in them.
  * Lists what the restored processes have to do themselves.  What could not be put back is
  * told in *notes; -1 is for what must not go on. */
-int files_restore(struct target *target, struct generation *generation,
+int files_restore(struct process *process, struct generation *generation,
 		  const struct avc_config *config, pid_t init, struct fd_table *table,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
 /* A process that is to be restored opens its pidfds itself: as many descriptors as it takes, until
@@ -226,7 +226,7 @@ struct file {
 	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 	struct file_video video;
-	/* The same open file description in `kin` of files_look(); NULL: not known to be */
+	/* The same open file description in `parent` of files_look(); NULL: not known to be */
 	const struct file *inherited;
 };
 
@@ -247,8 +247,8 @@ struct files {
 	uint32_t areas;
 	/* During a freeze: a table that has just been looked at.  What this one has in common
 	 * with it, as children have with their parents, is not looked at again. */
-	const struct files *kin;
-	pid_t kin_pid;
+	const struct files *parent;
+	pid_t parent_pid;
 	struct scratch *scratch; /* also only then                                 */
 	struct file_rights rights;
 	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
@@ -393,7 +393,7 @@ int file_make_dead(const struct file *want, pid_t template);
 /* files_restore.c and files_calls.c */
 /* One restore of a table: from `now` to `want`. */
 struct files_work {
-	struct target *target;
+	struct process *process;
 	struct generation *generation;
 	const struct avc_config *config;
 	pid_t init;

@@ -39,7 +39,7 @@ void files_note(struct files_work *work, const struct file *f, const char *probl
 		const size_t bytes = strlen(f->name);
 		const bool cut = bytes > NAME_SHOWN;
 
-		fail(work->notes, AVC_UNSUPPORTED, 0, work->target->inside, "restore descriptors",
+		fail(work->notes, AVC_UNSUPPORTED, 0, work->process->inside, "restore descriptors",
 		     "", "descriptor %d (%s%s): %s", f->fd, cut ? "..." : "",
 		     f->name + (cut ? bytes - NAME_SHOWN : 0), problem);
 	}
@@ -340,7 +340,7 @@ static bool is_urgent(const struct files_work *work)
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
 static struct fd_letter *mail_of(const struct files_work *work)
 {
-	return (struct fd_letter *)(parasite_files(&work->target->parasite,
+	return (struct fd_letter *)(parasite_files(&work->process->parasite,
 						   work->generation->slot) +
 				    INJ_FILES_BYTES / 2);
 }
@@ -355,9 +355,9 @@ static struct inj_syscall *list_of(const struct files_work *work)
 /* Of the task that has the table. */
 static struct inj_call *call_of(const struct files_work *work)
 {
-	return work->target->descendant
-		       ? &work->target->parasite.control->holder
-		       : &parasite_slot(&work->target->parasite, work->generation->slot)
+	return work->process->descendant
+		       ? &work->process->parasite.control->holder
+		       : &parasite_slot(&work->process->parasite, work->generation->slot)
 				  ->template_call;
 }
 
@@ -366,7 +366,7 @@ static void close_list(struct files_work *work)
 {
 	if (work->listed)
 		call_add(call_of(work), INJ_LIST,
-			 parasite_remote(&work->target->parasite, list_of(work)), work->listed, 0,
+			 parasite_remote(&work->process->parasite, list_of(work)), work->listed, 0,
 			 0, 0);
 	work->listed = 0;
 }
@@ -387,16 +387,16 @@ static void note_refused(struct files_work *work, uint32_t count)
 
 static int flush(struct files_work *work, struct avc_error *err)
 {
-	const struct target *target = work->target;
+	const struct process *process = work->process;
 	struct inj_call *call = call_of(work);
 	const uint32_t listed = work->listed;
 	int result = 0;
 
 	close_list(work);
 	if (call->count)
-		result = parasite_send(&target->parasite, work->table,
-				       target->descendant ? &target->holder_base
-							  : &work->generation->base,
+		result = parasite_send(&process->parasite, work->table,
+				       process->descendant ? &process->holder_base
+							   : &work->generation->base,
 				       call, err) ||
 			 parasite_run(work->table, call, err);
 	if (!result)
@@ -454,7 +454,7 @@ static int unlock_all(struct files_work *work, struct avc_error *err)
 	for (uint32_t i = 0; i < work->now->count; i++)
 		if (work->now->file[i].lock_count &&
 		    inject(work, err, SYS_fcntl, (uint64_t)work->now->file[i].fd, F_SETLK,
-			   parasite_remote(&work->target->parasite, all)))
+			   parasite_remote(&work->process->parasite, all)))
 			return -1;
 	return 0;
 }
@@ -527,7 +527,7 @@ static int lowest_free(const struct numbers *numbers, const struct files *avoid)
 static avc_remote lay_out_mail(const struct files_work *work)
 {
 	struct fd_letter *letter = mail_of(work);
-	const avc_remote remote = parasite_remote(&work->target->parasite, letter);
+	const avc_remote remote = parasite_remote(&work->process->parasite, letter);
 
 	fd_letter_write(letter, remote);
 	return remote;
@@ -570,7 +570,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 static int put_lost(struct files_work *work, struct avc_error *err)
 {
 	struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
-	const struct parasite *parasite = &work->target->parasite;
+	const struct parasite *parasite = &work->process->parasite;
 	struct inj_call *call = call_of(work);
 	struct numbers numbers = { .room = 16 };
 	int32_t ends[2];
@@ -595,7 +595,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	 * allowed once. */
 	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
 	    limit.rlim_cur < (rlim_t)numbers.room)
-		limit_lift(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
+		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
 		 parasite_remote(parasite, call->out), 0);
 	if (flush(work, err))
@@ -603,7 +603,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	memcpy(ends, call->out, sizeof ends);
 	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers.room || ends[1] < 0 ||
 	    ends[1] >= numbers.room) {
-		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->target->inside,
+		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->process->inside,
 		     "restore descriptors", "socketpair", "descriptors could not be handed over");
 		goto out;
 	}
@@ -772,7 +772,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	if (!work->now || !work->local || !work->source || !work->lost)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	/* The app died while it was cloning (guard_checkpoint.c, abandon()). */
-	if (work->table && work->target->descendant && work->target->doubtful &&
+	if (work->table && work->process->descendant && work->process->doubtful &&
 	    tracee_halt(work->table, err))
 		return -1;
 	if (look(work, err))
@@ -827,7 +827,7 @@ int files_work_gather(struct files_work *work, struct avc_error *err)
 	call_begin(call_of(work), INJ_AFTER_PARK);
 	if (forget_watches(work, err) || close_new(work, err))
 		return -1;
-	if (work->target->descendant)
+	if (work->process->descendant)
 		return gather_anew(work, err);
 	/* What is left on the list is made just before the fork (restore.c). */
 	return set_cloexec(work, err) || (is_urgent(work) && flush(work, err)) ? -1 : 0;
@@ -836,7 +836,7 @@ int files_work_gather(struct files_work *work, struct avc_error *err)
 int files_work_place(struct files_work *work, struct avc_error *err)
 {
 	make_lost(work);
-	if (!work->target->descendant && put_lost(work, err))
+	if (!work->process->descendant && put_lost(work, err))
 		return -1;
 	put_states(work);
 	return 0;
@@ -864,7 +864,7 @@ void files_work_finish(struct files_work *work)
 	files_connect_again(work);
 	remember_made(work);
 	files_list_calls(work);
-	if (!work->target->descendant)
+	if (!work->process->descendant)
 		close_list(work);
 }
 

@@ -26,14 +26,14 @@
 
 /* ---- telling ---------------------------------------------------------------- */
 
-struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind kind)
+struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind kind)
 {
 	return (struct avc_event){
 		.kind = kind,
 		.cookie = guard->cookie,
 		.at_ns = now_ns(),
-		.app_pid = guard->target.leader,
-		.app_pid_inside = guard->target.inside,
+		.app_pid = guard->main.leader,
+		.app_pid_inside = guard->main.inside,
 		.generations = guard->count,
 		.restores = guard->restores,
 	};
@@ -54,7 +54,7 @@ static void send_outbox(struct avc_guard *guard)
 	memmove(guard->outbox, guard->outbox + sent, guard->outbox_count * sizeof *guard->outbox);
 }
 
-void emit(struct avc_guard *guard, const struct avc_event *event)
+void guard_emit(struct avc_guard *guard, const struct avc_event *event)
 {
 	if (guard->outbox_count == OUTBOX_MAX)
 		memmove(guard->outbox, guard->outbox + 1,
@@ -63,22 +63,22 @@ void emit(struct avc_guard *guard, const struct avc_event *event)
 	send_outbox(guard);
 }
 
-void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
-		const struct avc_error *error)
+void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
+		      const struct avc_error *error)
 {
-	struct avc_event event = event_new(guard, kind);
+	struct avc_event event = guard_event(guard, kind);
 
 	event.ticket = ticket;
 	event.error = *error;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 }
 
-void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
+void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
 {
 	struct avc_error error = { 0 };
 
-	fail(&error, code, 0, guard->target.pid, "command", "", "%s", why);
-	emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+	fail(&error, code, 0, guard->main.pid, "command", "", "%s", why);
+	guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 }
 
 /* ---- commands -------------------------------------------------------------------- */
@@ -87,11 +87,11 @@ static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
 {
 	if (!guard->count) {
 		guard->room = 0;
-		refuse(guard, ticket, AVC_EMPTY, "no generation is held");
+		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held");
 		return;
 	}
 	guard->room = guard->count - 1;
-	lose_generation(guard, dispensable(guard, false), AVC_REASON_MEMORY, ticket);
+	guard_lose_generation(guard, guard_dispensable(guard, false), AVC_REASON_MEMORY, ticket);
 }
 
 static void refill(struct avc_guard *guard)
@@ -126,36 +126,36 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 {
 	struct avc_error error = { 0 };
 
-	if (!guard->count || !guard->target.pid) {
-		refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
+	if (!guard->count || !guard->main.pid) {
+		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
 		return;
 	}
 	if (init_channel_stop_asked(&guard->channel)) {
-		refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
-	    check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
-			 guard->target.pidfd, &error)) {
-		emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
+			       guard->main.pidfd, &error)) {
+		guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	target_kill(&guard->target);
+	process_kill(&guard->main);
 }
 
 static void obey(struct avc_guard *guard, enum avc_command command, uint64_t ticket)
 {
 	if (!guard->attached) {
-		refuse(guard, ticket, AVC_EMPTY, "avckpt-init has not started yet");
+		guard_refuse(guard, ticket, AVC_EMPTY, "avckpt-init has not started yet");
 		return;
 	}
 	switch (command) {
 	case AVC_COMMAND_CHECKPOINT:
-		checkpoint(guard, ticket);
+		guard_checkpoint(guard, ticket);
 		break;
 	case AVC_COMMAND_RESTORE:
 		roll_back(guard, ticket, AVC_REASON_COMMAND);
@@ -202,7 +202,7 @@ static void carry_out(struct avc_guard *guard)
 			obey(guard, request.command, request.ticket);
 		else if (request.kind == AVC_REQUEST_CONFIGURE &&
 			 !config_check(&request.config, &error))
-			take_config(guard, &request.config);
+			guard_take_config(guard, &request.config);
 	}
 	guard->stop = found < 0;
 }
@@ -217,21 +217,21 @@ static void attach(struct avc_guard *guard)
 
 	switch (init_channel_open(&guard->channel, &error)) {
 	case 1:
-		if (find_app(guard, &error)) {
+		if (guard_find_app(guard, &error)) {
 			init_channel_close(&guard->channel);
 			break;
 		}
 		guard->attached = true;
 		guard->unprotected = false;
-		guard->next_ns = interval_end(guard);
+		guard->next_ns = guard_interval_end(guard);
 		{
-			const struct avc_event event = event_new(guard, AVC_EVENT_ATTACHED);
+			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);
 
-			emit(guard, &event);
+			guard_emit(guard, &event);
 		}
 		return;
 	case -1:
-		unprotect(guard, 0, &error);
+		guard_unprotect(guard, 0, &error);
 	}
 	guard->next_ns = now +
 			 (now - guard->started_ns < LOOK_OFTEN_NS ? LOOK_AGAIN_NS : LOOK_SELDOM_NS);
@@ -250,32 +250,50 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 	guard->fds[(*n)++] = (struct pollfd){ .fd = fd, .events = POLLIN };
 }
 
-uint32_t all_stragglers(struct avc_guard *guard)
+uint32_t guard_tend_stragglers(struct avc_guard *guard)
 {
-	uint32_t left = stragglers(&guard->target);
+	uint32_t left = threads_tend_stragglers(&guard->main);
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		left += stragglers(guard->tree.member[i]);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		left += threads_tend_stragglers(guard->tree.process[i]);
 	return left;
 }
 
 static bool any_lost(const struct avc_guard *guard)
 {
-	bool lost = guard->target.lost;
+	bool lost = guard->main.lost;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		lost |= guard->tree.member[i]->lost;
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		lost |= guard->tree.process[i]->lost;
 	return lost;
+}
+
+/* Calls of the app's that a checkpoint has interrupted.  When the first of those that are
+ * left is to be ended. */
+static uint64_t end_waits(struct avc_guard *guard)
+{
+	uint64_t due;
+
+	waits_end(&guard->main, guard->timer);
+	due = guard->main.due_ns;
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		waits_end(guard->tree.process[i], guard->timer);
+		if (guard->tree.process[i]->due_ns < due)
+			due = guard->tree.process[i]->due_ns;
+	}
+	return due;
 }
 
 static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
+	const uint64_t waits_ns = end_waits(guard);
 	const uint64_t now = now_ns();
-	const uint64_t check_ns = exec_check_due(guard);
+	const uint64_t check_ns = guard_exec_check_due(guard);
 	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
 							     : tracee_ending_due();
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
-	const uint64_t due = guard->next_ns < sooner_ns ? guard->next_ns : sooner_ns;
+	const uint64_t soon_ns = waits_ns < sooner_ns ? waits_ns : sooner_ns;
+	const uint64_t due = guard->next_ns < soon_ns ? guard->next_ns : soon_ns;
 	uint64_t ns = due > now ? due - now : 0;
 	struct timespec timeout;
 	nfds_t n = 0;
@@ -285,10 +303,10 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
-	watch(guard, &n, guard->target.holder_pidfd);
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		watch(guard, &n, guard->tree.member[i]->pidfd);
-		watch(guard, &n, guard->tree.member[i]->holder_pidfd);
+	watch(guard, &n, guard->main.holder_pidfd);
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		watch(guard, &n, guard->tree.process[i]->pidfd);
+		watch(guard, &n, guard->tree.process[i]->holder_pidfd);
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		watch(guard, &n, guard->generations[i].pidfd);
@@ -323,9 +341,9 @@ static void tell_straggling(struct avc_guard *guard)
 	if (now - guard->told_stragglers_ns < NS_PER_S)
 		return;
 	guard->told_stragglers_ns = now;
-	fail(&error, AVC_DEADLINE, 0, guard->target.pid, "stop", "",
+	fail(&error, AVC_DEADLINE, 0, guard->main.pid, "stop", "",
 	     "a thread that was to stop has not done so for a second");
-	emit_error(guard, AVC_EVENT_MISSED, 0, &error);
+	guard_emit_error(guard, AVC_EVENT_MISSED, 0, &error);
 }
 
 static void let_go(struct avc_guard *guard)
@@ -334,18 +352,19 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
-	drop_all(guard);
-	unhold(&guard->target);
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		unhold(guard->tree.member[i]);
+	last_pid_forget();
+	guard_drop_all(guard);
+	process_unhold(&guard->main);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		process_unhold(guard->tree.process[i]);
 	/* The end of this process detaches what is left. */
 	tracee_end_now();
-	while (((guard->target.threads && all_stragglers(guard)) || tracee_reap_ending()) &&
+	while (((guard->main.threads && guard_tend_stragglers(guard)) || tracee_reap_ending()) &&
 	       now_ns() < end)
 		usleep(200);
 	tree_free(&guard->tree);
-	target_close(&guard->target);
-	parasite_close(&guard->target.parasite);
+	process_close(&guard->main);
+	parasite_close(&guard->main.parasite);
 	init_channel_close(&guard->channel);
 	close_fd(&guard->channel.init_pidfd);
 }
@@ -356,11 +375,11 @@ static void guard_main(struct avc_guard *guard)
 	bool ended = false;
 
 	if (tracee_timer_new(&guard->timer, &error)) {
-		emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 		ended = true;
 	}
 	while (!ended && !guard->stop) {
-		const uint32_t straggling = all_stragglers(guard);
+		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
@@ -369,38 +388,38 @@ static void guard_main(struct avc_guard *guard)
 		if (!straggling)
 			guard->told_stragglers_ns = now_ns(); /* there are none */
 		if (any_lost(guard))
-			kill_lost(guard);
+			guard_kill_lost(guard);
 		if (dying)
-			reap_unknown(guard);
+			guard_reap_unknown(guard);
 		wait_for_news(guard, straggling || dying);
 		if (guard->attached && init_channel_report(&guard->channel, &report)) {
-			died(guard, &report);
+			guard_app_died(guard, &report);
 			continue;
 		}
-		reap_dead(guard);
-		tend_tree(guard);
+		guard_reap_dead(guard);
+		guard_tend_tree(guard);
 		if (pidfd_ended(guard->channel.init_pidfd)) {
 			ended = true;
 			break;
 		}
 		carry_out(guard);
 		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
-			work_ahead(guard);
+			guard_work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;
 		if (!guard->attached)
 			attach(guard);
-		else if (all_stragglers(guard))
+		else if (guard_tend_stragglers(guard))
 			tell_straggling(guard);
 		else
-			checkpoint(guard, 0);
+			guard_checkpoint(guard, 0);
 	}
 	let_go(guard);
 	timer_delete(guard->timer);
 	if (ended) {
-		const struct avc_event event = event_new(guard, AVC_EVENT_ENDED);
+		const struct avc_event event = guard_event(guard, AVC_EVENT_ENDED);
 
-		emit(guard, &event);
+		guard_emit(guard, &event);
 	}
 }
 
@@ -445,16 +464,16 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	guard->room = start->config.keep;
 	guard->started_ns = now_ns();
 	init_channel_init(&guard->channel);
-	target_init(&guard->target);
+	process_init(&guard->main);
 	guard->tree = (struct tree){
-		.main = &guard->target,
+		.main = &guard->main,
 		.slots = start->config.keep + 1,
-		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),
-		.member = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.member),
-		.is_ours = is_ours,
+		.entry = calloc(PROCESSES_MAX, sizeof *guard->tree.entry),
+		.process = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.process),
+		.is_ours = guard_owns,
 		.arg = guard,
 	};
-	config_set(guard, &start->config);
+	guard_set_config(guard, &start->config);
 	guard->channel.init_pidfd = init_pidfd;
 	return guard;
 }
@@ -462,9 +481,9 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 static void guard_free(struct avc_guard *guard)
 {
 	files_written_free(guard->written);
-	target_free_room(&guard->target);
+	process_free_room(&guard->main);
 	tree_free(&guard->tree);
-	mem_others_free(guard->target.others);
+	mem_others_free(guard->main.others);
 	free(guard->fds);
 	free(guard);
 }
@@ -493,11 +512,11 @@ int guard_run(int socket)
 	guard = guard_new(socket, &start, init_pidfd);
 	if (!guard)
 		return GUARD_UNTOLD;
-	guard->target.others = mem_others_new();
-	if (!target_make_room(&guard->target) || !guard->target.others || !guard->tree.kin ||
-	    !guard->tree.member) {
+	guard->main.others = mem_others_new();
+	if (!process_make_room(&guard->main) || !guard->main.others || !guard->tree.entry ||
+	    !guard->tree.process) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
-		emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {
 		guard_main(guard);
 	}

@@ -38,7 +38,7 @@ static int unmap(const struct remap *r, struct syscall_batch *batch, struct avc_
 static int move_special(const struct remap *r, struct syscall_batch *batch, struct avc_error *err)
 {
 	static const char *const names[] = { "[vvar]", "[vvar_vclock]", "[vdso]" };
-	avc_remote between = r->target->parasite.base + r->target->parasite.bytes + PAGE;
+	avc_remote between = r->process->parasite.base + r->process->parasite.bytes + PAGE;
 
 	for (int away = 1; away >= 0; away--)
 		for (size_t i = 0; i < sizeof names / sizeof *names; i++) {
@@ -59,7 +59,7 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
 						  MREMAP_MAYMOVE | MREMAP_FIXED, b->start, 0);
 			between += bytes;
 			if (i + 1 == sizeof names / sizeof *names)
-				between = r->target->parasite.base + r->target->parasite.bytes +
+				between = r->process->parasite.base + r->process->parasite.bytes +
 					  PAGE;
 		}
 	return 0;
@@ -69,9 +69,7 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
  * in an overlay a copy would be made. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared && proc_mapped_for_writing(template, m->start, m->end)
-			       ? proc_open_mapped(template, m->start, m->end, O_RDWR)
-			       : -1;
+	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
 
 	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }
@@ -219,7 +217,6 @@ static int map_new(const struct remap *r, struct syscall_batch *batch, struct av
 		       : 0;
 }
 
-
 static int advice_of(enum page what)
 {
 	switch (what) {
@@ -265,8 +262,8 @@ static int fill(const struct remap *r, struct syscall_batch *batch, struct copie
 	return 0;
 }
 
-int remap(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
-	  struct avc_error *err)
+int remap_apply(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
+		struct avc_error *err)
 {
 	return unmap(r, batch, err) || move_special(r, batch, err) || map_new(r, batch, err) ||
 			       fill(r, batch, copier, err)

@@ -26,30 +26,30 @@ struct restore_times {
 /* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
  * there, before anything runs: it sends the verdict.  On success *pid is the new
  * main process. */
-int restore(struct target *target, struct generation *generation, struct init_channel *channel,
-	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
-	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
-	    struct restore_times *times, struct avc_error *notes,
-	    struct avc_error *err) warn_unused;
+int restore_app(struct process *process, struct generation *generation,
+		struct init_channel *channel, const struct avc_config *config, timer_t timer,
+		uint64_t died_ns, int (*ready)(void *arg, struct avc_error *err), void *arg,
+		pid_t *pid, struct restore_times *times, struct avc_error *notes,
+		struct avc_error *err) warn_unused;
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 
 /* Lets a stopped process that is what its template is put itself together; waits until
  * it has; tells what of it failed; lets it go. */
-int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
+int restore_start(struct process *process, struct generation *image, struct last_pid *helper,
 		  pid_t pid, struct sandbox **sandbox, struct avc_error *err) warn_unused;
-int restore_await(struct target *target, struct generation *image, pid_t pid,
+int restore_await(struct process *process, struct generation *image, pid_t pid,
 		  struct sandbox *sandbox, struct avc_error *err) warn_unused;
-void restore_note(struct target *target, struct generation *image, pid_t pid,
+void restore_note(struct process *process, struct generation *image, pid_t pid,
 		  struct avc_error *notes);
-void restore_go(struct target *target, struct generation *image, struct sandbox *sandbox);
+void restore_go(struct process *process, struct generation *image, struct sandbox *sandbox);
 
 /* ---- restore_tree.c ------------------------------------------------------------------------- */
 
 /* All processes of a generation, of which the main one is there; each is stopped.
  * `table`: of each branch. */
 struct restore_tree;
-struct restore_tree *restore_tree_new(struct target *main, struct generation *generation,
+struct restore_tree *restore_tree_new(struct process *main, struct generation *generation,
 				      struct last_pid *helper, struct init_channel *channel,
 				      timer_t timer, const struct fd_table *table,
 				      struct avc_error *err);
@@ -69,10 +69,10 @@ pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t branch);
 
 struct copier;
 
-/* Does it, with a batch that is in the parasite of the plan's target already; but the copier
+/* Does it, with a batch that is in the parasite of the plan's process already; but the copier
  * may not have finished. */
-int remap(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
-	  struct avc_error *err) warn_unused;
+int remap_apply(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
+		struct avc_error *err) warn_unused;
 
 /* ---- copier.c ----------------------------------------------------------------------- */
 

@@ -4,10 +4,10 @@
  */
 #include "state.h"
 
-struct branch *generation_branch(const struct generation *generation, const struct target *target)
+struct branch *generation_branch(const struct generation *generation, const struct process *process)
 {
 	for (uint32_t i = 0; generation && i < generation->branches; i++)
-		if (generation->branch[i].target == target)
+		if (generation->branch[i].process == process)
 			return &generation->branch[i];
 	return NULL;
 }

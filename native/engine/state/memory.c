@@ -33,7 +33,7 @@
 
 #define MSEAL 462 /* mseal(2), since Linux 6.10; the headers may be older */
 
-const char private_huge_pages[] =
+const char memory_private_huge_pages[] =
 	"it has private huge pages (hugetlb): a clone shares them, and the application could be "
 	"killed for want of another when it writes to one";
 
@@ -148,10 +148,10 @@ static size_t area_room(const struct area *a)
 	return a->wiped || a->again || a->left ? 0 : area_bytes(a);
 }
 
-int memory_prepare(const struct target *target, struct mem_image **image, struct mem_seen *seen,
+int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err)
 {
-	const struct areas *areas = &target->memory->areas;
+	const struct areas *areas = &process->memory->areas;
 	uint64_t left_bytes = 0;
 	size_t bytes = 0;
 
@@ -159,7 +159,7 @@ int memory_prepare(const struct target *target, struct mem_image **image, struct
 	for (uint32_t i = 0; i < areas->count; i++) {
 		struct area *a = &areas->area[i];
 
-		if (see(seen, a, target->shm_bytes, err))
+		if (see(seen, a, process->shm_bytes, err))
 			return -1;
 		bytes += area_room(a);
 		left_bytes += a->left ? area_bytes(a) : 0;
@@ -203,12 +203,12 @@ static bool copy_area(pid_t pid, struct area *a, uint8_t *to)
 	return n >= 0;
 }
 
-void memory_copy_own(const struct target *target, struct mem_image *image)
+void memory_copy_own(const struct process *process, struct mem_image *image)
 {
-	wiped_copy(target, image);
+	wiped_copy(process, image);
 }
 
-void memory_copy_shared(const struct target *target, struct mem_image *image)
+void memory_copy_shared(const struct process *process, struct mem_image *image)
 {
 	uint8_t *to = image->data;
 
@@ -219,8 +219,8 @@ void memory_copy_shared(const struct target *target, struct mem_image *image)
 			continue;
 		/* Before it is read: what is written meanwhile was written since. */
 		if (a->as_file)
-			a->writes = others_writes(target->others, a);
-		image->whole &= copy_area(target->pid, a, to);
+			a->writes = others_writes(process->others, a);
+		image->whole &= copy_area(process->pid, a, to);
 		to += area_room(a);
 	}
 }
@@ -292,26 +292,26 @@ static int find_dontfork(const struct mapping *m, void *arg)
 	return 0;
 }
 
-int memory_learn(struct target *target, long missing_pages, struct avc_error *err)
+int memory_learn(struct process *process, long missing_pages, struct avc_error *err)
 {
-	struct memory *memory = target->memory;
+	struct memory *memory = process->memory;
 	struct dontfork look = { .memory = memory };
 	int result;
 
 	memory->holes = 0;
-	result = proc_mappings(target->pid, "smaps", find_dontfork, &look);
+	result = proc_mappings(process->pid, "smaps", find_dontfork, &look);
 	memory->dontfork = !result && (memory->dontfork || look.found);
 	if (look.kept)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "it uses memory of a device, or huge pages, which a clone does not "
 			    "inherit (MADV_DONTFORK)");
 	if (!memory->dontfork)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "%ld kB of its memory are not inherited by a clone",
 			    missing_pages * ARCH_PAGE_BYTES / 1024);
 	/* Known before, it should not be missing again; but a device may have been
 	 * mapped since, at which the call stopped. */
-	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "keep template", "",
+	return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
 		    missing_pages * ARCH_PAGE_BYTES / 1024);
 }
@@ -326,9 +326,9 @@ static int find_locked(const struct mapping *m, void *arg)
 
 /* Pages become locked as they are touched (MLOCK_ONFAULT): to bring them all in at once
  * would make a copy of all that memory before the process may run. */
-static void lock_again(struct target *target, int64_t locked_kb, struct setup *setup)
+static void lock_again(struct process *process, int64_t locked_kb, struct setup *setup)
 {
-	struct memory *memory = target->memory;
+	struct memory *memory = process->memory;
 	const uint64_t start = now_ns();
 
 	if (locked_kb == 0)
@@ -340,7 +340,7 @@ static void lock_again(struct target *target, int64_t locked_kb, struct setup *s
 
 		/* Of one that has just died there is nothing to be seen any more; what
 		 * was known of it is right, as a rule. */
-		if (proc_mappings(target->pid, "smaps", find_locked, &found) == 0 && found.count) {
+		if (proc_mappings(process->pid, "smaps", find_locked, &found) == 0 && found.count) {
 			memory->locked = found;
 			memory->locked_kb = locked_kb;
 			memory->locked_layout = memory->layout;
@@ -391,46 +391,46 @@ static void seal_again(const struct memory *memory, struct setup *setup)
 }
 
 /* Of all processes, for the main one to tell. */
-static uint64_t bytes_left(const struct target *main, const struct generation *generation)
+static uint64_t bytes_left(const struct process *main, const struct generation *generation)
 {
 	uint64_t bytes = main->memory->left_bytes + generation->image->left_bytes;
 
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		const struct branch *branch = &generation->branch[i];
 
-		if (branch->target)
-			bytes += branch->target->memory->left_bytes +
+		if (branch->process)
+			bytes += branch->process->memory->left_bytes +
 				 branch->image->image->left_bytes;
 	}
 	return bytes;
 }
 
-int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
+int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
-	const struct thread *main_thread = thread_find(target, target->pid);
+	const struct thread *main_thread = thread_find(process, process->pid);
 	uint64_t left_bytes;
 
 	generation->image->seen = NULL; /* it was the freeze's                  */
-	if (areas_check(target, generation, err) || wiped_fill(target, generation, setup, err))
+	if (areas_check(process, generation, err) || wiped_fill(process, generation, setup, err))
 		return -1;
-	lock_again(target, locked_kb, setup);
-	advise_again(target->memory, setup);
-	if (target->descendant)
-		seal_again(target->memory, setup);
+	lock_again(process, locked_kb, setup);
+	advise_again(process->memory, setup);
+	if (process->descendant)
+		seal_again(process->memory, setup);
 	if (main_thread && main_thread->creds.future_lock)
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
 			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)
 			->flags = INJ_MAY_FAIL;
-	left_bytes = target->descendant ? 0 : bytes_left(target, generation);
+	left_bytes = process->descendant ? 0 : bytes_left(process, generation);
 	if (left_bytes && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
 		     (unsigned long long)left_bytes / 1024);
-	if (target->memory->others_bytes && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+	if (process->memory->others_bytes && !setup->notice.code)
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 		     "%llu kB of shared memory are also others', outside of the container, and are not rolled back",
-		     (unsigned long long)target->memory->others_bytes / 1024);
+		     (unsigned long long)process->memory->others_bytes / 1024);
 	return 0;
 }
 
@@ -465,14 +465,14 @@ static bool put_by_mapping(const struct area *a, int mem_fd, const uint8_t *from
 	return pwrite(mem_fd, from, a->kept, (off_t)a->start) == (ssize_t)a->kept;
 }
 
-static int protect(const struct target *target, const struct generation *image,
+static int protect(const struct process *process, const struct generation *image,
 		   const struct area *a, int protection, struct avc_error *err)
 {
-	struct inj_call *call = &parasite_slot(&target->parasite, image->slot)->template_call;
+	struct inj_call *call = &parasite_slot(&process->parasite, image->slot)->template_call;
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_mprotect, a->start, area_bytes(a), (uint64_t)protection, 0, 0);
-	return parasite_send(&target->parasite, image->template, &image->base, call, err) ||
+	return parasite_send(&process->parasite, image->template, &image->base, call, err) ||
 			       parasite_run(image->template, call, err)
 		       ? -1
 		       : 0;
@@ -490,34 +490,34 @@ static bool put_by_file(const struct area *a, pid_t pid, const uint8_t *from)
 	return put;
 }
 
-static int put_back(const struct target *target, const struct generation *image, struct area *a,
+static int put_back(const struct process *process, const struct generation *image, struct area *a,
 		    pid_t pid, int mem_fd, const uint8_t *from, struct avc_error *notes,
 		    struct avc_error *err)
 {
 	const bool opened = a->way == WAY_PROTECT;
 	bool put = false;
 
-	if (a->as_file && others_writes(target->others, a) != a->writes) {
+	if (a->as_file && others_writes(process->others, a) != a->writes) {
 		fail(notes, AVC_UNSUPPORTED, 0, pid, "restore", "",
 		     "%zu kB of shared memory have been written as files since, and are not rolled back",
 		     area_bytes(a) / 1024);
 		return 0;
 	}
-	if (opened && protect(target, image, a, PROT_READ | PROT_WRITE, err))
+	if (opened && protect(process, image, a, PROT_READ | PROT_WRITE, err))
 		return -1;
 	if (a->way != WAY_FILE)
 		put = put_by_mapping(a, mem_fd, from);
-	if (opened && protect(target, image, a, a->protection, err))
+	if (opened && protect(process, image, a, a->protection, err))
 		return -1;
 	if (!put) {
 		put = put_by_file(a, pid, from);
 		if (a->as_file) /* that was us */
-			a->writes = others_writes(target->others, a);
+			a->writes = others_writes(process->others, a);
 	}
 	return put ? 0 : note_unless_equal(a, mem_fd, from, notes);
 }
 
-int memory_put_back(const struct target *target, const struct generation *image, pid_t pid,
+int memory_put_back(const struct process *process, const struct generation *image, pid_t pid,
 		    struct avc_error *notes, struct avc_error *err)
 {
 	struct mem_image *memory = image->image;
@@ -533,7 +533,7 @@ int memory_put_back(const struct target *target, const struct generation *image,
 		struct area *a = &memory->areas.area[i];
 
 		if (area_room(a) && a->kept)
-			result = put_back(target, image, a, pid, mem_fd, from, notes, err);
+			result = put_back(process, image, a, pid, mem_fd, from, notes, err);
 		from += area_room(a);
 	}
 	close_fd(&mem_fd);

@@ -53,7 +53,7 @@ struct marks {
 
 #define HOLES_MAX 24
 
-/* What is known of a target's memory from one checkpoint to the next. */
+/* What is known of a process's memory from one checkpoint to the next. */
 struct memory {
 	bool dontfork;
 	/* Where a device (or the kernel's vvar) is mapped, or what else keeps_dontfork():
@@ -116,7 +116,7 @@ void areas_free(struct areas *areas);
 void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags);
 /* Were the areas that were copied those that there are?  Of the long file only as
  * often as it is worth it, and when the layout has changed. */
-int areas_check(struct target *target, const struct generation *generation,
+int areas_check(struct process *process, const struct generation *generation,
 		struct avc_error *err) warn_unused;
 /* A descriptor of that process, open for writing, of what the area is; -1: none. */
 int area_find_descriptor(pid_t pid, const struct area *area);
@@ -124,9 +124,9 @@ int area_find_descriptor(pid_t pid, const struct area *area);
 /* ---- memory_wiped.c --------------------------------------------------------- */
 
 /* While the process is stopped. */
-void wiped_copy(const struct target *target, struct mem_image *image);
+void wiped_copy(const struct process *process, struct mem_image *image);
 /* Puts it into the template, which is stopped, and forgets it. */
-int wiped_fill(struct target *target, struct generation *generation, struct setup *setup,
+int wiped_fill(struct process *process, struct generation *generation, struct setup *setup,
 	       struct avc_error *err) warn_unused;
 void wiped_free(struct wiped *wiped);
 
@@ -134,8 +134,8 @@ void wiped_free(struct wiped *wiped);
 
 /* Marks those areas that processes outside of the app's PID namespace have, too; `since`: a look
  * that is older is not good enough. */
-void others_look(struct mem_others *others, const struct target *target, const struct areas *areas,
-		 uint64_t since);
+void others_look(struct mem_others *others, const struct process *process,
+		 const struct areas *areas, uint64_t since);
 bool others_have(const struct mem_others *others, const struct area *area);
 /* From now on it is known whether anybody writes to it as to a file. */
 void others_watch(struct mem_others *others, pid_t template, const struct area *area);

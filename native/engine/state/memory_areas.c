@@ -41,7 +41,7 @@ void areas_free(struct areas *areas)
 }
 
 struct survey {
-	const struct target *target;
+	const struct process *process;
 	pid_t template;
 	struct memory *memory;
 	struct areas areas, foreign;
@@ -56,12 +56,12 @@ static uint64_t hash(uint64_t h, uint64_t value)
 	return h ^ h >> 29;
 }
 
-static bool is_pad(const struct target *target, avc_remote at)
+static bool is_pad(const struct process *process, avc_remote at)
 {
-	if (parasite_contains(&target->parasite, at))
+	if (parasite_contains(&process->parasite, at))
 		return true;
-	for (uint32_t i = 0; i < target->old_parasites; i++)
-		if (at - target->old_parasite[i].base < target->old_parasite[i].bytes)
+	for (uint32_t i = 0; i < process->old_parasites; i++)
+		if (at - process->old_parasite[i].base < process->old_parasite[i].bytes)
 			return true;
 	return false;
 }
@@ -161,7 +161,7 @@ static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
 
 	if (kind && mapping_is_special(m))
 		return kind | MAPPING_SPECIAL;
-	return survey->target->descendant && is_only_here(survey->template, m)
+	return survey->process->descendant && is_only_here(survey->template, m)
 		       ? kind | MAPPING_ONLY_HERE
 		       : kind;
 }
@@ -176,13 +176,13 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
-	if (!is_pad(survey->target, m->start)) {
+	if (!is_pad(survey->process, m->start)) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
-		if (survey->target->descendant)
+		if (survey->process->descendant)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
-	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->target, m->start))
+	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->process, m->start))
 		return 0;
 	if (survey->areas.count == AREAS_MAX) {
 		survey->too_many = true;
@@ -229,7 +229,7 @@ static void look_for_others(const struct survey *survey)
 	for (uint32_t i = 0; known && i < survey->areas.count; i++)
 		known = !survey->areas.area[i].named ||
 			is_known(survey->memory, &survey->areas.area[i]);
-	others_look(survey->target->others, survey->target, &survey->areas,
+	others_look(survey->process->others, survey->process, &survey->areas,
 		    known ? 0 : survey->since);
 }
 
@@ -248,7 +248,7 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 {
 	if (a->wiped)
 		return true;
-	if (a->named && others_have(survey->target->others, a)) {
+	if (a->named && others_have(survey->process->others, a)) {
 		survey->others_bytes += area_bytes(a);
 		/* It is looked for again, if there is no memory to remember it in. */
 		(void)areas_add(&survey->foreign, a);
@@ -257,13 +257,13 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 	a->way = way_of(survey->template, a);
 	if (a->way == WAY_NONE)
 		return false;
-	if (survey->shared_bytes + area_bytes(a) > survey->target->shm_bytes) {
+	if (survey->shared_bytes + area_bytes(a) > survey->process->shm_bytes) {
 		survey->left_bytes += area_bytes(a);
 		return false;
 	}
 	survey->shared_bytes += area_bytes(a);
 	if (a->as_file)
-		others_watch(survey->target->others, survey->template, a);
+		others_watch(survey->process->others, survey->template, a);
 	return true;
 }
 
@@ -304,14 +304,14 @@ static int remember(struct survey *survey, struct avc_error *err)
 	areas_free(&memory->areas);
 	memory->areas = survey->areas;
 	survey->areas = (struct areas){ 0 };
-	return fail(err, AVC_DEADLINE, EAGAIN, survey->target->pid, "keep memory", "",
+	return fail(err, AVC_RETRY, 0, survey->process->pid, "keep memory", "",
 		    "it has new shared or MADV_WIPEONFORK memory");
 }
 
 static int read_areas(struct survey *survey, const struct areas *copied, struct avc_error *err)
 {
 	struct memory *memory = survey->memory;
-	const pid_t pid = survey->target->pid;
+	const pid_t pid = survey->process->pid;
 	const uint64_t start = now_ns();
 	int result = 0;
 
@@ -329,7 +329,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	survey->foreign = (struct areas){ 0 };
 	if (survey->private_huge)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "", "%s",
-			      private_huge_pages);
+			      memory_private_huge_pages);
 	else if (survey->too_many)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "",
 			      "it has more than %d areas of shared or MADV_WIPEONFORK memory",
@@ -339,11 +339,11 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	return result;
 }
 
-static int check_layout(struct target *target, const struct generation *generation,
+static int check_layout(struct process *process, const struct generation *generation,
 			struct avc_error *err)
 {
-	struct memory *memory = target->memory;
-	struct survey survey = { .target = target };
+	struct memory *memory = process->memory;
+	struct survey survey = { .process = process };
 	const uint64_t start = now_ns();
 	int result;
 
@@ -354,7 +354,7 @@ static int check_layout(struct target *target, const struct generation *generati
 	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
 		return 0;
 	survey = (struct survey){
-		.target = target,
+		.process = process,
 		.template = generation->template,
 		.memory = memory,
 		.since = generation->taken_ns,
@@ -366,18 +366,18 @@ static int check_layout(struct target *target, const struct generation *generati
 	return result;
 }
 
-int areas_check(struct target *target, const struct generation *generation, struct avc_error *err)
+int areas_check(struct process *process, const struct generation *generation, struct avc_error *err)
 {
-	const int result = check_layout(target, generation, err);
+	const int result = check_layout(process, generation, err);
 
-	generation->image->kinds = target->memory->kinds;
+	generation->image->kinds = process->memory->kinds;
 	if (!result && generation->image->too_much)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			    "more than %u MB of its memory are wiped in a clone (MADV_WIPEONFORK), "
 			    "which is too much to copy",
 			    WIPED_MAX >> 20);
 	if (!result && !generation->image->whole)
-		return fail(err, AVC_DEADLINE, 0, target->pid, "keep memory", "",
+		return fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
 			    "its shared or MADV_WIPEONFORK memory cannot be read");
 	return result;
 }

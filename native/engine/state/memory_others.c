@@ -159,7 +159,7 @@ int area_find_descriptor(pid_t pid, const struct area *a)
 	return found;
 }
 
-static void look(struct mem_others *others, const struct target *target)
+static void look(struct mem_others *others, const struct process *process)
 {
 	char inside[64] = "", its[64];
 	DIR *proc = opendir("/proc");
@@ -167,7 +167,7 @@ static void look(struct mem_others *others, const struct target *target)
 
 	others->looked_ns = now_ns();
 	others->count = 0;
-	others->unknown = !proc || proc_link(target->init, "ns/pid", inside, sizeof inside) < 0;
+	others->unknown = !proc || proc_link(process->init, "ns/pid", inside, sizeof inside) < 0;
 	while (!others->unknown && (entry = readdir(proc))) {
 		const pid_t pid = (pid_t)atoi(entry->d_name);
 
@@ -185,8 +185,8 @@ static void look(struct mem_others *others, const struct target *target)
 	others->cost_ns = now_ns() - others->looked_ns;
 }
 
-void others_look(struct mem_others *others, const struct target *target, const struct areas *areas,
-		 uint64_t since)
+void others_look(struct mem_others *others, const struct process *process,
+		 const struct areas *areas, uint64_t since)
 {
 	bool any = false,
 	     fresh = now_ns() - others->looked_ns < LOOK_NS + others->cost_ns * LOOK_SHARE;
@@ -204,7 +204,7 @@ void others_look(struct mem_others *others, const struct target *target, const s
 			others->device[others->devices++] = a->device;
 	}
 	if (any && (!fresh || others->looked_ns < since))
-		look(others, target);
+		look(others, process);
 }
 
 bool others_have(const struct mem_others *others, const struct area *a)

@@ -21,7 +21,7 @@
 #define ENTRIES 512 /* of pagemap, at a time                                       */
 
 struct copying {
-	const struct target *target;
+	const struct process *process;
 	struct mem_image *image;
 	int pagemap;
 };
@@ -64,7 +64,7 @@ static bool add_page(const struct copying *copying, avc_remote page)
 		wiped->bytes = more;
 		wiped->size = size;
 	}
-	if (pread(copying->target->mem_fd, wiped->bytes + wiped->used, PAGE, (off_t)page) !=
+	if (pread(copying->process->mem_fd, wiped->bytes + wiped->used, PAGE, (off_t)page) !=
 		    (ssize_t)PAGE ||
 	    !add_run(image, page, false))
 		return false;
@@ -95,9 +95,9 @@ static int copy_stretch(avc_remote start, avc_remote end, void *arg)
 	return 0;
 }
 
-void wiped_copy(const struct target *target, struct mem_image *image)
+void wiped_copy(const struct process *process, struct mem_image *image)
 {
-	struct copying copying = { .target = target, .image = image, .pagemap = -1 };
+	struct copying copying = { .process = process, .image = image, .pagemap = -1 };
 
 	for (uint32_t i = 0; image->whole && i < image->areas.count; i++) {
 		const struct area *a = &image->areas.area[i];
@@ -105,7 +105,7 @@ void wiped_copy(const struct target *target, struct mem_image *image)
 		if (!a->wiped)
 			continue;
 		if (copying.pagemap < 0)
-			copying.pagemap = proc_open(target->pid, "pagemap", O_RDONLY);
+			copying.pagemap = proc_open(process->pid, "pagemap", O_RDONLY);
 		image->whole = copying.pagemap >= 0 &&
 			       !pagemap_walk(copying.pagemap, a->start, a->end, copy_stretch,
 					     &copying);
@@ -120,27 +120,27 @@ void wiped_free(struct wiped *wiped)
 	*wiped = (struct wiped){ 0 };
 }
 
-static int flush(struct target *target, struct generation *generation, struct inj_call *call,
+static int flush(struct process *process, struct generation *generation, struct inj_call *call,
 		 struct avc_error *err)
 {
-	if (call->count &&
-	    (parasite_send(&target->parasite, generation->template, &generation->base, call, err) ||
-	     parasite_run(generation->template, call, err)))
+	if (call->count && (parasite_send(&process->parasite, generation->template,
+					  &generation->base, call, err) ||
+			    parasite_run(generation->template, call, err)))
 		return -1;
 	call_begin(call, INJ_AFTER_PARK);
 	return 0;
 }
 
-static int advise(struct target *target, struct generation *generation, struct inj_call *call,
+static int advise(struct process *process, struct generation *generation, struct inj_call *call,
 		  avc_remote start, avc_remote end, int advice, struct avc_error *err)
 {
-	if (call->count >= INJ_CALLS_MAX && flush(target, generation, call, err))
+	if (call->count >= INJ_CALLS_MAX && flush(process, generation, call, err))
 		return -1;
 	call_add(call, SYS_madvise, start, end - start, (uint64_t)advice, 0, 0);
 	return 0;
 }
 
-int wiped_fill(struct target *target, struct generation *generation, struct setup *setup,
+int wiped_fill(struct process *process, struct generation *generation, struct setup *setup,
 	       struct avc_error *err)
 {
 	struct inj_call *call = &setup->slot->template_call;
@@ -156,7 +156,7 @@ int wiped_fill(struct target *target, struct generation *generation, struct setu
 		const size_t bytes = run->end - run->start;
 
 		if (run->guard) {
-			result = advise(target, generation, call, run->start, run->end,
+			result = advise(process, generation, call, run->start, run->end,
 					GUARD_INSTALL, err);
 		} else if (pwrite(mem_fd, from, bytes, (off_t)run->start) != (ssize_t)bytes) {
 			result = fail_errno(err, generation->template, "keep memory", "write(mem)",
@@ -170,11 +170,11 @@ int wiped_fill(struct target *target, struct generation *generation, struct setu
 
 		if (!a->wiped)
 			continue;
-		result = advise(target, generation, call, a->start, a->end, MADV_KEEPONFORK, err);
+		result = advise(process, generation, call, a->start, a->end, MADV_KEEPONFORK, err);
 		setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise, a->start, area_bytes(a),
 			  MADV_WIPEONFORK, 0, 0);
 	}
 	close_fd(&mem_fd);
 	wiped_free(&image->wiped);
-	return result || flush(target, generation, call, err) ? -1 : 0;
+	return result || flush(process, generation, call, err) ? -1 : 0;
 }

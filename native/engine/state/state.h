@@ -20,7 +20,7 @@
 
 /* What a generation has of a process that is not the main one. */
 struct branch {
-	struct target *target;    /* NULL: it had ended, and nobody had waited for it */
+	struct process *process;  /* NULL: it had ended, and nobody had waited for it */
 	struct generation *image; /* of this process alone                   */
 	int parent;               /* index of its parent's branch, or ...    */
 	pid_t inside;
@@ -93,48 +93,49 @@ struct generation {
 /* ---- image.c ---------------------------------------------------------------------- */
 
 /* That of a process that is not the main one, or NULL; `generation` may be NULL. */
-struct branch *generation_branch(const struct generation *generation, const struct target *target);
+struct branch *generation_branch(const struct generation *generation,
+				 const struct process *process);
 
 /* ---- pending.c ------------------------------------------------------------------ */
 
 struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
  * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
-int pending_read(struct target *target, struct avc_error *err) warn_unused;
+int pending_read(struct process *process, struct avc_error *err) warn_unused;
 /* One that the app dies of as soon as it runs again; 0: none. */
 int pending_deadly(const struct pending *pending);
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
-void pending_setup_thread(const struct target *target, const struct thread *thread,
+void pending_setup_thread(const struct process *process, const struct thread *thread,
 			  struct setup *setup);
-void pending_setup(const struct target *target, struct setup *setup);
+void pending_setup(const struct process *process, struct setup *setup);
 
 /* ---- timers.c -------------------------------------------------------------------- */
 
 struct timers *timers_new(void);
 /* While everything is stopped: what to call first in the list; when that was done. */
-void timers_ask(struct target *target, struct inj_call *call);
-void timers_answer(struct target *target, const struct inj_call *call, uint64_t took_ns);
+void timers_ask(struct process *process, struct inj_call *call);
+void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns);
 /* When the app runs again. */
-void timers_setup(struct target *target, struct setup *setup);
+void timers_setup(struct process *process, struct setup *setup);
 
 /* ---- attributes.c ----------------------------------------------------------------- */
 
 #define ATTRIBUTES_ASK_BYTES 376
 /* While it is stopped, from outside. */
-void scheduling_read(pid_t tid, struct scheduling *scheduling);
+void attributes_read_scheduling(pid_t tid, struct scheduling *scheduling);
 /* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
  * leave them.  Returns the first of the calls. */
 const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
 void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *creds);
 /* When the app runs again: each thread, after setup_thread(); the process. */
-int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
+int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
 /* Of a stopped thread: its seccomp filters, whatever they say. */
-uint64_t filters_read(pid_t tid);
-int attributes_keep(const struct target *target, struct generation *generation,
+uint64_t attributes_read_filters(pid_t tid);
+int attributes_keep(const struct process *process, struct generation *generation,
 		    struct avc_error *err) warn_unused;
 /* Before the restored threads go: what can be done from outside only. */
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
@@ -142,8 +143,8 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 /* ---- process_attrs.c ------------------------------------------------------------------------ */
 
 /* After the app runs again: what only the template can tell. */
-int branch_learn(struct branch *branch, struct avc_error *err) warn_unused;
-void branch_forget(struct branch *branch);
+int process_attrs_learn(struct branch *branch, struct avc_error *err) warn_unused;
+void process_attrs_forget(struct branch *branch);
 /* All protection keys, before its memory refers to some and while the kernel must not choose one
  * (pkeys(7), of what can only be executed).  process_attrs_put() frees those that it did not have. */
 int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err) warn_unused;
@@ -155,7 +156,7 @@ int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
 void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
 /* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
  * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
-void limit_lift(pid_t pid, int which, uint64_t least);
+void process_attrs_lift_limit(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
 void process_attrs_setup_limits(const struct branch *branch, struct setup *setup);
 
@@ -175,7 +176,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 
 /* Shared memory that an image of the same checkpoint has: one is enough; and what all of them have
  * taken of what they may. */
-#define WIPED_MAX (16u << 20)    /* bytes of MADV_WIPEONFORK memory                 */
+#define WIPED_MAX (16u << 20)     /* bytes of MADV_WIPEONFORK memory                 */
 #define WIPED_RUNS_MAX (1u << 14) /* stretches of it, and guard pages within          */
 struct mem_key {
 	uint64_t device, inode, offset, bytes;
@@ -196,7 +197,7 @@ struct memory *memory_new(void);
 void memory_forget(struct memory *memory); /* it is another program         */
 void memory_free(struct memory *memory);
 /* Room for what is to be copied in the freeze. */
-int memory_prepare(const struct target *target, struct mem_image **image, struct mem_seen *seen,
+int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
 void mem_image_free(struct mem_image *image);
 /* What only "smaps" tells of a mapping and a restore has to know, as of the checkpoint: enum
@@ -205,20 +206,20 @@ uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
 bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
 /* While everything is stopped: copies, what is its own when it stands still, what is shared
  * when everybody does; and what to call before the clone. */
-void memory_copy_own(const struct target *target, struct mem_image *image);
-void memory_copy_shared(const struct target *target, struct mem_image *image);
+void memory_copy_own(const struct process *process, struct mem_image *image);
+void memory_copy_shared(const struct process *process, struct mem_image *image);
 void memory_dofork(const struct memory *memory, struct inj_call *call);
-/* The template is smaller than the app: always fails, with EAGAIN if the next
+/* The template is smaller than the app: always fails, with AVC_RETRY if the next
  * attempt will be better. */
-int memory_learn(struct target *target, long missing_pages, struct avc_error *err);
-/* When the app runs again.  Fails with EAGAIN if what had to be copied was not. */
+int memory_learn(struct process *process, long missing_pages, struct avc_error *err);
+/* When the app runs again.  Fails with AVC_RETRY if what had to be copied was not. */
 /* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
  * pages is small, and whoever writes to a shared one when it is empty is killed. */
-extern const char private_huge_pages[];
-int memory_finish(struct target *target, struct generation *generation, int64_t locked_kb,
+extern const char memory_private_huge_pages[];
+int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
 /* At a restore, before anything runs; *notes: what can not be written. */
-int memory_put_back(const struct target *target, const struct generation *image, pid_t pid,
+int memory_put_back(const struct process *process, const struct generation *image, pid_t pid,
 		    struct avc_error *notes, struct avc_error *err) warn_unused;
 
 #endif

@@ -289,18 +289,21 @@ int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *er
 }
 
 /* From its parent's parasite into its own. */
-int syscall_batch_change_parasite(struct syscall_batch *batch, const struct target *target,
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
 				  uint32_t slot, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
+	const struct parasite *parasite = &process->parasite;
 
-	if (syscall_batch_give(batch, parasite->fd, err))
+	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
 			  PARASITE_FLAGS, 1, 0);
+	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (syscall_batch_give(batch, parasite->data_fd, err))
+		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
 			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1,
-			  INJ_CODE_BYTES);
+			  0);
 	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
 	if (syscall_batch_flush(batch, err))
 		return -1;

@@ -9,42 +9,36 @@
 
 #include "trace.h"
 
-struct thread *thread_find(struct target *target, pid_t tid)
+struct thread *thread_find(struct process *process, pid_t tid)
 {
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].tid == tid)
-			return &target->threads[i];
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].tid == tid)
+			return &process->threads[i];
 	return NULL;
 }
 
-struct thread *thread_add(struct target *target, pid_t tid, struct avc_error *err)
+struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *err)
 {
 	struct thread *t;
 
-	if (target->thread_count == target->thread_room) {
+	if (process->thread_count == process->thread_room) {
 		fail(err, AVC_DEADLINE, 0, tid, "freeze", "",
 		     "threads appear faster than they can be stopped");
 		return NULL;
 	}
-	t = &target->threads[target->thread_count++];
-	*t = (struct thread){ .tid = tid,
-			      .call.nr = -1,
-			      .rewound = { .nr = -1, .argument = -1 },
-			      .timeout_cell = -1,
-			      .block = -1 };
+	t = &process->threads[process->thread_count++];
+	*t = (struct thread){ .tid = tid, .call.nr = -1, .block = -1 };
 	return t;
 }
 
-void threads_forget_unseen(struct target *target)
+void threads_forget_unseen(struct process *process)
 {
 	uint32_t kept = 0;
 
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].seen || target->threads[i].attached)
-			target->threads[kept++] = target->threads[i];
-		else
-			rewind_forget(target, &target->threads[i]);
-	target->thread_count = kept;
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].seen || process->threads[i].attached)
+			process->threads[kept++] = process->threads[i];
+	process->thread_count = kept;
 }
 
 /* EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
@@ -67,7 +61,7 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 			  "not allowed to trace it (CAP_SYS_PTRACE and CAP_SYS_ADMIN are needed)");
 }
 
-int thread_stop(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_stop(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	int errnum;
 
@@ -84,7 +78,7 @@ int thread_stop(struct target *target, struct thread *thread, struct avc_error *
 			return 0;
 		}
 		errno = errnum;
-		return seize_failed(target->pid, thread->tid, err);
+		return seize_failed(process->pid, thread->tid, err);
 	}
 	thread->attached = true;
 	thread->stopped = false;
@@ -94,12 +88,12 @@ int thread_stop(struct target *target, struct thread *thread, struct avc_error *
 }
 
 /* A process or thread that a thread of ours has brought forth meanwhile. */
-static struct thread *adopt(struct target *target, pid_t tid, struct avc_error *err)
+static struct thread *adopt(struct process *process, pid_t tid, struct avc_error *err)
 {
-	struct thread *born = thread_find(target, tid);
+	struct thread *born = thread_find(process, tid);
 
 	if (!born)
-		born = thread_add(target, tid, err);
+		born = thread_add(process, tid, err);
 	if (born && !born->attached) {
 		born->attached = true;
 		born->stopped = false;
@@ -107,14 +101,14 @@ static struct thread *adopt(struct target *target, pid_t tid, struct avc_error *
 	return born;
 }
 
-int thread_await(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_await(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	pid_t child = 0;
 	const enum stop_kind kind = tracee_await(thread->tid, &child, err);
 
 	/* Whatever came of it: its new threads are found by the next walk, attached
-	 * already; new processes are not, which is how freeze() tells them. */
-	if (child && !adopt(target, child, err))
+	 * already; new processes are not, which is how freeze_tree() tells them. */
+	if (child && !adopt(process, child, err))
 		return -1;
 	switch (kind) {
 	case STOP_TRAP:
@@ -132,13 +126,13 @@ int thread_await(struct target *target, struct thread *thread, struct avc_error 
 		thread->stopped = false;
 		return fail_errno(err, thread->tid, "stop", "ptrace(GETREGS)", "it has ended");
 	}
-	rewind_call(target, thread);
+	rewind_call(process, thread);
 	return 0;
 }
 
 void thread_runs_on(struct thread *thread, const struct avc_error *err)
 {
-	if (err->code == AVC_DEADLINE || err->code == AVC_GONE)
+	if (err->code == AVC_DEADLINE || err->code == AVC_RETRY || err->code == AVC_GONE)
 		thread->stopped = false;
 }
 
@@ -149,7 +143,7 @@ void thread_release(struct thread *thread)
 	if (!thread->attached || !thread->stopped)
 		return;
 	if (thread->borrowed)
-		give_back(thread, &ignored);
+		thread_give_back(thread, &ignored);
 	if (ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) == 0) {
 		thread->attached = false;
 		thread->stopped = false;
@@ -159,15 +153,15 @@ void thread_release(struct thread *thread)
 	thread->stopped = false;
 }
 
-void thread_let_go(const struct target *target, struct thread *thread)
+void thread_let_go(const struct process *process, struct thread *thread)
 {
 	if (thread->attached && thread->stopped)
-		rewind_count_stop(target, thread);
+		rewind_count_stop(process, thread);
 	thread_release(thread);
 }
 
 /* True as long as it still has to be waited for. */
-static bool straggle(struct target *target, struct thread *thread)
+static bool straggle(struct process *process, struct thread *thread)
 {
 	const pid_t tid = thread->tid;
 	struct avc_error ignored = { 0 };
@@ -191,7 +185,7 @@ static bool straggle(struct target *target, struct thread *thread)
 	case STOP_DEADLINE:
 		return true;
 	case STOP_EXIT:
-		target->lost = target->lost || thread->borrowed;
+		process->lost = process->lost || thread->borrowed;
 		thread->attached = false;
 		thread->borrowed = false;
 		return false;
@@ -199,10 +193,10 @@ static bool straggle(struct target *target, struct thread *thread)
 		/* A borrowed thread may have found home by itself, and what it starts
 		 * there is the app's: to kill one thread is to kill them all. */
 		if (thread->borrowed && arch_regs_get(tid, &now) == 0 &&
-		    parasite_contains(&target->parasite, arch_pc(&now)))
+		    parasite_contains(&process->parasite, arch_pc(&now)))
 			tracee_kill(stop.message); /* our clone, too late */
 		else
-			adopt(target, stop.message, &ignored);
+			adopt(process, stop.message, &ignored);
 		/* fall through */
 	case STOP_SYSCALL:
 		/* Not a place to change registers: let it come to a better one. */
@@ -215,18 +209,18 @@ static bool straggle(struct target *target, struct thread *thread)
 	if (arch_regs_get(tid, &now) == 0) {
 		/* Not before it has waited for what it brought forth for us: the app would
 		 * find that. */
-		if (target->waiting && thread->borrowed &&
-		    parasite_contains(&target->parasite, arch_pc(&now)) &&
-		    !__atomic_load_n(&target->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
+		if (process->waiting && thread->borrowed &&
+		    parasite_contains(&process->parasite, arch_pc(&now)) &&
+		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
 			ptrace(PTRACE_CONT, tid, NULL, 0L);
 			return true;
 		}
-		if (thread->borrowed && parasite_contains(&target->parasite, arch_pc(&now))) {
-			give_back(thread, &ignored);
+		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {
+			thread_give_back(thread, &ignored);
 		} else {
 			thread->borrowed = false;
 			thread->regs = now;
-			rewind_call(target, thread);
+			rewind_call(process, thread);
 		}
 	}
 	if (ptrace(PTRACE_DETACH, tid, NULL, (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
@@ -235,12 +229,12 @@ static bool straggle(struct target *target, struct thread *thread)
 	return false;
 }
 
-uint32_t stragglers(struct target *target)
+uint32_t threads_tend_stragglers(struct process *process)
 {
 	uint32_t left = 0;
 
-	for (uint32_t i = 0; i < target->thread_count; i++) /* may grow */
-		if (target->threads[i].attached && straggle(target, &target->threads[i]))
+	for (uint32_t i = 0; i < process->thread_count; i++) /* may grow */
+		if (process->threads[i].attached && straggle(process, &process->threads[i]))
 			left++;
 	return left;
 }
@@ -250,7 +244,7 @@ struct rseq_cs {
 	uint64_t start, length, abort;
 };
 
-void rseq_fixup(int mem_fd, struct thread *thread)
+void thread_fix_rseq(int mem_fd, struct thread *thread)
 {
 	struct rseq_cs cs;
 	uint64_t pointer;

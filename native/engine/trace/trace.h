@@ -36,15 +36,13 @@ struct call {
 	uint64_t arg[3];
 };
 
-/* What is remembered of an interrupted call between two stops (rewind.c). */
+/* What is remembered of a call that was rewound (rewind.c). */
 struct rewound {
-	long nr; /* -1: nothing                                      */
-	avc_remote pc, sp;
-	int argument;      /* which one is the timeout, -1: none was changed   */
-	uint64_t original; /* that argument as the app passed it               */
-	uint64_t value;    /* and as we left it                                */
-	uint64_t at_ns;
-	uint64_t limit_ns; /* of a socket: how long the call may take          */
+	uint32_t mark; /* of that call; 0: none                            */
+	int answer;    /* when its time is up                              */
+	uint64_t due_ns;
+	uint64_t runs;            /* how often the thread had run when it was waiting again */
+	bool runs_known, waiting; /* waits.c                                        */
 };
 
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
@@ -76,7 +74,7 @@ struct creds {
 	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
 
-/* What a thread is asked (target.c); NULL: not that. */
+/* What a thread is asked (process.c); NULL: not that. */
 struct questions {
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
 };
@@ -89,8 +87,8 @@ struct thread {
 	int block;       /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
 	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
-	bool vetted;                         /* vet() has been at this stop                      */
-	struct arch_regs regs;               /* as of the stop, EINTR already mended          */
+	bool vetted;           /* thread_vet() has been at this stop                      */
+	struct arch_regs regs; /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
 	uint64_t rseq;
@@ -110,7 +108,6 @@ struct thread {
 	char name[16];
 	struct creds creds;
 	struct scheduling scheduling; /* at this freeze                         */
-	int timeout_cell;             /* of inj_control.timeout, -1: none                 */
 	struct call call;
 	struct rewound rewound;
 	uint64_t stopped_ns;
@@ -124,17 +121,21 @@ struct parasite {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
-	int fd; /* of those pages                                              */
+	/* The guard's own memory, not the app's: the code, sealed, so that nobody can write it; and
+	 * the rest, which the app can write as well. */
+	int code_fd, data_fd;
 };
+#define PARASITE_NAME "avckpt-parasite"
 /* How it is mapped in two parts. */
 #define PARASITE_CODE_PROT (PROT_READ | PROT_EXEC)
 #define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
 #define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
+#define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
 
-/* The live main process of the app. */
-struct target {
+/* A live process of the app. */
+struct process {
 	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
-	 * or, when that has ended, any other (target_follow).  0: none           */
+	 * or, when that has ended, any other (process_follow).  0: none           */
 	pid_t pid;
 	pid_t leader; /* the process's own number                            */
 	pid_t inside; /* the same in its own namespace                       */
@@ -146,7 +147,7 @@ struct target {
 	int holder_pidfd;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
-	uint64_t cells_used; /* bit mask over inj_control.timeout               */
+	uint64_t due_ns; /* when the first of its calls is to be ended (waits.c)   */
 	uint64_t nonce;
 	/* Parasites that a guard which died left behind; they go with the second
 	 * checkpoint, when no thread can be in them any more. */
@@ -171,29 +172,29 @@ struct target {
 	struct timers *timers;
 	struct memory *memory;
 	struct mem_others *others; /* of the main one, and so of all             */
-	uint64_t shm_bytes;     /* shared memory that is rolled back, at most       */
-	uint32_t plain_filters; /* seccomp filters of init: the container's        */
-	pid_t init;             /* avckpt-init                                      */
+	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
+	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
+	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool tcp_moved;    /* bytes of connections are to be counted           */
 	bool tcp_messages; /* quiescent is only who is between two messages    */
 	/* Of a process that is not the main one (tree.c). */
 	bool descendant;
-	uint64_t start;                  /* when it began; tells it from one with its number */
-	uint32_t images;                 /* generations that have one of it                  */
-	struct arch_regs holder_base;    /* a user context of the holder, which clones       */
-	bool cloning;                    /* by its holder, the main one by itself: freeze()  */
-	long clone_pages;                /* its size when that began                         */
-	long anon_pages;                 /* of its last template; 0: none yet                */
-	bool closing;                    /* by its holder: generation_close_tables()      */
-	bool doubtful;                   /* it was cloning when a checkpoint came to nothing */
-	bool waiting;                    /* its main thread is to wait for a task of ours       */
-	const struct creds *forebear;    /* what a process that is made from the main one has */
-	bool frozen;                     /* stopped in this freeze                            */
-	bool begun;                      /* and read, and asked                               */
-	bool adopts;                     /* it or one above it adopts orphans, or may do so    */
-	bool paused;                     /* between adopt_no_more() and adopt_again()         */
+	uint64_t start;               /* when it began; tells it from one with its number */
+	uint32_t images;              /* generations that have one of it                  */
+	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
+	long clone_pages;             /* its size when that began                         */
+	long anon_pages;              /* of its last template; 0: none yet                */
+	bool closing;                 /* by its holder: generation_close_tables()      */
+	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
+	bool waiting;                 /* its main thread is to wait for a task of ours       */
+	const struct creds *forebear; /* what a process that is made from the main one has */
+	bool frozen;                  /* stopped in this freeze                            */
+	bool begun;                   /* and read, and asked                               */
+	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
+	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */
 };
@@ -213,7 +214,7 @@ enum stop_kind {
 	STOP_SYSCALL,
 	STOP_SIGNAL,   /* about to receive `signal`                              */
 	STOP_EXIT,     /* gone; reaped                                           */
-	STOP_DYING,    /* killed, to be reaped later (stragglers())              */
+	STOP_DYING,    /* killed, to be reaped later (threads_tend_stragglers())              */
 	STOP_DEADLINE, /* did not stop in time                                   */
 	STOP_NONE,     /* WNOHANG: nothing new                                   */
 	STOP_OTHER
@@ -259,6 +260,8 @@ void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
 /* Of the i-th of them, to be watched; -1: there are no more. */
 int tracee_ending_pidfd(uint32_t i);
+/* Whether STOP_SYSCALL is of one that enters a system call, and not of one that leaves it. */
+bool tracee_enters_call(pid_t tid);
 /* Is this thread the one that traces it? */
 bool tracee_is_ours(pid_t tid);
 /* Holders, and processes that are being made: never to run on without us. */
@@ -269,44 +272,42 @@ bool tracee_is_ours(pid_t tid);
 /* ---- thread.c ------------------------------------------------------------------ */
 
 /* The entry for a tid; NULL when there is no room. */
-struct thread *thread_find(struct target *target, pid_t tid);
-struct thread *thread_add(struct target *target, pid_t tid, struct avc_error *err);
-void threads_forget_unseen(struct target *target);
+struct thread *thread_find(struct process *process, pid_t tid);
+struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *err);
+void threads_forget_unseen(struct process *process);
 /* Attaches and interrupts; thread_await() then waits for the stop, reads the
  * registers and mends the interrupted call. */
-int thread_stop(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
-int thread_await(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_stop(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_await(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 /* After injected code in it has failed: what did not come back in time is still on its way. */
 void thread_runs_on(struct thread *thread, const struct avc_error *err);
 /* Lets it go on as if nothing had been.  A thread that could not be stopped stays
  * attached: a straggler. */
 void thread_release(struct thread *thread);
 /* The same after a freeze: what that has taken is no time of a call that it was waiting in. */
-void thread_let_go(const struct target *target, struct thread *thread);
+void thread_let_go(const struct process *process, struct thread *thread);
 /* Looks after stragglers without waiting; returns how many are left. */
-uint32_t stragglers(struct target *target);
+uint32_t threads_tend_stragglers(struct process *process);
 /* Where a thread inside a restartable sequence has to go on (rseq(2)). */
-void rseq_fixup(int mem_fd, struct thread *thread);
+void thread_fix_rseq(int mem_fd, struct thread *thread);
 /* Of a stopped thread: whether it can be made to run something of ours. */
 int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 
 /* ---- rewind.c --------------------------------------------------------------------- */
 
 /* A thread that just stopped: remembers which call it is in.  If that was only interrupted
- * by us, the thread is set to make it again, with what is left of its timeout. */
-void rewind_call(struct target *target, struct thread *thread);
+ * by us, the thread is set to make it again, or, when the call's time is up, to answer that. */
+void rewind_call(struct process *process, struct thread *thread);
 /* Just before it goes on: takes off what the stop has added to a wait. */
-void rewind_count_stop(const struct target *target, const struct thread *thread);
-/* Registers as the app had them, before rewind_call() changed a timeout or the
- * kernel made restart_syscall(2) of the call. */
+void rewind_count_stop(const struct process *process, const struct thread *thread);
+/* Registers as the app had them, before rewind_call() marked the call or the kernel made
+ * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
-void rewind_forget(struct target *target, struct thread *thread);
 
 /* ---- parasite.c ------------------------------------------------------------------- */
 
-/* Maps the pages at `base` of process `pid` here and fills in code and control. */
-int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
-		  uint64_t nonce, struct avc_error *err) warn_unused;
+/* Makes the memory for a layout, with code and control filled in; it is in no process yet. */
+int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err) warn_unused;
 size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max);
 void parasite_close(struct parasite *parasite);
 struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot);
@@ -325,7 +326,7 @@ void call_begin(struct inj_call *call, enum inj_after after);
 struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
 			     uint64_t d, uint64_t e);
 /* Sends a stopped task into the parasite to make the calls.  `base` is a user context
- * of the task.  For a thread of the app use borrow(). */
+ * of the task.  For a thread of the app use thread_borrow(). */
 int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
 		  struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until all calls were made; it is in a plain trap stop then. */
@@ -334,7 +335,7 @@ int parasite_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_u
 int parasite_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 /* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
- * not let it, fails with AVC_KERNEL, and it is in a plain trap stop. */
+ * not let it, fails with AVC_LIMIT, and it is in a plain trap stop. */
 int parasite_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		       struct avc_error *err) warn_unused;
 /* The same in parts, for several at a time.  parasite_halt() waits until it is done and
@@ -348,18 +349,19 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
 /* exec puts another program in its place, at any moment, and the parasite is gone: whether it
- * is there, in a stopped thread.  If not, the target is not infected any more. */
-int parasite_check(struct target *target, pid_t tid, struct avc_error *err) warn_unused;
+ * is there, in a stopped thread.  If not, the process is not infected any more. */
+int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
-bool in_old_parasite(const struct target *target, avc_remote address);
+bool parasite_is_old(const struct process *process, avc_remote address);
 /* Until it is let go: it runs only what is ours meanwhile. */
-int suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
+int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
 /* May this stopped thread be borrowed?  What of that is to be read in its memory. */
-int vet(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_vet(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 /* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:
- * borrow, parasite_run*, give_back.  give_back() needs a plain trap stop. */
-int borrow(struct target *target, struct thread *thread, struct avc_error *err) warn_unused;
-int give_back(struct thread *thread, struct avc_error *err);
+ * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
+int thread_borrow(struct process *process, struct thread *thread,
+		  struct avc_error *err) warn_unused;
+int thread_give_back(struct thread *thread, struct avc_error *err);
 
 /* ---- setup.c ------------------------------------------------------------------- */
 
@@ -386,7 +388,7 @@ struct inj_setup *setup_add(struct setup *setup, enum inj_stage stage, const cha
 void setup_thread(struct setup *setup, struct inj_thread *thread);
 struct inj_setup *setup_add_thread(struct setup *setup, const char *name, long nr, uint64_t a,
 				   uint64_t b, uint64_t c, uint64_t d, uint64_t e);
-/* A copy of `bytes` bytes where the target can read it; the target's address. */
+/* A copy of `bytes` bytes where the process can read it; the process's address. */
 avc_remote setup_data(struct setup *setup, const void *data, size_t bytes);
 /* -1 if there was not enough room for it all. */
 int setup_end(const struct setup *setup, pid_t pid, struct avc_error *err) warn_unused;
@@ -395,7 +397,7 @@ const struct inj_setup *setup_failed(const struct parasite *parasite, uint32_t s
 /* The same for one stage; calls without a name do not count. */
 const struct inj_setup *setup_failed_stage(const struct parasite *parasite, uint32_t slot,
 					   enum inj_stage stage);
-/* The name of a call by the target's address of it. */
+/* The name of a call by the process's address of it. */
 const char *setup_name(const struct parasite *parasite, avc_remote address);
 
 /* ---- fd_channel.c ------------------------------------------------------------------ */
@@ -474,7 +476,7 @@ int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_chan
 				     struct avc_error *err) warn_unused;
 int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err) warn_unused;
 /* From its parent's parasite into its own. */
-int syscall_batch_change_parasite(struct syscall_batch *batch, const struct target *target,
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
 				  uint32_t slot, struct avc_error *err) warn_unused;
 /* Its descriptors; it gets no more after that. */
 int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *table,
@@ -482,11 +484,21 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 
 /* ---- last_pid.c ------------------------------------------------------------------- */
 
-/* Starts a helper task inside the PID namespace; it serves the slot's requests
- * until last_pid_stop().  last_pid_set() is the engine's own request. */
-struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
+/* A slot whose requests the helper serves. */
+struct last_pid_slot {
+	const struct parasite *parasite;
+	uint32_t number;
+};
+/* Starts the helper of the next restore, which waits for it; best effort. */
+void last_pid_prepare(int init_pidfd);
+void last_pid_forget(void);
+/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as the process that
+ * is restored in the first slot asks, or in that of last_pid_serve().  last_pid_set() is the
+ * engine's own request. */
+struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
+				struct avc_error *err);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
-/* From now on those of another slot. */
+/* From now on those of another one of the slots. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 
@@ -496,7 +508,6 @@ struct init_channel {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
-	int pidns_fd;        /* of the container                                 */
 	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
 	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
 };

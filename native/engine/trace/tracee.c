@@ -20,6 +20,8 @@
 #include "trace.h"
 
 #define TICK_NS (2 * (long)NS_PER_MS)
+#define PTRACE_GET_SYSCALL_INFO_ 0x420e /* since Linux 5.3 */
+#define SYSCALL_INFO_ENTRY 1
 
 #ifndef sigev_notify_thread_id
 #define sigev_notify_thread_id _sigev_un._tid
@@ -209,6 +211,15 @@ int tracee_halt(pid_t tid, struct avc_error *err)
 		return fail_errno(err, tid, "stop", "ptrace(INTERRUPT)", "it has gone");
 	(void)ptrace(PTRACE_CONT, tid, NULL, 0L); /* refused if it runs */
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
+bool tracee_enters_call(pid_t tid)
+{
+	/* struct ptrace_syscall_info of <linux/ptrace.h>, which does not go with <sys/ptrace.h>. */
+	uint8_t info[88] = { 0 };
+
+	return ptrace(PTRACE_GET_SYSCALL_INFO_, tid, sizeof info, info) > 0 &&
+	       info[0] == SYSCALL_INFO_ENTRY;
 }
 
 bool tracee_is_ours(pid_t tid)

@@ -97,6 +97,7 @@ def _container() -> Json:
             "init_pid": _integer("avckpt-init, in the sidecar's PID namespace"),
             "app_pid": _integer("the application, in the sidecar's PID namespace; 0: none yet"),
             "app_pid_inside": _integer("the same in the container's"),
+            "guard_pid": _integer("of the process that protects it, in the sidecar's PID namespace; 0: there is none"),
             "threads": _integer("of the last checkpoint or restore"),
             "interval_s": _seconds("between checkpoints"),
             "keep": _integer("generations kept"),

@@ -50,6 +50,8 @@ class Protected:
     """Why it is not (quite) protected, or how it ended; empty when all is well."""
     app_pid: int = 0
     app_pid_inside: int = 0
+    guard_pid: int = 0
+    """Of its avckpt-guard; 0: there is none."""
     threads: int = 0
     generation: int = 0
     generations: int = 0
@@ -102,7 +104,7 @@ class Protected:
         elif kind is EventKind.MISSED:
             self.missed += 1
             self._suffer(f"checkpoint missed: {event.error}")
-        elif kind is EventKind.UNPROTECTED:
+        elif kind in (EventKind.UNPROTECTED, EventKind.GUARD_LOST):
             self._to(State.UNPROTECTED, str(event.error))
         elif kind is EventKind.DIED:
             self._to(State.RESTORING)
@@ -157,6 +159,7 @@ class Protected:
             "init_pid": self.init_pid,
             "app_pid": self.app_pid,
             "app_pid_inside": self.app_pid_inside,
+            "guard_pid": self.guard_pid,
             "threads": self.threads,
             "interval_s": self.config.interval_s,
             "keep": self.config.keep,

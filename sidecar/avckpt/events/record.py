@@ -166,6 +166,7 @@ _KINDS = {
     EventKind.ENDED: Kind.ENDED,
     EventKind.REFUSED: Kind.REFUSED,
     EventKind.DROPPED: Kind.DROPPED,
+    EventKind.GUARD_LOST: Kind.UNPROTECTED,
 }
 _DEATHS = frozenset({Kind.DIED, Kind.RESTORED, Kind.GAVE_UP})
 _COUNTED = frozenset({Kind.CHECKPOINT, Kind.RESTORED, Kind.DROPPED})

@@ -23,117 +23,119 @@
 #define ASK_AGAIN_AFTER 8    /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
 
-void target_init(struct target *target)
+void process_init(struct process *process)
 {
-	*target = (struct target){ .pidfd = -1,
-				   .leader_pidfd = -1,
-				   .task_dirfd = -1,
-				   .mem_fd = -1,
-				   .timers_fd = -1,
-				   .stat_fd = -1,
-				   .statm_fd = -1,
-				   .holder_pidfd = -1 };
+	*process = (struct process){ .pidfd = -1,
+				     .leader_pidfd = -1,
+				     .task_dirfd = -1,
+				     .mem_fd = -1,
+				     .timers_fd = -1,
+				     .stat_fd = -1,
+				     .statm_fd = -1,
+				     .holder_pidfd = -1,
+				     .due_ns = UINT64_MAX };
 }
 
-bool target_make_room(struct target *target)
+bool process_make_room(struct process *process)
 {
-	target->threads = calloc(THREADS_MAX, sizeof *target->threads);
-	target->thread_room = THREADS_MAX;
-	target->memory = memory_new();
-	target->pending = pending_new();
-	target->timers = timers_new();
-	return target->threads && target->memory && target->pending && target->timers;
+	process->threads = calloc(THREADS_MAX, sizeof *process->threads);
+	process->thread_room = THREADS_MAX;
+	process->memory = memory_new();
+	process->pending = pending_new();
+	process->timers = timers_new();
+	return process->threads && process->memory && process->pending && process->timers;
 }
 
-void target_free_room(struct target *target)
+void process_free_room(struct process *process)
 {
-	free(target->threads);
-	memory_free(target->memory);
-	free(target->pending);
-	free(target->timers);
-	target->threads = NULL;
-	target->memory = NULL;
-	target->pending = NULL;
-	target->timers = NULL;
+	free(process->threads);
+	memory_free(process->memory);
+	free(process->pending);
+	free(process->timers);
+	process->threads = NULL;
+	process->memory = NULL;
+	process->pending = NULL;
+	process->timers = NULL;
 }
 
 /* A descriptor for its table of descriptors: the main thread has none any more when it
  * has ended, and the others have pidfds of their own since Linux 6.9. */
-static int follow(struct target *target, struct avc_error *err)
+static int follow(struct process *process, struct avc_error *err)
 {
-	const pid_t pid = proc_live_thread(target->leader);
+	const pid_t pid = proc_live_thread(process->leader);
 
 	if (!pid)
-		return fail(err, AVC_GONE, ESRCH, target->leader, "attach", "", "it has ended");
-	close_fd(&target->pidfd);
-	close_fd(&target->statm_fd);
-	target->pid = pid;
+		return fail(err, AVC_GONE, ESRCH, process->leader, "attach", "", "it has ended");
+	close_fd(&process->pidfd);
+	close_fd(&process->statm_fd);
+	process->pid = pid;
 	/* Its number is nobody else's as long as there are others. */
-	if (pid != target->leader && target->leader_pidfd < 0)
-		target->leader_pidfd = proc_pidfd_open(target->leader);
-	target->statm_fd = proc_open(pid, "statm", O_RDONLY);
-	target->pidfd = pid == target->leader ? proc_pidfd_open(pid)
-					      : (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
-	if (target->pidfd < 0 && errno == EINVAL)
-		return fail(err, AVC_UNSUPPORTED, EINVAL, target->leader, "attach",
+	if (pid != process->leader && process->leader_pidfd < 0)
+		process->leader_pidfd = proc_pidfd_open(process->leader);
+	process->statm_fd = proc_open(pid, "statm", O_RDONLY);
+	process->pidfd = pid == process->leader ? proc_pidfd_open(pid)
+						: (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
+	if (process->pidfd < 0 && errno == EINVAL)
+		return fail(err, AVC_UNSUPPORTED, EINVAL, process->leader, "attach",
 			    "pidfd_open(PIDFD_THREAD)",
 			    "its main thread has ended, which needs Linux 6.9");
-	if (target->pidfd < 0)
-		return fail_errno(err, target->leader, "attach", "pidfd_open", "it has ended");
+	if (process->pidfd < 0)
+		return fail_errno(err, process->leader, "attach", "pidfd_open", "it has ended");
 	return 0;
 }
 
-int target_follow(struct target *target, struct avc_error *err)
+int process_follow(struct process *process, struct avc_error *err)
 {
-	return proc_live_thread(target->pid) == target->pid ? 0 : follow(target, err);
+	return proc_live_thread(process->pid) == process->pid ? 0 : follow(process, err);
 }
 
-void target_kill(const struct target *target)
+void process_kill(const struct process *process)
 {
 	syscall(SYS_pidfd_send_signal,
-		target->leader_pidfd < 0 ? target->pidfd : target->leader_pidfd, SIGKILL, NULL, 0);
+		process->leader_pidfd < 0 ? process->pidfd : process->leader_pidfd, SIGKILL, NULL,
+		0);
 }
 
-int target_open(struct target *target, pid_t pid, pid_t inside, struct avc_error *err)
+int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_error *err)
 {
-	target->leader = pid;
-	target->inside = inside;
-	target->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
-	target->timers_fd = proc_open(pid, "timers", O_RDONLY);
-	target->stat_fd = proc_open(pid, "stat", O_RDONLY);
-	if (follow(target, err)) {
-		target_close(target);
+	process->leader = pid;
+	process->inside = inside;
+	process->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	process->timers_fd = proc_open(pid, "timers", O_RDONLY);
+	process->stat_fd = proc_open(pid, "stat", O_RDONLY);
+	if (follow(process, err)) {
+		process_close(process);
 		return -1;
 	}
-	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
-	if (target->pidfd < 0 || target->task_dirfd < 0 || target->mem_fd < 0 ||
-	    target->timers_fd < 0 || target->stat_fd < 0 || target->statm_fd < 0) {
+	process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
+	if (process->pidfd < 0 || process->task_dirfd < 0 || process->mem_fd < 0 ||
+	    process->timers_fd < 0 || process->stat_fd < 0 || process->statm_fd < 0) {
 		fail_errno(err, pid, "attach", "open(/proc)", "its /proc can not be read");
-		target_close(target);
+		process_close(process);
 		return -1;
 	}
 	return 0;
 }
 
-void target_close(struct target *target)
+void process_close(struct process *process)
 {
-	close_fd(&target->pidfd);
-	close_fd(&target->leader_pidfd);
-	close_fd(&target->task_dirfd);
-	close_fd(&target->mem_fd);
-	close_fd(&target->timers_fd);
-	close_fd(&target->stat_fd);
-	close_fd(&target->statm_fd);
-	target->pid = 0;
-	target->leader = 0;
-	target->infected = false;
+	close_fd(&process->pidfd);
+	close_fd(&process->leader_pidfd);
+	close_fd(&process->task_dirfd);
+	close_fd(&process->mem_fd);
+	close_fd(&process->timers_fd);
+	close_fd(&process->stat_fd);
+	close_fd(&process->statm_fd);
+	process->pid = 0;
+	process->leader = 0;
+	process->infected = false;
 	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		target->threads[i].seen = false;
-		target->threads[i].known = false;
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		process->threads[i].seen = false;
+		process->threads[i].known = false;
 	}
-	threads_forget_unseen(target);
-	files_forget(target);
+	threads_forget_unseen(process);
+	files_forget(process);
 }
 
 static int read_signal_state(struct thread *thread, struct avc_error *err)
@@ -166,7 +168,7 @@ int thread_read(struct thread *thread, struct avc_error *err)
 		return fail_errno(err, thread->tid, "read state", "get_robust_list",
 				  "it has ended");
 	/* As the kernel has it: bytes that were written, 0 on failure. */
-	scheduling_read(thread->tid, &thread->scheduling);
+	attributes_read_scheduling(thread->tid, &thread->scheduling);
 	thread->affinity_bytes = 0;
 	affinity = syscall(SYS_sched_getaffinity, thread->tid, sizeof thread->affinity,
 			   thread->affinity);
@@ -175,10 +177,10 @@ int thread_read(struct thread *thread, struct avc_error *err)
 	return 0;
 }
 
-void ask_add(const struct target *target, bool with_locks, struct inj_call *call,
-	     struct questions *questions)
+void thread_ask_add(const struct process *process, bool with_locks, struct inj_call *call,
+		    struct questions *questions)
 {
-	const avc_remote out = parasite_remote(&target->parasite, call->out);
+	const avc_remote out = parasite_remote(&process->parasite, call->out);
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
 
 	memset(call->out, 0, sizeof call->out);
@@ -194,25 +196,25 @@ void ask_add(const struct target *target, bool with_locks, struct inj_call *call
 	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
 }
 
-int ask(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_ask(struct process *process, struct thread *thread, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
-	const bool is_main = thread->tid == target->pid, asked_before = thread->inside != 0;
+	struct inj_call *call = &process->parasite.control->runner;
+	const bool is_main = thread->tid == process->pid, asked_before = thread->inside != 0;
 	const struct creds was = thread->creds;
 	struct questions questions;
 
 	call_begin(call, INJ_AFTER_HOME);
-	ask_add(target, is_main, call, &questions);
-	if (read_signal_state(thread, err) || borrow(target, thread, err) ||
+	thread_ask_add(process, is_main, call, &questions);
+	if (read_signal_state(thread, err) || thread_borrow(process, thread, err) ||
 	    parasite_run(thread->tid, call, err))
 		return -1;
-	if (give_back(thread, err) || ask_answer(thread, call, &questions, err))
+	if (thread_give_back(thread, err) || thread_ask_answer(thread, call, &questions, err))
 		return -1;
-	return is_main && asked_before ? ask_others(target, thread, &was, err) : 0;
+	return is_main && asked_before ? thread_ask_others(process, thread, &was, err) : 0;
 }
 
-int ask_answer(struct thread *thread, const struct inj_call *call,
-	       const struct questions *questions, struct avc_error *err)
+int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+		      const struct questions *questions, struct avc_error *err)
 {
 	const struct inj_syscall *altstack = questions->altstack, *inside = questions->inside,
 				 *name = questions->name, *locks = questions->locks;
@@ -238,7 +240,7 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
-	thread->creds.filters = filters_read(thread->tid);
+	thread->creds.filters = attributes_read_filters(thread->tid);
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->young = !thread->known;
 	thread->known = true;
@@ -246,22 +248,22 @@ int ask_answer(struct thread *thread, const struct inj_call *call,
 	return 0;
 }
 
-int ask_others(struct target *target, const struct thread *thread, const struct creds *was,
-	       struct avc_error *err)
+int thread_ask_others(struct process *process, const struct thread *thread, const struct creds *was,
+		      struct avc_error *err)
 {
 	struct creds is = thread->creds;
 
 	is.future_lock = was->future_lock; /* of the process's memory, no matter of threads */
-	if (target->thread_count == 1 || !memcmp(was, &is, sizeof is))
+	if (process->thread_count == 1 || !memcmp(was, &is, sizeof is))
 		return 0;
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		target->threads[i].known &= &target->threads[i] == thread;
-	return fail(err, AVC_DEADLINE, EAGAIN, target->pid, "read state", "",
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		process->threads[i].known &= &process->threads[i] == thread;
+	return fail(err, AVC_RETRY, 0, process->pid, "read state", "",
 		    "its threads are just changing what they may do");
 }
 
 struct walk {
-	struct target *target;
+	struct process *process;
 	uint32_t count, fresh;
 	struct avc_error *err;
 };
@@ -272,28 +274,29 @@ static int count_task(pid_t tid, void *arg)
 	struct thread *t;
 
 	walk->count++;
-	if (walk->count > walk->target->thread_room)
+	if (walk->count > walk->process->thread_room)
 		return 0;
-	t = thread_find(walk->target, tid);
+	t = thread_find(walk->process, tid);
 	if (!t)
-		t = thread_add(walk->target, tid, walk->err);
+		t = thread_add(walk->process, tid, walk->err);
 	if (t)
 		t->seen = true;
 	return 0;
 }
 
-int take_stock(struct target *target, struct avc_error *err)
+int process_take_stock(struct process *process, struct avc_error *err)
 {
-	struct walk walk = { .target = target, .err = err };
+	struct walk walk = { .process = process, .err = err };
 
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		target->threads[i].seen = false;
-	if (proc_tasks(target->task_dirfd, count_task, &walk))
-		return fail_errno(err, target->pid, "walk threads", "getdents64", "it has ended");
-	if (walk.count > target->thread_room)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "walk threads", "",
-			    "it has %u threads; %u are supported", walk.count, target->thread_room);
-	threads_forget_unseen(target);
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		process->threads[i].seen = false;
+	if (proc_tasks(process->task_dirfd, count_task, &walk))
+		return fail_errno(err, process->pid, "walk threads", "getdents64", "it has ended");
+	if (walk.count > process->thread_room)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "walk threads", "",
+			    "it has %u threads; %u are supported", walk.count,
+			    process->thread_room);
+	threads_forget_unseen(process);
 	return err->code ? -1 : 0;
 }
 
@@ -308,28 +311,28 @@ static int by_inside(const void *a, const void *b)
 
 /* A process that one of them has just brought forth stands among them, too, until the next
  * look (adopt()). */
-static bool is_thread(const struct target *target, pid_t tid)
+static bool is_thread(const struct process *process, pid_t tid)
 {
 	char number[16];
 
 	snprintf(number, sizeof number, "%d", tid);
-	return faccessat(target->task_dirfd, number, F_OK, 0) == 0;
+	return faccessat(process->task_dirfd, number, F_OK, 0) == 0;
 }
 
 /* unshare(2): those that are restored have the main thread's.  It is stopped. */
-static int check_unshared(const struct target *target, const struct thread *t,
+static int check_unshared(const struct process *process, const struct thread *t,
 			  struct avc_error *err)
 {
 	const char *what = NULL;
 
-	if (proc_shares(target->pid, t->tid, SHARED_FILES) == 0)
+	if (proc_shares(process->pid, t->tid, SHARED_FILES) == 0)
 		what = "a descriptor table of its own (CLONE_FILES)";
-	else if (proc_shares(target->pid, t->tid, SHARED_FOLDERS) == 0)
+	else if (proc_shares(process->pid, t->tid, SHARED_FOLDERS) == 0)
 		what = "a working directory of its own (CLONE_FS)";
 	/* A main thread that is just ending has none. */
-	if (!what || proc_is_exiting(target->pid) || proc_is_exiting(t->tid))
+	if (!what || proc_is_exiting(process->pid) || proc_is_exiting(t->tid))
 		return 0;
-	if (!is_thread(target, t->tid))
+	if (!is_thread(process, t->tid))
 		return fail(err, AVC_GONE, 0, t->tid, "check", "", "it is no thread");
 	return fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "", "thread %d has %s",
 		    proc_inside(t->tid), what);
@@ -348,8 +351,9 @@ static uint64_t space_of(int pidfd, unsigned int kind)
 }
 
 /* Those that it can have without a working directory of its own.  Not from /proc: see
- * ask_add(). */
-static int check_spaces(const struct target *target, const struct thread *t, struct avc_error *err)
+ * thread_ask_add(). */
+static int check_spaces(const struct process *process, const struct thread *t,
+			struct avc_error *err)
 {
 	static const struct {
 		unsigned int kind; /* linux/pidfd.h, PIDFD_GET_..._NAMESPACE */
@@ -357,14 +361,14 @@ static int check_spaces(const struct target *target, const struct thread *t, str
 	} spaces[] = { { 4, "network" }, { 10, "UTS" }, { 2, "IPC" }, { 1, "cgroup" } };
 	int result = 0, pidfd;
 
-	if (t->tid == target->pid)
+	if (t->tid == process->pid)
 		return 0;
 	pidfd = (int)syscall(SYS_pidfd_open, t->tid, PIDFD_THREAD_);
 	for (size_t i = 0; !result && pidfd >= 0 && i < sizeof spaces / sizeof *spaces; i++) {
 		const uint64_t own = space_of(pidfd, spaces[i].kind),
-			       others = space_of(target->pidfd, spaces[i].kind);
+			       others = space_of(process->pidfd, spaces[i].kind);
 
-		if (own && others && own != others && is_thread(target, t->tid))
+		if (own && others && own != others && is_thread(process, t->tid))
 			result = fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "",
 				      "thread %d has a namespace of its own (%s)", t->inside,
 				      spaces[i].name);
@@ -373,17 +377,18 @@ static int check_spaces(const struct target *target, const struct thread *t, str
 	return result;
 }
 
-int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
+int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
+		     struct avc_error *err)
 {
 	uint32_t again = 0;
 
 	/* All of them first: there is one way home in the parasite, and it may still need it. */
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].attached)
-			return fail(err, AVC_DEADLINE, 0, target->threads[i].tid, "stop", "",
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].attached)
+			return fail(err, AVC_DEADLINE, 0, process->threads[i].tid, "stop", "",
 				    "a thread has not come back from an earlier attempt yet");
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		struct thread *t = &target->threads[i];
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
 		struct avc_error gone = { 0 };
 
 		if (t->known) {
@@ -393,12 +398,12 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 			again += !t->young;
 		}
 		tracee_deadline_set(timer, deadline_ns);
-		if (thread_stop(target, t, &gone) || thread_await(target, t, &gone) ||
-		    check_unshared(target, t, &gone) || ask(target, t, &gone))
+		if (thread_stop(process, t, &gone) || thread_await(process, t, &gone) ||
+		    check_unshared(process, t, &gone) || thread_ask(process, t, &gone))
 			t->known = false;
 		thread_release(t);
 		tracee_deadline_clear(timer);
-		if (!gone.code && check_spaces(target, t, &gone))
+		if (!gone.code && check_spaces(process, t, &gone))
 			t->known = false;
 		if (gone.code && gone.code != AVC_GONE) {
 			*err = gone;
@@ -406,7 +411,7 @@ int acquaint(struct target *target, timer_t timer, uint64_t deadline_ns, struct 
 		}
 		t->seen |= t->known; /* or it is no thread */
 	}
-	threads_forget_unseen(target);
-	qsort(target->threads, target->thread_count, sizeof *target->threads, by_inside);
+	threads_forget_unseen(process);
+	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);
 	return 0;
 }
