@@ -841,7 +841,7 @@ int files_capture(struct process *process, struct generation *generation, bool s
  * there before it may be of either side, and is left alone at a restore. */
 void files_settle(struct process *process, struct generation *generation)
 {
-	file_rights_read(&generation->files->rights, target->pid);
+	file_rights_read(&generation->files->rights, process->pid);
 	for (uint32_t i = 0; i < generation->files->count; i++) {
 		struct file *f = &generation->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };
