@@ -267,8 +267,8 @@ static int send_slots(struct last_pid *helper, const struct last_pid_slot *slot,
 	for (uint32_t i = 0; i < count; i++) {
 		struct inj_slot *const at = parasite_slot(slot[i].parasite, slot[i].number);
 
-		message.offset[i] =
-			(uint64_t)((uint8_t *)at - slot[i].parasite->map) - INJ_CODE_BYTES;
+		message.offset[i] = (uint64_t)((uint8_t *)at - slot[i].parasite->map) -
+				    INJ_CODE_BYTES;
 		memcpy(CMSG_DATA(rights) + i * sizeof(int), &slot[i].parasite->data_fd,
 		       sizeof(int));
 		at->want = at->have = 0;
