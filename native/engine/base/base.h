@@ -175,7 +175,7 @@ struct proc_status {
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	int group_count;         /* supplementary; those beyond are not known   */
 	uint32_t groups[STATUS_GROUPS];
-	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };
