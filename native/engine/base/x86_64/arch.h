@@ -16,7 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
-#define ARCH_AUDIT AUDIT_ARCH_X86_64 /* as seccomp filters know it (linux/audit.h) */
+#define ARCH_AUDIT AUDIT_ARCH_X86_64           /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
