@@ -421,6 +421,7 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 		return NULL;
 	}
 	t->seen = true;
+	rewind_prepare(t);
 	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;

@@ -45,6 +45,12 @@ struct rewound {
 	bool runs_known, waiting; /* waits.c                                        */
 };
 
+/* A thread that slept, as far as one can tell from outside, just before it was stopped. */
+struct sleeper {
+	bool known;
+	struct proc_sched sched;
+};
+
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
 struct scheduling {
 	uint8_t attr[48] __attribute__((aligned(8)));
@@ -119,6 +125,7 @@ struct thread {
 	struct scheduling scheduling; /* at this freeze                         */
 	struct call call;
 	struct rewound rewound;
+	struct sleeper sleeper;
 	uint64_t stopped_ns;
 	bool signalled; /* was just about to run a handler                  */
 };
@@ -246,6 +253,9 @@ struct stop tracee_wait(pid_t tid, int options);
  * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
  * STOP_TRAP is an error. */
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
+/* The same; tick() is called now and then, as long as there is a deadline. */
+enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
+				  struct avc_error *err) warn_unused;
 /* The signal by which the one awaited last is stopped (job control); 0: it is not. */
 int tracee_group_signal(void);
 /* From a stop of another kind to a plain trap stop, on the kernel's way back to
@@ -253,6 +263,16 @@ int tracee_group_signal(void);
 int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
 /* The same of a task of ours of which it is not known whether it runs. */
 int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
+/* Where a tracee is, as soon as it is stopped; 0: it is not, after some milliseconds, or ended. */
+avc_remote tracee_pc(pid_t tid);
+/* Tracees of which we are not told: clone(2) with CLONE_PTRACE attaches a child to its parent's
+ * tracer, if there is one by then; but whether to tell it is decided at the call's beginning
+ * (kernel/fork.c, kernel_clone()).  One that is not known() is let go as soon as it has stopped. */
+void tracee_know(bool (*known)(pid_t tid, const void *arg), const void *arg);
+void tracee_release_strangers(void);
+/* One may come; for a second it is to be looked for. */
+void tracee_expect_strangers(void);
+bool tracee_expects_strangers(void);
 /* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
  * that a thread has brought forth when it was killed is a tracee nobody heard of. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
@@ -314,6 +334,9 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 /* Registers as the app had them, before rewind_call() marked the call or the kernel made
  * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
 
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
