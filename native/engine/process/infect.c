@@ -4,12 +4,11 @@
  * other threads run on meanwhile.
  *
  * The parasite is memory that the guard makes (parasite.c), so that what the app does to its own
- * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a
- * process with the same memory, from a stub in the zero padding behind some executable mapping, the
- * vDSO's as a rule.  The porter takes leave of the app's descriptors, so that no number is taken
- * for a moment that the app could miss; in a table of its own it is sent the memory over a socket,
- * maps it, and is killed.  It makes one system call at a time, of which every register is set from
- * outside.
+ * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a task
+ * with the same memory, from a stub in the zero padding behind some executable mapping, the vDSO's
+ * as a rule.  The porter takes leave of the app's descriptors, so that no number is taken for a
+ * moment that the app could miss; in a table of its own it is sent the memory over a socket, maps
+ * it, and ends.  It makes one system call at a time, of which every register is set from outside.
  *
  * The stub ends by loading the thread's own registers, so it gets home without us, and a porter
  * that we can not tell what to do ends by itself.
