@@ -383,8 +383,8 @@ bool file_is_pts(const struct file *file);
 int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights);
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
  * may be set on success as well: what is not as it was. */
-int file_make(const struct file *want, pid_t template, pid_t init,
-	      const struct file_rights *rights, const char **why);
+int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,
+	      const char **why);
 /* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
 int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
 /* A socket or pipe that reads as closed by the other side, after what was in it. */
