@@ -292,6 +292,7 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 	if (!maps)
 		return -1;
 	while (!result && getline(&line, &size, maps) > 0) {
+		heartbeat();
 		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
 			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
 				  MAPPING_KEYS;
