@@ -44,7 +44,7 @@ setup-images: ## the part of setup that makes Podman work and builds the images
 	@scripts/setup-sidecar.sh
 
 demo: setup ## kill a protected container's application twice and watch it go on
-	@$(VENV)/python scripts/demo.py
+	@$(VENV)/python -m scripts.demo
 
 test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-trees.sh
@@ -52,7 +52,7 @@ test: setup ## every test (T=expression selects, TESTS=folder narrows)
 
 test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp
 	@scripts/setup-programs.sh
-	@$(VENV)/python bench/programs.py --rounds $(ROUNDS)
+	@$(VENV)/python -m bench.programs --rounds $(ROUNDS)
 
 test-trees: setup ## the tests of process trees at length: more kills, 200 processes, PostgreSQL under load
 	@scripts/setup-trees.sh
@@ -69,49 +69,49 @@ machine-build: setup-build
 	@$(MAKE) -s -C native SANITIZE=1
 	@$(MAKE) -s -C tests/victims
 
-lint: setup-build ## ruff, mypy --strict, shellcheck and clang-format, where installed
+lint: setup-build ## ruff, mypy --strict, layers of the engine; shellcheck and clang-format, where installed
 	@scripts/lint.sh
 
 test-sqlite: setup ## kill SQLite under write load in containers, strict and rewind (KILLS=200; about an hour)
-	@$(VENV)/python bench/sqlite.py --kills $(KILLS)
+	@$(VENV)/python -m bench.sqlite --kills $(KILLS)
 
 soak: setup-build ## an hour of checkpoints, deaths and restores: does anything leak? (SECONDS=3600)
 	@$(VENV)/python -c 'import matplotlib' 2>/dev/null || $(VENV)/python -m pip install --disable-pip-version-check -q 'matplotlib>=3.6'
-	@$(VENV)/python bench/soak.py --seconds $(SECONDS)
+	@$(VENV)/python -m bench.soak --seconds $(SECONDS)
 
 bench: setup ## measure freeze, reap and restore beside a plain fork()
-	@$(VENV)/python bench/run.py
+	@$(VENV)/python -m bench.run
 
 bench-peers: setup ## measure avckpt beside CRIU (bare, and through Podman), cold start and a plain fork()
 	@scripts/setup-plots.sh
 	@scripts/setup-peers.sh
 	@scripts/setup-ros.sh
-	@$(VENV)/python bench/peers.py
-	@$(VENV)/python bench/ros_peers.py
+	@$(VENV)/python -m bench.peers
+	@$(VENV)/python -m bench.ros_peers
 
 bench-cost: setup-build ## measure what checkpoints cost a request/reply server over time
 	@scripts/setup-plots.sh
-	@$(VENV)/python bench/cost.py
+	@$(VENV)/python -m bench.cost
 
 bench-ros: setup ## crash nodes of a ROS pipeline, beside cold start: latency, recovery, messages cut in half, costs
 	@scripts/setup-ros.sh
-	@$(VENV)/python bench/ros.py
+	@$(VENV)/python -m bench.ros
 
 bench-ros-long: setup ## the same pipeline: 1,000 crashes, one every one or two seconds (half an hour)
 	@scripts/setup-ros.sh
-	@$(VENV)/python bench/ros_endurance.py
+	@$(VENV)/python -m bench.ros_endurance
 
 bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against the age of the checkpoint
 	@scripts/setup-ros2.sh
-	@$(VENV)/python bench/ros2.py
+	@$(VENV)/python -m bench.ros2
 
 bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
-	@$(VENV)/python bench/trees.py
+	@$(VENV)/python -m bench.trees
 
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
-	find hooks sidecar native tests scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
+	find hooks sidecar native tests testkit scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
 
 clean-system: clean ## also remove images, cached base and what setup-podman.sh changed
 	scripts/setup-podman.sh --undo

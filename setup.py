@@ -2,9 +2,9 @@
 """The package's build: native code first, then the cffi extension that links it.
 
 Everything declarative is in pyproject.toml.  What is done here: `make -C
-native` (engine and avckpt-init), the extension `avckpt._native`, and putting
+native` (avckpt-guard, avckpt-init and avckpt-exec), the extension `avckpt._native`, and putting
 into the wheel what `avckpt install` needs on a machine without this source
-tree: avckpt-init and the hook JSON.
+tree: the programs and the hook JSON.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ os.chdir(ROOT)
 
 
 def make_native() -> None:
-    """Builds native/build/libavckpt.a and native/build/avckpt-init; does nothing when they are new."""
+    """Builds what is native, below native/build; does nothing when they are new."""
     subprocess.run(["make", "--no-print-directory", "-C", str(ROOT / "native")], check=True)
 
 
@@ -52,7 +52,7 @@ class BuildPy(build_py):
 def data_files(build_lib: Path) -> list[tuple[Path, Path]]:
     """Where each data file comes from and where in the wheel it goes."""
     package = build_lib / "avckpt"
-    programs = ("avckpt-init", "avckpt-exec")
+    programs = ("avckpt-init", "avckpt-exec", "avckpt-guard")
     pairs = [(ROOT / "native" / "build" / name, package / "libexec" / name) for name in programs]
     pairs += [(path, package / "oci-hooks.d" / path.name) for path in sorted((ROOT / "oci-hooks.d").glob("*.json"))]
     return pairs

@@ -33,25 +33,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from avckpt.engine import Engine
+from avckpt.errors import AvckptError
+from avckpt.events.vocabulary import Event, EventKind
+from avckpt.guard import GuardConfig
+from avckpt.supervision.pressure import templates_of
 from rich.console import Console
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from avckpt import native  # noqa: E402
-from avckpt.errors import AvckptError  # noqa: E402
-from avckpt.events import Event, EventKind, GuardConfig  # noqa: E402
-from avckpt.pressure import templates_of  # noqa: E402
-from harness import free_port  # noqa: E402 - tests, whose folder is no package
-from native.board import Board, Seen  # noqa: E402
-
-from bench import cost_show  # noqa: E402
-from bench.cpu_group import REAL_TIME, first_in_line  # noqa: E402
-from bench.idle import memory_kb  # noqa: E402
-from bench.peers_subjects import Below  # noqa: E402
-from bench.subjects import BenchFailed, build, children, eventually  # noqa: E402
-from bench.workload import PROGRAMS, Client, boards_folder, build_workload, read_log  # noqa: E402
+from bench import cost_show
+from bench.cpu_group import REAL_TIME, first_in_line
+from bench.peers_subjects import Below
+from bench.subjects import BenchFailed, build, eventually
+from bench.workload import PROGRAMS, Client, boards_folder, build_workload, read_log
+from testkit.board import Board, Seen
+from testkit.harness import ROOT, free_port
+from testkit.procfs import children_of, figures
 
 RESULTS = ROOT / "bench" / "results" / "cost.json"
 MB = 256
@@ -134,13 +130,13 @@ class Protected:
             command += ["--fork-ms", str(round(way.interval_s * 1e3)), "--keep", str(way.keep)]
         self._below = Below(self.board, command)
         self._undo = contextlib.ExitStack()
-        self._engine: native.Engine | None = None
+        self._engine: Engine | None = None
 
     def __enter__(self) -> Protected:
         self._undo.callback(self.board.page.close)
         self._undo.enter_context(self._below)
         if self.way.kind == "avckpt":
-            self._engine = self._undo.enter_context(native.Engine())
+            self._engine = self._undo.enter_context(Engine())
             config = GuardConfig(
                 interval_s=self.way.interval_s,
                 keep=self.way.keep,
@@ -183,7 +179,7 @@ class Protected:
     def templates(self) -> list[int]:
         """Their PIDs."""
         found = []
-        for child in children(self.init_pid):
+        for child in children_of(self.init_pid):
             with contextlib.suppress(OSError):
                 if Path(f"/proc/{child}/comm").read_text().strip() == "avckpt-tmpl":
                     found.append(child)
@@ -262,19 +258,19 @@ def hold(way: Way, folder: Path, before: Sequence[str] = ()) -> Held:
             if len(server.templates()) != way.keep:
                 continue
             with contextlib.suppress(OSError):
-                held = [memory_kb(pid) for pid in templates_of(server.init_pid)]
-                app = memory_kb(_app(server))
-                pages = sum(each["pss"] for each in held) + app["pss"] - app["rss"]
+                held = [figures(pid) for pid in templates_of(server.init_pid)]
+                app = figures(_app(server))
+                pages = sum(each["Pss"] for each in held) + app["Pss"] - app["Rss"]
                 if pages / 1024 > highest:
                     highest = pages / 1024
-                    tables = sum(each["page_tables"] for each in held) / 1024
+                    tables = sum(each["VmPTE"] for each in held) / 1024
         if not tables:
             raise BenchFailed(f"{way.keep} generations were never seen")
     return Held(way.interval_s, way.rate_mb_s, way.mb, way.keep, round(highest, 2), round(tables, 2))
 
 
 def _app(server: Protected) -> int:
-    for child in children(server.init_pid):
+    for child in children_of(server.init_pid):
         with contextlib.suppress(OSError):
             if Path(f"/proc/{child}/comm").read_text().strip() == "server":
                 return child

@@ -10,15 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
-from bench.subjects import BenchFailed  # noqa: E402
+from bench.subjects import BenchFailed
 
 CONTROLLERS = Path("/sys/fs/cgroup")
 NAME = "avckpt-bench"

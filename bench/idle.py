@@ -7,7 +7,7 @@ once a second) runs in a container without a label, in a container with
 machine is doing falls on all of them.  CPU times are the scheduler's own
 (/proc/PID/task/TID/schedstat, ns), also those of templates that came and went.
 
-    python bench/idle.py [--seconds 60] [--json]
+    python -m bench.idle [--seconds 60] [--json]
 
 Needs what `make demo` needs.  Ends with 1 when something could not be measured.
 """
@@ -26,15 +26,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from avckpt.supervision.pressure import held_bytes, templates_of
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from avckpt.pressure import held_bytes, templates_of  # noqa: E402
-from harness import (  # noqa: E402 - tests, whose folder is no package
+from bench.subjects import VICTIMS, BenchFailed, build, eventually
+from testkit.harness import (
     SIDECAR_NAME,
     CommandFailed,
     ContainerFactory,
@@ -43,8 +40,7 @@ from harness import (  # noqa: E402 - tests, whose folder is no package
     machine_lock,
     running_sidecar,
 )
-
-from bench.subjects import VICTIMS, BenchFailed, build, eventually  # noqa: E402
+from testkit.procfs import below, figures
 
 MEGABYTES, THREADS = 100, 20
 PROGRAM = ["idle", str(MEGABYTES), str(THREADS), "--beat-us", "1000000"]
@@ -56,17 +52,6 @@ LIMIT_PERCENT = 1.0
 LOCK_PATIENCE_S = 600.0
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
-
-
-def descendants(pid: int) -> list[int]:
-    """A process and everything below it, as it is now."""
-    found, at = [pid], 0
-    while at < len(found):
-        with contextlib.suppress(OSError):
-            for task in os.listdir(f"/proc/{found[at]}/task"):
-                found += map(int, Path(f"/proc/{found[at]}/task/{task}/children").read_text().split())
-        at += 1
-    return found
 
 
 @dataclass
@@ -97,25 +82,9 @@ class Meter:
                     self._seen[pid, task] = used
 
 
-def memory_kb(pid: int) -> dict[str, int]:
-    """Sizes in kB: what is this process' alone, and its page tables."""
-    rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    status = Path(f"/proc/{pid}/status").read_text()
-
-    def value(text: str, key: str) -> int:
-        return next((int(line.split()[1]) for line in text.splitlines() if line.startswith(key + ":")), 0)
-
-    return {
-        "private": value(rollup, "Private_Clean") + value(rollup, "Private_Dirty"),
-        "pss": value(rollup, "Pss"),
-        "rss": value(rollup, "Rss"),
-        "page_tables": value(status, "VmPTE"),
-    }
-
-
 def app_of(init_pid: int) -> int:
     """The program below an avckpt-init."""
-    for pid in descendants(init_pid)[1:]:
+    for pid in below(init_pid):
         with contextlib.suppress(OSError):
             if Path(f"/proc/{pid}/comm").read_text().strip() == PROGRAM[0]:
                 return pid
@@ -130,7 +99,7 @@ def avckpt_run() -> Iterator[int]:
 
     def protects() -> bool:
         # Its init is a child of it.
-        return any(templates_of(pid) for pid in descendants(process.pid))
+        return any(templates_of(pid) for pid in [process.pid, *below(process.pid)])
 
     try:
         eventually(lambda: protects() or process.poll() is not None, "avckpt run protects")
@@ -184,11 +153,11 @@ def measure(seconds: float) -> Idle:
         sidecar_pid = podman.inspect(SIDECAR_NAME)["State"]["Pid"]
         run_pid = undo.enter_context(avckpt_run())
         meters = {
-            "sidecar": Meter("sidecar", lambda: descendants(sidecar_pid)),
-            "protected": Meter("protected", lambda: descendants(init)),
-            "plain": Meter("plain", lambda: descendants(plain)),
+            "sidecar": Meter("sidecar", lambda: [sidecar_pid, *below(sidecar_pid)]),
+            "protected": Meter("protected", lambda: [init, *below(init)]),
+            "plain": Meter("plain", lambda: [plain, *below(plain)]),
             "run": Meter("run", lambda: [run_pid]),
-            "program": Meter("program", lambda: descendants(run_pid)[1:]),
+            "program": Meter("program", lambda: below(run_pid)),
         }
         time.sleep(SETTLE_S)
         for meter in meters.values():
@@ -212,8 +181,8 @@ def measure(seconds: float) -> Idle:
             run_program_percent=round(percent["program"], 3),
             templates=len(templates),
             templates_mb=round(held_bytes(app_of(init), templates) / 2**20, 2),
-            page_tables_mb=round(sum(memory_kb(pid)["page_tables"] for pid in templates) / 1024, 2),
-            sidecar_rss_mb=round(sum(memory_kb(pid)["rss"] for pid in descendants(sidecar_pid)) / 1024, 1),
+            page_tables_mb=round(sum(figures(pid)["VmPTE"] for pid in templates) / 1024, 2),
+            sidecar_rss_mb=round(sum(figures(pid)["Rss"] for pid in [sidecar_pid, *below(sidecar_pid)]) / 1024, 1),
         )
 
 

@@ -31,18 +31,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from avckpt.errors import AvckptError
 from rich.console import Console
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from avckpt.errors import AvckptError  # noqa: E402
-from harness import SIDECAR_NAME, CommandFailed, Podman, Sidecar, machine_lock, running_sidecar  # noqa: E402
-
-from bench import peers_show  # noqa: E402
-from bench.cpu_group import first_in_line, join  # noqa: E402
-from bench.peers_subjects import (  # noqa: E402
+from bench import peers_show
+from bench.cpu_group import first_in_line, join
+from bench.peers_subjects import (
     AvckptEngine,
     AvckptPodman,
     ColdCommand,
@@ -54,9 +48,10 @@ from bench.peers_subjects import (  # noqa: E402
     InWorld,
     Subject,
 )
-from bench.peers_world import World  # noqa: E402
-from bench.subjects import BenchFailed, Forker, build, eventually  # noqa: E402
-from bench.workload import Client, boards_folder, build_workload  # noqa: E402
+from bench.peers_world import World
+from bench.subjects import BenchFailed, Forker, build, eventually
+from bench.workload import Client, boards_folder, build_workload
+from testkit.harness import ROOT, SIDECAR_NAME, CommandFailed, Podman, Sidecar, machine_lock, running_sidecar
 
 RESULTS = ROOT / "bench" / "results" / "peers.json"
 MEGABYTES = (10, 100, 1000)

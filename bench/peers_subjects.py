@@ -14,7 +14,6 @@ import re
 import select
 import signal
 import subprocess
-import sys
 import time
 import uuid
 from abc import ABC, abstractmethod
@@ -24,15 +23,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+from avckpt.artifacts import init_binary
+from avckpt.cli.client import Client as Api
+from avckpt.errors import AvckptError
+from avckpt.guard import Command
+from avckpt.supervision.pressure import held_bytes, templates_of
 
-from avckpt.artifacts import init_binary  # noqa: E402
-from avckpt.client import Client as Api  # noqa: E402
-from avckpt.errors import AvckptError  # noqa: E402
-from avckpt.events import Command  # noqa: E402
-from avckpt.pressure import held_bytes, templates_of  # noqa: E402
-from harness import (  # noqa: E402 - tests, whose folder is no package
+from bench.peers_world import BOARDS_INSIDE, IMAGE, PROGRAMS_INSIDE, World
+from bench.subjects import BenchFailed, Guarded, Idle, eventually
+from bench.workload import PROGRAMS, Client, find_server
+from testkit.board import Board
+from testkit.harness import (
     RUN_DIR,
     CommandFailed,
     Completed,
@@ -42,12 +43,7 @@ from harness import (  # noqa: E402 - tests, whose folder is no package
     Sidecar,
     free_port,
 )
-from native.board import Board  # noqa: E402
-
-from bench.idle import memory_kb  # noqa: E402
-from bench.peers_world import BOARDS_INSIDE, IMAGE, PROGRAMS_INSIDE, World  # noqa: E402
-from bench.subjects import BenchFailed, Guarded, Idle, eventually  # noqa: E402
-from bench.workload import PROGRAMS, Client, find_server  # noqa: E402
+from testkit.procfs import figures
 
 BEAT_US = 100
 PORT_INSIDE = 5555
@@ -214,7 +210,7 @@ def templates_mb(init_pid: int, app_pid: int) -> float:
     tables_kb = 0
     for template in templates:
         with contextlib.suppress(OSError):
-            tables_kb += memory_kb(template)["page_tables"]
+            tables_kb += figures(template)["VmPTE"]
     return held_bytes(app_pid, templates) / 2**20 + tables_kb / 1024
 
 

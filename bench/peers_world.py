@@ -11,18 +11,14 @@ import contextlib
 import os
 import re
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from types import TracebackType
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import Completed, run  # noqa: E402 - tests, whose folder is no package
-
-from bench.subjects import BenchFailed, children, eventually  # noqa: E402
-from bench.workload import PROGRAMS  # noqa: E402
+from bench.subjects import BenchFailed, eventually
+from bench.workload import PROGRAMS
+from testkit.harness import ROOT, Completed, run
+from testkit.procfs import children_of
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avckpt"
 # Where the script puts them.
@@ -62,8 +58,8 @@ class World:
             assert self._process.stdout is not None
             if self._process.stdout.readline() != "up\n":
                 raise BenchFailed("the peers' world does not start; what it said is above")
-            eventually(lambda: len(children(self._process.pid)) == 1, "the peers' world has a first process")
-            (self._first,) = children(self._process.pid)
+            eventually(lambda: len(children_of(self._process.pid)) == 1, "the peers' world has a first process")
+            (self._first,) = children_of(self._process.pid)
             self.enter = ["nsenter", "--target", str(self._first), "--mount", "--pid", "--net", "--ipc", "--uts"]
             self.enter += ["--root", "--wd", "--", "env", "PODMAN_IGNORE_CGROUPSV1_WARNING=1", "HOME=/root"]
         except BaseException:

@@ -2,7 +2,7 @@
 """Real programs under load: rounds of checkpoint, random wait, SIGKILL, restore, and how many succeed.
 
     make test-programs [ROUNDS=200]
-    .venv/bin/python bench/programs.py [--rounds 200] [--programs redis,go] [--modes keep,reset-moved]
+    .venv/bin/python -m bench.programs [--rounds 200] [--programs redis,go] [--modes keep,reset-moved]
 
 Needs root, Podman and what `make setup` and scripts/setup-programs.sh build.
 Takes the machine's sidecar and hooks for itself, a program at a time, as the
@@ -25,12 +25,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import Podman, machine_lock, running_sidecar  # noqa: E402
-from programs.registry import PROGRAMS, Program, find  # noqa: E402
-from programs.rounds import MODES, Outcome, run  # noqa: E402
+from testkit.harness import ROOT, Podman, machine_lock, running_sidecar
+from testkit.programs.registry import PROGRAMS, Program, find
+from testkit.programs.rounds import MODES, Outcome, run
 
 RESULTS = ROOT / "bench" / "results" / "programs.json"
 

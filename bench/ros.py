@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-ros`: what a crash does to a ROS pipeline, with avckpt and with a cold start, in the same run.
 
-    python bench/ros.py [--part latency,cut,cost] [--runs 20]
+    python -m bench.ros [--part latency,cut,cost] [--runs 20]
 
 The pipeline is examples/ros/vehicle.yaml, every node in a container of its own.
 Each part adds its results to bench/results/ros.json; plots and tables are made
@@ -23,11 +23,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
-from bench.ros_cost import cost  # noqa: E402
-from bench.ros_pipeline import (  # noqa: E402
+from bench.ros_cost import cost
+from bench.ros_pipeline import (
     LOST_M,
     PERIOD_S,
     CommandFailed,
@@ -37,6 +34,7 @@ from bench.ros_pipeline import (  # noqa: E402
     PipelineFailed,
     sidecar,
 )
+from testkit.harness import ROOT
 
 RESULTS = ROOT / "bench" / "results" / "ros.json"
 BEFORE_S, AFTER_S = 3.0, 2.0
@@ -126,8 +124,8 @@ def judge(variant: str, frames: Sequence[Frame], at: float, inside: int, restore
 
 def events(since: float) -> list[Json]:
     """avckpt's events since a time of day."""
-    from avckpt.client import Client
-    from avckpt_hooks import protocol
+    from avckpt.cli.client import Client
+    from avckpt_hooks.shared import protocol
 
     return Client(Path(protocol.run_dir())).history(since)
 

@@ -2,7 +2,7 @@
 """How long a ROS 2 node's peer hears nothing when the node is restored: CycloneDDS and zenoh.
 
     make bench-ros2
-    .venv/bin/python bench/ros2.py --only cyclonedds --remedies none,skip --rates 100 --intervals 1
+    .venv/bin/python -m bench.ros2 --only cyclonedds --remedies none,skip --rates 100 --intervals 1
 
 Real protected containers on Podman's bridge network: a node and, unprotected, its peer; both send to each other at a
 fixed rate.  The node's application is killed with SIGKILL at random moments.  Two gaps are measured, each from the last
@@ -35,11 +35,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import (  # noqa: E402
+from bench import ros2_show
+from testkit.harness import (
+    ROOT,
     Container,
     ContainerFactory,
     Podman,
@@ -49,8 +47,6 @@ from harness import (  # noqa: E402
     running_sidecar,
     wait_until,
 )
-
-from bench import ros2_show  # noqa: E402
 
 IMAGE = "localhost/avckpt-ros2:latest"
 RESULTS = ROOT / "bench/results/ros2.json"

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.ros_pipeline import NODES, PERIOD_S, Pipeline
+from testkit.procfs import below, figures
 
 LOOK_EVERY_S = 0.2
 SETTLE_S = 7.0
@@ -21,17 +22,6 @@ SETTLE_S = 7.0
 SETTINGS = {"INTERVAL": "3s", "KEEP": "1"}
 
 Json = dict[str, Any]
-
-
-def processes(pid: int) -> list[int]:
-    """A process and everything below it, as it is now."""
-    found, at = [pid], 0
-    while at < len(found):
-        with contextlib.suppress(OSError):
-            for task in Path(f"/proc/{found[at]}/task").iterdir():
-                found += map(int, (task / "children").read_text().split())
-        at += 1
-    return found
 
 
 def cpu_ns(pids: list[int]) -> dict[tuple[int, int], int]:
@@ -49,10 +39,8 @@ def memory_mb(pids: list[int]) -> float:
     kb = 0
     for pid in pids:
         with contextlib.suppress(OSError):
-            rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
-            kb += next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:"))
-            status = Path(f"/proc/{pid}/status").read_text()
-            kb += next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmPTE:")), 0)
+            has = figures(pid)
+            kb += has["Pss"] + has["VmPTE"]
     return kb / 1024
 
 
@@ -64,9 +52,9 @@ class Checkpoints:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
-        from avckpt.client import Client
+        from avckpt.cli.client import Client
         from avckpt.errors import AvckptError
-        from avckpt_hooks import protocol
+        from avckpt_hooks.shared import protocol
 
         with contextlib.suppress(AvckptError):
             for event in Client(Path(protocol.run_dir())).events(since=time.time(), routine=True):
@@ -81,10 +69,10 @@ def watch(pipeline: Pipeline, seconds: float) -> Json:
     main = int(pipeline.podman.inspect(NODES["voxel"])["State"]["Pid"])
     samples = []
     started = time.time()
-    last, last_at = cpu_ns(processes(main)), started
+    last, last_at = cpu_ns([main, *below(main)]), started
     while time.time() - started < seconds:
         time.sleep(LOOK_EVERY_S)
-        pids = processes(main)
+        pids = [main, *below(main)]
         now, now_at = cpu_ns(pids), time.time()
         used = sum(value - last.get(thread, 0) for thread, value in now.items())
         samples.append(

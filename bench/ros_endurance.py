@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-ros-long`: crashes one of the ROS chain's nodes, or both, every one or two seconds, again and again.
 
-    python bench/ros_endurance.py --crashes 1000 [--tcp messages] [--output FILE]
+    python -m bench.ros_endurance --crashes 1000 [--tcp messages] [--output FILE]
 
 A crash counts as survived when poses of three later scans come out within five
 seconds, each less than a metre from the truth.  One line of JSON is appended
@@ -21,10 +21,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
-from bench.ros_pipeline import CommandFailed, Crash, Pipeline, PipelineFailed, sidecar  # noqa: E402
+from bench.ros_pipeline import CommandFailed, Crash, Pipeline, PipelineFailed, sidecar
+from testkit.harness import ROOT
 
 OUTPUT = ROOT / "bench" / "results" / "ros_endurance.jsonl"
 WITHIN_S = 5.0

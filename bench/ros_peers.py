@@ -2,7 +2,7 @@
 """The ROS node beside CRIU: the pipeline of examples/ros in the peers' world, its voxel filter brought back by Podman,
 or, as a process without a container, by CRIU itself.
 
-    .venv/bin/python bench/ros_peers.py [--runs 2] [--ways bare,crun,runc]
+    .venv/bin/python -m bench.ros_peers [--runs 2] [--ways bare,crun,runc]
 
 Each run takes one checkpoint of the filter, kills it three seconds later with SIGKILL, and calls `podman container
 restore`, or `criu restore`, in that moment.  What a crash does to the chain is measured as in bench/ros.py, whose
@@ -28,18 +28,13 @@ from typing import Any, Protocol
 
 import yaml
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import CommandFailed  # noqa: E402
-
-from bench.peers_subjects import CLOSED, IN_FLIGHT, CriuContainer, CriuFailed, CriuImages, Taken  # noqa: E402
-from bench.peers_world import BOARDS_INSIDE, World  # noqa: E402
-from bench.ros import BEFORE_S, SETTLE_S, machine, say  # noqa: E402
-from bench.ros_pipeline import LOST_M, MANIFEST, PERIOD_S, START_S, Log, PipelineFailed  # noqa: E402
-from bench.ros_show import spread  # noqa: E402
-from bench.subjects import BenchFailed  # noqa: E402
+from bench.peers_subjects import CLOSED, IN_FLIGHT, CriuContainer, CriuFailed, CriuImages, Taken
+from bench.peers_world import BOARDS_INSIDE, World
+from bench.ros import BEFORE_S, SETTLE_S, machine, say
+from bench.ros_pipeline import LOST_M, MANIFEST, PERIOD_S, START_S, Log, PipelineFailed
+from bench.ros_show import spread
+from bench.subjects import BenchFailed
+from testkit.harness import ROOT, CommandFailed
 
 RESULTS = ROOT / "bench" / "results" / "ros_peers.json"
 BESIDE = ROOT / "bench" / "results" / "ros.json"

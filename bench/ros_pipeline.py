@@ -10,19 +10,13 @@ import os
 import random
 import shutil
 import signal
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import CommandFailed, Podman, app_pid, avckpt_command, run, wait_until  # noqa: E402 - tests/harness.py
-
-from bench.ros_streams import Ruler, Stream, scan_stream  # noqa: E402
+from bench.ros_streams import Ruler, Stream, scan_stream
+from testkit.harness import ROOT, CommandFailed, Podman, app_pid, avckpt_command, run, wait_until
 
 MANIFEST = ROOT / "examples" / "ros" / "vehicle.yaml"
 RESULTS = Path("/tmp/avckpt-ros")
@@ -266,7 +260,7 @@ class Pipeline:
 @contextlib.contextmanager
 def sidecar() -> Iterator[None]:
     """Takes the sidecar that `avckpt up` may have started, and the hooks, away again."""
-    from harness import DROP_IN, SIDECAR_NAME
+    from testkit.harness import DROP_IN, SIDECAR_NAME
 
     podman = Podman()
     installed, there = DROP_IN.exists(), podman.exists(SIDECAR_NAME)

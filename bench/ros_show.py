@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots (PNG and SVG) and tables (Markdown) of bench/results/ros.json.
 
-python bench/ros_show.py [bench/results/ros.json]
+python -m bench.ros_show [bench/results/ros.json]
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
-from bench.ros_cost import beside_checkpoints  # noqa: E402
-from bench.ros_endurance import OUTPUT as ENDURANCE  # noqa: E402
-from bench.ros_endurance import summary  # noqa: E402
+from bench.ros_cost import beside_checkpoints
+from bench.ros_endurance import OUTPUT as ENDURANCE
+from bench.ros_endurance import summary
+from testkit.harness import ROOT
 
 Json = dict[str, Any]
 COLOURS = {"avckpt": "tab:blue", "cold start": "tab:red", "plain": "tab:gray", "protected": "tab:blue"}

@@ -25,15 +25,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from avckpt.errors import AvckptError
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
-from avckpt.errors import AvckptError  # noqa: E402
-
-from bench.subjects import BenchFailed, Forker, Guarded, Idle, build  # noqa: E402
+from bench.subjects import BenchFailed, Forker, Guarded, Idle, build
+from testkit.harness import ROOT
 
 RESULTS = ROOT / "bench" / "results" / "engine.json"
 MEGABYTES = (10, 100, 1000)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What many small protected containers cost: CPU and memory of the sidecar, missed checkpoints.
 
-    .venv/bin/python bench/scale.py [--containers 100] [--seconds 60] [--interval 3s]
+    .venv/bin/python -m bench.scale [--containers 100] [--seconds 60] [--interval 3s]
 
 Needs root, Podman and what `make setup` builds.  Takes the machine's sidecar
 and hooks for itself, as the tests do, and removes every container it starts.
@@ -15,17 +15,14 @@ import json
 import os
 import statistics
 import subprocess
-import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+from avckpt.supervision.pressure import held_bytes, templates_of
 
-from avckpt.pressure import held_bytes, templates_of  # noqa: E402
-from harness import SIDECAR_NAME, ContainerFactory, Podman, Sidecar, machine_lock, running_sidecar  # noqa: E402
+from testkit.harness import ROOT, SIDECAR_NAME, ContainerFactory, Podman, Sidecar, machine_lock, running_sidecar
 
 VICTIMS = ROOT / "tests/victims/build-static"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")

@@ -7,7 +7,7 @@ its own.  The program is killed at random moments; twice in a row now and then. 
 seconds all that can leak is counted in the program, in init, in templates and in the
 sidecar (tests/census.py); what has more at the end than after the warm-up is a leak.
 
-    .venv/bin/python bench/soak.py [--seconds 3600] [--again]
+    .venv/bin/python -m bench.soak [--seconds 3600] [--again]
 
 Needs root, and no Podman.  Prints a table; writes bench/results/soak.json and soak.png.
 Ends with 1 when something leaked, the program found something wrong, or a restore failed.
@@ -27,17 +27,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+from avckpt.cli.client import Client
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
-from avckpt.client import Client  # noqa: E402
-from census import Census, Growth, Row, growths  # noqa: E402 - tests, whose folder is no package
-from harness import wait_until  # noqa: E402
-from local_sidecar import Container, local_sidecar  # noqa: E402
-from native.board import Board  # noqa: E402
+from testkit.board import Board
+from testkit.census import Census, Growth, Row, growths
+from testkit.harness import ROOT, wait_until
+from testkit.local_sidecar import Container, local_sidecar
 
 VICTIMS = ROOT / "tests" / "victims"
 RESULTS = ROOT / "bench" / "results" / "soak.json"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """SQLite in protected containers, killed under write load: what `avckpt.files` does to a database.
 
-A bank (tests/databases/bank.py) commits transactions in a container with a real Podman and sidecar, and tells
+A bank (testkit/databases/bank.py) commits transactions in a container with a real Podman and sidecar, and tells
 an observer outside of each after its COMMIT.  It is killed at random moments, in bursts of writing and in pauses
 between them.  After every death the observer asks the database: PRAGMA integrity_check, every transaction that was
 told, the sum of all accounts; and the bank compares what it knows in memory with the database.
@@ -9,7 +9,7 @@ told, the sum of all accounts; and the bank compares what it knows in memory wit
 With `avckpt.files=strict` one database is kept for all kills, and Podman's restart policy starts cold what is not
 restored.  With `rewind` a database that is damaged is the end of it, and the next kill has a new one.
 
-    .venv/bin/python bench/sqlite.py [--kills 200] [--rewind-kills 40] [--cases delete,wal]
+    .venv/bin/python -m bench.sqlite [--kills 200] [--rewind-kills 40] [--cases delete,wal]
 
 Needs root, Podman and what `make setup` builds; takes the machine's sidecar and hooks for itself, for a few
 minutes at a time.  Prints a table; writes bench/results/sqlite.json.  Ends with 1 when anything was lost under strict.
@@ -35,12 +35,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
-from databases.observer import Observer  # noqa: E402 - tests, whose folder is no package
-from databases.rounds import LOAD, Bank, Round, kill_at_random  # noqa: E402
-from harness import ContainerFactory, Podman, machine_lock, running_sidecar  # noqa: E402
+from testkit.databases.observer import Observer
+from testkit.databases.rounds import LOAD, Bank, Round, kill_at_random
+from testkit.harness import ROOT, ContainerFactory, Podman, machine_lock, running_sidecar
 
 RESULTS = ROOT / "bench" / "results" / "sqlite.json"
 BATCH_S = 200.0

@@ -5,7 +5,7 @@ Times `podman run --rm --network=none IMAGE true` in turns: without hooks (an em
 --hooks-dir), with the hooks installed but no label, and with the label.  The
 sidecar runs all the time.
 
-    python bench/startup.py [--cycles 30] [--json]
+    python -m bench.startup [--cycles 30] [--json]
 
 Needs what `make demo` needs.  Ends with 1 when something could not be measured.
 """
@@ -17,16 +17,11 @@ import json
 import statistics
 import sys
 import tempfile
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import (  # noqa: E402 - tests, whose folder is no package
+from testkit.harness import (
     BASE_IMAGE,
     OURS,
     CommandFailed,

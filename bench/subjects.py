@@ -7,20 +7,20 @@ import os
 import select
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+from avckpt.artifacts import init_binary
+from avckpt.engine import Engine
+from avckpt.events.vocabulary import Event, EventKind
+from avckpt.guard import Command, GuardConfig
 
-from avckpt import native  # noqa: E402
-from avckpt.artifacts import init_binary  # noqa: E402
-from avckpt.events import Command, Event, EventKind, GuardConfig  # noqa: E402
-from native.board import Board  # noqa: E402 - tests/native, whose folder is no package
+from testkit.board import Board
+from testkit.harness import ROOT, wait_until
+from testkit.procfs import children_of
 
 BUILD = ROOT / "build" / "bench"
 VICTIMS = ROOT / "tests" / "victims"
@@ -44,16 +44,10 @@ def build() -> None:
 
 def eventually(condition: Callable[[], bool], what: str, every_s: float = 0.01) -> None:
     """Raises BenchFailed when it is not so within PATIENCE_S."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > deadline:
-            raise BenchFailed(f"not within {PATIENCE_S:g} s: {what}")
-        time.sleep(every_s)
-
-
-def children(pid: int) -> list[int]:
-    """Of a process with one thread."""
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    try:
+        wait_until(condition, PATIENCE_S, what, every_s)
+    except TimeoutError as error:
+        raise BenchFailed(str(error)) from error
 
 
 class Forker:
@@ -106,9 +100,11 @@ class Idle:
         try:
             eventually(self._has_started, "the victim has touched its memory")
             # It may have ended meanwhile, which check() tells.
-            eventually(lambda: self._process.poll() is not None or bool(children(self._process.pid)), "init is there")
+            eventually(
+                lambda: self._process.poll() is not None or bool(children_of(self._process.pid)), "init is there"
+            )
             self.check()
-            (self.init_pid,) = children(self._process.pid)
+            (self.init_pid,) = children_of(self._process.pid)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -130,7 +126,7 @@ class Idle:
     @property
     def app_pid(self) -> int:
         """In our PID namespace: init's oldest child, as long as nobody has restored it."""
-        return children(self.init_pid)[0]
+        return children_of(self.init_pid)[0]
 
     def check(self) -> None:
         """Raises BenchFailed when it has ended or found something wrong with itself."""
@@ -156,7 +152,7 @@ class Guarded:
 
     def __init__(self, idle: Idle) -> None:
         self._idle = idle
-        self._engine = native.Engine()
+        self._engine = Engine()
         self._tickets = 0
         pidfd = os.pidfd_open(idle.init_pid)
         try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-trees`: freeze and restore of process trees beside plain forks of as much memory.
 
-    .venv/bin/python bench/trees.py [--cycles 20] [--only freeze,workers,exec,commands]
+    .venv/bin/python -m bench.trees [--cycles 20] [--only freeze,workers,exec,commands]
 
 Four questions, each with the limit that the project has set itself:
 
@@ -36,14 +36,10 @@ from unittest import mock
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-sys.path.insert(0, str(ROOT / "tests"))
-
-from native.family import kill_main, members  # noqa: E402
-from native.guarded import GuardProcess, Victim, config  # noqa: E402
-
-from bench.subjects import BenchFailed, build  # noqa: E402
+from bench.subjects import BenchFailed, build
+from testkit.family import kill_main, members
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import ROOT
 
 RESULTS = ROOT / "bench" / "results" / "trees.json"
 WARM_UP_CYCLES = 2

@@ -6,7 +6,6 @@ from __future__ import annotations
 import array
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,12 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
-from native.board import Board  # noqa: E402 - tests/native, whose folder is no package
-
-from bench.subjects import BUILD, VICTIMS, BenchFailed, eventually  # noqa: E402
+from bench.subjects import BUILD, VICTIMS, BenchFailed, eventually
+from testkit.board import Board
+from testkit.harness import ROOT
 
 PROGRAMS = BUILD / "programs"
 ASK_EVERY_US = 1000

@@ -20,19 +20,16 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
-from harness import (  # noqa: E402 - its folder is no package
+from testkit.harness import (
     BASE_IMAGE,
     OURS,
+    ROOT,
     SIDECAR_NAME,
     CommandFailed,
     Container,

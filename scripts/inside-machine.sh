@@ -5,7 +5,7 @@
 # how they ended, in its last line.
 set -o pipefail
 cd /opt/avckpt || exit 1
-# An emulated machine is about ten times slower (tests/harness.py).
+# An emulated machine is about ten times slower (testkit/harness.py).
 export HOME=/root LANG=C.UTF-8 AVCKPT_SLOWNESS=10
 mapfile -t arguments <build/machine-arguments
 printf 'Linux %s, %s, %s\n' "$(uname -r)" "$(podman --version)" "$(stat -f -c %T /sys/fs/cgroup)"

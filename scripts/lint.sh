@@ -20,8 +20,9 @@ mapfile -t c < <(git ls-files --cached --others --exclude-standard '*.c' '*.h')
 
 check "ruff check" .venv/bin/ruff check .
 check "ruff format" .venv/bin/ruff format --check --diff .
-mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests bench 2>/dev/null)
+mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests testkit bench 2>/dev/null)
 check "mypy --strict" .venv/bin/mypy "${typed[@]}"
+check "layers of the engine" make -s -C native layers
 if have shellcheck; then
 	check "shellcheck" shellcheck -x "${shell[@]}"
 else

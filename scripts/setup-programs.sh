@@ -1,21 +1,21 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# The image localhost/avckpt-programs: the real programs that tests/programs
+# The image localhost/avckpt-programs: the real programs that testkit/programs
 # checkpoints, kills and restores.  It is tagged with a key of what it is made
 # from: an unchanged tree builds nothing, and a changed source compiles only.
 
 # shellcheck source=scripts/lib.sh
 . "$(dirname "$0")/lib.sh"
 
-cd "$ROOT/tests/programs"
+cd "$ROOT/testkit/programs"
 BASE=localhost/avckpt-base
 IMAGE=localhost/avckpt-programs
 BUILDER=localhost/avckpt-programs-build
 
 base_id=$(podman image inspect --format '{{.Id}}' "$BASE:latest") || die "no base image: make setup builds it"
 sources=(Containerfile server_cpp.cpp server_go.go ServerJvm.java)
-key=$(content_key "${sources[@]/#/tests/programs/}" -- "$base_id")
+key=$(content_key "${sources[@]/#/testkit/programs/}" -- "$base_id")
 if podman image exists "$IMAGE:$key"; then
 	podman tag "$IMAGE:$key" "$IMAGE:latest"
 	note "image of real programs: $IMAGE is there"

@@ -11,10 +11,10 @@ import signal
 import subprocess
 from collections.abc import Callable, Generator, Iterator
 
-import devices
-import harness
 import pytest
-from harness import CommandFailed, ContainerFactory, Podman, Sidecar
+
+from testkit import devices, harness
+from testkit.harness import CommandFailed, ContainerFactory, Podman, Sidecar
 
 CONTAINERS = pytest.StashKey[ContainerFactory]()
 

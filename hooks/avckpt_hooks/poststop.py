@@ -13,7 +13,7 @@ import json
 import os
 import sys
 
-from avckpt_hooks import protocol, tell
+from avckpt_hooks.shared import protocol, tell
 
 PATIENCE_S = 0.1
 """For the sidecar's answer: it sees the end of the process anyway."""

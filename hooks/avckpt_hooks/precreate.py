@@ -16,7 +16,8 @@ from __future__ import annotations
 import os
 import sys
 
-from avckpt_hooks import VERSION, podman, tell
+from avckpt_hooks import VERSION, podman
+from avckpt_hooks.shared import tell
 
 TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
 if TYPE_CHECKING:
@@ -37,9 +38,6 @@ _MARK = b'"avckpt.'
 """Without it in a text of JSON, no label or annotation of ours is in there."""
 _LOOKALIKE = b'"avckpt'
 """Without it in a text of JSON in lower case, none that was meant for us is."""
-_OTHER_INITS = ("/run/podman-init", "/dev/init")
-_ONLY_AS_PID_1 = ("init", "systemd", "s6-svscan")
-"""Programs, wherever they are, that end or do less when they are not PID 1: systemd, s6-overlay (/init), s6."""
 
 
 class Refused(Exception):
@@ -86,7 +84,7 @@ def rewrite(config: bytes, parent: int) -> bytes:
 def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -> bytes:
     import json
 
-    from avckpt_hooks import labels
+    from avckpt_hooks.shared import labels
 
     data = json.loads(config)
     about = json.loads(spec)
@@ -137,9 +135,11 @@ def _ask_for_health(container: str, name: str, parent: int) -> None:
 
 def put_init_in_front(data: dict[str, Any]) -> None:
     """Makes avckpt-init the container's main process.  Changes `data`."""
+    from avckpt_hooks.shared.programs import OTHER_INITS
+
     args = data["process"]["args"]
     # --init's own init would only stand between ours and the app.
-    if args[0] in _OTHER_INITS:
+    if args[0] in OTHER_INITS:
         args = args[2:] if args[1:2] == ["--"] else args[1:]
     stop_signal = (data.get("annotations") or {}).get("org.opencontainers.image.stopSignal", "15")
     if not stop_signal.isdecimal():
@@ -213,6 +213,8 @@ def warn(line: str, parent: int) -> bool:
 
 def _unprotectable(data: dict[str, Any], container: str) -> str:
     """Why a container is better left as it is; "" if nothing speaks against it."""
+    from avckpt_hooks.shared.programs import must_be_pid_1
+
     if not _is_ours():
         return "only containers of root can be protected, and this Podman is rootless"
     process = data.get("process") or {}
@@ -230,11 +232,6 @@ def _unprotectable(data: dict[str, Any], container: str) -> str:
     return ""
 
 
-def must_be_pid_1(command: str) -> bool:
-    """Whether a program is better left without an init in front of it."""
-    return os.path.basename(command) in _ONLY_AS_PID_1 and command not in _OTHER_INITS
-
-
 def _is_ours() -> bool:
     """Whether this is root's Podman."""
     if os.environ.get("_CONTAINERS_ROOTLESS_UID") or os.geteuid() != 0:
@@ -247,7 +244,7 @@ def _tell_if_alone(name: str, parent: int) -> bool:
     """Warns when no sidecar listens.  True if the user has been told so."""
     import socket
 
-    from avckpt_hooks import protocol
+    from avckpt_hooks.shared import protocol
 
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:

@@ -2,7 +2,7 @@
 """Builds the cffi (API mode) extension `avckpt._native` from the C headers.
 
 The declarations are the headers themselves, run through the C preprocessor:
-there is one truth, and the C compiler checks it against libavckpt.a.
+there is one truth, and the C compiler checks it against libavckpt-client.a.
 Named in setup.py (`cffi_modules`); run by itself it builds in place.
 """
 
@@ -51,8 +51,8 @@ ffibuilder.set_source(
     "avckpt._native",
     "".join(f'#include "{header}"\n' for header in HEADERS),
     include_dirs=[relative(NATIVE / "include")],
-    extra_objects=[relative(NATIVE / "build" / "libavckpt.a")],
-    depends=[relative(NATIVE / "build" / "libavckpt.a")],
+    extra_objects=[relative(NATIVE / "build" / "libavckpt-client.a")],
+    depends=[relative(NATIVE / "build" / "libavckpt-client.a")],
     extra_compile_args=["-std=gnu11", "-O2"],
     libraries=["pthread"],
 )

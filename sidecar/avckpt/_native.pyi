@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# The cffi extension; only native.py looks inside.
+# The cffi extension; only engine.py looks inside.
 from typing import Any
 
 ffi: Any

@@ -27,6 +27,11 @@ def inside_binary() -> Path:
     return _program("avckpt-exec")
 
 
+def guard_binary() -> Path:
+    """The static program avckpt-guard (`native.py`).  Raises ConfigError when it is nowhere."""
+    return _program("avckpt-guard")
+
+
 def hooks_source() -> Path:
     """The directory of the Python package avckpt_hooks.  Raises ConfigError when it is nowhere."""
     candidates = (PACKAGE.parent / "avckpt_hooks", CHECKOUT / "hooks" / "avckpt_hooks")

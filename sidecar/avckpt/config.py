@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import yaml
-from avckpt_hooks.labels import LABELS, PREFIX, LabelError, parse_policy
+from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, parse_policy
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, create_model
 
 from avckpt import yamlfile
@@ -130,7 +130,7 @@ def examine(path: Path) -> tuple[Defaults, list[Problem]]:
         return Defaults(), [Problem(error.place, error.why)]
     try:
         document = {} if root is None else _plain(root)
-    except RecursionError:  # an anchor inside itself
+    except RecursionError:
         return Defaults(), [Problem(Place(str(path), 1), "nested too deeply")]
     problems = list(_repetitions(root, path))
     try:

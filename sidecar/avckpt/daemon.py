@@ -2,9 +2,9 @@
 """The sidecar's daemon: one guard per protected container.
 
 asyncio, one thread.  It sleeps until something happens: a hook's request, an
-event of the engine, an init that ends, a request on the API, a signal, or it is
-time to look at the records.  What is urgent (death to resume) happens in the
-engine's own threads, not here.
+event of a guard, an init that ends, a request on the API, a signal, or it is time to
+look at guards and records.  What is urgent (death to resume) happens in the guards, which are
+processes of their own, not here.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import dataclasses
 import fcntl
 import itertools
 import logging
+import math
 import os
 import resource
 import signal
@@ -23,13 +24,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avckpt_hooks.labels import Notify
-from avckpt_hooks.protocol import Deregister, Register
+from avckpt_hooks.shared.labels import Notify
+from avckpt_hooks.shared.protocol import Deregister, Register
 
-from avckpt import __version__, cgroup, native
-from avckpt.api import ApiServer
-from avckpt.caretaker import Caretaker
+from avckpt import __version__
+from avckpt.api.server import ApiServer
 from avckpt.config import Configuration
+from avckpt.containers import cgroup
+from avckpt.containers.listener import HookListener
+from avckpt.containers.looks import in_own_thread
+from avckpt.containers.process import has_ended, is_foreign, pid_of
+from avckpt.containers.protected import Protected
+from avckpt.containers.records import NOT_SEEN, Records, keep_private
+from avckpt.containers.registry import Registry
+from avckpt.engine import Engine, Guard, probe
 from avckpt.errors import (
     AvckptError,
     Busy,
@@ -41,25 +49,27 @@ from avckpt.errors import (
     TargetGone,
     Unprotected,
 )
-from avckpt.event_record import Cause, EventRecord, Kind, of_guard
-from avckpt.events import Command, Event, EventKind, why_not_restored
-from avckpt.feed import Feed
-from avckpt.history import History
-from avckpt.journal import Journal
-from avckpt.listener import HookListener
-from avckpt.metrics import Metrics
-from avckpt.notify import Notifier
-from avckpt.policy import Settings, changes, settings_of
-from avckpt.process import has_ended, is_foreign, pid_of
-from avckpt.protected import Protected
-from avckpt.records import NOT_SEEN, Records
-from avckpt.registry import Registry
-from avckpt.reload import Reloaded
+from avckpt.events.feed import Feed
+from avckpt.events.history import History
+from avckpt.events.journal import Journal
+from avckpt.events.metrics import Metrics
+from avckpt.events.record import Cause, EventRecord, Kind, of_guard
+from avckpt.events.vocabulary import Event, EventKind, why_not_restored
+from avckpt.guard import Command
+from avckpt.policy import Reloaded, Settings, changes, settings_of
+from avckpt.supervision.caretaker import Caretaker
+from avckpt.supervision.notify import Notifier
 
 log = logging.getLogger("avckpt")
 
 LOOK_S = 5.0
 """How often is looked for containers that could not be protected when they came."""
+GUARD_LOOK_S = 1.0
+"""Seconds between looks whether guards are alive."""
+GUARD_PATIENCE_S = 5.0
+"""A guard that gives no sign of life for so long is killed, and another one started."""
+GUARD_AGAIN_S = 30.0
+"""A guard that is lost sooner than that after the last one is started anew at the next look, not at once."""
 COMMAND_TIMEOUT_S = 30.0
 """How long a command waits for the engine's answer."""
 
@@ -77,7 +87,9 @@ class Watch:
     freezes_s: dict[int, float] = field(default_factory=dict)
     """Freeze times of the generations that may still be held, by number."""
     journal: Journal = field(default_factory=Journal)
-    guard: native.Guard | None = None
+    guard: Guard | None = None
+    guard_lost_s: float = -math.inf
+    """When a guard was lost last, time.monotonic()."""
 
     @property
     def notify(self) -> Notify | None:
@@ -104,7 +116,7 @@ class Daemon:
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
         self.started_at = time.time()
-        self._engine = native.Engine()
+        self._engine = Engine()
         self._watches: dict[int, Watch] = {}
         self._cookies = itertools.count(1)
         self._tickets = itertools.count(1)
@@ -264,8 +276,15 @@ class Daemon:
                 self._start_guard(watch)
 
     async def _keep_catching_up(self) -> None:
+        due_s = time.monotonic() + LOOK_S
         while True:
-            await asyncio.sleep(LOOK_S)
+            guards = [watch.guard for watch in self._watches.values() if watch.guard is not None]
+            for guard in guards:
+                guard.check(GUARD_PATIENCE_S)
+            await asyncio.sleep(GUARD_LOOK_S if guards else LOOK_S)
+            if time.monotonic() < due_s:
+                continue
+            due_s = time.monotonic() + LOOK_S
             try:
                 self._catch_up()
             except Exception:
@@ -324,6 +343,7 @@ class Daemon:
             container.fail(str(error))
             self.tell(watch, EventRecord(Kind.UNPROTECTED, error=error))
         else:
+            container.guard_pid = watch.guard.pid
             self.caretaker.begin(watch, watch.settings.policy)
 
     # Events
@@ -371,15 +391,33 @@ class Daemon:
                     self._lose_guard(watch, watch.guard)
                 continue
             record = self.tell(watch, self._record(watch, event, at))
+            if event.kind is EventKind.GUARD_LOST and watch.guard is not None:
+                self._replace_guard(watch, watch.guard)
             _, answer = self._answers.get(event.ticket, (0, None))
             if answer is not None and not answer.done():
                 answer.set_result((event, record))
 
-    def _lose_guard(self, watch: Watch, guard: native.Guard) -> None:
+    def _lose_guard(self, watch: Watch, guard: Guard) -> None:
         """It could not do its work, and said why; the next one may."""
         self.caretaker.end(watch)
-        guard.stop()  # its thread has ended
+        guard.stop()  # its process has ended
         watch.guard = None
+        watch.container.guard_pid = 0
+
+    def _replace_guard(self, watch: Watch, guard: Guard) -> None:
+        """Its process died or hung.  One that dies again and again must not keep us busy."""
+        self._lose_guard(watch, guard)
+        self._fail_answers(watch, "its guard died before it could be done")
+        now = time.monotonic()
+        since_s, watch.guard_lost_s = now - watch.guard_lost_s, now
+        if since_s > GUARD_AGAIN_S and not has_ended(watch.pidfd):
+            self._start_guard(watch)
+
+    def _fail_answers(self, watch: Watch, why: str) -> None:
+        container = watch.container
+        for cookie, answer in list(self._answers.values()):
+            if cookie == container.cookie and not answer.done():
+                answer.set_exception(TargetGone(f"{container.label}: {why}"))
 
     def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
         if event.kind is EventKind.CHECKPOINT:
@@ -404,7 +442,7 @@ class Daemon:
         container = watch.container
         if watch.guard is not None:
             # Blocks for as long as a checkpoint that is under way.
-            await asyncio.get_running_loop().run_in_executor(None, watch.guard.stop)
+            await in_own_thread(watch.guard.stop)
             self._take_events()  # it may just have said how the container ended
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)
@@ -414,9 +452,7 @@ class Daemon:
             container.end(time.time())
             self.tell(watch, EventRecord(Kind.ENDED, detail=container.reason))
             self.metrics.forget_all_but(each.label for each in self.registry.live() + self.registry.ended())
-        for cookie, answer in list(self._answers.values()):
-            if cookie == container.cookie and not answer.done():
-                answer.set_exception(TargetGone(f"{container.label} ended before it could be done"))
+        self._fail_answers(watch, "ended before it could be done")
 
 
 def check_answer(label: str, event: Event) -> None:
@@ -482,12 +518,14 @@ def serve(run_dir: Path, config_path: Path) -> None:
     Raises Denied or Unsupported when this process or machine can not do it,
     Busy when there is a sidecar already.
     """
-    native.probe()
+    probe()
     cgroup.see_whole_tree()
     raise_descriptor_limit()
     try:
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
         with only_one(run_dir):
+            for name in ("containers", "health"):
+                keep_private(run_dir / name)
             asyncio.run(Daemon(run_dir, config_path).run())
     except OSError as error:
         kind = Denied if isinstance(error, PermissionError) else AvckptError

@@ -28,6 +28,7 @@ class Code(enum.IntEnum):
     CONFIG = 7
     KERNEL = 8
     EMPTY = 9
+    LIMIT = 10
 
 
 class ExitCode(enum.IntEnum):
@@ -171,6 +172,13 @@ class KernelError(AvckptError):
     code = Code.KERNEL
 
 
+class NoRoom(AvckptError):
+    """A limit of processes, or of memory, leaves no room for one more process."""
+
+    kind = "limit"
+    code = Code.LIMIT
+
+
 class NothingToRestore(AvckptError):
     """There is no generation to restore from."""
 
@@ -218,6 +226,7 @@ _CLASSES: tuple[type[AvckptError], ...] = (
     ConfigError,
     LabelsWrong,
     KernelError,
+    NoRoom,
     NothingToRestore,
     Unprotected,
     NoSuchContainer,

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from avckpt_hooks.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy
+from avckpt_hooks.shared.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy, shown
 
 from avckpt.errors import LabelsWrong
-from avckpt.events import Files, GuardConfig, Tcp
+from avckpt.guard import Files, GuardConfig, Tcp
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,33 @@ class Change:
     after: str
 
     def __str__(self) -> str:
-        return f"{self.setting} {self.before or 'none'} -> {self.after or 'none'}"
+        before, after = (shown(text) if text else "none" for text in (self.before, self.after))
+        return f"{self.setting} {before} -> {after}"
+
+
+@dataclass(frozen=True)
+class Reloaded:
+    """A container that goes by other settings now, or, with a `problem`, by its old ones."""
+
+    container: str
+    changes: tuple[Change, ...]
+    problem: str = ""
+    """Why the file does not hold for it; empty: it does."""
+
+    @property
+    def what(self) -> str:
+        """In a line: "interval 3s -> 500ms, keep 2 -> 4"."""
+        return ", ".join(map(str, self.changes))
+
+    def to_json(self) -> dict[str, object]:
+        """For the API."""
+        return {
+            "container": self.container,
+            "changes": [
+                {"setting": change.setting, "before": change.before, "after": change.after} for change in self.changes
+            ],
+            "problem": self.problem,
+        }
 
 
 def guard_config(policy: Policy) -> GuardConfig:

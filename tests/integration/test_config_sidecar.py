@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import take_checkpoint, wait_until
-from local_sidecar import Container, LocalSidecar, local_sidecar
+
+from testkit.harness import take_checkpoint, wait_until
+from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
 

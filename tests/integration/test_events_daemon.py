@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avckpt.client import Client
-from avckpt.event_record import EventRecord, Kind
-from avckpt.history import History
-from harness import avckpt_command, take_checkpoint, wait_until
+from avckpt.cli.client import Client
+from avckpt.events.history import History
+from avckpt.events.record import EventRecord, Kind
 from jsonschema import Draft202012Validator
-from local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
 from prometheus_client.parser import text_string_to_metric_families
+
+from testkit.harness import avckpt_command, take_checkpoint, wait_until
+from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
 
 SLEEPER = ["sleep", "1000"]
 Stream = Generator[dict[str, Any], None, None]

@@ -15,10 +15,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.client import Client
-from avckpt.pressure import templates_of
-from harness import wait_until
-from local_sidecar import Container, LocalSidecar, local_sidecar
+from avckpt.cli.client import Client
+from avckpt.supervision.pressure import templates_of
+
+from testkit.harness import wait_until
+from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
 

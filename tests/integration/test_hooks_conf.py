@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt import containers_conf
-from avckpt.install import DROP_IN, HOOKS_DIR
-from harness import Podman, avckpt_command, hooks_installed, run, wait_until
+from avckpt.cli import containers_conf
+from avckpt.cli.install import DROP_IN, HOOKS_DIR
+
+from testkit.harness import Podman, avckpt_command, hooks_installed, run, wait_until
 
 INIT = "/run/avckpt-init"
 

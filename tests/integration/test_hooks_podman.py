@@ -19,8 +19,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt_hooks import protocol
-from harness import (
+from avckpt_hooks.shared import protocol
+
+from testkit.harness import (
     ROOT,
     SLOWNESS,
     Container,
@@ -419,7 +420,7 @@ def test_a_broken_hook_does_not_keep_a_container_from_running(
     """An installation that lost a file, as after an upgrade that broke off."""
     broken = tmp_path / "libexec"
     shutil.copytree(ROOT / "hooks", broken, symlinks=True)
-    (broken / "avckpt_hooks" / "labels.py").unlink()
+    (broken / "avckpt_hooks" / "shared" / "labels.py").unlink()
     [hook_json] = hooks_dir.glob("*.json")
     hook_json.write_text(hook_json.read_text().replace(str(ROOT / "hooks"), str(broken)))
     status, out, err = foreground(

@@ -10,8 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import SIDECAR_NAME, SLOWNESS, ContainerFactory, Sidecar, wait_until
-from integration.protected import QUICK, ours, start_victim
+
+from testkit.harness import SIDECAR_NAME, SLOWNESS, ContainerFactory, Sidecar, wait_until
+from testkit.protected import QUICK, ours, start_victim
 
 
 @pytest.mark.slow

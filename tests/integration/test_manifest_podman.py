@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 import yaml
-from avckpt.install import LIBEXEC
-from avckpt.manifest import COMPOSE_NAMES, Kind, check, files_meant
-from harness import (
+from avckpt.cli.compose.manifest import COMPOSE_NAMES, Kind, check, files_meant
+from avckpt.cli.install import LIBEXEC
+
+from testkit.harness import (
     BASE_IMAGE,
     CONFIG_DIR,
     ROOT,
@@ -254,7 +255,7 @@ def test_hooks_are_installed_only_when_asked_for(project: Project, sidecar: Side
 
 def test_hooks_of_another_build_are_said_and_brought_up_to_date(project: Project, sidecar: Sidecar) -> None:
     project.write(SERVICES)
-    with (LIBEXEC / "avckpt_hooks" / "tell.py").open("a") as installed:
+    with (LIBEXEC / "avckpt_hooks" / "shared" / "tell.py").open("a") as installed:
         installed.write("# of another build\n")
     warning = f"warning: hooks: of another build than this avckpt: {installed.name} (run: sudo avckpt install)"
     assert warning in project.avckpt("up", "by-map").stderr
@@ -298,7 +299,7 @@ def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Pr
 def test_without_a_sidecar_to_start_it_says_so(
     project: Project, sidecar: Sidecar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from avckpt import sidecar_container
+    from avckpt.cli import sidecar_container
     from avckpt.errors import SidecarUnreachable
 
     sidecar.stop()

@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import ROOT, take_checkpoint, wait_until
-from host_pressure import make_group, remove_group
-from local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
-from native.board import Board
+
+from testkit.board import Board
+from testkit.harness import ROOT, take_checkpoint, wait_until
+from testkit.host_pressure import make_group, remove_group
+from testkit.local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
 
 HOARD = ROOT / "tests/victims/build/hoard"
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")

@@ -6,15 +6,18 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from avckpt.client import Client
-from harness import wait_until
-from local_sidecar import QUICK, Container, LocalSidecar, children, ended, local_sidecar
+from avckpt.cli.client import Client
+
+from testkit.harness import wait_until
+from testkit.local_sidecar import QUICK, Container, LocalSidecar, ended, local_sidecar
+from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
 # Says READY, then a line for every SIGUSR1.
@@ -157,8 +160,9 @@ def test_a_command_runs_inside_with_the_event(local: LocalSidecar, tmp_path: Pat
 @pytest.mark.parametrize(
     ("command", "why"),
     [
-        ("sh -c 'echo one; echo two >&2; exit 3'", ": exited with status 3: two"),
-        ("/no/such/program --x", "/no/such/program --x: exited with status 127"),
+        ("sh -c 'echo one; echo two >&2; exit 3'", " sh: exited with status 3: two"),
+        # What a program is given may be secret; whoever reads the log need not be allowed to know it.
+        ("/no/such/program --password=x", "/no/such/program: exited with status 127"),
         ("sh -c 'kill -SEGV $$'", ": exited with status 139"),
     ],
 )
@@ -171,6 +175,27 @@ def test_a_command_that_fails_is_told(local: LocalSidecar, command: str, why: st
     assert not ended(web)
 
 
+def test_an_environment_without_an_end(local: LocalSidecar) -> None:
+    """A process says itself where its environment is; one without avckpt-init is the application."""
+    odd = local.container("odd", [sys.executable, "-m", "testkit.odd_environ", "300"], init=False)
+    wait_until(lambda: "set" in odd.output.read_text(), 10, "it has such an environment")
+    assert odd.hook("prestart", {"avckpt.group": "chain", "avckpt.notify": "exec:true"}) == ""
+    local.wait_for(odd, state="listening")
+    assert local.process is not None
+    status = Path(f"/proc/{local.process.pid}/status")
+    web = protected(local, "web", IN_GROUP)
+    before_kb = high_water_kb(status)
+    crash(local, web)
+    wait_until(lambda: told(local, "notify_failed"), 5, "the failure is told")
+    assert "its environment is longer than" in told(local, "notify_failed")[0]["message"]
+    assert high_water_kb(status) < before_kb + 50_000
+
+
+def high_water_kb(status: Path) -> int:
+    """The most memory a process ever had."""
+    return int(status.read_text().partition("VmHWM:")[2].split()[0])
+
+
 def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_path: Path) -> None:
     pids = tmp_path / "pids"
     stuck = protected(
@@ -180,7 +205,7 @@ def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_p
     )
     friend = listener(local, "friend", {**IN_GROUP, "avckpt.notify": "signal:USR1"})
     web = protected(local, "web", IN_GROUP)
-    before = len(children(stuck.init_pid))
+    before = len(children_of(stuck.init_pid))
     crash(local, web)
     wait_until(pids.exists, 5, "the command runs")
     # While it is stuck: others are told, its own container is checkpointed and restored, web again.
@@ -198,7 +223,7 @@ def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_p
     assert "killed after 5 s" in told(local, "notify_failed")[0]["message"]
     wait_until(lambda: pids.read_text().count("x") == 2, 3, "the one that waited has its turn")
     assert local.stop() == 0
-    wait_until(lambda: len(children(stuck.init_pid)) <= before, 5, "nothing of ours is left inside")
+    wait_until(lambda: len(children_of(stuck.init_pid)) <= before, 5, "nothing of ours is left inside")
     assert not [p for p in Path("/proc").iterdir() if p.name.isdigit() and _is_left(p)]
     assert not ended(stuck)
 

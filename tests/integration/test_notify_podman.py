@@ -8,7 +8,8 @@ import os
 import signal
 
 import pytest
-from harness import SIDECAR_NAME, Container, ContainerFactory, Podman, Sidecar, wait_until
+
+from testkit.harness import SIDECAR_NAME, Container, ContainerFactory, Podman, Sidecar, wait_until
 
 LISTENER = (
     "import signal, time\n"

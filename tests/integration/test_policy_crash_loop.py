@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import SLOWNESS, ContainerFactory, Sidecar, wait_until
-from integration.protected import ProtectedVictim, start_victim
-from integration.test_policy_labels import checkpoint, ended
+
+from testkit.harness import SLOWNESS, ContainerFactory, Sidecar, wait_until
+from testkit.protected import ProtectedVictim, ended, start_victim
 
 
 @pytest.fixture
@@ -29,9 +29,9 @@ def poison(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Any
 
 def test_a_poisoned_generation_is_left_for_an_older_one(poison: Any) -> None:
     victim = poison(int(300 * SLOWNESS), {"interval": "1h", "restore.max": "4/60s"})
-    checkpoint(victim)
+    victim.checkpoint()
     os.kill(victim.app, signal.SIGUSR1)
-    checkpoint(victim)  # before it crashes: this image is poisoned
+    victim.checkpoint()  # before it crashes: this image is poisoned
     entry = victim.sidecar.wait_restores(victim.container, 3)
     # Half of the four for the newest, then the clean one: and it lives.
     assert entry["generation"] == 1
@@ -72,7 +72,7 @@ def test_crashes_that_are_far_apart_go_on_being_restored(poison: Any) -> None:
 
 def test_a_roll_back_on_command_does_not_count(poison: Any) -> None:
     victim = poison(100000, {"interval": "1h", "restore.max": "2/60s"})
-    checkpoint(victim)
+    victim.checkpoint()
     for _ in range(4):
         victim.sidecar.avckpt("restore", victim.container.name)
     victim.wait_beats()

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import RUN_DIR, Container, ContainerFactory, Sidecar, wait_until
-from integration.protected import ProtectedVictim, start_victim
-from integration.test_policy_labels import ended
+
+from testkit.harness import RUN_DIR, Container, ContainerFactory, Sidecar, wait_until
+from testkit.protected import ProtectedVictim, ended, start_victim, told
 
 FRESH = "test -n \"$(find /tmp/alive -newermt '-1 seconds')\""
 """The victim `poison` touches that file as long as it does not hang."""
@@ -24,11 +24,6 @@ def check(command: str, retries: int = 2, timeout: str = "2s") -> list[str]:
         *("--health-cmd", command, "--health-interval", "1s", "--health-timeout", timeout),
         *("--health-retries", str(retries)),
     ]
-
-
-def told(sidecar: Sidecar, container: Container, kind: str) -> list[dict[str, Any]]:
-    events = [json.loads(line) for line in sidecar.avckpt("events", "--json").stdout.splitlines()]
-    return [event for event in events if event["id"] == container.id and event["kind"] == kind]
 
 
 def wait_told(sidecar: Sidecar, container: Container, kind: str, text: str) -> dict[str, Any]:

@@ -9,12 +9,12 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from harness import ROOT, ContainerFactory, Sidecar, take_checkpoint, wait_until
-from host_pressure import pressure
-from integration.test_policy_labels import checkpoint as checkpoint_of
-from integration.test_policy_memory import start, write
-from local_sidecar import ON_COMMAND, local_sidecar
-from native.board import Board
+
+from testkit.board import Board
+from testkit.harness import ROOT, ContainerFactory, Sidecar, take_checkpoint, wait_until
+from testkit.host_pressure import pressure
+from testkit.local_sidecar import ON_COMMAND, local_sidecar
+from testkit.protected import start_hoard, write_hoard
 
 VICTIMS = ROOT / "tests/victims/build"
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
@@ -45,11 +45,11 @@ def test_the_one_that_holds_most_gives_its_oldest_up(tmp_path: Path) -> None:
 def test_the_sidecar_in_its_container_hears_of_it(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    victim = start(sidecar, container, tmp_path, 60, 0)
+    victim = start_hoard(sidecar, container, tmp_path, 60, 0)
     app = victim.app
     for _ in range(2):
-        checkpoint_of(victim)
-        write(victim, signal.SIGUSR1, 60)
+        victim.checkpoint()
+        write_hoard(victim, signal.SIGUSR1, 60)
     with pressure():
         sidecar.wait_for(victim.container, lambda entry: entry["dropped"] >= 1, "a generation is given up", 30)
     victim.wait_beats()

@@ -9,8 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, take_checkpoint, wait_until
-from integration.protected import ProtectedVictim, ours, start_victim
+
+from testkit.harness import ContainerFactory, Sidecar, wait_until
+from testkit.protected import ProtectedVictim, ended, ours, start_victim
 
 ON_COMMAND = {"interval": "1h", "restore.max": "60/60s"}
 
@@ -26,10 +27,6 @@ def victim(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Cal
     return start
 
 
-def checkpoint(victim: ProtectedVictim) -> None:
-    take_checkpoint(victim.sidecar.avckpt, victim.container.name)
-
-
 def templates(victim: ProtectedVictim) -> list[int]:
     return ours(victim.container, "avckpt-tmpl")
 
@@ -38,7 +35,7 @@ def templates(victim: ProtectedVictim) -> list[int]:
 def test_so_many_generations_are_held(victim: Callable[..., ProtectedVictim], keep: int) -> None:
     held = victim("crash", keep=str(keep))
     for _ in range(keep + 2):
-        checkpoint(held)
+        held.checkpoint()
     entry = held.sidecar.find(held.container)
     assert entry is not None
     assert (entry["generation"], entry["generations"]) == (keep + 2, keep)
@@ -48,7 +45,7 @@ def test_so_many_generations_are_held(victim: Callable[..., ProtectedVictim], ke
 def test_an_older_generation_is_used_when_the_newest_is_gone(victim: Callable[..., ProtectedVictim]) -> None:
     held = victim("crash", keep="3")
     for _ in range(3):
-        checkpoint(held)
+        held.checkpoint()
     for expected in (2, 1):
         newest = max(templates(held))
         os.kill(newest, signal.SIGKILL)
@@ -76,7 +73,7 @@ def test_which_ends_are_abnormal(
     victim: Callable[..., ProtectedVictim], restore_on: str, how: signal.Signals, restored: bool
 ) -> None:
     crashing = victim("crash", restore_on=restore_on)
-    checkpoint(crashing)
+    crashing.checkpoint()
     os.kill(crashing.app, how)
     if restored:
         crashing.sidecar.wait_restores(crashing.container)
@@ -86,13 +83,3 @@ def test_which_ends_are_abnormal(
     status = {signal.SIGHUP: 3, signal.SIGUSR1: 139, signal.SIGUSR2: 134}[how]
     assert crashing.container.wait() == status
     assert "avckpt.restore.on does not name this end" in ended(crashing.sidecar, crashing.container)
-
-
-def ended(sidecar: Sidecar, container: Container) -> str:
-    """Why a container was not restored, as `avckpt ps -a` has it."""
-
-    def look() -> str:
-        found = [entry for entry in sidecar.ps("--all") if entry["id"] == container.id and entry["state"] == "ended"]
-        return str(found[-1]["reason"]) if found else ""
-
-    return wait_until(look, 10, f"avckpt ps -a tells how {container.name} ended")

@@ -9,31 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
-from integration.protected import ProtectedVictim, ours, start_victim
-from integration.test_policy_health import told
-from integration.test_policy_labels import checkpoint
+
+from testkit.harness import SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
+from testkit.protected import ours, start_hoard, told, write_hoard
 
 MB = 1 << 20
-
-
-def start(sidecar: Sidecar, factory: ContainerFactory, folder: Path, mb: int, limit_mb: int) -> ProtectedVictim:
-    return start_victim(
-        sidecar,
-        factory,
-        folder,
-        f"hoard {mb}",
-        labels={"interval": "1h"},
-        options=["--memory", f"{limit_mb}m", "--memory-swap", f"{limit_mb}m"] if limit_mb else [],
-        generation=0,
-    )
-
-
-def write(victim: ProtectedVictim, signum: int, mb: int) -> None:
-    """Has the victim write all its memory again, and waits until it has."""
-    wanted = victim.see().counter[0] + mb
-    os.kill(victim.app, signum)
-    wait_until(lambda: victim.see().counter[0] >= wanted, 20, f"{mb} MB written")
 
 
 def held(sidecar: Sidecar, container: Container) -> dict[str, Any]:
@@ -44,12 +24,12 @@ def held(sidecar: Sidecar, container: Container) -> dict[str, Any]:
 
 @pytest.mark.skipif(SLOWNESS > 1, reason="the sidecar is quicker there than the kernel's OOM killer")
 def test_the_oom_killer_takes_templates_first(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    victim = start(sidecar, container, tmp_path, 60, 160)
+    victim = start_hoard(sidecar, container, tmp_path, 60, 160)
     app = victim.app
     for _ in range(2):
-        checkpoint(victim)
+        victim.checkpoint()
         # At once: nobody but the kernel is quick enough to do something about it.
-        write(victim, signal.SIGUSR1, 60)
+        write_hoard(victim, signal.SIGUSR1, 60)
     sidecar.wait_for(victim.container, lambda e: e["dropped"] >= 1, "a generation is lost")
     victim.wait_beats()
     assert victim.app == app
@@ -57,7 +37,7 @@ def test_the_oom_killer_takes_templates_first(sidecar: Sidecar, container: Conta
     assert victim.see().starts == 1
     assert any("its template was killed" in event["detail"] for event in told(sidecar, victim.container, "dropped"))
     # Protection comes back by itself.
-    checkpoint(victim)
+    victim.checkpoint()
     assert held(sidecar, victim.container)["state"] == "protected"
     victim.kill(signal.SIGKILL)
 
@@ -65,10 +45,10 @@ def test_the_oom_killer_takes_templates_first(sidecar: Sidecar, container: Conta
 def test_near_its_limit_a_container_gives_the_oldest_generation_up(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    victim = start(sidecar, container, tmp_path, 60, 190)
-    checkpoint(victim)
-    write(victim, signal.SIGUSR1, 60)
-    checkpoint(victim)
+    victim = start_hoard(sidecar, container, tmp_path, 60, 190)
+    victim.checkpoint()
+    write_hoard(victim, signal.SIGUSR1, 60)
+    victim.checkpoint()
     # 120 MB are used, 60 more would be 180 of 190: it comes slowly.
     os.kill(victim.app, signal.SIGUSR2)
     entry = sidecar.wait_for(victim.container, lambda e: e["dropped"] >= 1, "a generation is given up")
@@ -79,11 +59,11 @@ def test_near_its_limit_a_container_gives_the_oldest_generation_up(
     # What is given up is free again, and nothing was killed.
     assert [event["generation"] for event in told(sidecar, victim.container, "dropped")] == [1]
     # One is held as long as memory is short, two when it is not.
-    checkpoint(victim)
+    victim.checkpoint()
     assert held(sidecar, victim.container)["generations"] == 1
 
     def two() -> bool:
-        checkpoint(victim)
+        victim.checkpoint()
         return bool(held(sidecar, victim.container)["generations"] == 2)
 
     wait_until(two, 40, "two generations again", every_s=1.0)
@@ -96,13 +76,13 @@ def templates(container: Container) -> list[int]:
 
 @pytest.mark.parametrize("held_mb", [60])
 def test_memory_held_is_shown(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, held_mb: int) -> None:
-    victim = start(sidecar, container, tmp_path, held_mb, 1000)
-    checkpoint(victim)
+    victim = start_hoard(sidecar, container, tmp_path, held_mb, 1000)
+    victim.checkpoint()
     assert held(sidecar, victim.container)["memory_bytes"] < 5 * MB
-    write(victim, signal.SIGUSR1, held_mb)
+    write_hoard(victim, signal.SIGUSR1, held_mb)
     assert held_mb * MB <= held(sidecar, victim.container)["memory_bytes"] < (held_mb + 5) * MB
-    checkpoint(victim)
+    victim.checkpoint()
     # Shared by both generations and no longer by the application: counted once.
-    checkpoint(victim)
-    write(victim, signal.SIGUSR1, held_mb)
+    victim.checkpoint()
+    write_hoard(victim, signal.SIGUSR1, held_mb)
     assert held_mb * MB <= held(sidecar, victim.container)["memory_bytes"] < (held_mb + 10) * MB

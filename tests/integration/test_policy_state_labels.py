@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, free_port, take_checkpoint, wait_until
+
+from testkit.harness import Container, ContainerFactory, Sidecar, free_port, take_checkpoint, wait_until
 
 # Appends to a file when told "write", counts in anonymous shared memory when told "count"; answers any
 # line with the file's offset, the count, and when it was started.

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import pytest
-from harness import Podman, Sidecar
-from programs.registry import PROGRAMS, Missing, find
-from programs.rounds import MODES, run
+
+from testkit.harness import Podman, Sidecar
+from testkit.programs.registry import PROGRAMS, Missing, find
+from testkit.programs.rounds import MODES, run
 
 ROUNDS = 4
 

@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import ContainerFactory, Sidecar, take_checkpoint, wait_until
-from integration.protected import QUICK, ours, start_victim
+
+from testkit.harness import ContainerFactory, Sidecar, take_checkpoint, wait_until
+from testkit.protected import QUICK, ours, start_victim
 
 OPTIONS = {
     "root": [],

@@ -10,9 +10,10 @@ import signal
 from pathlib import Path
 
 import pytest
-from harness import ContainerFactory, Sidecar, take_checkpoint
-from integration.protected import QUICK, ProtectedVictim, start_victim
-from native.scenario import disturb_app
+
+from testkit.harness import ContainerFactory, Sidecar, take_checkpoint
+from testkit.protected import QUICK, ProtectedVictim, start_victim
+from testkit.scenario import disturb_app
 
 KILLS = 6
 

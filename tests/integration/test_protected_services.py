@@ -11,7 +11,8 @@ import subprocess
 import time
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, wait_until
+
+from testkit.harness import Container, ContainerFactory, Sidecar, wait_until
 
 ASYNCIO_SERVER = """
 import asyncio, os, threading

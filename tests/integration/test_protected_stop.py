@@ -10,7 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import SIDECAR_NAME, SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
+
+from testkit.harness import SIDECAR_NAME, SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
 
 QUICK = {"interval": "100ms"}
 # Much less than the 20 s after which Podman kills it.

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import os
 import random
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import ROOT, Podman, Sidecar, wait_until
-
-sys.path.insert(0, str(ROOT))
 
 from bench.ros_pipeline import Crash, Pipeline
+from testkit.harness import Podman, Sidecar, wait_until
 
 IMAGE = "localhost/avckpt-ros:latest"
 DRIVE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avckpt" / "ros-drive" / "drive.bag"

@@ -21,8 +21,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from harness import ROOT, avckpt_command, run, wait_until
-from local_sidecar import app_of, children
+
+from testkit.harness import ROOT, avckpt_command, run, wait_until
+from testkit.local_sidecar import app_of
+from testkit.procfs import children_of
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root")
 needs_dds = pytest.mark.skipif(
@@ -53,7 +55,7 @@ class Spawned:
 
         def look() -> int:
             # The engine's probe has children, too, but in our own namespace; init's application is number 2 in its own.
-            return next((app for init in children(self.process.pid) if (app := app_of(init))), 0)
+            return next((app for init in children_of(self.process.pid) if (app := app_of(init))), 0)
 
         return wait_until(look, 20, f"the program runs: {self.said[-500:]!r}")
 
@@ -83,7 +85,7 @@ def spawn(tmp_path: Path) -> Iterator[Spawn]:
 
     yield start
     for spawned in started:
-        for pid in children(spawned.process.pid):
+        for pid in children_of(spawned.process.pid):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         spawned.process.kill()

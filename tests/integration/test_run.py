@@ -16,8 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from harness import Completed, avckpt_command, run, wait_until
-from local_sidecar import app_of, children
+
+from testkit.harness import Completed, avckpt_command, run, wait_until
+from testkit.local_sidecar import app_of
+from testkit.procfs import children_of
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root")
 
@@ -52,7 +54,7 @@ class Running:
 
     def _init(self) -> int:
         # The engine's probe has children, too, but in our own namespace.
-        for pid in children(self.process.pid):
+        for pid in children_of(self.process.pid):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):
                 if len(Path(f"/proc/{pid}/status").read_text().partition("NSpid:")[2].split("\n")[0].split()) == 2:
                     return pid
@@ -82,7 +84,7 @@ def start(tmp_path: Path) -> Iterator[object]:
 
     yield start
     for running in started:
-        for pid in [*children(running.process.pid), *running.pids]:
+        for pid in [*children_of(running.process.pid), *running.pids]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         running.process.kill()
@@ -224,7 +226,7 @@ def test_a_killed_avckpt_leaves_the_program_running(start, tmp_path: Path) -> No
     pidfd = os.pidfd_open(init)
     running.process.kill()
     running.process.wait(10)
-    wait_until(lambda: children(init) == [app], 5, "only the program is left")
+    wait_until(lambda: children_of(init) == [app], 5, "only the program is left")
     before = len((tmp_path / "out").read_text())
     wait_until(lambda: len((tmp_path / "out").read_text()) > before, 5, "it goes on counting")
     # Without a guard its end is the end.
@@ -327,8 +329,8 @@ def test_the_terminal_comes_back_after_a_restore(terminal) -> None:  # type: ign
     session.wait_for("protected: first checkpoint")
     session.type("kill -KILL $$\n")
     session.wait_for("got=kill")
-    avckpt = children(session.pid)[0]
-    os.kill(app_of(children(avckpt)[0]), signal.SIGKILL)
+    avckpt = children_of(session.pid)[0]
+    os.kill(app_of(children_of(avckpt)[0]), signal.SIGKILL)
     session.wait_for("restored in")
     session.type("again\n")
     session.wait_for("got=again")

@@ -21,10 +21,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.client import Client
-from cgroups import freezer
-from harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
-from local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, children, ended, local_sidecar
+from avckpt.cli.client import Client
+
+from testkit.cgroups import freezer
+from testkit.harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
+from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
+from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
@@ -65,7 +67,7 @@ def test_a_killed_application_comes_back_under_its_pid(local: LocalSidecar) -> N
         assert row["app_pid_inside"] == 2
         assert row["last_death"] == "killed by SIGKILL"
         assert 0 < row["last_restore_s"] < 5
-        assert children(web.init_pid)
+        assert children_of(web.init_pid)
     assert not ended(web)
     assert "web: died: killed by SIGKILL" in local.log
     assert local.log.count("web: killed by SIGKILL, restored in") == 2
@@ -391,7 +393,7 @@ def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSid
     assert sorted(path.name for path in local.run_dir.iterdir()) == ["containers", "history.jsonl", "lock"]
     assert not ended(web)
     # Templates are gone, the application is not traced any more and runs.
-    wait_until(lambda: children(web.init_pid) == [app], 5, "only the application is left")
+    wait_until(lambda: children_of(web.init_pid) == [app], 5, "only the application is left")
     status = Path(f"/proc/{app}/status").read_text()
     assert "TracerPid:\t0" in status
     assert "State:\tS" in status
@@ -405,7 +407,7 @@ def test_sigkill_leaves_the_application_running_and_the_next_one_takes_over(loca
     app = web.app_pid
     assert local.stop(signal.SIGKILL) == -signal.SIGKILL
     assert (local.run_dir / "hooks.sock").exists()
-    wait_until(lambda: children(web.init_pid) == [app], 5, "only the application is left")
+    wait_until(lambda: children_of(web.init_pid) == [app], 5, "only the application is left")
     assert not ended(web)
     local.start()
     row = local.wait_for(web, state="protected")

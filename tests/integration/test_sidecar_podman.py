@@ -10,12 +10,13 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from avckpt import doctor, sidecar_container
+from avckpt.cli import doctor, sidecar_container
 from avckpt.errors import SidecarUnreachable
-from harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
+
+from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
 
 if TYPE_CHECKING:
-    from harness import Completed, Container, ContainerFactory, Podman, Sidecar
+    from testkit.harness import Completed, Container, ContainerFactory, Podman, Sidecar
 
 COUNTER = "import time\nfor i in range(10**9):\n    print('n', i, flush=True)\n    time.sleep(0.02)"
 COUNT = ("python3", "-c", COUNTER)

@@ -12,9 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from databases.observer import Observer
-from databases.rounds import LOAD, Bank, kill_at_random
-from harness import ContainerFactory, Sidecar, take_checkpoint
+
+from testkit.databases.observer import Observer
+from testkit.databases.rounds import LOAD, Bank, kill_at_random
+from testkit.harness import ContainerFactory, Sidecar, take_checkpoint
 
 KILLS = 8
 

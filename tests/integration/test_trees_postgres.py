@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from harness import Container, ContainerFactory, Sidecar, wait_until
-from integration.trees import LONG, Tree, trees_image, write_files
+
+from testkit.harness import Container, ContainerFactory, Sidecar, wait_until
+from testkit.trees import LONG, Tree, trees_image, write_files
 
 IDLE_KILLS = 20 if LONG else 3
 LOAD_KILLS = 50 if LONG else 3

@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import ContainerFactory, Sidecar, wait_until
-from integration.trees import LONG, RESTORE_S, Tree, check_laps, laps, start_tree, write_files
+
+from testkit.harness import ContainerFactory, Sidecar, wait_until
+from testkit.trees import LONG, RESTORE_S, Tree, check_laps, laps, start_tree, write_files
 
 KILLS = 50 if LONG else 4
 

@@ -10,9 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import ContainerFactory, Sidecar, wait_until
-from integration.trees import LONG, Load, Tree, start_tree, write_files
-from native.family import memory_kb
+
+from testkit.harness import ContainerFactory, Sidecar, wait_until
+from testkit.procfs import figures
+from testkit.trees import LONG, Load, Tree, start_tree, write_files
 
 KILLS = 50 if LONG else 4
 
@@ -140,7 +141,7 @@ def test_workers_share_their_memory_after_a_restore(
     tree = gunicorn(sidecar, container, tmp_path)
     wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
     tree.next_generation()
-    before = sum(memory_kb(member.pid, "Pss") for member in tree.members())
+    before = sum(figures(member.pid)["Pss"] for member in tree.members())
     tree.kill()
-    after = sum(memory_kb(member.pid, "Pss") for member in tree.members())
+    after = sum(figures(member.pid)["Pss"] for member in tree.members())
     assert after < 1.3 * before + 8192, (before, after)

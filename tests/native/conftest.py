@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from testkit.harness import ROOT
 
 
 def make(folder: str, *goals: str) -> None:

@@ -9,9 +9,11 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.family import children_of, kill_main, look
-from native.guarded import GuardProcess, Victim, config, kill_at_random
+
+from testkit.family import kill_main, look
+from testkit.guarded import GuardProcess, Victim, config, kill_at_random
+from testkit.harness import wait_until
+from testkit.procfs import children_of
 
 KILLS = 12
 

@@ -20,11 +20,12 @@ from typing import Any
 
 import psutil
 import pytest
-from cgroups import Cgroup, freezer
-from harness import wait_until
-from native.family import ours
-from native.guarded import BUILD, GuardProcess, Victim, config, forks_beside
-from native.init_peer import children_of
+
+from testkit.cgroups import Cgroup, freezer
+from testkit.family import ours
+from testkit.guarded import BUILD, GuardProcess, Victim, config, forks_beside
+from testkit.harness import wait_until
+from testkit.procfs import children_of
 
 MEGABYTES = 300
 

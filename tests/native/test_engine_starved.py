@@ -13,9 +13,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.family import children_of, kill_main
-from native.guarded import GuardProcess, Victim, config
+
+from testkit.family import kill_main
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import wait_until
+from testkit.procfs import children_of
 
 ENOUGH = 6
 """Threads that were sent into the parasite and did not get there in time."""

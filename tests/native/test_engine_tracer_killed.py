@@ -4,18 +4,14 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from avckpt.events import GuardConfig
-from harness import wait_until
-from native.guarded import PEER, GuardProcess, Victim, config, parasites, threads
+
+from testkit.guarded import GuardProcess, Victim, config, parasites, storm
+from testkit.harness import wait_until
+from testkit.procfs import threads
 
 KILLS = 500
 NEVER_RESTARTED = {"epoll_wait", "epoll_pwait", "epoll_pwait2", "semop", "semtimedop", "sigtimedwait"}
@@ -23,32 +19,11 @@ KINDS = 43
 UNWOKEN = [9, 10, 11, 19, 22, 38]
 CALLS_OF_READ = 8 + 12
 """On the board of eintr.c; see there."""
-STORM = PEER.with_name("kill_storm.py")
 
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
-
-
-def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *victims: Victim) -> dict[str, object]:
-    """Runs kill_storm.py; what it says at the end."""
-    fields = {**dataclasses.asdict(guard_config), "restore_on_statuses": []}
-    done = subprocess.run(
-        [
-            *(sys.executable, str(STORM), json.dumps(fields), str(kills), str(max_ms), str(seed)),
-            *(str(victim.pid) for victim in victims),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(PEER.parent.parent), *sys.path])},
-    )
-    assert done.returncode == 0, done.stderr + "".join(victim.said for victim in victims)
-    assert done.stderr == ""
-    said: dict[str, object] = json.loads(done.stdout)
-    return said
 
 
 @pytest.mark.slow

@@ -18,22 +18,12 @@ from pathlib import Path
 
 import psutil
 import pytest
-from avckpt.events import GuardConfig
-from harness import wait_until
-from native.family import (
-    kill_main,
-    look,
-    main_process,
-    members,
-    memory_kb,
-    ours,
-    places,
-    progress,
-    wait_whole,
-)
-from native.guarded import GuardProcess, Victim, config, forks_beside, meanwhile
-from native.init_peer import children_of
-from native.test_engine_tracer_killed import storm
+from avckpt.guard import GuardConfig
+
+from testkit.family import kill_main, look, main_process, members, ours, places, progress, wait_whole
+from testkit.guarded import GuardProcess, Victim, config, forks_beside, meanwhile, storm
+from testkit.harness import wait_until
+from testkit.procfs import children_of, figures
 
 LONG = os.environ.get("AVCKPT_LONG") == "1"
 KILLS = 100 if LONG else 5
@@ -319,10 +309,10 @@ def test_pages_stay_shared(thp: bool, tmp_path: Path) -> None:
 
     def held_kb() -> int:
         # A holder has the application's memory itself, and would count it twice.
-        held = sum(memory_kb(m.pid, "Pss") for m in members(victim))
+        held = sum(figures(m.pid)["Pss"] for m in members(victim))
         for template in ours(victim, "avckpt-tmpl"):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # an old one, just ending
-                held += memory_kb(template, "Pss")
+                held += figures(template)["Pss"]
         return held
 
     with (
@@ -342,7 +332,7 @@ def test_pages_stay_shared(thp: bool, tmp_path: Path) -> None:
             victim.wait_beats(300)  # its workers read all of it, which must not unshare it
             assert len(members(victim)) == workers + 1
             assert held_kb() < with_templates + workers * 2048, (alone, with_templates)
-            assert all(memory_kb(m.pid, "AnonHugePages") >= huge for m in members(victim))
+            assert all(figures(m.pid)["AnonHugePages"] >= huge for m in members(victim))
 
 
 def test_a_template_killed_from_inside_costs_a_generation(tmp_path: Path) -> None:
@@ -411,7 +401,7 @@ def test_the_tracer_is_killed_after_restores(tmp_path: Path) -> None:
 @pytest.mark.skipif(psutil.virtual_memory().available < 12e9, reason="it takes 6 GB, and twice that to be at ease")
 def test_children_wait_as_long_as_a_big_process_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They were asked at the beginning, and must not go on by themselves before the end."""
-    monkeypatch.setattr("native.guarded.PATIENCE_S", 60.0)  # 6 GB are to be filled
+    monkeypatch.setattr("testkit.guarded.PATIENCE_S", 60.0)  # 6 GB are to be filled
     with Victim("prefork 2 6000", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(4):
             assert guard.command("checkpoint")["kind"] == "checkpoint"

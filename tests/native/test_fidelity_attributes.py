@@ -8,8 +8,9 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
+
+from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
+from testkit.harness import wait_until
 
 
 @pytest.fixture(autouse=True)

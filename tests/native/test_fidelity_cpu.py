@@ -6,7 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from native.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
+
+from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 
 
 @pytest.fixture(autouse=True)

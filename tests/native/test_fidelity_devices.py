@@ -9,9 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from devices import load_driver
-from native.guarded import WHERE, GuardProcess, Victim, config
-from native.scenario import checkpoint, disturb, disturb_and_restore, restored
+
+from testkit.devices import load_driver
+from testkit.guarded import WHERE, GuardProcess, Victim, config
+from testkit.scenario import checkpoint, disturb, disturb_and_restore, restored
 
 
 @pytest.fixture(autouse=True)

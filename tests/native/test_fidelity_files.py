@@ -14,12 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.events import Files, Tcp
-from harness import wait_until
-from native.family import descendants
-from native.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, since_linux
-from native.meddle import get_fd
-from native.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
+from avckpt.guard import Files, Tcp
+
+from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, since_linux
+from testkit.harness import wait_until
+from testkit.meddle import get_fd
+from testkit.procfs import below
+from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
 
 
 @pytest.fixture(autouse=True)
@@ -272,7 +273,7 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
         disturb(victim)
         restored(victim, guard)
         # The second generation's, of each process; and what is open for a moment, while the next holder is made.
-        processes = 1 + len(descendants(victim.app))
+        processes = 1 + len(below(victim.app))
         wait_until(lambda: guard.fds() <= fds + 2 * processes, 5, "no descriptor is left open")
 
 

@@ -9,7 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from native.guarded import GuardProcess, Victim, config, kill_at_random, since_linux, state_of, threads
+
+from testkit.guarded import GuardProcess, Victim, config, kill_at_random, since_linux
+from testkit.procfs import state_of, threads
 
 pytestmark = since_linux(6, 9, "pidfds of threads")
 

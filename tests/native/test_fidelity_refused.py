@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.guarded import GuardProcess, Victim, config, since_linux
+
+from testkit.guarded import GuardProcess, Victim, config, since_linux
+from testkit.harness import wait_until
 
 NETWORKS = since_linux(6, 11, "a namespace of a thread can be asked for")
 DISPATCH = since_linux(6, 4, "what a thread dispatches can be asked for")

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import wait_until
-from native.family import look
-from native.guarded import GuardProcess, Victim, children_of, config, inside, pads, state_of, threads
+
+from testkit.family import look
+from testkit.guarded import GuardProcess, Victim, config, parasites
+from testkit.harness import wait_until
+from testkit.procfs import children_of, inside, state_of, threads
 
 
 @pytest.fixture(autouse=True)
@@ -140,11 +142,11 @@ def test_nothing_is_left_behind(tmp_path: Path) -> None:
                 victim.wait_beats(2)
                 guard.burst(5)
             wait_until(lambda: len(victim.others()) == 4, 5, "two templates, a spare and the holder are left")
-            return (guard.fds(), pads(victim.app), len(children_of(victim.pid)), mappings(guard.pid))
+            return (guard.fds(), parasites(victim.app), len(children_of(victim.pid)), mappings(guard.pid))
 
         first = cycle(3)
         second = cycle(20)
-        assert second[:3] == first[:3], "descriptors of the guard, pads in the application, children of init"
+        assert second[:3] == first[:3], "descriptors of the guard, parasites in the application, children of init"
         assert second[3] <= first[3] + 2, "mappings of the guard"
         assert [state_of(pid) for pid in children_of(victim.pid)].count("Z") == 0
         guard.stop()

@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from native.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
+
+from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
 
 
 @pytest.fixture(autouse=True)

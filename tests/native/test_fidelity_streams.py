@@ -11,9 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from avckpt.events import Tcp
-from harness import SLOWNESS, wait_until
-from native.guarded import GuardProcess, Victim, config
+from avckpt.guard import Tcp
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import SLOWNESS, wait_until
 
 # An emulated sender is silent for longer within a message.
 AT_SPEED = pytest.mark.skipif(SLOWNESS > 1, reason="8 ms without a byte are a pause between messages")

@@ -19,7 +19,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from native.init_peer import INIT, Guard, Init, Phoenix, children_of, eventually, state_of
+
+from testkit.harness import wait_until
+from testkit.init_peer import INIT, PATIENCE_S, Guard, Init, Phoenix
+from testkit.procfs import children_of, state_of
 
 pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
 
@@ -341,9 +344,9 @@ def test_stopped_and_continued_app_goes_on(pid1: bool) -> None:
         app_pid = init.app_pid()
         host_pid = next(pid for pid in children_of(init.pid) if pid == app_pid or pid1)
         os.kill(host_pid, signal.SIGSTOP)
-        eventually("the stop", lambda: state_of(host_pid) == "T")
+        wait_until(lambda: state_of(host_pid) == "T", PATIENCE_S, "the stop")
         init.kill(signal.SIGCONT)
-        eventually("going on", lambda: state_of(host_pid) == "S")
+        wait_until(lambda: state_of(host_pid) == "S", PATIENCE_S, "going on")
         assert init.app_pid() == app_pid
 
 
@@ -375,7 +378,7 @@ def test_orphans_are_reaped(pid1: bool) -> None:
         assert len(family) == 2
         init.app.say("orphans 1000")
         assert init.app.hear(patience_s=60) == "done"
-        eventually("the orphans' end", lambda: set(children_of(init.pid)) == family)
+        wait_until(lambda: set(children_of(init.pid)) == family, PATIENCE_S, "the orphans' end")
         assert init.app_pid() > 0
 
 

@@ -14,7 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from native.init_peer import CTL, Guard, Init, Page, Phoenix, Verdict, children_of, comm_of, eventually, state_of
+
+from testkit.harness import wait_until
+from testkit.init_peer import CTL, PATIENCE_S, Guard, Init, Page, Phoenix, Verdict
+from testkit.procfs import children_of, comm_of, state_of
 
 pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
 
@@ -83,7 +86,7 @@ def test_failed_attempts_are_the_guards_business(init: Phoenix, guard: Guard) ->
     for _ in range(3):
         init.spawn(pid)
         os.kill(pid, signal.SIGKILL)
-        eventually("the attempt's end", lambda: state_of(pid) == "X")
+        wait_until(lambda: state_of(pid) == "X", PATIENCE_S, "the attempt's end")
     init.spawn(pid)
     guard.answer(1, Verdict.RESTORED)
     init.go()
@@ -97,7 +100,7 @@ def test_failed_attempt_does_not_become_the_exit_status(init: Phoenix, guard: Gu
     assert guard.report().seq == 1
     init.spawn(pid)
     os.kill(pid, signal.SIGKILL)
-    eventually("the attempt's end", lambda: state_of(pid) == "X")
+    wait_until(lambda: state_of(pid) == "X", PATIENCE_S, "the attempt's end")
     guard.answer(1, Verdict.GIVE_UP)
     assert init.end() == 128 + signal.SIGSEGV
 
@@ -110,10 +113,10 @@ def test_death_right_after_the_verdict_is_a_new_death(init: Phoenix, guard: Guar
         assert guard.report().seq == seq * 2 - 1
         init.spawn(pid)
         os.kill(init.pid, signal.SIGSTOP)
-        eventually("init's stop", lambda: state_of(init.pid) == "T")
+        wait_until(lambda: state_of(init.pid) == "T", PATIENCE_S, "init's stop")
         guard.answer(seq * 2 - 1, Verdict.RESTORED)
         os.kill(pid, signal.SIGKILL)
-        eventually("the death", lambda: state_of(pid) == "Z")
+        wait_until(lambda: state_of(pid) == "Z", PATIENCE_S, "the death")
         os.kill(init.pid, signal.SIGCONT)
         report = guard.report()
         assert (report.seq, report.status) == (seq * 2, signal.SIGKILL)
@@ -130,7 +133,7 @@ def test_killed_before_the_verdict_is_noticed(init: Phoenix, guard: Guard) -> No
     assert guard.report().seq == 1
     init.spawn(pid)
     os.kill(pid, signal.SIGKILL)
-    eventually("the process's end", lambda: state_of(pid) == "X")
+    wait_until(lambda: state_of(pid) == "X", PATIENCE_S, "the process's end")
     guard.answer(1, Verdict.RESTORED)
     report = guard.report()
     assert (report.seq, report.status) == (2, signal.SIGKILL)
@@ -152,7 +155,7 @@ def test_every_death_is_reported_once_whenever_it_comes(pid1: bool) -> None:
             host_pid = next(child for child in reversed(children_of(init.pid)) if child != template)
             os.kill(host_pid, signal.SIGKILL)
 
-        eventually("the template", lambda: any("tmpl" in comm_of(child) for child in children_of(init.pid)))
+        wait_until(lambda: any("tmpl" in comm_of(child) for child in children_of(init.pid)), PATIENCE_S, "the template")
         template = next(child for child in children_of(init.pid) if "tmpl" in comm_of(child))
         alive = True
         for seq in range(1, 151):
@@ -261,7 +264,7 @@ def test_verdict_of_a_guard_that_died_counts(init: Phoenix, guard: Guard) -> Non
     guard.report()
     init.spawn(pid)
     os.kill(init.pid, signal.SIGSTOP)
-    eventually("init's stop", lambda: state_of(init.pid) == "T")
+    wait_until(lambda: state_of(init.pid) == "T", PATIENCE_S, "init's stop")
     guard.answer(1, Verdict.RESTORED)
     guard.die()
     init.go()
@@ -369,14 +372,14 @@ def test_guard_does_not_see_the_app_before_its_exec(program: str) -> None:
     prefix = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=execve", "-e", "inject=execve:delay_enter=300000"]
     with Init([program, "60"], prefix=prefix, env={"PATH": "/nowhere:/bin"}) as init, Page(init) as page:
         assert (page.ctl().app_pid, page.ctl().exec_errno) == (0, 0)
-        eventually("the child", lambda: bool(children_of(init.pid)))
+        wait_until(lambda: bool(children_of(init.pid)), PATIENCE_S, "the child")
         assert page.ctl().app_pid == 0
         if program == "sleep":
-            eventually("the start", lambda: page.ctl().app_pid != 0)
+            wait_until(lambda: page.ctl().app_pid != 0, PATIENCE_S, "the start")
             assert children_of(init.pid) == [page.ctl().app_pid]
             assert "sleep" in Path(f"/proc/{page.ctl().app_pid}/cmdline").read_text()
         else:
-            eventually("the failure", lambda: page.ctl().exec_errno != 0)
+            wait_until(lambda: page.ctl().exec_errno != 0, PATIENCE_S, "the failure")
             assert (page.ctl().app_pid, page.ctl().exec_errno) == (0, errno.ENOENT)
             assert init.end() == 127
 
@@ -436,7 +439,7 @@ def test_stop_during_a_restore_is_not_lost(init: Phoenix, guard: Guard) -> None:
     init.app.say("die 11")
     guard.report()
     init.kill(signal.SIGTERM)
-    eventually("the page", lambda: guard.ctl().stop_asked_ns > 0)
+    wait_until(lambda: guard.ctl().stop_asked_ns > 0, PATIENCE_S, "the page")
     assert still_waits(init)
     init.spawn(pid)
     guard.answer(1, Verdict.RESTORED)
@@ -449,7 +452,9 @@ def test_other_signals_during_a_restore_are_not_lost(init: Phoenix, guard: Guard
     init.app.say("die 11")
     guard.report()
     init.kill(signal.SIGUSR2)
-    eventually("reading", lambda: "ShdPnd:\t0000000000000000" in Path(f"/proc/{init.pid}/status").read_text())
+    wait_until(
+        lambda: "ShdPnd:\t0000000000000000" in Path(f"/proc/{init.pid}/status").read_text(), PATIENCE_S, "reading"
+    )
     init.spawn(pid)
     guard.answer(1, Verdict.RESTORED)
     report = guard.report()
@@ -461,7 +466,7 @@ def test_who_asks_twice_does_not_wait(init: Phoenix, guard: Guard) -> None:
     init.app.say("die 11")
     guard.report()
     init.kill(signal.SIGTERM)
-    eventually("the page", lambda: guard.ctl().stop_asked_ns > 0)
+    wait_until(lambda: guard.ctl().stop_asked_ns > 0, PATIENCE_S, "the page")
     init.kill(signal.SIGTERM)
     assert init.end() == 128 + signal.SIGSEGV
 

@@ -15,7 +15,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
-from native.init_peer import INIT, Guard, Init, Phoenix, Verdict, children_of, eventually, state_of
+
+from testkit.harness import wait_until
+from testkit.init_peer import INIT, PATIENCE_S, Guard, Init, Phoenix, Verdict
+from testkit.procfs import children_of, state_of
 
 pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
 
@@ -135,8 +138,8 @@ def test_stopped_by_a_signal_it_stays_so(init: Phoenix, terminal: Terminal) -> N
     """Somebody wants it to stand still."""
     pid = place(init)[0]
     os.kill(pid, signal.SIGSTOP)
-    eventually("the stop", lambda: state_of(pid) == "T")
-    eventually("init to go on", lambda: state_of(init.pid) == "S")
+    wait_until(lambda: state_of(pid) == "T", PATIENCE_S, "the stop")
+    wait_until(lambda: state_of(init.pid) == "S", PATIENCE_S, "init to go on")
     assert state_of(pid) == "T"
     init.kill(signal.SIGCONT)
     assert place(init)[0] == pid
@@ -172,7 +175,7 @@ def test_restored_app_has_the_terminal(init: Phoenix, terminal: Terminal) -> Non
             terminal.type(b"\x03")  # init may not have read the verdict when the app runs already
             return init.popen.poll() is not None
 
-        eventually("the end", ended_by_a_key)
+        wait_until(ended_by_a_key, PATIENCE_S, "the end")
         assert init.end() == 128 + signal.SIGINT
 
 
@@ -208,7 +211,7 @@ def test_under_a_shells_job_control(terminal: Terminal) -> None:
         terminal.type(b"line\n")
         terminal.read_until(b"status-5")
         terminal.type(b"$INIT -- sleep 60; echo status-$?\n")
-        eventually("sleep", lambda: any(children_of(child) for child in children_of(pid)))
+        wait_until(lambda: any(children_of(child) for child in children_of(pid)), PATIENCE_S, "sleep")
         time.sleep(0.1)
         terminal.type(b"\x03")
         terminal.read_until(b"status-130")

@@ -11,11 +11,12 @@ import time
 from pathlib import Path
 
 import pytest
-from census import Census, Row, growths
-from harness import wait_until
-from local_sidecar import local_sidecar
-from native.board import Board
-from native.guarded import BUILD
+
+from testkit.board import Board
+from testkit.census import Census, Row, growths
+from testkit.guarded import BUILD
+from testkit.harness import wait_until
+from testkit.local_sidecar import local_sidecar
 
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "50ms", "avckpt.restore.max": "16/1s"}
 LOOKS, WARM_UP_LOOKS, KILLS_PER_LOOK = 9, 3, 2

@@ -15,11 +15,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS, wait_until
-from native.board import VIOLATION_STATUS
-from native.family import Member, main_process, members
-from native.guarded import Victim
-from native.meddle import get_fd, remote_syscall
+
+from testkit.board import VIOLATION_STATUS
+from testkit.family import Member, main_process, members
+from testkit.guarded import Victim
+from testkit.harness import SLOWNESS, wait_until
+from testkit.meddle import get_fd, remote_syscall
 
 CONTENT = [
     "tree 0",

@@ -18,10 +18,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS
-from native.board import MAGIC, UNAVAILABLE_STATUS, VIOLATION_STATUS, Board
-from native.init_peer import eventually
-from native.meddle import set_fpu_register
+
+from testkit.board import MAGIC, UNAVAILABLE_STATUS, VIOLATION_STATUS, Board
+from testkit.harness import SLOWNESS, wait_until
+from testkit.init_peer import PATIENCE_S
+from testkit.meddle import set_fpu_register
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -58,7 +59,7 @@ def start(victims_built: Path, board: Board) -> Iterator[Start]:
             text=True,
         )
         started.append(victim)
-        eventually("ready", lambda: board.see().ready == 1 or victim.poll() is not None)
+        wait_until(lambda: board.see().ready == 1 or victim.poll() is not None, PATIENCE_S, "ready")
         return victim
 
     yield go
@@ -119,14 +120,14 @@ def test_content_when_nothing_is_wrong(start: Start, board: Board, command: str)
 @pytest.mark.parametrize("kind", WOKEN)
 def test_blocked_and_woken(start: Start, board: Board, kind: str) -> None:
     start("eintr", kind, "30")
-    eventually("wake-ups", lambda: board.see().counter[5] >= 5)
+    wait_until(lambda: board.see().counter[5] >= 5, PATIENCE_S, "wake-ups")
     assert board.see().counter[1] == 0
 
 
 @pytest.mark.parametrize("kind", TIMED)
 def test_blocked_until_the_timeout(start: Start, board: Board, kind: str) -> None:
     start("eintr", kind, "0.1", "--quiet")
-    eventually("timeouts", lambda: board.see().counter[4] >= 3)
+    wait_until(lambda: board.see().counter[4] >= 3, PATIENCE_S, "timeouts")
     seen = board.see()
     assert seen.counter[1] == 0
     assert 99e6 < seen.counter[2] <= seen.counter[3] < 2e9
@@ -138,7 +139,7 @@ def test_eintr_is_counted(start: Start, board: Board) -> None:
     victim = start("eintr", "epoll_wait", "30", "--quiet")
     time.sleep(0.1)
     subprocess.run(["timeout", "0.3", "strace", "-qq", "-o", "/dev/null", "-p", str(victim.pid)])
-    eventually("an EINTR", lambda: board.see().counter[1] > 0)
+    wait_until(lambda: board.see().counter[1] > 0, PATIENCE_S, "an EINTR")
     assert board.see().violations == board.see().counter[1]
 
 
@@ -296,7 +297,7 @@ def test_echo_server(start: Start, board: Board, tmp_path: Path) -> None:
         assert ask("close") == "8 close"
         assert lines.readline() == ""
         assert ask("still here", others) == "2 still here"
-    eventually("ten lines", lambda: board.see().counter[0] == 10)  # they are counted after the answer
+    wait_until(lambda: board.see().counter[0] == 10, PATIENCE_S, "ten lines")  # they are counted after the answer
 
 
 def link(pid: int, fd: str) -> str:

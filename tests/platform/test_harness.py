@@ -7,7 +7,8 @@ import subprocess
 import time
 
 import pytest
-from harness import CommandFailed, Completed, ContainerFactory, Podman, run, wait_until
+
+from testkit.harness import CommandFailed, Completed, ContainerFactory, Podman, run, wait_until
 
 
 def test_run_gives_back_all_of_it() -> None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from harness import ROOT, ContainerFactory, Sidecar
+from testkit.harness import ROOT, ContainerFactory, Sidecar
 
 
 def test_a_killed_app_is_there_again(sidecar: Sidecar, container: ContainerFactory) -> None:
@@ -44,7 +44,7 @@ def test_a_failed_test_shows_its_containers(tmp_path: Path, container: Container
         "    assert not 'broken'\n"
     )
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "conftest", "-c", ROOT / "pyproject.toml", tmp_path],
+        [sys.executable, "-m", "pytest", "-p", "tests.conftest", "-c", ROOT / "pyproject.toml", tmp_path],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from avckpt.cgroup import groups_of
+from avckpt.containers.cgroup import groups_of
 
 MOUNT = 'mount --bind "$1" "$1" && shift && exec "$@"'
-LOOK = "import os; from avckpt.cgroup import groups_of; print(groups_of(os.getpid()).directories)"
+LOOK = "import os; from avckpt.containers.cgroup import groups_of; print(groups_of(os.getpid()).directories)"
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a mount namespace needs root")

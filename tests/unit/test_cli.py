@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 from avckpt import cli
-from avckpt.client import Client
+from avckpt.cli.client import Client
 from avckpt.errors import NothingToRestore
-from avckpt.events import Command
+from avckpt.guard import Command
 from click.testing import CliRunner, Result
 
 
@@ -157,7 +157,7 @@ def test_who_may_not_ask_is_told(run_dir: Path) -> None:
 
 
 def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
-    program = "import avckpt.cli, avckpt.client, sys; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    program = "import avckpt.cli, avckpt.cli.client, sys; print(sorted({m.split('.')[0] for m in sys.modules}))"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     for heavy in ("rich", "aiohttp", "asyncio", "cffi", "podman", "_cffi_backend"):
         assert f"'{heavy}'" not in loaded

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from avckpt import cli
-from avckpt.client import Client
+from avckpt.cli.client import Client
 from click.testing import CliRunner, Result
 
 

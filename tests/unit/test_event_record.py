@@ -9,8 +9,8 @@ from dataclasses import fields
 
 import pytest
 from avckpt.errors import DeadlineMissed, KernelError, NothingToRestore
-from avckpt.event_record import Cause, EventRecord, Kind, Outcome, of_guard
-from avckpt.events import GAVE_UP_WORDS, Event, EventKind, Reason
+from avckpt.events.record import Cause, EventRecord, Kind, Outcome, of_guard
+from avckpt.events.vocabulary import GAVE_UP_WORDS, Event, EventKind, Reason
 
 RESTORED = Event(
     EventKind.RESTORED,

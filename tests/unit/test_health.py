@@ -11,12 +11,12 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from avckpt.event_record import EventRecord
-from avckpt.events import GuardConfig
-from avckpt.health import HealthCheck, Pulse, _Watcher, describe, health_check_of
-from avckpt.inside import Done
-from avckpt.process import age_s
-from avckpt.protected import Protected
+from avckpt.containers.process import age_s
+from avckpt.containers.protected import Protected
+from avckpt.events.record import EventRecord
+from avckpt.guard import GuardConfig
+from avckpt.supervision.health import HealthCheck, Pulse, _Watcher, describe, health_check_of
+from avckpt.supervision.inside import Done
 
 S = 1_000_000_000
 

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 import pytest
-from avckpt.event_record import EventRecord, Kind
-from avckpt.history import History
+from avckpt.events.history import History
+from avckpt.events.record import EventRecord, Kind
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_it_is_whole_again_once_it_can_be_written(
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, before[1]))
     try:
         records += [history.add(died(at)) for at in (2.0, 3.0)]
-        monkeypatch.setattr("avckpt.history.AGAIN_S", 0.0)
+        monkeypatch.setattr("avckpt.events.history.AGAIN_S", 0.0)
         records.append(history.add(died(4.0)))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -120,8 +120,8 @@ def test_it_is_whole_again_once_it_can_be_written(
 def test_a_writer_that_is_killed_at_any_instant_leaves_a_history_without_a_gap(path: Path) -> None:
     """Small limit, so that many of the kills hit a replacement of the file."""
     program = (
-        "import sys\nfrom pathlib import Path\nfrom avckpt.history import History\n"
-        "from avckpt.event_record import EventRecord, Kind\n"
+        "import sys\nfrom pathlib import Path\nfrom avckpt.events.history import History\n"
+        "from avckpt.events.record import EventRecord, Kind\n"
         "h = History(Path(sys.argv[1]), limit=20)\nprint(flush=True)\n"
         "while True: print(h.add(EventRecord(Kind.DIED, wait_status=9)).seq, flush=True)\n"
     )

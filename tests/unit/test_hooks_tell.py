@@ -16,8 +16,6 @@ import pytest
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="a mount namespace of its own needs root")
 
-HOOKS = Path(__file__).resolve().parents[2] / "hooks"
-
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[socket.socket]:
@@ -32,7 +30,7 @@ def journal(line: str, log: str = "") -> None:
     inside = (
         'mount -t tmpfs none /dev; [ -z "$1" ] || { touch /dev/log; mount --bind "$1" /dev/log; }; shift; exec "$@"'
     )
-    script = f"import sys; sys.path.insert(0, {str(HOOKS)!r}); from avckpt_hooks import tell; tell.journal(sys.argv[1])"
+    script = "import sys; from avckpt_hooks.shared import tell; tell.journal(sys.argv[1])"
     command = ["unshare", "--mount", "sh", "-c", inside, "sh", log, sys.executable, "-c", script, line]
     done = subprocess.run(command, timeout=10, check=False, stdin=subprocess.PIPE, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import pytest
-from avckpt.inside import _inside
+from avckpt.supervision.inside import _inside
 
 MAP = "         0     100000       1000\n      1000     300000          9\n"
 

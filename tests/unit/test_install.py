@@ -16,11 +16,12 @@ from pathlib import Path
 import avckpt
 import avckpt_hooks
 import pytest
-from avckpt import artifacts, install
+from avckpt import artifacts
+from avckpt.cli import install
+from avckpt.containers.process import start_time
 from avckpt.errors import ConfigError
-from avckpt.process import start_time
-from avckpt_hooks import protocol
-from avckpt_hooks.protocol import Register
+from avckpt_hooks.shared import protocol
+from avckpt_hooks.shared.protocol import Register
 
 if os.geteuid() != 0:
     pytest.skip("avckpt install needs root", allow_module_level=True)
@@ -68,8 +69,9 @@ def test_everything_is_in_its_place(root: Path) -> None:
     # Users of containers come here too.
     for folder in (libexec, libexec / "avckpt_hooks", root / "usr/local/share/avckpt/oci-hooks.d", root / "run/avckpt"):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o755
-    modules = {path.name for path in (libexec / "avckpt_hooks").glob("*.py")}
-    assert modules == {path.name for path in artifacts.hooks_source().glob("*.py")}
+    installed, source = libexec / "avckpt_hooks", artifacts.hooks_source()
+    modules = {path.relative_to(installed) for path in installed.rglob("*.py")}
+    assert modules == {path.relative_to(source) for path in source.rglob("*.py")}
     [hook_json] = (root / "usr/local/share/avckpt/oci-hooks.d").glob("*.json")
     assert json.loads(hook_json.read_text())["hook"]["path"] == "/usr/local/libexec/avckpt/avckpt-hook"
     done_by = subprocess.run([libexec / "avckpt-hook"], capture_output=True, text=True, check=False)
@@ -228,7 +230,7 @@ def full_disk(root: Path) -> None:
     host(root)
     install.install(root)
     (root / "usr/local/libexec/avckpt/avckpt-init").write_bytes(b"of an older version")
-    for path in (root / "usr/local/libexec/avckpt/avckpt_hooks").glob("*.py"):
+    for path in (root / "usr/local/libexec/avckpt/avckpt_hooks").rglob("*.py"):
         path.write_bytes(path.read_bytes() + b"# of an older version\n")
     before = tree(root)
     room = len(artifacts.init_binary().read_bytes()) + 8_000

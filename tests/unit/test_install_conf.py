@@ -6,8 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from avckpt import containers_conf
-from avckpt.containers_conf import DEFAULT, HooksDirs
+from avckpt.cli import containers_conf
+from avckpt.cli.containers_conf import DEFAULT, HooksDirs
 
 OURS = Path("/ours")
 

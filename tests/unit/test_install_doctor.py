@@ -9,8 +9,8 @@ from pathlib import Path
 
 import avckpt
 import pytest
-from avckpt import doctor
-from avckpt.doctor import ConfigFacts, Facts, PodmanFacts, Status
+from avckpt.cli import doctor
+from avckpt.cli.doctor import ConfigFacts, Facts, PodmanFacts, Status
 
 GOOD = Facts(
     kernel="6.1.0-18-amd64",

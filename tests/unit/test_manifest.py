@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 from avckpt import cli
+from avckpt.cli.compose.manifest import Kind, Manifest, Severity, check, files_meant
 from avckpt.errors import ConfigError
-from avckpt.manifest import Kind, Manifest, Severity, check, files_meant
-from avckpt_hooks.labels import LABELS
+from avckpt_hooks.shared.labels import LABELS
 from click.testing import CliRunner
 
 SHARED = """\
@@ -196,7 +196,7 @@ def test_labels_under_deploy_are_not_the_containers(path: Path) -> None:
         ("- a\n", "v.yaml:1: not a mapping: is this a Compose file?"),
         ("defaults: {}\n", "v.yaml:1: no services: is this a Compose file?"),
         ("", "v.yaml:1: no services: is this a Compose file?"),
-        ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", ""),
+        ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", "v.yaml:1: an anchor that holds itself"),
         ("services: {a: , b: 3, c: [1], d: {labels: }, 5: {labels: {1: 2}}}\n", ""),
     ],
 )

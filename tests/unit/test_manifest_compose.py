@@ -12,14 +12,15 @@ from typing import Any
 
 import psutil
 import pytest
-from avckpt import compose
-from avckpt.compose import Started
+from avckpt.cli.compose import podman_compose
+from avckpt.cli.compose.podman_compose import Started
+from avckpt.cli.compose.vehicle import judge
 from avckpt.errors import AvckptError
-from avckpt.vehicle import judge
-from harness import wait_until
+
+from testkit.harness import wait_until
 
 
-class Fake(compose.Compose):
+class Fake(podman_compose.Compose):
     """Runs a shell script instead of podman-compose."""
 
     def __init__(self, script: str) -> None:
@@ -38,9 +39,9 @@ def podman(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compose, "STUCK_S", 0.5)
-    monkeypatch.setattr(compose, "UNHEALTHY_S", 2.0)
-    monkeypatch.setattr(compose, "LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr(podman_compose, "STUCK_S", 0.5)
+    monkeypatch.setattr(podman_compose, "UNHEALTHY_S", 2.0)
+    monkeypatch.setattr(podman_compose, "LOOK_EVERY_S", 0.05)
 
 
 def left_over(podman: Path) -> list[psutil.Process]:
@@ -137,4 +138,4 @@ def test_verdicts(started: Started, entry: Any, protected: bool, may_change: boo
 def test_who_wants_protection(labels: Any, annotations: Any, wanted: bool) -> None:
     state = {"Status": "running", "ExitCode": 0}
     config = {"Labels": labels, "Annotations": annotations}
-    assert compose._started({"Id": "1", "Name": "c", "Config": config, "State": state}).wanted is wanted
+    assert podman_compose._started({"Id": "1", "Name": "c", "Config": config, "State": state}).wanted is wanted

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+from avckpt.containers.protected import Protected, State
 from avckpt.errors import DeadlineMissed
-from avckpt.event_record import Cause, EventRecord, Kind, Outcome
-from avckpt.metrics import Held, Metrics
-from avckpt.protected import State
+from avckpt.events.metrics import Metrics
+from avckpt.events.record import Cause, EventRecord, Kind, Outcome
+from avckpt.policy import settings_of
 from prometheus_client.parser import text_string_to_metric_families
 
 
@@ -53,13 +54,23 @@ def test_events_are_counted_by_container_reason_and_outcome() -> None:
     assert value(text, "avckpt_notifications_total", container="db", outcome="failed") == 1
 
 
+def container(name: str, state: State, generations: int) -> Protected:
+    made = Protected(name[0] * 64, name, 1, 1, settings_of({}).config, 0.0, state=state)
+    made.generations, made.memory_bytes = generations, 1000
+    return made
+
+
 def test_gauges_are_of_live_containers_only() -> None:
     metrics = Metrics()
-    text = metrics.render([Held("web", 0, 0, 2, State.PROTECTED), Held("db", 0, 0, 0, State.UNPROTECTED)])
+    web, db = container("web", State.PROTECTED, 2), container("db", State.UNPROTECTED, 0)
+    text = metrics.render([web, db])
     assert value(text, "avckpt_generations", container="web") == 2
     assert value(text, "avckpt_protected", container="web") == 1
+    assert value(text, "avckpt_generations_memory_bytes", container="web") == 1000
+    assert value(text, "avckpt_generations_memory_bytes", container="db") == 0
     assert value(text, "avckpt_protected", container="db") == 0
-    text = metrics.render([Held("web", 0, 0, 2, State.RESTORING)])
+    web.state = State.RESTORING
+    text = metrics.render([web])
     assert value(text, "avckpt_protected", container="web") == 0
     assert value(text, "avckpt_protected", container="db") is None
 

@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
-from avckpt.event_record import EventRecord, Kind
-from avckpt.notify import Notifier
+from avckpt.containers.protected import Protected
+from avckpt.events.record import EventRecord, Kind
 from avckpt.policy import config_of_labels
-from avckpt.protected import Protected
-from avckpt_hooks.labels import Notify
+from avckpt.supervision.notify import Notifier
+from avckpt_hooks.shared.labels import Notify
 
 RESTORED = EventRecord(Kind.RESTORED, container="web")
 

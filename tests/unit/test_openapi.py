@@ -7,12 +7,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
 
-from avckpt.api import ApiServer, Backend
+from avckpt.api.openapi import document
+from avckpt.api.server import ApiServer, Backend
+from avckpt.containers.protected import Protected
 from avckpt.errors import KernelError
-from avckpt.event_record import EventRecord, Kind
-from avckpt.events import GuardConfig
-from avckpt.openapi import document
-from avckpt.protected import Protected
+from avckpt.events.record import EventRecord, Kind
+from avckpt.guard import GuardConfig
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
 

@@ -10,7 +10,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from avckpt.pressure import BACK_AFTER_MOST_S, BACK_AFTER_S, Advice, Allowance, HostPressure, held_bytes, templates_of
+from avckpt.supervision.pressure import (
+    BACK_AFTER_MOST_S,
+    BACK_AFTER_S,
+    Advice,
+    Allowance,
+    HostPressure,
+    held_bytes,
+    templates_of,
+)
 
 MB = 1 << 20
 LIMIT = 100 * MB
@@ -71,7 +79,7 @@ def test_without_psi_it_looks_at_what_is_available(tmp_path: Path, monkeypatch: 
     host = HostPressure(tmp_path / "no-such-file")
     assert host.fd is None
     assert not host.is_high()
-    monkeypatch.setattr("avckpt.pressure.AVAILABLE", 1.1)
+    monkeypatch.setattr("avckpt.supervision.pressure.AVAILABLE", 1.1)
     assert host.is_high()
 
 

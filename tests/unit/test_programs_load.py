@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clients of tests/programs find what can be wrong with a server: each of these lies in a way of its own."""
+"""The clients of testkit/programs find what can be wrong with a server: each of these lies in a way of its own."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from collections import Counter
 from collections.abc import Iterator
 
 import pytest
-from harness import wait_until
-from programs.lines import LineSession
-from programs.load import Load
+
+from testkit.harness import wait_until
+from testkit.programs.lines import LineSession
+from testkit.programs.load import Load
 
 
 class Liar(socketserver.ThreadingTCPServer):
-    """Answers like the servers of tests/programs, until `lie` says otherwise."""
+    """Answers like the servers of testkit/programs, until `lie` says otherwise."""
 
     allow_reuse_address = True
     daemon_threads = True

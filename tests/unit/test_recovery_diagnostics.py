@@ -14,9 +14,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from avckpt.event_record import EXPECTED, EventRecord, Kind, Outcome, of_guard
-from avckpt.events import Event, EventKind, Reason
-from harness import wait_until
+from avckpt.events.record import EXPECTED, EventRecord, Kind, Outcome, of_guard
+from avckpt.events.vocabulary import Event, EventKind, Reason
+
+from testkit.harness import wait_until
 
 SOURCE = Path(__file__).parents[2] / "examples" / "ros" / "recovery_diagnostics.py"
 

@@ -7,7 +7,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from harness import ROOT, Completed, run
+
+from testkit.harness import ROOT, Completed, run
 
 TOOLS = ("bash", "cat", "cut", "dirname", "head", "mkdir", "mktemp", "rm", "sed", "sleep", "sort", "tail", "tr", "env")
 

@@ -19,8 +19,10 @@ from avckpt.errors import (
     class_of_code,
     from_json,
 )
-from avckpt.events import Command, EventKind, Reason
-from harness import ROOT
+from avckpt.events.vocabulary import EventKind, Reason
+from avckpt.guard import Command
+
+from testkit.harness import ROOT
 
 
 def test_the_line_a_person_sees() -> None:

@@ -9,9 +9,9 @@ import signal
 
 import pytest
 from avckpt.errors import AvckptError, DeadlineMissed, KernelError, Unsupported
-from avckpt.event_record import EventRecord, Kind, of_guard
-from avckpt.events import Event, EventKind, Reason
-from avckpt.journal import SELDOM_S, Journal
+from avckpt.events.journal import SELDOM_S, Journal
+from avckpt.events.record import EventRecord, Kind, of_guard
+from avckpt.events.vocabulary import Event, EventKind, Reason
 
 
 def missed(at_s: float) -> EventRecord:

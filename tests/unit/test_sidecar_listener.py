@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from avckpt.containers.listener import HookListener
 from avckpt.errors import Busy
-from avckpt.listener import HookListener
-from avckpt_hooks import protocol
-from avckpt_hooks.protocol import Deregister, Register
+from avckpt_hooks.shared import protocol
+from avckpt_hooks.shared.protocol import Deregister, Register
 
 T = TypeVar("T")
 REGISTER = Register(id="ab" * 32, name="web", pid=1, starttime=1, bundle="/b", annotations={"avckpt.enable": "true"})

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import pytest
+from avckpt.cli.run import config_of_run
 from avckpt.errors import LabelsWrong
-from avckpt.events import Files, GuardConfig, Tcp
+from avckpt.guard import Files, GuardConfig, Tcp
 from avckpt.policy import config_of_labels
-from avckpt.run import config_of_run
 
 
 def test_defaults_are_those_of_the_label_table() -> None:

@@ -7,9 +7,10 @@ import dataclasses
 import signal
 
 import pytest
+from avckpt.containers.protected import Protected, State
 from avckpt.errors import DeadlineMissed, NothingToRestore, Unsupported
-from avckpt.events import Event, EventKind, GuardConfig, Reason, describe_wait_status, signal_name
-from avckpt.protected import Protected, State
+from avckpt.events.vocabulary import Event, EventKind, Reason, describe_wait_status, signal_name
+from avckpt.guard import GuardConfig
 
 CONFIG = GuardConfig(
     interval_s=3.0,

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import pytest
+from avckpt.containers.protected import Protected
+from avckpt.containers.registry import ENDED_KEPT, Registry
 from avckpt.errors import Ambiguous, NoSuchContainer
-from avckpt.events import GuardConfig
-from avckpt.protected import Protected
-from avckpt.registry import ENDED_KEPT, Registry
+from avckpt.guard import GuardConfig
 
 CONFIG = GuardConfig(3.0, 2, True, True, frozenset(), 5, 60.0, 0.02)
 

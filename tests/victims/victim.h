@@ -38,7 +38,7 @@
 #define VIOLATION_STATUS 99
 #define UNAVAILABLE_STATUS 77 /* this machine can not do what was asked for */
 
-/* All little-endian, no padding; tests/native/board.py reads it. */
+/* All little-endian, no padding; testkit/board.py reads it. */
 struct board {
 	uint64_t magic;
 	uint64_t starts;     /* how often the program was started (cold) */
@@ -130,7 +130,7 @@ __attribute__((noreturn)) static inline void unavailable(const char *what)
 	_exit(UNAVAILABLE_STATUS);
 }
 
-/* How many times later than usual things may come: tests/harness.py, SLOWNESS. */
+/* How many times later than usual things may come: testkit/harness.py, SLOWNESS. */
 static inline uint64_t slowness(void)
 {
 	const char *said = getenv("AVCKPT_SLOWNESS");

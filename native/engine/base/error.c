@@ -7,7 +7,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "base.h"
 
 /* No byte more is read than there is room for: names come out of the parasite, too, where the end
  * of one may just be overwritten. */

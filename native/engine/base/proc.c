@@ -15,7 +15,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "base.h"
 
 #define PF_EXITING 4 /* include/linux/sched.h; not for user space otherwise */
 
@@ -40,16 +40,20 @@ static struct mapped_path mapped_path(pid_t pid, avc_remote start, avc_remote en
 	return path;
 }
 
-int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
-{
-	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
-}
-
 bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end)
 {
 	struct stat st;
 
 	return lstat(mapped_path(pid, start, end).text, &st) == 0 && st.st_mode & S_IWUSR;
+}
+
+int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
+{
+	if ((flags & O_ACCMODE) != O_RDONLY && !proc_mapped_for_writing(pid, start, end)) {
+		errno = EACCES;
+		return -1;
+	}
+	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
 }
 
 /* From the start, also of one that was read before; what is read is terminated. */
@@ -501,4 +505,20 @@ bool pidfd_ended(int pidfd)
 	struct pollfd p = { .fd = pidfd, .events = POLLIN };
 
 	return poll(&p, 1, 0) == 1;
+}
+
+int proc_borrow_fd(int pidfd, int fd)
+{
+	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
+}
+
+void proc_set_oom_score_adj(pid_t pid, const char *value)
+{
+	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);
+
+	if (fd < 0)
+		return;
+	if (write(fd, value, strlen(value)) < 0)
+		errno = 0; /* best effort */
+	close(fd);
 }

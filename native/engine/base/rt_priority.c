@@ -9,7 +9,7 @@
  */
 #include <sched.h>
 
-#include "internal.h"
+#include "base.h"
 
 static __thread struct {
 	int depth, policy;

@@ -17,14 +17,14 @@
 /* ---- who there is ------------------------------------------------------------------------- */
 
 /* One that was found while everything was stopped has nothing of ours yet. */
-static int prepare_stopped(struct tree *tree, struct target *target, struct avc_error *err)
+static int prepare_stopped(struct tree *tree, struct process *process, struct avc_error *err)
 {
-	if (target->pid != target->leader)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
-			    "the main thread of process %d has ended", target->inside);
-	if (!target->infected && infect_stopped(target, tree->slots, err))
+	if (process->pid != process->leader)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "freeze", "",
+			    "the main thread of process %d has ended", process->inside);
+	if (!process->infected && process_infect_stopped(process, tree->slots, err))
 		return -1;
-	return target->files_image ? 0 : files_prepare(target, err);
+	return process->files_image ? 0 : files_prepare(process, err);
 }
 
 /* Of the leader of a session or group, as the app knows it; 0: it is none of the app's,
@@ -32,8 +32,9 @@ static int prepare_stopped(struct tree *tree, struct target *target, struct avc_
 static pid_t number_inside(const struct tree *tree, pid_t pid)
 {
 	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->kin[i].pid == pid)
-			return tree->kin[i].target ? tree->kin[i].target->inside : proc_inside(pid);
+		if (tree->entry[i].pid == pid)
+			return tree->entry[i].process ? tree->entry[i].process->inside
+						      : proc_inside(pid);
 	return 0;
 }
 
@@ -66,7 +67,7 @@ static int keep_place_of_main(const struct tree *tree, struct generation *genera
 	return 0;
 }
 
-/* The kin that were there are the branches, in the same order. */
+/* The entries that were there are the branches, in the same order. */
 static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	int index[PROCESSES_MAX];
@@ -76,32 +77,32 @@ static int make_branches(struct tree *tree, struct generation *generation, struc
 	if (!generation->branch)
 		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
 	for (uint32_t i = 1; i < tree->count; i++) {
-		const struct kin *kin = &tree->kin[i];
+		const struct tree_entry *entry = &tree->entry[i];
 		struct branch *branch = &generation->branch[generation->branches];
 
 		index[i] = (int)generation->branches;
-		if (!kin->pid)
+		if (!entry->pid)
 			continue;
-		branch->parent = kin->parent == PARENT_INIT ? PARENT_INIT : index[kin->parent];
-		branch->pid = kin->pid;
-		branch->inside = kin->ended ? proc_inside(kin->pid) : kin->target->inside;
-		branch->target = kin->target;
-		branch->session = number_inside(tree, kin->stat.session);
-		branch->group = number_inside(tree, kin->stat.group);
-		branch->exit_signal = kin->stat.exit_signal;
-		if (kin->ended) {
+		branch->parent = entry->parent == PARENT_INIT ? PARENT_INIT : index[entry->parent];
+		branch->pid = entry->pid;
+		branch->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
+		branch->process = entry->process;
+		branch->session = number_inside(tree, entry->stat.session);
+		branch->group = number_inside(tree, entry->stat.group);
+		branch->exit_signal = entry->stat.exit_signal;
+		if (entry->ended) {
 			if (branch->parent == PARENT_INIT || branch->inside <= 0)
 				continue; /* init is just about to wait for it */
-			branch->status = kin->stat.exit_status;
-			memcpy(branch->name, kin->stat.name, sizeof branch->name);
+			branch->status = entry->stat.exit_status;
+			memcpy(branch->name, entry->stat.name, sizeof branch->name);
 		} else {
 			branch->image = calloc(1, sizeof *branch->image);
 			if (!branch->image)
 				return fail_errno(err, 0, "freeze", "calloc", "out of memory");
 			branch->image->pidfd = -1;
 			branch->image->slot = generation->slot;
-			keep_place(tree, &kin->stat, branch->image);
-			kin->target->images++;
+			keep_place(tree, &entry->stat, branch->image);
+			entry->process->images++;
 		}
 		generation->branches++;
 	}
@@ -114,15 +115,15 @@ static int find_branches(struct tree *tree, struct generation *generation, struc
 		return 0;
 	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
 	for (uint32_t i = 1; i < tree->count; i++)
-		if (tree->kin[i].target && !tree->kin[i].target->infected &&
+		if (tree->entry[i].process && !tree->entry[i].process->infected &&
 		    tree_shares_memory(tree, i))
-			return fail(err, AVC_UNSUPPORTED, 0, tree->kin[i].pid, "check", "",
+			return fail(err, AVC_UNSUPPORTED, 0, tree->entry[i].pid, "check", "",
 				    "a child process has its parent's memory (CLONE_VM)");
 	if (make_branches(tree, generation, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target &&
-		    prepare_stopped(tree, generation->branch[i].target, err))
+		if (generation->branch[i].process &&
+		    prepare_stopped(tree, generation->branch[i].process, err))
 			return -1;
 	return 0;
 }
@@ -132,16 +133,16 @@ static int find_branches(struct tree *tree, struct generation *generation, struc
 static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen,
 		       struct avc_error *err)
 {
-	struct target *target = branch->target;
+	struct process *process = branch->process;
 
 	if (strict)
-		branch->image->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
-	if (memory_prepare(target->memory, &branch->image->image, seen, err))
+		branch->image->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
+	if (memory_prepare(process, &branch->image->image, seen, err))
 		return -1;
-	branch->image->threads = target->blocks;
+	branch->image->threads = process->blocks;
 	/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */
-	memory_copy_own(target, branch->image->image);
-	memory_copy_shared(target, branch->image->image);
+	memory_copy_own(process, branch->image->image);
+	memory_copy_shared(process, branch->image->image);
 	files_mapped_copy(branch->image->mapped);
 	return 0;
 }
@@ -150,18 +151,18 @@ static int keep_branches(struct generation *generation, struct mem_seen *seen,
 			 struct avc_error *err)
 {
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target &&
+		if (generation->branch[i].process &&
 		    keep_branch(&generation->branch[i], generation->mapped != NULL, seen, err))
 			return -1;
 	return 0;
 }
 
 /* The tables do not change while the kernel clones: nobody runs. */
-static void capture_files(struct target *target, struct generation *generation)
+static void capture_files(struct process *process, struct generation *generation)
 {
 	struct scratch scratch = { -1, -1, 0 };
 
-	files_capture(target, generation, generation->branches > 0, NULL, 0, &scratch,
+	files_capture(process, generation, generation->branches > 0, NULL, 0, &scratch,
 		      &generation->files_error);
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
@@ -169,10 +170,10 @@ static void capture_files(struct target *target, struct generation *generation)
 						      ? &generation->branch[branch->parent]
 						      : NULL;
 
-		if (branch->target)
-			files_capture(branch->target, branch->image, true,
+		if (branch->process)
+			files_capture(branch->process, branch->image, true,
 				      parent ? parent->image->files : generation->files,
-				      parent ? parent->target->pid : target->pid, &scratch,
+				      parent ? parent->process->pid : process->pid, &scratch,
 				      &branch->image->files_error);
 	}
 	scratch_close(&scratch);
@@ -183,12 +184,12 @@ static void capture_files(struct target *target, struct generation *generation)
 static int see_alive(const struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->count; i++) {
-		const struct target *target = tree->kin[i].target;
+		const struct process *process = tree->entry[i].process;
 		struct arch_regs ignored;
 
-		if (target && !target->asked && !(i == 0 && target->cloning) &&
-		    arch_regs_get(target->pid, &ignored))
-			return fail_errno(err, target->pid, "freeze", "ptrace(GETREGS)",
+		if (process && !process->asked && !(i == 0 && process->cloning) &&
+		    arch_regs_get(process->pid, &ignored))
+			return fail_errno(err, process->pid, "freeze", "ptrace(GETREGS)",
 					  "it has ended");
 	}
 	return 0;
@@ -199,27 +200,27 @@ static int see_alive(const struct tree *tree, struct avc_error *err)
 static bool has_all_holders(const struct tree *tree)
 {
 	for (uint32_t i = 1; i < tree->count; i++)
-		if (tree->kin[i].target && !tree->kin[i].target->holder)
+		if (tree->entry[i].process && !tree->entry[i].process->holder)
 			return false;
 	return true;
 }
 
 /* What a process above it adopts would be a child that it never had; it itself sees to that
- * (hold_stopped()). */
+ * (process_hold_stopped()). */
 static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *err)
 {
-	for (int k = tree->kin[i].parent; k >= 0; k = tree->kin[k].parent) {
-		struct target *above = tree->kin[k].target;
+	for (int k = tree->entry[i].parent; k >= 0; k = tree->entry[k].parent) {
+		struct process *above = tree->entry[k].process;
 		struct thread *thread = above ? thread_find(above, above->pid) : NULL;
 
 		if (!thread)
 			continue;
-		if (!above->paused && !above->descendant && ask(above, thread, err))
+		if (!above->paused && !above->descendant && thread_ask(above, thread, err))
 			return -1; /* the others were asked just now */
-		if (thread->creds.subreaper && adopt_no_more(above, err))
+		if (thread->creds.subreaper && process_adopt_no_more(above, err))
 			return -1;
 	}
-	return hold_stopped(tree->kin[i].target, tree->init, err);
+	return process_hold_stopped(tree->entry[i].process, tree->init, err);
 }
 
 /* Parents come before their children. */
@@ -229,10 +230,11 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 	int result = 0;
 
 	for (uint32_t i = 1; !result && i < tree->count; i++)
-		if (tree->kin[i].target && !tree->kin[i].target->holder)
+		if (tree->entry[i].process && !tree->entry[i].process->holder)
 			result = make_holder_missing(tree, i, err);
 	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->kin[i].target && adopt_again(tree->kin[i].target, &failed) && !result) {
+		if (tree->entry[i].process &&
+		    process_adopt_again(tree->entry[i].process, &failed) && !result) {
 			*err = failed;
 			result = -1;
 		}
@@ -246,13 +248,14 @@ static int clone_missing(struct tree *tree, struct generation *generation, struc
 	struct thread *main_thread = thread_find(tree->main, tree->main->pid);
 
 	/* First who waits in its parasite for us: how long the main process takes is not known yet. */
-	if (hear_all(tree, err) || await_app_clone(tree->main, main_thread, generation, err) ||
-	    rest_app(main_thread, err) || make_holders_missing(tree, err))
+	if (freeze_hear_all(tree, err) ||
+	    freeze_await_app_clone(tree->main, main_thread, generation, err) ||
+	    freeze_rest_app(main_thread, err) || make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
+		struct process *process = tree->entry[i].process;
 
-		if (target && !target->cloning && start_clone(target, err))
+		if (process && !process->cloning && freeze_start_clone(process, err))
 			return -1;
 	}
 	return 0;
@@ -263,11 +266,11 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
-		if (!branch->target)
+		if (!branch->process)
 			continue;
-		if (await_clone(branch->target, &branch->image->template, err))
+		if (freeze_await_clone(branch->process, &branch->image->template, err))
 			return -1;
-		branch->image->vm_pages = branch->target->clone_pages;
+		branch->image->vm_pages = branch->process->clone_pages;
 		branch->image->taken_ns = generation->taken_ns;
 	}
 	return 0;
@@ -275,10 +278,11 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 
 /* ---- all of it ------------------------------------------------------------------------------ */
 
-int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct generation *generation,
-	   struct mem_seen *seen, struct freeze_times *times, struct avc_error *err)
+int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
+		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
+		struct avc_error *err)
 {
-	struct target *target = tree->main;
+	struct process *process = tree->main;
 	struct avc_error failed = { 0 };
 	struct thread *main_thread;
 	bool cloned;
@@ -291,20 +295,22 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	start = now_ns();
-	result = stop_known(tree, err);
+	result = freeze_stop_known(tree, err);
 	generation->taken_ns = now_ns();
 	times->stop_ns = generation->taken_ns - start;
 	if (!result)
-		result = begin_known(tree, generation, err) || stop_others(tree, err) ? -1 : 0;
+		result = freeze_begin_known(tree, generation, err) || freeze_stop_others(tree, err)
+				 ? -1
+				 : 0;
 	/* The deadline is for getting things stopped; the clone of a big process takes its
 	 * time. */
 	tracee_deadline_set(timer, CLONE_NS);
 	if (!result) {
-		memory_copy_shared(target, generation->image);
+		memory_copy_shared(process, generation->image);
 		files_mapped_copy(generation->mapped);
 		result = keep_place_of_main(tree, generation, err) ||
 					 find_branches(tree, generation, err) ||
-					 begin_others(tree, generation, err) ||
+					 freeze_begin_others(tree, generation, err) ||
 					 keep_branches(generation, seen, err)
 				 ? -1
 				 : 0;
@@ -312,43 +318,44 @@ int freeze(struct tree *tree, timer_t timer, uint64_t deadline_ns, struct genera
 	if (!result && !has_all_holders(tree))
 		result = clone_missing(tree, generation, err);
 	if (!result) {
-		capture_files(target, generation);
+		capture_files(process, generation);
 		result = see_alive(tree, err);
 	}
 	/* Also what was begun before something failed. */
-	main_thread = thread_find(target, target->pid);
-	if (target->cloning &&
-	    await_app_clone(target, main_thread, generation, result ? &failed : err))
+	main_thread = thread_find(process, process->pid);
+	if (process->cloning &&
+	    freeze_await_app_clone(process, main_thread, generation, result ? &failed : err))
 		result = -1;
 	cloned = generation->template != 0;
-	if (hear_all(tree, result ? &failed : err))
+	if (freeze_hear_all(tree, result ? &failed : err))
 		result = -1;
 	if (!result)
 		result = await_clones(generation, err);
-	drop_clones(tree);
+	freeze_drop_clones(tree);
 	times->clone_ns = now_ns() - generation->taken_ns;
 	/* The image is whole.  The main thread first: it would have to share the CPUs with
 	 * everybody else. */
 	if (main_thread) {
 		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
 		if (cloned && main_thread->borrowed)
-			(void)rest_app(main_thread, &failed); /* or it is killed just now */
-		let_go_thread(target, main_thread);
+			(void)freeze_rest_app(main_thread, &failed); /* or it is killed just now */
+		thread_let_go(process, main_thread);
 	}
-	let_go_process(target);
-	for (uint32_t i = 0; i < tree->members; i++)
-		let_go_process(tree->member[i]);
+	process_let_go(process);
+	for (uint32_t i = 0; i < tree->processes; i++)
+		process_let_go(tree->process[i]);
 	times->freeze_ns = now_ns() - start;
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	if (!cloned || result)
 		return -1;
-	target->checkpoints++;
-	if (pending_deadly(target->pending))
-		return fail(err, AVC_GONE, 0, target->pid, "freeze", "",
-			    "it is just being ended by signal %d", pending_deadly(target->pending));
+	process->checkpoints++;
+	if (pending_deadly(process->pending))
+		return fail(err, AVC_GONE, 0, process->pid, "freeze", "",
+			    "it is just being ended by signal %d",
+			    pending_deadly(process->pending));
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target)
-			generation->branch[i].target->checkpoints++;
+		if (generation->branch[i].process)
+			generation->branch[i].process->checkpoints++;
 	return 0;
 }

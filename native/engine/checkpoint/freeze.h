@@ -9,17 +9,16 @@
 #ifndef AVCKPT_FREEZE_H
 #define AVCKPT_FREEZE_H
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* ---- freeze_stop.c ------------------------------------------------------------------------ */
 
 /* Those that have something of ours; another child may have to execute a program before its
  * parent can be stopped (vfork(2)). */
-int stop_known(struct tree *tree, struct avc_error *err) warn_unused;
+int freeze_stop_known(struct tree *tree, struct avc_error *err) warn_unused;
 /* Until a look at the whole tree finds nobody who is not stopped: processes create
  * processes while we look. */
-int stop_others(struct tree *tree, struct avc_error *err) warn_unused;
-void let_go_thread(const struct target *target, struct thread *thread);
+int freeze_stop_others(struct tree *tree, struct avc_error *err) warn_unused;
 
 /* ---- freeze_clone.c ----------------------------------------------------------------------- */
 
@@ -27,23 +26,23 @@ void let_go_thread(const struct target *target, struct thread *thread);
  * they do not take long, and they answer meanwhile what they are asked.  Whoever is found after that is stopped, too, and has
  * had nothing to do with the memory of the others.  (One that shares it is not protected:
  * find_branches().)  One that has no holder yet waits for the others. */
-int begin_known(struct tree *tree, struct generation *generation,
-		struct avc_error *err) warn_unused;
+int freeze_begin_known(struct tree *tree, struct generation *generation,
+		       struct avc_error *err) warn_unused;
 /* Those that have been found since.  Without a holder they are only read and asked. */
-int begin_others(struct tree *tree, struct generation *generation,
-		 struct avc_error *err) warn_unused;
+int freeze_begin_others(struct tree *tree, struct generation *generation,
+			struct avc_error *err) warn_unused;
 /* The clone of the main process, begun by now. */
-int await_app_clone(struct target *target, struct thread *main_thread,
-		    struct generation *generation, struct avc_error *err) warn_unused;
+int freeze_await_app_clone(struct process *process, struct thread *main_thread,
+			   struct generation *generation, struct avc_error *err) warn_unused;
 /* After that its main thread has a few steps to go before it can be let go. */
-int rest_app(struct thread *main_thread, struct avc_error *err);
+int freeze_rest_app(struct thread *main_thread, struct avc_error *err);
 /* The clone of another process: its holder shares the process' memory and descriptors. */
-int start_clone(struct target *target, struct avc_error *err) warn_unused;
-int await_clone(struct target *target, pid_t *template, struct avc_error *err) warn_unused;
+int freeze_start_clone(struct process *process, struct avc_error *err) warn_unused;
+int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err) warn_unused;
 /* The answers of all others, also of those that were asked before one failed. */
-int hear_all(struct tree *tree, struct avc_error *err) warn_unused;
+int freeze_hear_all(struct tree *tree, struct avc_error *err) warn_unused;
 /* Clones that nobody waits for any more: of a process that was killed meanwhile, and all of
  * them when the checkpoint failed. */
-void drop_clones(struct tree *tree);
+void freeze_drop_clones(struct tree *tree);
 
 #endif

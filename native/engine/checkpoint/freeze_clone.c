@@ -35,19 +35,19 @@ static bool may_be_disarmed(const struct thread *t)
 			       arch_sp(&t->regs) - t->altstack[0] < t->altstack[2]);
 }
 
-static int read_all(struct target *target, uint32_t slot, struct avc_error *err)
+static int read_all(struct process *process, uint32_t slot, struct avc_error *err)
 {
 	uint32_t next = 1;
 
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		struct thread *t = &target->threads[i];
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
 
 		if (t->attached && !t->seen)
-			return fail(err, AVC_DEADLINE, EAGAIN, t->tid, "freeze", "",
+			return fail(err, AVC_RETRY, 0, t->tid, "freeze", "",
 				    "it is just starting a process");
 		if (!t->stopped)
 			continue;
-		if (next >= target->parasite.threads_max && t->tid != target->leader)
+		if (next >= process->parasite.threads_max && t->tid != process->leader)
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "more threads than prepared for");
 		if (!arch_is_native(&t->regs))
@@ -55,24 +55,24 @@ static int read_all(struct target *target, uint32_t slot, struct avc_error *err)
 				    "it is a 32-bit program");
 		/* A thread that somebody who died sent into a parasite finds its way out
 		 * in microseconds: such an image would be of the parasite. */
-		if (parasite_contains(&target->parasite, arch_pc(&t->regs)))
+		if (parasite_contains(&process->parasite, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in the parasite");
-		if (in_old_parasite(target, arch_pc(&t->regs)))
+		if (parasite_is_old(process, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old parasite");
-		t->block = t->tid == target->leader ? 0 : (int)next++;
+		t->block = t->tid == process->leader ? 0 : (int)next++;
 		if (thread_read(t, err))
 			return -1;
-		if (arch_frame_read_xstate(t->tid, parasite_frame(&target->parasite, slot,
+		if (arch_frame_read_xstate(t->tid, parasite_frame(&process->parasite, slot,
 								  (uint32_t)t->block)))
 			return fail_errno(err, t->tid, "freeze", "ptrace(GETREGSET)",
 					  "its state can not be read");
 		if ((!t->known || t->known_tls != arch_tls(&t->regs) || may_be_disarmed(t)) &&
-		    ask(target, t, err))
+		    thread_ask(process, t, err))
 			return -1;
 	}
-	target->blocks = next;
+	process->blocks = next;
 	return 0;
 }
 
@@ -83,25 +83,26 @@ static const struct inj_syscall *ask_for_children(struct inj_call *call)
 }
 
 /* Nobody has looked below one that had none at the last checkpoint. */
-static int hear_of_children(struct target *target, struct avc_error *err)
+static int hear_of_children(struct process *process, struct avc_error *err)
 {
-	const bool was_childless = target->childless;
+	const bool was_childless = process->childless;
 
-	target->childless = target->children->result == -ECHILD;
-	return was_childless && !target->childless
-		       ? fail(err, AVC_DEADLINE, EAGAIN, target->pid, "freeze", "",
+	process->childless = process->children->result == -ECHILD;
+	return was_childless && !process->childless
+		       ? fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
 			      "it has just started another process")
 		       : 0;
 }
 
 /* Parasites of guards that died, and of the process that forked this one. */
-static void drop_old_pads(struct target *target, long *vm_pages, struct inj_call *call)
+static void drop_old_pads(struct process *process, long *vm_pages, struct inj_call *call)
 {
-	if (!target->checkpoints)
+	if (!process->checkpoints)
 		return;
-	for (; target->old_parasites && call->count < INJ_CALLS_MAX - 2; target->old_parasites--) {
-		const avc_remote base = target->old_parasite[target->old_parasites - 1].base;
-		const size_t bytes = target->old_parasite[target->old_parasites - 1].bytes;
+	for (; process->old_parasites && call->count < INJ_CALLS_MAX - 2;
+	     process->old_parasites--) {
+		const avc_remote base = process->old_parasite[process->old_parasites - 1].base;
+		const size_t bytes = process->old_parasite[process->old_parasites - 1].bytes;
 
 		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
 		*vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
@@ -110,97 +111,97 @@ static void drop_old_pads(struct target *target, long *vm_pages, struct inj_call
 
 /* ---- the main process ------------------------------------------------------------------- */
 
-static int start_app_clone(struct target *target, struct thread *main_thread, long *vm_pages,
+static int start_app_clone(struct process *process, struct thread *main_thread, long *vm_pages,
 			   struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
+	struct inj_call *call = &process->parasite.control->runner;
 
-	*vm_pages = proc_vm_pages(target->statm_fd, NULL);
+	*vm_pages = proc_vm_pages(process->statm_fd, NULL);
 	call_begin(call, INJ_AFTER_HOME);
-	timers_ask(target, call);
-	memory_dofork(target->memory, call);
-	drop_old_pads(target, vm_pages, call);
-	target->children = ask_for_children(call);
+	timers_ask(process, call);
+	memory_dofork(process->memory, call);
+	drop_old_pads(process, vm_pages, call);
+	process->children = ask_for_children(call);
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	target->asked_ns = now_ns();
-	if (borrow(target, main_thread, err) || parasite_start(main_thread->tid, err))
+	process->asked_ns = now_ns();
+	if (thread_borrow(process, main_thread, err) || parasite_start(main_thread->tid, err))
 		return -1;
-	target->cloning = true;
+	process->cloning = true;
 	return 0;
 }
 
-int await_app_clone(struct target *target, struct thread *main_thread,
-		    struct generation *generation, struct avc_error *err)
+int freeze_await_app_clone(struct process *process, struct thread *main_thread,
+			   struct generation *generation, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
+	struct inj_call *call = &process->parasite.control->runner;
 
-	target->cloning = false;
+	process->cloning = false;
 	if (parasite_await_clone(main_thread->tid, call, &generation->template, err)) {
-		target->lost |= err->code != AVC_KERNEL;
+		process->lost |= err->code != AVC_LIMIT;
 		thread_runs_on(main_thread, err);
 		return -1;
 	}
 	/* After the timers were asked: one that has expired just now is found here. */
-	if (pending_read(target, err))
+	if (pending_read(process, err))
 		return -1;
-	timers_answer(target, call, now_ns() - target->asked_ns);
-	return hear_of_children(target, err);
+	timers_answer(process, call, now_ns() - process->asked_ns);
+	return hear_of_children(process, err);
 }
 
-int rest_app(struct thread *main_thread, struct avc_error *err)
+int freeze_rest_app(struct thread *main_thread, struct avc_error *err)
 {
-	if (tracee_settle(main_thread->tid, err) == 0 && give_back(main_thread, err) == 0)
+	if (tracee_settle(main_thread->tid, err) == 0 && thread_give_back(main_thread, err) == 0)
 		return 0;
 	main_thread->stopped = false;
 	return -1;
 }
 
-static int begin_app(struct target *target, struct generation *generation, struct avc_error *err)
+static int begin_app(struct process *process, struct generation *generation, struct avc_error *err)
 {
-	struct thread *thread = thread_find(target, target->pid);
+	struct thread *thread = thread_find(process, process->pid);
 
 	if (!thread || !thread->stopped)
-		return fail(err, AVC_DEADLINE, 0, target->pid, "freeze", "",
+		return fail(err, AVC_DEADLINE, 0, process->pid, "freeze", "",
 			    "its main thread has just ended");
-	target->begun = true;
-	if (read_all(target, generation->slot, err))
+	process->begun = true;
+	if (read_all(process, generation->slot, err))
 		return -1;
-	generation->threads = target->blocks;
-	memory_copy_own(target, generation->image);
-	return start_app_clone(target, thread, &generation->vm_pages, err);
+	generation->threads = process->blocks;
+	memory_copy_own(process, generation->image);
+	return start_app_clone(process, thread, &generation->vm_pages, err);
 }
 
 /* ---- the others ------------------------------------------------------------------------- */
 
-int start_clone(struct target *target, struct avc_error *err)
+int freeze_start_clone(struct process *process, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->holder;
+	struct inj_call *call = &process->parasite.control->holder;
 
 	/* Before the holder runs, which maps something for a moment. */
-	target->clone_pages = proc_vm_pages(target->statm_fd, NULL);
+	process->clone_pages = proc_vm_pages(process->statm_fd, NULL);
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
-	memory_dofork(target->memory, call);
-	drop_old_pads(target, &target->clone_pages, call);
+	memory_dofork(process->memory, call);
+	drop_old_pads(process, &process->clone_pages, call);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	if (parasite_send(&target->parasite, target->holder, &target->holder_base, call, err) ||
-	    parasite_start(target->holder, err))
+	if (parasite_send(&process->parasite, process->holder, &process->holder_base, call, err) ||
+	    parasite_start(process->holder, err))
 		return -1;
-	target->cloning = true;
-	target->lost = true; /* until we have heard of the clone */
+	process->cloning = true;
+	process->lost = true; /* until we have heard of the clone */
 	return 0;
 }
 
-int await_clone(struct target *target, pid_t *template, struct avc_error *err)
+int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err)
 {
-	const struct inj_call *call = &target->parasite.control->holder;
-	struct thread *thread = thread_find(target, target->pid);
+	const struct inj_call *call = &process->parasite.control->holder;
+	struct thread *thread = thread_find(process, process->pid);
 
-	target->cloning = false;
-	if (parasite_await_clone(target->holder, call, template, err))
+	process->cloning = false;
+	if (parasite_await_clone(process->holder, call, template, err))
 		return -1;
-	target->lost = false;
+	process->lost = false;
 	if (thread && call->call[0].result > 0)
 		thread->creds.future_lock = (int32_t)call->call[0].result;
 	return 0;
@@ -208,10 +209,10 @@ int await_clone(struct target *target, pid_t *template, struct avc_error *err)
 
 /* Timers only the process itself can tell of.  And young processes change what they are
  * all the time: a name, a user.  All are asked at the same time. */
-static int ask_begin(struct target *target, uint64_t takes_ns, struct avc_error *err)
+static int ask_begin(struct process *process, uint64_t takes_ns, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
-	struct thread *thread = thread_find(target, target->pid);
+	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
 
 	call_begin(call, INJ_AFTER_HOME);
 	/* It is heard only when the main process is cloned, and the holders take the CPUs from us
@@ -219,57 +220,58 @@ static int ask_begin(struct target *target, uint64_t takes_ns, struct avc_error 
 	call->park_ms += (uint32_t)(PATIENCE *
 				    (takes_ns < CLONES_MAX_NS ? takes_ns : CLONES_MAX_NS) /
 				    NS_PER_MS);
-	timers_ask(target, call);
-	target->children = ask_for_children(call);
-	ask_add(target, false, call, &target->questions);
-	target->asked_ns = now_ns();
-	if (borrow(target, thread, err) || parasite_start(thread->tid, err))
+	timers_ask(process, call);
+	process->children = ask_for_children(call);
+	thread_ask_add(process, false, call, &process->questions);
+	process->asked_ns = now_ns();
+	if (thread_borrow(process, thread, err) || parasite_start(thread->tid, err))
 		return -1;
-	target->asked = true;
+	process->asked = true;
 	return 0;
 }
 
 /* All are interrupted before the first is waited for: it takes each some time to get there. */
-static int ask_halt(struct target *target, struct avc_error *err)
+static int ask_halt(struct process *process, struct avc_error *err)
 {
-	struct thread *thread = thread_find(target, target->pid);
+	struct thread *thread = thread_find(process, process->pid);
 
-	if (parasite_halt(thread->tid, &target->parasite.control->runner, err) == 0)
+	if (parasite_halt(thread->tid, &process->parasite.control->runner, err) == 0)
 		return 0;
-	target->asked = false;
+	process->asked = false;
 	thread_runs_on(thread, err);
 	return -1;
 }
 
-static int ask_end(struct target *target, struct avc_error *err)
+static int ask_end(struct process *process, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
-	struct thread *thread = thread_find(target, target->pid);
+	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
 	const struct creds was = thread->creds;
 
-	target->asked = false;
+	process->asked = false;
 	if (tracee_await(thread->tid, NULL, err) != STOP_TRAP) {
 		thread_runs_on(thread, err);
 		return -1;
 	}
-	if (give_back(thread, err) || pending_read(target, err))
+	if (thread_give_back(thread, err) || pending_read(process, err))
 		return -1;
-	timers_answer(target, call, now_ns() - target->asked_ns);
-	if (ask_answer(thread, call, &target->questions, err))
+	timers_answer(process, call, now_ns() - process->asked_ns);
+	if (thread_ask_answer(thread, call, &process->questions, err))
 		return -1;
-	return ask_others(target, thread, &was, err) || hear_of_children(target, err) ? -1 : 0;
+	return thread_ask_others(process, thread, &was, err) || hear_of_children(process, err) ? -1
+											       : 0;
 }
 
-int hear_all(struct tree *tree, struct avc_error *err)
+int freeze_hear_all(struct tree *tree, struct avc_error *err)
 {
-	int (*const step[])(struct target *, struct avc_error *) = { ask_halt, ask_end };
+	int (*const step[])(struct process *, struct avc_error *) = { ask_halt, ask_end };
 	int result = 0;
 
 	for (size_t k = 0; k < sizeof step / sizeof *step; k++)
-		for (uint32_t i = 0; i < tree->members; i++) {
+		for (uint32_t i = 0; i < tree->processes; i++) {
 			struct avc_error failed = { 0 };
 
-			if (tree->member[i]->asked && step[k](tree->member[i], &failed) &&
+			if (tree->process[i]->asked && step[k](tree->process[i], &failed) &&
 			    !result) {
 				*err = failed;
 				result = -1;
@@ -280,26 +282,26 @@ int hear_all(struct tree *tree, struct avc_error *err)
 
 /* It stands still: its clone begins, if it has a holder for that, and it answers meanwhile what
  * it is asked, which changes nothing of its memory. */
-static int begin(struct target *target, uint32_t slot, uint64_t takes_ns, struct avc_error *err)
+static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, struct avc_error *err)
 {
-	struct thread *thread = thread_find(target, target->pid);
+	struct thread *thread = thread_find(process, process->pid);
 
 	if (!thread || !thread->stopped)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "freeze", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "freeze", "",
 			    "its main thread has ended");
-	target->begun = true;
-	return read_all(target, slot, err) || vet(target, thread, err) ||
-			       (target->holder && start_clone(target, err)) ||
-			       ask_begin(target, takes_ns, err)
+	process->begun = true;
+	return read_all(process, slot, err) || thread_vet(process, thread, err) ||
+			       (process->holder && freeze_start_clone(process, err)) ||
+			       ask_begin(process, takes_ns, err)
 		       ? -1
 		       : 0;
 }
 
 /* What it has just brought forth was taken for a thread of its own; a look tells. */
-static bool has_strangers(const struct target *target)
+static bool has_strangers(const struct process *process)
 {
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].attached && !target->threads[i].seen)
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].attached && !process->threads[i].seen)
 			return true;
 	return false;
 }
@@ -316,17 +318,17 @@ static uint64_t clones_time_ns(const struct tree *tree)
 	uint64_t takes_ns = 0;
 
 	for (uint32_t i = 0; i < tree->count; i++) {
-		const struct target *target = tree->kin[i].target;
-		long pages = target ? target->anon_pages : 0;
+		const struct process *process = tree->entry[i].process;
+		long pages = process ? process->anon_pages : 0;
 
-		if (target && !pages)
-			proc_vm_pages(target->statm_fd, &pages);
+		if (process && !pages)
+			proc_vm_pages(process->statm_fd, &pages);
 		takes_ns += clone_time_ns(pages);
 	}
 	return takes_ns;
 }
 
-int begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
+int freeze_begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
 	uint64_t takes_ns = 0;
@@ -334,45 +336,45 @@ int begin_known(struct tree *tree, struct generation *generation, struct avc_err
 	if (!has_strangers(tree->main) && begin_app(tree->main, generation, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
+		struct process *process = tree->entry[i].process;
 
-		if (!target || !target->frozen || !target->holder || !target->anon_pages ||
-		    target->pid != target->leader || has_strangers(target))
+		if (!process || !process->frozen || !process->holder || !process->anon_pages ||
+		    process->pid != process->leader || has_strangers(process))
 			continue;
-		takes_ns += clone_time_ns(target->anon_pages);
+		takes_ns += clone_time_ns(process->anon_pages);
 		if (takes_ns > CLONES_AHEAD_NS)
 			break;
-		if (begin(target, generation->slot, all_ns, err))
+		if (begin(process, generation->slot, all_ns, err))
 			return -1;
 	}
 	return 0;
 }
 
-int begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
+int freeze_begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
 	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
 
 	if (!tree->main->begun && begin_app(tree->main, generation, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct target *target = generation->branch[i].target;
+		struct process *process = generation->branch[i].process;
 
-		if (target && !target->begun && begin(target, generation->slot, all_ns, err))
+		if (process && !process->begun && begin(process, generation->slot, all_ns, err))
 			return -1;
 	}
 	return 0;
 }
 
-void drop_clones(struct tree *tree)
+void freeze_drop_clones(struct tree *tree)
 {
-	for (uint32_t i = 0; i < tree->members; i++) {
-		struct target *target = tree->member[i];
+	for (uint32_t i = 0; i < tree->processes; i++) {
+		struct process *process = tree->process[i];
 		struct avc_error ignored = { 0 };
 		pid_t template;
 
-		if (!target->cloning || await_clone(target, &template, &ignored))
+		if (!process->cloning || freeze_await_clone(process, &template, &ignored))
 			continue;
 		tracee_kill(template);
-		target->lost = tracee_settle(target->holder, &ignored) != 0;
+		process->lost = tracee_settle(process->holder, &ignored) != 0;
 	}
 }

@@ -14,7 +14,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* In template_call.out: what the template had got by fork(2). */
 #define TEMPLATE_NAME 16
@@ -22,21 +22,10 @@
 #define TEMPLATE_ATTRIBUTES 64
 #define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
 
-/* The OOM killer is to take templates first; undone in what is restored. */
-void oom_score_adj_set(pid_t pid, const char *value)
-{
-	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);
-
-	if (fd < 0)
-		return;
-	if (write(fd, value, strlen(value)) < 0)
-		errno = 0; /* best effort */
-	close(fd);
-}
-
 /* A fork of the main thread has what that had at that instant, but for what fork(2) resets. */
-static int hear_template(struct target *target, struct thread *cloned, const struct inj_call *call,
-			 const struct inj_syscall *attributes, struct avc_error *err)
+static int hear_template(struct process *process, struct thread *cloned,
+			 const struct inj_call *call, const struct inj_syscall *attributes,
+			 struct avc_error *err)
 {
 	const struct creds was = cloned->creds;
 
@@ -47,44 +36,41 @@ static int hear_template(struct target *target, struct thread *cloned, const str
 	cloned->creds.filters = was.filters;
 	cloned->creds.future_lock = was.future_lock;
 	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
-	return ask_others(target, cloned, &was, err);
+	return thread_ask_others(process, cloned, &was, err);
 }
 
-static int quieten(struct target *target, struct generation *generation,
+static int quieten(struct process *process, struct generation *generation,
 		   const struct branch *branch, struct avc_error *err)
 {
-	struct thread *cloned = branch ? NULL : thread_find(target, target->pid);
-	struct inj_slot *slot = parasite_slot(&target->parasite, generation->slot);
+	struct thread *cloned = branch ? NULL : thread_find(process, process->pid);
+	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
 	struct inj_call *call = &slot->template_call;
 	const struct inj_syscall *rseq = NULL, *dumpable, *attributes = NULL;
 	const pid_t pid = generation->template;
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
-			  PTRACE_O_SUSPEND_SECCOMP)) ||
-	    arch_regs_get(pid, &generation->base))
+	if (parasite_own(&process->parasite, pid) || arch_regs_get(pid, &generation->base))
 		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
 	memset(call->out, 0, sizeof call->out);
 	memcpy(call->out, "avckpt-tmpl", 12);
 	call_begin(call, INJ_AFTER_PARK);
 	/* Out of the app's session or process group, or the number stays taken. */
-	if (branch || generation->stat.session == target->leader)
+	if (branch || generation->stat.session == process->leader)
 		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
 	else
 		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
 	call_add(call, SYS_prctl, PR_GET_NAME,
-		 parasite_remote(&target->parasite, call->out + TEMPLATE_NAME), 0, 0, 0);
-	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(&target->parasite, call->out), 0, 0,
+		 parasite_remote(&process->parasite, call->out + TEMPLATE_NAME), 0, 0, 0);
+	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, call->out), 0, 0,
 		 0);
 	dumpable = call_add(call, SYS_prctl, PR_GET_DUMPABLE, 0, 0, 0, 0);
 	if (cloned) {
 		call_add(call, SYS_sigaltstack, 0,
-			 parasite_remote(&target->parasite, call->out + TEMPLATE_ALTSTACK), 0, 0,
+			 parasite_remote(&process->parasite, call->out + TEMPLATE_ALTSTACK), 0, 0,
 			 0);
 		attributes = attributes_ask(call, call->out + TEMPLATE_ATTRIBUTES,
-					    parasite_remote(&target->parasite,
+					    parasite_remote(&process->parasite,
 							    call->out + TEMPLATE_ATTRIBUTES));
 	}
 	/* Or the kernel would write to its memory each time it runs, and to what is made of
@@ -92,40 +78,40 @@ static int quieten(struct target *target, struct generation *generation,
 	if (cloned && cloned->rseq)
 		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
 				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
-	if (parasite_send(&target->parasite, pid, &generation->base, call, err) ||
+	if (parasite_send(&process->parasite, pid, &generation->base, call, err) ||
 	    parasite_run(pid, call, err))
 		return -1;
 	if (rseq && rseq->result)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	generation->dumpable = dumpable->result;
-	oom_score_adj_set(pid, "1000");
-	return attributes ? hear_template(target, cloned, call, attributes, err) : 0;
+	proc_set_oom_score_adj(pid, "1000");
+	return attributes ? hear_template(process, cloned, call, attributes, err) : 0;
 }
 
 /* A main thread that has ended while others go on: it is there again until they are,
  * and ends again. */
-static void fill_ended(struct target *target, struct generation *generation)
+static void fill_ended(struct process *process, struct generation *generation)
 {
-	struct inj_thread *block = parasite_thread(&target->parasite, generation->slot, 0);
+	struct inj_thread *block = parasite_thread(&process->parasite, generation->slot, 0);
 
 	*block = (struct inj_thread){
-		.stack = parasite_remote(&target->parasite,
-					 parasite_stack(&target->parasite, generation->slot, 0)) -
+		.stack = parasite_remote(&process->parasite,
+					 parasite_stack(&process->parasite, generation->slot, 0)) -
 			 16,
-		.tid = target->inside,
+		.tid = process->inside,
 	};
-	if (proc_read(target->leader, "comm", block->name, sizeof block->name) > 0)
+	if (proc_read(process->leader, "comm", block->name, sizeof block->name) > 0)
 		block->name[strcspn(block->name, "\n")] = 0;
 }
 
-/* Fills the slot in from what freeze() has read: one block per thread. */
-static int fill_slot(struct target *target, struct generation *generation,
+/* Fills the slot in from what freeze_tree() has read: one block per thread. */
+static int fill_slot(struct process *process, struct generation *generation,
 		     const struct branch *branch, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
+	const struct parasite *parasite = &process->parasite;
 	struct inj_slot *slot = parasite_slot(parasite, generation->slot);
-	const struct thread *main_thread = thread_find(target, target->pid);
+	const struct thread *main_thread = thread_find(process, process->pid);
 	const struct proc_stat *stat = &generation->stat;
 	struct proc_status status;
 	struct setup setup;
@@ -134,17 +120,17 @@ static int fill_slot(struct target *target, struct generation *generation,
 	if (mem_fd < 0)
 		return fail_errno(err, generation->template, "keep template", "open(mem)",
 				  "it was killed");
-	if (proc_status(target->pid, &status) &&
+	if (proc_status(process->pid, &status) &&
 	    (!branch || proc_status(generation->template, &status))) {
 		close(mem_fd);
-		return fail_errno(err, target->pid, "keep template", "open(status)",
+		return fail_errno(err, process->pid, "keep template", "open(status)",
 				  "it has ended");
 	}
-	generation->headless = target->pid != target->leader;
+	generation->headless = process->pid != process->leader;
 	generation->stop_signal = main_thread->stop_signal;
 	setup_begin(&setup, parasite, generation->slot);
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		struct thread t = target->threads[i];
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread t = process->threads[i];
 		const uint32_t b = (uint32_t)t.block;
 		struct inj_thread *block;
 		uint8_t *frame;
@@ -156,8 +142,8 @@ static int fill_slot(struct target *target, struct generation *generation,
 
 		/* The borrowed thread's was seen to when it was borrowed; its own
 		 * memory has been run on since. */
-		if (t.tid != target->pid)
-			rseq_fixup(mem_fd, &t);
+		if (t.tid != process->pid)
+			thread_fix_rseq(mem_fd, &t);
 		rewind_original(&t, &t.regs);
 		arch_rewind(&t.regs);
 		*block = (struct inj_thread){
@@ -182,29 +168,31 @@ static int fill_slot(struct target *target, struct generation *generation,
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		/* Of the one that was cloned, as it was then. */
 		memcpy(block->name,
-		       !branch && t.tid == target->pid
+		       !branch && t.tid == process->pid
 			       ? (char *)slot->template_call.out + TEMPLATE_NAME
 			       : t.name,
 		       sizeof block->name);
 		setup_thread(&setup, block);
-		if (attributes_setup_thread(target, main_thread, &target->threads[i], &setup,
+		if (attributes_setup_thread(process, main_thread, &process->threads[i], &setup,
 					    err)) {
 			close(mem_fd);
 			return -1;
 		}
-		pending_setup_thread(target, &t, &setup);
+		pending_setup_thread(process, &t, &setup);
 	}
 	close(mem_fd);
 	if (generation->headless)
-		fill_ended(target, generation);
+		fill_ended(process, generation);
 	generation->sandboxed = status.seccomp == 1 ||
-				status.seccomp_filters > target->plain_filters;
-	if (memory_finish(target, generation, status.locked_kb, &setup, err))
+				status.seccomp_filters > process->plain_filters;
+	if (status.seccomp == 1)
+		process->parasite.seccomp = SECCOMP_SUPERVISED;
+	if (memory_finish(process, generation, status.locked_kb, &setup, err))
 		return -1;
-	pending_setup(target, &setup);
-	if (attributes_keep(target, generation, err))
+	pending_setup(process, &setup);
+	if (attributes_keep(process, generation, err))
 		return -1;
-	timers_setup(target, &setup);
+	timers_setup(process, &setup);
 	if (branch)
 		process_attrs_setup_limits(branch, &setup);
 	/* A change of users takes it from the whole process, whichever thread it is. */
@@ -215,31 +203,31 @@ static int fill_slot(struct target *target, struct generation *generation,
 	if (setup.notice.code)
 		generation->notice = setup.notice;
 	slot->threads = generation->threads;
-	slot->pid = target->inside;
+	slot->pid = process->inside;
 	/* Nothing but the app's own group, or one whose leader is visible, can be
 	 * put back. */
-	slot->group = generation->group > 0 ? generation->group : target->inside;
-	slot->session_leader = stat->session == target->leader;
-	slot->placed = target->descendant;
+	slot->group = generation->group > 0 ? generation->group : process->inside;
+	slot->session_leader = stat->session == process->leader;
+	slot->placed = process->descendant;
 	/* Of several processes: restore_tree.c. */
 	slot->tty_fd = !branch && stat->tty && stat->tty_group == stat->group
 			       ? files_find_device(generation->files, stat->tty)
 			       : -1;
-	return setup_end(&setup, target->pid, err);
+	return setup_end(&setup, process->pid, err);
 }
 
 /* What has to be known before anything is filled in: what the others are made from. */
-static int begin_template(struct target *target, struct generation *generation,
+static int begin_template(struct process *process, struct generation *generation,
 			  const struct branch *branch, struct avc_error *err)
 {
 	generation->pidfd = proc_pidfd_open(generation->template);
 	if (generation->pidfd < 0)
 		return fail_errno(err, generation->template, "keep template", "pidfd_open",
 				  "it was killed");
-	return quieten(target, generation, branch, err);
+	return quieten(process, generation, branch, err);
 }
 
-static int finish(struct target *target, struct generation *generation, struct branch *branch,
+static int finish(struct process *process, struct generation *generation, struct branch *branch,
 		  struct avc_error *err)
 {
 	int statm_fd;
@@ -247,48 +235,49 @@ static int finish(struct target *target, struct generation *generation, struct b
 
 	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
 	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
-	target->anon_pages = generation->anon_pages;
+	process->anon_pages = generation->anon_pages;
 	close_fd(&statm_fd);
 	if (pages >= 0 && pages != generation->vm_pages)
-		return memory_learn(target, generation->vm_pages - pages, err);
-	if (branch && branch_learn(branch, err))
+		return memory_learn(process, generation->vm_pages - pages, err);
+	if (branch && process_attrs_learn(branch, err))
 		return -1;
-	return fill_slot(target, generation, branch, err);
+	return fill_slot(process, generation, branch, err);
 }
 
 /* What only a process that makes another one its child has to know.  This one may have
  * ended meanwhile: a shell's children live for milliseconds. */
 static int finish_branch(struct branch *branch, struct avc_error *err)
 {
-	struct target *target = branch->target;
+	struct process *process = branch->process;
 
 	/* The holder rests again. */
-	return tracee_settle(target->holder, err) ||
-			       begin_template(target, branch->image, branch, err) ||
-			       finish(target, branch->image, branch, err)
+	return tracee_settle(process->holder, err) ||
+			       begin_template(process, branch->image, branch, err) ||
+			       finish(process, branch->image, branch, err)
 		       ? -1
 		       : 0;
 }
 
-int generation_finish(struct target *target, struct generation *generation, struct avc_error *err)
+int generation_finish(struct process *process, struct generation *generation, struct avc_error *err)
 {
-	const struct thread *main_thread = thread_find(target, target->pid);
+	const struct thread *main_thread = thread_find(process, process->pid);
 	struct avc_error again = { 0 };
 
 	if (generation->branches && !main_thread)
-		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
-	if (begin_template(target, generation, NULL, err))
+		return fail(err, AVC_GONE, ESRCH, process->pid, "keep template", "",
+			    "it has ended");
+	if (begin_template(process, generation, NULL, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 		struct avc_error failed = { 0 };
 
-		if (!branch->target)
+		if (!branch->process)
 			continue;
-		branch->target->forebear = &main_thread->creds;
+		branch->process->forebear = &main_thread->creds;
 		if (finish_branch(branch, &failed)) {
 			/* What was not as it was known is known now: of all of them. */
-			if (failed.code != AVC_DEADLINE || failed.errnum != EAGAIN) {
+			if (failed.code != AVC_RETRY) {
 				*err = failed;
 				return -1;
 			}
@@ -298,59 +287,59 @@ int generation_finish(struct target *target, struct generation *generation, stru
 		if (branch->image->notice.code && !generation->notice.code)
 			generation->notice = branch->image->notice;
 	}
-	if (finish(target, generation, NULL, err))
+	if (finish(process, generation, NULL, err))
 		return -1;
 	if (again.code)
 		*err = again;
 	if (again.code || restore_plan_check(generation, err))
 		return -1;
 	/* Not before its size was compared with the app's. */
-	files_unmap_areas(target, generation);
+	files_unmap_areas(process, generation);
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target)
-			files_unmap_areas(generation->branch[i].target,
+		if (generation->branch[i].process)
+			files_unmap_areas(generation->branch[i].process,
 					  generation->branch[i].image);
 	return 0;
 }
 
-void generation_close_files(struct target *target, struct generation *image)
+void generation_close_files(struct process *process, struct generation *image)
 {
-	struct inj_call *call = &parasite_slot(&target->parasite, image->slot)->template_call;
+	struct inj_call *call = &parasite_slot(&process->parasite, image->slot)->template_call;
 	struct avc_error ignored = { 0 };
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
-	if (parasite_send(&target->parasite, image->template, &image->base, call, &ignored) ||
+	if (parasite_send(&process->parasite, image->template, &image->base, call, &ignored) ||
 	    parasite_run(image->template, call, &ignored))
 		return; /* it was killed, and has nothing open any more */
 }
 
-static bool start_closing(struct target *target)
+static bool start_closing(struct process *process)
 {
-	struct inj_call *call = &target->parasite.control->holder;
+	struct inj_call *call = &process->parasite.control->holder;
 	struct avc_error gone = { 0 };
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
-	return parasite_send(&target->parasite, target->holder, &target->holder_base, call,
+	return parasite_send(&process->parasite, process->holder, &process->holder_base, call,
 			     &gone) == 0 &&
-	       parasite_start(target->holder, &gone) == 0;
+	       parasite_start(process->holder, &gone) == 0;
 }
 
 void generation_close_tables(const struct generation *generation)
 {
 	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct target *target = generation->branch[i].target;
+		struct process *process = generation->branch[i].process;
 
-		if (target)
-			target->closing = target->holder && start_closing(target);
+		if (process)
+			process->closing = process->holder && start_closing(process);
 	}
 	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct target *target = generation->branch[i].target;
+		struct process *process = generation->branch[i].process;
 		struct avc_error gone = { 0 };
 
-		if (target && target->closing &&
-		    parasite_finish(target->holder, &target->parasite.control->holder, &gone))
+		if (process && process->closing &&
+		    parasite_finish(process->holder, &process->parasite.control->holder, &gone))
 			continue; /* it was killed, and has nothing open any more */
 	}
 }
@@ -375,26 +364,18 @@ void generation_drop(struct generation *generation)
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		struct branch *branch = &generation->branch[i];
 
-		branch_forget(branch);
+		process_attrs_forget(branch);
 		if (!branch->image)
 			continue;
 		image_drop(branch->image);
 		free(branch->image);
-		if (branch->target)
-			branch->target->images--;
+		if (branch->process)
+			branch->process->images--;
 	}
 	restore_plan_free(generation->plan);
 	free(generation->branch);
 	image_drop(generation);
 	*generation = (struct generation){ .pidfd = -1 };
-}
-
-struct branch *generation_branch(const struct generation *generation, const struct target *target)
-{
-	for (uint32_t i = 0; generation && i < generation->branches; i++)
-		if (generation->branch[i].target == target)
-			return &generation->branch[i];
-	return NULL;
 }
 
 uint32_t generation_threads(const struct generation *generation)

@@ -10,14 +10,14 @@
  */
 #include <stdlib.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* Fewer pages are compared in no time. */
 #define WORTH_PAGES 1024
 /* About what it takes to compare a page. */
 #define PAGE_NS 60
 
-struct heir {
+struct plan_entry {
 	int host;                  /* a branch, or PARENT_MAIN                        */
 	struct snapshot *snapshot; /* NULL: nobody has asked yet                      */
 	struct remap *plan;        /* the same                                        */
@@ -27,8 +27,8 @@ struct restore_plan {
 	struct snapshot *main;
 	uint64_t left_ns; /* to be spent ahead                                        */
 	uint32_t next;    /* to be looked at ahead                                    */
-	uint32_t heirs;
-	struct heir heir[]; /* by branch                                              */
+	uint32_t entries;
+	struct plan_entry entry[]; /* by branch                                              */
 };
 
 /* Who forks it: its parent; an orphan's is gone, and somebody of its session does. */
@@ -37,7 +37,7 @@ static int host_of(const struct generation *generation, const struct branch *bra
 	if (branch->parent != PARENT_INIT)
 		return branch->parent;
 	for (uint32_t i = 0; i < generation->branches && &generation->branch[i] != branch; i++)
-		if (generation->branch[i].target &&
+		if (generation->branch[i].process &&
 		    generation->branch[i].session == branch->session)
 			return (int)i;
 	return PARENT_MAIN;
@@ -49,20 +49,20 @@ int restore_plan_begin(struct generation *generation, uint64_t ahead_ns, struct 
 
 	if (generation->plan)
 		return 0;
-	all = calloc(1, sizeof *all + generation->branches * sizeof *all->heir);
+	all = calloc(1, sizeof *all + generation->branches * sizeof *all->entry);
 	if (!all)
 		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
 	all->left_ns = ahead_ns;
-	all->heirs = generation->branches;
-	for (uint32_t i = 0; i < all->heirs; i++)
-		all->heir[i].host = host_of(generation, &generation->branch[i]);
+	all->entries = generation->branches;
+	for (uint32_t i = 0; i < all->entries; i++)
+		all->entry[i].host = host_of(generation, &generation->branch[i]);
 	generation->plan = all;
 	return 0;
 }
 
 int restore_plan_host(const struct generation *generation, uint32_t index)
 {
-	return generation->plan->heir[index].host;
+	return generation->plan->entry[index].host;
 }
 
 static const struct generation *image_of(const struct generation *generation, int branch)
@@ -82,7 +82,7 @@ static struct snapshot *snapshot_of(struct generation *generation, int branch,
 				    struct avc_error *err)
 {
 	struct restore_plan *all = generation->plan;
-	struct snapshot **snapshot = branch < 0 ? &all->main : &all->heir[branch].snapshot;
+	struct snapshot **snapshot = branch < 0 ? &all->main : &all->entry[branch].snapshot;
 
 	if (!*snapshot)
 		*snapshot = look_at(generation, branch, err);
@@ -94,29 +94,29 @@ static void rest(const struct generation *generation, int branch)
 {
 	struct restore_plan *all = generation->plan;
 
-	for (uint32_t i = 0; i < all->heirs; i++)
-		if (generation->branch[i].target && !all->heir[i].plan &&
-		    (all->heir[i].host == branch || (int)i == branch))
+	for (uint32_t i = 0; i < all->entries; i++)
+		if (generation->branch[i].process && !all->entry[i].plan &&
+		    (all->entry[i].host == branch || (int)i == branch))
 			return;
-	snapshot_rest(branch < 0 ? all->main : all->heir[branch].snapshot);
+	snapshot_rest(branch < 0 ? all->main : all->entry[branch].snapshot);
 }
 
 const struct remap *restore_plan_of(struct generation *generation, uint32_t index,
 				    struct avc_error *err)
 {
-	struct heir *heir = &generation->plan->heir[index];
+	struct plan_entry *entry = &generation->plan->entry[index];
 	struct snapshot *want, *is;
 
-	if (heir->plan)
-		return heir->plan;
+	if (entry->plan)
+		return entry->plan;
 	want = snapshot_of(generation, (int)index, err);
-	is = want ? snapshot_of(generation, heir->host, err) : NULL;
+	is = want ? snapshot_of(generation, entry->host, err) : NULL;
 	if (!is)
 		return NULL;
-	heir->plan = remap_plan(generation->branch[index].target, want, is, err);
+	entry->plan = remap_plan(generation->branch[index].process, want, is, err);
 	rest(generation, (int)index);
-	rest(generation, heir->host);
-	return heir->plan;
+	rest(generation, entry->host);
+	return entry->plan;
 }
 
 int restore_plan_check(const struct generation *generation, struct avc_error *err)
@@ -129,13 +129,13 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 		struct snapshot *want, *is;
 
 		/* Few have anything of the kind. */
-		if (!branch->target ||
+		if (!branch->process ||
 		    (!mem_image_has(branch->image->image, MAPPING_ONLY_HERE) &&
 		     !mem_image_has(image_of(generation, host)->image, MAPPING_SEALED)))
 			continue;
 		want = look_at(generation, (int)i, err);
 		is = want ? look_at(generation, host, err) : NULL;
-		result = is ? remap_check(branch->target, want, is, err) : -1;
+		result = is ? remap_check(branch->process, want, is, err) : -1;
 		snapshot_free(want);
 		snapshot_free(is);
 	}
@@ -148,7 +148,7 @@ bool restore_plan_next(struct generation *generation)
 
 	if (!all)
 		return false;
-	while (all->next < all->heirs) {
+	while (all->next < all->entries) {
 		const uint32_t i = all->next++;
 		const struct branch *branch = &generation->branch[i];
 		const uint64_t pages = branch->image ? (uint64_t)branch->image->anon_pages : 0;
@@ -161,16 +161,16 @@ bool restore_plan_next(struct generation *generation)
 		return true;
 	}
 	snapshot_rest(all->main);
-	for (uint32_t i = 0; i < all->heirs; i++)
-		snapshot_rest(all->heir[i].snapshot);
+	for (uint32_t i = 0; i < all->entries; i++)
+		snapshot_rest(all->entry[i].snapshot);
 	return false;
 }
 
 void restore_plan_free(struct restore_plan *all)
 {
-	for (uint32_t i = 0; all && i < all->heirs; i++) {
-		remap_free(all->heir[i].plan);
-		snapshot_free(all->heir[i].snapshot);
+	for (uint32_t i = 0; all && i < all->entries; i++) {
+		remap_free(all->entry[i].plan);
+		snapshot_free(all->entry[i].snapshot);
 	}
 	if (all)
 		snapshot_free(all->main);

@@ -13,7 +13,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "checkpoint.h"
 
 /* struct sched_attr, sched_setattr(2) */
 static uint32_t policy_of(const struct scheduling *s)
@@ -33,7 +33,7 @@ static bool step_aside(pid_t template, struct scheduling *was)
 
 	memset(all, 0xff, sizeof all);
 	(void)syscall(SYS_sched_setaffinity, template, sizeof all, all);
-	scheduling_read(template, was);
+	attributes_read_scheduling(template, was);
 	return (policy_of(was) == SCHED_FIFO || policy_of(was) == SCHED_RR) &&
 	       sched_setscheduler(template, SCHED_OTHER, &none) == 0;
 }
@@ -43,15 +43,15 @@ static int step_back(pid_t pid, const struct scheduling *was)
 	return (int)syscall(SYS_sched_setattr, pid, was->attr, 0);
 }
 
-static struct inj_call *call_of(const struct target *target, const struct generation *generation)
+static struct inj_call *call_of(const struct process *process, const struct generation *generation)
 {
-	return &parasite_slot(&target->parasite, generation->slot)->template_call;
+	return &parasite_slot(&process->parasite, generation->slot)->template_call;
 }
 
-static int begin_fork(struct target *target, struct generation *generation, struct avc_error *err)
+static int begin_fork(struct process *process, struct generation *generation, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
-	struct inj_call *call = call_of(target, generation);
+	const struct parasite *parasite = &process->parasite;
+	struct inj_call *call = call_of(process, generation);
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
@@ -62,30 +62,30 @@ static int begin_fork(struct target *target, struct generation *generation, stru
 	return 0;
 }
 
-static int end_fork(struct target *target, struct generation *generation, struct avc_error *err)
+static int end_fork(struct process *process, struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 
-	if (parasite_await_clone(generation->template, call_of(target, generation), &spare->pid,
+	if (parasite_await_clone(generation->template, call_of(process, generation), &spare->pid,
 				 err)) {
-		target->lost |= err->code != AVC_KERNEL && err->code != AVC_DEADLINE;
+		process->lost |= err->code != AVC_LIMIT && err->code != AVC_DEADLINE;
 		return -1;
 	}
 	if (!tracee_is_ours(spare->pid)) {
 		/* The template was killed before it could tell, or init_channel_kill_lost() did not
 		 * know of the spare. */
 		spare->pid = 0;
-		target->lost = true;
+		process->lost = true;
 	}
 	spare->pidfd = proc_pidfd_open(spare->pid);
 	spare->work = SPARE_REST;
 	return 0;
 }
 
-static bool name_spare(const struct target *target, const struct generation *generation)
+static bool name_spare(const struct process *process, const struct generation *generation)
 {
-	const struct parasite *parasite = &target->parasite;
-	struct inj_call *call = call_of(target, generation);
+	const struct parasite *parasite = &process->parasite;
+	struct inj_call *call = call_of(process, generation);
 	const pid_t spare = generation->spare.pid;
 	struct avc_error gone = { 0 };
 
@@ -97,46 +97,47 @@ static bool name_spare(const struct target *target, const struct generation *gen
 	       parasite_run(spare, call, &gone) == 0;
 }
 
-static int make(struct target *target, struct generation *generation, bool aside,
+static int make(struct process *process, struct generation *generation, bool aside,
 		struct avc_error *err)
 {
 	generation->spare.tried = true;
 	generation->spare.aside = aside;
-	return begin_fork(target, generation, err) || spare_await(target, generation, err) ? -1 : 0;
+	return begin_fork(process, generation, err) || spare_await(process, generation, err) ? -1
+											     : 0;
 }
 
-int spare_make(struct target *target, struct generation *generation, struct avc_error *err)
+int spare_make(struct process *process, struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 
-	if (make(target, generation, step_aside(generation->template, &spare->scheduling), err) ==
+	if (make(process, generation, step_aside(generation->template, &spare->scheduling), err) ==
 	    0)
 		return 0;
 	/* A frozen cgroup, or others have the CPUs; spare_await() goes on with it. */
 	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
 }
 
-int spare_make_now(struct target *target, struct generation *generation, struct avc_error *err)
+int spare_make_now(struct process *process, struct generation *generation, struct avc_error *err)
 {
-	return make(target, generation, false, err);
+	return make(process, generation, false, err);
 }
 
-int spare_await(struct target *target, struct generation *generation, struct avc_error *err)
+int spare_await(struct process *process, struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 	struct avc_error refused = { 0 };
 
 	if (!spare->work)
 		return 0;
-	if (spare->work == SPARE_FORK && end_fork(target, generation, &refused) &&
-	    refused.code != AVC_KERNEL) {
+	if (spare->work == SPARE_FORK && end_fork(process, generation, &refused) &&
+	    refused.code != AVC_LIMIT) {
 		*err = refused;
 		return -1;
 	}
 	if (spare->work == SPARE_REST && tracee_halt(generation->template, err))
 		return -1;
 	spare->work = SPARE_NO_WORK;
-	if (spare->pid && (!name_spare(target, generation) ||
+	if (spare->pid && (!name_spare(process, generation) ||
 			   (spare->aside && step_back(spare->pid, &spare->scheduling))))
 		spare_drop(generation);
 	if (spare->aside && step_back(generation->template, &spare->scheduling))

@@ -87,11 +87,6 @@ struct file *files_find(const struct files *files, int fd)
 	return NULL;
 }
 
-int files_borrow(int pidfd, int fd)
-{
-	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
-}
-
 /* The same file, socket, pipe...; of anonymous inodes only eventfds say who they are. */
 bool files_same_object(const struct file *a, const struct file *b)
 {
@@ -268,14 +263,14 @@ static bool look_at_remote(const struct look *look, int number, struct file *f)
  * the look at the parent has not seen. */
 static bool look_at_inherited(const struct look *look, int number, struct file *f)
 {
-	const struct files *kin = look->files->kin;
-	const struct file *is = kin ? files_find(kin, number) : NULL;
+	const struct files *parent = look->files->parent;
+	const struct file *is = parent ? files_find(parent, number) : NULL;
 	const struct file *k = is ? files_find(look->known, number) : NULL;
 
 	/* Of connections, locks and anonymous inodes there is more to know. */
 	if (!k || k->remote || k->lock_count || !is->known || is_anonymous(is) || is->told_ino ||
 	    (is->kind == FILE_SOCKET && look->files->with_tcp) ||
-	    syscall(SYS_kcmp, look->pid, look->files->kin_pid, KCMP_FILE, number, number))
+	    syscall(SYS_kcmp, look->pid, look->files->parent_pid, KCMP_FILE, number, number))
 		return false;
 	*f = (struct file){
 		.fd = number,
@@ -345,7 +340,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		files->count++;
 		return 0;
 	}
-	fd = files_borrow(look->pidfd, number);
+	fd = proc_borrow_fd(look->pidfd, number);
 	if (fd < 0) {
 		if (errno == EBADF)
 			return 0; /* closed meanwhile */
@@ -576,9 +571,9 @@ static bool may_be_ours(const struct files *files, const struct file *f)
 }
 
 /* What its parent's look has found in it. */
-static void copy_content(const struct files *kin, struct file *f)
+static void copy_content(const struct files *parent, struct file *f)
 {
-	const struct file *from = files_find(kin, f->inherited->shared);
+	const struct file *from = files_find(parent, f->inherited->shared);
 
 	f->ended = from->ended;
 	f->content_lost = from->content_lost;
@@ -602,11 +597,11 @@ static void keep_content(const struct look *look, struct file *f)
 	    f->outside || !is_channel(f))
 		return;
 	if (f->inherited) {
-		copy_content(look->files->kin, f);
+		copy_content(look->files->parent, f);
 		return;
 	}
 	if (f->ours <= 0)
-		f->ours = files_borrow(look->pidfd, f->fd);
+		f->ours = proc_borrow_fd(look->pidfd, f->fd);
 	end.fd = f->ours;
 	if (f->ours < 0 || poll(&end, 1, 0) != 1)
 		return;
@@ -708,22 +703,22 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 }
 
 /* Those of the app itself, whose process will be another one with its number. */
-static void find_own_pidfds(const struct target *target, struct files *files)
+static void find_own_pidfds(const struct process *process, struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++) {
 		struct file *f = &files->file[i];
 
 		if (f->kind != FILE_PIDFD)
 			continue;
-		f->pid_inside = f->pid == target->leader ? target->inside : 0;
-		for (uint32_t k = 0; !f->pid_inside && k < target->thread_count; k++)
-			if (target->threads[k].tid == f->pid)
-				f->pid_inside = target->threads[k].inside;
+		f->pid_inside = f->pid == process->leader ? process->inside : 0;
+		for (uint32_t k = 0; !f->pid_inside && k < process->thread_count; k++)
+			if (process->threads[k].tid == f->pid)
+				f->pid_inside = process->threads[k].inside;
 	}
 }
 
 /* Only the app itself, its threads and its group can be named again. */
-static void find_owners(const struct target *target, struct files *files)
+static void find_owners(const struct process *process, struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++) {
 		struct file *f = &files->file[i];
@@ -732,75 +727,75 @@ static void find_owners(const struct target *target, struct files *files)
 			continue;
 		if (f->owner_type == F_OWNER_PGRP)
 			f->owner_inside = proc_inside(f->owner);
-		else if (f->owner == target->leader)
-			f->owner_inside = target->inside;
-		for (uint32_t k = 0; f->owner_type == F_OWNER_TID && k < target->thread_count; k++)
-			if (target->threads[k].tid == f->owner)
-				f->owner_inside = target->threads[k].inside;
+		else if (f->owner == process->leader)
+			f->owner_inside = process->inside;
+		for (uint32_t k = 0; f->owner_type == F_OWNER_TID && k < process->thread_count; k++)
+			if (process->threads[k].tid == f->owner)
+				f->owner_inside = process->threads[k].inside;
 		if (f->owner_inside < 0)
 			f->owner_inside = 0;
 	}
 }
 
-int files_prepare(struct target *target, struct avc_error *err)
+int files_prepare(struct process *process, struct avc_error *err)
 {
-	struct files *before = files_new(target->files_seen + ROOM_SPARE);
+	struct files *before = files_new(process->files_seen + ROOM_SPARE);
 	struct files *image;
 
-	files_free(target->files_image);
-	target->files_image = NULL;
+	files_free(process->files_image);
+	process->files_image = NULL;
 	if (!before)
-		return fail_errno(err, target->pid, "look at descriptors", "calloc",
+		return fail_errno(err, process->pid, "look at descriptors", "calloc",
 				  "out of memory");
-	if (files_look(before, target->pid, target->pidfd, FILES_BEFORE, target->files_before,
-		       target->init, err)) {
+	if (files_look(before, process->pid, process->pidfd, FILES_BEFORE, process->files_before,
+		       process->init, err)) {
 		files_free(before);
 		return -1;
 	}
-	files_free(target->files_before);
-	target->files_before = before;
-	target->files_seen = before->count;
-	find_owners(target, before);
+	files_free(process->files_before);
+	process->files_before = before;
+	process->files_seen = before->count;
+	find_owners(process, before);
 	image = files_new(before->count + before->count / 4 + ROOM_SPARE);
 	if (!image)
-		return fail_errno(err, target->pid, "look at descriptors", "calloc",
+		return fail_errno(err, process->pid, "look at descriptors", "calloc",
 				  "out of memory");
 	/* Touched now: a first touch costs a fault, then while the app is stopped. */
 	memset(image->file, 0, image->room * sizeof *image->file);
-	image->with_tcp = target->tcp_moved;
-	target->files_image = image;
+	image->with_tcp = process->tcp_moved;
+	process->files_image = image;
 	return 0;
 }
 
-int files_capture(struct target *target, struct generation *generation, bool several,
-		  const struct files *kin, pid_t kin_pid, struct scratch *scratch,
+int files_capture(struct process *process, struct generation *generation, bool several,
+		  const struct files *parent, pid_t parent_pid, struct scratch *scratch,
 		  struct avc_error *err)
 {
-	struct files *image = target->files_image;
+	struct files *image = process->files_image;
 	int result;
 
-	target->files_image = NULL;
+	process->files_image = NULL;
 	image->several = several;
 	generation->files = image;
-	image->kin = kin;
-	image->kin_pid = kin_pid;
+	image->parent = parent;
+	image->parent_pid = parent_pid;
 	image->scratch = scratch;
-	result = files_look(image, target->pid, target->pidfd, FILES_FROZEN, target->files_before,
-			    target->init, err);
-	image->kin = NULL; /* may be gone before this one */
+	result = files_look(image, process->pid, process->pidfd, FILES_FROZEN,
+			    process->files_before, process->init, err);
+	image->parent = NULL; /* may be gone before this one */
 	image->scratch = NULL;
 	for (uint32_t i = 0; i < image->count; i++)
 		image->file[i].inherited = NULL;
 	if (result)
 		return -1;
-	find_owners(target, image);
-	find_own_pidfds(target, image);
+	find_owners(process, image);
+	find_own_pidfds(process, image);
 	return 0;
 }
 
 /* Nothing tells cheaply of flock(2): one that is there now, after the freeze, and was not
  * there before it may be of either side, and is left alone at a restore. */
-void files_settle(struct target *target, struct generation *generation)
+void files_settle(struct process *process, struct generation *generation)
 {
 	for (uint32_t i = 0; i < generation->files->count; i++) {
 		struct file *f = &generation->files->file[i];
@@ -808,7 +803,7 @@ void files_settle(struct target *target, struct generation *generation)
 
 		if (f->kind != FILE_REGULAR || f->flags & O_PATH)
 			continue;
-		file_read_info(target->pid, &now);
+		file_read_info(process->pid, &now);
 		for (uint32_t k = 0; k < now.lock_count; k++)
 			f->lock_unsure |= now.lock[k].kind == LOCK_FLOCK_;
 		for (uint32_t k = 0; k < f->lock_count; k++)
@@ -817,10 +812,10 @@ void files_settle(struct target *target, struct generation *generation)
 	}
 }
 
-void files_forget(struct target *target)
+void files_forget(struct process *process)
 {
-	files_free(target->files_before);
-	files_free(target->files_image);
-	target->files_before = NULL;
-	target->files_image = NULL;
+	files_free(process->files_before);
+	files_free(process->files_image);
+	process->files_before = NULL;
+	process->files_image = NULL;
 }

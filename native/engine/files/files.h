@@ -27,7 +27,74 @@
 #include <sys/socket.h>
 #include <time.h>
 
-#include "internal.h"
+#include "avckpt/engine.h"
+#include "state.h"
+
+/* ---- for the layers above ------------------------------------------------------- */
+
+/* Before a freeze: what can be known of the app's descriptors while it runs. */
+int files_prepare(struct process *process, struct avc_error *err) warn_unused;
+/* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
+struct scratch {
+	int in, out, bytes;
+};
+void scratch_close(struct scratch *scratch);
+/* During it: what is of this instant.  `several`: the app has other processes, which may
+ * have the other ends of pipes.  `parent`: what process `parent_pid` has, of the same freeze, or
+ * NULL. */
+int files_capture(struct process *process, struct generation *generation, bool several,
+		  const struct files *parent, pid_t parent_pid, struct scratch *scratch,
+		  struct avc_error *err);
+/* After it. */
+void files_settle(struct process *process, struct generation *generation);
+/* Of cameras, in the template (files_video.c). */
+void files_unmap_areas(struct process *process, const struct generation *generation);
+/* The same for all processes: what they share of open files, and who of them is named.
+ * `before`: the checkpoint before, or NULL. */
+void files_settle_family(const struct process *main, struct generation *generation,
+			 const struct generation *before);
+void files_forget(struct process *process);
+void files_free(struct files *files);
+/* Makes the tables of a dead app the generation's again: that of the main process, which
+ * its templates hold, at once; of the others (table[], by branch) what is to be in them.
+ * Lists what the restored processes have to do themselves.  What could not be put back is
+ * told in *notes; -1 is for what must not go on. */
+int files_restore(struct process *process, struct generation *generation,
+		  const struct avc_config *config, pid_t init, struct fd_table *table,
+		  struct avc_error *notes, struct avc_error *err) warn_unused;
+/* A process that is to be restored opens its pidfds itself: as many descriptors as it takes, until
+ * it puts its limit back after that. */
+void files_lift_limit(const struct files *want, pid_t pid);
+/* A descriptor of that device, as stat(2) numbers it; -1: there is none. */
+int files_find_device(const struct files *files, uint32_t rdev);
+/* Whether the restored process could do it all. */
+void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t inside,
+		       struct avc_error *notes);
+/* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
+ * that has the table as it is now, `holder` one that has the memory. */
+int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
+		       pid_t holder, struct avc_error *err) warn_unused;
+
+/* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
+ * out of memory. */
+struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);
+/* While everything is stopped; NULL: nothing. */
+void files_mapped_copy(struct files_mapped *mapped);
+void files_mapped_free(struct files_mapped *mapped);
+int files_mapped_check(const struct generation *generation, pid_t holder,
+		       struct avc_error *err) warn_unused;
+
+/* files_written.c: what is written in the container's mount namespace. */
+struct files_written *files_written_new(void);
+void files_written_free(struct files_written *written);
+/* From now on; *notice if it can not be. */
+void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice);
+/* Whether a file was written since the last time this was asked, and which; inherited
+ * ones in `files` (may be NULL) do not count. */
+bool files_written_since(struct files_written *written, const struct files *files,
+			 char name[FILES_NAME]);
+
+/* ---- what its own files give each other --------------------------------------------- */
 
 enum file_kind {
 	FILE_OTHER,
@@ -149,7 +216,7 @@ struct file {
 	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 	struct file_video video;
-	/* The same open file description in `kin` of files_look(); NULL: not known to be */
+	/* The same open file description in `parent` of files_look(); NULL: not known to be */
 	const struct file *inherited;
 };
 
@@ -163,8 +230,8 @@ struct files {
 	uint32_t areas;
 	/* During a freeze: a table that has just been looked at.  What this one has in common
 	 * with it, as children have with their parents, is not looked at again. */
-	const struct files *kin;
-	pid_t kin_pid;
+	const struct files *parent;
+	pid_t parent_pid;
 	struct scratch *scratch; /* also only then                                 */
 };
 
@@ -285,7 +352,7 @@ int file_make_dead(const struct file *want, pid_t template);
 /* files_restore.c and files_calls.c */
 /* One restore of a table: from `now` to `want`. */
 struct files_work {
-	struct target *target;
+	struct process *process;
 	struct generation *generation;
 	const struct avc_config *config;
 	pid_t init;
@@ -308,7 +375,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err) warn_unused
 int files_work_gather(struct files_work *work, struct avc_error *err) warn_unused;
 int files_work_place(struct files_work *work, struct avc_error *err) warn_unused;
 void files_work_finish(struct files_work *work);
-int files_work_table(const struct files_work *work, struct files_table *table,
+int files_work_table(const struct files_work *work, struct fd_table *table,
 		     struct avc_error *err) warn_unused;
 void files_work_end(struct files_work *work);
 /* A duplicate of what is at this place of the table now. */

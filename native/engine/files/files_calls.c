@@ -128,7 +128,8 @@ static bool has_pidfds(const struct files *files)
 void files_lift_limit(const struct files *want, pid_t pid)
 {
 	if (has_pidfds(want))
-		limit_lift(pid, RLIMIT_NOFILE, (uint64_t)want->file[want->count - 1].fd + 2);
+		process_attrs_lift_limit(pid, RLIMIT_NOFILE,
+					 (uint64_t)want->file[want->count - 1].fd + 2);
 }
 
 /* Of the main process; the others put all of theirs back (process_attrs.c). */
@@ -176,13 +177,13 @@ static void list_area(struct setup *setup, const struct file_area *area)
 
 void files_list_calls(struct files_work *work)
 {
-	struct inj_slot *slot = parasite_slot(&work->target->parasite, work->generation->slot);
+	struct inj_slot *slot = parasite_slot(&work->process->parasite, work->generation->slot);
 	struct setup list, *setup = &list;
 
 	*setup = (struct setup){
-		.parasite = &work->target->parasite,
+		.parasite = &work->process->parasite,
 		.slot = slot,
-		.memory = parasite_files(&work->target->parasite, work->generation->slot),
+		.memory = parasite_files(&work->process->parasite, work->generation->slot),
 		.tail[INJ_DESCRIPTORS] = &slot->setup[INJ_DESCRIPTORS],
 		.tail[INJ_OWNERS] = &slot->setup[INJ_OWNERS],
 	};
@@ -193,7 +194,7 @@ void files_list_calls(struct files_work *work)
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->want->file[i].pid_inside)
 			list_pidfd(setup, &work->want->file[i]);
-	if (!work->target->descendant && has_pidfds(work->want))
+	if (!work->process->descendant && has_pidfds(work->want))
 		list_limit(work, setup);
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
@@ -209,7 +210,7 @@ void files_list_calls(struct files_work *work)
 			list_owner(setup, w);
 	}
 	if (setup->full && !work->problems++)
-		fail(work->notes, AVC_UNSUPPORTED, 0, work->target->inside, "restore descriptors",
+		fail(work->notes, AVC_UNSUPPORTED, 0, work->process->inside, "restore descriptors",
 		     "", "too many descriptors are watched by epoll; some are not any more");
 }
 

@@ -43,9 +43,9 @@ static uint32_t list_held(struct files_held *held, const struct generation *imag
 }
 
 static const struct generation *image_of(const struct generation *generation,
-					 const struct target *target)
+					 const struct process *process)
 {
-	const struct branch *branch = generation_branch(generation, target);
+	const struct branch *branch = generation_branch(generation, process);
 
 	return branch ? branch->image : NULL;
 }
@@ -66,7 +66,7 @@ static void group_closed(struct files_held *held, uint32_t count)
 	}
 }
 
-static pid_t inside_of(const struct target *main, const struct generation *generation, pid_t pid)
+static pid_t inside_of(const struct process *main, const struct generation *generation, pid_t pid)
 {
 	if (pid == main->leader)
 		return main->inside;
@@ -77,7 +77,7 @@ static pid_t inside_of(const struct target *main, const struct generation *gener
 }
 
 /* Pidfds and owners: what the process itself is called is known already (files.c). */
-static void name_others(const struct target *main, const struct generation *generation,
+static void name_others(const struct process *main, const struct generation *generation,
 			struct files *files)
 {
 	for (uint32_t i = 0; files && i < files->count; i++) {
@@ -92,7 +92,7 @@ static void name_others(const struct target *main, const struct generation *gene
 
 /* By the templates, which have the tables as the processes have them.  What a process has
  * put in a place since is found to be shared with nobody. */
-void files_settle_family(const struct target *main, struct generation *generation,
+void files_settle_family(const struct process *main, struct generation *generation,
 			 const struct generation *before)
 {
 	struct files_held *held = NULL;
@@ -108,7 +108,7 @@ void files_settle_family(const struct target *main, struct generation *generatio
 			if (generation->branch[i].image)
 				count += list_held(held ? held + count : NULL,
 						   generation->branch[i].image,
-						   image_of(before, generation->branch[i].target));
+						   image_of(before, generation->branch[i].process));
 		if (!held)
 			held = calloc(count + 1, sizeof *held);
 		if (!held)
@@ -342,8 +342,8 @@ static void put_contents(const struct tables *tables)
 	}
 }
 
-int files_restore(struct target *target, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct files_table *table,
+int files_restore(struct process *process, struct generation *generation,
+		  const struct avc_config *config, pid_t init, struct fd_table *table,
 		  struct avc_error *notes, struct avc_error *err)
 {
 	struct tables tables = { .work = calloc(generation->branches + 1, sizeof *tables.work) };
@@ -355,16 +355,16 @@ int files_restore(struct target *target, struct generation *generation,
 		const struct branch *branch = i < 0 ? NULL : &generation->branch[i];
 		struct generation *image = branch ? branch->image : generation;
 
-		if (branch && !branch->target)
+		if (branch && !branch->process)
 			continue;
 		tables.work[tables.count++] = (struct files_work){
-			.target = branch ? branch->target : target,
+			.process = branch ? branch->process : process,
 			.generation = image,
 			.config = config,
 			.init = init,
 			/* Of one that has ended before, nobody has the table. */
-			.table = branch ? branch->target->holder : generation->template,
-			.table_pidfd = branch ? branch->target->holder_pidfd : generation->pidfd,
+			.table = branch ? branch->process->holder : generation->template,
+			.table_pidfd = branch ? branch->process->holder_pidfd : generation->pidfd,
 			.want = image->files,
 			.notes = notes,
 		};
@@ -387,7 +387,7 @@ int files_restore(struct target *target, struct generation *generation,
 		files_work_finish(&tables.work[i]);
 		if (!i)
 			continue;
-		while (!generation->branch[k].target)
+		while (!generation->branch[k].process)
 			k++;
 		if (files_work_table(&tables.work[i], &table[k++], err))
 			goto out;

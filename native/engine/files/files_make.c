@@ -264,7 +264,7 @@ static int take_from_init(const struct file *want, pid_t init)
 	int pidfd = proc_pidfd_open(init), fd = -1;
 
 	for (int i = 0; pidfd >= 0 && fd < 0 && i < 3; i++) {
-		fd = files_borrow(pidfd, i);
+		fd = proc_borrow_fd(pidfd, i);
 		if (fd >= 0 && (!is_the_one(fd, want) ||
 				(fcntl(fd, F_GETFL) & O_ACCMODE) != (want->flags & O_ACCMODE)))
 			close_fd(&fd);

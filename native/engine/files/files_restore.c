@@ -39,7 +39,7 @@ void files_note(struct files_work *work, const struct file *f, const char *probl
 		const size_t bytes = strlen(f->name);
 		const bool cut = bytes > NAME_SHOWN;
 
-		fail(work->notes, AVC_UNSUPPORTED, 0, work->target->inside, "restore descriptors",
+		fail(work->notes, AVC_UNSUPPORTED, 0, work->process->inside, "restore descriptors",
 		     "", "descriptor %d (%s%s): %s", f->fd, cut ? "..." : "",
 		     f->name + (cut ? bytes - NAME_SHOWN : 0), problem);
 	}
@@ -164,8 +164,8 @@ static void give_up_useless(struct files_work *work)
 			int fd = -1;
 
 			if (work->source[i] >= 0 && doubts[k].concerns(w))
-				fd = files_borrow(work->table_pidfd,
-						  work->now->file[work->source[i]].fd);
+				fd = proc_borrow_fd(work->table_pidfd,
+						    work->now->file[work->source[i]].fd);
 			if (fd >= 0 && doubts[k].is_useless(fd, w))
 				work->source[i] = -1;
 			close_fd(&fd);
@@ -262,7 +262,7 @@ static void share_port(const struct files_work *work, const struct file *w)
 		if (work->now->file[k].kind != FILE_SOCKET)
 			continue;
 		/* The port is at the same place in an IPv6 address. */
-		fd = files_borrow(work->table_pidfd, work->now->file[k].fd);
+		fd = proc_borrow_fd(work->table_pidfd, work->now->file[k].fd);
 		if (fd >= 0 && getsockname(fd, (struct sockaddr *)&address, &bytes) == 0 &&
 		    is->sin_family == wanted->sin_family && is->sin_port == wanted->sin_port)
 			setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
@@ -281,8 +281,8 @@ static void gather(struct files_work *work)
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
 		if (work->source[group] >= 0)
-			work->local[group] = files_borrow(work->table_pidfd,
-							  work->now->file[work->source[group]].fd);
+			work->local[group] = proc_borrow_fd(
+				work->table_pidfd, work->now->file[work->source[group]].fd);
 		if (work->local[group] < 0)
 			work->local[group] = reopen_pipe(work, w);
 		if (work->local[group] < 0)
@@ -323,11 +323,11 @@ static bool is_urgent(const struct files_work *work)
 /* ---- in the table ------------------------------------------------------------------ */
 
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
-static struct files_letter *mail_of(const struct files_work *work)
+static struct fd_letter *mail_of(const struct files_work *work)
 {
-	return (struct files_letter *)(parasite_files(&work->target->parasite,
-						      work->generation->slot) +
-				       INJ_FILES_BYTES / 2);
+	return (struct fd_letter *)(parasite_files(&work->process->parasite,
+						   work->generation->slot) +
+				    INJ_FILES_BYTES / 2);
 }
 
 static struct inj_syscall *list_of(const struct files_work *work)
@@ -335,15 +335,14 @@ static struct inj_syscall *list_of(const struct files_work *work)
 	return (struct inj_syscall *)(mail_of(work) + 1);
 }
 
-#define LISTED_MAX \
-	((INJ_FILES_BYTES / 2 - sizeof(struct files_letter)) / sizeof(struct inj_syscall))
+#define LISTED_MAX ((INJ_FILES_BYTES / 2 - sizeof(struct fd_letter)) / sizeof(struct inj_syscall))
 
 /* Of the task that has the table. */
 static struct inj_call *call_of(const struct files_work *work)
 {
-	return work->target->descendant
-		       ? &work->target->parasite.control->holder
-		       : &parasite_slot(&work->target->parasite, work->generation->slot)
+	return work->process->descendant
+		       ? &work->process->parasite.control->holder
+		       : &parasite_slot(&work->process->parasite, work->generation->slot)
 				  ->template_call;
 }
 
@@ -352,7 +351,7 @@ static void close_list(struct files_work *work)
 {
 	if (work->listed)
 		call_add(call_of(work), INJ_LIST,
-			 parasite_remote(&work->target->parasite, list_of(work)), work->listed, 0,
+			 parasite_remote(&work->process->parasite, list_of(work)), work->listed, 0,
 			 0, 0);
 	work->listed = 0;
 }
@@ -373,16 +372,16 @@ static void note_refused(struct files_work *work, uint32_t count)
 
 static int flush(struct files_work *work, struct avc_error *err)
 {
-	const struct target *target = work->target;
+	const struct process *process = work->process;
 	struct inj_call *call = call_of(work);
 	const uint32_t listed = work->listed;
 	int result = 0;
 
 	close_list(work);
 	if (call->count)
-		result = parasite_send(&target->parasite, work->table,
-				       target->descendant ? &target->holder_base
-							  : &work->generation->base,
+		result = parasite_send(&process->parasite, work->table,
+				       process->descendant ? &process->holder_base
+							   : &work->generation->base,
 				       call, err) ||
 			 parasite_run(work->table, call, err);
 	if (!result)
@@ -440,7 +439,7 @@ static int unlock_all(struct files_work *work, struct avc_error *err)
 	for (uint32_t i = 0; i < work->now->count; i++)
 		if (work->now->file[i].lock_count &&
 		    inject(work, err, SYS_fcntl, (uint64_t)work->now->file[i].fd, F_SETLK,
-			   parasite_remote(&work->target->parasite, all)))
+			   parasite_remote(&work->process->parasite, all)))
 			return -1;
 	return 0;
 }
@@ -502,41 +501,12 @@ static int lowest_free(const struct numbers *numbers, const struct files *avoid)
 	return -1;
 }
 
-int files_send(int socket, int fd)
-{
-	uint8_t byte = 0, control[CMSG_SPACE(sizeof fd)] __attribute__((aligned(8))) = { 0 };
-	struct iovec io = { &byte, 1 };
-	struct msghdr head = { .msg_iov = &io,
-			       .msg_iovlen = 1,
-			       .msg_control = control,
-			       .msg_controllen = sizeof control };
-	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
-
-	c->cmsg_level = SOL_SOCKET;
-	c->cmsg_type = SCM_RIGHTS;
-	c->cmsg_len = CMSG_LEN(sizeof fd);
-	memcpy(CMSG_DATA(c), &fd, sizeof fd);
-	return sendmsg(socket, &head, MSG_DONTWAIT | MSG_NOSIGNAL) == 1 ? 0 : -1;
-}
-
-void files_letter_write(struct files_letter *letter, avc_remote remote)
-{
-	*letter = (struct files_letter){ 0 };
-	letter->io = (struct iovec){ (void *)(remote + offsetof(struct files_letter, byte)), 1 };
-	letter->head = (struct msghdr){
-		.msg_iov = (void *)(remote + offsetof(struct files_letter, io)),
-		.msg_iovlen = 1,
-		.msg_control = (void *)(remote + offsetof(struct files_letter, control)),
-		.msg_controllen = sizeof letter->control,
-	};
-}
-
 static avc_remote lay_out_mail(const struct files_work *work)
 {
-	struct files_letter *letter = mail_of(work);
-	const avc_remote remote = parasite_remote(&work->target->parasite, letter);
+	struct fd_letter *letter = mail_of(work);
+	const avc_remote remote = parasite_remote(&work->process->parasite, letter);
 
-	files_letter_write(letter, remote);
+	fd_letter_write(letter, remote);
 	return remote;
 }
 
@@ -554,7 +524,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		to = lowest_free(numbers, NULL);
-		if (files_send(ours, from)) {
+		if (fd_send(ours, from)) {
 			files_note(work, w, "it could not be handed over");
 			continue;
 		}
@@ -577,7 +547,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 static int put_lost(struct files_work *work, struct avc_error *err)
 {
 	struct rlimit limit = { RLIM_INFINITY, RLIM_INFINITY };
-	const struct parasite *parasite = &work->target->parasite;
+	const struct parasite *parasite = &work->process->parasite;
 	struct inj_call *call = call_of(work);
 	struct numbers numbers = { .room = 16 };
 	int32_t ends[2];
@@ -602,7 +572,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	 * allowed once. */
 	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
 	    limit.rlim_cur < (rlim_t)numbers.room)
-		limit_lift(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
+		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
 		 parasite_remote(parasite, call->out), 0);
 	if (flush(work, err))
@@ -610,13 +580,13 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	memcpy(ends, call->out, sizeof ends);
 	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers.room || ends[1] < 0 ||
 	    ends[1] >= numbers.room) {
-		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->target->inside,
+		fail(err, AVC_KERNEL, (int)-call->call[0].result, work->process->inside,
 		     "restore descriptors", "socketpair", "descriptors could not be handed over");
 		goto out;
 	}
 	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
 	theirs = lowest_free(&numbers, work->want);
-	ours = files_borrow(work->generation->pidfd, ends[1]);
+	ours = proc_borrow_fd(work->generation->pidfd, ends[1]);
 	if (ours < 0) {
 		fail_errno(err, work->generation->template, "restore descriptors", "pidfd_getfd",
 			   "descriptors could not be handed over");
@@ -655,7 +625,7 @@ int files_borrow_placed(const struct files_work *work, const struct file *w)
 	const int local = work->local[files_leader(work->want, w)];
 
 	return local >= 0 ? fcntl(local, F_DUPFD_CLOEXEC, 0)
-			  : files_borrow(work->table_pidfd, w->fd);
+			  : proc_borrow_fd(work->table_pidfd, w->fd);
 }
 
 static void put_states(struct files_work *work)
@@ -709,7 +679,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	if (!work->now || !work->local || !work->source || !work->lost)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	/* The app died while it was cloning (guard_checkpoint.c, abandon()). */
-	if (work->table && work->target->descendant && work->target->doubtful &&
+	if (work->table && work->process->descendant && work->process->doubtful &&
 	    tracee_halt(work->table, err))
 		return -1;
 	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
@@ -767,7 +737,7 @@ int files_work_gather(struct files_work *work, struct avc_error *err)
 	call_begin(call_of(work), INJ_AFTER_PARK);
 	if (forget_watches(work, err) || close_new(work, err))
 		return -1;
-	if (work->target->descendant)
+	if (work->process->descendant)
 		return gather_anew(work, err);
 	/* What is left on the list is made just before the fork (restore.c). */
 	return set_cloexec(work, err) || (is_urgent(work) && flush(work, err)) ? -1 : 0;
@@ -776,7 +746,7 @@ int files_work_gather(struct files_work *work, struct avc_error *err)
 int files_work_place(struct files_work *work, struct avc_error *err)
 {
 	make_lost(work);
-	if (!work->target->descendant && put_lost(work, err))
+	if (!work->process->descendant && put_lost(work, err))
 		return -1;
 	put_states(work);
 	return 0;
@@ -804,12 +774,11 @@ void files_work_finish(struct files_work *work)
 	files_connect_again(work);
 	remember_made(work);
 	files_list_calls(work);
-	if (!work->target->descendant)
+	if (!work->process->descendant)
 		close_list(work);
 }
 
-int files_work_table(const struct files_work *work, struct files_table *table,
-		     struct avc_error *err)
+int files_work_table(const struct files_work *work, struct fd_table *table, struct avc_error *err)
 {
 	table->entry = calloc(work->want->count + 1, sizeof *table->entry);
 	if (!table->entry)
@@ -825,12 +794,4 @@ int files_work_table(const struct files_work *work, struct files_table *table,
 		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
 	}
 	return 0;
-}
-
-void files_table_free(struct files_table *table)
-{
-	for (uint32_t i = 0; i < table->count; i++)
-		close_fd(&table->entry[i].ours);
-	free(table->entry);
-	*table = (struct files_table){ 0 };
 }

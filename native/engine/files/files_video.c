@@ -216,9 +216,9 @@ void files_find_areas(struct files *files, pid_t pid)
 
 /* Something else is mapped in their place: nothing must come to be there, and where a camera is
  * lost for good, old pictures are black instead of deadly. */
-void files_unmap_areas(struct target *target, const struct generation *generation)
+void files_unmap_areas(struct process *process, const struct generation *generation)
 {
-	struct inj_call *call = &parasite_slot(&target->parasite, generation->slot)->template_call;
+	struct inj_call *call = &parasite_slot(&process->parasite, generation->slot)->template_call;
 	const struct files *files = generation->files;
 	struct avc_error ignored = { 0 };
 
@@ -228,7 +228,7 @@ void files_unmap_areas(struct target *target, const struct generation *generatio
 			call_add(call, SYS_mmap, files->area[i].start, files->area[i].bytes,
 				 (uint64_t)files->area[i].protection,
 				 MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED | MAP_NORESERVE, ~0u);
-		if (parasite_send(&target->parasite, generation->template, &generation->base, call,
+		if (parasite_send(&process->parasite, generation->template, &generation->base, call,
 				  &ignored) ||
 		    parasite_run(generation->template, call, &ignored))
 			return; /* it was killed, or they are mapped for some time more */

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The guard: one thread per container that waits, decides and reports.  It makes
- * every ptrace call for its container, so that it may.
+ * The guard: one process per container, whose main thread waits, decides and reports.
+ * That thread makes every ptrace call: a process can only be traced by one.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -9,8 +9,9 @@
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/eventfd.h>
-#include <sys/prctl.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "guard.h"
@@ -20,43 +21,64 @@
 #define LOOK_OFTEN_NS (5 * NS_PER_S)
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
+#define LAST_WORDS_MS 1000
+#define GUARD_UNTOLD 3 /* exit status: nobody of our build has told it what to do      */
 
 /* ---- telling ---------------------------------------------------------------- */
 
-struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind kind)
+struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind kind)
 {
 	return (struct avc_event){
 		.kind = kind,
 		.cookie = guard->cookie,
 		.at_ns = now_ns(),
-		.app_pid = guard->target.leader,
-		.app_pid_inside = guard->target.inside,
+		.app_pid = guard->main.leader,
+		.app_pid_inside = guard->main.inside,
 		.generations = guard->count,
 		.restores = guard->restores,
 	};
 }
 
-void emit(struct avc_guard *guard, const struct avc_event *event)
+/* A daemon that does not listen must not hold the guard up: what it has no room for stays
+ * here, and of more than that the oldest are lost. */
+static void send_outbox(struct avc_guard *guard)
 {
-	engine_emit(guard->engine, event);
+	uint32_t sent = 0;
+
+	while (sent < guard->outbox_count &&
+	       (send(guard->socket, &guard->outbox[sent], sizeof guard->outbox[sent],
+		     MSG_DONTWAIT | MSG_NOSIGNAL) >= 0 ||
+		(errno != EAGAIN && errno != ENOBUFS)))
+		sent++;
+	guard->outbox_count -= sent;
+	memmove(guard->outbox, guard->outbox + sent, guard->outbox_count * sizeof *guard->outbox);
 }
 
-void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
-		const struct avc_error *error)
+void guard_emit(struct avc_guard *guard, const struct avc_event *event)
 {
-	struct avc_event event = event_new(guard, kind);
+	if (guard->outbox_count == OUTBOX_MAX)
+		memmove(guard->outbox, guard->outbox + 1,
+			--guard->outbox_count * sizeof *guard->outbox);
+	guard->outbox[guard->outbox_count++] = *event;
+	send_outbox(guard);
+}
+
+void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
+		      const struct avc_error *error)
+{
+	struct avc_event event = guard_event(guard, kind);
 
 	event.ticket = ticket;
 	event.error = *error;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 }
 
-void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
+void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why)
 {
 	struct avc_error error = { 0 };
 
-	fail(&error, code, 0, guard->target.pid, "command", "", "%s", why);
-	emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+	fail(&error, code, 0, guard->main.pid, "command", "", "%s", why);
+	guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 }
 
 /* ---- commands -------------------------------------------------------------------- */
@@ -65,11 +87,11 @@ static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
 {
 	if (!guard->count) {
 		guard->room = 0;
-		refuse(guard, ticket, AVC_EMPTY, "no generation is held");
+		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held");
 		return;
 	}
 	guard->room = guard->count - 1;
-	lose_generation(guard, dispensable(guard, false), AVC_REASON_MEMORY, ticket);
+	guard_lose_generation(guard, guard_dispensable(guard, false), AVC_REASON_MEMORY, ticket);
 }
 
 static void refill(struct avc_guard *guard)
@@ -104,56 +126,45 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 {
 	struct avc_error error = { 0 };
 
-	if (!guard->count || !guard->target.pid) {
-		refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
+	if (!guard->count || !guard->main.pid) {
+		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
 		return;
 	}
 	if (init_channel_stop_asked(&guard->channel)) {
-		refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
-	    check_strict(guard, &guard->generations[guard->count - 1], guard->target.pid,
-			 guard->target.pidfd, &error)) {
-		emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
+	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
+			       guard->main.pidfd, &error)) {
+		guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	/* init reports the death; the rest is as after any other. */
-	target_kill(&guard->target);
+	process_kill(&guard->main);
 }
 
-static bool take_command(struct avc_guard *guard, struct command *command)
+static void obey(struct avc_guard *guard, enum avc_command command, uint64_t ticket)
 {
-	bool found = false;
-
-	pthread_mutex_lock(&guard->lock);
-	if (guard->command_count) {
-		*command = guard->commands[0];
-		memmove(guard->commands, guard->commands + 1,
-			--guard->command_count * sizeof *guard->commands);
-		found = true;
+	if (!guard->attached) {
+		guard_refuse(guard, ticket, AVC_EMPTY, "avckpt-init has not started yet");
+		return;
 	}
-	pthread_mutex_unlock(&guard->lock);
-	return found;
-}
-
-static void obey(struct avc_guard *guard, const struct command *command)
-{
-	switch (command->command) {
+	switch (command) {
 	case AVC_COMMAND_CHECKPOINT:
-		checkpoint(guard, command->ticket);
+		guard_checkpoint(guard, ticket);
 		break;
 	case AVC_COMMAND_RESTORE:
-		roll_back(guard, command->ticket, AVC_REASON_COMMAND);
+		roll_back(guard, ticket, AVC_REASON_COMMAND);
 		break;
 	case AVC_COMMAND_UNHEALTHY:
-		roll_back(guard, command->ticket, AVC_REASON_UNHEALTHY);
+		roll_back(guard, ticket, AVC_REASON_UNHEALTHY);
 		break;
 	case AVC_COMMAND_DROP_OLDEST:
-		drop_oldest(guard, command->ticket);
+		drop_oldest(guard, ticket);
 		break;
 	case AVC_COMMAND_REFILL:
 		refill(guard);
@@ -167,32 +178,36 @@ static void obey(struct avc_guard *guard, const struct command *command)
 	}
 }
 
+/* ---- the daemon ------------------------------------------------------------------- */
+
+/* 1: there is one; 0: none now; -1: there will be no more. */
+static int next_request(struct avc_guard *guard, struct avc_request *request)
+{
+	const ssize_t n = recv(guard->socket, request, sizeof *request, MSG_DONTWAIT);
+
+	if (n < 0)
+		return errno == EAGAIN || errno == EINTR ? 0 : -1;
+	return n == sizeof *request && request->magic == AVC_GUARD_MAGIC ? 1 : -1;
+}
+
 static void carry_out(struct avc_guard *guard)
 {
-	struct command command;
-	eventfd_t ignored;
+	struct avc_request request;
+	struct avc_error error = { 0 };
+	int found;
 
-	(void)eventfd_read(guard->wake_fd, &ignored);
-	take_config(guard);
-	while (take_command(guard, &command)) {
-		if (!guard->attached)
-			refuse(guard, command.ticket, AVC_EMPTY, "avckpt-init has not started yet");
-		else
-			obey(guard, &command);
+	send_outbox(guard);
+	while ((found = next_request(guard, &request)) > 0) {
+		if (request.kind == AVC_REQUEST_COMMAND)
+			obey(guard, request.command, request.ticket);
+		else if (request.kind == AVC_REQUEST_CONFIGURE &&
+			 !config_check(&request.config, &error))
+			guard_take_config(guard, &request.config);
 	}
+	guard->stop = found < 0;
 }
 
-/* ---- the thread --------------------------------------------------------------------- */
-
-static bool must_stop(struct avc_guard *guard)
-{
-	bool stop;
-
-	pthread_mutex_lock(&guard->lock);
-	stop = guard->stop;
-	pthread_mutex_unlock(&guard->lock);
-	return stop;
-}
+/* ---- the cycle -------------------------------------------------------------------- */
 
 /* Until init has set itself up: the hook runs before the container does. */
 static void attach(struct avc_guard *guard)
@@ -202,21 +217,21 @@ static void attach(struct avc_guard *guard)
 
 	switch (init_channel_open(&guard->channel, &error)) {
 	case 1:
-		if (find_app(guard, &error)) {
+		if (guard_find_app(guard, &error)) {
 			init_channel_close(&guard->channel);
 			break;
 		}
 		guard->attached = true;
 		guard->unprotected = false;
-		guard->next_ns = interval_end(guard);
+		guard->next_ns = guard_interval_end(guard);
 		{
-			const struct avc_event event = event_new(guard, AVC_EVENT_ATTACHED);
+			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);
 
-			emit(guard, &event);
+			guard_emit(guard, &event);
 		}
 		return;
 	case -1:
-		unprotect(guard, 0, &error);
+		guard_unprotect(guard, 0, &error);
 	}
 	guard->next_ns = now +
 			 (now - guard->started_ns < LOOK_OFTEN_NS ? LOOK_AGAIN_NS : LOOK_SELDOM_NS);
@@ -235,21 +250,21 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 	guard->fds[(*n)++] = (struct pollfd){ .fd = fd, .events = POLLIN };
 }
 
-uint32_t all_stragglers(struct avc_guard *guard)
+uint32_t guard_tend_stragglers(struct avc_guard *guard)
 {
-	uint32_t left = stragglers(&guard->target);
+	uint32_t left = threads_tend_stragglers(&guard->main);
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		left += stragglers(guard->tree.member[i]);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		left += threads_tend_stragglers(guard->tree.process[i]);
 	return left;
 }
 
 static bool any_lost(const struct avc_guard *guard)
 {
-	bool lost = guard->target.lost;
+	bool lost = guard->main.lost;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		lost |= guard->tree.member[i]->lost;
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		lost |= guard->tree.process[i]->lost;
 	return lost;
 }
 
@@ -259,12 +274,12 @@ static uint64_t end_waits(struct avc_guard *guard)
 {
 	uint64_t due;
 
-	waits_end(&guard->target, guard->timer);
-	due = guard->target.due_ns;
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		waits_end(guard->tree.member[i], guard->timer);
-		if (guard->tree.member[i]->due_ns < due)
-			due = guard->tree.member[i]->due_ns;
+	waits_end(&guard->main, guard->timer);
+	due = guard->main.due_ns;
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		waits_end(guard->tree.process[i], guard->timer);
+		if (guard->tree.process[i]->due_ns < due)
+			due = guard->tree.process[i]->due_ns;
 	}
 	return due;
 }
@@ -273,7 +288,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	const uint64_t waits_ns = end_waits(guard);
 	const uint64_t now = now_ns();
-	const uint64_t check_ns = exec_check_due(guard);
+	const uint64_t check_ns = guard_exec_check_due(guard);
 	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
 							     : tracee_ending_due();
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
@@ -283,13 +298,15 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	struct timespec timeout;
 	nfds_t n = 0;
 
-	watch(guard, &n, guard->wake_fd);
+	watch(guard, &n, guard->socket);
+	if (n && guard->outbox_count)
+		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
-	watch(guard, &n, guard->target.holder_pidfd);
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		watch(guard, &n, guard->tree.member[i]->pidfd);
-		watch(guard, &n, guard->tree.member[i]->holder_pidfd);
+	watch(guard, &n, guard->main.holder_pidfd);
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		watch(guard, &n, guard->tree.process[i]->pidfd);
+		watch(guard, &n, guard->tree.process[i]->holder_pidfd);
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		watch(guard, &n, guard->generations[i].pidfd);
@@ -307,9 +324,11 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 
 		ns = ns < slice ? ns : slice;
 	}
+	ns = ns < AVC_HEARTBEAT_NS ? ns : AVC_HEARTBEAT_NS;
 	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
 				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(guard->fds, n, due == UINT64_MAX && !straggling ? NULL : &timeout, NULL);
+	(void)ppoll(guard->fds, n, &timeout, NULL);
+	heartbeat();
 }
 
 /* Nobody is to believe that there are checkpoints when there are none. */
@@ -322,9 +341,9 @@ static void tell_straggling(struct avc_guard *guard)
 	if (now - guard->told_stragglers_ns < NS_PER_S)
 		return;
 	guard->told_stragglers_ns = now;
-	fail(&error, AVC_DEADLINE, 0, guard->target.pid, "stop", "",
+	fail(&error, AVC_DEADLINE, 0, guard->main.pid, "stop", "",
 	     "a thread that was to stop has not done so for a second");
-	emit_error(guard, AVC_EVENT_MISSED, 0, &error);
+	guard_emit_error(guard, AVC_EVENT_MISSED, 0, &error);
 }
 
 static void let_go(struct avc_guard *guard)
@@ -333,35 +352,34 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
-	drop_all(guard);
-	unhold(&guard->target);
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		unhold(guard->tree.member[i]);
-	/* The end of this thread detaches what is left. */
+	last_pid_forget();
+	guard_drop_all(guard);
+	process_unhold(&guard->main);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		process_unhold(guard->tree.process[i]);
+	/* The end of this process detaches what is left. */
 	tracee_end_now();
-	while (((guard->target.threads && all_stragglers(guard)) || tracee_reap_ending()) &&
+	while (((guard->main.threads && guard_tend_stragglers(guard)) || tracee_reap_ending()) &&
 	       now_ns() < end)
 		usleep(200);
 	tree_free(&guard->tree);
-	target_close(&guard->target);
-	parasite_close(&guard->target.parasite);
+	process_close(&guard->main);
+	parasite_close(&guard->main.parasite);
 	init_channel_close(&guard->channel);
 	close_fd(&guard->channel.init_pidfd);
 }
 
-static void *guard_main(void *arg)
+static void guard_main(struct avc_guard *guard)
 {
-	struct avc_guard *guard = arg;
 	struct avc_error error = { 0 };
 	bool ended = false;
 
-	prctl(PR_SET_NAME, "avckpt-guard");
 	if (tracee_timer_new(&guard->timer, &error)) {
-		emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 		ended = true;
 	}
-	while (!ended && !must_stop(guard)) {
-		const uint32_t straggling = all_stragglers(guard);
+	while (!ended && !guard->stop) {
+		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
@@ -370,135 +388,139 @@ static void *guard_main(void *arg)
 		if (!straggling)
 			guard->told_stragglers_ns = now_ns(); /* there are none */
 		if (any_lost(guard))
-			kill_lost(guard);
+			guard_kill_lost(guard);
 		if (dying)
-			reap_unknown(guard);
+			guard_reap_unknown(guard);
 		wait_for_news(guard, straggling || dying);
 		if (guard->attached && init_channel_report(&guard->channel, &report)) {
-			died(guard, &report);
+			guard_app_died(guard, &report);
 			continue;
 		}
-		reap_dead(guard);
-		tend_tree(guard);
+		guard_reap_dead(guard);
+		guard_tend_tree(guard);
 		if (pidfd_ended(guard->channel.init_pidfd)) {
 			ended = true;
 			break;
 		}
 		carry_out(guard);
 		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
-			work_ahead(guard);
+			guard_work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;
 		if (!guard->attached)
 			attach(guard);
-		else if (all_stragglers(guard))
+		else if (guard_tend_stragglers(guard))
 			tell_straggling(guard);
 		else
-			checkpoint(guard, 0);
+			guard_checkpoint(guard, 0);
 	}
 	let_go(guard);
 	timer_delete(guard->timer);
-	pthread_mutex_lock(&guard->lock);
-	guard->ended = true;
-	pthread_mutex_unlock(&guard->lock);
 	if (ended) {
-		const struct avc_event event = event_new(guard, AVC_EVENT_ENDED);
+		const struct avc_event event = guard_event(guard, AVC_EVENT_ENDED);
 
-		emit(guard, &event);
+		guard_emit(guard, &event);
 	}
-	return NULL;
 }
 
-/* ---- the interface ---------------------------------------------------------------------- */
+/* ---- its beginning and end --------------------------------------------------------- */
 
-struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
-				  uint64_t cookie, struct avc_error *err)
+/* The first message; *init_pidfd and *heartbeat_fd come with it. */
+static int receive_start(int socket, struct avc_request *request, int *init_pidfd,
+			 int *heartbeat_fd)
 {
-	struct avc_guard *guard = NULL;
-	int result;
+	union {
+		char bytes[CMSG_SPACE(2 * sizeof(int))];
+		struct cmsghdr align;
+	} control;
+	struct iovec data = { request, sizeof *request };
+	struct msghdr message = { .msg_iov = &data,
+				  .msg_iovlen = 1,
+				  .msg_control = &control,
+				  .msg_controllen = sizeof control };
+	struct cmsghdr *header;
+	int fds[2];
 
-	*err = (struct avc_error){ 0 };
-	if (config_check(config, err))
+	if (recvmsg(socket, &message, MSG_CMSG_CLOEXEC) != sizeof *request)
+		return -1;
+	header = CMSG_FIRSTHDR(&message);
+	if (request->magic != AVC_GUARD_MAGIC || request->kind != AVC_REQUEST_START || !header ||
+	    header->cmsg_type != SCM_RIGHTS || header->cmsg_len != CMSG_LEN(sizeof fds))
+		return -1;
+	memcpy(fds, CMSG_DATA(header), sizeof fds);
+	*init_pidfd = fds[0];
+	*heartbeat_fd = fds[1];
+	return 0;
+}
+
+static struct avc_guard *guard_new(int socket, const struct avc_request *start, int init_pidfd)
+{
+	struct avc_guard *guard = calloc(1, sizeof *guard);
+
+	if (!guard)
 		return NULL;
-	guard = calloc(1, sizeof *guard);
-	if (!guard) {
-		fail_errno(err, 0, "start guard", "calloc", "out of memory");
-		return NULL;
-	}
-	guard->engine = engine;
-	guard->cookie = cookie;
-	guard->room = config->keep;
+	guard->socket = socket;
+	guard->cookie = start->cookie;
+	guard->room = start->config.keep;
 	guard->started_ns = now_ns();
-	pthread_mutex_init(&guard->lock, NULL);
 	init_channel_init(&guard->channel);
-	target_init(&guard->target);
+	process_init(&guard->main);
 	guard->tree = (struct tree){
-		.main = &guard->target,
-		.slots = config->keep + 1,
-		.kin = calloc(PROCESSES_MAX, sizeof *guard->tree.kin),
-		.member = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.member),
-		.is_ours = is_ours,
+		.main = &guard->main,
+		.slots = start->config.keep + 1,
+		.entry = calloc(PROCESSES_MAX, sizeof *guard->tree.entry),
+		.process = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.process),
+		.is_ours = guard_owns,
 		.arg = guard,
 	};
-	config_set(guard, config);
-	guard->channel.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 3);
-	guard->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-	if (!target_make_room(&guard->target) || !guard->tree.kin || !guard->tree.member ||
-	    guard->channel.init_pidfd < 0 || guard->wake_fd < 0) {
-		fail_errno(err, 0, "start guard", "eventfd", "out of memory or descriptors");
-		goto failed;
-	}
-	result = pthread_create(&guard->thread, NULL, guard_main, guard);
-	if (result) {
-		errno = result;
-		fail_errno(err, 0, "start guard", "pthread_create", "no thread");
-		goto failed;
-	}
+	guard_set_config(guard, &start->config);
+	guard->channel.init_pidfd = init_pidfd;
 	return guard;
-failed:
-	close_fd(&guard->channel.init_pidfd);
-	close_fd(&guard->wake_fd);
-	target_free_room(&guard->target);
-	tree_free(&guard->tree);
-	free(guard->fds);
-	free(guard);
-	return NULL;
 }
 
-int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
-		      struct avc_error *err)
+static void guard_free(struct avc_guard *guard)
 {
-	int result = 0;
-
-	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNVOUCH)
-		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
-	pthread_mutex_lock(&guard->lock);
-	if (guard->ended)
-		result = fail(err, AVC_GONE, ESRCH, 0, "command", "", "the container has ended");
-	else if (guard->command_count == COMMANDS_MAX)
-		result = fail(err, AVC_BUSY, EAGAIN, 0, "command", "",
-			      "too many commands are waiting");
-	else
-		guard->commands[guard->command_count++] = (struct command){ command, ticket };
-	pthread_mutex_unlock(&guard->lock);
-	if (!result)
-		eventfd_write(guard->wake_fd, 1);
-	return result;
-}
-
-void avc_guard_stop(struct avc_guard *guard)
-{
-	pthread_mutex_lock(&guard->lock);
-	guard->stop = true;
-	pthread_mutex_unlock(&guard->lock);
-	eventfd_write(guard->wake_fd, 1);
-	pthread_join(guard->thread, NULL);
 	files_written_free(guard->written);
-	close_fd(&guard->wake_fd);
-	pthread_mutex_destroy(&guard->lock);
-	target_free_room(&guard->target);
+	process_free_room(&guard->main);
 	tree_free(&guard->tree);
+	mem_others_free(guard->main.others);
 	free(guard->fds);
 	free(guard);
+}
+
+/* What is left to be told, as far as somebody listens. */
+static void send_last_words(struct avc_guard *guard)
+{
+	struct pollfd daemon = { .fd = guard->socket, .events = POLLOUT };
+
+	send_outbox(guard);
+	while (guard->outbox_count && poll(&daemon, 1, LAST_WORDS_MS) == 1 &&
+	       !(daemon.revents & (POLLERR | POLLHUP)))
+		send_outbox(guard);
+}
+
+int guard_run(int socket)
+{
+	struct avc_request start;
+	struct avc_error error = { 0 };
+	struct avc_guard *guard;
+	int init_pidfd, heartbeat_fd;
+
+	if (receive_start(socket, &start, &init_pidfd, &heartbeat_fd) ||
+	    config_check(&start.config, &error) || heartbeat_open(heartbeat_fd))
+		return GUARD_UNTOLD;
+	guard = guard_new(socket, &start, init_pidfd);
+	if (!guard)
+		return GUARD_UNTOLD;
+	guard->main.others = mem_others_new();
+	if (!process_make_room(&guard->main) || !guard->main.others || !guard->tree.entry ||
+	    !guard->tree.process) {
+		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
+	} else {
+		guard_main(guard);
+	}
+	send_last_words(guard);
+	guard_free(guard);
+	return 0;
 }

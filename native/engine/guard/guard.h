@@ -1,9 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The guard's own state, and what its files give each other.  Only the guard's
- * thread runs any of it.
+ * The guard's own state, and what its files give each other.
  *
- *   guard.c             waits, obeys, tells; the public interface
+ *   guard.c             waits, obeys, tells
  *   guard_configure.c   what it is told to do
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
@@ -14,48 +13,37 @@
 
 #include <poll.h>
 
-#include "internal.h"
+#include "avckpt/guard.h"
+#include "restore.h"
 
-#define COMMANDS_MAX 64
-#define RESTORES_MAX 64
+#define OUTBOX_MAX 64 /* events that the daemon has not taken yet                */
 #define DYING_NS NS_PER_S
 #define AHEAD_AFTER_NS (20 * NS_PER_MS) /* the app has been held up, and goes first          */
 
-struct command {
-	enum avc_command command;
-	uint64_t ticket;
-};
-
 struct avc_guard {
-	struct avc_engine *engine;
 	struct avc_config config;
 	uint64_t cookie;
-	pthread_t thread;
-	int wake_fd;
-	/* Shared with callers, under the lock. */
-	pthread_mutex_t lock;
-	struct command commands[COMMANDS_MAX];
-	uint32_t command_count;
-	struct avc_config next_config; /* to be taken over, if one waits         */
-	bool config_waiting;
-	bool stop, ended;
-	/* The thread's own. */
+	int socket; /* to the daemon (avckpt/guard.h)                   */
+	bool stop;  /* the daemon wants it to, or is gone               */
+	struct avc_event outbox[OUTBOX_MAX];
+	uint32_t outbox_count;
 	timer_t timer;
 	struct init_channel channel;
 	bool attached, unprotected;
-	struct target target; /* the app's main process                         */
-	struct tree tree;     /* and the others                                 */
-	struct pollfd *fds;   /* room for wait_for_news()                       */
+	struct process main; /* the app's main process                         */
+	struct tree tree;    /* and the others                                 */
+	struct pollfd *fds;  /* room for wait_for_news()                       */
 	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
 	uint32_t count;
 	uint64_t number; /* of the last generation taken             */
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
-	uint64_t dying_until_ns; /* when it was found dying, some time more: see reap_unknown() */
-	uint32_t misses;         /* in a row, of one that is unsupported     */
-	bool cramped;            /* there is no room for spares              */
-	uint64_t ahead_ns;       /* when to work_ahead(); UINT64_MAX: never  */
-	uint32_t room;           /* generations that may be held now         */
+	uint64_t
+		dying_until_ns; /* when it was found dying, some time more: see guard_reap_unknown() */
+	uint32_t misses;        /* in a row, of one that is unsupported     */
+	bool cramped;           /* there is no room for spares              */
+	uint64_t ahead_ns;      /* when to guard_work_ahead(); UINT64_MAX: never  */
+	uint32_t room;          /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
 	/* Of the process that runs now. */
@@ -71,69 +59,81 @@ struct avc_guard {
 
 /* ---- guard.c: what is told ------------------------------------------------- */
 
-struct avc_event event_new(const struct avc_guard *guard, enum avc_event_kind kind);
-void emit(struct avc_guard *guard, const struct avc_event *event);
-void emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
-		const struct avc_error *error);
-void refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
+struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind kind);
+void guard_emit(struct avc_guard *guard, const struct avc_event *event);
+void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
+		      const struct avc_error *error);
+void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
 
 /* Looks after the threads that are on their way back; how many are left. */
-uint32_t all_stragglers(struct avc_guard *guard);
+uint32_t guard_tend_stragglers(struct avc_guard *guard);
 
 /* ---- guard_configure.c ----------------------------------------------------- */
 
-int config_check(const struct avc_config *config, struct avc_error *err);
 /* When the next checkpoint is due, an interval from now; UINT64_MAX: on command only. */
-uint64_t interval_end(const struct avc_guard *guard);
-void config_set(struct avc_guard *guard, const struct avc_config *config);
-void take_config(struct avc_guard *guard);
+uint64_t guard_interval_end(const struct avc_guard *guard);
+void guard_set_config(struct avc_guard *guard, const struct avc_config *config);
+/* What is held stays, unless there are more than are wanted now. */
+void guard_take_config(struct avc_guard *guard, const struct avc_config *config);
 
 /* ---- guard_generations.c --------------------------------------------------- */
 
-void drop_generation(struct avc_guard *guard, uint32_t i);
-void drop_all(struct avc_guard *guard);
-uint32_t free_slot(const struct avc_guard *guard);
-void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason, uint64_t ticket);
+void guard_drop_generation(struct avc_guard *guard, uint32_t i);
+void guard_drop_all(struct avc_guard *guard);
+uint32_t guard_free_slot(const struct avc_guard *guard);
+void guard_lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason,
+			   uint64_t ticket);
 /* A template or holder; with the app's own processes. */
-bool is_ours(pid_t pid, const void *guard);
-bool is_known_process(pid_t pid, const void *guard);
+bool guard_owns(pid_t pid, const void *guard);
+bool guard_knows_process(pid_t pid, const void *guard);
 /* Gives up a process that is gone.  What it had open must not stay open by us: somebody may
  * be reading a pipe to its end. */
-void release(struct avc_guard *guard, struct target *target);
+void guard_release(struct avc_guard *guard, struct process *process);
 /* Processes of the app that have ended, or are another program now. */
-void let_ended_go(struct avc_guard *guard);
-void tend_tree(struct avc_guard *guard);
+void guard_let_ended_go(struct avc_guard *guard);
+void guard_tend_tree(struct avc_guard *guard);
 /* Gives up what was brought into processes that have executed another program since;
  * `all`: whether or not it is time to look.  When it is: CLOCK_MONOTONIC, UINT64_MAX: never. */
-void let_executed_go(struct avc_guard *guard, bool all);
-uint64_t exec_check_due(const struct avc_guard *guard);
+void guard_let_executed_go(struct avc_guard *guard, bool all);
+uint64_t guard_exec_check_due(const struct avc_guard *guard);
 /* Tracees of ours that nobody knows of. */
-void kill_lost(struct avc_guard *guard);
-void await_spares(struct avc_guard *guard);
+void guard_kill_lost(struct avc_guard *guard);
+void guard_await_spares(struct avc_guard *guard);
 /* Those that are just ending, for 50 ms at most. */
-void wait_ended(void);
-void reap_dead(struct avc_guard *guard);
-void reap_unknown(const struct avc_guard *guard);
-uint32_t dispensable(const struct avc_guard *guard, bool probation);
-void keep_generation(struct avc_guard *guard, struct generation *fresh);
-void count_crash(struct avc_guard *guard, bool hung);
-void drop_unhealthy(struct avc_guard *guard);
-void choose(struct avc_guard *guard, bool used_up);
-void note_written(struct avc_guard *guard);
-int check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid, int pidfd,
-		 struct avc_error *err) warn_unused;
+void guard_wait_ended(void);
+void guard_reap_dead(struct avc_guard *guard);
+void guard_reap_unknown(const struct avc_guard *guard);
+uint32_t guard_dispensable(const struct avc_guard *guard, bool probation);
+void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
+void guard_count_crash(struct avc_guard *guard, bool hung);
+void guard_drop_unhealthy(struct avc_guard *guard);
+void guard_choose_generation(struct avc_guard *guard, bool used_up);
+void guard_note_written(struct avc_guard *guard);
+int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
+		       int pidfd, struct avc_error *err) warn_unused;
 
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 
-void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
-int find_app(struct avc_guard *guard, struct avc_error *err);
-void checkpoint(struct avc_guard *guard, uint64_t ticket);
+void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
+int guard_find_app(struct avc_guard *guard, struct avc_error *err);
+void guard_checkpoint(struct avc_guard *guard, uint64_t ticket);
 /* Of what a restore from the newest generation can be spared, some; when nobody is just ending,
  * which takes a CPU as well. */
-void work_ahead(struct avc_guard *guard);
+void guard_work_ahead(struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 
-void died(struct avc_guard *guard, const struct avc_report *report);
+void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
+
+/* ---- guard.c ---------------------------------------------------------------- */
+
+/* One guard, from its AVC_REQUEST_START on `socket` to its end.  Returns the exit status:
+ * 0, unless it could not start. */
+int guard_run(int socket);
+
+/* ---- probe.c ---------------------------------------------------------------- */
+
+/* Can this machine and this process do it?  Touches no process but a child of its own. */
+int guard_probe(struct avc_error *err);
 
 #endif

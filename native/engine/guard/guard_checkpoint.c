@@ -20,32 +20,32 @@
 /* ---- checkpoint --------------------------------------------------------------- */
 
 /* The app as it can not be protected: says so once, and gives everything up. */
-void unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
+void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
 {
-	drop_all(guard);
-	unhold(&guard->target);
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		unhold(guard->tree.member[i]);
+	guard_drop_all(guard);
+	process_unhold(&guard->main);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		process_unhold(guard->tree.process[i]);
 	if (!guard->unprotected || ticket)
-		emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
+		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, ticket, error);
 	guard->unprotected = true;
 }
 
-int find_app(struct avc_guard *guard, struct avc_error *err)
+int guard_find_app(struct avc_guard *guard, struct avc_error *err)
 {
 	struct proc_status init;
 	pid_t app;
 
-	if (guard->target.pid)
+	if (guard->main.pid)
 		return 0;
 	app = init_channel_app(&guard->channel);
 	if (!app || !init_channel_app_started(&guard->channel, app))
 		return fail(err, AVC_DEADLINE, 0, 0, "attach", "",
 			    "the application has not been started yet");
-	guard->target.init = guard->channel.init;
+	guard->main.init = guard->channel.init;
 	if (proc_status(guard->channel.init, &init) == 0)
-		guard->target.plain_filters = init.seccomp_filters;
-	return target_open(&guard->target, app, proc_inside(app), err);
+		guard->main.plain_filters = init.seccomp_filters;
+	return process_open(&guard->main, app, proc_inside(app), err);
 }
 
 static void wait_quiescent(struct avc_guard *guard, bool *found)
@@ -55,7 +55,7 @@ static void wait_quiescent(struct avc_guard *guard, bool *found)
 	*found = false;
 	if (!guard->config.quiesce_ns)
 		return;
-	while (!(*found = quiescent(&guard->target)) && now_ns() < end)
+	while (!(*found = process_is_quiescent(&guard->main)) && now_ns() < end)
 		usleep(QUIESCE_STEP_NS / 1000);
 }
 
@@ -73,54 +73,56 @@ static void touch_slot(const struct parasite *parasite, uint32_t slot, uint32_t 
 }
 
 /* Templates of another parasite are of another program, or too small. */
-static void drop_images(struct avc_guard *guard, const struct target *target)
+static void drop_images(struct avc_guard *guard, const struct process *process)
 {
 	for (uint32_t i = guard->count; i-- > 0;)
-		if (generation_branch(&guard->generations[i], target))
-			drop_generation(guard, i);
+		if (generation_branch(&guard->generations[i], process))
+			guard_drop_generation(guard, i);
 }
 
-static int prepare_process(struct avc_guard *guard, uint32_t kin, struct avc_error *err)
+static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_error *err)
 {
-	struct target *target = guard->tree.kin[kin].target;
+	struct process *process = guard->tree.entry[entry].process;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
-	if (target_follow(target, err) || support_check(target, err) || take_stock(target, err))
+	if (process_follow(process, err) || support_check(process, err) ||
+	    process_take_stock(process, err))
 		return -1;
-	if (target->infected && (target->thread_count > target->parasite.threads_max ||
-				 guard->config.keep >= target->parasite.slots))
-		target->infected = false;
-	if (!target->infected) {
-		if (target->descendant)
-			drop_images(guard, target);
+	if (process->infected && (process->thread_count > process->parasite.threads_max ||
+				  guard->config.keep >= process->parasite.slots))
+		process->infected = false;
+	if (!process->infected) {
+		if (process->descendant)
+			drop_images(guard, process);
 		else
-			drop_all(guard);
-		unhold(target);
-		for (uint32_t i = 0; i < target->thread_count; i++)
-			target->threads[i].known = false;
-		if (infect(target, guard->config.keep + 1, guard->timer, deadline, err))
+			guard_drop_all(guard);
+		process_unhold(process);
+		for (uint32_t i = 0; i < process->thread_count; i++)
+			process->threads[i].known = false;
+		if (process_infect(process, guard->config.keep + 1, guard->timer, deadline, err))
 			return -1;
 	}
-	if (acquaint(target, guard->timer, deadline, err))
+	if (process_acquaint(process, guard->timer, deadline, err))
 		return -1;
-	target->adopts = target->descendant && tree_has_reaper(&guard->tree, kin);
+	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
 	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
-	if (!target->holder && !target->adopts && hold(target, guard->timer, deadline, err))
+	if (!process->holder && !process->adopts &&
+	    process_hold(process, guard->timer, deadline, err))
 		return -1;
 	return 0;
 }
 
 static int renew_holders(struct avc_guard *guard, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
-		if (!target->doubtful)
+		if (!process->doubtful)
 			continue;
-		if (proc_is_exiting(guard->target.pid))
-			return fail(err, AVC_GONE, 0, guard->target.pid, "attach", "",
+		if (proc_is_exiting(guard->main.pid))
+			return fail(err, AVC_GONE, 0, guard->main.pid, "attach", "",
 				    "it has ended");
-		unhold(target);
+		process_unhold(process);
 	}
 	return 0;
 }
@@ -129,21 +131,21 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
 
-	if (find_app(guard, err) || renew_holders(guard, err))
+	if (guard_find_app(guard, err) || renew_holders(guard, err))
 		return -1;
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
-	let_executed_go(guard, true);
+	guard_let_executed_go(guard, true);
 	if (tree_look(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
+		struct process *process = tree->entry[i].process;
 		struct avc_error failed = { 0 };
 
-		if (!target || (!target->infected && tree_shares_memory(tree, i)))
+		if (!process || (!process->infected && tree_shares_memory(tree, i)))
 			continue;
-		target->shm_bytes = guard->target.shm_bytes;
-		target->tcp_moved = guard->target.tcp_moved;
+		process->shm_bytes = guard->main.shm_bytes;
+		process->tcp_moved = guard->main.tcp_moved;
 		if (prepare_process(guard, i, &failed) == 0)
 			continue;
 		/* One that is ending is seen to by the freeze. */
@@ -161,10 +163,10 @@ static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 	struct tree *tree = &guard->tree;
 
 	for (uint32_t i = 0; i < tree->count; i++) {
-		struct target *target = tree->kin[i].target;
+		struct process *process = tree->entry[i].process;
 		struct avc_error failed = { 0 };
 
-		if (target && files_prepare(target, &failed) &&
+		if (process && files_prepare(process, &failed) &&
 		    (i == 0 || failed.code != AVC_GONE)) {
 			*err = failed;
 			return -1;
@@ -179,11 +181,11 @@ static void abandon(struct avc_guard *guard, struct generation *fresh)
 {
 	generation_drop(fresh);
 	tracee_end_now(); /* they have the tables of processes that are in no generation yet */
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		guard->tree.member[i]->doubtful |= guard->tree.member[i]->lost;
-	if (guard->tree.members)
-		kill_lost(guard);
-	let_ended_go(guard);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		guard->tree.process[i]->doubtful |= guard->tree.process[i]->lost;
+	if (guard->tree.processes)
+		guard_kill_lost(guard);
+	guard_let_ended_go(guard);
 }
 
 static int files_errors(const struct generation *generation, struct avc_error *err)
@@ -193,7 +195,7 @@ static int files_errors(const struct generation *generation, struct avc_error *e
 		return -1;
 	}
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target && files_errors(generation->branch[i].image, err))
+		if (generation->branch[i].process && files_errors(generation->branch[i].image, err))
 			return -1;
 	return 0;
 }
@@ -201,13 +203,13 @@ static int files_errors(const struct generation *generation, struct avc_error *e
 /* avckpt.files=strict: from here on, nothing is written that is not seen. */
 static void watch_files(struct avc_guard *guard, struct generation *fresh)
 {
-	struct target *target = &guard->target;
+	struct process *process = &guard->main;
 
 	if (!guard->written)
 		guard->written = files_written_new();
 	if (guard->written)
-		files_written_watch(guard->written, target->pid, &fresh->notice);
-	fresh->mapped = files_mapped_prepare(target->pid, target->shm_bytes);
+		files_written_watch(guard->written, process->pid, &fresh->notice);
+	fresh->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
 }
 
 /* What a restore can be spared of it is found out when nothing else is to be done. */
@@ -249,14 +251,14 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	struct avc_error error = { 0 };
 
 	tracee_deadline_set(guard->timer, SPARE_NS);
-	/* A template that was killed is seen to by reap_dead(), as soon as that can be seen. */
-	if (spare_make(&guard->target, newest, &error) && error.code != AVC_GONE &&
+	/* A template that was killed is seen to by guard_reap_dead(), as soon as that can be seen. */
+	if (spare_make(&guard->main, newest, &error) && error.code != AVC_GONE &&
 	    !pidfd_ended(newest->pidfd))
-		lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
+		guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
 	tracee_deadline_clear(guard->timer);
 }
 
-void work_ahead(struct avc_guard *guard)
+void guard_work_ahead(struct avc_guard *guard)
 {
 	struct generation *newest;
 	bool more = true;
@@ -264,6 +266,7 @@ void work_ahead(struct avc_guard *guard)
 	guard->ahead_ns = UINT64_MAX;
 	if (!guard->count)
 		return;
+	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
 	if (drop_old_spare(guard))
 		; /* which has to end first */
@@ -276,34 +279,33 @@ void work_ahead(struct avc_guard *guard)
 		guard->ahead_ns = now_ns();
 }
 
-static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+static int take_seen(struct avc_guard *guard, struct mem_seen *seen, struct avc_event *event,
+		     struct avc_error *err)
 {
-	struct target *target = &guard->target;
-	struct generation fresh = { .pidfd = -1, .slot = free_slot(guard) };
-	struct mem_seen seen = { 0 };
+	struct process *process = &guard->main;
+	struct generation fresh = { .pidfd = -1, .slot = guard_free_slot(guard) };
 	struct freeze_times times;
 	int result;
 
-	if (prepare_files(guard, err) || memory_prepare(target->memory, &fresh.image, &seen, err)) {
+	if (prepare_files(guard, err) || memory_prepare(process, &fresh.image, seen, err)) {
 		generation_drop(&fresh);
 		return -1;
 	}
 	if (guard->config.files == AVC_FILES_STRICT)
 		watch_files(guard, &fresh);
-	touch_slot(&target->parasite, fresh.slot, target->thread_count);
+	touch_slot(&process->parasite, fresh.slot, process->thread_count);
 	for (uint32_t i = 1; i < guard->tree.count; i++)
-		if (guard->tree.kin[i].target && guard->tree.kin[i].target->infected)
-			touch_slot(&guard->tree.kin[i].target->parasite, fresh.slot,
-				   guard->tree.kin[i].target->thread_count);
+		if (guard->tree.entry[i].process && guard->tree.entry[i].process->infected)
+			touch_slot(&guard->tree.entry[i].process->parasite, fresh.slot,
+				   guard->tree.entry[i].process->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
-	waits_prepare(target);
-	for (uint32_t i = 1; i < guard->tree.count; i++)
-		if (guard->tree.kin[i].target)
-			waits_prepare(guard->tree.kin[i].target);
+	for (uint32_t i = 0; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process)
+			waits_prepare(guard->tree.entry[i].process);
 	/* What is written between here and the freeze counts as written after it. */
-	note_written(guard);
-	result = freeze(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh, &seen,
-			&times, err);
+	guard_note_written(guard);
+	result = freeze_tree(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
+			     seen, &times, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
@@ -312,7 +314,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		result = files_errors(&fresh, err);
 	if (!result) {
 		tracee_deadline_set(guard->timer, NS_PER_S);
-		result = generation_finish(target, &fresh, err);
+		result = generation_finish(process, &fresh, err);
 		tracee_deadline_clear(guard->timer);
 	}
 	if (result) {
@@ -320,108 +322,118 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 		return -1;
 	}
 	event->error = fresh.notice;
-	files_settle(target, &fresh);
+	files_settle(process, &fresh);
 	for (uint32_t i = 0; i < fresh.branches; i++)
-		if (fresh.branch[i].target)
-			files_settle(fresh.branch[i].target, fresh.branch[i].image);
+		if (fresh.branch[i].process)
+			files_settle(fresh.branch[i].process, fresh.branch[i].image);
 	if (fresh.branches)
-		files_settle_family(target, &fresh,
+		files_settle_family(process, &fresh,
 				    guard->count ? &guard->generations[guard->count - 1] : NULL);
 	fresh.number = ++guard->number;
 	fresh.clone_ns = times.clone_ns;
 	begin_ahead(guard, &fresh);
-	keep_generation(guard, &fresh);
+	guard_keep_generation(guard, &fresh);
 	init_channel_arm(&guard->channel, true);
 	event->generation = fresh.number;
 	event->generations = guard->count;
 	event->quiescent = fresh.quiescent;
-	tend_tree(guard);
+	guard_tend_tree(guard);
 	return 0;
+}
+
+static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	struct mem_seen seen = { 0 };
+	const int result = take_seen(guard, &seen, event, err);
+
+	mem_seen_free(&seen);
+	return result;
 }
 
 /* A limit of processes, or of memory, leaves no room for a template: spares have to go, and
  * those that were to go a little later. */
 static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
-	if (err->code != AVC_KERNEL || strcmp(err->syscall, "clone") != 0)
+	if (err->code != AVC_LIMIT)
 		return false;
-	await_spares(guard);
+	guard_await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
 		guard->cramped |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);
 	}
 	if (tracee_ending_pidfd(0) < 0)
 		return false;
-	wait_ended();
+	guard_wait_ended();
 	usleep(INIT_REAPS_US);
 	return true;
 }
 
-/* EAGAIN means that something was not as it was known to be, and is known now: memory
- * that has to be copied aside, or a process. */
 static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
-		if (tries == TAKE_TRIES ||
-		    (!make_way(guard, err) && (err->code != AVC_DEADLINE || err->errnum != EAGAIN)))
-			return -1;
+		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))
+			continue;
+		if (err->code == AVC_RETRY)
+			err->code = AVC_DEADLINE;
+		return -1;
 	}
 }
 
-void checkpoint(struct avc_guard *guard, uint64_t ticket)
+void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_CHECKPOINT);
+	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
 	bool hopeless;
 
-	guard->next_ns = interval_end(guard);
+	guard->next_ns = guard_interval_end(guard);
 	if (init_channel_stop_asked(&guard->channel)) {
 		if (ticket)
-			refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
+			guard_refuse(guard, ticket, AVC_GONE,
+				     "the application has been asked to stop");
 		return;
 	}
 	if (!guard->room) {
 		if (ticket)
-			refuse(guard, ticket, AVC_BUSY,
-			       "memory is short, so no generation is held");
+			guard_refuse(guard, ticket, AVC_BUSY,
+				     "memory is short, so no generation is held");
 		return;
 	}
 	if (take(guard, &event, &error) == 0) {
 		guard->misses = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
-		event.app_pid = guard->target.leader;
-		event.app_pid_inside = guard->target.inside;
-		emit(guard, &event);
+		event.app_pid = guard->main.leader;
+		event.app_pid_inside = guard->main.inside;
+		guard_emit(guard, &event);
 		return;
 	}
 	if (error.code == AVC_GONE)
 		guard->dying_until_ns = now_ns() + DYING_NS;
 	/* Of a dying app init's report tells; this is for one that is only away. */
-	if (error.code == AVC_GONE && guard->target.pid && pidfd_ended(guard->target.pidfd)) {
+	if (error.code == AVC_GONE && guard->main.pid && pidfd_ended(guard->main.pidfd)) {
 		if (ticket)
-			emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
 	/* A child process may be gone at the next look: the generations there are
 	 * stay good for a while. */
 	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
 		   error.code == AVC_BUSY;
-	if (hopeless && error.pid != guard->target.pid && guard->count &&
+	if (hopeless && error.pid != guard->main.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
-		emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
 	if (hopeless) {
-		unprotect(guard, ticket, &error);
+		guard_unprotect(guard, ticket, &error);
 		return;
 	}
 	event.kind = AVC_EVENT_MISSED;
 	event.generations = guard->count; /* another parasite may have cost them all */
 	event.ticket = ticket;
 	event.error = error;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 }

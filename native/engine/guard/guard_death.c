@@ -63,7 +63,7 @@ static bool is_abnormal(const struct avc_guard *guard, const struct avc_report *
 static void give_up(struct avc_guard *guard, const struct avc_report *report,
 		    enum avc_reason reason, const struct avc_error *error)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_GAVE_UP);
+	struct avc_event event = guard_event(guard, AVC_EVENT_GAVE_UP);
 	struct avc_error ignored = { 0 };
 
 	(void)init_channel_verdict(&guard->channel, AVC_VERDICT_GIVE_UP, &ignored);
@@ -72,10 +72,10 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	event.died_ns = report->reaped_ns;
 	event.error = *error;
 	event.ticket = guard->restore_ticket;
-	emit(guard, &event);
-	drop_all(guard);
-	unhold(&guard->target);
-	target_close(&guard->target);
+	guard_emit(guard, &event);
+	guard_drop_all(guard);
+	process_unhold(&guard->main);
+	process_close(&guard->main);
 	/* Init ends now, and why is what was told last. */
 	guard->next_ns = UINT64_MAX;
 }
@@ -83,10 +83,10 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 /* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
 static void release_new(struct avc_guard *guard, const struct generation *generation)
 {
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->holder &&
-		    !generation_branch(generation, guard->tree.member[i]))
-			release(guard, guard->tree.member[i]);
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->holder &&
+		    !generation_branch(generation, guard->tree.process[i]))
+			guard_release(guard, guard->tree.process[i]);
 }
 
 /* The other processes are those of the generation now; of what they had before they died
@@ -95,24 +95,24 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 {
 	struct tree *tree = &guard->tree;
 
-	for (uint32_t i = 0; i < tree->members; i++)
-		tree_let_go(tree->member[i]);
+	for (uint32_t i = 0; i < tree->processes; i++)
+		tree_let_go(tree->process[i]);
 	for (uint32_t i = 0; i < generation->branches; i++) {
 		const struct branch *branch = &generation->branch[i];
 		struct avc_error gone = { 0 };
 		struct proc_stat stat;
 
-		if (!branch->target)
+		if (!branch->process)
 			continue;
 		/* One that has died again already is seen to by the next checkpoint. */
 		if (proc_stat(branch->pid, &stat) == 0 &&
-		    target_open(branch->target, branch->pid, branch->inside, &gone) == 0) {
-			branch->target->infected = true;
-			branch->target->start = stat.start;
+		    process_open(branch->process, branch->pid, branch->inside, &gone) == 0) {
+			branch->process->infected = true;
+			branch->process->start = stat.start;
 		}
 	}
 	tree->count = 0;
-	guard->target.childless = !generation->branches;
+	guard->main.childless = !generation->branches;
 }
 
 /* The newest generation; when restores are used up, the one before it.  There were `had`
@@ -120,8 +120,8 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		       enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_RESTORED);
-	struct target *target = &guard->target;
+	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
+	struct process *process = &guard->main;
 	const struct avc_config *config = &guard->config;
 	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
 	bool ending = guard->count < had, again = false;
@@ -136,20 +136,20 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 
 		/* What was written since the newest was written since all others, also
 		 * where that can not be seen any more. */
-		if (check_strict(guard, generation, generation->template, generation->pidfd,
-				 &failed)) {
+		if (guard_check_strict(guard, generation, generation->template, generation->pidfd,
+				       &failed)) {
 			*error = failed;
-			drop_all(guard);
+			guard_drop_all(guard);
 			break;
 		}
 		release_new(guard, generation);
 		/* Nor do templates of one that was lost by this death: theirs are the same
 		 * tables.  And they count where processes are limited, as a spare does. */
 		if (ending)
-			wait_ended();
-		if (restore(target, generation, &guard->channel, config, guard->timer,
-			    report->reaped_ns, say_restored, guard, &pid, &times, &notes,
-			    &failed)) {
+			guard_wait_ended();
+		if (restore_app(process, generation, &guard->channel, config, guard->timer,
+				report->reaped_ns, say_restored, guard, &pid, &times, &notes,
+				&failed)) {
 			/* Perhaps because the spare was killed when it was needed, or was one
 			 * process too many.  The template is as good as before. */
 			if (generation->spare.pid && !again) {
@@ -159,18 +159,18 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			} else {
 				if (!error->code)
 					*error = failed;
-				drop_generation(guard, guard->count - 1);
+				guard_drop_generation(guard, guard->count - 1);
 				again = false;
 			}
 			ending = true;
-			kill_lost(guard);
+			guard_kill_lost(guard);
 			continue;
 		}
 		/* If this fails it has died already: the next report tells. */
-		target->infected =
-			target_open(target, pid,
-				    parasite_slot(&target->parasite, generation->slot)->pid,
-				    &failed) == 0;
+		process->infected =
+			process_open(process, pid,
+				     parasite_slot(&process->parasite, generation->slot)->pid,
+				     &failed) == 0;
 		adopt_family(guard, generation);
 		generation->spare.tried = false; /* that one is used up */
 		guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
@@ -185,7 +185,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		}
 		event.reason = reason;
 		event.app_pid = pid;
-		event.app_pid_inside = target->inside;
+		event.app_pid_inside = process->inside;
 		event.wait_status = report->status;
 		event.died_ns = report->reaped_ns;
 		event.restore_ns = times.restore_ns;
@@ -200,11 +200,11 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		event.error = error->code ? *error : notes;
 		event.age_ns = report->reaped_ns - generation->taken_ns;
 		event.at_ns = now_ns();
-		emit(guard, &event);
+		guard_emit(guard, &event);
 		break;
 	}
 	/* It has the dead app's memory, and what was open is the restored one's. */
-	unhold_soon(target);
+	process_unhold_soon(process);
 	return guard->count > 0;
 }
 
@@ -215,14 +215,14 @@ static void hold_all(struct avc_guard *guard)
 	struct avc_error ignored = { 0 };
 
 	/* The next checkpoint tries again, and tells. */
-	if (hold(&guard->target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+	if (process_hold(&guard->main, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 		guard->dying_until_ns = now_ns() + DYING_NS;
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
 		ignored = (struct avc_error){ 0 };
-		if (target->pid && !target->adopts &&
-		    hold(target, guard->timer, guard->config.freeze_deadline_ns, &ignored))
+		if (process->pid && !process->adopts &&
+		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;
 	}
 }
@@ -233,13 +233,13 @@ static void reap_tracees(void *arg)
 {
 	struct avc_guard *guard = arg;
 
-	(void)all_stragglers(guard);
-	reap_unknown(guard);
+	(void)guard_tend_stragglers(guard);
+	guard_reap_unknown(guard);
 }
 
-void died(struct avc_guard *guard, const struct avc_report *report)
+void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
-	struct avc_event event = event_new(guard, AVC_EVENT_DIED);
+	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
 	const uint32_t had = guard->count;
 	struct avc_error error = { 0 };
 	enum avc_reason reason;
@@ -249,9 +249,9 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	guard->channel.working_ns = now_ns();
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
-	emit(guard, &event);
-	target_close(&guard->target);
-	kill_lost(guard);
+	guard_emit(guard, &event);
+	process_close(&guard->main);
+	guard_kill_lost(guard);
 	if (!is_abnormal(guard, report, &reason)) {
 		give_up(guard, report, reason, &error);
 		goto out;
@@ -259,10 +259,10 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	if (reason != AVC_REASON_COMMAND && guard->count) {
 		const uint32_t restores = restores_within(guard, now_ns());
 
-		count_crash(guard, reason == AVC_REASON_UNHEALTHY);
+		guard_count_crash(guard, reason == AVC_REASON_UNHEALTHY);
 		if (reason == AVC_REASON_UNHEALTHY)
-			drop_unhealthy(guard);
-		choose(guard, restores >= guard->config.restore_max);
+			guard_drop_unhealthy(guard);
+		guard_choose_generation(guard, restores >= guard->config.restore_max);
 		if (!guard->count) {
 			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
 			     "it was restored %u time(s) already", guard->restores);
@@ -270,10 +270,10 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 			goto out;
 		}
 	}
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->pid)
-			target_kill(guard->tree.member[i]);
-	if (init_channel_kill_leftovers(&guard->channel, is_ours, reap_tracees, guard, &error)) {
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->pid)
+			process_kill(guard->tree.process[i]);
+	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
@@ -281,9 +281,9 @@ void died(struct avc_guard *guard, const struct avc_report *report)
 	} else if (!bring_back(guard, report, reason, had, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else {
-		if (guard->target.pid)
+		if (guard->main.pid)
 			hold_all(guard);
-		guard->next_ns = interval_end(guard);
+		guard->next_ns = guard_interval_end(guard);
 	}
 out:
 	rt_priority_end();

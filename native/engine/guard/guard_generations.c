@@ -16,25 +16,25 @@
 
 /* ---- generations ------------------------------------------------------------ */
 
-void drop_generation(struct avc_guard *guard, uint32_t i)
+void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 {
 	/* Disarmed first: a death in between is then final at once. */
 	if (guard->count == 1 && guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
-	guard->target.lost |= spare_is_unknown(&guard->generations[i]);
+	guard->main.lost |= spare_is_unknown(&guard->generations[i]);
 	generation_drop(&guard->generations[i]);
 	guard->count--;
 	memmove(&guard->generations[i], &guard->generations[i + 1],
 		(guard->count - i) * sizeof *guard->generations);
 }
 
-void drop_all(struct avc_guard *guard)
+void guard_drop_all(struct avc_guard *guard)
 {
 	while (guard->count)
-		drop_generation(guard, 0);
+		guard_drop_generation(guard, 0);
 }
 
-uint32_t free_slot(const struct avc_guard *guard)
+uint32_t guard_free_slot(const struct avc_guard *guard)
 {
 	for (uint32_t slot = 0;; slot++) {
 		bool used = false;
@@ -52,8 +52,8 @@ static struct avc_event lost_generation(struct avc_guard *guard, uint32_t i, enu
 	const struct generation lost = guard->generations[i];
 	struct avc_event event;
 
-	drop_generation(guard, i);
-	event = event_new(guard, AVC_EVENT_DROPPED);
+	guard_drop_generation(guard, i);
+	event = guard_event(guard, AVC_EVENT_DROPPED);
 	event.reason = reason;
 	event.generation = lost.number;
 	event.age_ns = event.at_ns - lost.taken_ns;
@@ -61,22 +61,23 @@ static struct avc_event lost_generation(struct avc_guard *guard, uint32_t i, enu
 	return event;
 }
 
-void lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason, uint64_t ticket)
+void guard_lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason,
+			   uint64_t ticket)
 {
 	struct avc_event event = lost_generation(guard, i, reason);
 
 	event.ticket = ticket;
-	emit(guard, &event);
+	guard_emit(guard, &event);
 }
 
-bool is_ours(pid_t pid, const void *arg)
+bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->target.holder || tracee_is_ending(pid))
+	if (pid == guard->main.holder || tracee_is_ending(pid))
 		return true;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->holder == pid)
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->holder == pid)
 			return true;
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct generation *generation = &guard->generations[i];
@@ -91,19 +92,19 @@ bool is_ours(pid_t pid, const void *arg)
 	return false;
 }
 
-bool is_known_process(pid_t pid, const void *arg)
+bool guard_knows_process(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->target.leader)
+	if (pid == guard->main.leader)
 		return true;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (guard->tree.member[i]->leader == pid)
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->leader == pid)
 			return true;
-	return is_ours(pid, guard);
+	return guard_owns(pid, guard);
 }
 
-void wait_ended(void)
+void guard_wait_ended(void)
 {
 	const uint64_t end = now_ns() + ENDED_NS;
 
@@ -113,7 +114,7 @@ void wait_ended(void)
 }
 
 /* Of those that were late (spare_make), whichever has been made by now. */
-void await_spares(struct avc_guard *guard)
+void guard_await_spares(struct avc_guard *guard)
 {
 	for (uint32_t i = 0; i < guard->count; i++) {
 		struct avc_error late = { 0 };
@@ -121,26 +122,26 @@ void await_spares(struct avc_guard *guard)
 		if (!guard->generations[i].spare.work)
 			continue;
 		tracee_deadline_set(guard->timer, LATE_SPARE_NS);
-		/* Or it is still on its way; who was killed is seen to by reap_dead(). */
-		if (spare_await(&guard->target, &guard->generations[i], &late))
-			guard->target.lost |= late.code != AVC_DEADLINE;
+		/* Or it is still on its way; who was killed is seen to by guard_reap_dead(). */
+		if (spare_await(&guard->main, &guard->generations[i], &late))
+			guard->main.lost |= late.code != AVC_DEADLINE;
 		tracee_deadline_clear(guard->timer);
 	}
 }
 
-void kill_lost(struct avc_guard *guard)
+void guard_kill_lost(struct avc_guard *guard)
 {
-	await_spares(guard);
-	init_channel_kill_lost(&guard->channel, is_known_process, guard);
-	guard->target.lost = false;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		guard->tree.member[i]->lost = false;
+	guard_await_spares(guard);
+	init_channel_kill_lost(&guard->channel, guard_knows_process, guard);
+	guard->main.lost = false;
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		guard->tree.process[i]->lost = false;
 }
 
-static bool has_thread(const struct target *target, pid_t tid)
+static bool has_thread(const struct process *process, pid_t tid)
 {
-	for (uint32_t i = 0; i < target->thread_count; i++)
-		if (target->threads[i].tid == tid && target->threads[i].attached)
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].tid == tid && process->threads[i].attached)
 			return true;
 	return false;
 }
@@ -149,73 +150,73 @@ static bool is_known(pid_t tid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (is_ours(tid, guard) || has_thread(&guard->target, tid))
+	if (guard_owns(tid, guard) || has_thread(&guard->main, tid))
 		return true;
-	for (uint32_t i = 0; i < guard->tree.members; i++)
-		if (has_thread(guard->tree.member[i], tid))
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (has_thread(guard->tree.process[i], tid))
 			return true;
 	return false;
 }
 
-void release(struct avc_guard *guard, struct target *target)
+void guard_release(struct avc_guard *guard, struct process *process)
 {
 	for (uint32_t i = 0; i < guard->count; i++) {
-		const struct branch *branch = generation_branch(&guard->generations[i], target);
+		const struct branch *branch = generation_branch(&guard->generations[i], process);
 
 		if (branch)
-			generation_close_files(target, branch->image);
+			generation_close_files(process, branch->image);
 	}
-	tree_let_go(target);
+	tree_let_go(process);
 }
 
 #define EXEC_CHECK_NS (1 * NS_PER_MS)
 #define EXEC_CHECK_LONG_NS (200 * NS_PER_MS)
 
-static bool found_executed(struct target *target, uint64_t now)
+static bool found_executed(struct process *process, uint64_t now)
 {
-	uint64_t pause = (now - target->held_ns) / 8;
+	uint64_t pause = (now - process->held_ns) / 8;
 
 	if (pause < EXEC_CHECK_NS)
 		pause = EXEC_CHECK_NS;
 	if (pause > EXEC_CHECK_LONG_NS)
 		pause = EXEC_CHECK_LONG_NS;
-	target->exec_check_ns = now + pause;
-	return has_executed(target);
+	process->exec_check_ns = now + pause;
+	return process_has_executed(process);
 }
 
 /* One that executes another program closes what it has marked for that (O_CLOEXEC), and
  * somebody may be waiting for just that.  The kernel does not tell, so it is looked at: often
  * at first, for most do it at once if they do it at all. */
-void let_executed_go(struct avc_guard *guard, bool all)
+void guard_let_executed_go(struct avc_guard *guard, bool all)
 {
-	struct target *main = &guard->target;
+	struct process *main = &guard->main;
 	const uint64_t now = now_ns();
 
 	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
 		while (guard->count)
-			lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
+			guard_lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
 		tracee_end_now(); /* they have the table that exec(2) has left */
-		unhold(main);
+		process_unhold(main);
 		main->infected = false; /* what was mapped there went with its memory */
 	}
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
-		if (target->pid && target->infected && (all || now >= target->exec_check_ns) &&
-		    found_executed(target, now))
-			release(guard, target);
+		if (process->pid && process->infected && (all || now >= process->exec_check_ns) &&
+		    found_executed(process, now))
+			guard_release(guard, process);
 	}
 }
 
-uint64_t exec_check_due(const struct avc_guard *guard)
+uint64_t guard_exec_check_due(const struct avc_guard *guard)
 {
-	uint64_t due = guard->target.holder ? guard->target.exec_check_ns : UINT64_MAX;
+	uint64_t due = guard->main.holder ? guard->main.exec_check_ns : UINT64_MAX;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		const struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		const struct process *process = guard->tree.process[i];
 
-		if (target->pid && target->infected && target->exec_check_ns < due)
-			due = target->exec_check_ns;
+		if (process->pid && process->infected && process->exec_check_ns < due)
+			due = process->exec_check_ns;
 	}
 	return due;
 }
@@ -223,31 +224,31 @@ uint64_t exec_check_due(const struct avc_guard *guard)
 /* When the main process goes, the others go with it, and all of it comes back with what
  * the holders have.  Some end by themselves, as soon as it has closed what it has open:
  * before its own end can be seen.  So that is looked for last. */
-void let_ended_go(struct avc_guard *guard)
+void guard_let_ended_go(struct avc_guard *guard)
 {
-	const struct target *main = &guard->target;
+	const struct process *main = &guard->main;
 
-	for (uint32_t i = 0; i < guard->tree.members; i++) {
-		struct target *target = guard->tree.member[i];
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
 
-		if (!target->pid || !pidfd_ended(target->pidfd))
+		if (!process->pid || !pidfd_ended(process->pidfd))
 			continue;
 		if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
 			return;
-		release(guard, target);
+		guard_release(guard, process);
 	}
 	tree_sweep(&guard->tree);
 }
 
-void tend_tree(struct avc_guard *guard)
+void guard_tend_tree(struct avc_guard *guard)
 {
-	let_executed_go(guard, false);
-	let_ended_go(guard);
+	guard_let_executed_go(guard, false);
+	guard_let_ended_go(guard);
 }
 
 /* An app that is killed while its threads are being stopped may leave a thread that
  * was just being made: attached to us, unheard of, and in the way of its leader's end. */
-void reap_unknown(const struct avc_guard *guard)
+void guard_reap_unknown(const struct avc_guard *guard)
 {
 	/* The first that is known hides the others. */
 	(void)tracee_reap_ending();
@@ -266,7 +267,7 @@ static bool has_ended(const struct generation *generation)
 }
 
 /* Templates that were killed: by us, from inside the container or by the OOM killer. */
-void reap_dead(struct avc_guard *guard)
+void guard_reap_dead(struct avc_guard *guard)
 {
 	struct avc_event events[AVC_KEEP_MAX];
 	struct pollfd news[] = {
@@ -284,12 +285,12 @@ void reap_dead(struct avc_guard *guard)
 		for (uint32_t i = guard->count; i-- > 0;)
 			if (has_ended(&guard->generations[i]))
 				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
-		if (guard->target.holder && pidfd_ended(guard->target.holder_pidfd))
-			unhold(&guard->target);
-		for (uint32_t i = 0; i < guard->tree.members; i++)
-			if (guard->tree.member[i]->holder &&
-			    pidfd_ended(guard->tree.member[i]->holder_pidfd))
-				unhold(guard->tree.member[i]);
+		if (guard->main.holder && pidfd_ended(guard->main.holder_pidfd))
+			process_unhold(&guard->main);
+		for (uint32_t i = 0; i < guard->tree.processes; i++)
+			if (guard->tree.process[i]->holder &&
+			    pidfd_ended(guard->tree.process[i]->holder_pidfd))
+				process_unhold(guard->tree.process[i]);
 		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
 			return;
 		if (news[1].revents & POLLIN)
@@ -298,7 +299,7 @@ void reap_dead(struct avc_guard *guard)
 			news[1].fd = -1; /* init is just ending */
 	}
 	for (uint32_t i = 0; i < count; i++)
-		emit(guard, &events[i]);
+		guard_emit(guard, &events[i]);
 }
 
 /* ---- which generations are worth keeping ------------------------------------------
@@ -333,7 +334,7 @@ static int newest_seen(const struct avc_guard *guard)
 }
 
 /* Which one goes next, if one must. */
-uint32_t dispensable(const struct avc_guard *guard, bool probation)
+uint32_t guard_dispensable(const struct avc_guard *guard, bool probation)
 {
 	const int vouched = newest_vouched(guard), seen = newest_seen(guard);
 
@@ -349,7 +350,7 @@ uint32_t dispensable(const struct avc_guard *guard, bool probation)
 }
 
 /* Takes in a new generation, its lineage known. */
-void keep_generation(struct avc_guard *guard, struct generation *fresh)
+void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 {
 	const bool probation = on_probation(guard);
 
@@ -363,7 +364,7 @@ void keep_generation(struct avc_guard *guard, struct generation *fresh)
 		    guard->generations[i].crashes > fresh->crashes)
 			fresh->crashes = guard->generations[i].crashes;
 	while (guard->count >= guard->room)
-		drop_generation(guard, dispensable(guard, probation));
+		guard_drop_generation(guard, guard_dispensable(guard, probation));
 	guard->generations[guard->count++] = *fresh;
 	/* Only a health check can say that a process does not hang. */
 	if (!guard->vouching)
@@ -373,7 +374,7 @@ void keep_generation(struct avc_guard *guard, struct generation *fresh)
 /* The process that ran is gone, and nobody wanted that: what it came from is suspect.
  * A hang takes its time to be noticed, so that a hung one is on probation until it was
  * healthy once. */
-void count_crash(struct avc_guard *guard, bool hung)
+void guard_count_crash(struct avc_guard *guard, bool hung)
 {
 	const bool probation = on_probation(guard) ||
 			       (hung && guard->restored_from && !guard->proved);
@@ -389,17 +390,17 @@ void count_crash(struct avc_guard *guard, bool hung)
 }
 
 /* Of a hung process, checkpoints may have been taken for as long as nobody noticed. */
-void drop_unhealthy(struct avc_guard *guard)
+void guard_drop_unhealthy(struct avc_guard *guard)
 {
 	const int vouched = newest_vouched(guard);
 	const uint32_t good = vouched < 0 ? 0 : (uint32_t)vouched;
 
 	while (guard->count > good + 1)
-		lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
+		guard_lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
 }
 
 /* Leaves the generation to restore from as the newest, or none. */
-void choose(struct avc_guard *guard, bool used_up)
+void guard_choose_generation(struct avc_guard *guard, bool used_up)
 {
 	const uint32_t max = guard->config.restore_max;
 
@@ -410,7 +411,7 @@ void choose(struct avc_guard *guard, bool used_up)
 		if (!(used_up && (newest->crashes || newest->lost)) &&
 		    newest->lost < (tries ? tries : 1))
 			break;
-		lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
+		guard_lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
 	}
 }
 
@@ -418,7 +419,7 @@ void choose(struct avc_guard *guard, bool used_up)
 
 /* Before the next generation is taken, and before one is restored: no generation is
  * good any more after a file was written. */
-void note_written(struct avc_guard *guard)
+void guard_note_written(struct avc_guard *guard)
 {
 	const struct files *known = guard->count ? guard->generations[guard->count - 1].files
 						 : NULL;
@@ -432,22 +433,22 @@ void note_written(struct avc_guard *guard)
 
 /* Whether it may be restored, in a container that is strict.  A process that has the
  * table of descriptors as it is now. */
-int check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid, int pidfd,
-		 struct avc_error *err)
+int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
+		       int pidfd, struct avc_error *err)
 {
 	if (guard->config.files != AVC_FILES_STRICT)
 		return 0;
-	note_written(guard);
+	guard_note_written(guard);
 	for (uint32_t i = 0; i < generation->branches; i++) {
-		const struct target *target = generation->branch[i].target;
+		const struct process *process = generation->branch[i].process;
 
-		/* What one that has ended before has written, note_written() knows. */
-		if (target && target->holder &&
-		    files_check_strict(generation->branch[i].image, target->holder,
-				       target->holder_pidfd, guard->channel.init, target->holder,
+		/* What one that has ended before has written, guard_note_written() knows. */
+		if (process && process->holder &&
+		    files_check_strict(generation->branch[i].image, process->holder,
+				       process->holder_pidfd, guard->channel.init, process->holder,
 				       err))
 			return -1;
 	}
-	return files_check_strict(generation, pid, pidfd, guard->channel.init, guard->target.holder,
+	return files_check_strict(generation, pid, pidfd, guard->channel.init, guard->main.holder,
 				  err);
 }

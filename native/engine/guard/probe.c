@@ -14,7 +14,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "guard.h"
 
 static int probe_child(pid_t child, struct avc_error *err)
 {
@@ -38,7 +38,7 @@ static int probe_child(pid_t child, struct avc_error *err)
 	return 0;
 }
 
-int avc_engine_probe(struct avc_error *err)
+int guard_probe(struct avc_error *err)
 {
 	void *page;
 	pid_t child;
@@ -80,7 +80,7 @@ int avc_engine_probe(struct avc_error *err)
 	result = probe_child(child, err);
 	if (!result) {
 		fd = proc_open_mapped(child, (avc_remote)page, (avc_remote)page + ARCH_PAGE_BYTES,
-				      O_RDWR);
+				      O_RDONLY);
 		if (fd < 0)
 			result = fail_errno(err, 0, "probe", "open(map_files)",
 					    "needs CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN");

@@ -3,13 +3,20 @@
  * Parasite and holder are brought into the live app through its main thread; the
  * other threads run on meanwhile.
  *
- * To get the first mapping, the thread makes two system calls (mmap, mprotect)
- * from a stub in the zero padding behind some executable mapping, the vDSO's as
- * a rule.  The stub ends by loading the thread's own registers, so it gets home
- * without us.
+ * The parasite is memory that the guard makes (parasite.c), so that what the app does to its own
+ * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a
+ * process with the same memory, from a stub in the zero padding behind some executable mapping, the
+ * vDSO's as a rule.  The porter takes leave of the app's descriptors, so that no number is taken
+ * for a moment that the app could miss; in a table of its own it is sent the memory over a socket,
+ * maps it, and is killed.  It makes one system call at a time, of which every register is set from
+ * outside.
+ *
+ * The stub ends by loading the thread's own registers, so it gets home without us, and a porter
+ * that we can not tell what to do ends by itself.
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/close_range.h>
 #include <sched.h>
 #include <signal.h>
 #include <stdio.h>
@@ -20,12 +27,13 @@
 #include <sys/ptrace.h>
 #include <sys/random.h>
 #include <sys/resource.h>
+#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/uio.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "process.h"
 
 #define CAVE_BYTES 256
 #define PADS_START UINT64_C(0x200000000000)
@@ -65,24 +73,24 @@ static bool is_place_of_pads(avc_remote base)
 }
 
 /* The mapping of a guard that died before it wrote anything is told by its place. */
-static void note_old_pad(struct target *target, avc_remote base, avc_remote end)
+static void note_old_pad(struct process *process, avc_remote base, avc_remote end)
 {
 	uint64_t magic;
 
-	if (target->old_parasites == OLD_PARASITES_MAX || base == target->parasite.base ||
+	if (process->old_parasites == OLD_PARASITES_MAX || base == process->parasite.base ||
 	    end - base < INJ_CODE_BYTES + sizeof(struct inj_control) ||
-	    pread(target->mem_fd, &magic, sizeof magic,
+	    pread(process->mem_fd, &magic, sizeof magic,
 		  (off_t)(base + INJ_CODE_BYTES + offsetof(struct inj_control, magic))) !=
 		    sizeof magic ||
 	    (magic != INJ_MAGIC && (magic || !is_place_of_pads(base))))
 		return;
-	target->old_parasite[target->old_parasites].base = base;
-	target->old_parasite[target->old_parasites++].bytes = end - base;
+	process->old_parasite[process->old_parasites].base = base;
+	process->old_parasite[process->old_parasites++].bytes = end - base;
 }
 
 /* Finds a cave, and the parasites of guards that died.  Fails if the stopped main thread
  * is still in one of those, or in a stub. */
-static int survey(struct target *target, avc_remote pc, avc_remote *cave, struct avc_error *err)
+static int survey(struct process *process, avc_remote pc, avc_remote *cave, struct avc_error *err)
 {
 	char path[64], line[512];
 	avc_remote code = 0, code_end = 0;
@@ -90,179 +98,350 @@ static int survey(struct target *target, avc_remote pc, avc_remote *cave, struct
 	FILE *maps;
 
 	*cave = 0;
-	target->old_parasites = 0;
-	snprintf(path, sizeof path, "/proc/%d/maps", target->pid);
+	process->old_parasites = 0;
+	snprintf(path, sizeof path, "/proc/%d/maps", process->pid);
 	maps = fopen(path, "re");
 	if (!maps)
-		return fail_errno(err, target->pid, "infect", "open(maps)", "it has ended");
+		return fail_errno(err, process->pid, "infect", "open(maps)", "it has ended");
 	while (fgets(line, sizeof line, maps)) {
 		unsigned long start, end;
 		char mode[5];
 
 		if (sscanf(line, "%lx-%lx %4s", &start, &end, mode) != 3)
 			continue;
-		if (strstr(line, "/dev/zero (deleted)")) {
+		if (strstr(line, "/memfd:" PARASITE_NAME " (deleted)")) {
 			if (!strcmp(mode, "r-xs") && end - start == INJ_CODE_BYTES) {
 				code = start;
 				code_end = end;
 			} else {
-				/* In one piece until its first pages are made executable. */
-				note_old_pad(target, code && start == code_end ? code : start, end);
+				note_old_pad(process, code && start == code_end ? code : start,
+					     end);
 				code = 0;
 			}
 		}
 		if (mode[2] == 'x' && mode[3] == 'p' && pc < end && pc >= end - CAVE_BYTES)
-			in_stub = has_stub(target->mem_fd, end);
+			in_stub = has_stub(process->mem_fd, end);
 		if (mode[0] == 'r' && mode[2] == 'x' && mode[3] == 'p' &&
 		    (!*cave || strstr(line, "[vdso]")) &&
-		    (has_cave(target->mem_fd, end) || has_stub(target->mem_fd, end)))
+		    (has_cave(process->mem_fd, end) || has_stub(process->mem_fd, end)))
 			*cave = end - CAVE_BYTES;
 	}
 	fclose(maps);
-	if (in_stub || in_old_parasite(target, pc))
-		return fail(err, AVC_DEADLINE, 0, target->pid, "infect", "",
+	if (in_stub || parasite_is_old(process, pc))
+		return fail(err, AVC_DEADLINE, 0, process->pid, "infect", "",
 			    "still on its way home from a guard that died");
 	if (!*cave)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "infect", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "infect", "",
 			    "there is no room for the first injected instructions");
 	return 0;
 }
 
-/* One system call from the stub.  The thread is in a plain trap stop before and
- * after; its own registers are put back by the caller. */
-static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const uint64_t arg[6],
-			long *result, struct avc_error *err)
+static int step_failed(const struct stop *stop, pid_t tid, struct avc_error *err)
 {
-	const uint64_t all = ~UINT64_C(0);
-	const pid_t tid = thread->tid;
+	if (stop->kind == STOP_DEADLINE)
+		return fail(err, AVC_DEADLINE, 0, tid, "infect", "",
+			    "it did not get to run in time");
+	return fail(err, AVC_GONE, 0, tid, "infect", "", "it has ended");
+}
+
+/* To the next entry into a system call, exit from one, or new task.  Other stops may come in
+ * between: job control, or SIGSTOP, which can not be blocked. */
+static int step(pid_t tid, struct stop *stop, struct avc_error *err)
+{
+	do {
+		if (seccomp_go_on(tid, stop))
+			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
+		*stop = tracee_wait(tid, 0);
+		if (stop->kind == STOP_EXIT || stop->kind == STOP_DYING ||
+		    stop->kind == STOP_DEADLINE)
+			return step_failed(stop, tid, err);
+	} while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK);
+	return 0;
+}
+
+/* From stop to stop, to the exit from a call `nr` that will not be made again.  1: on the way it
+ * has brought forth *child. */
+static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_error *err)
+{
+	struct stop stop = { .kind = STOP_OTHER };
 	struct arch_regs regs;
 
-	arch_stub_call(&regs, &thread->regs, cave, nr, arg);
-	if (suspend_seccomp(thread, err))
-		return -1;
-	if (arch_regs_set(tid, &regs) || ptrace(PTRACE_SETSIGMASK, tid, sizeof all, &all))
-		return fail_errno(err, tid, "infect", "ptrace(SETREGS)", "it has gone");
+	for (;;) {
+		if (step(tid, &stop, err))
+			return -1;
+		if (stop.kind == STOP_FORK && child) {
+			*child = stop.message;
+			return 1;
+		}
+		if (stop.kind == STOP_FORK || tracee_enters_call(tid))
+			continue;
+		if (arch_regs_get(tid, &regs))
+			return fail_errno(err, tid, "infect", "ptrace(GETREGS)", "it has gone");
+		*result = arch_syscall_result(&regs);
+		/* -ERESTARTSYS and its like (include/linux/errno.h): for a SIGSTOP. */
+		if (arch_syscall_nr(&regs) == nr && (*result > -512 || *result < -516))
+			return 0;
+	}
+}
+
+struct porter {
+	pid_t pid;
+	avc_remote cave;
+	const struct arch_regs *base;
+};
+
+/* The main thread makes it, and stays in the event's stop. */
+static int make_porter(struct process *process, struct thread *thread, struct porter *porter,
+		       struct avc_error *err)
+{
+	const uint64_t all = ~UINT64_C(0);
+	/* The main process' is init's child.  Another's is its own, of which nobody is told: all of
+	 * that process stands still until the stub has waited for it. */
+	const uint64_t kin = process->descendant ? 0 : CLONE_PARENT | SIGCHLD;
+	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | kin };
+	struct arch_regs regs;
+	long refused;
+	int born;
+
+	arch_stub_call(&regs, &thread->regs, porter->cave, SYS_clone, arg);
+	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
+	    arch_regs_set(thread->tid, &regs) ||
+	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
+		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
 	thread->borrowed_for = NULL;
-	/* Entry and exit.  Other stops may come in between: job control, or SIGSTOP,
-	 * which can not be blocked. */
-	for (int stops = 0, signal = 0; stops < 2;) {
-		struct stop stop;
-
-		if (ptrace(PTRACE_SYSCALL, tid, NULL, (long)signal))
-			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
-		stop = tracee_wait(tid, 0);
-		signal = stop.kind == STOP_SIGNAL ? stop.signal : 0;
-		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
-			return fail(err, AVC_GONE, 0, tid, "infect", "", "it has ended");
-		if (stop.kind == STOP_DEADLINE) {
-			thread->stopped = false;
-			return fail(err, AVC_DEADLINE, 0, tid, "infect", "",
-				    "it did not get to run in time");
-		}
-		stops += stop.kind == STOP_SYSCALL;
-	}
-	if (arch_regs_get(tid, &regs))
-		return fail_errno(err, tid, "infect", "ptrace(GETREGS)", "it has gone");
-	*result = arch_syscall_result(&regs);
-	if (tracee_settle(tid, err)) {
-		/* It runs: in the stub, which must stay, and home. */
-		thread->stopped = false;
+	born = step_over(thread->tid, SYS_clone, &refused, &porter->pid, err);
+	if (born < 0) {
+		process->lost = true;
+		thread->stopped = false; /* it runs: in the stub, which must stay, and home */
 		return -1;
 	}
+	if (!born) {
+		if (tracee_settle(thread->tid, err)) {
+			thread->stopped = false;
+			return -1;
+		}
+		return fail(err, AVC_KERNEL, (int)-refused, process->pid, "infect", "clone",
+			    "it may not have another process: %s", strerror((int)-refused));
+	}
+	if (tracee_await(porter->pid, NULL, err) != STOP_TRAP)
+		return -1;
+	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    seccomp_supervise(porter->pid, 0, (long)TRACE_OPTIONS_OURS))
+		return fail_errno(err, porter->pid, "infect", "ptrace(SETOPTIONS)", "it has ended");
+	return 0;
+}
+
+/* The porter is gone: the main thread out of the stub's calls, to where it can be sent home. */
+static int leave_stub(struct thread *thread, struct avc_error *err)
+{
+	long result;
+
+	/* It is inside of clone(2) still. */
+	if (step_over(thread->tid, SYS_clone, &result, NULL, err) == 0 &&
+	    step_over(thread->tid, ARCH_STUB_WAIT, &result, NULL, err) == 0 &&
+	    tracee_settle(thread->tid, err) == 0)
+		return 0;
+	thread->stopped = false;
+	return -1;
+}
+
+static int porter_call(const struct porter *porter, long nr, const uint64_t arg[6], long *result,
+		       struct avc_error *err)
+{
+	struct arch_regs regs;
+
+	arch_stub_call(&regs, porter->base, porter->cave, nr, arg);
+	if (arch_regs_set(porter->pid, &regs))
+		return fail_errno(err, porter->pid, "infect", "ptrace(SETREGS)", "it has gone");
+	return step_over(porter->pid, nr, result, NULL, err);
+}
+
+/* One that must not fail. */
+static int porter_must(const struct porter *porter, const char *name, const char *problem, long nr,
+		       const uint64_t arg[6], struct avc_error *err)
+{
+	long result;
+
+	if (porter_call(porter, nr, arg, &result, err))
+		return -1;
+	if (result < 0 && result > -4096)
+		return fail(err, AVC_UNSUPPORTED, (int)-result, porter->pid, "infect", name, "%s",
+			    problem);
 	return 0;
 }
 
 /* A child has its parent's parasite mapped, and at a restore is there together with it for
  * a moment: each has a place of its own, in a part of the address space that programs
  * do not use by themselves.  The kernel takes another place if this one is taken. */
-static uint64_t where_to_map(const struct target *target)
+static uint64_t where_to_map(const struct process *process)
 {
-	return PADS_START + target->nonce % PADS * PARASITE_DISTANCE;
+	return PADS_START + process->nonce % PADS * PARASITE_DISTANCE;
 }
 
 /* RLIMIT_AS counts the parasite, too: what the app could still map before it has to be able to map
  * with it, as far as one can tell.  So only where the parasite is next to nothing of that. */
-static int check_room(const struct target *target, size_t bytes, struct avc_error *err)
+static int check_room(const struct process *process, size_t bytes, struct avc_error *err)
 {
-	const long pages = proc_vm_pages(target->statm_fd, NULL);
+	const long pages = proc_vm_pages(process->statm_fd, NULL);
 	uint64_t limit[LIMITS][2];
 
-	if (pages < 0 || proc_limits(target->pid, limit))
-		return fail_errno(err, target->pid, "infect", "open(limits)", "it has ended");
+	if (pages < 0 || proc_limits(process->pid, limit))
+		return fail_errno(err, process->pid, "infect", "open(limits)", "it has ended");
 	if (limit[RLIMIT_AS][0] == ~UINT64_C(0) ||
 	    (uint64_t)pages * ARCH_PAGE_BYTES + PARASITE_SHARE * bytes <= limit[RLIMIT_AS][0])
 		return 0;
-	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "infect", "",
+	return fail(err, AVC_UNSUPPORTED, 0, process->pid, "infect", "",
 		    "it may map so little more memory (RLIMIT_AS, ulimit -v) that it would miss "
 		    "the %zu kB which protection takes",
 		    bytes / 1024);
 }
 
-static int make_pad(struct target *target, struct thread *thread, avc_remote cave, uint32_t slots,
-		    uint32_t threads_max, struct avc_error *err)
+/* The other end of a socket of the porter's, whose own one is descriptor 0: the first of a table
+ * that it shares with nobody. */
+static int open_channel(const struct porter *porter, avc_remote scratch, struct avc_error *err)
 {
-	struct parasite *parasite = &target->parasite;
-	uint64_t arg[6] = { where_to_map(target),   parasite_layout(parasite, slots, threads_max),
-			    PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS | MAP_NORESERVE,
-			    (uint64_t)-1,           0 };
-	long base, result;
+	const uint64_t leave[6] = { 0, ~0u, CLOSE_RANGE_UNSHARE };
+	const uint64_t pair[6] = { AF_UNIX, SOCK_STREAM, 0, scratch };
+	const uint64_t ours[6] = { 1 };
+	int pidfd, channel;
 
-	if (check_room(target, parasite->bytes, err))
+	if (porter_must(porter, "close_range", "it needs a table of descriptors of its own",
+			SYS_close_range, leave, err) ||
+	    porter_must(porter, "socketpair", "it may not have a socket", SYS_socketpair, pair,
+			err))
 		return -1;
-	if (stub_syscall(thread, cave, SYS_mmap, arg, &base, err))
+	pidfd = proc_pidfd_open(porter->pid);
+	channel = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 1);
+	close_fd(&pidfd);
+	if (channel < 0)
+		return fail_errno(err, porter->pid, "infect", "pidfd_getfd", "it was killed");
+	if (porter_must(porter, "close", "its end of a socket can not be closed", SYS_close, ours,
+			err))
+		close_fd(&channel);
+	return channel;
+}
+
+/* One part of the parasite; it comes as descriptor 1.  If somebody has changed the letter
+ * meanwhile, it comes not at all, or is not there to be mapped. */
+static int bring(const struct process *process, const struct porter *porter, int channel, int fd,
+		 avc_remote scratch, const uint64_t map[6], struct avc_error *err)
+{
+	const uint64_t receive[6] = { 0, scratch, MSG_CMSG_CLOEXEC | MSG_DONTWAIT };
+	const uint64_t received[6] = { 1 };
+	struct fd_letter letter;
+
+	fd_letter_write(&letter, scratch);
+	if (pwrite(process->mem_fd, &letter, sizeof letter, (off_t)scratch) != sizeof letter)
+		return fail_errno(err, process->pid, "infect", "write(mem)", "it has ended");
+	if (fd_send(channel, fd))
+		return fail_errno(err, process->pid, "infect", "sendmsg",
+				  "the parasite can not be handed over");
+	return porter_must(porter, "recvmsg", "the parasite can not be handed over", SYS_recvmsg,
+			   receive, err) ||
+			       porter_must(porter, "mmap",
+					   map[2] & PROT_EXEC
+						   ? "it may not have new executable memory"
+						   : "it may not map the parasite",
+					   SYS_mmap, map, err) ||
+			       porter_must(porter, "close", "a descriptor can not be closed",
+					   SYS_close, received, err)
+		       ? -1
+		       : 0;
+}
+
+/* All of the place first: what comes into it then takes no other mapping's.  Its first page holds
+ * the letters until the code comes there. */
+static int bring_parasite(struct process *process, const struct porter *porter,
+			  struct avc_error *err)
+{
+	struct parasite *parasite = &process->parasite;
+	const size_t data_bytes = parasite->bytes - INJ_CODE_BYTES;
+	const uint64_t place[6] = { where_to_map(process), parasite->bytes, PROT_NONE,
+				    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, (uint64_t)-1 };
+	uint64_t scratch[6] = { 0, ARCH_PAGE_BYTES, PROT_READ | PROT_WRITE };
+	uint64_t code[6] = { 0, INJ_CODE_BYTES, PARASITE_CODE_PROT, PARASITE_FLAGS_OVER, 1 };
+	uint64_t data[6] = { 0, data_bytes, PARASITE_DATA_PROT, PARASITE_FLAGS_OVER, 1 };
+	int channel, result;
+	long base;
+
+	if (porter_call(porter, SYS_mmap, place, &base, err))
 		return -1;
 	if (base < 0 && base > -4096)
-		return fail(err, AVC_UNSUPPORTED, (int)-base, target->pid, "infect", "mmap",
+		return fail(err, AVC_UNSUPPORTED, (int)-base, process->pid, "infect", "mmap",
 			    "it may not map %zu kB more memory", parasite->bytes / 1024);
-	if (parasite_open(parasite, target->pid, (avc_remote)base, parasite->bytes, target->nonce,
-			  err))
+	parasite->base = scratch[0] = code[0] = (uint64_t)base;
+	data[0] = (uint64_t)base + INJ_CODE_BYTES;
+	if (porter_must(porter, "mprotect", "it may not have new memory", SYS_mprotect, scratch,
+			err))
 		return -1;
-	arg[0] = (uint64_t)base;
-	arg[1] = INJ_CODE_BYTES;
-	arg[2] = PROT_READ | PROT_EXEC;
-	if (stub_syscall(thread, cave, SYS_mprotect, arg, &result, err))
+	channel = open_channel(porter, scratch[0], err);
+	if (channel < 0)
 		return -1;
-	if (result < 0)
-		return fail(err, AVC_UNSUPPORTED, (int)-result, target->pid, "infect", "mprotect",
-			    "it may not have new executable memory");
-	return 0;
+	result = bring(process, porter, channel, parasite->data_fd, scratch[0], data, err) ||
+				 bring(process, porter, channel, parasite->code_fd, scratch[0],
+				       code, err)
+			 ? -1
+			 : 0;
+	close_fd(&channel);
+	return result;
+}
+
+static int make_pad(struct process *process, struct thread *thread, avc_remote cave, uint32_t slots,
+		    uint32_t threads_max, struct avc_error *err)
+{
+	struct porter porter = { .cave = cave, .base = &thread->regs };
+	int result;
+
+	if (check_room(process, parasite_layout(&process->parasite, slots, threads_max), err) ||
+	    parasite_make(&process->parasite, process->nonce, err))
+		return -1;
+	result = make_porter(process, thread, &porter, err);
+	if (!result)
+		result = bring_parasite(process, &porter, err);
+	if (porter.pid) {
+		tracee_kill(porter.pid);
+		seccomp_let_be(porter.pid);
+		if (leave_stub(thread, err))
+			result = -1;
+	}
+	return result;
 }
 
 /* The main thread, stopped, with everything read that borrowing it needs. */
-static struct thread *stop_main(struct target *target, struct avc_error *err)
+static struct thread *stop_main(struct process *process, struct avc_error *err)
 {
-	struct thread *t = thread_find(target, target->pid);
+	struct thread *t = thread_find(process, process->pid);
 
 	if (!t)
-		t = thread_add(target, target->pid, err);
+		t = thread_add(process, process->pid, err);
 	if (!t || t->attached) {
-		fail(err, AVC_DEADLINE, 0, target->pid, "stop", "",
+		fail(err, AVC_DEADLINE, 0, process->pid, "stop", "",
 		     "not back from an earlier attempt yet");
 		return NULL;
 	}
 	t->seen = true;
 	rewind_prepare(t);
-	if (thread_stop(target, t, err) || thread_await(target, t, err) || thread_read(t, err)) {
+	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;
 	}
 	return t;
 }
 
-static int check_task(struct target *target, const struct thread *t, struct avc_error *err)
+static int check_task(struct process *process, const struct thread *t, struct avc_error *err)
 {
 	if (!arch_is_native(&t->regs))
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "infect", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "infect", "",
 			    "it is a 32-bit program");
 	return 0;
 }
 
-static int infect_thread(struct target *target, struct thread *thread, uint32_t slots,
+static int infect_thread(struct process *process, struct thread *thread, uint32_t slots,
 			 struct avc_error *err)
 {
 	uint8_t stub[ARCH_STUB_BYTES], zero[ARCH_STUB_BYTES] = { 0 };
-	uint32_t threads_max = 32, threads = target->thread_count * 2;
+	uint32_t threads_max = 32, threads = process->thread_count * 2;
 	struct arch_regs home;
 	avc_remote cave;
 	size_t bytes;
@@ -270,156 +449,157 @@ static int infect_thread(struct target *target, struct thread *thread, uint32_t 
 
 	while (threads_max < threads)
 		threads_max *= 2;
-	parasite_close(&target->parasite);
-	memory_forget(target->memory);
-	if (getrandom(&target->nonce, sizeof target->nonce, 0) < 0)
+	parasite_close(&process->parasite);
+	process->parasite.inside = process->inside;
+	memory_forget(process->memory);
+	if (getrandom(&process->nonce, sizeof process->nonce, 0) < 0)
 		return fail_errno(err, 0, "infect", "getrandom", "no random number");
 	/* An exec since then has made another address space of it. */
-	close_fd(&target->mem_fd);
-	target->mem_fd = proc_open(target->pid, "mem", O_RDWR);
-	if (target->mem_fd < 0)
-		return fail_errno(err, target->pid, "infect", "open(mem)", "it has ended");
-	if (support_check_thread(thread->tid, err) || check_task(target, thread, err) ||
-	    survey(target, arch_pc(&thread->regs), &cave, err))
+	close_fd(&process->mem_fd);
+	process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
+	if (process->mem_fd < 0)
+		return fail_errno(err, process->pid, "infect", "open(mem)", "it has ended");
+	if (thread_check_dispatch(thread->tid, err) || check_task(process, thread, err) ||
+	    survey(process, arch_pc(&thread->regs), &cave, err))
 		return -1;
-	rseq_fixup(target->mem_fd, thread);
+	thread_fix_rseq(process->mem_fd, thread);
 	home = thread->regs;
 	arch_resume(&home);
 	bytes = arch_stub_build(stub, &home, thread->sigmask);
-	if (pwrite(target->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
-		return fail_errno(err, target->pid, "infect", "write(mem)",
+	if (pwrite(process->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
+		return fail_errno(err, process->pid, "infect", "write(mem)",
 				  "its code can not be written");
-	result = make_pad(target, thread, cave, slots, threads_max, err);
+	result = make_pad(process, thread, cave, slots, threads_max, err);
 	/* Nobody is in the stub any more: leave no trace. */
-	if (thread->stopped && (!thread->borrowed || give_back(thread, err) == 0)) {
-		if (pwrite(target->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
+	if (thread->stopped && (!thread->borrowed || thread_give_back(thread, err) == 0)) {
+		if (pwrite(process->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
 			err->undo_failures++;
 	}
 	if (result)
-		parasite_close(&target->parasite);
-	target->infected = !result;
-	target->checkpoints = 0;
+		parasite_close(&process->parasite);
+	process->infected = !result;
+	process->checkpoints = 0;
 	return result;
 }
 
-int infect(struct target *target, uint32_t slots, timer_t timer, uint64_t deadline_ns,
-	   struct avc_error *err)
+int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+		   struct avc_error *err)
 {
 	struct thread *thread;
 	int result;
 
 	tracee_deadline_set(timer, deadline_ns);
-	thread = stop_main(target, err);
+	thread = stop_main(process, err);
 	if (!thread) {
 		tracee_deadline_clear(timer);
 		return -1;
 	}
-	result = infect_thread(target, thread, slots, err);
+	result = infect_thread(process, thread, slots, err);
 	thread_release(thread);
 	tracee_deadline_clear(timer);
 	return result;
 }
 
-int infect_stopped(struct target *target, uint32_t slots, struct avc_error *err)
+int process_infect_stopped(struct process *process, uint32_t slots, struct avc_error *err)
 {
-	struct thread *thread = thread_find(target, target->pid);
+	struct thread *thread = thread_find(process, process->pid);
 
 	if (!thread || !thread->stopped)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "infect", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "infect", "",
 			    "its main thread has ended");
 	if (thread_read(thread, err))
 		return -1;
-	return infect_thread(target, thread, slots, err);
+	return infect_thread(process, thread, slots, err);
 }
 
 /* ESRCH is of one that is ending: exec(2) has memory, but not this. */
-bool has_executed(const struct target *target)
+bool process_has_executed(const struct process *process)
 {
 	uint64_t nonce = 0;
 	struct iovec here = { &nonce, sizeof nonce };
-	struct iovec there = { (void *)(target->parasite.base + INJ_CODE_BYTES +
+	struct iovec there = { (void *)(process->parasite.base + INJ_CODE_BYTES +
 					offsetof(struct inj_control, nonce)),
 			       sizeof nonce };
-	const ssize_t n = process_vm_readv(target->pid, &here, 1, &there, 1, 0);
+	const ssize_t n = process_vm_readv(process->pid, &here, 1, &there, 1, 0);
 
-	return n == sizeof nonce ? nonce != target->nonce : errno == EFAULT;
+	return n == sizeof nonce ? nonce != process->nonce : errno == EFAULT;
 }
 
 /* What makes a new task the holder: it lies still, is known as such, and has none of
  * the app's numbers. */
-static int make_holder(struct target *target, pid_t holder, const struct arch_regs *base,
+static int make_holder(struct process *process, pid_t holder, const struct arch_regs *base,
 		       struct avc_error *err)
 {
-	struct inj_call *own = &target->parasite.control->holder;
+	struct inj_call *own = &process->parasite.control->holder;
 	const struct sched_param first = { .sched_priority = 1 };
 
 	/* It clones while all of the app stands still.  Best effort; not for its clones. */
-	if (target->descendant)
+	if (process->descendant)
 		(void)sched_setscheduler(holder, SCHED_FIFO | SCHED_RESET_ON_FORK, &first);
 	memcpy(own->out, "avckpt-hold", 12);
 	call_begin(own, INJ_AFTER_PARK);
 	/* Out of the app's process group, or the number stays taken; and of its session,
 	 * which another process of the app may lead. */
-	call_add(own, target->descendant ? SYS_setsid : SYS_setpgid, 0, 0, 0, 0, 0);
-	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&target->parasite, own->out), 0, 0,
+	call_add(own, process->descendant ? SYS_setsid : SYS_setpgid, 0, 0, 0, 0, 0);
+	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, own->out), 0, 0,
 		 0);
-	return parasite_send(&target->parasite, holder, base, own, err) ||
+	return parasite_send(&process->parasite, holder, base, own, err) ||
 			       parasite_run(holder, own, err)
 		       ? -1
 		       : 0;
 }
 
-int adopt_no_more(struct target *target, struct avc_error *err)
+int process_adopt_no_more(struct process *process, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
-	struct thread *thread = thread_find(target, target->pid);
+	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
 
-	if (target->paused)
+	if (process->paused)
 		return 0;
 	call_begin(call, INJ_AFTER_HOME);
 	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0);
 	call_add(call, INJ_PAUSE, 0, 0, 0, 0, 0);
 	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
-	if (borrow(target, thread, err))
+	if (thread_borrow(process, thread, err))
 		return -1;
-	target->paused = true;
+	process->paused = true;
 	if (parasite_run_to_pause(thread->tid, call, err)) {
 		thread->stopped = false; /* on its way through the parasite, and home */
-		target->paused = false;
+		process->paused = false;
 		return -1;
 	}
 	return 0;
 }
 
-int adopt_again(struct target *target, struct avc_error *err)
+int process_adopt_again(struct process *process, struct avc_error *err)
 {
-	struct thread *thread = thread_find(target, target->pid);
+	struct thread *thread = thread_find(process, process->pid);
 
-	if (!target->paused)
+	if (!process->paused)
 		return 0;
-	target->paused = false;
-	if (parasite_run_on(thread->tid, &target->parasite.control->runner, err)) {
+	process->paused = false;
+	if (parasite_run_on(thread->tid, &process->parasite.control->runner, err)) {
 		thread->stopped = false;
 		return -1;
 	}
-	return give_back(thread, err);
+	return thread_give_back(thread, err);
 }
 
-static int keep_holder(struct target *target, pid_t holder, int result, struct avc_error *err)
+static int keep_holder(struct process *process, pid_t holder, int result, struct avc_error *err)
 {
-	target->holder = holder;
-	target->held_ns = now_ns();
-	target->exec_check_ns = 0;
-	target->holder_pidfd = proc_pidfd_open(holder);
-	if (!result && target->holder_pidfd >= 0)
+	process->holder = holder;
+	process->held_ns = now_ns();
+	process->exec_check_ns = 0;
+	process->holder_pidfd = proc_pidfd_open(holder);
+	if (!result && process->holder_pidfd >= 0)
 		return 0;
 	if (!err->code)
 		fail_errno(err, holder, "make holder", "pidfd_open", "it was killed");
-	unhold(target);
+	process_unhold(process);
 	return -1;
 }
 
-static int hold_descendant(struct target *target, timer_t timer, uint64_t deadline_ns,
+static int hold_descendant(struct process *process, timer_t timer, uint64_t deadline_ns,
 			   struct avc_error *err)
 {
 	struct thread *thread;
@@ -428,31 +608,33 @@ static int hold_descendant(struct target *target, timer_t timer, uint64_t deadli
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	/* All of it: another thread may be waiting for children, of any kind (__WALL). */
-	result = stop_process(target, err);
-	thread = thread_find(target, target->pid);
+	result = process_stop(process, err);
+	thread = thread_find(process, process->pid);
 	if (!result && (!thread || !thread->stopped))
-		result = fail(err, AVC_GONE, 0, target->pid, "make holder", "", "it has ended");
+		result = fail(err, AVC_GONE, 0, process->pid, "make holder", "", "it has ended");
 	if (!result)
-		result = thread_read(thread, err) || hold_stopped(target, target->init, err);
-	let_go_process(target);
+		result = thread_read(thread, err) ||
+			 process_hold_stopped(process, process->init, err);
+	process_let_go(process);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	return result;
 }
 
-int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_error *err)
+int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
+		 struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
+	struct inj_call *call = &process->parasite.control->runner;
 	struct thread *thread;
 	struct arch_regs base;
 	pid_t holder = 0;
 	int result;
 
-	if (target->descendant)
-		return hold_descendant(target, timer, deadline_ns, err);
+	if (process->descendant)
+		return hold_descendant(process, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	thread = stop_main(target, err);
+	thread = stop_main(process, err);
 	if (!thread) {
 		tracee_deadline_clear(timer);
 		rt_priority_end();
@@ -460,17 +642,17 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	}
 	call_begin(call, INJ_AFTER_HOME);
 	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	result = borrow(target, thread, err);
+	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
-		target->lost = target->lost || (result && err->code != AVC_KERNEL);
+		process->lost = process->lost || (result && err->code != AVC_KERNEL);
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
 	else if (err->code == AVC_DEADLINE && thread->borrowed)
 		thread->stopped = false; /* on its way through the parasite, and home */
 	if (!result)
-		result = give_back(thread, err);
+		result = thread_give_back(thread, err);
 	thread_release(thread);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
@@ -480,28 +662,27 @@ int hold(struct target *target, timer_t timer, uint64_t deadline_ns, struct avc_
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(holder, &base))
+	if (parasite_own(&process->parasite, holder) || arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
-		result = make_holder(target, holder, &base, err);
+		result = make_holder(process, holder, &base, err);
 	tracee_deadline_clear(timer);
-	return keep_holder(target, holder, result, err);
+	return keep_holder(process, holder, result, err);
 }
 
 /* A stopped task in the parasite makes one clone; *child is in its first stop. */
-static int clone_by(struct target *target, pid_t tid, const struct arch_regs *base,
+static int clone_by(struct process *process, pid_t tid, const struct arch_regs *base,
 		    struct inj_call *call, uint64_t flags, pid_t *child, struct avc_error *err)
 {
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, flags, 0, 0, 0, 0);
-	if (parasite_send(&target->parasite, tid, base, call, err) ||
+	if (parasite_send(&process->parasite, tid, base, call, err) ||
 	    parasite_run_clone(tid, call, child, err))
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(&process->parasite, *child))
 		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -514,16 +695,16 @@ static int clone_by(struct target *target, pid_t tid, const struct arch_regs *ba
  *
  * This holder also makes the templates.  They have its signal handlers and working
  * directory, which are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
-int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
+int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err)
 {
-	struct inj_call *call = &target->parasite.control->runner;
-	struct thread *thread = thread_find(target, target->pid);
+	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
 	struct proc_stat stat = { 0 };
 	pid_t between = 0, holder = 0;
 	int result;
 
 	if (!thread || !thread->stopped)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "make holder", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "make holder", "",
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
 	if (thread->creds.subreaper)
@@ -532,61 +713,61 @@ int hold_stopped(struct target *target, pid_t init, struct avc_error *err)
 	call_add(call, INJ_WAIT, 0, 0, 0, 0, 0);
 	if (thread->creds.subreaper)
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
-	if (borrow(target, thread, err))
+	if (thread_borrow(process, thread, err))
 		return -1;
-	target->waiting = true;
+	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
-		target->lost = target->lost || err->code != AVC_KERNEL;
+		process->lost = process->lost || err->code != AVC_KERNEL;
 		thread_runs_on(thread, err);
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||
-	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(between, &target->holder_base))
+	    parasite_own(&process->parasite, between) ||
+	    arch_regs_get(between, &process->holder_base))
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
-		result = clone_by(target, between, &target->holder_base,
-				  &target->parasite.control->holder,
+		result = clone_by(process, between, &process->holder_base,
+				  &process->parasite.control->holder,
 				  CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD,
 				  &holder, err);
 	tracee_kill(between);
 	if (!result)
-		result = make_holder(target, holder, &target->holder_base, err);
+		result = make_holder(process, holder, &process->holder_base, err);
 	if (!result && proc_stat(holder, &stat))
 		result = fail_errno(err, holder, "make holder", "open(stat)", "it was killed");
 	if (!result && stat.parent != init)
-		result = fail(err, AVC_DEADLINE, EAGAIN, target->pid, "make holder", "",
+		result = fail(err, AVC_RETRY, 0, process->pid, "make holder", "",
 			      "a process above it adopts orphans now (PR_SET_CHILD_SUBREAPER)");
-	if (holder && keep_holder(target, holder, result, err))
+	if (holder && keep_holder(process, holder, result, err))
 		result = -1;
 	if (parasite_run(thread->tid, call, err)) {
 		thread->stopped = false;
 		return -1;
 	}
-	target->waiting = false;
-	return give_back(thread, err) || result ? -1 : 0;
+	process->waiting = false;
+	return thread_give_back(thread, err) || result ? -1 : 0;
 }
 
-static void forget_holder(struct target *target)
+static void forget_holder(struct process *process)
 {
-	target->doubtful = false;
-	target->holder = 0;
-	target->holder_pidfd = -1;
+	process->doubtful = false;
+	process->holder = 0;
+	process->holder_pidfd = -1;
 }
 
-void unhold(struct target *target)
+void process_unhold(struct process *process)
 {
-	if (target->holder)
-		tracee_kill(target->holder);
-	close_fd(&target->holder_pidfd);
-	forget_holder(target);
+	if (process->holder)
+		tracee_kill(process->holder);
+	close_fd(&process->holder_pidfd);
+	forget_holder(process);
 }
 
-void unhold_soon(struct target *target)
+void process_unhold_soon(struct process *process)
 {
-	if (target->holder)
-		tracee_end(target->holder, target->holder_pidfd);
-	forget_holder(target);
+	if (process->holder)
+		tracee_end(process->holder, process->holder_pidfd);
+	forget_holder(process);
 }

@@ -15,7 +15,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "files.h"
+#include "process.h"
 
 static const struct {
 	const char *prefix, *reason;
@@ -29,30 +29,30 @@ static const struct {
 	{ "/dev/kvm", "it runs virtual machines" },
 };
 
-static int check_descriptors(struct target *target, struct avc_error *err)
+static int check_descriptors(struct process *process, struct avc_error *err)
 {
 	char path[64], link[128];
 	struct dirent *entry;
 	int result = 0;
 	DIR *dir;
 
-	snprintf(path, sizeof path, "/proc/%d/fd", target->pid);
+	snprintf(path, sizeof path, "/proc/%d/fd", process->pid);
 	dir = opendir(path);
 	if (!dir)
-		return fail_errno(err, target->pid, "check", "open(fd)", "it has ended");
-	target->socket_count = 0;
+		return fail_errno(err, process->pid, "check", "open(fd)", "it has ended");
+	process->socket_count = 0;
 	while (!result && (entry = readdir(dir))) {
 		ssize_t n = readlinkat(dirfd(dir), entry->d_name, link, sizeof link - 1);
 
 		if (n <= 0)
 			continue;
 		link[n] = 0;
-		if (!strncmp(link, "socket:", 7) && target->socket_count < SOCKETS_MAX)
-			target->sockets[target->socket_count++] = atoi(entry->d_name);
+		if (!strncmp(link, "socket:", 7) && process->socket_count < SOCKETS_MAX)
+			process->sockets[process->socket_count++] = atoi(entry->d_name);
 		for (size_t i = 0; i < sizeof unsupported_fds / sizeof *unsupported_fds; i++)
 			if (!strncmp(link, unsupported_fds[i].prefix,
 				     strlen(unsupported_fds[i].prefix)))
-				result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+				result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
 					      "%s", unsupported_fds[i].reason);
 	}
 	closedir(dir);
@@ -60,30 +60,30 @@ static int check_descriptors(struct target *target, struct avc_error *err)
 }
 
 /* Only when its size has changed: the file is long. */
-static int check_mappings(struct target *target, struct avc_error *err)
+static int check_mappings(struct process *process, struct avc_error *err)
 {
-	const long pages = proc_vm_pages(target->statm_fd, NULL);
+	const long pages = proc_vm_pages(process->statm_fd, NULL);
 	char path[64], line[512];
 	int result = 0;
 	FILE *maps;
 
-	if (pages == target->surveyed_pages)
+	if (pages == process->surveyed_pages)
 		return 0;
-	snprintf(path, sizeof path, "/proc/%d/maps", target->pid);
+	snprintf(path, sizeof path, "/proc/%d/maps", process->pid);
 	maps = fopen(path, "re");
 	if (!maps)
-		return fail_errno(err, target->pid, "check", "open(maps)", "it has ended");
+		return fail_errno(err, process->pid, "check", "open(maps)", "it has ended");
 	while (!result && fgets(line, sizeof line, maps)) {
 		if (strstr(line, " /[aio]"))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
 				      "it uses kernel AIO");
 		/* Those of files are found in the first clone. */
 		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
-				      private_huge_pages);
+			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s",
+				      memory_private_huge_pages);
 	}
 	fclose(maps);
-	target->surveyed_pages = result ? -1 : pages;
+	process->surveyed_pages = result ? -1 : pages;
 	return result;
 }
 
@@ -99,7 +99,7 @@ static int not_seen(pid_t pid, struct avc_error *err)
 }
 
 /* Its children are made by their parents, which have to have what their children have. */
-static int check_descendant(const struct target *target, struct avc_error *err)
+static int check_descendant(const struct process *process, struct avc_error *err)
 {
 	static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "user", "cgroup", "pid" };
 	struct proc_status status;
@@ -108,36 +108,36 @@ static int check_descendant(const struct target *target, struct avc_error *err)
 		char path[64];
 		struct stat own, inits;
 
-		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->pid, spaces[i]);
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", process->pid, spaces[i]);
 		if (stat(path, &own))
-			return not_seen(target->pid, err);
-		snprintf(path, sizeof path, "/proc/%d/ns/%s", target->init, spaces[i]);
+			return not_seen(process->pid, err);
+		snprintf(path, sizeof path, "/proc/%d/ns/%s", process->init, spaces[i]);
 		if (stat(path, &inits) || own.st_ino != inits.st_ino)
-			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
-				    "process %d has a %s namespace of its own", target->inside,
+			return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
+				    "process %d has a %s namespace of its own", process->inside,
 				    spaces[i]);
 	}
-	if (proc_status(target->pid, &status))
-		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
-	if (status.seccomp == 1 || status.seccomp_filters > target->plain_filters)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+	if (proc_status(process->pid, &status))
+		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
+	if (status.seccomp == 1 || status.seccomp_filters > process->plain_filters)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
 			    "process %d is not the main one and has a seccomp filter of its own",
-			    target->inside);
+			    process->inside);
 	return 0;
 }
 
 /* A thread's second stack would not know of what it was made to do in the parasite, and return
  * to the wrong place: so before that.  A program has it from its start, or not at all. */
-static int check_shadow_stack(struct target *target, struct avc_error *err)
+static int check_shadow_stack(struct process *process, struct avc_error *err)
 {
 	struct proc_status status;
 
-	if (target->infected)
+	if (process->infected)
 		return 0;
-	if (proc_status(target->pid, &status))
-		return fail_errno(err, target->pid, "check", "open(status)", "it has ended");
+	if (proc_status(process->pid, &status))
+		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
 	if (status.shadow_stack)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
 			    "it has shadow stacks (CET), which can not be put back; "
 			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
 	return 0;
@@ -145,7 +145,7 @@ static int check_shadow_stack(struct target *target, struct avc_error *err)
 
 /* unshare(2) and setns(2): its next child is the first process of another namespace.  A
  * clone of ours would be that, and the namespace would end with it. */
-static int check_namespaces(struct target *target, struct avc_error *err)
+static int check_namespaces(struct process *process, struct avc_error *err)
 {
 	static const struct {
 		const char *own, *of_children, *reason;
@@ -159,11 +159,11 @@ static int check_namespaces(struct target *target, struct avc_error *err)
 	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++) {
 		char path[64], own[64] = "", theirs[64] = "";
 
-		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].own);
+		snprintf(path, sizeof path, "/proc/%d/%s", process->pid, kinds[i].own);
 		if (readlink(path, own, sizeof own - 1) < 0)
 			continue; /* the kernel has none of these; or it has ended */
 		/* Of a namespace in which there was no process yet nothing is told. */
-		snprintf(path, sizeof path, "/proc/%d/%s", target->pid, kinds[i].of_children);
+		snprintf(path, sizeof path, "/proc/%d/%s", process->pid, kinds[i].of_children);
 		if (readlink(path, theirs, sizeof theirs - 1) < 0) {
 			char other[64];
 
@@ -171,48 +171,29 @@ static int check_namespaces(struct target *target, struct avc_error *err)
 				continue;
 			/* Nor of any of one that is just ending (kernel/exit.c,
 			 * exit_task_namespaces()). */
-			snprintf(path, sizeof path, "/proc/%d/ns/uts", target->pid);
+			snprintf(path, sizeof path, "/proc/%d/ns/uts", process->pid);
 			if (readlink(path, other, sizeof other) < 0)
-				return fail(err, AVC_GONE, ESRCH, target->pid, "check", "readlink",
+				return fail(err, AVC_GONE, ESRCH, process->pid, "check", "readlink",
 					    "it has ended");
 		}
 		/* Behind the kind: "pid:[4026531836]". */
 		if (strcmp(own + strcspn(own, "["), theirs + strcspn(theirs, "[")) != 0)
-			return fail(err, AVC_UNSUPPORTED, 0, target->pid, "check", "", "%s",
+			return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s",
 				    kinds[i].reason);
 	}
 	return 0;
 }
 
-/* Since Linux 6.4; the headers may be older. */
-#define GET_DISPATCH 0x4211 /* PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG */
-
-/* Asked before a thread runs anything of ours: while its selector says so, every system call that
- * is not made where it has them made is a SIGSYS (Documentation/admin-guide/
- * syscall-user-dispatch.rst), which is the app's end when all signals are blocked. */
-int support_check_thread(pid_t tid, struct avc_error *err)
+int support_check(struct process *process, struct avc_error *err)
 {
-	struct {
-		uint64_t mode, selector, offset, bytes;
-	} dispatch = { 0 };
-
-	if (ptrace(GET_DISPATCH, tid, sizeof dispatch, &dispatch) == 0 && dispatch.mode)
-		return fail(err, AVC_UNSUPPORTED, 0, tid, "check", "",
-			    "it dispatches system calls by itself (Syscall User Dispatch, as Wine "
-			    "does)");
-	return 0;
-}
-
-int support_check(struct target *target, struct avc_error *err)
-{
-	if (check_shadow_stack(target, err) || check_namespaces(target, err) ||
-	    check_descriptors(target, err) || check_mappings(target, err))
+	if (check_shadow_stack(process, err) || check_namespaces(process, err) ||
+	    check_descriptors(process, err) || check_mappings(process, err))
 		return -1;
-	return target->descendant ? check_descendant(target, err) : 0;
+	return process->descendant ? check_descendant(process, err) : 0;
 }
 
 /* By way of the process: a second entry for each thread in the kernel's memory of
- * /proc would make its end longer (see ask()). */
+ * /proc would make its end longer (see thread_ask()). */
 static int is_awake(pid_t tid, void *arg)
 {
 	const pid_t pid = *(const pid_t *)arg;
@@ -225,17 +206,17 @@ static int is_awake(pid_t tid, void *arg)
 	return p && p[1] == ' ' && p[2] == 'R' ? -1 : 0;
 }
 
-static bool unread_bytes(const struct target *target)
+static bool unread_bytes(const struct process *process)
 {
-	for (uint32_t i = 0; i < target->socket_count; i++) {
-		int fd = (int)syscall(SYS_pidfd_getfd, target->pidfd, target->sockets[i], 0),
+	for (uint32_t i = 0; i < process->socket_count; i++) {
+		int fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, process->sockets[i], 0),
 		    bytes = 0;
 
 		if (fd < 0)
 			continue; /* closed since */
 		if (ioctl(fd, FIONREAD, &bytes))
 			bytes = 0; /* not one that bytes come from */
-		if (target->tcp_messages && file_is_coming(fd))
+		if (process->tcp_messages && file_is_coming(fd))
 			bytes = 1;
 		close(fd);
 		if (bytes)
@@ -244,9 +225,9 @@ static bool unread_bytes(const struct target *target)
 	return false;
 }
 
-bool quiescent(const struct target *target)
+bool process_is_quiescent(const struct process *process)
 {
-	pid_t pid = target->pid;
+	pid_t pid = process->pid;
 
-	return proc_tasks(target->task_dirfd, is_awake, &pid) == 0 && !unread_bytes(target);
+	return proc_tasks(process->task_dirfd, is_awake, &pid) == 0 && !unread_bytes(process);
 }

@@ -11,7 +11,7 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "process.h"
 
 /* ---- who there is --------------------------------------------------------------- */
 
@@ -22,15 +22,15 @@ struct looking {
 	struct avc_error *err;
 };
 
-static int add_kin(struct tree *tree, pid_t pid, int parent, struct avc_error *err)
+static int add_entry(struct tree *tree, pid_t pid, int parent, struct avc_error *err)
 {
 	if (tree->count == PROCESSES_MAX)
 		return fail(err, AVC_UNSUPPORTED, 0, tree->main->pid, "look at processes", "",
 			    "it has more than %d processes", PROCESSES_MAX);
 	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->kin[i].pid == pid)
+		if (tree->entry[i].pid == pid)
 			return 0; /* its parent has just gone: seen twice */
-	tree->kin[tree->count++] = (struct kin){ .pid = pid, .parent = parent };
+	tree->entry[tree->count++] = (struct tree_entry){ .pid = pid, .parent = parent };
 	return 0;
 }
 
@@ -38,15 +38,15 @@ static bool any_cloning(const struct tree *tree)
 {
 	bool cloning = tree->main->cloning;
 
-	for (uint32_t i = 0; i < tree->members; i++)
-		cloning |= tree->member[i]->cloning;
+	for (uint32_t i = 0; i < tree->processes; i++)
+		cloning |= tree->process[i]->cloning;
 	return cloning;
 }
 
-static bool is_member(const struct tree *tree, pid_t pid)
+static bool has_process(const struct tree *tree, pid_t pid)
 {
-	for (uint32_t i = 0; i < tree->members; i++)
-		if (tree->member[i]->leader == pid)
+	for (uint32_t i = 0; i < tree->processes; i++)
+		if (tree->process[i]->leader == pid)
 			return true;
 	return false;
 }
@@ -54,7 +54,7 @@ static bool is_member(const struct tree *tree, pid_t pid)
 /* A clone of ours: of a holder that is at it, or one of which we never heard. */
 static bool is_clone(const struct tree *tree, pid_t pid)
 {
-	if (is_member(tree, pid) || !tracee_is_ours(pid))
+	if (has_process(tree, pid) || !tracee_is_ours(pid))
 		return false;
 	tree->main->lost |= !any_cloning(tree);
 	return true;
@@ -73,7 +73,7 @@ static int look_at_task(pid_t tid, void *arg)
 		    (children[i] == tree->main->leader || tree->is_ours(children[i], tree->arg) ||
 		     is_clone(tree, children[i])))
 			continue;
-		if (add_kin(tree, children[i], look->parent, look->err))
+		if (add_entry(tree, children[i], look->parent, look->err))
 			return -1;
 	}
 	return 0;
@@ -104,51 +104,52 @@ static bool is_zombie(const struct proc_stat *stat)
 	return (stat->state == 'Z' || stat->state == 'X') && stat->threads < 2;
 }
 
-/* ---- targets -------------------------------------------------------------------- */
+/* ---- processes -------------------------------------------------------------------- */
 
-static struct target *target_new(const struct tree *tree)
+static struct process *process_new(const struct tree *tree)
 {
-	const struct target *main = tree->main;
-	struct target *target = malloc(sizeof *target);
+	const struct process *main = tree->main;
+	struct process *process = malloc(sizeof *process);
 
-	if (!target)
+	if (!process)
 		return NULL;
-	target_init(target);
-	target->descendant = true;
-	target->shm_bytes = main->shm_bytes;
-	target->tcp_moved = main->tcp_moved;
-	target->plain_filters = main->plain_filters;
-	target->init = main->init;
-	if (!target_make_room(target)) {
-		target_free_room(target);
-		free(target);
+	process_init(process);
+	process->descendant = true;
+	process->shm_bytes = main->shm_bytes;
+	process->others = main->others;
+	process->tcp_moved = main->tcp_moved;
+	process->plain_filters = main->plain_filters;
+	process->init = main->init;
+	if (!process_make_room(process)) {
+		process_free_room(process);
+		free(process);
 		return NULL;
 	}
-	return target;
+	return process;
 }
 
-static void target_free(struct target *target)
+static void process_free(struct process *process)
 {
-	unhold(target);
-	target_close(target);
-	parasite_close(&target->parasite);
-	target_free_room(target);
-	free(target);
+	process_unhold(process);
+	process_close(process);
+	parasite_close(&process->parasite);
+	process_free_room(process);
+	free(process);
 }
 
-static struct target *find_member(const struct tree *tree, pid_t pid, uint64_t start)
+static struct process *find_process(const struct tree *tree, pid_t pid, uint64_t start)
 {
-	for (uint32_t i = 0; i < tree->members; i++)
-		if (tree->member[i]->leader == pid && tree->member[i]->start == start)
-			return tree->member[i];
+	for (uint32_t i = 0; i < tree->processes; i++)
+		if (tree->process[i]->leader == pid && tree->process[i]->start == start)
+			return tree->process[i];
 	return NULL;
 }
 
 /* A thread of ours that forked while it was being stopped has brought it forth as our
- * tracee, and it was taken for one more thread (target.c, adopt()). */
-static void forget_thread(struct target *target, pid_t tid)
+ * tracee, and it was taken for one more thread (trace/thread.c, adopt()). */
+static void forget_thread(struct process *process, pid_t tid)
 {
-	struct thread *t = thread_find(target, tid);
+	struct thread *t = thread_find(process, tid);
 
 	if (t && !t->seen) {
 		t->attached = false;
@@ -156,105 +157,107 @@ static void forget_thread(struct target *target, pid_t tid)
 	}
 }
 
-static struct target *add_member(struct tree *tree, pid_t pid, uint64_t start,
-				 struct avc_error *err)
+static struct process *add_process(struct tree *tree, pid_t pid, uint64_t start,
+				   struct avc_error *err)
 {
-	struct target *target;
+	struct process *process;
 
-	if (tree->members == 2 * PROCESSES_MAX) {
+	if (tree->processes == 2 * PROCESSES_MAX) {
 		fail(err, AVC_UNSUPPORTED, 0, tree->main->pid, "look at processes", "",
 		     "it has had too many processes since the oldest generation");
 		return NULL;
 	}
-	target = target_new(tree);
-	if (!target) {
+	process = process_new(tree);
+	if (!process) {
 		fail_errno(err, pid, "look at processes", "malloc", "out of memory");
 		return NULL;
 	}
-	if (target_open(target, pid, proc_inside(pid), err)) {
-		target_free(target);
+	if (process_open(process, pid, proc_inside(pid), err)) {
+		process_free(process);
 		return NULL;
 	}
-	target->start = start;
+	process->start = start;
 	forget_thread(tree->main, pid);
-	for (uint32_t i = 0; i < tree->members; i++)
-		forget_thread(tree->member[i], pid);
-	tree->member[tree->members++] = target;
-	return target;
+	for (uint32_t i = 0; i < tree->processes; i++)
+		forget_thread(tree->process[i], pid);
+	tree->process[tree->processes++] = process;
+	return process;
 }
 
 /* What is kept open of one that is known takes less to look at. */
 static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 {
-	for (uint32_t i = 0; i < tree->members; i++)
-		if (tree->member[i]->leader == pid &&
-		    proc_stat_of(tree->member[i]->stat_fd, stat) == 0)
+	for (uint32_t i = 0; i < tree->processes; i++)
+		if (tree->process[i]->leader == pid &&
+		    proc_stat_of(tree->process[i]->stat_fd, stat) == 0)
 			return 0;
 	return proc_stat(pid, stat);
 }
 
 /* clone(2): what one of them opens, or where it goes, is the other's, too; those that are
  * restored have tables and directories of their own. */
-static int check_sharing(const struct tree *tree, const struct kin *kin, struct avc_error *err)
+static int check_sharing(const struct tree *tree, const struct tree_entry *entry,
+			 struct avc_error *err)
 {
-	const struct target *parent = kin->parent >= 0 ? tree->kin[kin->parent].target : NULL;
+	const struct process *parent = entry->parent >= 0 ? tree->entry[entry->parent].process
+							  : NULL;
 	const char *what = NULL;
 
-	if (parent && proc_shares(kin->pid, parent->pid, SHARED_FILES) == 1)
+	if (parent && proc_shares(entry->pid, parent->pid, SHARED_FILES) == 1)
 		what = "descriptor table (CLONE_FILES)";
-	else if (parent && proc_shares(kin->pid, parent->pid, SHARED_FOLDERS) == 1)
+	else if (parent && proc_shares(entry->pid, parent->pid, SHARED_FOLDERS) == 1)
 		what = "working directory (CLONE_FS)";
 	/* Two that are just ending have none. */
-	if (!what || proc_is_exiting(kin->pid))
+	if (!what || proc_is_exiting(entry->pid))
 		return 0;
-	return fail(err, AVC_UNSUPPORTED, 0, kin->pid, "look at processes", "",
-		    "process %d shares its %s with its parent", proc_inside(kin->pid), what);
+	return fail(err, AVC_UNSUPPORTED, 0, entry->pid, "look at processes", "",
+		    "process %d shares its %s with its parent", proc_inside(entry->pid), what);
 }
 
 int tree_look(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
-	if (add_kin(tree, tree->main->leader, PARENT_INIT, err))
+	if (add_entry(tree, tree->main->leader, PARENT_INIT, err))
 		return -1;
-	tree->kin[0].target = tree->main;
+	tree->entry[0].process = tree->main;
 	if (look_below_init(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
-		struct kin *kin = &tree->kin[i];
+		struct tree_entry *entry = &tree->entry[i];
 		struct proc_stat stat;
 
-		if (i && look_at(tree, kin->pid, &stat)) {
-			kin->pid = 0; /* it was waited for just now */
+		if (i && look_at(tree, entry->pid, &stat)) {
+			entry->pid = 0; /* it was waited for just now */
 			continue;
 		}
 		if (i)
-			kin->stat = stat;
+			entry->stat = stat;
 		if (i && is_zombie(&stat)) {
-			kin->ended = true;
+			entry->ended = true;
 			continue;
 		}
 		if (i) {
-			kin->target = find_member(tree, kin->pid, stat.start);
-			if (!kin->target) {
+			entry->process = find_process(tree, entry->pid, stat.start);
+			if (!entry->process) {
 				struct avc_error gone = { 0 };
 
-				if (check_sharing(tree, kin, err))
+				if (check_sharing(tree, entry, err))
 					return -1;
-				kin->target = add_member(tree, kin->pid, stat.start, &gone);
-				if (!kin->target && gone.code != AVC_GONE) {
+				entry->process = add_process(tree, entry->pid, stat.start, &gone);
+				if (!entry->process && gone.code != AVC_GONE) {
 					*err = gone;
 					return -1;
 				}
-				if (!kin->target) {
-					kin->ending = true;
+				if (!entry->process) {
+					entry->ending = true;
 					continue;
 				}
 			}
 		}
 		/* Thread by thread only when the last checkpoint did not find that it
 		 * has none: then the next one will find that it has. */
-		if (!kin->target->childless &&
-		    look_below(tree, kin->target->task_dirfd, (int)i, err))
+		if (!entry->process->childless &&
+		    look_below(tree, entry->process->task_dirfd, (int)i, err))
 			return -1;
 	}
 	return 0;
@@ -262,61 +265,61 @@ int tree_look(struct tree *tree, struct avc_error *err)
 
 /* Who could not be asked is just ending, and nobody knows of it yet: what is found here also
  * holds for the one that is restored in its place (guard_death.c, hold_all()). */
-static bool may_be_reaper(struct target *target)
+static bool may_be_reaper(struct process *process)
 {
-	const struct thread *thread = target ? thread_find(target, target->pid) : NULL;
+	const struct thread *thread = process ? thread_find(process, process->pid) : NULL;
 
 	return !thread || !thread->known || thread->creds.subreaper;
 }
 
 bool tree_has_reaper(const struct tree *tree, uint32_t i)
 {
-	for (int k = (int)i; k >= 0; k = tree->kin[k].parent)
-		if (may_be_reaper(tree->kin[k].target))
+	for (int k = (int)i; k >= 0; k = tree->entry[k].parent)
+		if (may_be_reaper(tree->entry[k].process))
 			return true;
 	return false;
 }
 
 bool tree_shares_memory(const struct tree *tree, uint32_t i)
 {
-	const int parent = tree->kin[i].parent;
+	const int parent = tree->entry[i].parent;
 
-	return parent >= 0 && tree->kin[parent].target &&
-	       proc_same_memory(tree->kin[i].pid, tree->kin[parent].pid);
+	return parent >= 0 && tree->entry[parent].process &&
+	       proc_same_memory(tree->entry[i].pid, tree->entry[parent].pid);
 }
 
 /* ---- the end of one --------------------------------------------------------------- */
 
-void tree_let_go(struct target *target)
+void tree_let_go(struct process *process)
 {
-	unhold(target);
-	target_close(target);
+	process_unhold(process);
+	process_close(process);
 }
 
 void tree_sweep(struct tree *tree)
 {
 	uint32_t kept = 0;
 
-	for (uint32_t i = 0; i < tree->members; i++) {
-		struct target *target = tree->member[i];
+	for (uint32_t i = 0; i < tree->processes; i++) {
+		struct process *process = tree->process[i];
 
 		/* One of which a thread is still ours has to be waited for. */
-		if (!target->pid && !target->images && !target->thread_count && !target->lost)
-			target_free(target);
+		if (!process->pid && !process->images && !process->thread_count && !process->lost)
+			process_free(process);
 		else
-			tree->member[kept++] = target;
+			tree->process[kept++] = process;
 	}
-	tree->members = kept;
+	tree->processes = kept;
 }
 
 void tree_free(struct tree *tree)
 {
-	for (uint32_t i = 0; i < tree->members; i++)
-		target_free(tree->member[i]);
-	free(tree->member);
-	free(tree->kin);
-	tree->member = NULL;
-	tree->kin = NULL;
-	tree->members = 0;
+	for (uint32_t i = 0; i < tree->processes; i++)
+		process_free(tree->process[i]);
+	free(tree->process);
+	free(tree->entry);
+	tree->process = NULL;
+	tree->entry = NULL;
+	tree->processes = 0;
 	tree->count = 0;
 }

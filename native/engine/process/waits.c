@@ -5,7 +5,7 @@
  */
 #include <stdio.h>
 
-#include "internal.h"
+#include "process.h"
 
 #define END_DEADLINE_NS (20 * NS_PER_MS)
 #define LOOKS_MAX 64 /* of some 50 us, before a checkpoint */
@@ -32,37 +32,37 @@ static bool is_waiting(struct thread *thread)
 }
 
 /* To be stopped is all it takes (rewind_call()). */
-static void end(struct target *target, struct thread *thread, timer_t timer)
+static void end(struct process *process, struct thread *thread, timer_t timer)
 {
 	struct avc_error gone = { 0 };
 
 	rt_priority_begin();
 	tracee_deadline_set(timer, END_DEADLINE_NS);
-	if (thread_stop(target, thread, &gone) == 0 && thread_await(target, thread, &gone) == 0)
-		thread_release(thread); /* or stragglers() does it, later */
+	if (thread_stop(process, thread, &gone) == 0 && thread_await(process, thread, &gone) == 0)
+		thread_release(thread); /* or threads_tend_stragglers() does it, later */
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 }
 
-void waits_prepare(struct target *target)
+void waits_prepare(struct process *process)
 {
 	uint32_t looks = 0;
 
-	for (uint32_t i = 0; i < target->thread_count && looks < LOOKS_MAX; i++) {
-		rewind_prepare(&target->threads[i]);
-		looks += target->threads[i].sleeper.known;
+	for (uint32_t i = 0; i < process->thread_count && looks < LOOKS_MAX; i++) {
+		rewind_prepare(&process->threads[i]);
+		looks += process->threads[i].sleeper.known;
 	}
 }
 
-void waits_end(struct target *target, timer_t timer)
+void waits_end(struct process *process, timer_t timer)
 {
 	const uint64_t now = now_ns();
 	uint64_t due = UINT64_MAX;
 
-	if (target->due_ns == UINT64_MAX)
+	if (process->due_ns == UINT64_MAX)
 		return;
-	for (uint32_t i = 0; i < target->thread_count; i++) { /* may grow */
-		struct thread *t = &target->threads[i];
+	for (uint32_t i = 0; i < process->thread_count; i++) { /* may grow */
+		struct thread *t = &process->threads[i];
 		struct rewound *r = &t->rewound;
 
 		if (!r->mark || r->due_ns == UINT64_MAX || t->attached)
@@ -80,7 +80,7 @@ void waits_end(struct target *target, timer_t timer)
 		}
 		r->waiting = false;
 		if (is_waiting(t))
-			end(target, t, timer);
+			end(process, t, timer);
 	}
-	target->due_ns = due;
+	process->due_ns = due;
 }

@@ -15,7 +15,7 @@
 #include <sys/uio.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "restore.h"
 
 #define BUFFER_BYTES (256u << 10)
 /* What one of the two takes at a time. */

@@ -1,16 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * The memory of a process that its restored parent has forked: it is the parent's, and
- * is made that of the template.
- *
- * Where both have the same mapped at the same place it stays, and with it the pages that
- * they share: of equal page frames (pagemap, Documentation/admin-guide/mm/pagemap.rst)
- * there is nothing to do.  Everything else is unmapped, mapped, and copied.  What that is
- * is found out by the templates of both, before there is a process that it is for.
+ * is made that of the template, by the plan that checkpoint/remap_plan.c has made.
  */
 #include <fcntl.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/shm.h>
@@ -18,131 +11,10 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "remap.h"
+#include "restore.h"
 
-#define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 #define DROPPABLE 0x08 /* MAP_DROPPABLE, since Linux 6.11; the headers may be older */
-
-/* A stretch that is in one mapping of both at most. */
-struct piece {
-	avc_remote start, end;
-	const struct mapping *is, *want; /* NULL: nothing is mapped             */
-	bool kept;
-};
-
-enum page {
-	PAGE_SAME,
-	PAGE_COPY,
-	PAGE_DROP,
-	PAGE_GUARD,    /* becomes a guard page                                   */
-	PAGE_OPEN,     /* is one, and is to be empty                             */
-	PAGE_OPEN_COPY /* is one, and is to be copied                           */
-};
-
-struct run {
-	avc_remote start, end;
-	enum page what;
-	bool plain; /* it may be read and written                           */
-};
-
-struct remap {
-	const struct target *target;
-	struct snapshot *is, *want;
-	struct piece *piece;
-	uint32_t pieces;
-	struct run *run;
-	uint32_t runs, room;
-};
-
-/* ---- mappings ------------------------------------------------------------------- */
-
-static bool is_stack(const struct mapping *m)
-{
-	return !strcmp(m->name, "[stack]");
-}
-
-static bool is_file(const struct mapping *m)
-{
-	return m->inode != 0;
-}
-
-/* By which it was mapped. */
-static uint32_t kind_of(const struct mapping *m)
-{
-	return (m->flags & (MAPPING_DROPPABLE | MAPPING_GROWING)) |
-	       (is_stack(m) ? MAPPING_GROWING : 0);
-}
-
-static bool same_backing(const struct mapping *a, const struct mapping *b)
-{
-	return a->shared == b->shared && is_stack(a) == is_stack(b) && a->inode == b->inode &&
-	       mapping_is_special(a) == mapping_is_special(b) && kind_of(a) == kind_of(b) &&
-	       (!is_file(a) ||
-		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
-}
-
-/* What stays where it is whatever happens; where our parasite is nothing else is touched. */
-static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
-{
-	return mapping_is_special(m) || parasite_contains(&r->target->parasite, address);
-}
-
-static const struct mapping *at(const struct mappings *maps, uint32_t *next, avc_remote address)
-{
-	while (*next < maps->count && maps->map[*next].end <= address)
-		++*next;
-	return *next < maps->count && maps->map[*next].start <= address ? &maps->map[*next] : NULL;
-}
-
-static avc_remote boundary(const struct mappings *maps, uint32_t next, avc_remote address)
-{
-	if (next == maps->count)
-		return UINT64_MAX;
-	return maps->map[next].start > address ? maps->map[next].start : maps->map[next].end;
-}
-
-/* Both lists side by side. */
-static int cut(struct remap *r, struct avc_error *err)
-{
-	const struct mappings *is_maps = &r->is->maps, *want_maps = &r->want->maps;
-	avc_remote address = 0;
-	uint32_t is = 0, want = 0;
-
-	r->piece = calloc(2 * (is_maps->count + want_maps->count) + 2, sizeof *r->piece);
-	if (!r->piece)
-		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
-	for (;;) {
-		const struct mapping *a = at(is_maps, &is, address);
-		const struct mapping *b = at(want_maps, &want, address);
-		const avc_remote x = boundary(is_maps, is, address);
-		const avc_remote y = boundary(want_maps, want, address);
-		const avc_remote end = x < y ? x : y;
-
-		if (end == UINT64_MAX)
-			return 0;
-		if ((a && is_fixed(r, a, address)) || (b && is_fixed(r, b, address)))
-			a = b = NULL;
-		if (a || b)
-			r->piece[r->pieces++] = (struct piece){
-				.start = address,
-				.end = end,
-				.is = a,
-				.want = b,
-				.kept = a && b && same_backing(a, b),
-			};
-		address = end;
-	}
-}
-
-static uint32_t key_of(const struct mapping *m)
-{
-	return (m->flags & MAPPING_KEYS) / MAPPING_KEY_ONE;
-}
-
-static bool same_protection(const struct mapping *a, const struct mapping *b)
-{
-	return mapping_protection(a) == mapping_protection(b) && key_of(a) == key_of(b);
-}
 
 static int unmap(const struct remap *r, struct syscall_batch *batch, struct avc_error *err)
 {
@@ -161,25 +33,17 @@ static int unmap(const struct remap *r, struct syscall_batch *batch, struct avc_
 	return 0;
 }
 
-static const struct mapping *find_special(const struct mappings *maps, const char *name)
-{
-	for (uint32_t i = 0; i < maps->count; i++)
-		if (!strcmp(maps->map[i].name, name))
-			return &maps->map[i];
-	return NULL;
-}
-
 /* Of a program that was executed anew the vDSO is somewhere else.  By way of a place that
  * neither has anything at: behind the parasite. */
 static int move_special(const struct remap *r, struct syscall_batch *batch, struct avc_error *err)
 {
 	static const char *const names[] = { "[vvar]", "[vvar_vclock]", "[vdso]" };
-	avc_remote between = r->target->parasite.base + r->target->parasite.bytes + PAGE;
+	avc_remote between = r->process->parasite.base + r->process->parasite.bytes + PAGE;
 
 	for (int away = 1; away >= 0; away--)
 		for (size_t i = 0; i < sizeof names / sizeof *names; i++) {
-			const struct mapping *a = find_special(&r->is->maps, names[i]);
-			const struct mapping *b = find_special(&r->want->maps, names[i]);
+			const struct mapping *a = mappings_find(&r->is->maps, names[i]);
+			const struct mapping *b = mappings_find(&r->want->maps, names[i]);
 			const uint64_t bytes = a ? a->end - a->start : 0;
 
 			if (!a || !b || a->start == b->start)
@@ -195,7 +59,7 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
 						  MREMAP_MAYMOVE | MREMAP_FIXED, b->start, 0);
 			between += bytes;
 			if (i + 1 == sizeof names / sizeof *names)
-				between = r->target->parasite.base + r->target->parasite.bytes +
+				between = r->process->parasite.base + r->process->parasite.bytes +
 					  PAGE;
 		}
 	return 0;
@@ -205,9 +69,7 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
  * in an overlay a copy would be made. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared && proc_mapped_for_writing(template, m->start, m->end)
-			       ? proc_open_mapped(template, m->start, m->end, O_RDWR)
-			       : -1;
+	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
 
 	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }
@@ -292,9 +154,9 @@ static int map_piece(const struct remap *r, struct syscall_batch *batch, const s
 			  (m->shared                      ? MAP_SHARED
 			   : m->flags & MAPPING_DROPPABLE ? DROPPABLE
 							  : MAP_PRIVATE | MAP_NORESERVE);
-	const int growing = kind_of(m) & MAPPING_GROWING ? MAP_GROWSDOWN : 0;
+	const int growing = mapping_kind(m) & MAPPING_GROWING ? MAP_GROWSDOWN : 0;
 
-	if (!is_file(m))
+	if (!mapping_is_file(m))
 		return syscall_batch_ask(batch, SYS_mmap, piece->start, bytes, prot,
 					 (uint64_t)(flags | MAP_ANONYMOUS | growing), (uint64_t)-1,
 					 0, err);
@@ -312,10 +174,10 @@ static int protect_piece(struct syscall_batch *batch, const struct piece *piece,
 {
 	const struct mapping *want = piece->want;
 	const uint64_t mode = (uint64_t)mapping_protection(want), bytes = piece->end - piece->start;
-	const uint32_t key = key_of(want);
+	const uint32_t key = mapping_key(want);
 
 	/* Without keys, pkey_mprotect(2) may not know key 0 either. */
-	if (!key && (!piece->is || !key_of(piece->is)))
+	if (!key && (!piece->is || !mapping_key(piece->is)))
 		return syscall_batch_ask(batch, SYS_mprotect, piece->start, bytes, mode, 0, 0, 0,
 					 err);
 	/* What can only be executed has a key that the kernel took (pkeys(7)).  Where this process
@@ -340,105 +202,19 @@ static int map_new(const struct remap *r, struct syscall_batch *batch, struct av
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
 
-		if (!piece->want || (piece->kept && same_protection(piece->is, piece->want)))
+		if (!piece->want ||
+		    (piece->kept && mapping_same_protection(piece->is, piece->want)))
 			continue;
 		changed = true;
 		if (!piece->kept && map_piece(r, batch, piece, &given, err))
 			return -1;
-		if ((piece->kept || key_of(piece->want)) && protect_piece(batch, piece, err))
+		if ((piece->kept || mapping_key(piece->want)) && protect_piece(batch, piece, err))
 			return -1;
 	}
 	return give_file(r, batch, NULL, &given, err) ||
 			       (changed && syscall_batch_flush(batch, err))
 		       ? -1
 		       : 0;
-}
-
-/* ---- pages -------------------------------------------------------------------------- */
-
-#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
-#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
-#define PAGEMAP_FILE (UINT64_C(1) << 61)
-#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
-#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
-/* Where it stands in the page table: a swap entry of the last type, which is none, with
- * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
-#define GUARD_MARKER (UINT64_C(4) << 5 | 31)
-/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE; the headers may be older. */
-#define GUARD_INSTALL 102
-#define GUARD_REMOVE 103
-
-/* A guard page without a mapping of its own (madvise(2), Linux 6.13). */
-static bool is_guard(uint64_t frame)
-{
-	return frame & PAGEMAP_GUARD ||
-	       (frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED | PAGEMAP_FRAME)) ==
-		       (PAGEMAP_SWAPPED | GUARD_MARKER);
-}
-
-static bool is_own(uint64_t frame)
-{
-	return frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(frame & PAGEMAP_FILE);
-}
-
-/* Of a private mapping.  What is of a file is there by itself. */
-static enum page compare(uint64_t want, uint64_t is)
-{
-	if (is_guard(want))
-		return is_guard(is) ? PAGE_SAME : PAGE_GUARD;
-	if (is_guard(is))
-		return is_own(want) ? PAGE_OPEN_COPY : PAGE_OPEN;
-	if (!is_own(want))
-		return is_own(is) ? PAGE_DROP : PAGE_SAME;
-	if (is_own(is) && want & PAGEMAP_FRAME &&
-	    !((want ^ is) & (PAGEMAP_FRAME | PAGEMAP_PRESENT | PAGEMAP_SWAPPED)))
-		return PAGE_SAME;
-	return PAGE_COPY;
-}
-
-static int add_run(struct remap *r, const struct mapping *m, enum page what, avc_remote start,
-		   avc_remote end, struct avc_error *err)
-{
-	const bool plain = m->mode[0] == 'r' && m->mode[1] == 'w';
-	struct run *last = r->runs ? &r->run[r->runs - 1] : NULL;
-
-	if (last && last->what == what && last->end == start && last->plain == plain) {
-		last->end = end;
-		return 0;
-	}
-	if (!make_room(&r->run, r->runs, &r->room, sizeof *r->run))
-		return fail_errno(err, 0, "restore memory", "realloc", "out of memory");
-	r->run[r->runs++] = (struct run){ start, end, what, plain };
-	return 0;
-}
-
-static int compare_piece(struct remap *r, const struct piece *piece, struct avc_error *err)
-{
-	static const struct pages nothing;
-	const struct pages *wanted = snapshot_pages(r->want, piece->want, err);
-	const struct pages *had = piece->kept ? snapshot_pages(r->is, piece->is, err) : &nothing;
-	uint32_t next_wanted = 0, next_had = 0;
-
-	if (!wanted || !had)
-		return -1;
-	for (avc_remote start = piece->start, end; start < piece->end; start = end) {
-		const uint64_t *want, *is;
-
-		end = piece->end;
-		want = pages_frames(wanted, &next_wanted, start, &end);
-		is = pages_frames(had, &next_had, start, &end);
-		if (!want && !is)
-			continue;
-		for (size_t i = 0, count = (end - start) / PAGE; i < count; i++) {
-			const avc_remote page = start + i * PAGE;
-			const enum page what = compare(want ? want[i] : 0, is ? is[i] : 0);
-
-			if (what != PAGE_SAME &&
-			    add_run(r, piece->want, what, page, page + PAGE, err))
-				return -1;
-		}
-	}
-	return 0;
 }
 
 static int advice_of(enum page what)
@@ -486,86 +262,11 @@ static int fill(const struct remap *r, struct syscall_batch *batch, struct copie
 	return 0;
 }
 
-/* ---- all of it ----------------------------------------------------------------------- */
-
-struct remap *remap_plan(const struct target *target, struct snapshot *want, struct snapshot *is,
-			 struct avc_error *err)
-{
-	struct remap *r = calloc(1, sizeof *r);
-
-	if (!r) {
-		fail_errno(err, 0, "restore memory", "calloc", "out of memory");
-		return NULL;
-	}
-	*r = (struct remap){ .target = target, .want = want, .is = is };
-	if (cut(r, err))
-		goto failed;
-	for (uint32_t i = 0; i < r->pieces; i++) {
-		const struct piece *piece = &r->piece[i];
-
-		if (piece->want && !piece->want->shared && compare_piece(r, piece, err))
-			goto failed;
-	}
-	return r;
-failed:
-	remap_free(r);
-	return NULL;
-}
-
-/* mseal(2): nobody takes it away or protects it otherwise, not in a fork either. */
-static bool is_stuck(const struct piece *piece)
-{
-	return piece->is && piece->is->flags & MAPPING_SEALED &&
-	       (!piece->kept || !same_protection(piece->is, piece->want));
-}
-
-static bool is_lost(const struct piece *piece)
-{
-	return piece->want && piece->want->flags & MAPPING_ONLY_HERE && !piece->kept;
-}
-
-int remap_check(const struct target *target, struct snapshot *want, struct snapshot *is,
+int remap_apply(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
 		struct avc_error *err)
-{
-	struct remap r = { .target = target, .want = want, .is = is };
-	const struct mapping *a = find_special(&is->maps, "[vdso]");
-	const struct mapping *b = find_special(&want->maps, "[vdso]");
-	int result = cut(&r, err);
-
-	if (!result && a && b && a->flags & MAPPING_SEALED && a->start != b->start)
-		result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
-			      "process %d has executed another program, and the kernel seals its "
-			      "vDSO (mseal(2))",
-			      target->inside);
-	for (uint32_t i = 0; !result && i < r.pieces; i++) {
-		if (is_lost(&r.piece[i]))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
-				      "process %d has mapped what no other process can map: %s",
-				      target->inside, r.piece[i].want->name);
-		else if (is_stuck(&r.piece[i]))
-			result = fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep memory", "",
-				      "process %d has other memory than its parent where that has "
-				      "sealed it (mseal(2))",
-				      target->inside);
-	}
-	free(r.piece);
-	return result;
-}
-
-int remap(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
-	  struct avc_error *err)
 {
 	return unmap(r, batch, err) || move_special(r, batch, err) || map_new(r, batch, err) ||
 			       fill(r, batch, copier, err)
 		       ? -1
 		       : 0;
-}
-
-void remap_free(struct remap *r)
-{
-	if (!r)
-		return;
-	free(r->piece);
-	free(r->run);
-	free(r);
 }

@@ -15,8 +15,8 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
 #include "parasite_blob.h"
+#include "restore.h"
 
 #define TRIES 8 /* at once */
 #define TRY_NS NS_PER_S
@@ -74,10 +74,10 @@ static void reset(const struct parasite *parasite, uint32_t slot_number)
 }
 
 /* A stopped process is sent to inj_restore() and let go. */
-static int send_off(struct target *target, struct generation *generation, pid_t child,
+static int send_off(struct process *process, struct generation *generation, pid_t child,
 		    struct sandbox **sandbox, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
+	const struct parasite *parasite = &process->parasite;
 	struct arch_regs regs;
 
 	/* Its stack is the first thread's, in the slot. */
@@ -89,7 +89,7 @@ static int send_off(struct target *target, struct generation *generation, pid_t 
 		arch_tls_set(&regs, parasite_thread(parasite, generation->slot, 0)->tls);
 	if ((generation->sandboxed || generation->stop_signal) &&
 	    arch_regs_set(child, &regs) == 0) {
-		*sandbox = sandbox_begin(child, err);
+		*sandbox = sandbox_begin(child, process->inside, err);
 		if (*sandbox)
 			return 0;
 		tracee_kill(child);
@@ -105,10 +105,10 @@ static int send_off(struct target *target, struct generation *generation, pid_t 
 
 /* One fork of the template, or what is to have the memory of its spare.  If it is to have
  * children, it stays stopped. */
-static int fork_template(struct target *target, struct generation *generation, pid_t *pid,
+static int fork_template(struct process *process, struct generation *generation, pid_t *pid,
 			 int *pidfd, bool again, struct sandbox **sandbox, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
+	const struct parasite *parasite = &process->parasite;
 	struct inj_slot *slot = parasite_slot(parasite, generation->slot);
 	struct inj_call *call = &slot->template_call;
 	const bool spare = spare_is_there(generation);
@@ -142,7 +142,7 @@ static int fork_template(struct target *target, struct generation *generation, p
 		}
 		return tracee_settle(from, err);
 	}
-	if (send_off(target, generation, child, sandbox, err))
+	if (send_off(process, generation, child, sandbox, err))
 		return -1;
 	*pid = child;
 	/* The template can come to rest meanwhile. */
@@ -168,11 +168,11 @@ static int describe_failure(const struct parasite *parasite, const struct inj_sl
 
 /* Forks until the number that comes out is the app's; in a PID namespace that is
  * shared somebody else may fork in between. */
-static int rebuild(struct target *target, struct generation *generation, struct last_pid *helper,
+static int rebuild(struct process *process, struct generation *generation, struct last_pid *helper,
 		   struct restore_tree *others, pid_t *pid, int *pidfd, struct sandbox **sandbox,
 		   struct restore_times *times, struct avc_error *notes, struct avc_error *err)
 {
-	struct inj_slot *slot = parasite_slot(&target->parasite, generation->slot);
+	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
 
 	const uint64_t end = now_ns() + TRY_NS;
 
@@ -184,14 +184,14 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 		if (i >= TRIES)
 			usleep(TRY_AGAIN_NS / 1000);
 		start = now_ns();
-		reset(&target->parasite, generation->slot);
+		reset(&process->parasite, generation->slot);
 		if (last_pid_set(helper, slot->pid - 1, err) ||
-		    fork_template(target, generation, pid, pidfd, i > 0, sandbox, err))
+		    fork_template(process, generation, pid, pidfd, i > 0, sandbox, err))
 			return -1;
 		times->fork_ns = now_ns() - start;
 		if (others && slot->state == INJ_IDLE) {
 			if (restore_tree_make(others, *pid, notes, err) ||
-			    send_off(target, generation, *pid, sandbox, err))
+			    send_off(process, generation, *pid, sandbox, err))
 				return -1;
 			times->fork_ns = now_ns() - start;
 		}
@@ -206,7 +206,7 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 			sandbox_end(*sandbox);
 		*sandbox = NULL;
 		if (slot->state == INJ_FAILED)
-			return describe_failure(&target->parasite, slot, err);
+			return describe_failure(&process->parasite, slot, err);
 	}
 	return fail(err, AVC_KERNEL, EEXIST, slot->pid, "restore", "clone",
 		    "the PID is taken by somebody else");
@@ -214,23 +214,23 @@ static int rebuild(struct target *target, struct generation *generation, struct 
 
 /* ---- one of several ---------------------------------------------------------------- */
 
-int restore_start(struct target *target, struct generation *image, struct last_pid *helper,
+int restore_start(struct process *process, struct generation *image, struct last_pid *helper,
 		  pid_t pid, struct sandbox **sandbox, struct avc_error *err)
 {
-	reset(&target->parasite, image->slot);
-	last_pid_serve(helper, parasite_slot(&target->parasite, image->slot));
-	return send_off(target, image, pid, sandbox, err);
+	reset(&process->parasite, image->slot);
+	last_pid_serve(helper, parasite_slot(&process->parasite, image->slot));
+	return send_off(process, image, pid, sandbox, err);
 }
 
-int restore_await(struct target *target, struct generation *image, pid_t pid,
+int restore_await(struct process *process, struct generation *image, pid_t pid,
 		  struct sandbox *sandbox, struct avc_error *err)
 {
-	struct inj_slot *slot = parasite_slot(&target->parasite, image->slot);
+	struct inj_slot *slot = parasite_slot(&process->parasite, image->slot);
 
 	if (!await_state(slot, sandbox))
 		return fail(err, AVC_KERNEL, ETIMEDOUT, pid, "restore", "",
 			    "the new process does not answer");
-	return slot->state == INJ_READY ? 0 : describe_failure(&target->parasite, slot, err);
+	return slot->state == INJ_READY ? 0 : describe_failure(&process->parasite, slot, err);
 }
 
 /* What was allowed to fail, and did: to be told. */
@@ -252,34 +252,61 @@ static void let_go(struct inj_slot *slot, enum inj_go stage)
 }
 
 /* As the others knew it: its main thread has ended, it is stopped. */
-void restore_go(struct target *target, struct generation *image, struct sandbox *sandbox)
+void restore_go(struct process *process, struct generation *image, struct sandbox *sandbox)
 {
-	struct inj_slot *slot = parasite_slot(&target->parasite, image->slot);
+	struct inj_slot *slot = parasite_slot(&process->parasite, image->slot);
 
 	if (sandbox)
-		sandbox_go(sandbox, &target->parasite, image->slot, image->stop_signal);
+		sandbox_go(sandbox, &process->parasite, image->slot, image->stop_signal);
 	let_go(slot, INJ_GO_ALL);
 }
 
-void restore_note(struct target *target, struct generation *image, pid_t pid,
+void restore_note(struct process *process, struct generation *image, pid_t pid,
 		  struct avc_error *notes)
 {
-	note_failed(&target->parasite, image->slot, pid, notes);
-	files_check_calls(&target->parasite, image->slot,
-			  parasite_slot(&target->parasite, image->slot)->pid, notes);
+	note_failed(&process->parasite, image->slot, pid, notes);
+	files_check_calls(&process->parasite, image->slot,
+			  parasite_slot(&process->parasite, image->slot)->pid, notes);
 	attributes_put_back(image->attributes, pid, notes);
 }
 
-int restore(struct target *target, struct generation *generation, struct init_channel *channel,
-	    const struct avc_config *config, timer_t timer, uint64_t died_ns,
-	    int (*ready)(void *arg, struct avc_error *err), void *arg, pid_t *pid,
-	    struct restore_times *times, struct avc_error *notes, struct avc_error *err)
+/* It serves all processes that ask for numbers: those that are no zombies. */
+static struct last_pid *start_helper(const struct process *process,
+				     const struct generation *generation,
+				     const struct init_channel *channel, struct avc_error *err)
 {
-	struct inj_slot *slot = parasite_slot(&target->parasite, generation->slot);
-	struct last_pid *helper = last_pid_start(channel->pidns_fd, slot, err);
+	struct last_pid_slot *slot = calloc(generation->branches + 1, sizeof *slot);
+	struct last_pid *helper = NULL;
+	uint32_t count = 0;
+
+	if (!slot) {
+		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		return NULL;
+	}
+	slot[count++] = (struct last_pid_slot){ &process->parasite, generation->slot };
+	for (uint32_t i = 0; i < generation->branches; i++) {
+		const struct branch *branch = &generation->branch[i];
+
+		if (branch->process)
+			slot[count++] = (struct last_pid_slot){ &branch->process->parasite,
+								branch->image->slot };
+	}
+	helper = last_pid_start(channel->init_pidfd, slot, count, err);
+	free(slot);
+	return helper;
+}
+
+int restore_app(struct process *process, struct generation *generation,
+		struct init_channel *channel, const struct avc_config *config, timer_t timer,
+		uint64_t died_ns, int (*ready)(void *arg, struct avc_error *err), void *arg,
+		pid_t *pid, struct restore_times *times, struct avc_error *notes,
+		struct avc_error *err)
+{
+	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
+	struct last_pid *helper = start_helper(process, generation, channel, err);
 	struct sandbox *sandbox = NULL;
 	struct restore_tree *others = NULL;
-	struct files_table *tables = calloc(generation->branches + 1, sizeof *tables);
+	struct fd_table *tables = calloc(generation->branches + 1, sizeof *tables);
 	int result, pidfd = -1;
 	uint64_t start, spare_ns;
 
@@ -292,22 +319,22 @@ int restore(struct target *target, struct generation *generation, struct init_ch
 	}
 	tracee_deadline_set(timer, FORK_NS);
 	start = now_ns();
-	result = spare_await(target, generation, err);
+	result = spare_await(process, generation, err);
 	/* To fork takes so long that the number would be somebody else's in the end. */
 	if (!result && generation->anon_pages >= COPIED_PAGES && !generation->spare.unwanted &&
 	    !spare_is_there(generation))
-		result = spare_make_now(target, generation, err);
+		result = spare_make_now(process, generation, err);
 	spare_ns = now_ns() - start;
 	if (!result)
-		result = files_restore(target, generation, config, channel->init, tables, notes,
+		result = files_restore(process, generation, config, channel->init, tables, notes,
 				       err);
 	if (!result && generation->branches) {
-		others = restore_tree_new(target, generation, helper, channel, timer, tables, err);
+		others = restore_tree_new(process, generation, helper, channel, timer, tables, err);
 		result = others ? 0 : -1;
 	}
 	init_channel_working(channel);
 	if (!result)
-		result = rebuild(target, generation, helper, others, pid, &pidfd, &sandbox, times,
+		result = rebuild(process, generation, helper, others, pid, &pidfd, &sandbox, times,
 				 notes, err);
 	if (!result && others)
 		result = restore_tree_start(others, notes, err);
@@ -316,12 +343,12 @@ int restore(struct target *target, struct generation *generation, struct init_ch
 	tracee_deadline_clear(timer);
 	last_pid_stop(helper);
 	for (uint32_t i = 0; i < generation->branches; i++)
-		files_table_free(&tables[i]);
+		fd_table_free(&tables[i]);
 	free(tables);
 	if (!result)
-		restore_note(target, generation, *pid, notes);
+		restore_note(process, generation, *pid, notes);
 	if (!result)
-		result = memory_put_back(generation->image, *pid, notes, err);
+		result = memory_put_back(process, generation, *pid, notes, err);
 	if (!result)
 		result = ready(arg, err);
 	if (result) {
@@ -348,7 +375,7 @@ int restore(struct target *target, struct generation *generation, struct init_ch
 		let_go(slot, INJ_GO_ENDED);
 		proc_await_end(*pid);
 	}
-	restore_go(target, generation, sandbox);
+	restore_go(process, generation, sandbox);
 	spare_drop(generation); /* it has the memory of what runs now */
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);

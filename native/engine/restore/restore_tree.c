@@ -17,7 +17,7 @@
 #include <sys/syscall.h>
 #include <sys/wait.h>
 
-#include "internal.h"
+#include "restore.h"
 
 #define TRIES 64
 #define TRY_AGAIN_US 200
@@ -26,7 +26,7 @@
 /* So many children have fd_channel of their own. */
 #define FEW 2
 
-struct member {
+struct forked {
 	pid_t pid; /* 0: not made yet                                         */
 	int pidfd;
 	bool traced;
@@ -35,23 +35,23 @@ struct member {
 };
 
 struct restore_tree {
-	struct target *main;
+	struct process *main;
 	struct generation *generation;
 	struct last_pid *helper;
 	struct init_channel *channel;
 	timer_t timer;
-	const struct files_table *table; /* by branch                            */
+	const struct fd_table *table; /* by branch                            */
 	struct copier *copier;
 	struct fd_channel fd_channel; /* of the main process's children                  */
 	uint64_t flush;               /* signals of children that ended (sigset_t)       */
 	pid_t last_number;            /* the number given out last; 0: not known          */
-	struct member first;          /* the main process                              */
-	struct member *member;        /* by branch                                   */
+	struct forked first;          /* the main process                              */
+	struct forked *forked;        /* by branch                                   */
 };
 
-struct restore_tree *restore_tree_new(struct target *main, struct generation *generation,
+struct restore_tree *restore_tree_new(struct process *main, struct generation *generation,
 				      struct last_pid *helper, struct init_channel *channel,
-				      timer_t timer, const struct files_table *table,
+				      timer_t timer, const struct fd_table *table,
 				      struct avc_error *err)
 {
 	struct restore_tree *restored = calloc(1, sizeof *restored);
@@ -59,8 +59,8 @@ struct restore_tree *restore_tree_new(struct target *main, struct generation *ge
 	if (restored && restore_plan_begin(generation, 0, err) == 0)
 		restored->copier = copier_new(err);
 	if (restored && restored->copier)
-		restored->member = calloc(generation->branches + 1, sizeof *restored->member);
-	if (!restored || !restored->member) {
+		restored->forked = calloc(generation->branches + 1, sizeof *restored->forked);
+	if (!restored || !restored->forked) {
 		if (restored)
 			copier_free(restored->copier);
 		free(restored);
@@ -76,13 +76,13 @@ struct restore_tree *restore_tree_new(struct target *main, struct generation *ge
 	restored->fd_channel = (struct fd_channel){ -1, -1 };
 	restored->first.pidfd = restored->first.batch.socket = -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		restored->member[i].pidfd = restored->member[i].batch.socket = -1;
+		restored->forked[i].pidfd = restored->forked[i].batch.socket = -1;
 	return restored;
 }
 
-static struct member *member_of(struct restore_tree *restored, int branch)
+static struct forked *forked_of(struct restore_tree *restored, int branch)
 {
-	return branch < 0 ? &restored->first : &restored->member[branch];
+	return branch < 0 ? &restored->first : &restored->forked[branch];
 }
 
 /* What is done while a process forks, which takes its time if it is big: how the child
@@ -118,7 +118,7 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 		return -1;
 	if (tracee_settle(batch->pid, err) || tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(batch->parasite, *child))
 		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
 	return 0;
 }
@@ -138,7 +138,7 @@ static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *
 
 /* A child of the host's, with the number if nobody else has taken it.  `copy`: a child of the
  * host's that is as it came out of fork(2), and gives its memory to this one; 0: there is none. */
-static int fork_once(struct restore_tree *restored, struct member *host,
+static int fork_once(struct restore_tree *restored, struct forked *host,
 		     const struct branch *branch, pid_t copy, struct chores *chores, pid_t *child,
 		     struct avc_error *err)
 {
@@ -183,7 +183,7 @@ static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc
  * copy_process()), when everything is copied: what is big may never get it where others fork all
  * the time.  So the first that has another one is kept as a copy.  To give its memory away takes
  * no time. */
-static int fork_host(struct restore_tree *restored, struct member *host,
+static int fork_host(struct restore_tree *restored, struct forked *host,
 		     const struct branch *branch, struct chores *chores, pid_t *child,
 		     struct avc_error *err)
 {
@@ -229,12 +229,12 @@ static int fork_host(struct restore_tree *restored, struct member *host,
 }
 
 /* Ended, and not waited for: it ends again, and nobody waits for it. */
-static int make_zombie(struct member *member, const struct branch *branch, struct avc_error *err)
+static int make_zombie(struct forked *forked, const struct branch *branch, struct avc_error *err)
 {
 	const int signal = WIFSIGNALED(branch->status) ? WTERMSIG(branch->status) : 0;
 	const struct rlimit none = { 0, 0 };
 	const uint64_t open_mask = 0;
-	struct syscall_batch *batch = &member->batch;
+	struct syscall_batch *batch = &forked->batch;
 	avc_remote remote;
 	uint8_t *data = syscall_batch_data(batch, &remote);
 
@@ -261,7 +261,7 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
 	}
-	if (ptrace(PTRACE_CONT, batch->pid, NULL, 0L))
+	if (seccomp_go_on(batch->pid, NULL))
 		return fail_errno(err, batch->pid, "restore", "ptrace(CONT)", "it was killed");
 	for (;;) {
 		const struct stop stop = tracee_wait(batch->pid, 0);
@@ -272,16 +272,15 @@ static int make_zombie(struct member *member, const struct branch *branch, struc
 			return fail(err, AVC_DEADLINE, 0, batch->pid, "restore", "",
 				    "it did not end again");
 		if (stop.kind != STOP_DYING)
-			ptrace(PTRACE_CONT, batch->pid, NULL,
-			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+			seccomp_go_on(batch->pid, &stop);
 	}
 }
 
 /* Session and group before it has children of its own.  What it has from its parent is
  * right as a rule. */
-static int place(struct member *member, const struct branch *branch, struct avc_error *err)
+static int place(struct forked *forked, const struct branch *branch, struct avc_error *err)
 {
-	struct syscall_batch *batch = &member->batch;
+	struct syscall_batch *batch = &forked->batch;
 	struct proc_stat stat;
 
 	if (proc_stat(batch->pid, &stat))
@@ -327,9 +326,9 @@ static int put_foreground(struct syscall_batch *batch, const struct generation *
 }
 
 /* When all are there: into groups that others lead. */
-static int join_group(struct member *member, const struct branch *branch, struct avc_error *err)
+static int join_group(struct forked *forked, const struct branch *branch, struct avc_error *err)
 {
-	struct syscall_batch *batch = &member->batch;
+	struct syscall_batch *batch = &forked->batch;
 	struct proc_stat stat;
 
 	if (proc_stat(batch->pid, &stat))
@@ -346,17 +345,18 @@ static int join_group(struct member *member, const struct branch *branch, struct
 static int become(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
 	struct branch *branch = &restored->generation->branch[index];
-	struct member *member = &restored->member[index];
-	struct syscall_batch *batch = &member->batch;
+	struct forked *forked = &restored->forked[index];
+	struct syscall_batch *batch = &forked->batch;
 	const struct remap *plan = restore_plan_of(restored->generation, index, err);
 	const bool is_mains = restore_plan_host(restored->generation, index) == PARENT_MAIN;
 
 	if (!plan ||
 	    syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL, err))
 		return -1;
-	if (syscall_batch_change_parasite(batch, branch->target, branch->image->slot, err) ||
-	    process_attrs_take_keys(batch, err) || remap(plan, batch, restored->copier, err) ||
-	    process_attrs_put(batch, branch, err) || place(member, branch, err) ||
+	if (syscall_batch_change_parasite(batch, branch->process, branch->image->slot, err) ||
+	    process_attrs_take_keys(batch, err) ||
+	    remap_apply(plan, batch, restored->copier, err) ||
+	    process_attrs_put(batch, branch, err) || place(forked, branch, err) ||
 	    syscall_batch_put_files(batch, &restored->table[index], err))
 		return -1;
 	take_terminal(batch, branch);
@@ -398,7 +398,7 @@ static int finish_copies(struct restore_tree *restored, struct avc_error *err)
 /* What it has open is below that, with some for those that are only on their way. */
 static uint32_t files_of(const struct restore_tree *restored, uint32_t index)
 {
-	const struct files_table *table = &restored->table[index];
+	const struct fd_table *table = &restored->table[index];
 
 	return (table->count ? (uint32_t)table->entry[table->count - 1].fd : 0) + FILES_SPARE;
 }
@@ -409,7 +409,7 @@ static int make_member(struct restore_tree *restored, uint32_t index, int *last,
 {
 	const struct branch *branch = &restored->generation->branch[index];
 	const int host = restore_plan_host(restored->generation, index);
-	struct member *member = &restored->member[index], *by = member_of(restored, host);
+	struct forked *forked = &restored->forked[index], *by = forked_of(restored, host);
 	struct chores chores = { .restored = restored };
 
 	go_on(restored);
@@ -422,29 +422,29 @@ static int make_member(struct restore_tree *restored, uint32_t index, int *last,
 	/* ... and have all its memory. */
 	if (host >= 0 && finish_copies(restored, err))
 		return -1;
-	chores.child = branch->target ? (int)index : -1;
+	chores.child = branch->process ? (int)index : -1;
 	chores.last = *last;
 	*last = -1;
-	if (fork_host(restored, by, branch, &chores, &member->pid, err))
+	if (fork_host(restored, by, branch, &chores, &forked->pid, err))
 		return -1;
-	member->traced = true;
-	member->batch = by->batch;
-	member->batch.pid = member->pid;
-	member->batch.inside = branch->inside;
-	member->batch.socket = -1;
-	member->pidfd = proc_pidfd_open(member->pid);
-	if (member->pidfd < 0)
-		return fail_errno(err, member->pid, "restore", "pidfd_open", "it was killed");
+	forked->traced = true;
+	forked->batch = by->batch;
+	forked->batch.pid = forked->pid;
+	forked->batch.inside = branch->inside;
+	forked->batch.socket = -1;
+	forked->pidfd = proc_pidfd_open(forked->pid);
+	if (forked->pidfd < 0)
+		return fail_errno(err, forked->pid, "restore", "pidfd_open", "it was killed");
 	if (chores.result) {
 		*err = chores.error;
 		return -1;
 	}
-	if (branch->target) {
-		process_attrs_lift_limits(member->pid, branch, files_of(restored, index));
+	if (branch->process) {
+		process_attrs_lift_limits(forked->pid, branch, files_of(restored, index));
 		*last = (int)index;
 		return 0;
 	}
-	return place(member, branch, err) || syscall_batch_flush(&member->batch, err) ? -1 : 0;
+	return place(forked, branch, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
 }
 
 /* When nobody is to join a group that they lead any more. */
@@ -452,14 +452,14 @@ static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < restored->generation->branches; i++) {
 		const struct branch *branch = &restored->generation->branch[i];
-		struct member *member = &restored->member[i];
+		struct forked *forked = &restored->forked[i];
 
-		if (branch->target)
+		if (branch->process)
 			continue;
 		note_end(restored, branch);
-		if (make_zombie(member, branch, err))
+		if (make_zombie(forked, branch, err))
 			return -1;
-		member->traced = false;
+		forked->traced = false;
 	}
 	return 0;
 }
@@ -488,7 +488,7 @@ int restore_tree_make(struct restore_tree *restored, pid_t main_pid, struct avc_
 {
 	struct generation *generation = restored->generation;
 	struct inj_slot *slot = parasite_slot(&restored->main->parasite, generation->slot);
-	struct member *first = &restored->first;
+	struct forked *first = &restored->first;
 	int last = -1;
 
 	first->pid = first->batch.pid = main_pid;
@@ -497,8 +497,7 @@ int restore_tree_make(struct restore_tree *restored, pid_t main_pid, struct avc_
 	first->batch.inside = slot->pid;
 	first->batch.notes = notes;
 	syscall_batch_enter(&first->batch, &restored->main->parasite, generation->slot);
-	if (first->pidfd < 0 ||
-	    ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)TRACE_OPTIONS_OURS) ||
+	if (first->pidfd < 0 || parasite_own(&restored->main->parasite, main_pid) ||
 	    arch_regs_get(main_pid, &first->batch.base))
 		return fail_errno(err, main_pid, "restore", "ptrace(GETREGS)", "it was killed");
 	if (slot->session_leader)
@@ -522,19 +521,19 @@ int restore_tree_make(struct restore_tree *restored, pid_t main_pid, struct avc_
 	if (finish_copies(restored, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (join_group(&restored->member[i], &generation->branch[i], err))
+		if (join_group(&restored->forked[i], &generation->branch[i], err))
 			return -1;
 	if (end_zombies(restored, err))
 		return -1;
 	for (int i = -1; i < (int)generation->branches; i++)
-		if ((i < 0 || (generation->branch[i].target &&
+		if ((i < 0 || (generation->branch[i].process &&
 			       generation->branch[i].session == generation->branch[i].inside)) &&
-		    put_foreground(&member_of(restored, i)->batch,
+		    put_foreground(&forked_of(restored, i)->batch,
 				   i < 0 ? generation : generation->branch[i].image, err))
 			return -1;
 	for (int i = -1; restored->flush && i < (int)generation->branches; i++)
-		if ((i < 0 || generation->branch[i].target) &&
-		    flush_signals(restored, &member_of(restored, i)->batch, err))
+		if ((i < 0 || generation->branch[i].process) &&
+		    flush_signals(restored, &forked_of(restored, i)->batch, err))
 			return -1;
 	return 0;
 }
@@ -544,12 +543,12 @@ int restore_tree_make(struct restore_tree *restored, pid_t main_pid, struct avc_
 static int start_member(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
 	struct branch *branch = &restored->generation->branch[index];
-	struct member *member = &restored->member[index];
+	struct forked *forked = &restored->forked[index];
 
-	if (restore_start(branch->target, branch->image, restored->helper, member->pid,
-			  &member->sandbox, err))
+	if (restore_start(branch->process, branch->image, restored->helper, forked->pid,
+			  &forked->sandbox, err))
 		return -1;
-	member->traced = false;
+	forked->traced = false;
 	return 0;
 }
 
@@ -557,12 +556,12 @@ static int await_member(struct restore_tree *restored, uint32_t index, struct av
 			struct avc_error *err)
 {
 	struct branch *branch = &restored->generation->branch[index];
-	struct member *member = &restored->member[index];
+	struct forked *forked = &restored->forked[index];
 
-	if (restore_await(branch->target, branch->image, member->pid, member->sandbox, err))
+	if (restore_await(branch->process, branch->image, forked->pid, forked->sandbox, err))
 		return -1;
-	restore_note(branch->target, branch->image, member->pid, notes);
-	return memory_put_back(branch->image->image, member->pid, notes, err);
+	restore_note(branch->process, branch->image, forked->pid, notes);
+	return memory_put_back(branch->process, branch->image, forked->pid, notes, err);
 }
 
 /* It asks nothing of us while it puts itself together: no numbers for threads, no
@@ -578,13 +577,14 @@ int restore_tree_start(struct restore_tree *restored, struct avc_error *notes,
 	const struct generation *generation = restored->generation;
 
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target && is_on_its_own(generation->branch[i].image) &&
+		if (generation->branch[i].process && is_on_its_own(generation->branch[i].image) &&
 		    start_member(restored, i, err))
 			return -1;
 	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].target && ((!is_on_its_own(generation->branch[i].image) &&
-						      start_member(restored, i, err)) ||
-						     await_member(restored, i, notes, err)))
+		if (generation->branch[i].process &&
+		    ((!is_on_its_own(generation->branch[i].image) &&
+		      start_member(restored, i, err)) ||
+		     await_member(restored, i, notes, err)))
 			return -1;
 	return 0;
 }
@@ -596,36 +596,36 @@ void restore_tree_go(struct restore_tree *restored)
 		for (uint32_t i = 0; i < restored->generation->branches; i++) {
 			struct branch *branch = &restored->generation->branch[i];
 
-			if (branch->target && !branch->image->stop_signal == !stopped)
-				restore_go(branch->target, branch->image,
-					   restored->member[i].sandbox);
+			if (branch->process && !branch->image->stop_signal == !stopped)
+				restore_go(branch->process, branch->image,
+					   restored->forked[i].sandbox);
 		}
 }
 
 pid_t restore_tree_pid(const struct restore_tree *restored, uint32_t branch)
 {
-	return restored->member[branch].pid;
+	return restored->forked[branch].pid;
 }
 
-static void kill_member(struct member *member)
+static void kill_member(struct forked *forked)
 {
-	if (member->sandbox)
-		sandbox_end(member->sandbox);
-	else if (member->pid && member->traced)
-		tracee_kill(member->pid);
-	else if (member->pidfd >= 0)
-		syscall(SYS_pidfd_send_signal, member->pidfd, SIGKILL, NULL, 0);
-	member->sandbox = NULL;
-	member->traced = false;
+	if (forked->sandbox)
+		sandbox_end(forked->sandbox);
+	else if (forked->pid && forked->traced)
+		tracee_kill(forked->pid);
+	else if (forked->pidfd >= 0)
+		syscall(SYS_pidfd_send_signal, forked->pidfd, SIGKILL, NULL, 0);
+	forked->sandbox = NULL;
+	forked->traced = false;
 }
 
 void restore_tree_kill(struct restore_tree *restored)
 {
 	for (uint32_t i = restored->generation->branches; i-- > 0;)
-		kill_member(&restored->member[i]);
+		kill_member(&restored->forked[i]);
 	kill_member(&restored->first);
 	for (uint32_t i = 0; i < restored->generation->branches; i++) {
-		struct pollfd gone = { .fd = restored->member[i].pidfd, .events = POLLIN };
+		struct pollfd gone = { .fd = restored->forked[i].pidfd, .events = POLLIN };
 
 		if (gone.fd >= 0)
 			poll(&gone, 1, 1000);
@@ -637,12 +637,12 @@ void restore_tree_free(struct restore_tree *restored)
 	if (!restored)
 		return;
 	for (uint32_t i = 0; i < restored->generation->branches; i++) {
-		close_fd(&restored->member[i].pidfd);
-		close_fd(&restored->member[i].batch.socket);
+		close_fd(&restored->forked[i].pidfd);
+		close_fd(&restored->forked[i].batch.socket);
 	}
 	copier_free(restored->copier);
 	close_fd(&restored->fd_channel.ours);
 	close_fd(&restored->first.pidfd);
-	free(restored->member);
+	free(restored->forked);
 	free(restored);
 }

@@ -23,7 +23,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define IOPRIO_WHO_PROCESS 1
 #define CAPABILITY_VERSION_3 0x20080522
@@ -67,7 +67,7 @@ enum {
 	AMBIENT
 };
 
-void scheduling_read(pid_t tid, struct scheduling *s)
+void attributes_read_scheduling(pid_t tid, struct scheduling *s)
 {
 	memset(s, 0, sizeof *s);
 	if (syscall(SYS_sched_getattr, tid, s->attr, sizeof s->attr, 0))
@@ -135,7 +135,7 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	c->subreaper = a->subreaper;
 }
 
-uint64_t filters_read(pid_t tid)
+uint64_t attributes_read_filters(pid_t tid)
 {
 	uint64_t program[FILTER_MAX], sum = 0; /* of struct sock_filter */
 
@@ -280,17 +280,17 @@ static bool fits_locks(const struct creds *from, const struct creds *to)
 	return !(locks & ~to->securebits) && !(locks >> 1 & changed);
 }
 
-static int refuse(const struct target *target, pid_t inside, const char *has, const char *main,
+static int refuse(const struct process *process, pid_t inside, const char *has, const char *main,
 		  struct avc_error *err)
 {
-	const char *which = target->descendant ? "process" : "thread";
+	const char *which = process->descendant ? "process" : "thread";
 
-	return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+	return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 		    "%s %d has %s the main %s%s", which, inside, has, which, main);
 }
 
 /* A thread that is made by another one gets what it has not from that. */
-static int set_apart(const struct target *target, pid_t inside, const struct creds *from,
+static int set_apart(const struct process *process, pid_t inside, const struct creds *from,
 		     const struct creds *to, struct setup *setup, struct avc_error *err)
 {
 	if (to->slack_ns && to->slack_ns != from->slack_ns)
@@ -305,38 +305,38 @@ static int set_apart(const struct target *target, pid_t inside, const struct cre
 			->flags = INJ_MAY_FAIL;
 	if (differ_in_groups(from, to) &&
 	    (!(from->caps[0] >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "thread %d has other supplementary groups than the main thread, which "
 			    "can not be put back",
 			    inside);
 	if (to->seccomp != from->seccomp || to->filters != from->filters)
-		return fail(err, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "its threads differ in their seccomp filters (thread %d)", inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
-		return refuse(target, inside, "privileges that", " has given up", err);
+		return refuse(process, inside, "privileges that", " has given up", err);
 	if (!may_be_lowered(from, to))
-		return refuse(target, inside,
+		return refuse(process, inside,
 			      "other capability sets (bounding, ambient, securebits) than",
 			      ", which lacks CAP_SETPCAP to give up the same", err);
 	if (!fits_locks(from, to))
-		return refuse(target, inside, "another user or other securebits than",
+		return refuse(process, inside, "another user or other securebits than",
 			      ", which has locked its own", err);
 	lower(from, to, setup);
 	return 0;
 }
 
-int attributes_setup_thread(const struct target *target, const struct thread *main_thread,
+int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
 			    const struct thread *t, struct setup *setup, struct avc_error *err)
 {
 	/* One that is not the main process is made from that, as are its threads. */
-	const struct creds *from = target->descendant ? target->forebear : &main_thread->creds;
+	const struct creds *from = process->descendant ? process->forebear : &main_thread->creds;
 	const struct creds *to = &t->creds;
 
 	if (t == main_thread && to->subreaper)
 		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
 				 0, 0);
-	if ((t != main_thread || target->descendant) &&
-	    set_apart(target, t->inside, from, to, setup, err))
+	if ((t != main_thread || process->descendant) &&
+	    set_apart(process, t->inside, from, to, setup, err))
 		return -1;
 	/* A process that is made gets its own with what else it has (process_attrs.c). */
 	if (to->personality != main_thread->creds.personality)
@@ -354,7 +354,7 @@ static bool same_scheduling(const struct scheduling *a, const struct scheduling 
 	return !memcmp(a, b, sizeof *a);
 }
 
-int attributes_keep(const struct target *target, struct generation *generation,
+int attributes_keep(const struct process *process, struct generation *generation,
 		    struct avc_error *err)
 {
 	struct attributes *kept =
@@ -365,16 +365,17 @@ int attributes_keep(const struct target *target, struct generation *generation,
 	if (!kept)
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
-	if (proc_read(target->pid, "oom_score_adj", kept->oom_score_adj,
+	if (proc_read(process->pid, "oom_score_adj", kept->oom_score_adj,
 		      sizeof kept->oom_score_adj) <= 0 &&
-	    !target->descendant) /* else it has its parent's */
-		return fail(err, AVC_GONE, ESRCH, target->pid, "keep template", "", "it has ended");
-	scheduling_read(generation->template, &inherited);
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		const struct thread *t = &target->threads[i];
+	    !process->descendant) /* else it has its parent's */
+		return fail(err, AVC_GONE, ESRCH, process->pid, "keep template", "",
+			    "it has ended");
+	attributes_read_scheduling(generation->template, &inherited);
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		const struct thread *t = &process->threads[i];
 
 		if (t->block < 0 ||
-		    (!target->descendant && same_scheduling(&t->scheduling, &inherited)))
+		    (!process->descendant && same_scheduling(&t->scheduling, &inherited)))
 			continue;
 		kept->thread[kept->count].inside = t->inside;
 		kept->thread[kept->count++].scheduling = t->scheduling;
@@ -416,7 +417,7 @@ static bool has_all(const struct attributes *attributes, pid_t pid)
 {
 	struct scheduling is;
 
-	scheduling_read(pid, &is);
+	attributes_read_scheduling(pid, &is);
 	for (uint32_t i = 0; i < attributes->count; i++)
 		if (!same_scheduling(&attributes->thread[i].scheduling, &is))
 			return false;
@@ -429,7 +430,7 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 	int dirfd;
 
 	if (attributes->oom_score_adj[0])
-		oom_score_adj_set(pid, attributes->oom_score_adj);
+		proc_set_oom_score_adj(pid, attributes->oom_score_adj);
 	if (has_all(attributes, pid))
 		return;
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);

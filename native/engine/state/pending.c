@@ -11,7 +11,7 @@
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define PENDING_MAX 1024
 #define AT_ONCE 32
@@ -92,9 +92,9 @@ static bool takes(const struct thread *t, int signal)
 /* A thread that was just about to run a handler: its call is cut short by the signal,
  * so it has to get that, also one that any thread could take.  (One that is ignored
  * is queued only because we trace.) */
-static void assign(struct target *target, const struct dispositions *dispositions)
+static void assign(struct process *process, const struct dispositions *dispositions)
 {
-	struct pending *pending = target->pending;
+	struct pending *pending = process->pending;
 	const uint64_t handled = dispositions->caught;
 
 	for (uint32_t k = 0; k < pending->count; k++) {
@@ -103,8 +103,8 @@ static void assign(struct target *target, const struct dispositions *disposition
 
 		if (!(handled >> (signal - 1) & 1))
 			continue;
-		for (uint32_t i = 0; i < target->thread_count; i++) {
-			struct thread *t = &target->threads[i];
+		for (uint32_t i = 0; i < process->thread_count; i++) {
+			struct thread *t = &process->threads[i];
 
 			/* The kernel, too, likes to give the main thread such a one. */
 			if (takes(t, signal) &&
@@ -127,9 +127,9 @@ static bool ends_by_default(int signal)
 
 /* A process that has got a deadly signal and was stopped by us before it could die of
  * it: every restore of such an image would die at once. */
-static int find_deadly(const struct target *target, const struct dispositions *dispositions)
+static int find_deadly(const struct process *process, const struct dispositions *dispositions)
 {
-	const struct pending *pending = target->pending;
+	const struct pending *pending = process->pending;
 	const uint64_t spared = dispositions->caught | dispositions->ignored;
 
 	for (uint32_t k = 0; k < pending->count; k++) {
@@ -137,8 +137,8 @@ static int find_deadly(const struct target *target, const struct dispositions *d
 
 		if (!ends_by_default(signal) || spared >> (signal - 1) & 1)
 			continue;
-		for (uint32_t i = 0; i < target->thread_count; i++) {
-			const struct thread *t = &target->threads[i];
+		for (uint32_t i = 0; i < process->thread_count; i++) {
+			const struct thread *t = &process->threads[i];
 
 			if (takes(t, signal) &&
 			    (pending->signal[k].block < 0 || pending->signal[k].block == t->block))
@@ -148,27 +148,27 @@ static int find_deadly(const struct target *target, const struct dispositions *d
 	return 0;
 }
 
-int pending_read(struct target *target, struct avc_error *err)
+int pending_read(struct process *process, struct avc_error *err)
 {
-	struct pending *pending = target->pending;
+	struct pending *pending = process->pending;
 	struct dispositions dispositions;
 
 	pending->count = 0;
 	pending->deadly = 0;
 	pending->too_many = false;
-	for (uint32_t i = 0; i < target->thread_count; i++) {
-		struct thread *t = &target->threads[i];
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
 
 		t->signalled = false;
 		if (t->block < 0)
 			continue;
-		if ((t->tid == target->pid && read_queue(pending, t->tid, -1, err)) ||
+		if ((t->tid == process->pid && read_queue(pending, t->tid, -1, err)) ||
 		    read_queue(pending, t->tid, t->block, err))
 			return -1;
 	}
-	if (pending->count && read_dispositions(target->pid, &dispositions)) {
-		assign(target, &dispositions);
-		pending->deadly = find_deadly(target, &dispositions);
+	if (pending->count && read_dispositions(process->pid, &dispositions)) {
+		assign(process, &dispositions);
+		pending->deadly = find_deadly(process, &dispositions);
 	}
 	return 0;
 }
@@ -196,38 +196,38 @@ static bool can_be_queued(const siginfo_t *info)
 	return info->si_signo != SIGSTOP && info->si_signo != SIGKILL;
 }
 
-void pending_setup_thread(const struct target *target, const struct thread *thread,
+void pending_setup_thread(const struct process *process, const struct thread *thread,
 			  struct setup *setup)
 {
-	const struct pending *pending = target->pending;
+	const struct pending *pending = process->pending;
 
 	for (uint32_t i = 0; i < pending->count; i++) {
 		const siginfo_t *info = &pending->signal[i].info;
 
 		if (pending->signal[i].block == thread->block && can_be_queued(info))
 			setup_add_thread(setup, "rt_tgsigqueueinfo", SYS_rt_tgsigqueueinfo,
-					 (uint64_t)target->inside, (uint64_t)thread->inside,
+					 (uint64_t)process->inside, (uint64_t)thread->inside,
 					 (uint64_t)info->si_signo,
 					 setup_data(setup, info, sizeof *info), 0)
 				->flags = INJ_MAY_FAIL;
 	}
 }
 
-void pending_setup(const struct target *target, struct setup *setup)
+void pending_setup(const struct process *process, struct setup *setup)
 {
-	const struct pending *pending = target->pending;
+	const struct pending *pending = process->pending;
 
 	for (uint32_t i = 0; i < pending->count; i++) {
 		const siginfo_t *info = &pending->signal[i].info;
 
 		if (pending->signal[i].block < 0 && can_be_queued(info))
 			setup_add(setup, INJ_AFTER, "rt_sigqueueinfo", SYS_rt_sigqueueinfo,
-				  (uint64_t)target->inside, (uint64_t)info->si_signo,
+				  (uint64_t)process->inside, (uint64_t)info->si_signo,
 				  setup_data(setup, info, sizeof *info), 0, 0)
 				->flags = INJ_MAY_FAIL;
 	}
 	if (pending->too_many && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 		     "more than %d signals are pending; the others are lost at a restore",
 		     PENDING_MAX);
 }

@@ -14,7 +14,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define SIGNALS 64
 #define AUXV_BYTES 1024
@@ -156,15 +156,15 @@ static int64_t barriers_of(const struct inj_syscall *told, const struct inj_sysc
 	return registered;
 }
 
-int branch_learn(struct branch *branch, struct avc_error *err)
+int process_attrs_learn(struct branch *branch, struct avc_error *err)
 {
-	const struct parasite *parasite = &branch->target->parasite;
+	const struct parasite *parasite = &branch->process->parasite;
 	struct generation *image = branch->image;
 	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 	uint8_t *memory = parasite_files(parasite, image->slot) + INJ_FILES_BYTES / 2;
 	struct inj_syscall *list = (struct inj_syscall *)memory;
 	struct action *action = (struct action *)(list + SIGNALS + 8 + KEYS);
-	const struct thread *main_thread = thread_find(branch->target, branch->target->pid);
+	const struct thread *main_thread = thread_find(branch->process, branch->process->pid);
 	struct process_attrs *attrs = calloc(1, sizeof *attrs);
 	const struct inj_syscall *keys;
 	uint32_t n = 0;
@@ -203,14 +203,14 @@ int branch_learn(struct branch *branch, struct avc_error *err)
 	attrs->state_permitted = main_thread->creds.state_permitted;
 	/* The template has limits of the time when the holder was made. */
 	if (read_mm(image->template, attrs) || read_status(image->template, attrs) ||
-	    (proc_limits(branch->target->pid, attrs->limit) &&
+	    (proc_limits(branch->process->pid, attrs->limit) &&
 	     proc_limits(image->template, attrs->limit)))
 		return fail_errno(err, image->template, "keep template", "open(/proc)",
 				  "it was killed");
 	return 0;
 }
 
-void branch_forget(struct branch *branch)
+void process_attrs_forget(struct branch *branch)
 {
 	free(branch->attrs);
 	branch->attrs = NULL;
@@ -254,7 +254,7 @@ static void put_mm(struct syscall_batch *batch, const struct process_attrs *attr
 			     "what it knows of its heap and arguments could not be put back");
 }
 
-void limit_lift(pid_t pid, int which, uint64_t least)
+void process_attrs_lift_limit(pid_t pid, int which, uint64_t least)
 {
 	struct rlimit now, lifted;
 
@@ -274,8 +274,8 @@ void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t 
 {
 	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
 	for (int i = 0; i < LIMITS; i++)
-		limit_lift(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
-	limit_lift(pid, RLIMIT_NOFILE, branch->attrs->limit[RLIMIT_NOFILE][1]);
+		process_attrs_lift_limit(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
+	process_attrs_lift_limit(pid, RLIMIT_NOFILE, branch->attrs->limit[RLIMIT_NOFILE][1]);
 }
 
 void process_attrs_setup_limits(const struct branch *branch, struct setup *setup)

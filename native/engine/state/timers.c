@@ -20,7 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "state.h"
 
 #define ITIMERS 3                  /* ITIMER_REAL, ITIMER_VIRTUAL, ITIMER_PROF */
 #define CLOCK (INJ_TIMERS_MAX - 1) /* where the time of the question goes */
@@ -86,10 +86,11 @@ static void parse(struct timers *timers, char *text)
 	}
 }
 
-void timers_ask(struct target *target, struct inj_call *call)
+void timers_ask(struct process *process, struct inj_call *call)
 {
-	struct timers *timers = target->timers;
-	const avc_remote out = parasite_remote(&target->parasite, target->parasite.control->timer);
+	struct timers *timers = process->timers;
+	const avc_remote out = parasite_remote(&process->parasite,
+					       process->parasite.control->timer);
 	ssize_t n;
 
 	timers->count = 0;
@@ -97,7 +98,7 @@ void timers_ask(struct target *target, struct inj_call *call)
 	for (int which = 0; which < ITIMERS; which++)
 		call_add(call, SYS_getitimer, (uint64_t)which,
 			 out + (uint64_t)which * sizeof(struct inj_timer), 0, 0, 0);
-	n = pread(target->timers_fd, timers->text, sizeof timers->text - 1, 0);
+	n = pread(process->timers_fd, timers->text, sizeof timers->text - 1, 0);
 	if (n > 0) {
 		timers->text[n] = 0;
 		parse(timers, timers->text);
@@ -109,17 +110,17 @@ void timers_ask(struct target *target, struct inj_call *call)
 		 0, 0, 0);
 }
 
-void timers_answer(struct target *target, const struct inj_call *call, uint64_t took_ns)
+void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns)
 {
-	struct timers *timers = target->timers;
+	struct timers *timers = process->timers;
 	struct timespec asked;
 
 	timers->took_ns = took_ns;
 	for (uint32_t i = 0; i < ITIMERS + timers->count; i++) {
 		timers->valid[i] = call->call[i].result == 0;
-		timers->setting[i] = target->parasite.control->timer[i];
+		timers->setting[i] = process->parasite.control->timer[i];
 	}
-	memcpy(&asked, &target->parasite.control->timer[CLOCK], sizeof asked);
+	memcpy(&asked, &process->parasite.control->timer[CLOCK], sizeof asked);
 	timers->asked_ns = (uint64_t)asked.tv_sec * NS_PER_S + (uint64_t)asked.tv_nsec;
 }
 
@@ -135,12 +136,12 @@ static bool runs(const struct inj_timer *s)
 }
 
 /* Expired between the two, and its signal is among the pending ones: once is enough. */
-static bool has_just_expired(const struct target *target, const struct inj_timer *s,
+static bool has_just_expired(const struct process *process, const struct inj_timer *s,
 			     int64_t unit_ns, int signal, int id)
 {
 	return !s->interval[0] && !s->interval[1] && !s->left[0] &&
-	       s->left[1] * unit_ns <= (int64_t)target->timers->took_ns &&
-	       pending_contains(target->pending, signal, id);
+	       s->left[1] * unit_ns <= (int64_t)process->timers->took_ns &&
+	       pending_contains(process->pending, signal, id);
 }
 
 /* ITIMER_REAL with its signal pending stands still until that is delivered, and
@@ -166,8 +167,8 @@ static void add_setting(struct setup *setup, const struct timers *timers, const 
 	set->flags = INJ_MAY_FAIL;
 }
 
-static void add_posix(struct target *target, const struct posix_timer *t, const struct inj_timer *s,
-		      bool valid, struct setup *setup)
+static void add_posix(struct process *process, const struct posix_timer *t,
+		      const struct inj_timer *s, bool valid, struct setup *setup)
 {
 	const int32_t id = t->id;
 	struct sigevent event = {
@@ -177,7 +178,7 @@ static void add_posix(struct target *target, const struct posix_timer *t, const 
 	};
 
 	if (t->notify & SIGEV_THREAD_ID) {
-		const struct thread *thread = thread_find(target, t->tid);
+		const struct thread *thread = thread_find(process, t->tid);
 
 		if (!thread || thread->block < 0)
 			return; /* the thread had ended: it could not fire any more */
@@ -187,9 +188,9 @@ static void add_posix(struct target *target, const struct posix_timer *t, const 
 		  setup_data(setup, &event, sizeof event), setup_data(setup, &id, sizeof id),
 		  (uint64_t)id, 0)
 		->flags = INJ_MAY_FAIL;
-	if (valid && runs(s) && !has_just_expired(target, s, 1, t->signal, t->id))
-		add_setting(setup, target->timers, "timer_settime", SYS_timer_settime, (uint64_t)id,
-			    s, counts_cpu(t->clock));
+	if (valid && runs(s) && !has_just_expired(process, s, 1, t->signal, t->id))
+		add_setting(setup, process->timers, "timer_settime", SYS_timer_settime,
+			    (uint64_t)id, s, counts_cpu(t->clock));
 }
 
 static int by_id(const void *a, const void *b)
@@ -199,9 +200,9 @@ static int by_id(const void *a, const void *b)
 	return ((*x)->id > (*y)->id) - ((*x)->id < (*y)->id);
 }
 
-void timers_setup(struct target *target, struct setup *setup)
+void timers_setup(struct process *process, struct setup *setup)
 {
-	const struct timers *timers = target->timers;
+	const struct timers *timers = process->timers;
 	const struct posix_timer *sorted[POSIX_MAX];
 
 	/* Ascending, for a kernel on which ids can only be counted up to. */
@@ -211,7 +212,7 @@ void timers_setup(struct target *target, struct setup *setup)
 	for (uint32_t i = 0; i < timers->count; i++) {
 		const size_t k = (size_t)(sorted[i] - timers->posix);
 
-		add_posix(target, sorted[i], &timers->setting[ITIMERS + k],
+		add_posix(process, sorted[i], &timers->setting[ITIMERS + k],
 			  timers->valid[ITIMERS + k], setup);
 	}
 	for (int which = 0; which < ITIMERS; which++) {
@@ -219,12 +220,12 @@ void timers_setup(struct target *target, struct setup *setup)
 		const bool real = which == ITIMER_REAL;
 
 		if (timers->valid[which] && (runs(s) || (real && ticks(s))) &&
-		    !(real && has_just_expired(target, s, 1000, SIGALRM, -1)))
+		    !(real && has_just_expired(process, s, 1000, SIGALRM, -1)))
 			add_setting(setup, timers, "setitimer", SYS_setitimer, (uint64_t)which, s,
 				    !real);
 	}
 	if (timers->too_many && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, target->pid, "keep template", "",
+		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 		     "it has more than %d POSIX timers; the others are lost at a restore",
 		     POSIX_MAX);
 }

@@ -6,6 +6,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/futex.h>
+#include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
@@ -15,11 +16,12 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "internal.h"
 #include "parasite_blob.h"
+#include "trace.h"
 
 #define HOMEWARD_NS (INJ_PARK_MS / 2 * NS_PER_MS)
 #define PARKED_NS NS_PER_S
+#define MFD_NOEXEC_SEAL_ 8U /* linux/memfd.h, since Linux 6.3: not to be executed by a path */
 
 static size_t page_up(size_t n)
 {
@@ -45,26 +47,69 @@ size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threa
 	return parasite->bytes;
 }
 
-int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
-		  uint64_t nonce, struct avc_error *err)
+/* Memory of ours, and of nobody else, until it is handed out: it can neither be taken away from
+ * under us (SIGBUS) nor grow. */
+static int make_memory(size_t bytes)
 {
-	void *map;
-	int fd;
+	int fd = memfd_create(PARASITE_NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING | MFD_NOEXEC_SEAL_);
 
-	fd = proc_open_mapped(pid, base, base + bytes, O_RDWR);
-	if (fd < 0)
-		return fail_errno(err, pid, "infect", "open(map_files)",
-				  "the parasite can not be reached");
-	map = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-	if (map == MAP_FAILED) {
-		close(fd);
-		return fail_errno(err, pid, "infect", "mmap", "the parasite can not be mapped");
+	if (fd < 0 && errno == EINVAL) /* before Linux 6.3 */
+		fd = memfd_create(PARASITE_NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING);
+	if (fd >= 0 &&
+	    (ftruncate(fd, (off_t)bytes) || fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW)))
+		close_fd(&fd);
+	return fd;
+}
+
+/* Read-only: who has it like this can not map it for writing; kernels before 6.7 let nobody map
+ * by any other descriptor what is sealed for good. */
+static int open_read_only(int fd)
+{
+	char path[32];
+
+	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
+	return open(path, O_RDONLY | O_CLOEXEC);
+}
+
+/* The code is the same in every process, and nobody can write it: one for all. */
+static pthread_once_t code_once = PTHREAD_ONCE_INIT;
+static int code_fd = -1;
+
+static void make_code(void)
+{
+	int fd = make_memory(INJ_CODE_BYTES);
+
+	if (fd >= 0 &&
+	    pwrite(fd, parasite_blob, sizeof parasite_blob, 0) == (ssize_t)sizeof parasite_blob &&
+	    fcntl(fd, F_ADD_SEALS, F_SEAL_WRITE | F_SEAL_SEAL) == 0)
+		code_fd = open_read_only(fd);
+	close_fd(&fd);
+}
+
+int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err)
+{
+	int fd;
+	uint8_t *map;
+
+	pthread_once(&code_once, make_code);
+	fd = make_memory(parasite->bytes - INJ_CODE_BYTES);
+	if (code_fd < 0 || fd < 0 || fcntl(fd, F_ADD_SEALS, F_SEAL_SEAL)) {
+		close_fd(&fd);
+		return fail_errno(err, 0, "infect", "memfd_create", "no memory for the parasite");
 	}
-	parasite->fd = fd;
-	parasite->base = base;
+	map = mmap(NULL, parasite->bytes, PROT_READ, MAP_SHARED, code_fd, 0);
+	if (map == MAP_FAILED ||
+	    mmap(map + INJ_CODE_BYTES, parasite->bytes - INJ_CODE_BYTES, PROT_READ | PROT_WRITE,
+		 MAP_SHARED | MAP_FIXED, fd, 0) == MAP_FAILED) {
+		if (map != MAP_FAILED)
+			munmap(map, parasite->bytes);
+		close(fd);
+		return fail_errno(err, 0, "infect", "mmap", "the parasite can not be mapped");
+	}
+	parasite->code_fd = code_fd;
+	parasite->data_fd = fd;
 	parasite->map = map;
 	parasite->control = (struct inj_control *)(parasite->map + INJ_CODE_BYTES);
-	memcpy(parasite->map, parasite_blob, sizeof parasite_blob);
 	parasite->control->nonce = nonce;
 	parasite->control->magic = INJ_MAGIC;
 	return 0;
@@ -74,7 +119,7 @@ void parasite_close(struct parasite *parasite)
 {
 	if (parasite->map) {
 		munmap(parasite->map, parasite->bytes);
-		close(parasite->fd);
+		close(parasite->data_fd);
 	}
 	*parasite = (struct parasite){ 0 };
 }
@@ -160,17 +205,23 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 	const uint64_t end = now_ns() + (call->after == INJ_AFTER_PARK ? PARKED_NS : HOMEWARD_NS);
 
 	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
+		const bool supervised = seccomp_is_supervised(tid);
 		struct stop stop;
 
-		syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
+		heartbeat();
+		/* One that is supervised stops all the time. */
+		if (!supervised)
+			syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
 		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
 			break;
-		stop = tracee_wait(tid, WNOHANG);
+		tracee_watch(supervised ? word : NULL);
+		stop = tracee_wait(tid, supervised ? 0 : WNOHANG);
+		tracee_watch(NULL);
 		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
 			return fail(err, AVC_GONE, 0, tid, "run injected code", "", "it has ended");
-		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP)
-			ptrace(PTRACE_CONT, tid, NULL,
-			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP ||
+		    stop.kind == STOP_SYSCALL)
+			seccomp_go_on(tid, &stop);
 		if (now_ns() > end)
 			return fail(err, AVC_DEADLINE, 0, tid, "run injected code", "",
 				    "the task did not get to run in time");
@@ -178,11 +229,18 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 	return 0;
 }
 
-int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
-		  struct inj_call *call, struct avc_error *err)
+static long options_of(const struct parasite *parasite, bool ours);
+
+static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
+		   const struct arch_regs *base, struct inj_call *call, struct avc_error *err)
 {
 	struct arch_regs regs;
 
+	if (parasite->seccomp != SECCOMP_SUPERVISED)
+		seccomp_let_be(tid);
+	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours)))
+		return fail(err, AVC_UNSUPPORTED, 0, tid, "run injected code", "",
+			    "it has too many processes under seccomp filters of its own");
 	arch_call(&regs, base, parasite->base + INJ_RUN_OFFSET,
 		  parasite_remote(parasite, call->stack + sizeof call->stack),
 		  parasite_remote(parasite, call));
@@ -191,9 +249,15 @@ int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_
 	return 0;
 }
 
+int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
+		  struct inj_call *call, struct avc_error *err)
+{
+	return send_in(parasite, tid, true, base, call, err);
+}
+
 int parasite_start(pid_t tid, struct avc_error *err)
 {
-	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+	if (seccomp_go_on(tid, NULL))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
 	return 0;
 }
@@ -248,7 +312,7 @@ static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_erro
 		return fail_errno(err, tid, "clone", "ptrace(INTERRUPT)", "it has gone");
 	if (tracee_await(tid, NULL, err) != STOP_TRAP)
 		return -1;
-	return fail(err, AVC_KERNEL, (int)-result, tid, "clone", "clone",
+	return fail(err, AVC_LIMIT, (int)-result, tid, "clone", "clone",
 		    "it may not have another process: %s", strerror((int)-result));
 }
 
@@ -276,8 +340,7 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		default:
 			/* SIGSTOP, SIGCONT and job control make stops of their own
 			 * (ptrace(2), PTRACE_EVENT_STOP). */
-			if (ptrace(PTRACE_CONT, tid, NULL,
-				   (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
+			if (seccomp_go_on(tid, &stop))
 				return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
 		}
 	}
@@ -298,26 +361,46 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 	return parasite_await_clone(tid, call, child, err);
 }
 
-bool in_old_parasite(const struct target *target, avc_remote address)
+bool parasite_is_old(const struct process *process, avc_remote address)
 {
-	for (uint32_t i = 0; i < target->old_parasites; i++)
-		if (address - target->old_parasite[i].base < target->old_parasite[i].bytes)
+	for (uint32_t i = 0; i < process->old_parasites; i++)
+		if (address - process->old_parasite[i].base < process->old_parasite[i].bytes)
 			return true;
 	return false;
 }
 
-int suspend_seccomp(const struct thread *thread, struct avc_error *err)
+static long options_of(const struct parasite *parasite, bool ours)
 {
-	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL,
-		   (long)(TRACE_OPTIONS_APP | PTRACE_O_SUSPEND_SECCOMP)))
+	return (long)((ours ? TRACE_OPTIONS_OURS : TRACE_OPTIONS_APP) |
+		      (parasite->seccomp == SECCOMP_NONE ? PTRACE_O_SUSPEND_SECCOMP : 0));
+}
+
+int parasite_own(const struct parasite *parasite, pid_t tid)
+{
+	return ptrace(PTRACE_SETOPTIONS, tid, NULL, options_of(parasite, true)) ? -1 : 0;
+}
+
+/* How the thread is going to be let run: it is borrowed next. */
+static int look_at_seccomp(struct process *process, struct thread *thread, struct avc_error *err)
+{
+	struct parasite *parasite = &process->parasite;
+
+	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as a checkpoint has found */
+		thread->seccomp = SECCOMP_SUPERVISED;
+	if (seccomp_look(thread->tid, process->plain_filters, &thread->filters_known,
+			 &thread->seccomp))
+		return fail_errno(err, thread->tid, "run injected code",
+				  "ptrace(SECCOMP_GET_FILTER)", "its filters can not be read");
+	parasite->seccomp = thread->seccomp;
+	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL, options_of(parasite, false)))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",
 				  "it has gone");
 	return 0;
 }
 
-int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
+int parasite_check(struct process *process, pid_t tid, struct avc_error *err)
 {
-	const avc_remote at = target->parasite.base + INJ_CODE_BYTES +
+	const avc_remote at = process->parasite.base + INJ_CODE_BYTES +
 			      offsetof(struct inj_control, nonce);
 	long nonce;
 
@@ -325,8 +408,8 @@ int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
 	nonce = ptrace(PTRACE_PEEKDATA, tid, (void *)at, NULL);
 	if (errno == ESRCH)
 		return fail_errno(err, tid, "stop", "ptrace(PEEKDATA)", "it has ended");
-	if (errno || (uint64_t)nonce != target->nonce) {
-		target->infected = false;
+	if (errno || (uint64_t)nonce != process->nonce) {
+		process->infected = false;
 		return fail(err, AVC_DEADLINE, 0, tid, "stop", "",
 			    "it has executed another program");
 	}
@@ -334,37 +417,37 @@ int parasite_check(struct target *target, pid_t tid, struct avc_error *err)
 }
 
 /* A holder has the memory of the program that it was made in. */
-static bool has_memory_of_holder(const struct target *target)
+static bool has_memory_of_holder(const struct process *process)
 {
-	return target->holder && proc_same_memory(target->pid, target->holder);
+	return process->holder && proc_same_memory(process->pid, process->holder);
 }
 
-int vet(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_vet(struct process *process, struct thread *thread, struct avc_error *err)
 {
-	if (support_check_thread(thread->tid, err))
+	if (thread_check_dispatch(thread->tid, err))
 		return -1;
-	if (!has_memory_of_holder(target) && parasite_check(target, thread->tid, err))
+	if (!has_memory_of_holder(process) && parasite_check(process, thread->tid, err))
 		return -1;
 	/* Homes are places of the app's, never of a parasite that will be taken away. */
-	if (in_old_parasite(target, arch_pc(&thread->regs)))
+	if (parasite_is_old(process, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
 			    "still on its way home from a guard that died");
 	/* The kernel forgets a restartable sequence as soon as the thread is
 	 * seen elsewhere: it has to go on where the kernel would send it.  There
 	 * are no system calls in one. */
 	if (thread->call.nr < 0)
-		rseq_fixup(target->mem_fd, thread);
+		thread_fix_rseq(process->mem_fd, thread);
 	thread->vetted = true;
 	return 0;
 }
 
-int borrow(struct target *target, struct thread *thread, struct avc_error *err)
+int thread_borrow(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
-	struct inj_control *control = target->parasite.control;
+	struct inj_control *control = process->parasite.control;
 	struct arch_regs home;
 
-	if (!thread->vetted && vet(target, thread, err))
+	if (!thread->vetted && thread_vet(process, thread, err))
 		return -1;
 	home = thread->regs;
 	arch_resume(&home);
@@ -372,18 +455,18 @@ int borrow(struct target *target, struct thread *thread, struct avc_error *err)
 	/* Registers first: if we die between the two, the thread is in the parasite
 	 * with its own mask and goes home with it.  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
-	if (suspend_seccomp(thread, err) ||
-	    parasite_send(&target->parasite, thread->tid, &thread->regs, &control->runner, err))
+	if (look_at_seccomp(process, thread, err) ||
+	    send_in(&process->parasite, thread->tid, false, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
-	thread->borrowed_for = &target->parasite;
+	thread->borrowed_for = &process->parasite;
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
 				  "it has gone");
 	return 0;
 }
 
-int give_back(struct thread *thread, struct avc_error *err)
+int thread_give_back(struct thread *thread, struct avc_error *err)
 {
 	struct arch_regs now;
 
@@ -393,15 +476,15 @@ int give_back(struct thread *thread, struct avc_error *err)
 	 * has gone home by itself, and its registers are newer than those that we know. */
 	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
 		thread->borrowed = false;
-		return fail(err, AVC_DEADLINE, EAGAIN, thread->tid, "give back", "",
+		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}
 	/* The mask first, for the same reason. */
 	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
-	/* Its own seccomp filters are in force again when it is let go: nothing else
-	 * comes in between. */
+	/* Strict mode is in force again when it is let go: nothing else comes in between. */
+	seccomp_let_be(thread->tid);
 	thread->borrowed = false;
 	return 0;
 }

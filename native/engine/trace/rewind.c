@@ -36,7 +36,7 @@
 #include <sys/uio.h>
 #include <unistd.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define ERESTARTNOHAND 514 /* include/linux/errno.h */
 #define ERESTART_RESTARTBLOCK 516
@@ -92,11 +92,11 @@ static const struct rewindable {
 /* ---- how long a call may take --------------------------------------------------------- */
 
 /* In ns; 0: for ever. */
-static uint64_t time_in_memory(const struct target *target, avc_remote pointer, uint64_t unit_ns)
+static uint64_t time_in_memory(const struct process *process, avc_remote pointer, uint64_t unit_ns)
 {
 	int64_t time[2];
 
-	if (!pointer || pread(target->mem_fd, time, sizeof time, (off_t)pointer) != sizeof time ||
+	if (!pointer || pread(process->mem_fd, time, sizeof time, (off_t)pointer) != sizeof time ||
 	    time[0] < 0 || time[1] < 0 || time[0] > INT32_MAX) /* as good as for ever */
 		return 0;
 	return (uint64_t)time[0] * NS_PER_S + (uint64_t)time[1] * unit_ns;
@@ -120,10 +120,10 @@ static bool is_unix_socket(int fd)
 	return getsockopt(fd, SOL_SOCKET, SO_DOMAIN, &domain, &bytes) == 0 && domain == AF_UNIX;
 }
 
-static uint64_t time_of_socket(const struct target *target, int app_fd, enum timeout kind,
+static uint64_t time_of_socket(const struct process *process, int app_fd, enum timeout kind,
 			       int *answer)
 {
-	int fd = (int)syscall(SYS_pidfd_getfd, target->pidfd, app_fd, 0);
+	int fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, app_fd, 0);
 	uint64_t limit;
 
 	if (fd < 0)
@@ -135,7 +135,7 @@ static uint64_t time_of_socket(const struct target *target, int app_fd, enum tim
 	return limit;
 }
 
-static uint64_t time_of_call(const struct target *target, const struct arch_regs *regs,
+static uint64_t time_of_call(const struct process *process, const struct arch_regs *regs,
 			     const struct rewindable *call, int *answer)
 {
 	const uint64_t argument = arch_syscall_arg(regs, call->argument);
@@ -146,12 +146,12 @@ static uint64_t time_of_call(const struct target *target, const struct arch_regs
 	case MILLISECONDS:
 		return ms > 0 ? (uint64_t)ms * NS_PER_MS : 0;
 	case TIMESPEC:
-		return time_in_memory(target, argument, 1);
+		return time_in_memory(process, argument, 1);
 	case TIMEVAL:
-		return time_in_memory(target, argument, 1000);
+		return time_in_memory(process, argument, 1000);
 	case RECEIVE:
 	case SEND:
-		return time_of_socket(target, (int)argument, call->timeout, answer);
+		return time_of_socket(process, (int)argument, call->timeout, answer);
 	case NO_TIMEOUT:
 		break;
 	}
@@ -167,7 +167,7 @@ static bool has_timeout(long nr)
 }
 
 /* False: the call is none of those.  *limit_ns: 0, it may take for ever. */
-static bool look_up(const struct target *target, const struct arch_regs *regs, uint64_t *limit_ns,
+static bool look_up(const struct process *process, const struct arch_regs *regs, uint64_t *limit_ns,
 		    int *answer)
 {
 	bool found = false;
@@ -175,7 +175,7 @@ static bool look_up(const struct target *target, const struct arch_regs *regs, u
 	*limit_ns = 0;
 	for (size_t i = 0; !*limit_ns && i < sizeof rewindable / sizeof *rewindable; i++)
 		if (rewindable[i].nr == arch_syscall_nr(regs)) {
-			*limit_ns = time_of_call(target, regs, &rewindable[i], answer);
+			*limit_ns = time_of_call(process, regs, &rewindable[i], answer);
 			found = true;
 		}
 	return found;
@@ -228,7 +228,7 @@ static void answer_late(struct thread *thread)
  * there the call itself has to be made again, and its number is no longer in the
  * registers.  Normally we have seen it before.  If not (a guard that came later),
  * the code in front of the system call or the arguments tell. */
-static long guess_call(const struct target *target, const struct arch_regs *regs, avc_remote pc)
+static long guess_call(const struct process *process, const struct arch_regs *regs, avc_remote pc)
 {
 	const uint64_t a = arch_syscall_arg(regs, 0), b = arch_syscall_arg(regs, 1),
 		       c = arch_syscall_arg(regs, 2), d = arch_syscall_arg(regs, 3);
@@ -236,7 +236,7 @@ static long guess_call(const struct target *target, const struct arch_regs *regs
 	uint8_t code[ARCH_CODE_BYTES];
 	long nr;
 
-	if (pread(target->mem_fd, code, sizeof code, (off_t)(pc - sizeof code)) == sizeof code) {
+	if (pread(process->mem_fd, code, sizeof code, (off_t)(pc - sizeof code)) == sizeof code) {
 		nr = arch_syscall_nr_before(code);
 		if (nr >= 0)
 			return nr;
@@ -252,16 +252,16 @@ static long guess_call(const struct target *target, const struct arch_regs *regs
 
 /* Let go a moment ago, and stopped again before it was back in its call: the kernel
  * has sent it back to the instruction, with the number of restart_syscall(2). */
-static bool is_about_to_restart(const struct target *target, const struct arch_regs *regs)
+static bool is_about_to_restart(const struct process *process, const struct arch_regs *regs)
 {
 	uint8_t code[ARCH_SYSCALL_BYTES];
 
 	return arch_syscall_result(regs) == SYS_restart_syscall &&
-	       pread(target->mem_fd, code, sizeof code, (off_t)arch_pc(regs)) == sizeof code &&
+	       pread(process->mem_fd, code, sizeof code, (off_t)arch_pc(regs)) == sizeof code &&
 	       arch_is_syscall(code);
 }
 
-static void note_call(const struct target *target, struct thread *t)
+static void note_call(const struct process *process, struct thread *t)
 {
 	struct call now = { .nr = arch_syscall_nr(&t->regs),
 			    .pc = arch_pc(&t->regs),
@@ -269,14 +269,14 @@ static void note_call(const struct target *target, struct thread *t)
 
 	for (unsigned int n = 0; n < 3; n++)
 		now.arg[n] = arch_syscall_arg(&t->regs, n);
-	if (is_about_to_restart(target, &t->regs)) {
+	if (is_about_to_restart(process, &t->regs)) {
 		now.nr = SYS_restart_syscall;
 		now.pc += ARCH_SYSCALL_BYTES;
 	}
 	if (now.nr == SYS_restart_syscall) {
 		now.nr = t->call.nr;
 		if (now.nr < 0 || memcmp(&now, &t->call, sizeof now) != 0)
-			now.nr = guess_call(target, &t->regs, now.pc);
+			now.nr = guess_call(process, &t->regs, now.pc);
 	}
 	t->call = now;
 }
@@ -320,13 +320,13 @@ static uint64_t waited_ns(struct thread *thread)
 }
 
 /* A call that answers EINTR to a stop is from now on watched. */
-static void begin_watch(const struct target *target, struct thread *thread, uint64_t now)
+static void begin_watch(const struct process *process, struct thread *thread, uint64_t now)
 {
 	uint64_t limit_ns;
 	int answer;
 
 	thread->rewound = (struct rewound){ 0 };
-	if (!look_up(target, &thread->regs, &limit_ns, &answer))
+	if (!look_up(process, &thread->regs, &limit_ns, &answer))
 		return;
 	thread->rewound = (struct rewound){ .mark = (uint32_t)now | 1,
 					    .answer = answer,
@@ -335,19 +335,19 @@ static void begin_watch(const struct target *target, struct thread *thread, uint
 		thread->rewound.due_ns = now + limit_ns - waited_ns(thread);
 }
 
-void rewind_call(struct target *target, struct thread *thread)
+void rewind_call(struct process *process, struct thread *thread)
 {
 	struct arch_regs *regs = &thread->regs;
 	struct rewound *r = &thread->rewound;
 	const uint64_t now = now_ns();
 
 	thread->stopped_ns = now;
-	note_call(target, thread);
+	note_call(process, thread);
 	if (arch_syscall_nr(regs) < 0 || is_about_to_rewind(thread))
 		return;
 	if (arch_syscall_result(regs) == -EINTR) {
 		if (!is_rewound(thread))
-			begin_watch(target, thread, now);
+			begin_watch(process, thread, now);
 		/* The result first: a guard that dies before the mark is set leaves a wait
 		 * that is too long, not one that fails. */
 		if (!r->mark || arch_result_set(thread->tid, -ERESTARTNOHAND))
@@ -361,14 +361,14 @@ void rewind_call(struct target *target, struct thread *thread)
 	r->runs_known = false;
 	if (now >= r->due_ns)
 		answer_late(thread);
-	else if (r->due_ns < target->due_ns)
-		target->due_ns = r->due_ns;
+	else if (r->due_ns < process->due_ns)
+		process->due_ns = r->due_ns;
 }
 
 /* ppoll, pselect and select write what is left of their timeout to the app's memory
  * when they are interrupted, and are made again with that: what they do not count
  * is the time they were stopped. */
-void rewind_count_stop(const struct target *target, const struct thread *thread)
+void rewind_count_stop(const struct process *process, const struct thread *thread)
 {
 	const struct arch_regs *regs = &thread->regs;
 	const long nr = arch_syscall_nr(regs);
@@ -382,14 +382,14 @@ void rewind_count_stop(const struct target *target, const struct thread *thread)
 	if (is_rewound(thread))
 		return; /* it could not write that */
 	pointer = arch_syscall_arg(regs, nr == SYS_ppoll ? 2 : 4);
-	if (!pointer || pread(target->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left ||
+	if (!pointer || pread(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left ||
 	    left[0] > INT32_MAX)
 		return;
 	ns = left[0] * (int64_t)NS_PER_S + left[1] * unit_ns -
 	     (int64_t)(now_ns() - thread->stopped_ns);
 	left[0] = ns > 0 ? ns / (int64_t)NS_PER_S : 0;
 	left[1] = ns > 0 ? ns % (int64_t)NS_PER_S / unit_ns : 0;
-	if (pwrite(target->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left)
+	if (pwrite(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left)
 		return; /* a little late, then */
 }
 

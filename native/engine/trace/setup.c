@@ -6,7 +6,7 @@
  */
 #include <string.h>
 
-#include "internal.h"
+#include "trace.h"
 
 void setup_begin(struct setup *setup, const struct parasite *parasite, uint32_t slot)
 {
@@ -84,7 +84,7 @@ int setup_end(const struct setup *setup, pid_t pid, struct avc_error *err)
 	return 0;
 }
 
-/* Where the engine sees what the target calls `address`; the parasite is the app's to
+/* Where the engine sees what the process calls `address`; the parasite is the app's to
  * scribble on, so nothing in there is believed. */
 static const struct inj_setup *local(const struct parasite *parasite, avc_remote address)
 {

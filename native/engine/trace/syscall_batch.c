@@ -15,7 +15,7 @@
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
 
-#include "internal.h"
+#include "trace.h"
 
 #define SPARE \
 	8 /* syscall_batch_add() is used for so many in a row at most, syscall_batch_ask() for more */
@@ -83,7 +83,9 @@ static int await_end(const struct syscall_batch *batch, const struct inj_syscall
 		default:
 			break;
 		}
-		if (ptrace(PTRACE_CONT, batch->pid, NULL, (long)signal))
+		if (stop.kind == STOP_SIGNAL && !signal)
+			stop.kind = STOP_OTHER;
+		if (seccomp_go_on(batch->pid, &stop))
 			return fail_errno(err, batch->pid, "run injected code", "ptrace(CONT)",
 					  "it has gone");
 	}
@@ -198,17 +200,17 @@ void *syscall_batch_data(const struct syscall_batch *batch, avc_remote *remote)
 static avc_remote write_letter(const struct syscall_batch *batch)
 {
 	avc_remote remote;
-	struct files_letter *letter = syscall_batch_data(batch, &remote);
+	struct fd_letter *letter = syscall_batch_data(batch, &remote);
 
 	_Static_assert(sizeof *letter <= sizeof batch->call->out, "room for a letter");
-	files_letter_write(letter, remote);
+	fd_letter_write(letter, remote);
 	return remote;
 }
 
 static int fetch(const struct syscall_batch *batch, int fd, struct avc_error *err)
 {
 	int pidfd = proc_pidfd_open(batch->pid);
-	const int ours = pidfd < 0 ? -1 : files_borrow(pidfd, fd);
+	const int ours = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, fd);
 
 	close_fd(&pidfd);
 	if (ours < 0)
@@ -275,8 +277,8 @@ int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_chan
 static int hand_over(struct syscall_batch *batch, int socket, int fd, struct avc_error *err)
 {
 	/* What is not received yet waits in the socket. */
-	if (files_send(batch->socket, fd) &&
-	    (errno != EAGAIN || syscall_batch_flush(batch, err) || files_send(batch->socket, fd)))
+	if (fd_send(batch->socket, fd) &&
+	    (errno != EAGAIN || syscall_batch_flush(batch, err) || fd_send(batch->socket, fd)))
 		return fail_errno(err, batch->pid, "restore", "sendmsg",
 				  "a descriptor could not be handed over");
 	return syscall_batch_ask(batch, SYS_recvmsg, (uint64_t)socket, write_letter(batch),
@@ -289,18 +291,21 @@ int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *er
 }
 
 /* From its parent's parasite into its own. */
-int syscall_batch_change_parasite(struct syscall_batch *batch, const struct target *target,
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
 				  uint32_t slot, struct avc_error *err)
 {
-	const struct parasite *parasite = &target->parasite;
+	const struct parasite *parasite = &process->parasite;
 
-	if (syscall_batch_give(batch, parasite->fd, err))
+	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
 			  PARASITE_FLAGS, 1, 0);
+	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (syscall_batch_give(batch, parasite->data_fd, err))
+		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
 			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1,
-			  INJ_CODE_BYTES);
+			  0);
 	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
 	if (syscall_batch_flush(batch, err))
 		return -1;
@@ -310,7 +315,7 @@ int syscall_batch_change_parasite(struct syscall_batch *batch, const struct targ
 
 /* In order; what is received comes to the lowest number that is free.  The last of the calls
  * are made with what comes next. */
-int syscall_batch_put_files(struct syscall_batch *batch, const struct files_table *table,
+int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *table,
 			    struct avc_error *err)
 {
 	int socket = 0, lowest = 0;

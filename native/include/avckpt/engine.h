@@ -2,14 +2,15 @@
  *
  * libavckpt: freeze, clone and restore.
  *
- * An *engine* owns a queue of events.  A *guard* protects one container: it is
- * one native thread that makes every ptrace(2) call for that container, takes
- * checkpoints on the interval, and restores when avckpt-init reports a death,
- * with no call back into the caller between death and resume.
+ * An *engine* owns a queue of events.  A *guard* protects one container: it is a process
+ * of its own (avckpt-guard), which makes every ptrace(2) call for that container, takes
+ * checkpoints on the interval, and restores when avckpt-init reports a death, with no call
+ * back into the caller between death and resume.  What the two say to each other is in
+ * avckpt/guard.h.  When the caller ends, its guards let their containers go and end.
  *
- * Functions return 0, or -1 with *err filled in, unless said otherwise.  All
- * of them may be called from any thread; none blocks for longer than it takes
- * to hand a message over, except avc_guard_stop() and avc_engine_free().
+ * Functions return 0, or -1 with *err filled in, unless said otherwise.  All of them may
+ * be called from any thread; none blocks for longer than it takes to hand a message over,
+ * except avc_guard_stop(), avc_engine_probe() and avc_engine_free().
  */
 #ifndef AVCKPT_ENGINE_H
 #define AVCKPT_ENGINE_H
@@ -75,9 +76,12 @@ enum avc_event_kind {
 	AVC_EVENT_ENDED = 8,       /* init is gone; the guard's last event, after
 	                            * it avc_guard_stop() returns at once         */
 	AVC_EVENT_REFUSED = 9,     /* a command could not be carried out          */
-	AVC_EVENT_DROPPED = 10     /* `generation` was given up before its time;
+	AVC_EVENT_DROPPED = 10,    /* `generation` was given up before its time;
 	                            * `reason` is why: CRASHED (`attempt` times),
 	                            * UNHEALTHY, MEMORY, KILLED, EXECUTED         */
+	AVC_EVENT_GUARD_LOST = 11  /* the guard's process has died, or hung and was
+	                            * killed; `error` says how.  The application
+	                            * runs on, unprotected.  The guard's last event */
 };
 
 enum avc_reason {
@@ -157,8 +161,9 @@ struct avc_guard;
 /* The library's version, "MAJOR.MINOR.PATCH"; static. */
 const char *avc_version(void);
 
-/* A new engine.  Errors: AVC_KERNEL. */
-struct avc_engine *avc_engine_new(struct avc_error *err);
+/* A new engine whose guards are processes of `program` (avckpt-guard).
+ * Errors: AVC_KERNEL. */
+struct avc_engine *avc_engine_new(const char *program, struct avc_error *err);
 
 /* A descriptor that is readable (poll(2)) while events are queued.  It stays
  * the engine's.  Read the events with avc_engine_next_event(), not the fd. */
@@ -171,21 +176,28 @@ int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event);
 /* Frees the engine.  Every guard must have been stopped. */
 void avc_engine_free(struct avc_engine *engine);
 
-/* Can this machine and this process do it at all?  Checks architecture, kernel
- * features and privileges without touching any process but a child of its own.
+/* Can this machine and a guard do it at all?  Has `program` check architecture, kernel
+ * features and privileges; it touches no process but a child of its own.
  * Errors: AVC_UNSUPPORTED, AVC_DENIED, AVC_KERNEL. */
-int avc_engine_probe(struct avc_error *err);
+int avc_engine_probe(const char *program, struct avc_error *err);
 
 /* Starts a guard for the container of which config->init_pidfd is init.
  * Returns NULL with *err filled in when the config makes no sense or the guard
- * can not be started; what goes wrong later comes as events with `cookie`.
+ * cannot be started; what goes wrong later comes as events with `cookie`.
  * The guard waits for init to have set itself up (bounded), then says ATTACHED.
  * Precondition: init is visible in the caller's PID namespace and /proc. */
 struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
 				  uint64_t cookie, struct avc_error *err);
 
+/* The process, or 0 when it has ended. */
+int32_t avc_guard_pid(struct avc_guard *guard);
+
+/* Kills a guard that has given no sign of life for `patience_ns`, unless it is only
+ * waiting for a CPU; then GUARD_LOST follows.  To be called every now and then. */
+void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns);
+
 /* Hands a command over.  The answer is an event with the same ticket (not 0).
- * Errors: AVC_GONE when the guard has ended. */
+ * Errors: AVC_GONE when the guard has ended, AVC_BUSY when it does not take them. */
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
 		      struct avc_error *err);
 
@@ -197,9 +209,9 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
 int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config,
 			struct avc_error *err);
 
-/* Lets the app go (it runs on, unprotected), gives up every generation, joins
- * the thread and frees the guard.  Blocks for as long as a checkpoint or
- * restore that is under way. */
+/* Lets the app go (it runs on, unprotected), gives up every generation, waits for the
+ * process to end (it is killed after 15 s) and frees the guard.  Blocks for as long as a
+ * checkpoint or restore that is under way.  Events that it sent until then are queued. */
 void avc_guard_stop(struct avc_guard *guard);
 
 #endif

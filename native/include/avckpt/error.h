@@ -21,7 +21,11 @@ enum avc_code {
 	AVC_PROTOCOL = 6,    /* the other side is not a (matching) avckpt-init      */
 	AVC_CONFIG = 7,      /* a value of struct avc_config makes no sense         */
 	AVC_KERNEL = 8,      /* the kernel said no where it should not have         */
-	AVC_EMPTY = 9        /* there is no generation to restore from              */
+	AVC_EMPTY = 9,       /* there is no generation to restore from              */
+	AVC_LIMIT = 10,      /* a limit, or memory, leaves no room for a process    */
+	/* What was known of it was not so any more, and is known now: the next attempt will
+	 * be better.  Does not leave the engine. */
+	AVC_RETRY = 11
 };
 
 struct avc_error {

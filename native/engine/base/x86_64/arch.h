@@ -6,6 +6,7 @@
 #ifndef AVCKPT_ARCH_H
 #define AVCKPT_ARCH_H
 
+#include <linux/audit.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -15,6 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
+#define ARCH_AUDIT AUDIT_ARCH_X86_64 /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
@@ -22,7 +24,7 @@ struct arch_regs {
 	struct user_regs_struct r;
 };
 
-/* An address in a target, never to be dereferenced here. */
+/* An address in a process, never to be dereferenced here. */
 typedef uint64_t avc_remote;
 
 int arch_regs_get(pid_t tid, struct arch_regs *regs);
@@ -125,7 +127,7 @@ size_t arch_xstate_bytes(void);
 /* Room one thread's signal frame takes, and how it is built: first, while the
  * thread is stopped, the extended state is read straight into the frame; later
  * the rest is filled in.  `frame` is where the engine sees it (aligned to 64),
- * `remote` where the target will.  Returns the stack pointer for
+ * `remote` where the process will.  Returns the stack pointer for
  * inj_sigreturn(). */
 size_t arch_frame_bytes(void);
 int arch_frame_read_xstate(pid_t tid, void *frame);
@@ -142,9 +144,10 @@ bool arch_frame_needs_room(const void *frame);
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
 			    uint64_t sigmask, const uint64_t altstack[3]);
 
-/* A stub that makes one system call (registers preset by arch_stub_call) and
- * then goes back to `regs` by itself, signal mask included.  Writes at most
- * ARCH_STUB_BYTES to `code`, position dependent on `address`. */
+/* A stub that makes one system call (registers preset by arch_stub_call), clone(2) as a rule, and
+ * then goes back to `regs` by itself, signal mask included.  A new task ends; who made it waits for
+ * it before it goes home, by ARCH_STUB_WAIT.  Writes at most ARCH_STUB_BYTES to `code`. */
+#define ARCH_STUB_WAIT SYS_wait4
 #define ARCH_STUB_BYTES 224
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
 /* Whether `code` is what arch_stub_build() has written once. */

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `avckpt.*` labels: what they may say, and what they mean.
+
+Hook and sidecar read labels through this module only, so that a container that
+was let through by the one is understood by the other.
+
+Decided here, because no label table says it:
+- Labels and annotations of the same name mean the same.  One name with two
+  different values is an error: nobody can know which was meant.
+- Unknown names and malformed values are errors whether `avckpt.enable` is true
+  or not: `avckpt.enabled=true` must not quietly start an unprotected container.
+- Without `avckpt.enable` a container is not protected, whatever else is set;
+  with `avckpt.group` and `avckpt.notify` it hears of the recoveries of others.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+PREFIX = "avckpt."
+RESERVED = frozenset({"avckpt.version", "avckpt.name"})
+"""Stamped on a protected container by the precreate hook; not for users to set."""
+
+KEEP_MAX = 16
+"""AVC_KEEP_MAX of the engine."""
+RESTORES_MAX = 64
+"""RESTORES_MAX of the engine: how many it remembers."""
+
+SHM_MAX_BYTES = 1_000_000_000
+
+
+class LabelError(ValueError):
+    """A label that can not be honoured.  The text is one line for a person."""
+
+    def __init__(self, key: str, value: str | None, why: str, allowed: str) -> None:
+        setting = shown(key) if value is None else f"{shown(key)}={shown(value)}"
+        super().__init__(f"label {setting}: {why}; {allowed}")
+        self.key = key
+        self.value = value
+        self.why = why
+        self.allowed = allowed
+
+
+@dataclass(frozen=True)
+class RestoreOn:
+    """Which ends of the app are abnormal."""
+
+    signal: bool = True
+    """Killed by a signal nobody asked for."""
+    exit: bool = True
+    """Any non-zero exit status."""
+    statuses: frozenset[int] = frozenset()
+    """These exit statuses, 1..255."""
+    unhealthy: bool = False
+    """The container's health check fails."""
+
+
+@dataclass(frozen=True)
+class Notify:
+    """How a container wants to hear of a recovery: by a signal, or by a command run in it."""
+
+    signal: int = 0
+    """0: none."""
+    command: tuple[str, ...] = ()
+    """Program and arguments; empty: none."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What the labels of one container ask for.  Durations in seconds."""
+
+    enable: bool = False
+    interval_s: float = 3.0
+    """Time between checkpoints."""
+    keep: int = 2
+    """Generations kept, 1..KEEP_MAX."""
+    restore_on: RestoreOn = field(default_factory=RestoreOn)
+    restore_max: int = 5
+    """At most so many restores within `restore_window_s`."""
+    restore_window_s: float = 60.0
+    quiesce_s: float = 0.02
+    """How long to look for a quiescent moment; 0: not at all."""
+    shm_bytes: int = 4_000_000
+    """Shared memory of the application's own that is rolled back with it, at most."""
+    files: str = "rewind"
+    """Regular files at a restore: rewind, keep or strict."""
+    tcp: str = "keep"
+    """Established TCP connections at a restore: keep, reset, reset-moved or messages."""
+    group: str = ""
+    """Containers that hear of each other's recoveries; empty: none."""
+    notify: Notify | None = None
+    """Of the recoveries of others in the group."""
+    notify_self: Notify | None = None
+    """Of its own."""
+
+    @property
+    def listens(self) -> bool:
+        """It wants to hear of others, which takes no protection of its own."""
+        return self.notify is not None and bool(self.group)
+
+
+def parse_policy(mapping: Mapping[str, str]) -> Policy:
+    """What `mapping` (labels or annotations; other names are ignored) asks for.
+
+    Raises LabelError for the first name or value, in alphabetical order, that
+    can not be honoured.
+    """
+    fields: dict[str, Any] = {}
+    for key in sorted(mapping):
+        if not key.startswith(PREFIX) or key in RESERVED:
+            continue
+        value = mapping[key].strip()
+        label = LABELS.get(key)
+        if label is None:
+            raise _unknown(key)
+        try:
+            fields.update(label.parse(value))
+        except ValueError as error:
+            raise LabelError(key, value, str(error), "allowed: " + label.allowed) from None
+    policy = Policy(**fields)
+    if policy.restore_on.unhealthy and policy.keep < 2:
+        # A hang is noticed late: by then the newest generation hangs, too.
+        raise LabelError(
+            "avckpt.keep", mapping["avckpt.keep"], "too few for avckpt.restore.on=unhealthy", "allowed there: 2 to 16"
+        )
+    if policy.enable and policy.notify is not None and not policy.group:
+        raise LabelError(
+            "avckpt.notify",
+            mapping["avckpt.notify"],
+            "without a group there is nobody to hear of",
+            "add avckpt.group=NAME, or use avckpt.notify.self for its own recoveries",
+        )
+    return policy
+
+
+def merge(labels: Mapping[str, str], annotations: Mapping[str, str]) -> dict[str, str]:
+    """The `avckpt.*` entries of both.  Raises LabelError where they disagree.
+
+    Annotations with reserved names are left out (an earlier start of the same
+    container may have stamped them); labels with reserved names are errors.
+    """
+    merged: dict[str, str] = {}
+    for key, value in labels.items():
+        if key in RESERVED:
+            raise LabelError(key, value, "avckpt sets this itself", "remove the label")
+        if key.startswith(PREFIX):
+            merged[key] = value
+    for key, value in annotations.items():
+        if not key.startswith(PREFIX) or key in RESERVED:
+            continue
+        if merged.setdefault(key, value).strip() != value.strip():
+            raise LabelError(
+                key,
+                merged[key],
+                f"the annotation of the same name says {shown(value)}",
+                "give one of them, or the same value to both",
+            )
+    return merged
+
+
+@dataclass(frozen=True)
+class Label:
+    """One row of the table of labels."""
+
+    default: str
+    """As a user would write it; empty: there is none."""
+    allowed: str
+    """What a value may be, as a clause for error messages."""
+    parse: Callable[[str], dict[str, Any]]
+    """Text to fields of Policy.  Raises ValueError with a clause that says why."""
+
+
+_UNITS_S = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0}
+_TRUE = frozenset({"true", "1", "yes", "on"})
+_FALSE = frozenset({"false", "0", "no", "off"})
+
+
+def _duration_s(text: str, least: str, most: str) -> float:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)(ms|s|m|h)", text, re.ASCII)
+    if found is None:
+        if re.fullmatch(r"\d+(\.\d+)?", text, re.ASCII):
+            raise ValueError("a duration needs a unit")
+        raise ValueError("not a duration")
+    value_s = float(found[1]) * _UNITS_S[found[2]]
+    if least and value_s < _duration_s(least, "", ""):
+        raise ValueError(f"less than {least}")
+    if most and value_s > _duration_s(most, "", ""):
+        raise ValueError(f"more than {most}")
+    return value_s
+
+
+def _whole(text: str, least: int, most: int) -> int:
+    if not re.fullmatch(r"\d{1,9}", text, re.ASCII):
+        raise ValueError("not a whole number")
+    if not least <= int(text) <= most:
+        raise ValueError(f"not within {least} to {most}")
+    return int(text)
+
+
+def _parse_enable(text: str) -> dict[str, Any]:
+    if text.lower() not in _TRUE | _FALSE:
+        raise ValueError("neither true nor false")
+    return {"enable": text.lower() in _TRUE}
+
+
+def _parse_interval(text: str) -> dict[str, Any]:
+    return {"interval_s": _duration_s(text, "10ms", "24h")}
+
+
+def _parse_keep(text: str) -> dict[str, Any]:
+    return {"keep": _whole(text, 1, KEEP_MAX)}
+
+
+def _parse_restore_on(text: str) -> dict[str, Any]:
+    words = [word.strip() for word in text.split(",")]
+    statuses = set()
+    for word in words:
+        if word.isdecimal():
+            status = _whole(word, 0, 999999999)
+            if not 1 <= status <= 255:
+                raise ValueError(f"{word} is not an exit code that can mean failure (1 to 255)")
+            statuses.add(status)
+        elif word not in ("signal", "exit", "unhealthy"):
+            raise ValueError(f"{shown(word)} is unknown" if word else "an entry is empty")
+    restore_on = RestoreOn("signal" in words, "exit" in words, frozenset(statuses), "unhealthy" in words)
+    return {"restore_on": restore_on}
+
+
+def _parse_restore_max(text: str) -> dict[str, Any]:
+    count, slash, window = text.partition("/")
+    if not slash:
+        raise ValueError("not a number of restores, a slash and a time")
+    return {
+        "restore_max": _whole(count.strip(), 1, RESTORES_MAX),
+        "restore_window_s": _duration_s(window.strip(), "1s", "24h"),
+    }
+
+
+def _parse_quiesce(text: str) -> dict[str, Any]:
+    return {"quiesce_s": 0.0 if text == "0" else _duration_s(text, "", "1s")}
+
+
+def _one_of(field_name: str, *values: str) -> Callable[[str], dict[str, Any]]:
+    def parse(text: str) -> dict[str, Any]:
+        if text not in values:
+            raise ValueError("unknown value")
+        return {field_name: text}
+
+    return parse
+
+
+def _parse_shm(text: str) -> dict[str, Any]:
+    found = re.fullmatch(r"(\d{1,12})\s*([KMG]?)(I?)B?", text.upper(), re.ASCII)
+    if found is None or (found[3] and not found[2]):
+        raise ValueError("not a size")
+    size_bytes = int(found[1]) * (1024 if found[3] else 1000) ** " KMG".index(found[2] or " ")
+    if size_bytes > SHM_MAX_BYTES:
+        raise ValueError("too large, it is copied while the application stands still")
+    return {"shm_bytes": size_bytes}
+
+
+def _parse_group(text: str) -> dict[str, Any]:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}", text, re.ASCII):
+        raise ValueError("not a name")
+    return {"group": text}
+
+
+def _parse_notify(text: str) -> dict[str, Any]:
+    return {"notify": _notify(text)}
+
+
+def _parse_notify_self(text: str) -> dict[str, Any]:
+    return {"notify_self": _notify(text)}
+
+
+def _notify(text: str) -> Notify:
+    kind, colon, what = text.partition(":")
+    if kind not in ("signal", "exec") or not colon or not what.strip():
+        raise ValueError("neither a signal nor a command")
+    if kind == "signal":
+        return Notify(signal=_signal_number(what.strip()))
+    import shlex
+
+    try:
+        return Notify(command=tuple(shlex.split(what)))
+    except ValueError:
+        raise ValueError("a quotation that does not end") from None
+
+
+def _signal_number(text: str) -> int:
+    import signal
+
+    found = re.fullmatch(r"(?:SIG)?(RTMIN|RTMAX)([+-]\d{1,2})?", text.upper(), re.ASCII)
+    if found is not None:
+        number = int(getattr(signal, "SIG" + found[1])) + int(found[2] or 0)
+    elif text.isdecimal():
+        number = _whole(text, 1, 64)
+    else:
+        name = text.upper() if text.upper().startswith("SIG") else "SIG" + text.upper()
+        number = int(getattr(signal.Signals, name, 0))
+    # Below SIGRTMIN two real-time signals belong to the C library.
+    if number not in signal.valid_signals() or signal.SIGSYS < number < signal.SIGRTMIN:
+        raise ValueError(f"{shown(text)} is no signal")
+    if number in (signal.SIGKILL, signal.SIGSTOP):
+        raise ValueError("nobody can be told by that signal, it can not be caught")
+    return number
+
+
+_NOTIFY = "signal:NAME, as signal:USR1, or exec:PROGRAM ARGS, as exec:/bin/reconnect --fast"
+_DURATION = "a number with ms, s, m or h"
+
+LABELS: dict[str, Label] = {
+    "avckpt.enable": Label("false", "true or false", _parse_enable),
+    "avckpt.interval": Label("3s", f"{_DURATION}, from 10ms to 24h, as 500ms, 3s or 1m", _parse_interval),
+    "avckpt.keep": Label("2", f"a whole number from 1 to {KEEP_MAX}", _parse_keep),
+    "avckpt.restore.on": Label(
+        "signal,exit",
+        "signal, exit, unhealthy and exit codes from 1 to 255, joined by commas",
+        _parse_restore_on,
+    ),
+    "avckpt.restore.max": Label(
+        "5/60s",
+        f"restores per time, 1 to {RESTORES_MAX} within 1s to 24h, as 5/60s",
+        _parse_restore_max,
+    ),
+    "avckpt.tcp": Label(
+        "keep",
+        "keep, reset, reset-moved or messages",
+        _one_of("tcp", "keep", "reset", "reset-moved", "messages"),
+    ),
+    "avckpt.files": Label("rewind", "rewind, keep or strict", _one_of("files", "rewind", "keep", "strict")),
+    "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
+    "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
+    "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),
+    "avckpt.notify": Label("", _NOTIFY, _parse_notify),
+    "avckpt.notify.self": Label("", _NOTIFY, _parse_notify_self),
+}
+"""Every label a user may set."""
+
+
+LOOKALIKE = re.compile(r"avckpt[._-]", re.IGNORECASE)
+"""How names begin that were meant for us, right or wrong."""
+
+
+def meant_by(name: str) -> str:
+    """The label that was probably meant by a name that is not ours; "" if it looks like none."""
+    import difflib  # costs milliseconds: not for names that are nothing like ours
+
+    plain = name.lower().replace("_", ".").replace("-", ".")
+    near = difflib.get_close_matches(plain, LABELS, n=1, cutoff=0.9)
+    return near[0] if near else ""
+
+
+def _unknown(key: str) -> LabelError:
+    import difflib  # a mistake may cost the milliseconds that this takes, a start may not
+
+    near = difflib.get_close_matches(key, LABELS, n=1)
+    if near:
+        return LabelError(key, None, "unknown label", f"did you mean {near[0]}?")
+    return LabelError(key, None, "unknown label", "known are " + ", ".join(sorted(LABELS)))
+
+
+def shown(text: str) -> str:
+    """One printable word or two of a value, whatever somebody put into it.
+
+    Of a command only the program: its arguments may be secrets, and messages end
+    up in logs that others read.
+    """
+    if text.startswith("exec:"):
+        program, *arguments = text.split(None, 1)
+        text = f"{program} ..." if arguments else program
+    printable = "".join(c if c.isprintable() else "?" for c in text)
+    printable = printable if len(printable) <= 60 else printable[:57] + "..."
+    return printable or '""'

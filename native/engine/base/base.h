@@ -1,0 +1,223 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The lowest of the engine's layers: errors, /proc, and a CPU at once.  It knows nothing of
+ * applications.
+ *
+ * Everything in the engine runs in the guard's main thread unless said otherwise: a process can
+ * only be traced by one thread.  A layer's header includes those below it, and no layer calls one above
+ * (native/layers.py).
+ *
+ *   error.c         what went wrong
+ *   config.c        whether settings make sense
+ *   heartbeat.c     the guard's sign of life
+ *   proc.c          /proc
+ *   pagemap.c       which pages of a process are there
+ *   rt_priority.c   a CPU at once while an app waits for us
+ *   CPU/arch.c      everything about the CPU
+ */
+#ifndef AVCKPT_BASE_H
+#define AVCKPT_BASE_H
+
+#include <pthread.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <sys/socket.h>
+#include <sys/types.h>
+
+#include "arch.h"
+#include "avckpt/engine.h"
+#include "avckpt/error.h"
+
+#define NS_PER_MS UINT64_C(1000000)
+#define NS_PER_S UINT64_C(1000000000)
+#define CHILDREN_MAX 4096 /* of init: orphans, holders and templates, too   */
+
+#define warn_unused __attribute__((warn_unused_result))
+
+/* ---- error.c --------------------------------------------------------------- */
+
+/* Fills *err in unless it holds an error already.  Always returns -1. */
+int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const char *operation,
+	 const char *syscall, const char *detail, ...) __attribute__((format(printf, 7, 8)));
+/* The same with the code that suits errno: ESRCH gone, EPERM denied, else kernel. */
+int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
+	       const char *detail, ...) __attribute__((format(printf, 5, 6)));
+uint64_t now_ns(void);
+void close_fd(int *fd);
+/* As much of it as there is; -1: it can not be read. */
+ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
+/* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
+ * and nothing has changed. */
+bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
+
+/* ---- heartbeat.c ------------------------------------------------------------ */
+
+/* Takes the memory for it, and closes the descriptor.  0 or -1. */
+int heartbeat_open(int fd) warn_unused;
+/* We get on: the daemon kills a guard of which it has not heard for seconds. */
+void heartbeat(void);
+
+/* ---- config.c -------------------------------------------------------------- */
+
+#define RESTORES_MAX 64
+
+int config_check(const struct avc_config *config, struct avc_error *err) warn_unused;
+
+/* ---- proc.c ---------------------------------------------------------------- */
+
+struct proc_stat {
+	char state;
+	pid_t parent, group, session, tty_group;
+	uint32_t tty, flags; /* PF_*                                            */
+	int threads;
+	uint64_t start;  /* clock ticks after boot                            */
+	int exit_signal; /* that its parent gets when it ends, 0: none        */
+	int exit_status; /* of a zombie, as wait(2) says it                   */
+	char name[16];
+};
+
+/* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
+ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
+int proc_stat(pid_t pid, struct proc_stat *stat);
+/* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
+int proc_stat_of(int stat_fd, struct proc_stat *stat);
+/* The number of a task in its own (innermost) PID namespace, or -1. */
+pid_t proc_inside(pid_t tid);
+/* A thread of the process that has not ended: the main thread, as long as it has not.
+ * 0: none. */
+pid_t proc_live_thread(pid_t pid);
+/* Until that thread has ended; a second at most. */
+void proc_await_end(pid_t tid);
+/* Children of a (single-threaded) process; returns how many (at most max), or -1. */
+int proc_children(pid_t pid, pid_t *children, int max);
+/* The same of one thread, by the open /proc/PID/task of its process. */
+int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
+/* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
+int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
+/* Whether two tasks have the same memory (kcmp(2)). */
+bool proc_same_memory(pid_t a, pid_t b);
+/* Likewise the same descriptor table, or the same working directory and umask: 1 or 0; -1: it can
+ * not be told.  One that is just ending has none. */
+enum shared { SHARED_FILES, SHARED_FOLDERS };
+int proc_shares(pid_t a, pid_t b, enum shared what);
+/* How many threads there are, by an open /proc/PID/task; 0: the process is gone. */
+int proc_thread_count(int task_dirfd);
+/* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be
+ * NULL): how many are resident and of no file. */
+long proc_vm_pages(int statm_fd, long *anonymous);
+/* The PID a pidfd stands for, in our namespace, or -1. */
+pid_t proc_pidfd_pid(int pidfd);
+int proc_pidfd_open(pid_t pid);
+
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
+/* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
+int proc_link(pid_t pid, const char *name, char *buf, size_t size);
+/* It is just ending, and may have closed already what it had open. */
+bool proc_is_exiting(pid_t tid);
+bool pidfd_ended(int pidfd);
+enum mapping_flag {
+	MAPPING_DONTFORK = 1,     /* dc */
+	MAPPING_WIPEONFORK = 2,   /* wf */
+	MAPPING_DEVICE = 4,       /* io */
+	MAPPING_LOCKED = 8,       /* lo */
+	MAPPING_DROPPABLE = 16,   /* dp */
+	MAPPING_HUGETLB = 32,     /* ht */
+	MAPPING_HUGE = 64,        /* hg: transparent huge pages               */
+	MAPPING_SMALL = 128,      /* nh */
+	MAPPING_DONTDUMP = 256,   /* dd */
+	MAPPING_MERGEABLE = 512,  /* mg */
+	MAPPING_GROWING = 1024,   /* gd: downwards                           */
+	MAPPING_SEALED = 2048,    /* sl: mseal(2)                            */
+	MAPPING_ONLY_HERE = 4096, /* no other process could map it: memory.c */
+	MAPPING_SPECIAL = 8192,   /* mapping_is_special()                    */
+	MAPPING_FIXED = 16384,    /* de, pf, mm: a driver's, or huge pages   */
+	MAPPING_KEYS = 15 << 16   /* the number of its protection key (pkeys(7)) */
+};
+#define MAPPING_KEY_ONE (1 << 16)
+
+struct mapping {
+	avc_remote start, end;
+	uint64_t offset, inode, device;
+	char mode[5]; /* "rwxp"                                           */
+	bool shared;
+	uint32_t flags; /* enum mapping_flag; of "smaps", or of an image    */
+	char name[64];  /* its beginning                                    */
+};
+
+/* Calls fn for every mapping of /proc/PID/maps or (slow) smaps; stops when it
+ * returns < 0.  0 or -1. */
+int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
+		  void *arg);
+
+/* The vDSO, or what belongs to it. */
+bool mapping_is_special(const struct mapping *m);
+/* As mmap(2) has it. */
+int mapping_protection(const struct mapping *m);
+
+/* /proc/PID/limits, as getrlimit(2) numbers them; ~0: no limit.  0 or -1. */
+#define LIMITS 16
+int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
+
+/* What is of interest in /proc/PID/status. */
+struct proc_status {
+	int64_t locked_kb;       /* -1: it has no memory any more                    */
+	pid_t inside;            /* in the innermost PID namespace                   */
+	pid_t tracer;            /* a thread, in our namespace; 0: none              */
+	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
+	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
+	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	uint32_t no_new_privs, seccomp, seccomp_filters;
+	bool shadow_stack; /* x86: CET                                        */
+};
+
+int proc_status(pid_t tid, struct proc_status *status);
+/* "/proc/PID/NAME" opened, or -1 with errno. */
+int proc_open(pid_t pid, const char *name, int flags);
+/* What is mapped there (proc(5), map_files), or -1 with errno.  Needs CAP_CHECKPOINT_RESTORE or
+ * CAP_SYS_ADMIN.  For writing only of who stands still, with all that share its memory (a template):
+ * another could map something else meanwhile, which it may only read; and only if it was open for
+ * writing there, too. */
+int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags);
+/* Whether that was open for writing, and not for reading alone: the link says so (fs/proc/base.c,
+ * proc_map_files_instantiate()). */
+bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
+/* A duplicate of a descriptor of another process, or -1. */
+int proc_borrow_fd(int pidfd, int fd);
+/* The OOM killer takes those with a higher value first; best effort. */
+void proc_set_oom_score_adj(pid_t pid, const char *value);
+
+/* ---- pagemap.c ------------------------------------------------------------------------ */
+
+/* An entry, of one page. */
+#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
+#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
+#define PAGEMAP_FILE (UINT64_C(1) << 61)
+#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
+#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
+/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE (Linux 6.13); the headers may be older. */
+#define GUARD_INSTALL 102
+#define GUARD_REMOVE 103
+
+/* A guard page without a mapping of its own (madvise(2)); one of the process's own. */
+bool page_is_guard(uint64_t entry);
+bool page_is_own(uint64_t entry);
+/* Calls fn for every stretch in which there are pages of no file, or guard pages; for all of it
+ * if the kernel cannot tell (before Linux 6.7).  Stops when fn does not return 0.  0 or -1. */
+int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
+		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
+
+/* ---- rt_priority.c -------------------------------------------------------------------- */
+
+/* The calling thread gets a CPU before others from here to the other; best effort.
+ * May be nested. */
+void rt_priority_begin(void);
+void rt_priority_end(void);
+
+#endif

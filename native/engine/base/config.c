@@ -1,0 +1,19 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Whether a guard's settings make sense: asked by the daemon before it sends them, and by
+ * the guard, which believes nobody.
+ */
+#include <errno.h>
+
+#include "base.h"
+
+int config_check(const struct avc_config *config, struct avc_error *err)
+{
+	if (config->keep < 1 || config->keep > AVC_KEEP_MAX)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
+			    "keep must be 1 to %d", AVC_KEEP_MAX);
+	if (config->restore_max > RESTORES_MAX)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
+			    "restore_max must be at most %d", RESTORES_MAX);
+	return 0;
+}

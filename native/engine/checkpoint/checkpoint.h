@@ -1,0 +1,132 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A checkpoint taken, and what is kept of it.
+ *
+ *   freeze.c        stop everything, read it, clone it, let go; see freeze.h
+ *   generation.c    templates kept
+ *   spare.c         ... and forked ahead of the next restore
+ *   snapshot.c      mappings and pages of a template
+ *   remap_plan.c    how the memory of one differs from another's
+ *   restore_plan.c  ... of all the processes from that of their parents
+ */
+#ifndef AVCKPT_CHECKPOINT_H
+#define AVCKPT_CHECKPOINT_H
+
+#include "process.h"
+
+/* ---- freeze.c ------------------------------------------------------------------ */
+
+struct freeze_times {
+	uint64_t freeze_ns, stop_ns, clone_ns;
+};
+
+/* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
+ * shared memory that is prepared for already.
+ * On return the app runs, whatever happened. */
+int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
+		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
+		struct avc_error *err) warn_unused;
+
+/* ---- generation.c -------------------------------------------------------------- */
+
+/* After the app runs again: finishes the template and its slot. */
+int generation_finish(struct process *process, struct generation *generation,
+		      struct avc_error *err) warn_unused;
+void generation_drop(struct generation *generation);
+/* Of all its processes. */
+uint32_t generation_threads(const struct generation *generation);
+/* Closes what the template of a process that has ended still has open. */
+void generation_close_files(struct process *process, struct generation *image);
+/* The same of all processes but the main one, once they are restored and have tables of
+ * their own: before they go on, for what they close is to be closed. */
+void generation_close_tables(const struct generation *generation);
+
+/* ---- spare.c ------------------------------------------------------------------------ */
+
+/* Makes one for a generation that is whole, if the kernel lets it, and if it comes to that
+ * before the deadline.  -1: nothing can be restored from the generation any more. */
+int spare_make(struct process *process, struct generation *generation,
+	       struct avc_error *err) warn_unused;
+/* While the app is dead: at the template's own priority, and until it is there or refused. */
+int spare_make_now(struct process *process, struct generation *generation,
+		   struct avc_error *err) warn_unused;
+/* Before the template is used for anything else: waits until it has done what it had not at
+ * the deadline of spare_make().  -1: it has not, AVC_DEADLINE, or as above. */
+int spare_await(struct process *process, struct generation *generation,
+		struct avc_error *err) warn_unused;
+bool spare_is_there(struct generation *generation);
+/* There may be one that only the kernel knows of (init_channel_kill_lost). */
+bool spare_is_unknown(const struct generation *generation);
+void spare_drop(struct generation *generation);
+
+/* ---- snapshot.c --------------------------------------------------------------------- */
+
+struct mappings {
+	struct mapping *map;
+	uint32_t count, room;
+};
+
+/* A stretch of a mapping, and what pagemap says of each page. */
+struct extent {
+	avc_remote start, end;
+	uint64_t *frame;
+};
+
+struct pages {
+	bool known;
+	uint32_t count, room;
+	struct extent *extent; /* in order                                           */
+};
+
+struct snapshot {
+	pid_t template;
+	int pagemap;
+	struct mappings maps;
+	struct pages *pages; /* by mapping, of those that were asked for              */
+};
+
+/* `image`: of the same process. */
+struct snapshot *snapshot_new(pid_t template, const struct mem_image *image, struct avc_error *err);
+void snapshot_free(struct snapshot *snapshot);
+/* Frees what it knows of pages, until it is asked for them again; NULL: nothing to do. */
+void snapshot_rest(struct snapshot *snapshot);
+/* Of one of its mappings, a private one.  NULL on error. */
+const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mapping *mapping,
+				   struct avc_error *err);
+/* From `address` on; NULL where there is nothing.  `*end` is lowered to where that changes;
+ * `*next`, 0 at first, is where the search for a higher address begins. */
+const uint64_t *pages_frames(const struct pages *pages, uint32_t *next, avc_remote address,
+			     avc_remote *end);
+
+/* ---- remap.c ----------------------------------------------------------------------- */
+
+struct remap;
+
+/* What makes the memory of a fork of `is` that of `want`.  Both snapshots have to stay.
+ * NULL on error. */
+struct remap *remap_plan(const struct process *process, struct snapshot *want, struct snapshot *is,
+			 struct avc_error *err);
+/* Whether there is a way from the one to the other, while it is not needed yet: of some mappings
+ * only who has them can give them to others, and only by a fork. */
+int remap_check(const struct process *process, struct snapshot *want, struct snapshot *is,
+		struct avc_error *err) warn_unused;
+void remap_free(struct remap *plan);
+
+/* ---- restore_plan.c --------------------------------------------------------------------- */
+
+/* Of a generation that is whole; once is enough.  `ahead_ns`: CPU time that restore_plan_next() may
+ * spend on it, about. */
+int restore_plan_begin(struct generation *generation, uint64_t ahead_ns,
+		       struct avc_error *err) warn_unused;
+/* Who is to fork a branch's process: another branch, or PARENT_MAIN. */
+int restore_plan_host(const struct generation *generation, uint32_t index);
+/* How it is made of that fork; NULL on error. */
+const struct remap *restore_plan_of(struct generation *generation, uint32_t index,
+				    struct avc_error *err);
+/* Of a checkpoint: whether the processes can be made of their parents at all. */
+int restore_plan_check(const struct generation *generation, struct avc_error *err) warn_unused;
+/* Finds out about one more of them, so that a restore need not; false: that is all. */
+bool restore_plan_next(struct generation *generation);
+void restore_plan_free(struct restore_plan *plan);
+
+#endif

@@ -1,0 +1,418 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The app's main process and its threads: stopped, asked, let go.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "process.h"
+
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h */
+#define PIDFS_MAGIC 0xff     /* the same, PIDFS_IOCTL_MAGIC */
+#define ASK_AGAIN_AFTER 8    /* checkpoints */
+#define ASK_AGAIN_AT_ONCE 2
+
+void process_init(struct process *process)
+{
+	*process = (struct process){ .pidfd = -1,
+				     .leader_pidfd = -1,
+				     .task_dirfd = -1,
+				     .mem_fd = -1,
+				     .timers_fd = -1,
+				     .stat_fd = -1,
+				     .statm_fd = -1,
+				     .holder_pidfd = -1,
+				     .due_ns = UINT64_MAX };
+}
+
+bool process_make_room(struct process *process)
+{
+	process->threads = calloc(THREADS_MAX, sizeof *process->threads);
+	process->thread_room = THREADS_MAX;
+	process->memory = memory_new();
+	process->pending = pending_new();
+	process->timers = timers_new();
+	return process->threads && process->memory && process->pending && process->timers;
+}
+
+void process_free_room(struct process *process)
+{
+	free(process->threads);
+	memory_free(process->memory);
+	free(process->pending);
+	free(process->timers);
+	process->threads = NULL;
+	process->memory = NULL;
+	process->pending = NULL;
+	process->timers = NULL;
+}
+
+/* A descriptor for its table of descriptors: the main thread has none any more when it
+ * has ended, and the others have pidfds of their own since Linux 6.9. */
+static int follow(struct process *process, struct avc_error *err)
+{
+	const pid_t pid = proc_live_thread(process->leader);
+
+	if (!pid)
+		return fail(err, AVC_GONE, ESRCH, process->leader, "attach", "", "it has ended");
+	close_fd(&process->pidfd);
+	close_fd(&process->statm_fd);
+	process->pid = pid;
+	/* Its number is nobody else's as long as there are others. */
+	if (pid != process->leader && process->leader_pidfd < 0)
+		process->leader_pidfd = proc_pidfd_open(process->leader);
+	process->statm_fd = proc_open(pid, "statm", O_RDONLY);
+	process->pidfd = pid == process->leader ? proc_pidfd_open(pid)
+						: (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
+	if (process->pidfd < 0 && errno == EINVAL)
+		return fail(err, AVC_UNSUPPORTED, EINVAL, process->leader, "attach",
+			    "pidfd_open(PIDFD_THREAD)",
+			    "its main thread has ended, which needs Linux 6.9");
+	if (process->pidfd < 0)
+		return fail_errno(err, process->leader, "attach", "pidfd_open", "it has ended");
+	return 0;
+}
+
+int process_follow(struct process *process, struct avc_error *err)
+{
+	return proc_live_thread(process->pid) == process->pid ? 0 : follow(process, err);
+}
+
+void process_kill(const struct process *process)
+{
+	syscall(SYS_pidfd_send_signal,
+		process->leader_pidfd < 0 ? process->pidfd : process->leader_pidfd, SIGKILL, NULL,
+		0);
+}
+
+int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_error *err)
+{
+	process->leader = pid;
+	process->inside = inside;
+	process->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
+	process->timers_fd = proc_open(pid, "timers", O_RDONLY);
+	process->stat_fd = proc_open(pid, "stat", O_RDONLY);
+	if (follow(process, err)) {
+		process_close(process);
+		return -1;
+	}
+	process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
+	if (process->pidfd < 0 || process->task_dirfd < 0 || process->mem_fd < 0 ||
+	    process->timers_fd < 0 || process->stat_fd < 0 || process->statm_fd < 0) {
+		fail_errno(err, pid, "attach", "open(/proc)", "its /proc can not be read");
+		process_close(process);
+		return -1;
+	}
+	return 0;
+}
+
+void process_close(struct process *process)
+{
+	close_fd(&process->pidfd);
+	close_fd(&process->leader_pidfd);
+	close_fd(&process->task_dirfd);
+	close_fd(&process->mem_fd);
+	close_fd(&process->timers_fd);
+	close_fd(&process->stat_fd);
+	close_fd(&process->statm_fd);
+	process->pid = 0;
+	process->leader = 0;
+	process->infected = false;
+	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		process->threads[i].seen = false;
+		process->threads[i].known = false;
+	}
+	threads_forget_unseen(process);
+	files_forget(process);
+}
+
+static int read_signal_state(struct thread *thread, struct avc_error *err)
+{
+	struct ptrace_rseq_configuration_ {
+		uint64_t pointer;
+		uint32_t bytes, signature, flags, parasite;
+	} rseq = { 0 };
+
+	if (ptrace(PTRACE_GETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask))
+		return fail_errno(err, thread->tid, "read state", "ptrace(GETSIGMASK)",
+				  "it has ended");
+	/* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13 */
+	if (ptrace(PTRACE_GET_RSEQ, thread->tid, sizeof rseq, &rseq) < 0)
+		return fail_errno(err, thread->tid, "read state", "ptrace(GET_RSEQ_CONFIGURATION)",
+				  "rseq can not be read");
+	thread->rseq = rseq.pointer;
+	thread->rseq_bytes = rseq.bytes;
+	thread->rseq_signature = rseq.signature;
+	return 0;
+}
+
+int thread_read(struct thread *thread, struct avc_error *err)
+{
+	long affinity;
+
+	if (read_signal_state(thread, err))
+		return -1;
+	if (syscall(SYS_get_robust_list, thread->tid, &thread->robust_list, &thread->robust_bytes))
+		return fail_errno(err, thread->tid, "read state", "get_robust_list",
+				  "it has ended");
+	/* As the kernel has it: bytes that were written, 0 on failure. */
+	attributes_read_scheduling(thread->tid, &thread->scheduling);
+	thread->affinity_bytes = 0;
+	affinity = syscall(SYS_sched_getaffinity, thread->tid, sizeof thread->affinity,
+			   thread->affinity);
+	if (affinity > 0)
+		thread->affinity_bytes = (uint32_t)affinity;
+	return 0;
+}
+
+void thread_ask_add(const struct process *process, bool with_locks, struct inj_call *call,
+		    struct questions *questions)
+{
+	const avc_remote out = parasite_remote(&process->parasite, call->out);
+	const struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
+
+	memset(call->out, 0, sizeof call->out);
+	tid_address = call_add(call, SYS_prctl, PR_GET_TID_ADDRESS, out, 0, 0, 0);
+	altstack = call_add(call, SYS_sigaltstack, 0, out + 8, 0, 0, 0);
+	/* Not from /proc: whatever is looked at there is remembered, and makes the
+	 * thread's end, for which a restore waits, several microseconds longer
+	 * (fs/proc/base.c, proc_flush_pid()). */
+	inside = call_add(call, SYS_gettid, 0, 0, 0, 0, 0);
+	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32, 0, 0, 0);
+	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
+	attributes = attributes_ask(call, call->out + 64, out + 64);
+	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
+}
+
+int thread_ask(struct process *process, struct thread *thread, struct avc_error *err)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const bool is_main = thread->tid == process->pid, asked_before = thread->inside != 0;
+	const struct creds was = thread->creds;
+	struct questions questions;
+
+	call_begin(call, INJ_AFTER_HOME);
+	thread_ask_add(process, is_main, call, &questions);
+	if (read_signal_state(thread, err) || thread_borrow(process, thread, err) ||
+	    parasite_run(thread->tid, call, err))
+		return -1;
+	if (thread_give_back(thread, err) || thread_ask_answer(thread, call, &questions, err))
+		return -1;
+	return is_main && asked_before ? thread_ask_others(process, thread, &was, err) : 0;
+}
+
+int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+		      const struct questions *questions, struct avc_error *err)
+{
+	const struct inj_syscall *altstack = questions->altstack, *inside = questions->inside,
+				 *name = questions->name, *locks = questions->locks;
+	bool was_disarming;
+
+	if (questions->tid_address->result)
+		return fail(err, AVC_UNSUPPORTED, (int)-questions->tid_address->result, thread->tid,
+			    "read state", "prctl(PR_GET_TID_ADDRESS)",
+			    "the kernel lacks CONFIG_CHECKPOINT_RESTORE");
+	if (altstack->result)
+		return fail(err, AVC_KERNEL, (int)-altstack->result, thread->tid, "read state",
+			    "sigaltstack", "refused");
+	memcpy(&thread->clear_tid, call->out, 8);
+	was_disarming = thread->disarmed || thread->altstack[1] & SS_AUTODISARM_;
+	memcpy(thread->altstack, call->out + 8, 24);
+	thread->disarmed = was_disarming && thread->altstack[1] & SS_DISABLE;
+	if (inside->result <= 0 || name->result)
+		return fail(err, AVC_KERNEL, (int)-name->result, thread->tid, "read state",
+			    "prctl(PR_GET_NAME)", "refused");
+	thread->inside = (pid_t)inside->result;
+	memcpy(thread->name, call->out + 32, sizeof thread->name);
+	thread->name[sizeof thread->name - 1] = 0;
+	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
+	if (locks && locks->result > 0)
+		thread->creds.future_lock = (int32_t)locks->result;
+	thread->creds.filters = attributes_read_filters(thread->tid);
+	thread->known_tls = arch_tls(&thread->regs);
+	thread->young = !thread->known;
+	thread->known = true;
+	thread->asked = 0;
+	return 0;
+}
+
+int thread_ask_others(struct process *process, const struct thread *thread, const struct creds *was,
+		      struct avc_error *err)
+{
+	struct creds is = thread->creds;
+
+	is.future_lock = was->future_lock; /* of the process's memory, no matter of threads */
+	if (process->thread_count == 1 || !memcmp(was, &is, sizeof is))
+		return 0;
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		process->threads[i].known &= &process->threads[i] == thread;
+	return fail(err, AVC_RETRY, 0, process->pid, "read state", "",
+		    "its threads are just changing what they may do");
+}
+
+struct walk {
+	struct process *process;
+	uint32_t count, fresh;
+	struct avc_error *err;
+};
+
+static int count_task(pid_t tid, void *arg)
+{
+	struct walk *walk = arg;
+	struct thread *t;
+
+	walk->count++;
+	if (walk->count > walk->process->thread_room)
+		return 0;
+	t = thread_find(walk->process, tid);
+	if (!t)
+		t = thread_add(walk->process, tid, walk->err);
+	if (t)
+		t->seen = true;
+	return 0;
+}
+
+int process_take_stock(struct process *process, struct avc_error *err)
+{
+	struct walk walk = { .process = process, .err = err };
+
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		process->threads[i].seen = false;
+	if (proc_tasks(process->task_dirfd, count_task, &walk))
+		return fail_errno(err, process->pid, "walk threads", "getdents64", "it has ended");
+	if (walk.count > process->thread_room)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "walk threads", "",
+			    "it has %u threads; %u are supported", walk.count,
+			    process->thread_room);
+	threads_forget_unseen(process);
+	return err->code ? -1 : 0;
+}
+
+/* In the order of their numbers they can be made again with the fewest writes to
+ * ns_last_pid. */
+static int by_inside(const void *a, const void *b)
+{
+	const struct thread *x = a, *y = b;
+
+	return (x->inside > y->inside) - (x->inside < y->inside);
+}
+
+/* A process that one of them has just brought forth stands among them, too, until the next
+ * look (adopt()). */
+static bool is_thread(const struct process *process, pid_t tid)
+{
+	char number[16];
+
+	snprintf(number, sizeof number, "%d", tid);
+	return faccessat(process->task_dirfd, number, F_OK, 0) == 0;
+}
+
+/* unshare(2): those that are restored have the main thread's.  It is stopped. */
+static int check_unshared(const struct process *process, const struct thread *t,
+			  struct avc_error *err)
+{
+	const char *what = NULL;
+
+	if (proc_shares(process->pid, t->tid, SHARED_FILES) == 0)
+		what = "a descriptor table of its own (CLONE_FILES)";
+	else if (proc_shares(process->pid, t->tid, SHARED_FOLDERS) == 0)
+		what = "a working directory of its own (CLONE_FS)";
+	/* A main thread that is just ending has none. */
+	if (!what || proc_is_exiting(process->pid) || proc_is_exiting(t->tid))
+		return 0;
+	if (!is_thread(process, t->tid))
+		return fail(err, AVC_GONE, 0, t->tid, "check", "", "it is no thread");
+	return fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "", "thread %d has %s",
+		    proc_inside(t->tid), what);
+}
+
+/* 0: the kernel does not tell (it does since Linux 6.11), or the task is ending. */
+static uint64_t space_of(int pidfd, unsigned int kind)
+{
+	struct stat st = { 0 };
+	int fd = ioctl(pidfd, _IO(PIDFS_MAGIC, kind), 0);
+
+	if (fd >= 0 && fstat(fd, &st))
+		st.st_ino = 0;
+	close_fd(&fd);
+	return st.st_ino;
+}
+
+/* Those that it can have without a working directory of its own.  Not from /proc: see
+ * thread_ask_add(). */
+static int check_spaces(const struct process *process, const struct thread *t,
+			struct avc_error *err)
+{
+	static const struct {
+		unsigned int kind; /* linux/pidfd.h, PIDFD_GET_..._NAMESPACE */
+		const char *name;
+	} spaces[] = { { 4, "network" }, { 10, "UTS" }, { 2, "IPC" }, { 1, "cgroup" } };
+	int result = 0, pidfd;
+
+	if (t->tid == process->pid)
+		return 0;
+	pidfd = (int)syscall(SYS_pidfd_open, t->tid, PIDFD_THREAD_);
+	for (size_t i = 0; !result && pidfd >= 0 && i < sizeof spaces / sizeof *spaces; i++) {
+		const uint64_t own = space_of(pidfd, spaces[i].kind),
+			       others = space_of(process->pidfd, spaces[i].kind);
+
+		if (own && others && own != others && is_thread(process, t->tid))
+			result = fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "",
+				      "thread %d has a namespace of its own (%s)", t->inside,
+				      spaces[i].name);
+	}
+	close_fd(&pidfd);
+	return result;
+}
+
+int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
+		     struct avc_error *err)
+{
+	uint32_t again = 0;
+
+	/* All of them first: there is one way home in the parasite, and it may still need it. */
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].attached)
+			return fail(err, AVC_DEADLINE, 0, process->threads[i].tid, "stop", "",
+				    "a thread has not come back from an earlier attempt yet");
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
+		struct avc_error gone = { 0 };
+
+		if (t->known) {
+			t->asked++;
+			if (!t->young && (t->asked < ASK_AGAIN_AFTER || again == ASK_AGAIN_AT_ONCE))
+				continue;
+			again += !t->young;
+		}
+		tracee_deadline_set(timer, deadline_ns);
+		rewind_prepare(t);
+		if (thread_stop(process, t, &gone) || thread_await(process, t, &gone) ||
+		    check_unshared(process, t, &gone) || thread_ask(process, t, &gone))
+			t->known = false;
+		thread_release(t);
+		tracee_deadline_clear(timer);
+		if (!gone.code && check_spaces(process, t, &gone))
+			t->known = false;
+		if (gone.code && gone.code != AVC_GONE) {
+			*err = gone;
+			return -1;
+		}
+		t->seen |= t->known; /* or it is no thread */
+	}
+	threads_forget_unseen(process);
+	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);
+	return 0;
+}

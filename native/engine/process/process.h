@@ -1,0 +1,146 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Live processes of the app.
+ *
+ *   process.c        one of them: looked at, asked, stopped
+ *   stop.c          ... stopped, let go
+ *   infect.c        parasite and holder brought into it
+ *   support.c       what can not be protected; quiescence
+ *   waits.c         calls that are to be ended
+ *   tree.c          all of them
+ */
+#ifndef AVCKPT_PROCESS_H
+#define AVCKPT_PROCESS_H
+
+#include "files.h"
+
+#define PROCESSES_MAX 512 /* of one app                                     */
+
+/* One process of the app, as it was found. */
+struct tree_entry {
+	pid_t pid;
+	int parent;  /* index, PARENT_INIT; the main process is 0           */
+	bool ended;  /* a zombie                                         */
+	bool ending; /* neither a process any more nor a zombie yet      */
+	struct proc_stat stat;
+	struct process *process;
+};
+
+/* All processes of an app (tree.c). */
+struct tree {
+	struct process *main;
+	pid_t init;
+	uint32_t slots;           /* of a parasite                                         */
+	struct tree_entry *entry; /* parents before children                        */
+	uint32_t count;
+	struct process **process; /* of those that are not the main process; those
+				 * that have ended as long as there are images of them */
+	uint32_t processes;
+	/* Is this child of init one of our own? */
+	bool (*is_ours)(pid_t pid, const void *arg);
+	const void *arg;
+};
+
+/* ---- process.c ----------------------------------------------------------------- */
+
+void process_init(struct process *process);
+/* Room for threads and all else that a process has; false: out of memory. */
+bool process_make_room(struct process *process);
+void process_free_room(struct process *process);
+int process_open(struct process *process, pid_t pid, pid_t inside,
+		 struct avc_error *err) warn_unused;
+/* Before anything else is done with it: the main thread may have ended, and others go
+ * on (pthread_exit(3)). */
+int process_follow(struct process *process, struct avc_error *err) warn_unused;
+/* All of it, whichever of its threads have ended meanwhile. */
+void process_kill(const struct process *process);
+/* Forgets the process (the parasite stays mapped here: templates live in it). */
+void process_close(struct process *process);
+/* What ptrace can read of a stopped thread: mask, robust list, rseq. */
+int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
+/* What only a thread itself can tell (clear_child_tid, sigaltstack, credentials): added to
+ * calls that it makes anyway, and what came of it.  `with_locks`: of its process, what is to
+ * be locked in memory; there is a mapping more while that is found out. */
+void thread_ask_add(const struct process *process, bool with_locks, struct inj_call *call,
+		    struct questions *questions);
+int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+		      const struct questions *questions, struct avc_error *err) warn_unused;
+/* Asks a stopped thread just that; if it is the main thread, thread_ask_others(). */
+int thread_ask(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
+/* The main thread was asked, and had other credentials before: a change may be one of all
+ * threads (nptl(7), setuid(3)), so these are to be asked again, too (AVC_RETRY). */
+int thread_ask_others(struct process *process, const struct thread *thread, const struct creds *was,
+		      struct avc_error *err) warn_unused;
+/* The threads there are now; those that ended are forgotten. */
+int process_take_stock(struct process *process, struct avc_error *err) warn_unused;
+/* Gets known every thread that is not yet, one at a time, before a freeze. */
+int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
+		     struct avc_error *err) warn_unused;
+
+/* ---- stop.c --------------------------------------------------------------------- */
+
+/* Every thread of one process is stopped; all go on. */
+int process_stop(struct process *process, struct avc_error *err) warn_unused;
+/* The same in parts, for several at a time: what is known of the last time is forgotten; those
+ * threads are interrupted that are known; all are waited for, and the others found. */
+void process_stop_begin(struct process *process);
+void process_interrupt(struct process *process);
+int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
+void process_let_go(struct process *process);
+
+/* ---- infect.c ----------------------------------------------------------------- */
+
+/* Brings the parasite into the app, through its main thread.  The other threads run. */
+int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+		   struct avc_error *err) warn_unused;
+/* The same while everything is stopped. */
+int process_infect_stopped(struct process *process, uint32_t slots,
+			   struct avc_error *err) warn_unused;
+/* The holder of one that is not the main process, by its stopped main thread. */
+int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err) warn_unused;
+/* A stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) does not for a while: they
+ * are init's.  If we die meanwhile it does again all by itself. */
+int process_adopt_no_more(struct process *process, struct avc_error *err) warn_unused;
+int process_adopt_again(struct process *process, struct avc_error *err) warn_unused;
+/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until what it has open is
+ * closed and its memory gone. */
+int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
+		 struct avc_error *err) warn_unused;
+void process_unhold(struct process *process);
+void process_unhold_soon(struct process *process);
+
+/* ---- support.c --------------------------------------------------------------------- */
+
+/* Looks at a running app for what can not be protected.  0, or -1 with
+ * AVC_UNSUPPORTED and the reason in words. */
+int support_check(struct process *process, struct avc_error *err) warn_unused;
+/* Whether the (running, infected) process has another program: what was brought into it
+ * is gone. */
+bool process_has_executed(const struct process *process);
+/* True if this looks like a moment at which nobody is in the middle of anything. */
+bool process_is_quiescent(const struct process *process);
+
+/* ---- tree.c --------------------------------------------------------------------- */
+
+/* Looks who there is; new ones are opened. */
+int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
+/* Whether entry[i] or a process above it adopts orphans, or could not be asked whether it does. */
+bool tree_has_reaper(const struct tree *tree, uint32_t i);
+/* Whether entry[i] has its parent's memory, and not its own: after vfork(2) until it has
+ * executed a program. */
+bool tree_shares_memory(const struct tree *tree, uint32_t i);
+/* Frees those that have ended and of which there is no image. */
+void tree_sweep(struct tree *tree);
+/* It is gone, or another program: what it had open must not stay open by us. */
+void tree_let_go(struct process *process);
+void tree_free(struct tree *tree);
+
+/* ---- waits.c ---------------------------------------------------------------------- */
+
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct process *process);
+/* Ends the calls that were rewound and whose time is up; the next one's is at
+ * process->due_ns (UINT64_MAX: none). */
+void waits_end(struct process *process, timer_t timer);
+
+#endif

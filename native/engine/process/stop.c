@@ -1,0 +1,113 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A process is stopped: every thread of it, until there is nobody left who could create another
+ * one; and let go.
+ */
+#include "process.h"
+
+struct walk {
+	struct process *process;
+	uint32_t fresh;
+	struct avc_error *err;
+};
+
+static int stop_task(pid_t tid, void *arg)
+{
+	struct walk *walk = arg;
+	struct process *process = walk->process;
+	struct thread *t = thread_find(process, tid);
+	struct avc_error gone = { 0 };
+
+	if (t && t->seen)
+		return 0;
+	if (!t)
+		t = thread_add(process, tid, walk->err);
+	if (!t)
+		return -1;
+	t->seen = true;
+	walk->fresh++;
+	if (t->attached)
+		return 0; /* born of a thread of ours: comes with its own stop */
+	if (thread_stop(process, t, &gone)) {
+		if (gone.code == AVC_GONE && tid != process->pid)
+			return 0; /* it ended meanwhile */
+		if (!walk->err->code)
+			*walk->err = gone;
+		return -1;
+	}
+	return 0;
+}
+
+/* Those that are known; what fails is seen when it is waited for. */
+void process_interrupt(struct process *process)
+{
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
+		struct avc_error ignored = { 0 };
+
+		if (!t->attached)
+			t->seen = thread_stop(process, t, &ignored) == 0;
+	}
+}
+
+/* Then nobody is left who could create another one. */
+static bool everybody_stopped(const struct process *process)
+{
+	int stopped = 0;
+
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		stopped += process->threads[i].seen && process->threads[i].stopped;
+	return stopped && proc_thread_count(process->task_dirfd) == stopped;
+}
+
+void process_stop_begin(struct process *process)
+{
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		process->threads[i].seen = false;
+		process->threads[i].block = -1;
+	}
+	process->frozen = false;
+	process->begun = false;
+}
+
+/* Until all are stopped, for threads create threads meanwhile: then a walk finds them. */
+int process_stop_all(struct process *process, struct avc_error *err)
+{
+	for (;;) {
+		struct walk walk = { .process = process, .err = err };
+
+		for (uint32_t i = 0; i < process->thread_count; i++) {
+			struct thread *t = &process->threads[i];
+			struct avc_error gone = { 0 };
+
+			if (!t->attached || t->stopped || !thread_await(process, t, &gone))
+				continue;
+			if (gone.code == AVC_GONE && t->tid != process->pid)
+				continue;
+			if (!err->code)
+				*err = gone;
+			return -1;
+		}
+		if (everybody_stopped(process))
+			return 0;
+		if (proc_tasks(process->task_dirfd, stop_task, &walk))
+			return err->code ? -1
+					 : fail_errno(err, process->pid, "freeze", "getdents64",
+						      "it has ended");
+		if (!walk.fresh)
+			return 0;
+	}
+}
+
+int process_stop(struct process *process, struct avc_error *err)
+{
+	process_stop_begin(process);
+	process_interrupt(process);
+	return process_stop_all(process, err);
+}
+
+void process_let_go(struct process *process)
+{
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		thread_let_go(process, &process->threads[i]);
+}

@@ -1,0 +1,93 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Templates become the app again.
+ *
+ *   restore.c       the main process
+ *   restore_tree.c  a restored process makes its children
+ *   remap.c         ... and their memory
+ *   copier.c        ... which a second thread helps to copy
+ */
+#ifndef AVCKPT_RESTORE_H
+#define AVCKPT_RESTORE_H
+
+#include "checkpoint.h"
+
+/* ---- restore.c ------------------------------------------------------------------ */
+
+/* What takes less than a millisecond or so to fork gets the number that it is to have sooner or
+ * later, also where others fork all the time.  What has more pages is copied first (spare.c). */
+#define COPIED_PAGES 16384
+
+struct restore_times {
+	uint64_t restore_ns, fork_ns, threads_ns;
+	struct avc_error notice; /* what could not be put back                  */
+};
+
+/* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
+ * there, before anything runs: it sends the verdict.  On success *pid is the new
+ * main process. */
+int restore_app(struct process *process, struct generation *generation,
+		struct init_channel *channel, const struct avc_config *config, timer_t timer,
+		uint64_t died_ns, int (*ready)(void *arg, struct avc_error *err), void *arg,
+		pid_t *pid, struct restore_times *times, struct avc_error *notes,
+		struct avc_error *err) warn_unused;
+
+/* ---- restore.c, for one process of several ----------------------------------------- */
+
+/* Lets a stopped process that is what its template is put itself together; waits until
+ * it has; tells what of it failed; lets it go. */
+int restore_start(struct process *process, struct generation *image, struct last_pid *helper,
+		  pid_t pid, struct sandbox **sandbox, struct avc_error *err) warn_unused;
+int restore_await(struct process *process, struct generation *image, pid_t pid,
+		  struct sandbox *sandbox, struct avc_error *err) warn_unused;
+void restore_note(struct process *process, struct generation *image, pid_t pid,
+		  struct avc_error *notes);
+void restore_go(struct process *process, struct generation *image, struct sandbox *sandbox);
+
+/* ---- restore_tree.c ------------------------------------------------------------------------- */
+
+/* All processes of a generation, of which the main one is there; each is stopped.
+ * `table`: of each branch. */
+struct restore_tree;
+struct restore_tree *restore_tree_new(struct process *main, struct generation *generation,
+				      struct last_pid *helper, struct init_channel *channel,
+				      timer_t timer, const struct fd_table *table,
+				      struct avc_error *err);
+/* The main process (a stopped tracee) brings forth the others. */
+int restore_tree_make(struct restore_tree *tree, pid_t main_pid, struct avc_error *notes,
+		      struct avc_error *err) warn_unused;
+/* They put themselves together, but for the main one. */
+int restore_tree_start(struct restore_tree *tree, struct avc_error *notes,
+		       struct avc_error *err) warn_unused;
+void restore_tree_go(struct restore_tree *tree);
+void restore_tree_kill(struct restore_tree *tree);
+void restore_tree_free(struct restore_tree *tree);
+/* PID of a branch's process, when all of it is there. */
+pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t branch);
+
+/* ---- remap.c ------------------------------------------------------------------------ */
+
+struct copier;
+
+/* Does it, with a batch that is in the parasite of the plan's process already; but the copier
+ * may not have finished. */
+int remap_apply(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
+		struct avc_error *err) warn_unused;
+
+/* ---- copier.c ----------------------------------------------------------------------- */
+
+struct copier;
+
+struct copier *copier_new(struct avc_error *err); /* NULL on error */
+/* What is added from here on goes from `template` to `pid`. */
+int copier_open(struct copier *copier, pid_t template, pid_t pid,
+		struct avc_error *err) warn_unused;
+/* One stretch of memory.  `plain`: the mapping may be read and written. */
+int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain,
+	       struct avc_error *err) warn_unused;
+/* Lends a hand; false when nothing is left, and then it can be finished. */
+bool copier_help(struct copier *copier);
+int copier_finish(struct copier *copier, struct avc_error *err) warn_unused;
+void copier_free(struct copier *copier);
+
+#endif

@@ -1,0 +1,225 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What a process has, but for what it has open: asked while it is stopped, kept in an image, put
+ * back.
+ *
+ *   image.c         which image is whose
+ *   attributes.c    scheduling, credentials, prctl settings
+ *   process_attrs.c what only a template can tell: signal handlers, limits, directories
+ *   pending.c       signals that have not been delivered
+ *   timers.c        interval timers, POSIX timers
+ *   memory*.c       memory that a clone does not carry as it is
+ *   sandbox.c       restoring an app that has a seccomp filter of its own
+ */
+#ifndef AVCKPT_STATE_H
+#define AVCKPT_STATE_H
+
+#include "trace.h"
+
+#define FILES_NAME 81 /* of a file, for people                                  */
+
+/* What a generation has of a process that is not the main one. */
+struct branch {
+	struct process *process;  /* NULL: it had ended, and nobody had waited for it */
+	struct generation *image; /* of this process alone                   */
+	int parent;               /* index of its parent's branch, or ...    */
+	pid_t inside;
+	pid_t session, group;        /* inside; 0: outside of the app           */
+	struct process_attrs *attrs; /* process_attrs.c                                */
+	pid_t pid;                   /* as of the freeze; then as restored last */
+	int exit_signal;             /* struct proc_stat                       */
+	int status;                  /* of one that had ended, as from wait(2)  */
+	char name[16];               /* the same                                */
+};
+#define PARENT_MAIN (-1)
+#define PARENT_INIT (-2)
+
+struct restore_plan;
+
+/* A fork of a template, for the next restore (spare.c). */
+struct spare {
+	pid_t pid; /* 0: none                                           */
+	int pidfd;
+	bool tried;    /* it was begun to make one                               */
+	bool unwanted; /* it was one process too many for a restore              */
+	/* What the template has been told to do for it and has not done yet. */
+	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
+	struct scheduling scheduling; /* the template's own                        */
+	bool aside;                   /* it has another policy for as long         */
+};
+
+/* Also the image of one process of several: then what is of the whole is unused. */
+struct generation {
+	uint64_t number; /* 0: unused                                        */
+	pid_t template;
+	int pidfd;
+	struct spare spare;
+	uint32_t slot;
+	uint32_t threads;
+	uint64_t taken_ns;
+	uint64_t clone_ns; /* what the clones of it took                      */
+	bool quiescent;
+	/* Taken from a process that had been restored lately: of the same lineage
+	 * as what that one was restored from, and as suspect. */
+	uint32_t lineage;
+	uint32_t crashes;      /* of its lineage, soon after a restore             */
+	uint32_t lost;         /* restores from it that came to nothing            */
+	bool seen;             /* held when the app was healthy; again so: vouched */
+	bool vouched;          /* the app was healthy well after it was taken      */
+	struct arch_regs base; /* a user context of the template                */
+	long vm_pages;         /* of the app when it was taken                     */
+	long anon_pages;       /* resident ones that are of no file                */
+	bool sandboxed;        /* has seccomp filters of its own                   */
+	bool headless;         /* its main thread had ended                       */
+	int stop_signal;       /* stopped by that (job control), 0: it was not     */
+	int64_t dumpable;      /* prctl(2), PR_GET_DUMPABLE                        */
+	struct proc_stat stat; /* as of the freeze                                */
+	/* The main process' group, and the one in the foreground of its terminal; inside,
+	 * 0: none that could be seen. */
+	pid_t group, tty_group;
+	struct attributes *attributes;
+	struct mem_image *image;      /* of memory that is not in the template       */
+	struct avc_error notice;      /* what of it can not be put back              */
+	struct files *files;          /* descriptors                                     */
+	struct avc_error files_error; /* why they could not be read             */
+	/* avckpt.files=strict */
+	struct files_mapped *mapped; /* NULL: it was not strict                         */
+	char written[FILES_NAME];    /* a file that was written since; "": none         */
+	struct branch *branch;       /* the other processes, parents first        */
+	uint32_t branches;
+	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                */
+};
+
+/* ---- image.c ---------------------------------------------------------------------- */
+
+/* That of a process that is not the main one, or NULL; `generation` may be NULL. */
+struct branch *generation_branch(const struct generation *generation,
+				 const struct process *process);
+
+/* ---- pending.c ------------------------------------------------------------------ */
+
+struct pending *pending_new(void);
+/* While everything is stopped: those of all threads that are in the image.  Sets
+ * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
+int pending_read(struct process *process, struct avc_error *err) warn_unused;
+/* One that the app dies of as soon as it runs again; 0: none. */
+int pending_deadly(const struct pending *pending);
+/* Is there such a signal; of a POSIX timer, if timer >= 0? */
+bool pending_contains(const struct pending *pending, int signal, int timer);
+/* When the app runs again: one thread's, after setup_thread(); the process's. */
+void pending_setup_thread(const struct process *process, const struct thread *thread,
+			  struct setup *setup);
+void pending_setup(const struct process *process, struct setup *setup);
+
+/* ---- timers.c -------------------------------------------------------------------- */
+
+struct timers *timers_new(void);
+/* While everything is stopped: what to call first in the list; when that was done. */
+void timers_ask(struct process *process, struct inj_call *call);
+void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns);
+/* When the app runs again. */
+void timers_setup(struct process *process, struct setup *setup);
+
+/* ---- attributes.c ----------------------------------------------------------------- */
+
+#define ATTRIBUTES_ASK_BYTES 376
+/* While it is stopped, from outside. */
+void attributes_read_scheduling(pid_t tid, struct scheduling *scheduling);
+/* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
+ * leave them.  Returns the first of the calls. */
+const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
+void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *creds);
+/* When the app runs again: each thread, after setup_thread(); the process. */
+int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
+			    const struct thread *thread, struct setup *setup,
+			    struct avc_error *err) warn_unused;
+/* Of a stopped thread: its seccomp filters, whatever they say. */
+uint64_t attributes_read_filters(pid_t tid);
+int attributes_keep(const struct process *process, struct generation *generation,
+		    struct avc_error *err) warn_unused;
+/* Before the restored threads go: what can be done from outside only. */
+void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
+
+/* ---- process_attrs.c ------------------------------------------------------------------------ */
+
+/* After the app runs again: what only the template can tell. */
+int process_attrs_learn(struct branch *branch, struct avc_error *err) warn_unused;
+void process_attrs_forget(struct branch *branch);
+/* All protection keys, before its memory refers to some and while the kernel must not choose one
+ * (pkeys(7), of what can only be executed).  process_attrs_put() frees those that it did not have. */
+int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+/* A restored process gets it, with the batch's next flush. */
+int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
+		      struct avc_error *err) warn_unused;
+/* Until then nothing is limited: it may have more than it may have now, and its parent may have
+ * lowered its own limits since.  Its descriptors are below `files`. */
+void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
+/* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
+ * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
+void process_attrs_lift_limit(pid_t pid, int which, uint64_t least);
+/* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
+void process_attrs_setup_limits(const struct branch *branch, struct setup *setup);
+
+/* ---- sandbox.c --------------------------------------------------------------------- */
+
+/* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
+struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err);
+/* Waits while *state is INJ_IDLE; false when it ended or was too late. */
+bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
+/* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where
+ * they stop (job control), 0: go on. */
+void sandbox_end(struct sandbox *sandbox);
+void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32_t slot,
+		int stop_signal);
+
+/* ---- memory.c ------------------------------------------------------------------ */
+
+/* Shared memory that an image of the same checkpoint has: one is enough; and what all of them have
+ * taken of what they may. */
+#define WIPED_MAX (16u << 20)     /* bytes of MADV_WIPEONFORK memory                 */
+#define WIPED_RUNS_MAX (1u << 14) /* stretches of it, and guard pages within          */
+struct mem_key {
+	uint64_t device, inode, offset, bytes;
+};
+struct mem_seen {
+	uint32_t count, room;
+	struct mem_key *key;
+	uint64_t shared_bytes, wiped_bytes;
+	uint32_t runs;
+};
+void mem_seen_free(struct mem_seen *seen);
+
+/* memory_others.c: who else has shared memory of the application's; one for all its processes. */
+struct mem_others *mem_others_new(void);
+void mem_others_free(struct mem_others *others);
+
+struct memory *memory_new(void);
+void memory_forget(struct memory *memory); /* it is another program         */
+void memory_free(struct memory *memory);
+/* Room for what is to be copied in the freeze. */
+int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
+		   struct avc_error *err) warn_unused;
+void mem_image_free(struct mem_image *image);
+/* What only "smaps" tells of a mapping and a restore has to know, as of the checkpoint: enum
+ * mapping_flag.  And whether it is so of any. */
+uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
+bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
+/* While everything is stopped: copies, what is its own when it stands still, what is shared
+ * when everybody does; and what to call before the clone. */
+void memory_copy_own(const struct process *process, struct mem_image *image);
+void memory_copy_shared(const struct process *process, struct mem_image *image);
+void memory_dofork(const struct memory *memory, struct inj_call *call);
+/* The template is smaller than the app: always fails, with AVC_RETRY if the next
+ * attempt will be better. */
+int memory_learn(struct process *process, long missing_pages, struct avc_error *err);
+/* When the app runs again.  Fails with AVC_RETRY if what had to be copied was not. */
+/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
+ * pages is small, and whoever writes to a shared one when it is empty is killed. */
+extern const char memory_private_huge_pages[];
+int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
+		  struct setup *setup, struct avc_error *err) warn_unused;
+/* At a restore, before anything runs; *notes: what can not be written. */
+int memory_put_back(const struct process *process, const struct generation *image, pid_t pid,
+		    struct avc_error *notes, struct avc_error *err) warn_unused;
+
+#endif

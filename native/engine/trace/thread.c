@@ -1,0 +1,278 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A thread of the app: stopped, waited for, let go.
+ */
+#include <errno.h>
+#include <sys/ptrace.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "trace.h"
+
+struct thread *thread_find(struct process *process, pid_t tid)
+{
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].tid == tid)
+			return &process->threads[i];
+	return NULL;
+}
+
+struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *err)
+{
+	struct thread *t;
+
+	if (process->thread_count == process->thread_room) {
+		fail(err, AVC_DEADLINE, 0, tid, "freeze", "",
+		     "threads appear faster than they can be stopped");
+		return NULL;
+	}
+	t = &process->threads[process->thread_count++];
+	*t = (struct thread){ .tid = tid, .call.nr = -1, .block = -1 };
+	return t;
+}
+
+void threads_forget_unseen(struct process *process)
+{
+	uint32_t kept = 0;
+
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].seen || process->threads[i].attached)
+			process->threads[kept++] = process->threads[i];
+	process->thread_count = kept;
+}
+
+/* EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
+ * has no memory any more, or is a zombie. */
+static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
+{
+	const int errnum = errno;
+	struct proc_status status;
+
+	if (errnum == EPERM) {
+		if (proc_status(tid, &status) || status.locked_kb < 0)
+			return fail(err, AVC_GONE, errnum, tid, "stop", "ptrace(SEIZE)",
+				    "it has ended");
+		if (status.tracer)
+			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
+				    "it is being traced by process %d", status.tracer);
+	}
+	errno = errnum;
+	return fail_errno(err, tid, "stop", "ptrace(SEIZE)",
+			  "not allowed to trace it (CAP_SYS_PTRACE and CAP_SYS_ADMIN are needed)");
+}
+
+int thread_stop(struct process *process, struct thread *thread, struct avc_error *err)
+{
+	int errnum;
+
+	if (ptrace(PTRACE_SEIZE, thread->tid, NULL, (long)TRACE_OPTIONS_APP)) {
+		if (errno == ESRCH)
+			return fail(err, AVC_GONE, ESRCH, thread->tid, "stop", "ptrace(SEIZE)",
+				    "it has ended");
+		errnum = errno;
+		/* One that a thread of ours has just brought forth is our tracee already,
+		 * though we may not have heard of it yet. */
+		if (errnum == EPERM && tracee_is_ours(thread->tid)) {
+			thread->attached = true; /* and comes with its own stop */
+			thread->stopped = false;
+			return 0;
+		}
+		errno = errnum;
+		return seize_failed(process->pid, thread->tid, err);
+	}
+	thread->attached = true;
+	thread->stopped = false;
+	if (ptrace(PTRACE_INTERRUPT, thread->tid, NULL, NULL))
+		return fail_errno(err, thread->tid, "stop", "ptrace(INTERRUPT)", "it has ended");
+	return 0;
+}
+
+/* A process or thread that a thread of ours has brought forth meanwhile. */
+static struct thread *adopt(struct process *process, pid_t tid, struct avc_error *err)
+{
+	struct thread *born = thread_find(process, tid);
+
+	if (!born)
+		born = thread_add(process, tid, err);
+	if (born && !born->attached) {
+		born->attached = true;
+		born->stopped = false;
+	}
+	return born;
+}
+
+int thread_await(struct process *process, struct thread *thread, struct avc_error *err)
+{
+	pid_t child = 0;
+	const enum stop_kind kind = tracee_await(thread->tid, &child, err);
+
+	/* Whatever came of it: its new threads are found by the next walk, attached
+	 * already; new processes are not, which is how freeze_tree() tells them. */
+	if (child && !adopt(process, child, err))
+		return -1;
+	switch (kind) {
+	case STOP_TRAP:
+		break;
+	case STOP_EXIT:
+		thread->attached = false; /* reaped */
+		return -1;
+	default:
+		return -1;
+	}
+	thread->stopped = true;
+	thread->vetted = false;
+	thread->stop_signal = tracee_group_signal();
+	if (arch_regs_get(thread->tid, &thread->regs)) {
+		thread->stopped = false;
+		return fail_errno(err, thread->tid, "stop", "ptrace(GETREGS)", "it has ended");
+	}
+	rewind_call(process, thread);
+	return 0;
+}
+
+void thread_runs_on(struct thread *thread, const struct avc_error *err)
+{
+	if (err->code == AVC_DEADLINE || err->code == AVC_RETRY || err->code == AVC_GONE)
+		thread->stopped = false;
+}
+
+void thread_release(struct thread *thread)
+{
+	struct avc_error ignored = { 0 };
+
+	if (!thread->attached || !thread->stopped)
+		return;
+	if (thread->borrowed)
+		thread_give_back(thread, &ignored);
+	if (ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) == 0) {
+		thread->attached = false;
+		thread->stopped = false;
+		return;
+	}
+	/* SIGKILL has taken it out of its stop: it has to be reaped. */
+	thread->stopped = false;
+}
+
+void thread_let_go(const struct process *process, struct thread *thread)
+{
+	if (thread->attached && thread->stopped)
+		rewind_count_stop(process, thread);
+	thread_release(thread);
+}
+
+/* True as long as it still has to be waited for. */
+static bool straggle(struct process *process, struct thread *thread)
+{
+	const pid_t tid = thread->tid;
+	struct avc_error ignored = { 0 };
+	struct stop stop = tracee_wait(tid, WNOHANG);
+	struct arch_regs now;
+
+	/* Registers can be read of what is stopped only.  If that is no news, somebody has
+	 * heard of it already, and it would stay so for ever. */
+	if (stop.kind == STOP_NONE && arch_regs_get(tid, &now) == 0) {
+		stop = tracee_wait(tid, WNOHANG);
+		if (stop.kind == STOP_NONE)
+			stop.kind = STOP_TRAP;
+	}
+
+	switch (stop.kind) {
+	case STOP_NONE:
+		/* It may have found home by itself meanwhile, and would never stop again. */
+		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		return true;
+	case STOP_DYING:
+	case STOP_DEADLINE:
+		return true;
+	case STOP_EXIT:
+		process->lost = process->lost || thread->borrowed;
+		thread->attached = false;
+		thread->borrowed = false;
+		return false;
+	case STOP_FORK:
+		/* A borrowed thread may have found home by itself, and what it starts
+		 * there is the app's: to kill one thread is to kill them all. */
+		if (thread->borrowed && arch_regs_get(tid, &now) == 0 &&
+		    parasite_contains(&process->parasite, arch_pc(&now)))
+			tracee_kill(stop.message); /* our clone, too late */
+		else
+			adopt(process, stop.message, &ignored);
+		/* fall through */
+	case STOP_SYSCALL:
+		/* Not a place to change registers: let it come to a better one. */
+		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		seccomp_go_on(tid, &stop);
+		return true;
+	default:
+		break;
+	}
+	if (arch_regs_get(tid, &now) == 0) {
+		/* Not before it has waited for what it brought forth for us: the app would
+		 * find that. */
+		if (process->waiting && thread->borrowed &&
+		    parasite_contains(&process->parasite, arch_pc(&now)) &&
+		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
+			seccomp_go_on(tid, NULL);
+			return true;
+		}
+		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {
+			thread_give_back(thread, &ignored);
+		} else {
+			thread->borrowed = false;
+			thread->regs = now;
+			rewind_call(process, thread);
+		}
+	}
+	if (ptrace(PTRACE_DETACH, tid, NULL, (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
+		return true; /* killed: to be reaped */
+	thread->attached = false;
+	return false;
+}
+
+uint32_t threads_tend_stragglers(struct process *process)
+{
+	uint32_t left = 0;
+
+	for (uint32_t i = 0; i < process->thread_count; i++) /* may grow */
+		if (process->threads[i].attached && straggle(process, &process->threads[i]))
+			left++;
+	return left;
+}
+
+struct rseq_cs {
+	uint32_t version, flags;
+	uint64_t start, length, abort;
+};
+
+void thread_fix_rseq(int mem_fd, struct thread *thread)
+{
+	struct rseq_cs cs;
+	uint64_t pointer;
+
+	/* struct rseq: cpu_id_start, cpu_id (4 bytes each), rseq_cs */
+	if (!thread->rseq ||
+	    pread(mem_fd, &pointer, sizeof pointer, (off_t)(thread->rseq + 8)) != sizeof pointer ||
+	    !pointer || pread(mem_fd, &cs, sizeof cs, (off_t)pointer) != sizeof cs)
+		return;
+	if (arch_pc(&thread->regs) - cs.start < cs.length)
+		arch_pc_set(&thread->regs, cs.abort);
+}
+
+/* Since Linux 6.4; the headers may be older. */
+#define GET_DISPATCH 0x4211 /* PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG */
+
+/* Asked before a thread runs anything of ours: while its selector says so, every system call that
+ * is not made where it has them made is a SIGSYS (Documentation/admin-guide/
+ * syscall-user-dispatch.rst), which is the app's end when all signals are blocked. */
+int thread_check_dispatch(pid_t tid, struct avc_error *err)
+{
+	struct {
+		uint64_t mode, selector, offset, bytes;
+	} dispatch = { 0 };
+
+	if (ptrace(GET_DISPATCH, tid, sizeof dispatch, &dispatch) == 0 && dispatch.mode)
+		return fail(err, AVC_UNSUPPORTED, 0, tid, "check", "",
+			    "it dispatches system calls by itself (Syscall User Dispatch, as Wine "
+			    "does)");
+	return 0;
+}

@@ -1,0 +1,581 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Stopped tasks: ptrace(2), threads of the app, and code of ours run in them.
+ *
+ *   tracee.c        seize, stop, wait, release
+ *   thread.c        a thread of the app: stopped, let go
+ *   rewind.c        interrupted system calls
+ *   parasite.c      the parasite as the engine sees it, code run in a process
+ *   setup.c         lists of calls that a restored process makes
+ *   syscall_batch.c a process that is being made
+ *   fd_channel.c    ... and gets descriptors
+ *   last_pid.c      the next PID of another PID namespace
+ *   init_channel.c  to avckpt-init: control page, reports, verdicts
+ */
+#ifndef AVCKPT_TRACE_H
+#define AVCKPT_TRACE_H
+
+#include <sys/socket.h>
+#include <sys/uio.h>
+
+#include "avckpt/ctl.h"
+#include "base.h"
+#include "parasite.h"
+
+#define THREADS_MAX 4096
+#define OLD_PARASITES_MAX 128
+#define SOCKETS_MAX 64
+/* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13; glibc before 2.35 lacks the name. */
+#define PTRACE_GET_RSEQ 0x420f
+#define SS_AUTODISARM_ (1u << 31) /* linux/signal.h, which does not go with signal.h */
+
+/* The call a thread was in when it was stopped last. */
+struct call {
+	long nr;
+	avc_remote pc, sp;
+	uint64_t arg[3];
+};
+
+/* What is remembered of a call that was rewound (rewind.c). */
+struct rewound {
+	uint32_t mark; /* of that call; 0: none                            */
+	int answer;    /* when its time is up                              */
+	uint64_t due_ns;
+	uint64_t runs;            /* how often the thread had run when it was waiting again */
+	bool runs_known, waiting; /* waits.c                                        */
+};
+
+/* A thread that slept, as far as one can tell from outside, just before it was stopped. */
+struct sleeper {
+	bool known;
+	struct proc_sched sched;
+};
+
+/* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
+struct scheduling {
+	uint8_t attr[48] __attribute__((aligned(8)));
+	int32_t io_priority;
+	int32_t reserved;
+};
+
+#define GROUPS_KEPT 32 /* of a thread; of one with more it is only known how many */
+#define NODE_WORDS 16  /* 1024 nodes of memory                                   */
+
+struct creds {
+	uint32_t uid[3], gid[3]; /* real, effective, saved                      */
+	uint32_t fsuid, fsgid;
+	uint32_t caps[6]; /* as capget(2) has them                            */
+	uint64_t bounding, ambient;
+	uint64_t state_permitted; /* arch.h, ARCH_STATE_PERMITTED                     */
+	uint32_t personality;
+	uint32_t securebits, no_new_privs;
+	uint32_t death_signal, subreaper;
+	int32_t seccomp;  /* mode                                             */
+	uint64_t filters; /* of seccomp: a hash                               */
+	int32_t group_count;
+	uint32_t group[GROUPS_KEPT]; /* supplementary                             */
+	int32_t memory_policy;       /* set_mempolicy(2), -1: the kernel has none */
+	uint64_t nodes[NODE_WORDS];
+	uint64_t slack_ns;   /* of timers                                        */
+	int32_t future_lock; /* mlockall(2), of the main thread only            */
+};
+
+/* What a thread is asked (process.c); NULL: not that. */
+struct questions {
+	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
+};
+
+/* How injected code gets along with the app's seccomp filters (seccomp.c). */
+enum seccomp_way {
+	SECCOMP_NONE,      /* there are none                                       */
+	SECCOMP_IN_FORCE,  /* they let pass what it calls                          */
+	SECCOMP_SUPERVISED /* they do not                                          */
+};
+
+struct thread {
+	pid_t tid; /* in our namespace                                 */
+	bool seen; /* there at this freeze                             */
+	bool attached, stopped;
+	int stop_signal; /* the process is stopped by job control           */
+	int block;       /* of the slot, main thread 0; -1: not in the image */
+	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
+	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
+	uint32_t filters_known;              /* of seccomp, when they were looked at last       */
+	enum seccomp_way seccomp;
+	bool vetted;           /* thread_vet() has been at this stop                      */
+	struct arch_regs regs; /* as of the stop, EINTR already mended          */
+	uint64_t sigmask;
+	uint64_t robust_list, robust_bytes;
+	uint64_t rseq;
+	uint32_t rseq_bytes, rseq_signature;
+	uint64_t affinity[INJ_CPU_WORDS];
+	uint32_t affinity_bytes;
+	/* Asked of the thread itself, or slow to read; kept between checkpoints
+	 * as long as it looks like the same thread. */
+	bool known;
+	uint32_t asked; /* checkpoints since                                */
+	bool young;     /* was asked once only: it may just be setting itself up    */
+	pid_t inside;
+	uint64_t known_tls;
+	uint64_t clear_tid;
+	uint64_t altstack[3]; /* sp, flags, size                                */
+	bool disarmed;        /* has none as long as it is in a handler on it   */
+	char name[16];
+	struct creds creds;
+	struct scheduling scheduling; /* at this freeze                         */
+	struct call call;
+	struct rewound rewound;
+	struct sleeper sleeper;
+	uint64_t stopped_ns;
+	bool signalled; /* was just about to run a handler                  */
+};
+
+struct parasite {
+	avc_remote base; /* 0: none                                          */
+	enum seccomp_way seccomp;
+	pid_t inside; /* the process it was brought into, as that knows it     */
+	size_t bytes;
+	uint8_t *map; /* our view of the same pages                       */
+	struct inj_control *control;
+	uint32_t slots, threads_max;
+	size_t slot_bytes, block_bytes;
+	/* The guard's own memory, not the app's: the code, sealed, so that nobody can write it; and
+	 * the rest, which the app can write as well. */
+	int code_fd, data_fd;
+};
+#define PARASITE_NAME "avckpt-parasite"
+/* How it is mapped in two parts. */
+#define PARASITE_CODE_PROT (PROT_READ | PROT_EXEC)
+#define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
+#define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
+#define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
+
+/* A live process of the app. */
+struct process {
+	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
+	 * or, when that has ended, any other (process_follow).  0: none           */
+	pid_t pid;
+	pid_t leader; /* the process's own number                            */
+	pid_t inside; /* the same in its own namespace                       */
+	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd;
+	int leader_pidfd; /* when pidfd is of another thread: of the process    */
+	struct parasite parasite;
+	bool infected; /* the parasite is known to be in this process           */
+	pid_t holder;  /* 0: none                                          */
+	int holder_pidfd;
+	struct thread *threads;
+	uint32_t thread_count, thread_room;
+	uint64_t due_ns; /* when the first of its calls is to be ended (waits.c)   */
+	uint64_t nonce;
+	/* Parasites that a guard which died left behind; they go with the second
+	 * checkpoint, when no thread can be in them any more. */
+	struct {
+		avc_remote base;
+		size_t bytes;
+	} old_parasite[OLD_PARASITES_MAX];
+	uint32_t old_parasites, checkpoints;
+	/* A thread died while it may have been cloning: there may be a tracee that
+	 * nobody knows (init_channel_kill_lost). */
+	bool lost;
+	bool childless;                     /* it had no child process at the last checkpoint   */
+	const struct inj_syscall *children; /* the question whether it has, in a freeze */
+	struct questions questions;         /* and what else it is asked               */
+	uint64_t asked_ns;
+	bool asked;
+	uint32_t blocks;     /* of the slot, that its threads take up in this freeze     */
+	long surveyed_pages; /* size when its mappings were looked at last      */
+	int sockets[SOCKETS_MAX];
+	uint32_t socket_count;
+	struct pending *pending;
+	struct timers *timers;
+	struct memory *memory;
+	struct mem_others *others; /* of the main one, and so of all             */
+	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
+	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
+	pid_t init;                /* avckpt-init                                      */
+	struct files *files_before, *files_image; /* files.c                   */
+	uint32_t files_seen;
+	bool tcp_moved;    /* bytes of connections are to be counted           */
+	bool tcp_messages; /* quiescent is only who is between two messages    */
+	/* Of a process that is not the main one (tree.c). */
+	bool descendant;
+	uint64_t start;               /* when it began; tells it from one with its number */
+	uint32_t images;              /* generations that have one of it                  */
+	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
+	long clone_pages;             /* its size when that began                         */
+	long anon_pages;              /* of its last template; 0: none yet                */
+	bool closing;                 /* by its holder: generation_close_tables()      */
+	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
+	bool waiting;                 /* its main thread is to wait for a task of ours       */
+	const struct creds *forebear; /* what a process that is made from the main one has */
+	bool frozen;                  /* stopped in this freeze                            */
+	bool begun;                   /* and read, and asked                               */
+	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
+	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
+	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
+					  * executed another program                       */
+};
+
+/* ---- tracee.c ---------------------------------------------------------------- */
+
+/* The one signal the library uses, thread-directed, to end a wait(2) in time. */
+int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
+void tracee_deadline_set(timer_t timer, uint64_t ns);
+void tracee_deadline_clear(timer_t timer);
+bool tracee_deadline_passed(void);
+
+enum stop_kind {
+	STOP_TRAP,  /* our PTRACE_INTERRUPT, or a new tracee's first stop     */
+	STOP_GROUP, /* job control: the app is stopped by a signal            */
+	STOP_FORK,  /* FORK, VFORK, CLONE event; `message` is the child       */
+	STOP_SYSCALL,
+	STOP_SIGNAL,   /* about to receive `signal`                              */
+	STOP_EXIT,     /* gone; reaped                                           */
+	STOP_DYING,    /* killed, to be reaped later (threads_tend_stragglers())              */
+	STOP_DEADLINE, /* did not stop in time                                   */
+	STOP_NONE,     /* WNOHANG: nothing new                                   */
+	STOP_OTHER
+};
+
+struct stop {
+	enum stop_kind kind;
+	int event, signal, status;
+	pid_t message;
+};
+
+/* From now on a wait also ends (as at the deadline) when *word is not 0; NULL: no more. */
+void tracee_watch(const uint32_t *word);
+/* Waits for the next stop of one tracee of this thread; options: 0 or WNOHANG. */
+struct stop tracee_wait(pid_t tid, int options);
+/* For a running tracee that was interrupted (or is new): waits until it is in a
+ * plain trap stop (STOP_TRAP); signals that come in between are delivered.  A new
+ * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
+ * STOP_TRAP is an error. */
+enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
+/* The signal by which the one awaited last is stopped (job control); 0: it is not. */
+int tracee_group_signal(void);
+/* From a stop of another kind to a plain trap stop, on the kernel's way back to
+ * the app, where it sees to interrupted calls and signals. */
+int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
+/* The same of a task of ours of which it is not known whether it runs. */
+int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
+/* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
+ * that a thread has brought forth when it was killed is a tracee nobody heard of. */
+bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
+/* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
+void tracee_kill(pid_t pid);
+/* The same some milliseconds later, and without waiting for its end: the kernel takes some 10 ms
+ * for each GB that it has mapped, and longer if it gets no CPU.  Takes `pidfd`.  Until
+ * tracee_reap_ending() has killed and reaped it, it is_ending(): the task, of this thread.  That
+ * returns how many are left, and tracee_ending_due() when to call it again if there is no news of
+ * theirs: CLOCK_MONOTONIC, UINT64_MAX: never. */
+void tracee_end(pid_t pid, int pidfd);
+uint32_t tracee_reap_ending(void);
+uint64_t tracee_ending_due(void);
+/* Kills them now. */
+void tracee_end_now(void);
+bool tracee_is_ending(pid_t pid);
+/* Of the i-th of them, to be watched; -1: there are no more. */
+int tracee_ending_pidfd(uint32_t i);
+/* Whether STOP_SYSCALL is of one that enters a system call, and not of one that leaves it. */
+bool tracee_enters_call(pid_t tid);
+/* Is this thread the one that traces it? */
+bool tracee_is_ours(pid_t tid);
+/* Holders, and processes that are being made: never to run on without us. */
+#define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | TRACE_OPTIONS_APP)
+#define TRACE_OPTIONS_APP \
+	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
+
+/* ---- thread.c ------------------------------------------------------------------ */
+
+/* The entry for a tid; NULL when there is no room. */
+struct thread *thread_find(struct process *process, pid_t tid);
+struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *err);
+void threads_forget_unseen(struct process *process);
+/* Attaches and interrupts; thread_await() then waits for the stop, reads the
+ * registers and mends the interrupted call. */
+int thread_stop(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
+int thread_await(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
+/* After injected code in it has failed: what did not come back in time is still on its way. */
+void thread_runs_on(struct thread *thread, const struct avc_error *err);
+/* Lets it go on as if nothing had been.  A thread that could not be stopped stays
+ * attached: a straggler. */
+void thread_release(struct thread *thread);
+/* The same after a freeze: what that has taken is no time of a call that it was waiting in. */
+void thread_let_go(const struct process *process, struct thread *thread);
+/* Looks after stragglers without waiting; returns how many are left. */
+uint32_t threads_tend_stragglers(struct process *process);
+/* Where a thread inside a restartable sequence has to go on (rseq(2)). */
+void thread_fix_rseq(int mem_fd, struct thread *thread);
+/* Of a stopped thread: whether it can be made to run something of ours. */
+int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
+
+/* ---- rewind.c --------------------------------------------------------------------- */
+
+/* A thread that just stopped: remembers which call it is in.  If that was only interrupted
+ * by us, the thread is set to make it again, or, when the call's time is up, to answer that. */
+void rewind_call(struct process *process, struct thread *thread);
+/* Just before it goes on: takes off what the stop has added to a wait. */
+void rewind_count_stop(const struct process *process, const struct thread *thread);
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
+/* Registers as the app had them, before rewind_call() marked the call or the kernel made
+ * restart_syscall(2) of it. */
+void rewind_original(const struct thread *thread, struct arch_regs *regs);
+
+/* ---- seccomp.c -------------------------------------------------------------------- */
+
+/* Looks at a stopped thread's filters, of which the first `containers` are the container's; *known:
+ * how many there were the last time.  Who is supervised stays so.  0, or -1 with errno. */
+int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known,
+		 enum seccomp_way *way) warn_unused;
+/* From now on, until seccomp_let_be(): `options` are those it has else, `inside` the number of its
+ * process as that knows it. */
+int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
+void seccomp_let_be(pid_t tid);
+bool seccomp_is_supervised(pid_t tid);
+/* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
+void seccomp_at_call(pid_t tid, pid_t inside, long options);
+/* ptrace(PTRACE_CONT) for whoever runs injected code: from `stop`, with its signal if it is one;
+ * NULL: it was told of before. */
+long seccomp_go_on(pid_t tid, const struct stop *stop);
+
+/* ---- parasite.c ------------------------------------------------------------------- */
+
+/* Makes the memory for a layout, with code and control filled in; it is in no process yet. */
+int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err) warn_unused;
+size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max);
+void parasite_close(struct parasite *parasite);
+struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot);
+avc_remote parasite_remote(const struct parasite *parasite, const void *local);
+bool parasite_contains(const struct parasite *parasite, avc_remote address);
+/* Block of thread `i` in a slot, its signal frame, the top of its stack. */
+struct inj_thread *parasite_thread(const struct parasite *parasite, uint32_t slot, uint32_t i);
+void *parasite_frame(const struct parasite *parasite, uint32_t slot, uint32_t i);
+void *parasite_stack(const struct parasite *parasite, uint32_t slot, uint32_t i);
+
+uint8_t *parasite_setup(const struct parasite *parasite, uint32_t slot); /* INJ_SETUP_BYTES */
+uint8_t *parasite_files(const struct parasite *parasite, uint32_t slot); /* INJ_FILES_BYTES */
+
+/* Prepares a list of calls; returns the next call to fill in. */
+void call_begin(struct inj_call *call, enum inj_after after);
+struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
+			     uint64_t d, uint64_t e);
+/* Sends a stopped task into the parasite to make the calls.  `base` is a user context
+ * of the task.  For a thread of the app use thread_borrow(). */
+int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
+		  struct inj_call *call, struct avc_error *err) warn_unused;
+/* Resumes it until all calls were made; it is in a plain trap stop then. */
+int parasite_run(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+/* Resumes it until it pauses (INJ_PAUSE), and from there. */
+int parasite_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+/* Resumes it until it has cloned; it is in the event's stop then.  If the kernel does
+ * not let it, fails with AVC_LIMIT, and it is in a plain trap stop. */
+int parasite_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+		       struct avc_error *err) warn_unused;
+/* The same in parts, for several at a time.  parasite_halt() waits until it is done and
+ * interrupts it; its stop is still to come, for which parasite_finish() waits, too. */
+int parasite_start(pid_t tid, struct avc_error *err) warn_unused;
+int parasite_halt(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_finish(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
+int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
+			 struct avc_error *err) warn_unused;
+/* The same; `meanwhile` is called once while the kernel clones. */
+int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
+			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* exec puts another program in its place, at any moment, and the parasite is gone: whether it
+ * is there, in a stopped thread.  If not, the process is not infected any more. */
+int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
+/* In what a guard that died left behind? */
+bool parasite_is_old(const struct process *process, avc_remote address);
+/* Options for a task of ours, which is stopped, with the memory of the parasite's process. */
+int parasite_own(const struct parasite *parasite, pid_t tid) warn_unused;
+/* May this stopped thread be borrowed?  What of that is to be read in its memory. */
+int thread_vet(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
+/* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:
+ * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
+int thread_borrow(struct process *process, struct thread *thread,
+		  struct avc_error *err) warn_unused;
+int thread_give_back(struct thread *thread, struct avc_error *err);
+
+/* ---- setup.c ------------------------------------------------------------------- */
+
+/* The lists of calls of one slot, while they are being made.  Used by
+ * generation_finish() and what it calls, in this order: setup_begin(), any number
+ * of the others, setup_end(). */
+struct setup {
+	const struct parasite *parasite;
+	struct inj_slot *slot;
+	uint8_t *memory;
+	size_t used;
+	uint64_t *tail[INJ_STAGES]; /* where the next one's address goes        */
+	uint64_t *thread_tail;
+	bool full;
+	struct avc_error notice; /* what can not be put back, the first of it */
+	struct inj_setup spare;  /* written to when there is no room         */
+};
+
+void setup_begin(struct setup *setup, const struct parasite *parasite, uint32_t slot);
+/* One more call for a stage or (after setup_thread()) for a thread; `name` is for
+ * messages.  To be filled in further: call.arg[5], store, flags. */
+struct inj_setup *setup_add(struct setup *setup, enum inj_stage stage, const char *name, long nr,
+			    uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e);
+void setup_thread(struct setup *setup, struct inj_thread *thread);
+struct inj_setup *setup_add_thread(struct setup *setup, const char *name, long nr, uint64_t a,
+				   uint64_t b, uint64_t c, uint64_t d, uint64_t e);
+/* A copy of `bytes` bytes where the process can read it; the process's address. */
+avc_remote setup_data(struct setup *setup, const void *data, size_t bytes);
+/* -1 if there was not enough room for it all. */
+int setup_end(const struct setup *setup, pid_t pid, struct avc_error *err) warn_unused;
+/* After a restore: the first call of the slot that was allowed to fail, and did. */
+const struct inj_setup *setup_failed(const struct parasite *parasite, uint32_t slot);
+/* The same for one stage; calls without a name do not count. */
+const struct inj_setup *setup_failed_stage(const struct parasite *parasite, uint32_t slot,
+					   enum inj_stage stage);
+/* The name of a call by the process's address of it. */
+const char *setup_name(const struct parasite *parasite, avc_remote address);
+
+/* ---- fd_channel.c ------------------------------------------------------------------ */
+
+/* In a parasite: what recvmsg(2) needs for one descriptor, `remote` there; the header is first. */
+struct fd_letter {
+	struct msghdr head;
+	struct iovec io;
+	uint8_t byte;
+	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
+};
+void fd_letter_write(struct fd_letter *letter, avc_remote remote);
+/* One descriptor over a socket (unix(7), SCM_RIGHTS). */
+int fd_send(int socket, int fd);
+/* A table that is made anew: what is to be in it. */
+struct fd_table {
+	uint32_t count;
+	struct {
+		int fd, ours;
+		bool cloexec;
+	} * entry; /* by fd, ascending                                        */
+};
+void fd_table_free(struct fd_table *table);
+
+/* ---- syscall_batch.c ----------------------------------------------------------------------- */
+
+#define BATCH_SOFTS 64
+
+/* A task that a restored process has forked, and that is made what a template is. */
+struct syscall_batch {
+	pid_t pid;
+	const struct parasite *parasite; /* the one it runs in                              */
+	struct inj_call *call;
+	struct arch_regs base;
+	struct inj_syscall *list; /* in the parasite: calls not made yet                  */
+	uint32_t listed, list_max;
+	uint8_t *data; /* in the parasite: for what the calls refer to             */
+	struct soft {
+		uint32_t index;
+		const char *problem;
+	} soft[BATCH_SOFTS]; /* of the calls, those that may fail                  */
+	uint32_t softs;
+	pid_t inside; /* for notes: what did fail                            */
+	struct avc_error *notes;
+	int socket; /* ours, through which it gets descriptors; -1     */
+};
+
+/* From now on it runs in that parasite. */
+void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *parasite,
+			 uint32_t slot);
+/* One more call.  All of them are made by syscall_batch_flush(), which leaves the results in
+ * batch->list and tells the first that failed. */
+void syscall_batch_add(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
+		       uint64_t d, uint64_t e, uint64_t f);
+/* The same, for any number: those before it are made when there is no more room. */
+int syscall_batch_ask(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
+		      uint64_t d, uint64_t e, uint64_t f, struct avc_error *err) warn_unused;
+/* The last one may fail: then `problem`, if any, is noted. */
+void syscall_batch_soften(struct syscall_batch *batch, const char *problem);
+int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+void *syscall_batch_data(const struct syscall_batch *batch, avc_remote *remote);
+/* Two ends of a socket: ours, and the number of the other one there.  Both -1: there is none. */
+struct fd_channel {
+	int ours, theirs;
+};
+
+/* Closes what it has from its parent; from here on it can be given descriptors, each to be
+ * number 1 until that is closed.  By the `fd_channel` that it has from its parent, if any, or its own. */
+int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
+				  struct avc_error *err) warn_unused;
+/* Of the main process, for its children, who have it from the fork: to make one takes longer than
+ * all that comes by it.  None where there is no number left for it. */
+int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
+				   struct avc_error *err) warn_unused;
+int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
+				     struct avc_error *err) warn_unused;
+int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err) warn_unused;
+/* From its parent's parasite into its own. */
+int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
+				  uint32_t slot, struct avc_error *err) warn_unused;
+/* Its descriptors; it gets no more after that. */
+int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *table,
+			    struct avc_error *err) warn_unused;
+
+/* ---- last_pid.c ------------------------------------------------------------------- */
+
+/* A slot whose requests the helper serves. */
+struct last_pid_slot {
+	const struct parasite *parasite;
+	uint32_t number;
+};
+/* Starts the helper of the next restore, which waits for it; best effort. */
+void last_pid_prepare(int init_pidfd);
+void last_pid_forget(void);
+/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as the process that
+ * is restored in the first slot asks, or in that of last_pid_serve().  last_pid_set() is the
+ * engine's own request. */
+struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
+				struct avc_error *err);
+int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
+/* From now on those of another one of the slots. */
+void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
+void last_pid_stop(struct last_pid *helper);
+
+/* ---- init_channel.c -------------------------------------------------------------- */
+
+struct init_channel {
+	int init_pidfd, ctl_fd, report_fd, verdict_fd;
+	pid_t init, init_inside;
+	struct avc_ctl *ctl;
+	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
+	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
+};
+
+void init_channel_init(struct init_channel *channel);
+/* True once the app's main process runs a program of its own. */
+bool init_channel_app_started(const struct init_channel *channel, pid_t app);
+/* 1: connected, 0: init is not ready yet, -1: error. */
+int init_channel_open(struct init_channel *channel, struct avc_error *err) warn_unused;
+void init_channel_close(struct init_channel *channel);
+/* The app's main process in our namespace, 0 if it is not there (yet). */
+pid_t init_channel_app(const struct init_channel *channel);
+void init_channel_arm(struct init_channel *channel, bool armed);
+bool init_channel_stop_asked(const struct init_channel *channel);
+int init_channel_report(struct init_channel *channel, struct avc_report *report);
+/* Of the last death.  init waits for only so long, and anew from each init_channel_working() on,
+ * which may be called as often as there is progress. */
+int init_channel_verdict(const struct init_channel *channel, enum avc_verdict_kind kind,
+			 struct avc_error *err);
+void init_channel_working(struct init_channel *channel);
+/* Kills and reaps the children of init that are tracees of ours but not known:
+ * clones of which we never heard, because the thread that made them was killed before
+ * it could tell.  They would keep the app's number (as a process group's) and, as
+ * zombies, the container from ending. */
+void init_channel_kill_lost(const struct init_channel *channel,
+			    bool (*known)(pid_t pid, const void *arg), const void *arg);
+/* Kills what the dead app left behind: children of init, but those to keep.  tend() is called
+ * while it waits for their end.  0: none of them runs any more; AVC_DEADLINE: one does. */
+int init_channel_kill_leftovers(struct init_channel *channel,
+				bool (*keep)(pid_t pid, const void *arg), void (*tend)(void *arg),
+				void *arg, struct avc_error *err) warn_unused;
+
+#endif

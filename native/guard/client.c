@@ -1,0 +1,478 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The daemon's side of its guards: starts them, tells them what to do, queues what they
+ * say.  This is all of the native code that runs in the daemon.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <pthread.h>
+#include <signal.h>
+#include <spawn.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include "avckpt/guard.h"
+#include "base.h"
+
+#define QUEUE_MAX 4096
+#define STOP_MS 15000     /* a guard may be in the middle of a restore                    */
+#define END_MS 1000       /* from the end of its socket to the end of the process         */
+#define STARVED_FACTOR 10 /* so much more patience with who only waits for a CPU          */
+#ifndef AVC_VERSION
+#define AVC_VERSION "0.1.0"
+#endif
+
+extern char **environ;
+
+struct avc_guard {
+	struct avc_engine *engine;
+	struct avc_guard *next;
+	uint64_t cookie;
+	pid_t pid;
+	int pidfd, socket;
+	const struct avc_heartbeat *heartbeat;
+	uint64_t beats, beats_ns; /* the last that were seen, and when              */
+	bool stopping;            /* somebody has asked for its end                 */
+	bool ended;               /* its socket says so                             */
+	bool hung;                /* and we have killed it                          */
+	int status;               /* of the ended process, as from waitpid(2)       */
+};
+
+struct avc_engine {
+	pthread_mutex_t lock;
+	char *program;
+	int epoll_fd; /* its guards' sockets, and queue_fd                        */
+	int queue_fd; /* eventfd: something is queued                             */
+	struct avc_guard *guards;
+	uint32_t first, count;
+	struct avc_event queue[QUEUE_MAX];
+};
+
+const char *avc_version(void)
+{
+	return AVC_VERSION;
+}
+
+/* ---- the queue ------------------------------------------------------------------ */
+
+struct avc_engine *avc_engine_new(const char *program, struct avc_error *err)
+{
+	struct epoll_event on = { .events = EPOLLIN };
+	struct avc_engine *engine;
+
+	*err = (struct avc_error){ 0 };
+	engine = calloc(1, sizeof *engine);
+	if (!engine) {
+		fail_errno(err, 0, "start engine", "calloc", "out of memory");
+		return NULL;
+	}
+	engine->program = strdup(program);
+	engine->queue_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+	engine->epoll_fd = epoll_create1(EPOLL_CLOEXEC);
+	pthread_mutex_init(&engine->lock, NULL);
+	if (!engine->program || engine->queue_fd < 0 || engine->epoll_fd < 0 ||
+	    epoll_ctl(engine->epoll_fd, EPOLL_CTL_ADD, engine->queue_fd, &on)) {
+		fail_errno(err, 0, "start engine", "epoll_create1", "no descriptor for events");
+		avc_engine_free(engine);
+		return NULL;
+	}
+	return engine;
+}
+
+int avc_engine_event_fd(struct avc_engine *engine)
+{
+	return engine->epoll_fd;
+}
+
+static void queue_event(struct avc_engine *engine, const struct avc_event *event)
+{
+	if (engine->count == QUEUE_MAX) {
+		engine->first = (engine->first + 1) % QUEUE_MAX;
+		engine->count--;
+	}
+	engine->queue[(engine->first + engine->count++) % QUEUE_MAX] = *event;
+	eventfd_write(engine->queue_fd, 1);
+}
+
+/* Reaps it.  It may take a moment from the end of its socket to its own. */
+static void guard_reap(struct avc_guard *guard, int patience_ms)
+{
+	struct pollfd ending = { .fd = guard->pidfd, .events = POLLIN };
+
+	if (!guard->pid)
+		return;
+	if (poll(&ending, 1, patience_ms) != 1)
+		syscall(SYS_pidfd_send_signal, guard->pidfd, SIGKILL, NULL, 0);
+	while (waitpid(guard->pid, &guard->status, 0) < 0 && errno == EINTR)
+		;
+	guard->pid = 0;
+}
+
+/* It has ended, and nobody had asked for that: the daemon is to start another one. */
+static void guard_lost(struct avc_guard *guard)
+{
+	struct avc_event event = { .kind = AVC_EVENT_GUARD_LOST,
+				   .cookie = guard->cookie,
+				   .at_ns = now_ns() };
+
+	if (guard->hung)
+		fail(&event.error, AVC_DEADLINE, 0, 0, "", "",
+		     "its guard gave no sign of life and was killed");
+	else if (WIFSIGNALED(guard->status))
+		fail(&event.error, AVC_GONE, 0, 0, "", "", "its guard was killed by signal %d",
+		     WTERMSIG(guard->status));
+	else
+		fail(&event.error, AVC_GONE, 0, 0, "", "", "its guard ended with status %d",
+		     WEXITSTATUS(guard->status));
+	queue_event(guard->engine, &event);
+}
+
+/* Queues what it has said so far. */
+static void guard_listen(struct avc_guard *guard)
+{
+	struct avc_event event;
+	ssize_t n;
+
+	while ((n = recv(guard->socket, &event, sizeof event, MSG_DONTWAIT)) == sizeof event) {
+		/* Its last word, after which it ends by itself. */
+		guard->stopping |= event.kind == AVC_EVENT_ENDED;
+		queue_event(guard->engine, &event);
+	}
+	if (n < 0 && (errno == EAGAIN || errno == EINTR))
+		return;
+	guard->ended = true;
+	epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
+	if (guard->stopping)
+		return;
+	guard_reap(guard, END_MS);
+	guard_lost(guard);
+}
+
+int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event)
+{
+	eventfd_t ignored;
+	int found = 0;
+
+	pthread_mutex_lock(&engine->lock);
+	if (!engine->count) {
+		struct epoll_event ready[16];
+		const int n = epoll_wait(engine->epoll_fd, ready, 16, 0);
+
+		for (int i = 0; i < n; i++)
+			if (ready[i].data.ptr)
+				guard_listen(ready[i].data.ptr);
+	}
+	if (engine->count) {
+		*event = engine->queue[engine->first];
+		engine->first = (engine->first + 1) % QUEUE_MAX;
+		engine->count--;
+		found = 1;
+	}
+	if (!engine->count)
+		(void)eventfd_read(engine->queue_fd, &ignored);
+	pthread_mutex_unlock(&engine->lock);
+	return found;
+}
+
+void avc_engine_free(struct avc_engine *engine)
+{
+	close_fd(&engine->epoll_fd);
+	close_fd(&engine->queue_fd);
+	pthread_mutex_destroy(&engine->lock);
+	free(engine->program);
+	free(engine);
+}
+
+/* ---- processes ------------------------------------------------------------------- */
+
+/* `program`, with `socket` as AVC_GUARD_FD, no signal blocked or ignored, and in a session of
+ * its own: what is typed at our terminal is not for it. */
+static int spawn(const char *program, char *const argv[], int socket, pid_t *pid)
+{
+	posix_spawn_file_actions_t actions;
+	posix_spawnattr_t attributes;
+	sigset_t none, all;
+	int result;
+
+	sigemptyset(&none);
+	sigfillset(&all);
+	posix_spawn_file_actions_init(&actions);
+	posix_spawnattr_init(&attributes);
+	posix_spawnattr_setsigmask(&attributes, &none);
+	posix_spawnattr_setsigdefault(&attributes, &all);
+	posix_spawnattr_setflags(&attributes, POSIX_SPAWN_SETSIGMASK | POSIX_SPAWN_SETSIGDEF |
+						      POSIX_SPAWN_SETSID);
+	result = posix_spawn_file_actions_adddup2(&actions, socket, AVC_GUARD_FD);
+	if (!result)
+		result = posix_spawn(pid, program, &actions, &attributes, argv, environ);
+	posix_spawnattr_destroy(&attributes);
+	posix_spawn_file_actions_destroy(&actions);
+	errno = result;
+	return result ? -1 : 0;
+}
+
+int avc_engine_probe(const char *program, struct avc_error *err)
+{
+	char *const argv[] = { (char *)"avckpt-guard", (char *)"--probe", NULL };
+	struct avc_error answer;
+	int ends[2], status;
+	ssize_t n = -1;
+	pid_t pid;
+
+	*err = (struct avc_error){ 0 };
+	if (pipe2(ends, O_CLOEXEC))
+		return fail_errno(err, 0, "probe", "pipe2", "no descriptors");
+	if (spawn(program, argv, ends[1], &pid)) {
+		fail_errno(err, 0, "probe", "posix_spawn", "%s cannot be started: %s", program,
+			   strerror(errno));
+		pid = 0;
+	}
+	close_fd(&ends[1]);
+	if (pid) {
+		while ((n = read(ends[0], &answer, sizeof answer)) < 0 && errno == EINTR)
+			;
+		while (waitpid(pid, &status, 0) < 0 && errno == EINTR)
+			;
+	}
+	close_fd(&ends[0]);
+	if (pid && n != sizeof answer)
+		return fail(err, AVC_KERNEL, 0, 0, "probe", "", "%s did not answer", program);
+	if (pid)
+		*err = answer;
+	return err->code ? -1 : 0;
+}
+
+/* ---- one guard ----------------------------------------------------------------------- */
+
+static int send_start(int socket, const struct avc_config *config, uint64_t cookie,
+		      int heartbeat_fd)
+{
+	struct avc_request request = { .magic = AVC_GUARD_MAGIC,
+				       .kind = AVC_REQUEST_START,
+				       .cookie = cookie,
+				       .config = *config };
+	const int fds[2] = { config->init_pidfd, heartbeat_fd };
+	union {
+		char bytes[CMSG_SPACE(sizeof fds)];
+		struct cmsghdr align;
+	} control = { { 0 } };
+	struct iovec data = { &request, sizeof request };
+	struct msghdr message = { .msg_iov = &data,
+				  .msg_iovlen = 1,
+				  .msg_control = &control,
+				  .msg_controllen = sizeof control };
+	struct cmsghdr *header = CMSG_FIRSTHDR(&message);
+
+	header->cmsg_level = SOL_SOCKET;
+	header->cmsg_type = SCM_RIGHTS;
+	header->cmsg_len = CMSG_LEN(sizeof fds);
+	memcpy(CMSG_DATA(header), fds, sizeof fds);
+	return sendmsg(socket, &message, MSG_NOSIGNAL | MSG_DONTWAIT) < 0 ? -1 : 0;
+}
+
+static void guard_free(struct avc_guard *guard)
+{
+	if (guard->heartbeat)
+		munmap((void *)guard->heartbeat, sizeof *guard->heartbeat);
+	close_fd(&guard->pidfd);
+	close_fd(&guard->socket);
+	free(guard);
+}
+
+/* Its memory, its process; what fails is left to guard_free(). */
+static int guard_spawn(struct avc_guard *guard, const struct avc_config *config,
+		       struct avc_error *err)
+{
+	char *const argv[] = { (char *)"avckpt-guard", NULL };
+	int ends[2], heartbeat_fd, result;
+	void *map;
+
+	heartbeat_fd = memfd_create("avckpt-heartbeat", MFD_CLOEXEC);
+	if (heartbeat_fd < 0 || ftruncate(heartbeat_fd, sizeof *guard->heartbeat))
+		map = MAP_FAILED;
+	else
+		map = mmap(NULL, sizeof *guard->heartbeat, PROT_READ, MAP_SHARED, heartbeat_fd, 0);
+	if (map == MAP_FAILED) {
+		fail_errno(err, 0, "start guard", "memfd_create", "no memory to share");
+		close_fd(&heartbeat_fd);
+		return -1;
+	}
+	guard->heartbeat = map;
+	if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, ends)) {
+		close_fd(&heartbeat_fd);
+		return fail_errno(err, 0, "start guard", "socketpair", "no descriptors");
+	}
+	guard->socket = ends[0];
+	/* Before it is there: the message waits for it. */
+	result = send_start(guard->socket, config, guard->cookie, heartbeat_fd);
+	if (result)
+		fail_errno(err, 0, "start guard", "sendmsg", "it cannot be told what to do");
+	else if (spawn(guard->engine->program, argv, ends[1], &guard->pid))
+		result = fail_errno(err, 0, "start guard", "posix_spawn",
+				    "%s cannot be started: %s", guard->engine->program,
+				    strerror(errno));
+	close_fd(&ends[1]);
+	close_fd(&heartbeat_fd);
+	if (result)
+		return -1;
+	guard->pidfd = (int)syscall(SYS_pidfd_open, guard->pid, 0);
+	if (guard->pidfd >= 0)
+		return 0;
+	fail_errno(err, 0, "start guard", "pidfd_open", "no descriptor");
+	kill(guard->pid, SIGKILL); /* our child, not reaped: the number is its own */
+	waitpid(guard->pid, NULL, 0);
+	return -1;
+}
+
+struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
+				  uint64_t cookie, struct avc_error *err)
+{
+	struct epoll_event on = { .events = EPOLLIN };
+	struct avc_guard *guard;
+
+	*err = (struct avc_error){ 0 };
+	if (config_check(config, err))
+		return NULL;
+	guard = calloc(1, sizeof *guard);
+	if (!guard) {
+		fail_errno(err, 0, "start guard", "calloc", "out of memory");
+		return NULL;
+	}
+	guard->engine = engine;
+	guard->cookie = cookie;
+	guard->pidfd = guard->socket = -1;
+	guard->beats_ns = now_ns();
+	if (guard_spawn(guard, config, err)) {
+		guard_free(guard);
+		return NULL;
+	}
+	on.data.ptr = guard;
+	pthread_mutex_lock(&engine->lock);
+	guard->next = engine->guards;
+	engine->guards = guard;
+	if (epoll_ctl(engine->epoll_fd, EPOLL_CTL_ADD, guard->socket, &on))
+		fail_errno(err, 0, "start guard", "epoll_ctl", "its events cannot be waited for");
+	pthread_mutex_unlock(&engine->lock);
+	if (err->code) {
+		avc_guard_stop(guard);
+		return NULL;
+	}
+	return guard;
+}
+
+int32_t avc_guard_pid(struct avc_guard *guard)
+{
+	int32_t pid;
+
+	pthread_mutex_lock(&guard->engine->lock);
+	pid = guard->pid;
+	pthread_mutex_unlock(&guard->engine->lock);
+	return pid;
+}
+
+/* Whether it would run if it got a CPU; a loop without end is told by its patience. */
+static bool is_runnable(pid_t pid)
+{
+	struct proc_stat stat;
+
+	return proc_stat(pid, &stat) == 0 && stat.state == 'R';
+}
+
+void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
+{
+	uint64_t beats, silent_ns;
+
+	pthread_mutex_lock(&guard->engine->lock);
+	beats = __atomic_load_n(&guard->heartbeat->beats, __ATOMIC_RELAXED);
+	if (beats != guard->beats) {
+		guard->beats = beats;
+		guard->beats_ns = now_ns();
+	}
+	silent_ns = now_ns() - guard->beats_ns;
+	if (guard->pid && !guard->stopping && silent_ns > patience_ns &&
+	    (!is_runnable(guard->pid) || silent_ns > STARVED_FACTOR * patience_ns)) {
+		guard->hung = true;
+		syscall(SYS_pidfd_send_signal, guard->pidfd, SIGKILL, NULL, 0);
+	}
+	pthread_mutex_unlock(&guard->engine->lock);
+}
+
+static int guard_send(struct avc_guard *guard, const struct avc_request *request,
+		      struct avc_error *err)
+{
+	int result = 0;
+
+	pthread_mutex_lock(&guard->engine->lock);
+	if (guard->ended || guard->stopping)
+		result = fail(err, AVC_GONE, ESRCH, 0, "command", "", "the container has ended");
+	else if (send(guard->socket, request, sizeof *request, MSG_DONTWAIT | MSG_NOSIGNAL) < 0)
+		result = errno == EAGAIN || errno == ENOBUFS
+				 ? fail(err, AVC_BUSY, errno, 0, "command", "send",
+					"too many commands are waiting")
+				 : fail(err, AVC_GONE, errno, 0, "command", "send",
+					"its guard has ended");
+	pthread_mutex_unlock(&guard->engine->lock);
+	return result;
+}
+
+int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
+		      struct avc_error *err)
+{
+	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
+					     .kind = AVC_REQUEST_COMMAND,
+					     .command = command,
+					     .ticket = ticket };
+
+	*err = (struct avc_error){ 0 };
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNVOUCH)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
+	return guard_send(guard, &request, err);
+}
+
+int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config,
+			struct avc_error *err)
+{
+	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
+					     .kind = AVC_REQUEST_CONFIGURE,
+					     .config = *config };
+
+	*err = (struct avc_error){ 0 };
+	return config_check(config, err) ? -1 : guard_send(guard, &request, err);
+}
+
+void avc_guard_stop(struct avc_guard *guard)
+{
+	struct avc_engine *engine = guard->engine;
+	const uint64_t end = now_ns() + STOP_MS * NS_PER_MS;
+	struct avc_guard **at;
+
+	pthread_mutex_lock(&engine->lock);
+	guard->stopping = true;
+	shutdown(guard->socket, SHUT_WR);
+	/* What it still says is queued, or it could not say all of it. */
+	while (!guard->ended && now_ns() < end) {
+		struct pollfd news = { .fd = guard->socket, .events = POLLIN };
+
+		pthread_mutex_unlock(&engine->lock);
+		(void)poll(&news, 1, END_MS);
+		pthread_mutex_lock(&engine->lock);
+		if (!guard->ended)
+			guard_listen(guard);
+	}
+	if (!guard->ended)
+		epoll_ctl(engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
+	for (at = &engine->guards; *at != guard; at = &(*at)->next)
+		;
+	*at = guard->next;
+	pthread_mutex_unlock(&engine->lock);
+	guard_reap(guard, guard->ended ? END_MS : 0);
+	guard_free(guard);
+}

@@ -1,0 +1,56 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the daemon and a guard process (avckpt-guard) say to each other.
+ *
+ * The daemon starts one guard per protected container, with one end of a SOCK_SEQPACKET
+ * pair as descriptor AVC_GUARD_FD.  Each message is one struct:
+ *
+ *   daemon to guard   struct avc_request, the first one AVC_REQUEST_START with two
+ *                     descriptors (SCM_RIGHTS): the pidfd of avckpt-init, and a memfd that
+ *                     holds one struct avc_heartbeat
+ *   guard to daemon   struct avc_event (engine.h)
+ *
+ * End of file tells the guard to stop: it lets the application go (which runs on,
+ * unprotected), gives up its generations and ends with 0.  That is also what happens when
+ * the daemon dies; a restore under way is finished first.  End of file tells the daemon
+ * that the guard has ended; if it did so unasked, its status says why.
+ *
+ * Both are of one build: `magic` says so.
+ */
+#ifndef AVCKPT_GUARD_PROTOCOL_H
+#define AVCKPT_GUARD_PROTOCOL_H
+
+#include <stdint.h>
+
+#include "avckpt/engine.h"
+
+#define AVC_GUARD_FD 3
+#define AVC_GUARD_MAGIC                                                     \
+	(UINT32_C(0x47560000) + (uint32_t)sizeof(struct avc_request) * 31 + \
+	 (uint32_t)sizeof(struct avc_event))
+
+enum avc_request_kind {
+	AVC_REQUEST_START = 1,     /* cookie, config                                  */
+	AVC_REQUEST_COMMAND = 2,   /* command, ticket                                 */
+	AVC_REQUEST_CONFIGURE = 3, /* config                                          */
+};
+
+struct avc_request {
+	uint32_t magic;   /* AVC_GUARD_MAGIC                                  */
+	uint32_t kind;    /* enum avc_request_kind                            */
+	uint32_t command; /* enum avc_command                                 */
+	uint32_t reserved;
+	uint64_t ticket; /* of the command                                   */
+	uint64_t cookie; /* of the guard's events                            */
+	struct avc_config config;
+};
+
+/* Shared memory of the two.  The guard counts up at least once in AVC_HEARTBEAT_NS while it
+ * has nothing to do, and wherever it gets on with something long. */
+struct avc_heartbeat {
+	uint64_t beats;
+};
+
+#define AVC_HEARTBEAT_NS UINT64_C(1000000000)
+
+#endif

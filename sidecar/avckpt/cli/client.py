@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Talks to the sidecar's API (see api.py).  Standard library only, so that commands start fast."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import socket
+from collections.abc import Iterator
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import quote, urlencode
+
+from avckpt.errors import Denied, ProtocolError, SidecarUnreachable, from_json
+from avckpt.guard import Command
+
+Json = dict[str, Any]
+
+TIMEOUT_S = 40.0
+"""For a whole request; longer than the sidecar itself waits for the engine."""
+
+START_IT = (
+    "start it with: podman run -d --restart=always --name avckpt-sidecar --privileged --pid=host --network=none "
+    "-v /run/avckpt:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
+)
+
+
+class Client:
+    """The sidecar whose run-time directory is `run_dir`.
+
+    Every method raises SidecarUnreachable when nobody answers, Denied when we
+    may not ask, and the sidecar's own error as the exception that it was there.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._path = run_dir / "api.sock"
+
+    def info(self) -> Json:
+        """Who the sidecar is."""
+        return self._request("GET", "/v1/info")
+
+    def containers(self, *, ended: bool = False, memory: bool = True) -> list[Json]:
+        """The protected containers, with `ended` also the last few that are gone.
+
+        Who looks often does without `memory`, of which the kernel walks page tables.
+        """
+        answer = self._request("GET", f"/v1/containers?all={int(ended)}&memory={int(memory)}")
+        return cast("list[Json]", answer["containers"])
+
+    def command(self, name: str, command: Command) -> Json:
+        """Carries out a command; returns {"container": ..., "event": ...}."""
+        return self._request("POST", f"/v1/containers/{quote(name, safe='')}/{command.name.lower()}")
+
+    def reload(self) -> Json:
+        """Has the configuration file read again; returns {"config": ..., "containers": [...]}."""
+        return self._request("POST", "/v1/reload")
+
+    def history(self, since: float | None = None) -> list[Json]:
+        """The events that are kept, oldest first, with `since` (seconds since 1970) those from then on."""
+        query = "" if since is None else f"?since={since!r}"
+        return cast("list[Json]", self._request("GET", f"/v1/history{query}")["events"])
+
+    def events(self, after: int | None = None, since: float | None = None, *, routine: bool = False) -> Iterator[Json]:
+        """Events as they come, those that are kept first; ends when the sidecar is told to stop.
+
+        With `after` only those with a greater "seq", with `since` only those
+        from that time of day on; with `routine` also those that are not kept.
+        """
+        query = {"all": "1"} if routine else {}
+        if after is not None:
+            query["after"] = str(after)
+        if since is not None:
+            query["since"] = repr(since)
+        with self._connected() as connection:
+            connection.request("GET", f"/v1/events?{urlencode(query)}")
+            response = connection.getresponse()
+            if response.status != HTTPStatus.OK:
+                _decode(response.read())
+                raise ProtocolError(f"the sidecar answered with HTTP status {response.status}")
+            for line in response:
+                # One line of data per event, which is all that the sidecar makes of the format.
+                if line.startswith(b"data: "):
+                    yield _decode(line[len(b"data: ") :])
+
+    def _request(self, method: str, target: str) -> Json:
+        with self._connected() as connection:
+            connection.request(method, target)
+            body = connection.getresponse().read()
+        return _decode(body)
+
+    @contextlib.contextmanager
+    def _connected(self) -> Iterator[_UnixConnection]:
+        """A connection; what goes wrong with it in the body becomes our errors."""
+        connection = _UnixConnection(self._path)
+        try:
+            yield connection
+        except (FileNotFoundError, ConnectionRefusedError) as error:
+            why = f"no {self._path}" if isinstance(error, FileNotFoundError) else f"nobody listens on {self._path}"
+            raise SidecarUnreachable(f"the sidecar is not running ({why}): {START_IT}") from error
+        except PermissionError as error:
+            raise Denied(f"{self._path} is for root only: use sudo") from error
+        except TimeoutError as error:
+            raise SidecarUnreachable(f"the sidecar did not answer within {TIMEOUT_S:g} s: see its log") from error
+        except (OSError, http.client.HTTPException) as error:
+            raise SidecarUnreachable(f"the sidecar went away ({error}): see its log") from error
+        finally:
+            connection.close()
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    """HTTP over a Unix socket."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("localhost", timeout=TIMEOUT_S)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(TIMEOUT_S)
+        self.sock.connect(str(self._path))
+
+
+def _decode(body: bytes) -> Json:
+    try:
+        answer = json.loads(body)
+    except ValueError as error:
+        raise ProtocolError(f"the sidecar's answer is not JSON: {body[:80]!r}") from error
+    if not isinstance(answer, dict):
+        raise ProtocolError(f"the sidecar's answer makes no sense: {body[:80]!r}")
+    # An event may have an error of its own, and always has a kind.
+    if isinstance(answer.get("error"), dict) and "kind" not in answer:
+        raise from_json(answer["error"])
+    return answer

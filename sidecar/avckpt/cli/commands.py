@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `avckpt`.
+
+Every command imports what it needs when it runs: `avckpt run` and `avckpt ps`
+should start at once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from avckpt import __version__
+from avckpt.cli.compose.commands import check, down, up
+from avckpt.cli.events import complete_container, completion, events
+from avckpt.errors import AvckptError, ExitCode
+
+if TYPE_CHECKING:
+    from avckpt.cli.client import Client, Json
+
+EPILOG = """
+Exit status: 0 done, 1 failed, 2 wrong usage, 3 the sidecar can not be reached,
+4 no such container, 5 the container is unprotected or has nothing to restore.
+"avckpt run" ends with its program's status, 128+N if signal N killed it, and
+with 125 if it could not start it.
+"""
+
+
+START_AGAIN_S = 3.0
+"""How long a sidecar that could not start waits before it ends, in a container."""
+STATE_STYLES = {"protected": "green", "starting": "yellow", "restoring": "yellow", "unprotected": "bold red"}
+
+
+class Cli(click.Group):
+    """Turns our errors into one line on stderr and the exit status that fits."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Runs the command."""
+        try:
+            return super().invoke(ctx)
+        except AvckptError as error:
+            click.echo(f"avckpt: {error}", err=True)
+            sys.exit(int(error.exit_code))
+
+
+@click.group(cls=Cli, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="avckpt", message="%(prog)s %(version)s")
+def main() -> None:
+    """Keeps Podman containers alive through crashes.
+
+    A container started with --label avckpt.enable=true is checkpointed in
+    memory every few seconds; when its application dies, the checkpoint takes
+    over within milliseconds.
+    """
+
+
+main.add_command(events)
+main.add_command(completion)
+for command in (check, up, down):
+    main.add_command(command)
+
+root_option = click.option(
+    "--root",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    default="/",
+    help="Where the host's file system is; for use in a container.",
+)
+
+
+@main.command()
+@root_option
+@click.option("--json", "as_json", is_flag=True, help="A JSON list of what was done.")
+def install(root: Path, as_json: bool) -> None:
+    """Put hooks and avckpt-init in place on this host."""
+    from avckpt.cli import install as installer
+
+    _print_lines(installer.install(root), as_json)
+
+
+@main.command()
+@root_option
+@click.option("--json", "as_json", is_flag=True, help="A JSON list of what was done.")
+def uninstall(root: Path, as_json: bool) -> None:
+    """Remove exactly what "avckpt install" put in place."""
+    from avckpt.cli import install as installer
+
+    _print_lines(installer.uninstall(root), as_json)
+
+
+@main.command()
+@click.option("-v", "--verbose", is_flag=True, help="Also log every checkpoint.")
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    envvar="AVCKPT_CONFIG",
+    default="/etc/avckpt/config.yaml",
+    show_default=True,
+    help="Defaults for all containers.",
+)
+def sidecar(verbose: bool, config: Path) -> None:
+    """Run the sidecar's daemon in the foreground (in its container)."""
+    import logging
+
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(asctime)s %(levelname)s %(message)s",
+        stream=sys.stderr,
+    )
+    logging.getLogger("asyncio").setLevel(logging.WARNING)
+    try:
+        from avckpt.daemon import serve
+
+        serve(_run_dir(), config)
+    except AvckptError as error:
+        click.echo(f"avckpt: {error}", err=True)
+        # Podman starts its container again at once, for ever (--restart=always).
+        if "container" in os.environ:  # podman-run(1)
+            time.sleep(START_AGAIN_S)
+        sys.exit(int(ExitCode.FAILED))
+
+
+@main.command()
+@click.option("-a", "--all", "ended", is_flag=True, help="Also the last few that have ended.")
+@click.option("--json", "as_json", is_flag=True, help="A JSON list instead of a table.")
+def ps(ended: bool, as_json: bool) -> None:
+    """List protected containers: state, generations, last freeze, restores."""
+    containers = _client().containers(ended=ended)
+    if as_json:
+        click.echo(json.dumps(containers, indent=2))
+        return
+    _print_table(containers)
+
+
+@main.command()
+@click.argument("name", shell_complete=complete_container)
+@click.option("--json", "as_json", is_flag=True, help="The answer as JSON.")
+def checkpoint(name: str, as_json: bool) -> None:
+    """Take a checkpoint of container NAME now."""
+    from avckpt.guard import Command
+
+    answer = _client().command(name, Command.CHECKPOINT)
+    event = answer["event"]
+    if as_json:
+        click.echo(json.dumps(answer, indent=2))
+        return
+    click.echo(
+        f"{_called(answer['container'])}: generation {event.get('generation', 0)}, "
+        f"{event.get('threads', 0)} thread(s), frozen {event.get('freeze_s', 0.0) * 1000:.2f} ms"
+    )
+
+
+@main.command()
+@click.argument("name", shell_complete=complete_container)
+@click.option("--json", "as_json", is_flag=True, help="The answer as JSON.")
+def restore(name: str, as_json: bool) -> None:
+    """Roll the running container NAME back to its newest checkpoint."""
+    from avckpt.guard import Command
+
+    answer = _client().command(name, Command.RESTORE)
+    event = answer["event"]
+    if as_json:
+        click.echo(json.dumps(answer, indent=2))
+        return
+    click.echo(
+        f"{_called(answer['container'])}: back at generation {event.get('generation', 0)}, "
+        f"{event.get('age_s', 0.0):.1f} s old, in {event.get('restore_s', 0.0) * 1000:.1f} ms"
+    )
+
+
+@main.command()
+@click.option("--json", "as_json", is_flag=True, help="The answer as JSON.")
+def reload(as_json: bool) -> None:
+    """Have the sidecar read /etc/avckpt/config.yaml again.
+
+    It holds for containers that run, too; what it changes is told.  If anything
+    in it is wrong, it is refused and the old one stays in force.
+    """
+    answer = _client().reload()
+    if as_json:
+        click.echo(json.dumps(answer, indent=2))
+        return
+    config = answer["config"]
+    click.echo(f"{config['path']}: {'in force' if config['found'] else 'not there, the built-in defaults hold'}")
+    for one in answer["containers"]:
+        changes = ", ".join(f"{c['setting']} {c['before'] or 'none'} -> {c['after'] or 'none'}" for c in one["changes"])
+        click.echo(f"{one['container']}: {changes or 'goes on as before: ' + one['problem']}")
+    if not answer["containers"]:
+        click.echo("it changes nothing for the containers that run")
+
+
+@main.command()
+@click.option("--json", "as_json", is_flag=True, help="A JSON list instead of text.")
+def doctor(as_json: bool) -> None:
+    """Check kernel, Podman, hooks and privileges, and say what to do.
+
+    Ends with 1 when something is missing.
+    """
+    from dataclasses import asdict
+
+    from avckpt.cli import doctor as doctor_checks
+
+    checks = [asdict(check) for check in doctor_checks.checks()]
+    if as_json:
+        click.echo(json.dumps(checks, indent=2, default=str))
+    else:
+        for check in checks:
+            _print_check(check)
+    if any(_status(check) == "fail" for check in checks):
+        sys.exit(int(ExitCode.FAILED))
+
+
+@main.command(
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+    options_metavar="[--label avckpt.KEY=VALUE ...] [-v] --",
+)
+@click.option("-l", "--label", "labels", multiple=True, metavar="avckpt.KEY=VALUE", help="As of a container.")
+@click.option("-v", "--verbose", is_flag=True, help="Say more than deaths and restores.")
+@click.argument("argv", nargs=-1, required=True, type=click.UNPROCESSED, metavar="PROGRAM [ARGS...]")
+def run(labels: tuple[str, ...], verbose: bool, argv: tuple[str, ...]) -> None:
+    """Protect a plain program: no Podman, no sidecar.
+
+    PROGRAM runs in a PID namespace of its own; its input, output and exit
+    status are untouched, avckpt's own messages go to stderr.
+    """
+    from avckpt.errors import LabelsWrong
+
+    try:
+        from avckpt.cli import run as runner
+
+        config = runner.config_of_run(dict(_split_label(label) for label in labels))
+        status = runner.run(config, list(argv), verbose=verbose)
+    except LabelsWrong as error:
+        click.echo(f"avckpt: {error}", err=True)
+        status = int(ExitCode.USAGE)
+    except AvckptError as error:
+        click.echo(f"avckpt: {argv[0]} was not started: {error}", err=True)
+        status = 125
+    sys.exit(status)
+
+
+def _print_lines(lines: Iterable[str], as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps(list(lines), indent=2))
+        return
+    for line in lines:
+        click.echo(line, err=line.startswith("warning: "))
+
+
+def _status(check: dict[str, Any]) -> str:
+    status = check["status"]
+    return str(getattr(status, "value", status))
+
+
+def _print_check(check: dict[str, Any]) -> None:
+    colour = {"ok": "green", "warn": "yellow", "fail": "red"}.get(_status(check))
+    click.echo(f"{click.style(f'{_status(check):<4}', fg=colour)}  {check['name']}: {check['detail']}")
+    if check["remedy"]:
+        click.echo(f"      {check['remedy']}")
+
+
+def _split_label(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise click.UsageError(f"--label {text}: write it as KEY=VALUE")
+    return key, value
+
+
+def _run_dir() -> Path:
+    from avckpt_hooks.shared import protocol
+
+    return Path(protocol.run_dir())
+
+
+def _client() -> Client:
+    from avckpt.cli.client import Client
+
+    return Client(_run_dir())
+
+
+def _called(container: Json) -> str:
+    return str(container["name"] or container["id"][:12])
+
+
+def _print_table(containers: list[Json]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    rows = [_row(container) for container in containers]
+    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows)]
+    for name, width in zip(COLUMNS[:-1], widths):
+        table.add_column(name, no_wrap=True, min_width=width)
+    table.add_column(COLUMNS[-1], overflow="fold")
+    for name, state, *others in rows:
+        table.add_row(name, Text(state, style=STATE_STYLES.get(state, "")), *others)
+    # Into a pipe nothing is wrapped: a line is a container.  On a terminal only the
+    # note is; where even the rest is too wide, the terminal wraps it and nothing is lost.
+    width = max(Console().width, sum(widths[:-1]) + 2 * len(widths) + NOTE_LEAST) if sys.stdout.isatty() else 1000
+    Console(width=width, highlight=False, markup=False).print(table)
+
+
+COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")
+"""Generations, what they hold, age and freeze time of the newest; restores, and how long the last one took."""
+NOTE_LEAST = 16
+
+
+def _row(c: Json) -> tuple[str, ...]:
+    age_s = None if c["last_checkpoint_at"] is None else max(time.time() - c["last_checkpoint_at"], 0)
+    return (
+        _called(c),
+        c["state"],
+        "-" if c["state"] == "listening" else f"{c['generations']}/{c['keep']}",
+        f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
+        "-" if age_s is None else f"{age_s:.0f} s ago",
+        _ms(c["last_freeze_s"]),
+        str(c["restores"]),
+        _ms(c["last_restore_s"]),
+        c["reason"],
+    )
+
+
+def _ms(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{seconds * 1000:.2f} ms"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,479 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a Compose file says to avckpt, and what of it can not be honoured.
+
+Only the `avckpt.*` labels and annotations of services are looked at; whether
+the rest of the file is good Compose is podman-compose's to say.  Followed are
+anchors, merge keys, `extends` and `include`.  A value with ${VARIABLES} in it
+is known only when the file is brought up: there the hooks check it.
+"""
+
+from __future__ import annotations
+
+import enum
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, meant_by, merge, parse_policy
+from avckpt_hooks.shared.programs import must_be_pid_1
+
+from avckpt import yamlfile
+from avckpt.errors import ConfigError
+from avckpt.yamlfile import Place, Unreadable
+
+ENABLE = f"{PREFIX}enable"
+USUAL_NAME = "vehicle.yaml"
+"""Is meant, and nothing else, when no file is named."""
+COMPOSE_NAMES = (
+    "compose.yaml",
+    "compose.yml",
+    "compose.override.yaml",
+    "compose.override.yml",
+    "podman-compose.yaml",
+    "podman-compose.yml",
+    "docker-compose.yml",
+    "docker-compose.yaml",
+    "docker-compose.override.yml",
+    "docker-compose.override.yaml",
+    "container-compose.yml",
+    "container-compose.yaml",
+    "container-compose.override.yml",
+    "container-compose.override.yaml",
+)
+"""Without that, all of these that are there, later ones over earlier ones: so does podman-compose 1.6."""
+
+EXTENDS_MOST = 50
+"""Services that one extends, one by way of the other."""
+
+
+class Kind(enum.Enum):
+    """Where a service says it."""
+
+    LABEL = "label"
+    ANNOTATION = "annotation"
+
+
+class Severity(enum.Enum):
+    """How bad it is."""
+
+    ERROR = "error"
+    """The container would not start, or not as it is meant."""
+    WARNING = "warning"
+    """It works, but is hardly meant."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something to be mended in a file."""
+
+    place: Place
+    service: str
+    """Empty: it is the file's, not a service's."""
+    message: str
+    severity: Severity = Severity.ERROR
+
+    def __str__(self) -> str:
+        service = f"service {self.service}: " if self.service else ""
+        warning = "warning: " if self.severity is Severity.WARNING else ""
+        return f"{self.place}: {service}{warning}{self.message}"
+
+    def to_json(self) -> dict[str, object]:
+        """For programs."""
+        return {
+            "file": self.place.file,
+            "line": self.place.line,
+            "service": self.service or None,
+            "severity": self.severity.value,
+            "message": self.message,
+        }
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One label or annotation, as a service or what it extends gives it."""
+
+    key: str
+    value: str
+    place: Place
+
+    @property
+    def is_open(self) -> bool:
+        """Its value is not known before the environment is."""
+        return _is_open(self.value)
+
+    @property
+    def final(self) -> str:
+        """The value the container gets; only if it is not open."""
+        return self.value.replace("$$", "$")
+
+
+@dataclass
+class Service:
+    """A service and its `avckpt.*` settings, its own over those it extends."""
+
+    name: str
+    place: Place
+    settings: dict[Kind, dict[str, Setting]] = field(default_factory=lambda: {kind: {} for kind in Kind})
+    extends: tuple[Path, str] | None = None
+    """The file and the service in it; the path is this service's own file's for one of the same project."""
+    profiles: tuple[str, ...] = ()
+    """It is started with one of these only; none: always.  Nobody inherits them by `extends`."""
+    programs: dict[str, str] = field(default_factory=dict)
+    """The first words of `entrypoint` and `command`, as far as they are given."""
+
+    @property
+    def enabled(self) -> bool | None:
+        """Whether it asks to be protected; None: the environment will tell.  Wrong values ask for nothing."""
+        for settings in self.settings.values():
+            setting = settings.get(ENABLE)
+            if setting is None:
+                continue
+            if setting.is_open:
+                return None
+            try:
+                return parse_policy({ENABLE: setting.final}).enable
+            except LabelError:
+                return False
+        return False
+
+    def all_settings(self) -> Iterator[tuple[Kind, Setting]]:
+        """Labels, then annotations."""
+        for kind, settings in self.settings.items():
+            for setting in settings.values():
+                yield kind, setting
+
+
+@dataclass
+class Manifest:
+    """What one or several Compose files come to together."""
+
+    files: tuple[Path, ...]
+    services: dict[str, Service] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+    @property
+    def errors(self) -> list[Problem]:
+        return [problem for problem in self.problems if problem.severity is Severity.ERROR]
+
+    @property
+    def wants_protection(self) -> bool:
+        """Some service asks for it, or may."""
+        return any(service.enabled is not False for service in self.services.values())
+
+    def to_json(self) -> dict[str, object]:
+        """For programs."""
+        return {
+            "files": [str(path) for path in self.files],
+            "services": [
+                {
+                    "name": service.name,
+                    "file": service.place.file,
+                    "line": service.place.line,
+                    "protected": service.enabled,
+                    "profiles": list(service.profiles),
+                    "settings": {setting.key: setting.value for _, setting in service.all_settings()},
+                }
+                for service in self.services.values()
+            ],
+            "problems": [problem.to_json() for problem in self.problems],
+        }
+
+
+def files_meant(named: Sequence[Path], environ: Mapping[str, str]) -> tuple[Path, ...]:
+    """The files that are meant when these are named, or none: what podman-compose takes, and vehicle.yaml.
+
+    Raises ConfigError when there is none.
+    """
+    project = environ.get("COMPOSE_PROJECT_DIR", "")
+    directory = Path(project).resolve() if os.path.isdir(project) else Path()
+    if named:
+        return tuple(directory / path for path in named)
+    names: Sequence[str] = (USUAL_NAME,) if (directory / USUAL_NAME).exists() else COMPOSE_NAMES
+    listed = environ.get("COMPOSE_FILE", "")
+    if listed:
+        names = listed.split(environ.get("COMPOSE_PATH_SEPARATOR", os.pathsep))
+    found = tuple(directory / name for name in names if (directory / name).exists())
+    if not found:
+        looked_for = f"of COMPOSE_FILE={listed}" if listed else f"called {USUAL_NAME} or compose.yaml"
+        raise ConfigError(f"no file is named, and none {looked_for} is here: name one with -f FILE")
+    return found
+
+
+def check(files: Sequence[Path]) -> Manifest:
+    """Reads the files, later ones over earlier ones as podman-compose does, and finds every problem."""
+    manifest = Manifest(tuple(files))
+    reader = _Reader(manifest)
+    # A file that includes others is overridden by them, and they by nobody: so does podman-compose.
+    reader.queue = list(files)
+    while reader.queue:
+        reader.read(reader.queue.pop(0))
+    for service in list(manifest.services.values()):
+        reader.resolve(service)
+    for service in manifest.services.values():
+        found = list(_judge(service))
+        # After a mistake (avckpt.enabled=true, say) nobody needs to be told what follows from it.
+        manifest.problems += found or list(_doubts(service))
+    if not manifest.services and not manifest.problems:
+        manifest.problems.append(Problem(Place(str(files[0]), 1), "", "no services: is this a Compose file?"))
+    # What several services share through an anchor is one mistake, not several.
+    unique = {(problem.place, problem.message): problem for problem in reversed(manifest.problems)}
+    manifest.problems = sorted(unique.values(), key=lambda problem: problem.place)
+    return manifest
+
+
+class _Reader:
+    """Takes files apart into services."""
+
+    def __init__(self, manifest: Manifest) -> None:
+        self._manifest = manifest
+        self.queue: list[Path] = []
+        """Files to be read yet."""
+        self._read: set[Path] = set()
+        self._roots: dict[Path, yaml.Node | None] = {}
+        self._resolved: set[int] = set()
+        self._others: dict[Path, dict[str, tuple[yaml.ScalarNode, yaml.Node]]] = {}
+        """Services of files that are only extended, by name."""
+        self._bases: dict[tuple[Path, str], Service] = {}
+        """Those of them that are extended."""
+
+    def read(self, path: Path) -> None:
+        """Adds the services of a file, and the files it includes to the queue."""
+        if path.resolve() in self._read:
+            return
+        self._read.add(path.resolve())
+        root = self._root(path)
+        if root is not None and not isinstance(root, yaml.MappingNode):
+            self._complain(yamlfile.place_of(root, path), "not a mapping: is this a Compose file?")
+            return
+        services = yamlfile.lookup(root, "services")
+        for key, node in yamlfile.entries(services):
+            service = self._service(key.value, yamlfile.place_of(key, path), node, path)
+            self._add(service)
+        include = yamlfile.lookup(root, "include")
+        for item in include.value if isinstance(include, yaml.SequenceNode) else []:
+            paths = yamlfile.lookup(item, "path") if isinstance(item, yaml.MappingNode) else item
+            for one in paths.value if isinstance(paths, yaml.SequenceNode) else [paths]:
+                if isinstance(one, yaml.ScalarNode) and not _is_open(one.value):
+                    included = path.parent / one.value
+                    self._root(included, yamlfile.place_of(one, path))
+                    self.queue.append(included)
+
+    def resolve(self, service: Service) -> None:
+        """Puts what `service` extends under its own settings."""
+        self._resolve(service, ())
+
+    def _resolve(self, service: Service, above: tuple[tuple[Path, str], ...]) -> None:
+        if service.extends is None or id(service) in self._resolved:
+            return
+        path, name = service.extends
+        if (path, name) in above:
+            self._complain(service.place, f"extends itself, by way of {name}", service.name)
+            return
+        if len(above) >= EXTENDS_MOST:
+            self._complain(
+                service.place, f"extends more than {EXTENDS_MOST} services, one by way of the other", service.name
+            )
+            return
+        base = self._base(service, path, name)
+        if base is None:
+            return
+        self._resolve(base, (*above, (path, name)))
+        self._resolved.add(id(service))
+        for kind, settings in base.settings.items():
+            service.settings[kind] = {**settings, **service.settings[kind]}
+        service.programs = {**base.programs, **service.programs}
+
+    def _base(self, service: Service, path: Path, name: str) -> Service | None:
+        if path == Path(service.place.file) and name in self._manifest.services:
+            return self._manifest.services[name]
+        if (path, name) in self._bases:
+            return self._bases[path, name]
+        root = self._root(path, service.place, service.name)
+        if path not in self._others:
+            there = yamlfile.entries(yamlfile.lookup(root, "services") or root)
+            self._others[path] = {key.value: (key, node) for key, node in reversed(there)}
+        if name in self._others[path]:
+            key, node = self._others[path][name]
+            base = self._bases[path, name] = self._service(name, yamlfile.place_of(key, path), node, path)
+            return base
+        if root is not None:
+            where = "" if path == Path(service.place.file) else f" in {path}"
+            self._complain(service.place, f"extends {name}, and there is no such service{where}", service.name)
+        return None
+
+    def _service(self, name: str, place: Place, node: yaml.Node, path: Path) -> Service:
+        service = Service(name, place, extends=_extends(node, path), profiles=_profiles(node), programs=_programs(node))
+        for kind, key in ((Kind.LABEL, "labels"), (Kind.ANNOTATION, "annotations")):
+            for setting in self._settings(yamlfile.lookup(node, key), path, name):
+                known = service.settings[kind].get(setting.key)
+                if known is not None and known.value != setting.value:
+                    self._complain(
+                        setting.place, f"{kind.value} {setting.key}: line {known.place.line} says {known.value}", name
+                    )
+                service.settings[kind][setting.key] = setting
+        deploy = yamlfile.lookup(yamlfile.lookup(node, "deploy"), "labels")
+        for setting in self._settings(deploy, path, name):
+            self._complain(
+                setting.place, f"{setting.key} under deploy is no label of the container; put it under labels", name
+            )
+        return service
+
+    def _settings(self, node: yaml.Node | None, path: Path, name: str) -> Iterator[Setting]:
+        """The `avckpt.*` entries of labels or annotations, whichever way they are written."""
+        if isinstance(node, yaml.MappingNode):
+            for key, value in yamlfile.entries(node):
+                place = yamlfile.place_of(key, path)
+                if self._is_ours(key.value, place, name):
+                    try:
+                        yield Setting(key.value, yamlfile.text_of(value), place)
+                    except ValueError as error:
+                        self._complain(place, f"{key.value}: {error}", name)
+            return
+        for item in node.value if isinstance(node, yaml.SequenceNode) else [node]:
+            if isinstance(item, yaml.ScalarNode):
+                text, _, value = item.value.partition("=")
+                place = yamlfile.place_of(item, path)
+                if self._is_ours(text, place, name):
+                    yield Setting(text, value, place)
+            for inner, _ in yamlfile.entries(item):  # "- avckpt.enable: true"
+                place = yamlfile.place_of(inner, path)
+                if self._is_ours(inner.value, place, name):
+                    self._complain(place, f"{inner.value}: in a list, write it as {inner.value}=VALUE", name)
+
+    def _is_ours(self, key: str, place: Place, service: str) -> bool:
+        if key.startswith(PREFIX):
+            return not _is_open(key)
+        meant = meant_by(key)
+        if meant:
+            self._complain(place, f"{key} is no label of avckpt's; did you mean {meant}?", service)
+        return False
+
+    def _add(self, service: Service) -> None:
+        earlier = self._manifest.services.get(service.name)
+        if earlier is not None:
+            for kind, settings in earlier.settings.items():
+                service.settings[kind] = {**settings, **service.settings[kind]}
+            service.extends = service.extends or earlier.extends
+            service.profiles = (*earlier.profiles, *service.profiles)
+            service.programs = {**earlier.programs, **service.programs}
+        self._manifest.services[service.name] = service
+
+    def _root(self, path: Path, asked_at: Place | None = None, service: str = "") -> yaml.Node | None:
+        if path not in self._roots:
+            self._roots[path] = None
+            try:
+                self._roots[path] = yamlfile.read(path)
+            except Unreadable as error:
+                if asked_at is not None and isinstance(error.__cause__, OSError):
+                    self._complain(asked_at, f"{path}: {error.why}", service)
+                else:
+                    self._complain(error.place, error.why)
+        return self._roots[path]
+
+    def _complain(self, place: Place, message: str, service: str = "") -> None:
+        self._manifest.problems.append(Problem(place, service, message))
+
+
+def _extends(node: yaml.Node, path: Path) -> tuple[Path, str] | None:
+    extends = yamlfile.lookup(node, "extends")
+    name = yamlfile.lookup(extends, "service") if isinstance(extends, yaml.MappingNode) else extends
+    file = yamlfile.lookup(extends, "file")
+    if not isinstance(name, yaml.ScalarNode) or _is_open(name.value):
+        return None
+    if not isinstance(file, yaml.ScalarNode):
+        return path, name.value
+    return None if _is_open(file.value) else (path.parent / file.value, name.value)
+
+
+def _profiles(node: yaml.Node) -> tuple[str, ...]:
+    profiles = yamlfile.lookup(node, "profiles")
+    items = profiles.value if isinstance(profiles, yaml.SequenceNode) else []
+    return tuple(item.value for item in items if isinstance(item, yaml.ScalarNode))
+
+
+def _programs(node: yaml.Node) -> dict[str, str]:
+    programs = {}
+    for key in ("entrypoint", "command"):
+        value = yamlfile.lookup(node, key)
+        first = next(iter(value.value), None) if isinstance(value, yaml.SequenceNode) else value
+        if isinstance(first, yaml.ScalarNode):
+            programs[key] = "".join(first.value.split()[:1])
+    return programs
+
+
+def _judge(service: Service) -> Iterator[Problem]:
+    """Everything that is wrong with the settings of a service."""
+    alone = {"avckpt.group": "any"}  # which avckpt.notify asks for
+    right: dict[str, Setting] = {}
+    for kind, setting in service.all_settings():
+        value = {setting.key: setting.final}
+        try:
+            if setting.is_open:
+                _judge_key(setting.key)
+                continue
+            if kind is Kind.LABEL:
+                merge(value, {})
+            parse_policy(value if setting.key == ENABLE else {**alone, **value})
+        except LabelError as error:
+            yield Problem(setting.place, service.name, str(error).replace("label", kind.value, 1))
+        else:
+            right[setting.key] = setting
+    yield from _judge_both(service)
+    if not any(setting.is_open for _, setting in service.all_settings()):
+        yield from _judge_together(service, right)
+
+
+def _judge_together(service: Service, settings: Mapping[str, Setting]) -> Iterator[Problem]:
+    """Of values that are right by themselves.  Where the environment has a say, nobody can know."""
+    try:
+        parse_policy({key: setting.final for key, setting in settings.items()})
+    except LabelError as error:
+        yield Problem(settings[error.key].place, service.name, str(error))
+
+
+def _doubts(service: Service) -> Iterator[Problem]:
+    """What can be honoured, but is hardly meant."""
+    hears_of_others = {"avckpt.group", "avckpt.notify"} <= set(_keys(service))
+    if service.enabled is False and not hears_of_others and not any(key == ENABLE for key in _keys(service)):
+        for _, setting in service.all_settings():
+            message = f"{setting.key} has no effect: without {ENABLE}=true the container is not protected"
+            yield Problem(setting.place, service.name, message, Severity.WARNING)
+            break
+    program = service.programs.get("entrypoint") or service.programs.get("command", "")
+    if service.enabled and must_be_pid_1(program):
+        unless = "" if "entrypoint" in service.programs else ", unless its image has an entrypoint of its own"
+        message = f"{program} must itself be PID 1: this service runs unprotected{unless}"
+        yield Problem(service.place, service.name, message, Severity.WARNING)
+
+
+def _judge_key(key: str) -> None:
+    """Raises LabelError for a name that no value could make right."""
+    label = LABELS.get(key)
+    # A good value of a label that there is; and any value of one that there is not.
+    if label is None:
+        parse_policy({key: ""})
+        merge({key: ""}, {})
+
+
+def _judge_both(service: Service) -> Iterator[Problem]:
+    annotations: Mapping[str, Setting] = service.settings[Kind.ANNOTATION]
+    for key, label in service.settings[Kind.LABEL].items():
+        annotation = annotations.get(key)
+        if annotation is None or label.is_open or annotation.is_open:
+            continue
+        try:
+            merge({key: label.final}, {key: annotation.final})
+        except LabelError as error:
+            yield Problem(annotation.place, service.name, str(error))
+
+
+def _keys(service: Service) -> Iterator[str]:
+    for _, setting in service.all_settings():
+        yield setting.key
+
+
+def _is_open(text: str) -> bool:
+    """Compose will put something of the environment into it."""
+    return "$" in text.replace("$$", "")

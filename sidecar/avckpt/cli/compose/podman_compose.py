@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs podman-compose, a program of its own, and bounds what it leaves unbounded.
+
+podman-compose 1.6 waits for a dependency with `podman wait --condition=running`
+and no end: one service that can not start hangs everything that depends on it.
+While that is all it does, no container will change any more; then it is ended.
+The same goes for `--condition=healthy`, with more patience: where nobody runs
+the health checks, no container ever becomes healthy.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import psutil
+from avckpt_hooks.shared.labels import LabelError, merge, parse_policy
+
+from avckpt.errors import AvckptError
+
+STUCK_S = 5.0
+"""So long may podman-compose do nothing but wait for containers to run that nobody starts."""
+UNHEALTHY_S = 300.0
+"""The same where it waits for one to become healthy."""
+LOOK_EVERY_S = 0.2
+QUERY_TIMEOUT_S = 60.0
+
+Say = Callable[[str], None]
+"""Takes a line for the person who waits."""
+
+_HEALTHY = "--condition=healthy"
+_WAITS = {"--condition=running": "running", _HEALTHY: "healthy"}
+_ID = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Started:
+    """A container of the project, as Podman knows it."""
+
+    id: str
+    name: str
+    service: str
+    status: str
+    """As `podman ps` has it: "running", "exited", "created", ..."""
+    exit_code: int
+    error: str
+    """Why it could not be started; often empty, also when it could not."""
+    wanted: bool
+    """Its labels or annotations, the image's included, ask for protection."""
+    command: str
+    """Its first process: avckpt-init, where the hooks have put it in front."""
+
+
+class Compose:
+    """A project: files that belong together, named as podman-compose wants them."""
+
+    def __init__(
+        self, files: Sequence[Path], project: str = "", *, profiles: Sequence[str] = (), env_file: Path | None = None
+    ) -> None:
+        self._command = [sys.executable, "-m", "podman_compose"]
+        for path in files:
+            self._command += ["-f", str(path)]
+        if project:
+            self._command += ["-p", project]
+        for profile in profiles:
+            self._command += ["--profile", profile]
+        if env_file is not None:
+            self._command += ["--env-file", str(env_file)]
+
+    def up(self, services: Sequence[str], say: Say) -> None:
+        """`up -d`.  What it prints goes to `say`.
+
+        Raises AvckptError when it fails or hangs; containers may have been
+        started all the same.
+        """
+        self._run(["up", "-d", *services], say)
+
+    def down(self, services: Sequence[str], volumes: bool, say: Say) -> None:
+        """`down`.  Raises AvckptError when it fails."""
+        self._run(["down", *(["--volumes"] if volumes else []), *services], say)
+
+    def services(self) -> list[str]:
+        """Those that `up` would start; not those of a profile that nobody asks for.  Raises AvckptError."""
+        return self._ask([*self._command, "config", "--services"]).split()
+
+    def containers(self) -> list[Started]:
+        """All containers of the project, running or not.  Raises AvckptError."""
+        ids = self._ask([*self._command, "ps", "-q"]).split()
+        if not ids:
+            return []
+        # One may be removed at this moment; the others count.
+        found: list[dict[str, Any]] = json.loads(
+            self._ask(["podman", "inspect", "--type", "container", *ids], lenient=True) or "[]"
+        )
+        return [_started(entry) for entry in found]
+
+    def _run(self, args: list[str], say: Say) -> None:
+        said: list[str] = []
+        # A file, not a pipe: what a container's monitor inherits of a pipe would
+        # have to be read until the container ends.
+        with tempfile.NamedTemporaryFile() as written, open(written.name, errors="replace") as output:
+            process = subprocess.Popen(
+                [*self._command, *args], stdin=subprocess.DEVNULL, stdout=written, stderr=subprocess.STDOUT
+            )
+            try:
+                stuck = _watch(process, lambda: said.extend(_tell(output, say)))
+            finally:
+                if process.poll() is None:
+                    _end(process)
+            said.extend(_tell(output, say))
+        command = f"podman-compose {args[0]}"
+        if stuck:
+            raise AvckptError(f"{command} was ended: it waited in vain for {', '.join(stuck)}")
+        if process.returncode != 0:
+            last = said[-1] if said else f"exit status {process.returncode}"
+            raise AvckptError(f"{command} failed: {last}")
+
+    def _ask(self, command: list[str], *, lenient: bool = False) -> str:
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=QUERY_TIMEOUT_S)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise AvckptError(f"{command[0]}: {error}") from error
+        if done.returncode != 0 and not lenient:
+            lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+            raise AvckptError(f"{' '.join(command[-2:])}: {lines[-1]}")
+        return done.stdout
+
+
+def _watch(process: subprocess.Popen[bytes], look: Callable[[], None]) -> list[str]:
+    """Waits for podman-compose's end; the containers it hangs on if it hangs, else none."""
+    waiting_since: float | None = None
+    while True:
+        try:
+            process.wait(LOOK_EVERY_S)
+            return []
+        except subprocess.TimeoutExpired:
+            look()
+        awaited = _awaited(process.pid)
+        now = time.monotonic()
+        if awaited is None:
+            waiting_since = None
+        elif awaited:
+            waiting_since = waiting_since or now
+            patience_s = UNHEALTHY_S if _HEALTHY in awaited.values() else STUCK_S
+            if now - waiting_since > patience_s:
+                return sorted(f"{name} to become {_WAITS[awaited[name]]}" for name in awaited)
+
+
+def _awaited(pid: int) -> dict[str, str] | None:
+    """Containers it waits for, and for what; None: it does something else too; empty: nothing at this moment."""
+    awaited: dict[str, str] = {}
+    try:
+        children = psutil.Process(pid).children()
+    except psutil.NoSuchProcess:
+        return None
+    for child in children:
+        try:
+            command = child.cmdline()
+            if child.status() == psutil.STATUS_ZOMBIE:
+                continue
+        except psutil.NoSuchProcess:
+            continue
+        condition = next((word for word in command if word in _WAITS), None)
+        if condition is None or "wait" not in command:
+            return None
+        awaited.update(dict.fromkeys(command[command.index(condition) + 1 :], condition))
+    return awaited
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Ends podman-compose and the Podman commands it waits for.  Containers are nobody's children here."""
+    try:
+        ours = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    except psutil.NoSuchProcess:
+        ours = []
+    for one in ours:
+        try:
+            one.terminate()
+        except psutil.NoSuchProcess:
+            continue
+    try:
+        process.wait(5)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _tell(output: IO[str], say: Say) -> list[str]:
+    """Passes on the whole lines that have come; ids of what was made tell nobody anything."""
+    lines = []
+    while True:
+        at = output.tell()
+        line = output.readline()
+        if not line.endswith("\n"):
+            output.seek(at)
+            break
+        text = line.rstrip()
+        if text and not _ID.fullmatch(text):
+            lines.append(text)
+            say(text)
+    return lines
+
+
+def _started(entry: dict[str, Any]) -> Started:
+    config, state = entry["Config"], entry["State"]
+    labels = config.get("Labels") or {}
+    try:
+        wanted = parse_policy(merge(labels, config.get("Annotations") or {})).enable
+    except LabelError:
+        wanted = True  # it does not start, and the person who wrote it meant something
+    return Started(
+        id=str(entry["Id"]),
+        name=str(entry["Name"]),
+        service=str(labels.get("io.podman.compose.service", "")),
+        status=str(state["Status"]),
+        exit_code=int(state["ExitCode"]),
+        error=str(state.get("Error") or ""),
+        wanted=wanted,
+        command=str(entry.get("Path") or ""),
+    )

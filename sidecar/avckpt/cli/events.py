@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands `avckpt events` and `avckpt completion`."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from avckpt.errors import AvckptError, SidecarUnreachable
+
+if TYPE_CHECKING:
+    from avckpt.cli.client import Client, Json
+
+RETRY_S = 1.0
+"""How often somebody who follows looks whether the sidecar is back."""
+
+COLOURS = {
+    "restored": "yellow",
+    "gave_up": "red",
+    "unprotected": "red",
+    "notify_failed": "red",
+    "refused": "red",
+    "checkpoint": "green",
+}
+
+_UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+
+
+class Instant(click.ParamType):  # type: ignore[type-arg] # generic only in newer releases of click
+    """A time of day: so long ago, or when."""
+
+    name = "TIME"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """To seconds since 1970."""
+        if isinstance(value, float):
+            return value
+        found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value, re.ASCII)
+        if found is not None:
+            return time.time() - float(found[1]) * _UNITS_S[found[2]]
+        try:
+            return datetime.fromisoformat(value).timestamp()
+        except (ValueError, OverflowError):
+            self.fail(f"{value!r} is neither a time ago (30s, 10m, 2h, 1d) nor a date and time (2026-05-17T08:30)")
+
+
+@click.command()
+@click.option("-f", "--follow", is_flag=True, help="Go on with those to come, also over a restart of the sidecar.")
+@click.option("--since", type=Instant(), help="Only from then on: 10m (ago), or 2026-05-17T08:30.")
+@click.option("-a", "--all", "routine", is_flag=True, help="With --follow: also every single checkpoint.")
+@click.option("--json", "as_json", is_flag=True, help="JSON lines, one for each event.")
+def events(follow: bool, since: float | None, routine: bool, as_json: bool) -> None:
+    """Tell what happened: crashes, restores, what is unprotected and why.
+
+    The sidecar keeps the last 1000 events, also over its own restart.
+    """
+    client = _client()
+    try:
+        for event in _followed(client, since, routine) if follow else client.history(since):
+            click.echo(json.dumps(event) if as_json else _line(event))
+            sys.stdout.flush()
+    except KeyboardInterrupt:
+        return  # the usual way to have enough
+
+
+def _followed(client: Client, since: float | None, routine: bool) -> Iterator[Json]:
+    """Events for ever.  Raises SidecarUnreachable when there is no sidecar; one that goes away is waited for."""
+    client.info()
+    after: int | None = None
+    while True:
+        try:
+            for event in client.events(after, since, routine=routine):
+                after = event["seq"] or after
+                yield event
+            problem = "the sidecar was stopped"
+        except SidecarUnreachable as error:
+            problem = str(error)
+        click.echo(f"avckpt: {problem}; waiting for the next one", err=True)
+        _wait(client)
+
+
+def _wait(client: Client) -> None:
+    """Returns when a sidecar answers."""
+    while True:
+        time.sleep(RETRY_S)
+        try:
+            client.info()
+        except SidecarUnreachable:
+            continue
+        return
+
+
+def _line(event: Json) -> str:
+    at = datetime.fromtimestamp(event["at"]).isoformat(" ", "milliseconds")
+    return f"{at}  {event['container']}: {click.style(event['message'], fg=COLOURS.get(event['kind']))}"
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion(shell: str) -> None:
+    """Print a script that completes avckpt's commands in a shell.
+
+    \b
+    bash:  avckpt completion bash > /etc/bash_completion.d/avckpt
+    zsh:   avckpt completion zsh > "${fpath[1]}/_avckpt"
+    fish:  avckpt completion fish > ~/.config/fish/completions/avckpt.fish
+    """
+    from click.shell_completion import get_completion_class
+
+    found = get_completion_class(shell)
+    root = click.get_current_context().find_root().command
+    assert found is not None
+    click.echo(found(root, {}, "avckpt", "_AVCKPT_COMPLETE").source())
+
+
+def complete_container(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Names of protected containers; none when there is no sidecar to ask."""
+    try:
+        names = [str(row["name"] or row["id"][:12]) for row in _client().containers(memory=False)]
+    except AvckptError:
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def _client() -> Client:
+    from avckpt_hooks.shared import protocol
+
+    from avckpt.cli.client import Client
+
+    return Client(Path(protocol.run_dir()))

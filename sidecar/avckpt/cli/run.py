@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`avckpt run`: protects a plain program, with no Podman and no sidecar.
+
+    avckpt run            guard (engine), messages; outside the new PID namespace
+      avckpt-init         PID 1 of a PID namespace with a /proc of its own
+        PROGRAM
+
+The program has our standard descriptors and, if we had it, the foreground of
+our terminal.  SIGTSTP (^Z) is then ignored in the program, as under any parent
+that does no job control: nobody could bring it back.
+
+When `avckpt run` itself is killed with SIGKILL, init and program go on as
+orphans, unprotected.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import selectors
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import FrameType
+
+from avckpt.artifacts import init_binary
+from avckpt.cli.namespace import spawn_pid1
+from avckpt.engine import Engine, probe
+from avckpt.errors import AvckptError, LabelsWrong
+from avckpt.events.journal import Journal
+from avckpt.events.record import of_guard
+from avckpt.events.vocabulary import EventKind, signal_name
+from avckpt.guard import GuardConfig
+from avckpt.policy import settings_of
+
+NOT_FORWARDED = frozenset(
+    {
+        # Not to be caught.
+        signal.SIGKILL,
+        signal.SIGSTOP,
+        # Ours: children, and writing to terminals and pipes.
+        signal.SIGCHLD,
+        signal.SIGPIPE,
+        signal.SIGTTOU,
+        signal.SIGTTIN,
+        signal.SIGTSTP,
+        # Our own crash.
+        signal.SIGSEGV,
+        signal.SIGBUS,
+        signal.SIGFPE,
+        signal.SIGILL,
+        signal.SIGTRAP,
+        signal.SIGABRT,
+        signal.SIGSYS,
+    }
+)
+
+
+def config_of_run(labels: Mapping[str, str]) -> GuardConfig:
+    """What `--label` says; `avckpt.enable` is implied.  Raises LabelsWrong."""
+    for key in labels:
+        if not key.startswith("avckpt."):
+            raise LabelsWrong(f"label {key}: avckpt run knows only avckpt.* labels")
+        if key == "avckpt.group" or key.startswith("avckpt.notify"):
+            raise LabelsWrong(f"label {key}: it takes containers and the sidecar, leave it out")
+    settings = settings_of({"avckpt.enable": "true", **labels})
+    if settings.policy.restore_on.unhealthy:
+        raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
+    if labels.get("avckpt.enable", "true").strip().lower() in ("false", "0", "no", "off"):
+        raise LabelsWrong("label avckpt.enable=false: then run the program without avckpt run")
+    return settings.config
+
+
+def run(config: GuardConfig, argv: list[str], *, verbose: bool) -> int:
+    """Runs `argv` to its end and returns its exit status, 128+N when signal N killed it.
+
+    Raises AvckptError when it can not be started.
+    """
+    probe()
+    init = init_binary()
+    with _signals() as signals_fd, _terminal() as terminal:
+        ignored = [signal.SIGTSTP] if terminal is not None else []
+        command = [init.name, "--wait-ms", "2000", "--stop-signal", "15", "--", *argv]
+        pid = spawn_pid1(str(init), command, tty=terminal, ignored=ignored)
+        if terminal is not None:
+            # We are in the background now, and say things all the same.
+            signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+        pidfd = os.pidfd_open(pid)
+        try:
+            _Supervisor(argv[0], pidfd, signals_fd, verbose).watch(config)
+            _, status = os.waitpid(pid, 0)
+        finally:
+            os.close(pidfd)
+            if terminal is not None:
+                _take_back(terminal, pid)
+    return os.WEXITSTATUS(status) if os.WIFEXITED(status) else 128 + os.WTERMSIG(status)
+
+
+class _Supervisor:
+    """Forwards signals and tells events until init has ended."""
+
+    def __init__(self, name: str, init_pidfd: int, signals_fd: int, verbose: bool) -> None:
+        self._name = name
+        self._pidfd = init_pidfd
+        self._signals_fd = signals_fd
+        self._verbose = verbose
+        self._journal = Journal()
+        # The kernel drops what is sent to a PID 1 that is not ready for it, so
+        # signals wait for the guard's first word of init.
+        self._ready = False
+        self._waiting: list[int] = []
+
+    def watch(self, config: GuardConfig) -> None:
+        """Returns when init has ended."""
+        with Engine() as engine, selectors.DefaultSelector() as selector:
+            try:
+                guard = engine.start_guard(self._pidfd, config, cookie=1)
+            except AvckptError as error:
+                say(f"{self._name}: runs unprotected: {error}")
+                guard = None
+                self._ready = True
+            selector.register(self._pidfd, selectors.EVENT_READ)
+            selector.register(engine.event_fd, selectors.EVENT_READ)
+            selector.register(self._signals_fd, selectors.EVENT_READ)
+            ended = False
+            while not ended:
+                for key, _ in selector.select():
+                    if key.fd == self._pidfd:
+                        ended = True
+                    elif key.fd == self._signals_fd:
+                        self._take_signals()
+                self._take_events(engine)
+            if guard is not None:
+                guard.stop()
+            self._take_events(engine)
+
+    def _take_events(self, engine: Engine) -> None:
+        while (event := engine.next_event()) is not None:
+            if not self._ready:
+                self._ready = True
+                for signum in self._waiting:
+                    self._forward(signum)
+            line = self._journal.line(of_guard(event))
+            if line is None:
+                continue
+            level, text = line
+            quiet = level < logging.WARNING or event.kind is EventKind.MISSED
+            if self._verbose or not quiet:
+                say(f"{self._name}: {text}")
+
+    def _take_signals(self) -> None:
+        try:
+            numbers = os.read(self._signals_fd, 4096)
+        except BlockingIOError:
+            return
+        for signum in numbers:
+            if self._ready:
+                self._forward(signum)
+            else:
+                self._waiting.append(signum)
+
+    def _forward(self, signum: int) -> None:
+        try:
+            signal.pidfd_send_signal(self._pidfd, signum)
+        except ProcessLookupError:
+            return  # it has ended meanwhile
+        if self._verbose:
+            say(f"{self._name}: {signal_name(signum)} passed on")
+
+
+def say(text: str) -> None:
+    """One message of ours.  That nobody reads it must not end the program."""
+    try:
+        os.write(2, f"avckpt: {text}\n".encode())
+    except OSError:
+        return
+
+
+@contextmanager
+def _signals() -> Iterator[int]:
+    """Catches every signal that is to be forwarded; a descriptor that yields their numbers, a byte each.
+
+    Those that we were started to ignore (nohup) stay ignored, and the program inherits that.
+    """
+    read_fd, write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
+    caught = [n for n in signal.valid_signals() - NOT_FORWARDED if signal.getsignal(n) is not signal.SIG_IGN]
+    for signum in caught:
+        signal.signal(signum, _caught)
+    try:
+        yield read_fd
+    finally:
+        signal.set_wakeup_fd(-1)
+        for signum in caught:
+            signal.signal(signum, signal.SIG_DFL)
+        os.close(read_fd)
+        os.close(write_fd)
+
+
+def _caught(signum: int, frame: FrameType | None) -> None:
+    """Nothing: the wakeup descriptor has it."""
+
+
+@contextmanager
+def _terminal() -> Iterator[int | None]:
+    """A descriptor of the controlling terminal while we are in its foreground, else None."""
+    try:
+        fd = os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY | os.O_CLOEXEC)
+    except OSError:
+        yield None
+        return
+    try:
+        yield fd if os.tcgetpgrp(fd) == os.getpgrp() else None
+    finally:
+        os.close(fd)
+
+
+def _take_back(terminal: int, init_pid: int) -> None:
+    """Makes us the foreground again: our own caller may be a script that goes on reading the terminal."""
+    try:
+        foreground = os.tcgetpgrp(terminal)
+        if foreground != init_pid and _group_exists(foreground):
+            return  # a shell has taken the terminal meanwhile
+        os.tcsetpgrp(terminal, os.getpgrp())
+    except OSError:
+        return  # the terminal is gone
+
+
+def _group_exists(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The containers that the sidecar knows, and where it learns of them."""

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of one protected container, and how events change it.  No I/O."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from avckpt.events.vocabulary import DROPPED_WORDS, Event, EventKind, describe_wait_status, why_not_restored
+from avckpt.guard import GuardConfig
+
+
+class State(enum.Enum):
+    """Where a container stands."""
+
+    STARTING = "starting"
+    """Guarded, but no checkpoint yet: a death now is final."""
+    PROTECTED = "protected"
+    """At least one generation is held."""
+    UNPROTECTED = "unprotected"
+    """It runs as if avckpt were not there; `reason` says why."""
+    LISTENING = "listening"
+    """Not to be protected: it only wants to hear of others in its group."""
+    RESTORING = "restoring"
+    """The app died; nothing runs at this moment."""
+    ENDED = "ended"
+
+
+@dataclass
+class Protected:
+    """One run of a container, from its init's start to its init's end.
+
+    Instants (`_at`) are seconds since the epoch, durations (`_s`) seconds; None: has not happened.
+    """
+
+    id: str
+    name: str
+    cookie: int
+    """Which guard: unique in this process, so that two runs of one container are never confused."""
+    init_pid: int
+    """In this process's PID namespace, for people."""
+    config: GuardConfig
+    registered_at: float
+    group: str = ""
+    """`avckpt.group`; empty: none."""
+    adopted: bool = False
+    """It ran already when the sidecar started."""
+    state: State = State.STARTING
+    reason: str = "avckpt-init has not started yet"
+    """Why it is not (quite) protected, or how it ended; empty when all is well."""
+    app_pid: int = 0
+    app_pid_inside: int = 0
+    guard_pid: int = 0
+    """Of its avckpt-guard; 0: there is none."""
+    threads: int = 0
+    generation: int = 0
+    generations: int = 0
+    checkpoints: int = 0
+    missed: int = 0
+    restores: int = 0
+    attempt: int = 0
+    """Restores within the time of avckpt.restore.max, at the last one."""
+    dropped: int = 0
+    """Generations given up before their time."""
+    last_dropped: str = ""
+    """Which, and why."""
+    memory_bytes: int = 0
+    last_checkpoint_at: float | None = None
+    last_freeze_s: float | None = None
+    last_quiescent: bool | None = None
+    last_death: str = ""
+    last_death_at: float | None = None
+    last_death_ns: int = 0
+    """The same on CLOCK_MONOTONIC, for durations; 0: has not happened."""
+    last_restore_s: float | None = None
+    last_restore_age_s: float | None = None
+    """How old the generation was that the last restore went back to."""
+    ended_at: float | None = None
+
+    @property
+    def label(self) -> str:
+        """How to call it in a message: its name, or the short id."""
+        return self.name or self.id[:12]
+
+    def apply(self, event: Event, at: float) -> None:
+        """Takes in an event of this container's guard that happened at `at`."""
+        if event.app_pid:
+            self.app_pid = event.app_pid
+            self.app_pid_inside = event.app_pid_inside
+        self.generations = event.generations
+        if not self.generations:
+            self.memory_bytes = 0
+        kind = event.kind
+        if kind is EventKind.ATTACHED:
+            self._to(State.STARTING, "no checkpoint yet")
+        elif kind is EventKind.CHECKPOINT:
+            self._to(State.PROTECTED, self._crashing(event.at_ns))
+            self.checkpoints += 1
+            self.generation = event.generation
+            self.threads = event.threads
+            self.last_checkpoint_at = at
+            self.last_freeze_s = event.freeze_s
+            self.last_quiescent = event.quiescent
+        elif kind is EventKind.MISSED:
+            self.missed += 1
+            self._suffer(f"checkpoint missed: {event.error}")
+        elif kind in (EventKind.UNPROTECTED, EventKind.GUARD_LOST):
+            self._to(State.UNPROTECTED, str(event.error))
+        elif kind is EventKind.DIED:
+            self._to(State.RESTORING)
+            self.last_death = describe_wait_status(event.wait_status)
+            self.last_death_at = at
+            self.last_death_ns = event.at_ns
+        elif kind is EventKind.RESTORED:
+            self.restores = event.restores
+            self.attempt = event.attempt
+            self.generation = event.generation
+            self.threads = event.threads
+            self.last_restore_s = event.restore_s
+            self.last_restore_age_s = event.age_s
+            self._to(State.PROTECTED, self._crashing(event.at_ns))
+        elif kind is EventKind.DROPPED:
+            self.dropped += 1
+            self.last_dropped = f"generation {event.generation}: {DROPPED_WORDS.get(event.reason, '')}"
+            if self.state is State.PROTECTED:
+                left = f"; {event.generations} left" if event.generations else ""
+                self._suffer(f"{self.last_dropped}{left}")
+        elif kind is EventKind.GAVE_UP:
+            how = describe_wait_status(event.wait_status)
+            self._to(State.ENDED, f"{how}; {why_not_restored(event.reason, event.error)}")
+            self.generations = 0
+            self.memory_bytes = 0
+
+    def end(self, at: float) -> None:
+        """Its init is gone."""
+        if self.state is not State.ENDED:
+            self._to(State.ENDED, "the container was stopped or killed")
+        self.generations = 0
+        self.memory_bytes = 0
+        self.ended_at = at
+
+    def listen(self) -> None:
+        """It is told of others, and has no guard: its main process is its application."""
+        self.app_pid = self.init_pid
+        self._to(State.LISTENING, "only hears of others in its group: avckpt.enable is not true")
+
+    def fail(self, reason: str) -> None:
+        """There is no guard for it, and why."""
+        self._to(State.UNPROTECTED, reason)
+
+    def to_json(self) -> dict[str, object]:
+        """Every field a person or a program may want; the keys are part of the API."""
+        return {
+            "id": self.id,
+            "name": self.name,
+            "group": self.group,
+            "state": self.state.value,
+            "reason": self.reason,
+            "init_pid": self.init_pid,
+            "app_pid": self.app_pid,
+            "app_pid_inside": self.app_pid_inside,
+            "guard_pid": self.guard_pid,
+            "threads": self.threads,
+            "interval_s": self.config.interval_s,
+            "keep": self.config.keep,
+            "generation": self.generation,
+            "generations": self.generations,
+            "checkpoints": self.checkpoints,
+            "missed": self.missed,
+            "restores": self.restores,
+            "attempt": self.attempt,
+            "restore_max": self.config.restore_max,
+            "dropped": self.dropped,
+            "last_dropped": self.last_dropped,
+            "memory_bytes": self.memory_bytes,
+            "last_checkpoint_at": self.last_checkpoint_at,
+            "last_freeze_s": self.last_freeze_s,
+            "last_quiescent": self.last_quiescent,
+            "last_death": self.last_death,
+            "last_death_at": self.last_death_at,
+            "last_restore_s": self.last_restore_s,
+            "last_restore_age_s": self.last_restore_age_s,
+            "adopted": self.adopted,
+            "registered_at": self.registered_at,
+            "ended_at": self.ended_at,
+        }
+
+    def _crashing(self, at_ns: int) -> str:
+        """What is tried against a crash that comes back; empty: nothing."""
+        window_s = self.config.restore_window_s
+        if self.attempt < 2 or at_ns - self.last_death_ns > window_s * 1e9:
+            return ""
+        text = f"keeps crashing: restore {self.attempt} of {self.config.restore_max} within {window_s:g} s"
+        return f"{text}; given up: {self.last_dropped}" if self.last_dropped else text
+
+    def _suffer(self, reason: str) -> None:
+        """Something went wrong: what is held protects as before, if anything is."""
+        if self.state is State.PROTECTED and not self.generations:
+            self._to(State.UNPROTECTED, f"{reason}; checkpoints go on as soon as they can")
+        else:
+            self.reason = reason
+
+    def _to(self, state: State, reason: str = "") -> None:
+        self.state = state
+        self.reason = reason

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The records of live protected containers that the prestart hook leaves for a sidecar that starts later."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from avckpt_hooks.shared.files import make_private, read_bounded
+from avckpt_hooks.shared.protocol import MAX_BYTES, Register
+
+from avckpt.containers.process import open_pidfd
+from avckpt.errors import Denied, TargetGone
+
+log = logging.getLogger("avckpt")
+
+RECORD_BYTES = 2 * MAX_BYTES
+"""The hook registers what it has written, in a packet."""
+PID_MOST = 1 << 22
+"""PID_MAX_LIMIT, include/linux/threads.h."""
+OWN_NAMESPACE = os.stat("/proc/self/ns/pid").st_ino
+NOT_SEEN = "the sidecar does not see the host's processes: start it with --pid=host"
+
+
+def keep_private(directory: Path) -> None:
+    """Takes from others what they may do with the files that hooks leave in a directory, and makes it.
+
+    Earlier versions left them readable by everybody.  Raises OSError.
+    """
+    make_private(str(directory))
+    for path in directory.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # its container has just stopped
+            path.chmod(0o600)
+
+
+class Records:
+    """The records in a directory, which may be looked at again and again.  What is wrong with one is logged once."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._complaints: dict[str, str] = {}
+        """By file name, as long as there is the file."""
+
+    def adoptable(self, is_known: Callable[[str], bool]) -> Iterator[tuple[Register, int]]:
+        """Every recorded container whose init still lives, with a pidfd that becomes the caller's.
+
+        Those whose id `is_known` are left out, at the cost of a listing.  Records
+        of containers that have ended are removed; those that can not be read, or
+        whose PID means nothing here, are left where they are and logged.  Raises
+        nothing: whatever is wrong now may be right at the next look.
+        """
+        try:
+            names = sorted(name for name in os.listdir(self._directory) if name.endswith(".json"))
+        except FileNotFoundError:
+            return  # no hook has left one yet
+        except OSError as error:
+            self.complain("", f"{self._directory} can not be read, containers may run unprotected: {error.strerror}")
+            return
+        self._complaints = {name: line for name, line in self._complaints.items() if name in names}
+        for path in map(self._directory.joinpath, names):
+            if is_known(path.stem):
+                continue
+            try:
+                found = _open(path)
+            except FileNotFoundError:
+                continue  # its container has just stopped
+            except Denied as error:
+                self.complain(path.stem, str(error))
+            except OSError as error:
+                self.complain(path.stem, f"the container of {path} runs unprotected: {error.strerror}")
+            except ValueError as error:
+                self.complain(path.stem, f"{path} is not a record of a container ({error}): left alone")
+            else:
+                if found is not None:
+                    yield found
+
+    def complain(self, container_id: str, line: str) -> None:
+        """Logs what is wrong with a record ("": with all of them), unless that was said at the last look."""
+        name = f"{container_id}.json"
+        if self._complaints.get(name) != line:
+            log.error("%s", line)
+        self._complaints[name] = line
+
+
+def _open(path: Path) -> tuple[Register, int] | None:
+    """The container of a record, with a pidfd; None when it has ended: then the record is removed.
+
+    Raises OSError, and what _parse() does.
+    """
+    text = read_bounded(str(path), RECORD_BYTES)
+    record = _parse(text)
+    try:
+        return record, open_pidfd(record.pid, record.starttime)
+    except TargetGone:
+        remove_if(path, text)
+        return None
+
+
+def _parse(text: bytes) -> Register:
+    """Raises ValueError when it is no record, Denied when its PID is one of a PID namespace that we do not see."""
+    try:
+        data = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    record = Register.from_record(data)
+    if not 0 < record.pid <= PID_MOST:
+        raise ValueError(f"its pid is {record.pid}")
+    if data.get("pid_namespace", OWN_NAMESPACE) != OWN_NAMESPACE:
+        raise Denied(f"runs unprotected: {NOT_SEEN}", container=record.name or record.id[:12])
+    return record
+
+
+def remove_if(path: Path, text: bytes) -> None:
+    """Removes a record if it still says `text`.
+
+    A container that is being restarted replaces its record at any moment, so it
+    is taken aside first, looked at, and put back if it is a new one.  Raises OSError.
+    """
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.rename(aside)
+    except FileNotFoundError:
+        return
+    is_it = False
+    try:
+        is_it = aside.read_bytes() == text
+    finally:
+        if not is_it:
+            # link(2) does not replace: a still newer record wins.
+            with contextlib.suppress(FileExistsError):
+                os.link(aside, path)
+        aside.unlink()

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The protected containers a sidecar knows, and finding one by what a person calls it.  No I/O."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from avckpt.containers.protected import Protected
+from avckpt.errors import Ambiguous, NoSuchContainer
+
+ENDED_KEPT = 32
+"""How many containers that have ended `avckpt ps -a` still shows."""
+
+
+class Registry:
+    """Live containers by id, guards by cookie, and the last few that have ended."""
+
+    def __init__(self) -> None:
+        self._live: dict[str, Protected] = {}
+        self._by_cookie: dict[int, Protected] = {}
+        self._ended: deque[Protected] = deque(maxlen=ENDED_KEPT)
+
+    def add(self, container: Protected) -> None:
+        """Takes in a container; an earlier run with the same id stays known by its cookie until it is `remove`d."""
+        self._live[container.id] = container
+        self._by_cookie[container.cookie] = container
+
+    def remove(self, container: Protected) -> None:
+        """Moves a container that has ended to the ended ones."""
+        if self._by_cookie.pop(container.cookie, None) is None:
+            return
+        # A restarted container has the same id: its new run may be there already.
+        if self._live.get(container.id) is container:
+            del self._live[container.id]
+        self._ended.append(container)
+
+    def by_cookie(self, cookie: int) -> Protected | None:
+        """Whose guard it is; None when that run has been removed."""
+        return self._by_cookie.get(cookie)
+
+    def by_id(self, container_id: str) -> Protected | None:
+        """The live run of a container."""
+        return self._live.get(container_id)
+
+    def live(self) -> list[Protected]:
+        """Live containers, oldest first."""
+        return list(self._live.values())
+
+    def ended(self) -> list[Protected]:
+        """The last few that ended, oldest first."""
+        return list(self._ended)
+
+    def find(self, name: str) -> Protected:
+        """A live container by name, id or unique id prefix.  Raises NoSuchContainer, Ambiguous."""
+        return find(self._live.values(), name)
+
+
+def find(containers: Iterable[Protected], name: str) -> Protected:
+    """As `podman` finds one: the exact name wins, then the exact id, then a prefix of one id only."""
+    candidates = list(containers)
+    for container in candidates:
+        if container.name == name:
+            return container
+    if name:
+        matches = [container for container in candidates if container.id.startswith(name)]
+        if len(matches) == 1:
+            return matches[0]
+        if len(matches) > 1:
+            ids = ", ".join(container.id[:12] for container in matches)
+            raise Ambiguous(f"{name!r} may be any of {ids}: give more digits, or the name")
+    raise NoSuchContainer(
+        f"no protected container is called {name!r}: see avckpt ps; was it started with "
+        "--label avckpt.enable=true, and are the hooks installed (avckpt doctor)?"
+    )

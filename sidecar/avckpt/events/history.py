@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last events, numbered, in a file that outlives the sidecar.
+
+One JSON object per line, appended by one write(2) each, so that a sidecar that
+is killed at any instant leaves at most one torn line, which the next one drops.
+The file grows to twice `limit` lines and is then replaced by its newer half.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+import time
+from collections import deque
+from pathlib import Path
+
+from avckpt.events.record import EventRecord
+
+log = logging.getLogger("avckpt")
+
+LIMIT = 1000
+"""Events kept."""
+AGAIN_S = 10.0
+"""What could not be written is tried again with the first event after this time: a full disk may not stay full."""
+
+
+class History:
+    """The events of a machine since it started, at most `limit`.  For one thread.
+
+    What can not be written is kept in memory until it can, and the log says so once.
+    """
+
+    def __init__(self, path: Path, limit: int = LIMIT) -> None:
+        self._path = path
+        self._limit = limit
+        self._kept: deque[EventRecord] = deque(maxlen=limit)
+        self._lines = 0
+        self._fd = -1
+        self._closed = False
+        self._failed_s: float | None = None
+        """When it could not be written (CLOCK_MONOTONIC); None: all is well."""
+        whole = self._load()
+        # The time of day as the first number: numbers given out before a
+        # history was lost are smaller, so that nobody who resumes after one of
+        # them misses anything.
+        self._next = self._kept[-1].seq + 1 if self._kept else int(time.time())
+        if not whole or self._lines >= 2 * limit:
+            self._compact()
+
+    def add(self, record: EventRecord) -> EventRecord:
+        """Numbers an event and keeps it; returns it with its number."""
+        record = dataclasses.replace(record, seq=self._next)
+        self._next += 1
+        self._kept.append(record)
+        if self._failed_s is None and self._lines < 2 * self._limit:
+            self._append(record)
+        elif self._failed_s is None or time.monotonic() - self._failed_s >= AGAIN_S:
+            self._compact()
+        return record
+
+    def after(self, seq: int | None = None, since: float | None = None) -> list[EventRecord]:
+        """What is kept, oldest first: later than number `seq`, and not before the time of day `since`."""
+        if seq is not None and seq >= self._next:
+            seq = None  # of another history: this one was lost, or the clock was set back
+        return [
+            record
+            for record in self._kept
+            if (seq is None or record.seq > seq) and (since is None or record.at >= since)
+        ]
+
+    def close(self) -> None:
+        """Closes the file; what is added from now on is not written."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+        self._closed = True
+
+    def _load(self) -> bool:
+        """Reads the file; False when there is something in it that must go before it is added to."""
+        try:
+            content = self._path.read_bytes()
+        except FileNotFoundError:
+            return True
+        except OSError as error:
+            self._complain(error)
+            return True
+        whole = content.endswith(b"\n") or not content
+        last = 0
+        for line in content.splitlines():
+            self._lines += 1
+            try:
+                record = EventRecord.from_json(json.loads(line))
+            except (ValueError, AttributeError, UnicodeDecodeError):
+                whole = False
+                continue
+            if record.seq > last:
+                self._kept.append(record)
+                last = record.seq
+        return whole
+
+    def _append(self, record: EventRecord) -> None:
+        if self._closed:
+            return
+        line = _line(record)
+        try:
+            if self._fd < 0:
+                flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+                self._fd = os.open(self._path, flags, 0o600)
+                os.fchmod(self._fd, 0o600)
+            written = os.write(self._fd, line)
+        except OSError as error:
+            self._complain(error)
+            return
+        self._lines += 1
+        if written != len(line):
+            self._compact()
+
+    def _compact(self) -> None:
+        """Replaces the file by what is kept, at once or not at all."""
+        if self._closed:
+            return
+        aside = self._path.with_name(f"{self._path.name}.new")
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                aside.unlink()
+            fd = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            with os.fdopen(fd, "wb") as file:
+                file.writelines(map(_line, self._kept))
+            aside.replace(self._path)
+        except OSError as error:
+            self._complain(error)
+            return
+        self._lines = len(self._kept)
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+        if self._failed_s is not None:
+            self._failed_s = None
+            log.info("%s is written again", self._path)
+
+    def _complain(self, error: OSError) -> None:
+        if self._failed_s is None:
+            log.error("%s can not be used (%s): events are kept in memory only", self._path, error.strerror)
+        self._failed_s = time.monotonic()
+
+
+def _line(record: EventRecord) -> bytes:
+    return json.dumps(record.to_json(), separators=(",", ":")).encode() + b"\n"

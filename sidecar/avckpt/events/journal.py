@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which events are worth a line, and how it reads.  One line per event of interest."""
+
+from __future__ import annotations
+
+import logging
+
+from avckpt.events.record import EXPECTED, EventRecord, Kind
+from avckpt.events.vocabulary import DROPPED_WORDS, Reason
+
+SELDOM_S = 60.0
+"""What may go wrong at every interval (a checkpoint, a health check) is told at most this often, of one container."""
+
+LEVELS = {
+    Kind.REGISTERED: logging.INFO,
+    Kind.ATTACHED: logging.DEBUG,
+    Kind.DIED: logging.INFO,
+    Kind.RESTORED: logging.WARNING,
+    Kind.GAVE_UP: logging.ERROR,
+    Kind.DROPPED: logging.WARNING,
+    Kind.HEALTH: logging.WARNING,
+    Kind.CONFIGURED: logging.INFO,
+    Kind.REFUSED: logging.WARNING,
+    Kind.ENDED: logging.INFO,
+    Kind.NOTIFIED: logging.DEBUG,
+    Kind.NOTIFY_FAILED: logging.WARNING,
+}
+"""Levels of the kinds that are always told.  What is below INFO is routine: it is not kept in the history."""
+
+
+class _Seldom:
+    """Lines of something that is told at most every `SELDOM_S`; the others are counted."""
+
+    def __init__(self) -> None:
+        self._told_s = 0.0
+        self._untold = 0
+
+    def line(self, record: EventRecord) -> tuple[int, str] | None:
+        if self._told_s and record.monotonic_s - self._told_s < SELDOM_S:
+            self._untold += 1
+            return None
+        more = f" (and {self._untold} more since this was last said)" if self._untold else ""
+        self._told_s, self._untold = record.monotonic_s, 0
+        return logging.WARNING, f"{record.message}{more}"
+
+
+class Journal:
+    """Makes the lines of one container.  Remembers what it has said, so that nothing is said every interval."""
+
+    def __init__(self) -> None:
+        self._held = False
+        self._unprotected = ""
+        self._lacking = ""
+        self._missed = _Seldom()
+        self._unhealthy = _Seldom()
+
+    def line(self, record: EventRecord) -> tuple[int, str] | None:
+        """A logging level and the text (without the container's name), or None for silence."""
+        kind = record.kind
+        if kind is Kind.CHECKPOINT:
+            return self._checkpoint(record)
+        was_held = self._held
+        if record.generations == 0:
+            self._held = False
+        if kind is Kind.MISSED:
+            # One that cost what was held is always told.
+            return (logging.WARNING, record.message) if was_held and not self._held else self._missed.line(record)
+        if kind is Kind.HEALTH and record.error is not None:
+            return self._unhealthy.line(record)
+        if kind is Kind.UNPROTECTED:
+            return self._lost(record)
+        if kind is Kind.DROPPED and record.detail == DROPPED_WORDS[Reason.EXECUTED]:
+            return logging.INFO, record.message  # as the entry points of many images do
+        if kind is Kind.GAVE_UP and record.outcome in EXPECTED:
+            return logging.INFO, record.message
+        if kind is Kind.CONFIGURED and record.error is not None:
+            return logging.WARNING, record.message
+        return LEVELS[kind], record.message
+
+    def _checkpoint(self, record: EventRecord) -> tuple[int, str]:
+        self._unprotected = ""
+        lacking = str(record.error) if record.error is not None else ""
+        new, self._lacking = lacking != self._lacking, lacking
+        if lacking and new:
+            self._held = True
+            return logging.WARNING, f"protected, but {lacking}"
+        if not self._held:
+            self._held = True
+            return logging.INFO, f"protected: first {record.message.replace(':', ',', 1)}"
+        return logging.DEBUG, record.message
+
+    def _lost(self, record: EventRecord) -> tuple[int, str] | None:
+        # The guard looks again every interval: say it once per reason.
+        self._held = False
+        if record.message == self._unprotected:
+            return None
+        self._unprotected = record.message
+        return logging.WARNING, record.message

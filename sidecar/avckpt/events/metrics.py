@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prometheus metrics: counted as events come, gauges looked at when somebody asks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeVar
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
+
+from avckpt.containers.protected import Protected, State
+from avckpt.events.record import EventRecord, Kind
+
+Metric = TypeVar("Metric", Counter, Histogram)
+
+CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
+FREEZE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25)
+RESTORE_BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
+
+
+class Metrics:
+    """All metrics of a sidecar, by container."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self._freeze = Histogram(
+            "avckpt_freeze_seconds",
+            "How long checkpoints held the application",
+            ["container"],
+            buckets=FREEZE_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._restore = Histogram(
+            "avckpt_restore_seconds",
+            "Death of the application to its last thread running again",
+            ["container"],
+            buckets=RESTORE_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._taken = self._counter("avckpt_checkpoints_total", "Checkpoints taken")
+        self._missed = self._counter("avckpt_checkpoints_missed_total", "Checkpoints not taken, by error", "reason")
+        self._restores = self._counter(
+            "avckpt_restores_total",
+            "Deaths and roll backs, by cause and by what followed (restored, or why not)",
+            "reason",
+            "outcome",
+        )
+        self._notifications = self._counter(
+            "avckpt_notifications_total", "Notifications for a container, by outcome", "outcome"
+        )
+        self._generations = self._gauge("avckpt_generations", "Generations held")
+        self._memory = self._gauge(
+            "avckpt_generations_memory_bytes",
+            "Memory that a container's generations hold and its application does not use",
+        )
+        self._protected = self._gauge("avckpt_protected", "1 while at least one generation is held, else 0")
+        self._labels: dict[str, set[tuple[Counter | Histogram, tuple[str, ...]]]] = {}
+
+    def take(self, record: EventRecord) -> None:
+        """Counts an event."""
+        container = record.container
+        if record.kind is Kind.CHECKPOINT:
+            self._of(self._taken, container).inc()
+            self._of(self._freeze, container).observe(record.freeze_s or 0.0)
+        elif record.kind is Kind.MISSED:
+            self._of(self._missed, container, record.error.kind if record.error else "failed").inc()
+        elif record.kind in (Kind.RESTORED, Kind.GAVE_UP):
+            cause = record.reason.value if record.reason else ""
+            self._of(self._restores, container, cause, record.outcome.value if record.outcome else "").inc()
+            if record.restore_s is not None:
+                self._of(self._restore, container).observe(record.restore_s)
+        elif record.kind in (Kind.NOTIFIED, Kind.NOTIFY_FAILED):
+            outcome = "delivered" if record.kind is Kind.NOTIFIED else "failed"
+            self._of(self._notifications, container, outcome).inc()
+
+    def forget_all_but(self, containers: Iterable[str]) -> None:
+        """Drops the series of containers that nobody knows any more, or a year of new names would fill memory."""
+        for gone in set(self._labels) - set(containers):
+            for metric, labels in self._labels.pop(gone):
+                metric.remove(*labels)
+
+    def render(self, live: Iterable[Protected]) -> bytes:
+        """The text that Prometheus reads, with what the generations of each held at the last look."""
+        for gauge in (self._generations, self._memory, self._protected):
+            gauge.clear()
+        for container in live:
+            self._generations.labels(container.label).set(container.generations)
+            self._memory.labels(container.label).set(container.memory_bytes if container.generations else 0)
+            self._protected.labels(container.label).set(container.state is State.PROTECTED)
+        return generate_latest(self._registry)
+
+    def _counter(self, name: str, text: str, *labels: str) -> Counter:
+        return Counter(name, text, ["container", *labels], registry=self._registry)
+
+    def _gauge(self, name: str, text: str) -> Gauge:
+        return Gauge(name, text, ["container"], registry=self._registry)
+
+    def _of(self, metric: Metric, *labels: str) -> Metric:
+        self._labels.setdefault(labels[0], set()).add((metric, labels))
+        return metric.labels(*labels)

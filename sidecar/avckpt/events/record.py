@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One thing that happened to a container, as everybody is told of it.
+
+Log, API, history, notifications and metrics all use `EventRecord`, and what a
+field means is written here and nowhere else: the API's description and
+docs/events.md are checked against it.  No I/O.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, cast
+
+from avckpt.errors import AvckptError, from_json
+from avckpt.events.vocabulary import DROPPED_WORDS, Event, EventKind, Reason, describe_wait_status, why_not_restored
+
+
+class Kind(str, enum.Enum):
+    """What happened."""
+
+    REGISTERED = "registered"
+    ATTACHED = "attached"
+    CHECKPOINT = "checkpoint"
+    MISSED = "missed"
+    UNPROTECTED = "unprotected"
+    DIED = "died"
+    RESTORED = "restored"
+    GAVE_UP = "gave_up"
+    DROPPED = "dropped"
+    HEALTH = "health"
+    CONFIGURED = "configured"
+    REFUSED = "refused"
+    ENDED = "ended"
+    NOTIFIED = "notified"
+    NOTIFY_FAILED = "notify_failed"
+
+
+class Cause(str, enum.Enum):
+    """Why an application died, or was rolled back."""
+
+    SIGNAL = "signal"
+    EXIT = "exit"
+    UNHEALTHY = "unhealthy"
+    MANUAL = "manual"
+
+
+class Outcome(str, enum.Enum):
+    """What followed."""
+
+    RESTORED = "restored"
+    CLEAN_EXIT = "clean_exit"
+    STOPPED = "stopped"
+    POLICY = "policy"
+    LIMIT = "limit"
+    FAILED = "failed"
+    EMPTY = "empty"
+
+
+EXPECTED = frozenset({Outcome.CLEAN_EXIT, Outcome.STOPPED})
+"""Ends that somebody meant."""
+
+
+def said(description: str, default: Any = None) -> Any:
+    """A field of EventRecord with its meaning."""
+    return field(default=default, metadata={"description": description})
+
+
+@dataclass(frozen=True)
+class EventRecord:
+    """`_s` is a duration in seconds.  None: it means nothing for this kind."""
+
+    kind: Kind = field(metadata={"description": "what happened"})
+    container: str = said("name of the container, or its short id where it has none", "")
+    id: str = said("its id, 64 hex digits", "")
+    group: str = said("its `avckpt.group`, empty: none", "")
+    at: float = said("time of day, seconds since 1970", 0.0)
+    monotonic_s: float = said("the same instant on CLOCK_MONOTONIC, for differences", 0.0)
+    seq: int = said("number in the history, growing; 0: routine (every checkpoint), told once and not kept", 0)
+    reason: Cause | None = said("why the application died: `signal`, `exit`, `unhealthy` or `manual`")  # noqa: RUF009
+    outcome: Outcome | None = said(  # noqa: RUF009
+        "what followed: `restored`, or why not: `clean_exit`, `stopped` (meant), `policy` (avckpt.restore.on), "
+        "`limit` (avckpt.restore.max), `failed`, `empty` (no generation held)"
+    )
+    wait_status: int | None = said("of the death, as from waitpid(2)")
+    generation: int | None = said("number of the generation taken, restored or dropped, from 1")
+    generations: int | None = said("generations held now")
+    age_s: float | None = said("age of the restored generation when the application died, or of the dropped one")
+    lost_s: float | None = said("what the application lost: age_s and restore_s together")
+    freeze_s: float | None = said("how long the application stood still for this generation's checkpoint")
+    restore_s: float | None = said("death to the last thread running again")
+    threads: int | None = said("threads of the checkpoint or restore")
+    attempt: int | None = said(
+        "restores within the time of avckpt.restore.max, this one included; of a dropped generation: its crashes"
+    )
+    restores: int | None = said("restores since the sidecar protects this run of the container")
+    quiescent: bool | None = said("whether the checkpoint was taken at a quiet moment")
+    app_pid: int | None = said("the application's main process, in the sidecar's PID namespace")
+    app_pid_inside: int | None = said("the same in the container's")
+    detail: str = said("one clause for a person, where the rest does not say it", "")
+    error: AvckptError | None = said("what went wrong, as in the API's errors")  # noqa: RUF009
+
+    @property
+    def message(self) -> str:
+        """One line for a person, without the container's name."""
+        return _MESSAGES[self.kind](self)
+
+    def to_json(self) -> dict[str, object]:
+        """The fields that mean something, and `message`."""
+        data: dict[str, object] = {}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, enum.Enum):
+                value = value.value
+            elif isinstance(value, AvckptError):
+                value = value.to_json()
+            if value is not None:
+                data[each.name] = value
+        data["message"] = self.message
+        return data
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, object]) -> EventRecord:
+        """What `to_json()` made; what this release does not know is left out.
+
+        Raises ValueError when it is no event.
+        """
+        types = field_types()
+        values: dict[str, object] = {}
+        for name, value in data.items():
+            if name in types:
+                values[name] = _value(name, types[name], value)
+        if "kind" not in values:
+            raise ValueError("it has no kind")
+        return cls(**cast("dict[str, Any]", values))
+
+
+def _value(name: str, kind: type, value: object) -> object:
+    if kind is AvckptError and isinstance(value, dict):
+        return from_json(value)
+    if issubclass(kind, enum.Enum):
+        return kind(value)
+    if type(value) is kind or (kind is float and type(value) is int):
+        return value
+    raise ValueError(f"{name} is {value!r}")
+
+
+_TYPES: dict[str, type] = {cls.__name__: cls for cls in (Kind, Cause, Outcome, AvckptError, str, int, float, bool)}
+
+
+def field_types() -> dict[str, type]:
+    """Types of the fields of EventRecord by name, without the None."""
+    # Read as text: to evaluate `int | None` takes Python 3.10.
+    return {each.name: _TYPES[str(each.type).partition(" ")[0]] for each in fields(EventRecord)}
+
+
+_KINDS = {
+    EventKind.ATTACHED: Kind.ATTACHED,
+    EventKind.CHECKPOINT: Kind.CHECKPOINT,
+    EventKind.MISSED: Kind.MISSED,
+    EventKind.UNPROTECTED: Kind.UNPROTECTED,
+    EventKind.DIED: Kind.DIED,
+    EventKind.RESTORED: Kind.RESTORED,
+    EventKind.GAVE_UP: Kind.GAVE_UP,
+    EventKind.ENDED: Kind.ENDED,
+    EventKind.REFUSED: Kind.REFUSED,
+    EventKind.DROPPED: Kind.DROPPED,
+    EventKind.GUARD_LOST: Kind.UNPROTECTED,
+}
+_DEATHS = frozenset({Kind.DIED, Kind.RESTORED, Kind.GAVE_UP})
+_COUNTED = frozenset({Kind.CHECKPOINT, Kind.RESTORED, Kind.DROPPED})
+
+
+def of_guard(
+    event: Event,
+    *,
+    container: str = "",
+    id: str = "",
+    group: str = "",
+    at: float = 0.0,
+    freeze_s: float | None = None,
+    commanded: Cause | None = None,
+) -> EventRecord:
+    """What a guard said, as a record.
+
+    `freeze_s` is the freeze time of the generation that was restored, where it
+    is known, and `commanded` why a roll back was asked for, if one was.
+    """
+    kind = _KINDS[event.kind]
+    restored = kind is Kind.RESTORED
+    if kind is Kind.CHECKPOINT or kind is Kind.MISSED:
+        freeze_s = event.freeze_s
+    counted = kind in _COUNTED
+    return EventRecord(
+        kind=kind,
+        container=container,
+        id=id,
+        group=group,
+        at=at,
+        monotonic_s=event.at_ns / 1e9,
+        reason=_cause(event, commanded) if kind in _DEATHS else None,
+        outcome=_outcome(event),
+        wait_status=event.wait_status if kind in _DEATHS else None,
+        generation=event.generation if counted else None,
+        generations=event.generations if counted or kind is Kind.MISSED else None,
+        age_s=event.age_s if restored or kind is Kind.DROPPED else None,
+        lost_s=event.age_s + event.restore_s if restored else None,
+        freeze_s=freeze_s,
+        restore_s=event.restore_s if restored else None,
+        threads=event.threads if counted and kind is not Kind.DROPPED else None,
+        attempt=event.attempt if restored or kind is Kind.DROPPED else None,
+        restores=event.restores if restored else None,
+        quiescent=event.quiescent if kind is Kind.CHECKPOINT else None,
+        app_pid=event.app_pid or None,
+        app_pid_inside=event.app_pid_inside or None,
+        detail=DROPPED_WORDS.get(event.reason, "") if kind is Kind.DROPPED else "",
+        error=event.error,
+    )
+
+
+def _cause(event: Event, commanded: Cause | None) -> Cause | None:
+    if event.reason is Reason.COMMAND or commanded is not None:
+        return commanded or Cause.MANUAL
+    if event.reason is Reason.UNHEALTHY:
+        return Cause.UNHEALTHY
+    if event.wait_status & 0x7F:
+        return Cause.SIGNAL
+    return Cause.EXIT
+
+
+def _outcome(event: Event) -> Outcome | None:
+    if event.kind is EventKind.RESTORED:
+        return Outcome.RESTORED
+    if event.kind is EventKind.GAVE_UP:
+        # The engine's reasons to give up have the outcomes' names.
+        return Outcome.__members__.get(event.reason.name, Outcome.FAILED)
+    return None
+
+
+# ---- in words ---------------------------------------------------------------
+
+
+def _death(record: EventRecord) -> str:
+    if record.reason is Cause.MANUAL and record.kind is not Kind.GAVE_UP:
+        return "rolled back on command"
+    if record.reason is Cause.UNHEALTHY and record.kind is not Kind.GAVE_UP:
+        return "unhealthy, rolled back"
+    return describe_wait_status(record.wait_status or 0)
+
+
+def _why_not(record: EventRecord) -> str:
+    outcome = record.outcome or Outcome.FAILED
+    return why_not_restored(Reason[outcome.name], record.error)
+
+
+def _checkpoint(record: EventRecord) -> str:
+    return (
+        f"generation {record.generation}, {record.threads} thread(s), frozen {(record.freeze_s or 0) * 1000:.2f} ms"
+        f"{'' if record.quiescent else ', not at a quiet moment'}"
+    )
+
+
+def _restored(record: EventRecord) -> str:
+    return (
+        f"{_death(record)}, restored in {(record.restore_s or 0) * 1000:.1f} ms from generation {record.generation} "
+        f"({record.age_s or 0:.1f} s old), {record.threads} thread(s), restore {record.restores}"
+        f"{'' if record.error is None else f'; but {record.error}'}"
+    )
+
+
+def _nothing_held(record: EventRecord) -> str:
+    return "; nothing is held to go back to" if record.generations == 0 else ""
+
+
+def _crashes(record: EventRecord) -> str:
+    return f" ({record.attempt} time(s))" if record.attempt else ""
+
+
+def _detail(record: EventRecord) -> str:
+    return f"{record.detail}: {record.error}" if record.error else record.detail
+
+
+_MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
+    Kind.REGISTERED: lambda record: record.detail,
+    Kind.ATTACHED: lambda record: f"attached to application {record.app_pid} (inside {record.app_pid_inside})",
+    Kind.CHECKPOINT: lambda record: f"checkpoint: {_checkpoint(record)}",
+    Kind.MISSED: lambda record: f"checkpoint missed: {record.error}{_nothing_held(record)}",
+    Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
+    # Whether this is bad news is known only with what follows.
+    Kind.DIED: lambda record: f"died: {describe_wait_status(record.wait_status or 0)}",
+    Kind.RESTORED: _restored,
+    Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
+    Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
+    Kind.HEALTH: _detail,
+    Kind.CONFIGURED: _detail,
+    Kind.REFUSED: lambda record: f"command refused: {record.error}",
+    Kind.ENDED: lambda record: f"ended: {record.detail}" if record.detail else "ended",
+    Kind.NOTIFIED: lambda record: record.detail,
+    Kind.NOTIFY_FAILED: lambda record: f"was not notified: {record.detail}",
+}

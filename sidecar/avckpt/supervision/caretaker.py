@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looks after the daemon's containers beyond deaths: their health, and the memory generations hold.
+
+One per daemon, in its event loop.  It only gives orders to guards; what comes
+of them it hears like everybody else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from avckpt_hooks.shared.labels import Policy
+
+from avckpt.containers.cgroup import Groups, groups_of
+from avckpt.errors import AvckptError
+from avckpt.events.record import EventRecord
+from avckpt.guard import Command
+from avckpt.supervision.health import Ward, watch_health
+from avckpt.supervision.pressure import (
+    LEAST_WORTH_BYTES,
+    Advice,
+    Allowance,
+    HostPressure,
+    held_by,
+    now_s,
+)
+
+log = logging.getLogger("avckpt")
+
+LOOK_S = 1.0
+"""How often limits are looked at."""
+W = TypeVar("W", bound=Ward)
+
+
+@dataclass
+class _Care(Generic[W]):
+    ward: W
+    groups: Groups
+    """Where its memory is counted, and limited now or later."""
+    allowance: Allowance = field(default_factory=Allowance)
+    health: asyncio.Task[None] | None = None
+
+
+class Caretaker(Generic[W]):
+    """`begin()` and `end()` it for every container, `close()` it at the end."""
+
+    def __init__(self, run_dir: Path, tell: Callable[[W, EventRecord], EventRecord]) -> None:
+        self._health_dir = run_dir / "health"
+        self._tell = tell
+        self._cares: dict[int, _Care[W]] = {}
+        self._host: HostPressure | None = None
+        self._looking: asyncio.Task[None] | None = None
+        self._relieving: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begins to watch the host's memory."""
+        self._host = HostPressure()
+        if self._host.fd is not None:
+            asyncio.get_running_loop().add_reader(self._host.fd, self._host_is_short)
+
+    def begin(self, ward: W, policy: Policy) -> None:
+        """A container that is guarded from now on."""
+        try:
+            groups = groups_of(ward.container.init_pid)
+        except OSError:  # it has just ended
+            groups = Groups((), None, None)
+        care = self._cares[ward.container.cookie] = _Care(ward, groups)
+        if policy.restore_on.unhealthy:
+            self._watch_health(care)
+        self._look_if_needed()
+
+    def change(self, ward: W, policy: Policy) -> None:
+        """Another policy holds from now on; a health check that goes on keeps its count."""
+        care = self._cares.get(ward.container.cookie)
+        if care is None:
+            return
+        if policy.restore_on.unhealthy:
+            if care.health is None or care.health.done():
+                self._watch_health(care)
+        elif care.health is not None:
+            care.health.cancel()
+            care.health = None
+            self._order(care, Command.UNVOUCH)
+
+    def end(self, ward: W) -> None:
+        """Its guard is about to be stopped.  A second call does nothing."""
+        care = self._cares.pop(ward.container.cookie, None)
+        if care is not None and care.health is not None:
+            care.health.cancel()
+
+    async def close(self) -> None:
+        """Ends everything that is under way."""
+        tasks = [care.health for care in self._cares.values() if care.health is not None]
+        tasks += [task for task in (self._looking, self._relieving) if task is not None]
+        self._cares.clear()
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+        if self._host is not None:
+            if self._host.fd is not None:
+                asyncio.get_running_loop().remove_reader(self._host.fd)
+            self._host.close()
+
+    def _watch_health(self, care: _Care[W]) -> None:
+        ward, tell = care.ward, self._tell
+        answer = self._health_dir / f"{ward.container.id}.json"
+        care.health = asyncio.get_running_loop().create_task(
+            watch_health(ward, answer, lambda record: tell(ward, record))
+        )
+        care.health.add_done_callback(_log_failure)
+
+    def _must_look(self) -> bool:
+        blind = self._host is not None and self._host.fd is None
+        return any(blind or care.groups.memory or care.allowance.short for care in self._cares.values())
+
+    def _look_if_needed(self) -> None:
+        if self._must_look() and (self._looking is None or self._looking.done()):
+            self._looking = asyncio.get_running_loop().create_task(self._look())
+            self._looking.add_done_callback(_log_failure)
+
+    async def _look(self) -> None:
+        while self._must_look():
+            await asyncio.sleep(LOOK_S)
+            if self._host is not None and self._host.fd is None and self._host.is_high():
+                self._host_is_short()
+            for care in list(self._cares.values()):
+                advice = await self._advise(care)
+                if advice is Advice.DROP_OLDEST:
+                    self._order(care, Command.DROP_OLDEST)
+                elif advice is Advice.REFILL:
+                    self._order(care, Command.REFILL)
+
+    async def _advise(self, care: _Care[W]) -> Advice:
+        # The limit may be another one each time (podman update --memory).
+        limit = care.groups.memory_limit_bytes()
+        used = care.groups.memory_used_bytes() if limit is not None else None
+        if used is None or limit is None:
+            return care.allowance.come_back(now_s())
+        held = await held_by(care.ward.container) if care.allowance.near_limit(used, limit) else 0
+        return care.allowance.advise(used, limit, held, now_s())
+
+    def _host_is_short(self) -> None:
+        # Pressure that lasts is told every second; to look who holds most may take longer.
+        if self._relieving is None or self._relieving.done():
+            self._relieving = asyncio.get_running_loop().create_task(self._relieve())
+            self._relieving.add_done_callback(_log_failure)
+
+    async def _relieve(self) -> None:
+        most, held_most = None, LEAST_WORTH_BYTES
+        for care in list(self._cares.values()):
+            held = await held_by(care.ward.container)
+            if held >= held_most:
+                most, held_most = care, held
+        if most is None:
+            return
+        most.allowance.gave_up(now_s())
+        log.warning("the host is short of memory: %s gives up a generation", most.ward.container.label)
+        self._order(most, Command.DROP_OLDEST)
+        self._look_if_needed()
+
+    def _order(self, care: _Care[W], command: Command) -> None:
+        if care.ward.guard is not None:
+            with contextlib.suppress(AvckptError):  # it has ended
+                care.ward.guard.command(command, 0)
+
+
+def _log_failure(task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and task.exception() is not None:
+        log.error("the care of a container has ended", exc_info=task.exception())

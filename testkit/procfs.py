@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looks into /proc.  A process that has just ended is an empty answer, no error, where the docstring says so."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+GONE = (FileNotFoundError, ProcessLookupError)
+
+
+def children_of(pid: int) -> list[int]:
+    """The children of a process's main thread, oldest first, zombies included; empty when it is gone."""
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except GONE:
+        return []
+
+
+def below(pid: int) -> list[int]:
+    """Every process below one, nearest first, threads' children and zombies included; empty when it is gone."""
+    found, at = [pid], 0
+    while at < len(found):
+        with contextlib.suppress(*GONE):
+            for task in os.listdir(f"/proc/{found[at]}/task"):
+                found += map(int, Path(f"/proc/{found[at]}/task/{task}/children").read_text().split())
+        at += 1
+    return found[1:]
+
+
+def comm_of(pid: int) -> str:
+    """The name of proc(5); "" when there is no such process."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except GONE:
+        return ""
+
+
+def state_of(pid: int) -> str:
+    """The letter of proc(5): R, S, T, Z ...; X when there is no such process."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except GONE:
+        return "X"
+
+
+def numbers_of(pid: int) -> list[int]:
+    """A task's numbers in its PID namespaces, ours first, its own last.  Raises OSError when it is gone."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    line = next(line for line in status.splitlines() if line.startswith("NSpid:"))
+    return [int(word) for word in line.split()[1:]]
+
+
+def inside(pid: int) -> int:
+    """A task's number in its own PID namespace.  Raises OSError when it is gone."""
+    return numbers_of(pid)[-1]
+
+
+def threads(pid: int) -> dict[int, str]:
+    """Threads of a process: inner TID and name.  Raises OSError when it is gone."""
+    found = {}
+    for tid in os.listdir(f"/proc/{pid}/task"):
+        with contextlib.suppress(*GONE):  # it has just ended
+            found[inside(int(tid))] = Path(f"/proc/{pid}/task/{tid}/comm").read_text().strip()
+    return found
+
+
+def figures(pid: int) -> dict[str, int]:
+    """What /proc/PID/status and smaps_rollup give as one number each, kB where it is memory.
+
+    "Pss", say, is what a process has of memory when shared pages are divided.  Raises OSError when it is gone.
+    """
+    found = {}
+    for name in ("status", "smaps_rollup"):
+        for line in Path(f"/proc/{pid}/{name}").read_text().splitlines():
+            key, _, value = line.partition(":")
+            words = value.split()
+            if words and words[0].isdigit():
+                found[key] = int(words[0])
+    return found
