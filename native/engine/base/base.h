@@ -108,15 +108,6 @@ long proc_vm_pages(int statm_fd, long *anonymous);
 /* The PID a pidfd stands for, in our namespace, or -1. */
 pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
-
-/* A task as the scheduler sees it (/proc/PID/sched). */
-struct proc_sched {
-	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
-	uint64_t switches, migrations;
-};
-
-/* -1: the kernel does not tell, or it has ended. */
-int proc_sched(pid_t tid, struct proc_sched *sched);
 /* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
 int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 /* It is just ending, and may have closed already what it had open. */
@@ -164,6 +155,15 @@ int mapping_protection(const struct mapping *m);
 /* /proc/PID/limits, as getrlimit(2) numbers them; ~0: no limit.  0 or -1. */
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
+
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
 
 /* What is of interest in /proc/PID/status. */
 struct proc_status {

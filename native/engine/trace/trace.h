@@ -318,12 +318,12 @@ int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 void rewind_call(struct process *process, struct thread *thread);
 /* Just before it goes on: takes off what the stop has added to a wait. */
 void rewind_count_stop(const struct process *process, const struct thread *thread);
-/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
- * it sleeps. */
-void rewind_prepare(struct thread *thread);
 /* Registers as the app had them, before rewind_call() marked the call or the kernel made
  * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
 
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
