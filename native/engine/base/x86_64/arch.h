@@ -16,7 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
-#define ARCH_AUDIT AUDIT_ARCH_X86_64 /* as seccomp filters know it (linux/audit.h) */
+#define ARCH_AUDIT AUDIT_ARCH_X86_64           /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
@@ -116,6 +116,10 @@ void arch_resume(struct arch_regs *regs);
 /* `base` (a live user context of the task) sent to `pc` with one argument. */
 void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
 	       uint64_t arg);
+
+/* Likewise with two arguments, the stack as it is. */
+void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
+		uint64_t b);
 
 /* Fills in the context that inj_go_home() goes back to. */
 void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
