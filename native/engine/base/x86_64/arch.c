@@ -133,6 +133,18 @@ void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote 
 	regs->r.eflags &= ~(unsigned long long)FLAG_DF;
 }
 
+void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
+		uint64_t b)
+{
+	*regs = *base;
+	regs->r.rip = pc;
+	regs->r.rdi = a;
+	regs->r.rsi = b;
+	regs->r.rax = 0;
+	regs->r.orig_rax = -1ULL;
+	regs->r.eflags &= ~(unsigned long long)FLAG_DF;
+}
+
 /* What `add $1, %al; sahf` needs in %eax to bring the flags back. */
 static uint32_t flags_word(uint64_t eflags)
 {

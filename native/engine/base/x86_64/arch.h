@@ -117,6 +117,10 @@ void arch_resume(struct arch_regs *regs);
 void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
 	       uint64_t arg);
 
+/* Likewise with two arguments, the stack as it is. */
+void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
+		uint64_t b);
+
 /* Fills in the context that inj_go_home() goes back to. */
 void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
 
