@@ -107,6 +107,7 @@ def backend() -> Iterator[int]:
 
 def wait_answers(port: int) -> None:
     """Until somebody listens."""
+
     def connects() -> bool:
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
             return True

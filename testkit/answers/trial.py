@@ -38,9 +38,7 @@ class Outcome:
     wrong: list[str]
 
 
-def run(
-    server: str, requests: int, folder: Path, labels: Mapping[str, str] | None = None, seed: int = 1
-) -> Outcome:
+def run(server: str, requests: int, folder: Path, labels: Mapping[str, str] | None = None, seed: int = 1) -> Outcome:
     """Kills the main process again and again until there are so many answers, or a wrong one."""
     rng = random.Random(seed)
     config = config_of_labels({**OFTEN, **(labels or {})})
@@ -65,9 +63,7 @@ def run(
                 kills += 1
                 # What came wrong after the restore has to be heard; and some are to be served by it.
                 clients.wait_answered(min(requests, clients.answered + 10))
-    return Outcome(
-        server, kills, clients.asked, clients.answered, clients.closed, clients.silent, list(clients.wrong)
-    )
+    return Outcome(server, kills, clients.asked, clients.answered, clients.closed, clients.silent, list(clients.wrong))
 
 
 def _app(init: Init) -> int:
