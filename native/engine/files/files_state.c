@@ -631,8 +631,8 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 
 bool file_tcp_moved(const struct file *want, const struct file *now)
 {
-	return !want->tcp_counted || !now->tcp_counted ||
-	       want->tcp_written != now->tcp_written || want->tcp_taken != now->tcp_taken;
+	return !want->tcp_counted || !now->tcp_counted || want->tcp_written != now->tcp_written ||
+	       want->tcp_taken != now->tcp_taken;
 }
 
 /* connect(2) to nothing resets it, shutdown(2) makes it read as closed. */
