@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS
-from native.guarded import GuardProcess, Victim, children_of, config
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import SLOWNESS
 
 CHILDREN = 40
 PATIENCE_S = 30.0 * SLOWNESS
@@ -21,7 +22,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 def guard_of(peer: GuardProcess, cookie: int = 1) -> int:
     """The process that protects that container."""
-    return sorted(children_of(peer.pid))[cookie - 1]
+    return peer.guards[cookie - 1]
 
 
 def fds(pid: int) -> int:

@@ -32,6 +32,7 @@
 #include "files.h"
 
 #define CONTENT_MAX (1 << 20)
+#define DRAIN_READS 16384       /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
 #define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
@@ -394,12 +395,14 @@ static int reopen(int fd, int flags)
 static void drain(int fd, const struct file *want)
 {
 	char buf[65536];
+	int reads = 0;
 	ssize_t n;
 
+	/* Somebody outside of the application may go on writing. */
 	do {
 		n = want->kind == FILE_PIPE ? read(fd, buf, sizeof buf)
 					    : recv(fd, buf, sizeof buf, MSG_DONTWAIT);
-	} while (n > 0);
+	} while (n > 0 && ++reads < DRAIN_READS);
 }
 
 const char *file_put_content(int fd, int other_fd, const struct file *want)
@@ -448,16 +451,24 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 
 static const char *put_count(int fd, const struct file *want, const struct file *now)
 {
-	uint64_t value;
+	uint64_t value, count;
 	struct iovec io = { &value, sizeof value };
 
 	if (now && now->count == want->count)
 		return NULL;
-	/* Down to 0 without ever waiting, whatever its flags are. */
-	for (int i = 0; i < 1000000; i++)
+	count = file_count(fd); /* another process that has it may have put it back */
+	if (count == want->count)
+		return NULL;
+	/* Without ever waiting, whatever its flags are.  A semaphore's goes down by one; one that is
+	 * far too high has been given up for a new one (files_restore.c). */
+	for (int i = 0; count > want->count && i < FILE_COUNT_READS; i++) {
 		if (preadv2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value)
-			break;
-	value = want->count;
+			return "its count could not be put back";
+		count -= value < count ? value : count;
+	}
+	if (count > want->count)
+		return "its count could not be put back";
+	value = want->count - count;
 	if (value && pwritev2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value &&
 	    write(fd, &value, sizeof value) < 0)
 		return "its count could not be put back";
