@@ -6,6 +6,7 @@
  *
  *   shared   MANY areas of shared memory of its own, of a page each
  *   wiped    MANY MB of memory that is wiped in forks (MADV_WIPEONFORK), never touched
+ *   common   MANY MB of shared memory that all of them have
  */
 #include "victim.h"
 
@@ -23,7 +24,7 @@ static void have(const char *kind, size_t many)
 		must(!madvise(map(many << 20, PROT_READ | PROT_WRITE, MAP_PRIVATE), many << 20,
 			      MADV_WIPEONFORK),
 		     "MADV_WIPEONFORK");
-	else
+	else if (!strcmp(kind, "shared"))
 		for (size_t i = 0; i < many; i++) {
 			*(int *)map(4096, PROT_READ | PROT_WRITE, MAP_SHARED) = 1;
 			/* Between them, or the kernel makes one of them. */
@@ -39,6 +40,8 @@ int main(int argc, char **argv)
 	victim_start(&argc, argv, 3, "KIND PROCESSES MANY");
 	processes = atoi(argv[2]);
 	there = map(4096, PROT_READ | PROT_WRITE, MAP_SHARED);
+	if (!strcmp(argv[1], "common"))
+		map((size_t)atol(argv[3]) << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
 	for (int i = 0; i < processes; i++) {
 		const pid_t child = fork();
 
