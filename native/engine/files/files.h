@@ -257,6 +257,7 @@ struct files {
 };
 
 struct files_work;
+struct tcp_info;
 
 enum files_depth {
 	FILES_BEFORE, /* everything about what stays the same; the app runs         */
@@ -341,6 +342,7 @@ void files_connect_again(struct files_work *work);
 /* files_stream.c */
 /* Whether bytes are just coming in; whether some that were to go out did not fit. */
 bool file_is_coming(int fd);
+bool file_was_coming(const struct tcp_info *info, int unread);
 bool file_is_going(int fd);
 /* Looks at epoll sets for who waits to write on. */
 void files_find_going(struct files *files);

@@ -46,6 +46,7 @@ void memory_forget(struct memory *memory)
 {
 	areas_free(&memory->areas);
 	areas_free(&memory->foreign);
+	areas_free(&memory->unkept);
 	*memory = (struct memory){ 0 };
 }
 
@@ -412,7 +413,8 @@ int memory_finish(struct process *process, struct generation *generation, int64_
 	uint64_t left_bytes;
 
 	generation->image->seen = NULL; /* it was the freeze's                  */
-	if (areas_check(process, generation, err) || wiped_fill(process, generation, setup, err))
+	if (areas_check(process, generation, err) || wiped_fill(process, generation, setup, err) ||
+	    (!process->descendant && areas_check_unkept(process, generation, err)))
 		return -1;
 	lock_again(process, locked_kb, setup);
 	advise_again(process->memory, setup);

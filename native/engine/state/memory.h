@@ -64,6 +64,7 @@ struct memory {
 	} hole[HOLES_MAX];
 	struct areas areas;
 	struct areas foreign; /* of others, too; by what they are, not where        */
+	struct areas unkept;  /* beyond the limit, or not writable here; likewise    */
 	uint64_t layout;      /* a hash of the mappings when the areas were read */
 	uint64_t read_ns, cost_ns;
 	uint64_t left_bytes;   /* shared memory beyond the limit                  */
@@ -118,6 +119,10 @@ void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags);
  * often as it is worth it, and when the layout has changed. */
 int areas_check(struct process *process, const struct generation *generation,
 		struct avc_error *err) warn_unused;
+/* When all processes are known: -1 if several of them have shared memory that is not rolled back
+ * with them.  One that went back would wait for what another one had done. */
+int areas_check_unkept(const struct process *main, const struct generation *generation,
+		       struct avc_error *err) warn_unused;
 /* A descriptor of that process, open for writing, of what the area is; -1: none. */
 int area_find_descriptor(pid_t pid, const struct area *area);
 
