@@ -390,8 +390,7 @@ void files_connect_again(struct files_work *work)
 		fd = files_borrow_placed(work, w);
 		if (fd >= 0)
 			files_note(work, w,
-				   connect_unix(fd, w->socket, work->generation->template,
-						work->init));
+				   connect_unix(fd, w->socket, work->image->template, work->init));
 		close_fd(&fd);
 	}
 }

@@ -638,19 +638,18 @@ static int remember(struct process *process, pid_t template, struct areas *found
 
 /* Were the areas that were copied those that there are?  Of the long file only as
  * often as it is worth it, and when the layout has changed. */
-static int check_areas(struct process *process, const struct generation *generation,
-		       struct avc_error *err)
+static int check_areas(struct process *process, const struct image *image, struct avc_error *err)
 {
 	static const struct areas none;
 	struct memory *memory = process->memory;
-	const struct areas *copied = generation->image ? &generation->image->areas : &none;
+	const struct areas *copied = image->memory ? &image->memory->areas : &none;
 	struct survey survey = { .process = process, .limit = process->shm_bytes };
 	struct areas *found;
 	uint64_t start = now_ns();
 	int result = 0;
 
-	if (proc_mappings(generation->template, "maps", hash_mapping, &survey))
-		return fail_errno(err, generation->template, "keep memory", "read(maps)",
+	if (proc_mappings(image->template, "maps", hash_mapping, &survey))
+		return fail_errno(err, image->template, "keep memory", "read(maps)",
 				  "it was killed");
 	if (survey.layout == memory->layout &&
 	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
@@ -661,14 +660,14 @@ static int check_areas(struct process *process, const struct generation *generat
 	start = now_ns();
 	survey = (struct survey){
 		.process = process,
-		.template = generation->template,
+		.template = image->template,
 		.memory = memory,
 		.limit = process->shm_bytes,
 		.areas = found,
 	};
 	memory->advised.count = memory->kinds.count = 0;
-	if (proc_mappings(generation->template, "smaps", find_area, &survey))
-		result = fail_errno(err, generation->template, "keep memory", "read(smaps)",
+	if (proc_mappings(image->template, "smaps", find_area, &survey))
+		result = fail_errno(err, image->template, "keep memory", "read(smaps)",
 				    "it was killed");
 	memory->read_ns = now_ns();
 	memory->cost_ns = memory->read_ns - start;
@@ -678,7 +677,7 @@ static int check_areas(struct process *process, const struct generation *generat
 		result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "", "%s",
 			      memory_private_huge_pages);
 	if (!result && !same_areas(found, copied)) {
-		result = remember(process, generation->template, found, err);
+		result = remember(process, image->template, found, err);
 		if (!result)
 			result = fail(err, AVC_RETRY, 0, process->pid, "keep memory", "",
 				      "it has new shared or MADV_WIPEONFORK memory");
@@ -686,9 +685,9 @@ static int check_areas(struct process *process, const struct generation *generat
 	memory->layout = result ? 0 : survey.layout;
 	free(found);
 out:
-	if (generation->image)
-		generation->image->kinds = memory->kinds;
-	if (!result && generation->image && !generation->image->whole)
+	if (image->memory)
+		image->memory->kinds = memory->kinds;
+	if (!result && image->memory && !image->memory->whole)
 		result = fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
 			      "its shared memory can not be read");
 	return result;
@@ -697,33 +696,33 @@ out:
 /* ---- when the app runs again ------------------------------------------------------------- */
 
 /* Puts the wiped areas into the template, which is stopped. */
-static int fill_wiped(struct process *process, struct generation *generation, struct setup *setup,
+static int fill_wiped(struct process *process, struct image *image, struct setup *setup,
 		      struct avc_error *err)
 {
 	struct inj_call *call = &setup->slot->template_call;
-	const struct mem_image *image = generation->image;
-	const uint8_t *from = image ? image->data : NULL;
+	const struct mem_image *kept = image->memory;
+	const uint8_t *from = kept ? kept->data : NULL;
 	int mem_fd = -1, result = 0;
 
 	call_begin(call, INJ_AFTER_PARK);
-	for (uint32_t i = 0; !result && image && i < image->areas.count; i++) {
-		const struct area *a = &image->areas.area[i];
+	for (uint32_t i = 0; !result && kept && i < kept->areas.count; i++) {
+		const struct area *a = &kept->areas.area[i];
 
 		if (a->wiped && mem_fd < 0)
-			mem_fd = proc_open(generation->template, "mem", O_RDWR);
+			mem_fd = proc_open(image->template, "mem", O_RDWR);
 		if (a->wiped &&
 		    pwrite(mem_fd, from, area_bytes(a), (off_t)a->start) != (ssize_t)area_bytes(a))
-			result = fail_errno(err, generation->template, "keep memory", "write(mem)",
+			result = fail_errno(err, image->template, "keep memory", "write(mem)",
 					    "it was killed");
 		if (a->wiped) {
 			call_add(call, SYS_madvise, a->start, area_bytes(a), MADV_KEEPONFORK, 0, 0);
 			setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise, a->start,
 				  area_bytes(a), MADV_WIPEONFORK, 0, 0);
 		}
-		if (call->count >= INJ_CALLS_MAX || (call->count && i + 1 == image->areas.count)) {
-			if (parasite_send(&process->parasite, generation->template,
-					  &generation->base, call, err) ||
-			    parasite_run(generation->template, call, err))
+		if (call->count >= INJ_CALLS_MAX || (call->count && i + 1 == kept->areas.count)) {
+			if (parasite_send(&process->parasite, image->template, &image->base, call,
+					  err) ||
+			    parasite_run(image->template, call, err))
 				result = -1;
 			call_begin(call, INJ_AFTER_PARK);
 		}
@@ -795,12 +794,12 @@ static void seal_again(const struct memory *memory, struct setup *setup)
 				->flags = INJ_MAY_FAIL;
 }
 
-int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
+int memory_finish(struct process *process, struct image *image, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err)
 {
 	const struct thread *main_thread = thread_find(process, process->pid);
 
-	if (check_areas(process, generation, err) || fill_wiped(process, generation, setup, err))
+	if (check_areas(process, image, err) || fill_wiped(process, image, setup, err))
 		return -1;
 	lock_again(process, locked_kb, setup);
 	advise_again(process->memory, setup);
