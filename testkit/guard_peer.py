@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that holds the engine, and nothing else: so that tests can give it commands, and kill it.
+"""A process that starts guards, and nothing else: so that tests can give them commands, and kill them.
 
     python -m testkit.guard_peer CONFIG INIT_PID...
 
@@ -8,6 +8,7 @@ JSON on standard output.  Commands are lines on standard input:
 
     checkpoint COOKIE TICKET       restore COOKIE TICKET
     burst COOKIE TICKET N          N checkpoints back to back; one line {"burst": TICKET, ...} at the end
+    check COOKIE MS                kills a guard that has not been heard of for so long
     stop                           stops the guards and ends
 
 The end of the input ends it as `stop` does.
@@ -23,8 +24,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from avckpt.engine import Engine
-from avckpt.events.vocabulary import Event, EventKind
-from avckpt.guard import Command, GuardConfig
+from avckpt.events.vocabulary import Kind
+from avckpt.guard import Command, Event, GuardConfig
 
 
 def config_of_json(text: str) -> GuardConfig:
@@ -49,7 +50,7 @@ class Burst:
     def take(self, event: Event) -> None:
         """Counts the answer to one of them."""
         self.left -= 1
-        if event.kind is EventKind.CHECKPOINT:
+        if event.kind is Kind.CHECKPOINT:
             self.taken += 1
             self.freeze_s.append(event.freeze_s)
         else:
@@ -99,6 +100,9 @@ class Peer:
     def obey(self, words: list[str]) -> None:
         """One line of the input."""
         cookie, ticket = int(words[1]), int(words[2])
+        if words[0] == "check":
+            self.guards[cookie].check(ticket / 1000)
+            return
         if words[0] == "burst":
             self.burst = Burst(cookie, ticket, int(words[3]))
             self.guards[cookie].command(Command.CHECKPOINT, ticket)
@@ -129,7 +133,7 @@ def main() -> None:
     """See above."""
     with Engine() as engine:
         peer = Peer(engine, config_of_json(sys.argv[1]), [int(pid) for pid in sys.argv[2:]])
-        tell({"kind": "started"})
+        tell({"kind": "started", "guards": [guard.pid for guard in peer.guards.values()]})
         peer.serve()
         for guard in peer.guards.values():
             guard.stop()

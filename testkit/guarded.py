@@ -9,6 +9,7 @@ import json
 import os
 import random
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -69,7 +70,7 @@ class GuardProcess:
         self._tickets = 0
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.wait("started")
+        self.guards: list[int] = self.wait("started")["guards"]
 
     def __enter__(self) -> GuardProcess:
         return self
@@ -86,10 +87,21 @@ class GuardProcess:
 
     @property
     def pid(self) -> int:
-        return self.process.pid
+        """The (first) guard."""
+        return self.guards[0]
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """SIGKILL for the guards, then for the process that started them; returns when they are gone."""
+        pidfds = []
+        for pid in self.guards:
+            with contextlib.suppress(ProcessLookupError):
+                pidfds.append(os.pidfd_open(pid))
+        for pidfd in pidfds:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+        for pidfd in pidfds:
+            select.select([pidfd], [], [], PATIENCE_S)
+            os.close(pidfd)
         self.process.kill()
         self.process.wait()
 
@@ -268,7 +280,7 @@ def since_linux(major: int, minor: int, what: str) -> pytest.MarkDecorator:
 
 def parasites(pid: int) -> int:
     """Mappings of ours in a process."""
-    return Path(f"/proc/{pid}/maps").read_text().count("/dev/zero (deleted)")
+    return Path(f"/proc/{pid}/maps").read_text().count("/memfd:avckpt-parasite (deleted)")
 
 
 def kill_at_random(
@@ -325,6 +337,6 @@ def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *vict
         cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr + "".join(victim.said for victim in victims)
-    assert done.stderr == ""
+    assert done.stderr == "", done.stderr
     said: dict[str, object] = json.loads(done.stdout)
     return said

@@ -1,52 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills a guarding process at random moments, again and again.
+"""Kills guards at random moments, again and again.
 
     python -m testkit.kill_storm CONFIG KILLS MAX_MS SEED INIT_PID...
 
-Each round forks a process that starts an engine with a guard for every init, and kills it with
-SIGKILL up to MAX_MS ms later.  Prints one line of JSON at the end: what was hit, and what was
-left behind in the containers.
+Each round starts a guard for every init, and kills them with SIGKILL up to MAX_MS ms later.
+Prints one line of JSON at the end: what was hit, and what was left behind in the containers.
 """
 
 from __future__ import annotations
 
 import json
-import mmap
 import os
 import random
 import select
 import signal
-import struct
 import sys
 import time
+from collections import Counter
 from pathlib import Path
-from typing import NoReturn
 
 from avckpt.engine import Engine
-from avckpt.events.vocabulary import EventKind
+from avckpt.events.vocabulary import Kind
 from avckpt.guard import GuardConfig
 
 from testkit.guard_peer import config_of_json
 from testkit.procfs import children_of
 
-KINDS = (EventKind.ATTACHED, EventKind.CHECKPOINT, EventKind.MISSED, EventKind.UNPROTECTED)
+KINDS = (Kind.ATTACHED, Kind.CHECKPOINT, Kind.MISSED, Kind.UNPROTECTED)
 LEAVE_S = 3.0
-
-
-def guard_for_ever(guard_config: GuardConfig, inits: list[int], counts: mmap.mmap) -> NoReturn:
-    """What is killed."""
-    with Engine() as engine:
-        for cookie, pid in enumerate(inits, 1):
-            engine.start_guard(os.pidfd_open(pid), guard_config, cookie)
-        seen = dict.fromkeys(KINDS, 0)
-        while True:
-            select.select([engine.event_fd], [], [])
-            while (event := engine.next_event()) is not None:
-                if event.kind in seen:
-                    seen[event.kind] += 1
-                    struct.pack_into(f"{len(KINDS)}Q", counts, 0, *seen.values())
-                if event.kind is EventKind.UNPROTECTED:
-                    print(event, file=sys.stderr, flush=True)
 
 
 def ours_below(init: int) -> list[str]:
@@ -72,35 +53,45 @@ def wait_gone(inits: list[int]) -> list[str]:
         time.sleep(0.001)
 
 
+def round_of_guards(engine: Engine, guard_config: GuardConfig, inits: list[int], patience_s: float) -> Counter[Kind]:
+    """Guards of all of them, killed after some time; what they said until then."""
+    guards = []
+    for cookie, pid in enumerate(inits, 1):
+        pidfd = os.pidfd_open(pid)
+        guards.append(engine.start_guard(pidfd, guard_config, cookie))
+        os.close(pidfd)
+    time.sleep(patience_s)
+    for guard in guards:
+        os.kill(guard.pid, signal.SIGKILL)  # our children, not reaped yet
+    seen: Counter[Kind] = Counter()
+    while seen[Kind.GUARD_LOST] < len(guards):
+        select.select([engine.event_fd], [], [], 10.0)
+        while (event := engine.next_event()) is not None:
+            seen[event.kind] += 1
+            if event.kind is Kind.UNPROTECTED:
+                print(event, file=sys.stderr, flush=True)
+    for guard in guards:
+        guard.stop()
+    return seen
+
+
 def main() -> None:
     """See above."""
     guard_config = config_of_json(sys.argv[1])
     kills, max_ms, seed = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
     inits = [int(pid) for pid in sys.argv[5:]]
     rng = random.Random(seed)
-    counts = mmap.mmap(-1, 4096)
-    totals = [0] * len(KINDS)
+    totals: Counter[Kind] = Counter()
     hit = 0
     left: list[str] = []
-    for _ in range(kills):
-        counts[:] = bytes(4096)
-        child = os.fork()
-        if child == 0:
-            try:
-                guard_for_ever(guard_config, inits, counts)
-            finally:
-                os._exit(1)
-        time.sleep(rng.uniform(0.0, max_ms) / 1000)
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        if not os.WIFSIGNALED(status):
-            raise SystemExit(f"the guarding process ended by itself, status {status:#x}")
-        round_counts = struct.unpack_from(f"{len(KINDS)}Q", counts)
-        totals = [total + n for total, n in zip(totals, round_counts)]
-        hit += round_counts[1] > 0
-        left += wait_gone(inits)
-    names = [kind.name.lower() for kind in KINDS]
-    print(json.dumps({"kills": kills, "hit": hit, "left": left, **dict(zip(names, totals))}))
+    with Engine() as engine:
+        for _ in range(kills):
+            seen = round_of_guards(engine, guard_config, inits, rng.uniform(0.0, max_ms) / 1000)
+            totals += seen
+            hit += seen[Kind.CHECKPOINT] > 0
+            left += wait_gone(inits)
+    said = {kind.name.lower(): totals[kind] for kind in KINDS}
+    print(json.dumps({"kills": kills, "hit": hit, "left": left, **said}))
 
 
 if __name__ == "__main__":

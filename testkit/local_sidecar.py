@@ -19,7 +19,7 @@ from avckpt.cli.client import Client
 from avckpt.containers.process import has_ended
 from avckpt.errors import SidecarUnreachable
 
-from testkit.harness import Completed, avckpt_command, run, wait_until
+from testkit.harness import ROOT, Completed, avckpt_command, run, wait_until
 from testkit.procfs import children_of, inside
 
 QUICK = {"avckpt.enable": "true", "avckpt.interval": "100ms"}
@@ -135,20 +135,25 @@ class LocalSidecar:
             raise AssertionError(f"{error}; it is {last}; log:\n{self.log}") from None
         return last
 
-    def container(self, name: str, argv: Sequence[str], container_id: str | None = None) -> Container:
-        """Starts avckpt-init with a program; nobody is told of it yet."""
+    def container(
+        self, name: str, argv: Sequence[str], container_id: str | None = None, *, init: bool = True
+    ) -> Container:
+        """Starts avckpt-init with a program, or the program alone; nobody is told of it yet."""
         output = self.run_dir.parent / f"{name}-{len(self.containers)}.out"
+        command = (str(init_binary()), "--wait-ms", "2000", "--") if init else ()
         # unshare stays as the parent, so that the container has an exit status to wait for.
         with output.open("wb") as out:
             process = subprocess.Popen(
-                ["unshare", "--pid", "--fork", "--mount-proc", str(init_binary()), "--wait-ms", "2000", "--", *argv],
+                ["unshare", "--pid", "--fork", "--mount-proc", *command, *argv],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=out,
+                cwd=ROOT,
             )
         init_pid = wait_until(lambda: next(iter(children_of(process.pid)), 0), 5, "init starts")
         pidfd = os.pidfd_open(init_pid)
-        wait_until(lambda: children_of(init_pid), 5, "the application starts")
+        if init:
+            wait_until(lambda: children_of(init_pid), 5, "the application starts")
         made = Container(
             container_id or f"{len(self.containers) + 1:x}".rjust(2, "c") * 32,
             name,

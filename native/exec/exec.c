@@ -309,32 +309,23 @@ static void drop_privileges(void)
 		if (job.ambient >> cap & 1)
 			must(prctl(PR_CAP_AMBIENT, PR_CAP_AMBIENT_RAISE, cap, 0, 0) == 0,
 			     "prctl(CAP_AMBIENT)");
-	if (job.no_new_privs) {
+	if (job.no_new_privs)
 		must(prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0, "prctl(NO_NEW_PRIVS)");
-		install_filters();
-	}
 }
 
-/* Whoever has CAP_SYS_PTRACE in the container's PID namespace can take a process in
- * there over, also one that is not dumpable.  So privileges go first, and what the
- * container can make last for as long as it likes comes when they are gone: its
- * control groups (a CPU quota, a freezer) and its working directory (FUSE). */
+/* Whoever has CAP_SYS_PTRACE in the container's PID namespace can take a process in there
+ * over, also one that is not dumpable.  So what is born there is what the command will be,
+ * with nothing more: its parent, which is outside, has become that before.  What the
+ * container can make last for as long as it likes comes when it is there: its control
+ * groups (a CPU quota, a freezer) and its working directory (FUSE). */
 static _Noreturn void become_command(int gate)
 {
 	char go;
 
-	must(prctl(PR_SET_DUMPABLE, 0, 0, 0, 0) == 0, "prctl(SET_DUMPABLE)");
+	if (job.no_new_privs)
+		install_filters();
 	must(setsid() >= 0, "setsid");
-	for (int i = 0; i < job.cgroup_count; i++)
-		close(job.cgroup_fds[i]);
-	for (int i = 0; i < RLIM_NLIMITS; i++)
-		if (setrlimit((__rlimit_resource_t)i, &job.limits[i]))
-			errno = 0; /* raise_limits() could not */
-	umask(022);
-	must(close_range(3, ~0U, CLOSE_RANGE_CLOEXEC) == 0, "close_range");
-	drop_privileges();
-	/* After the change of credentials, which clears it.  A parent that has died
-	 * before that has closed the gate. */
+	/* A parent that has died before that has closed the gate. */
 	must(prctl(PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0) == 0, "prctl(SET_PDEATHSIG)");
 	must(write(gate, "", 1) == 1 && read(gate, &go, 1) == 1, "avckpt-exec has ended");
 	/* Who may not enter the main process's directory could do nothing there, and
@@ -346,6 +337,65 @@ static _Noreturn void become_command(int gate)
 	execvp(job.command[0], job.command);
 	dprintf(2, "%s: %s\n", job.command[0], strerror(errno));
 	_exit(errno == ENOENT ? EXIT_NOT_FOUND : EXIT_CANNOT_RUN);
+}
+
+/* And the standard three; all of them are for us alone. */
+static void keep_only(const int *fds, size_t count)
+{
+	unsigned int from = 3;
+
+	for (;;) {
+		unsigned int next = ~0U;
+
+		for (size_t i = 0; i < count; i++)
+			if (fds[i] >= (int)from && (unsigned int)fds[i] < next)
+				next = (unsigned int)fds[i];
+		if (next > from)
+			must(close_range(from, next - 1, 0) == 0, "close_range");
+		if (next == ~0U)
+			break;
+		from = next + 1;
+	}
+	must(close_range(3, ~0U, CLOSE_RANGE_CLOEXEC) == 0, "close_range");
+}
+
+/* Outside of the PID namespace, until it has become the container's.  The command is a child of
+ * its parent's. */
+static _Noreturn void go_inside(int gate, int namespaces)
+{
+	long child;
+
+	must(prctl(PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0) == 0, "prctl(SET_PDEATHSIG)");
+	must(setns(job.pidfd, namespaces) == 0, "setns");
+	for (int i = 0; i < RLIM_NLIMITS; i++)
+		if (setrlimit((__rlimit_resource_t)i, &job.limits[i]))
+			errno = 0; /* raise_limits() could not */
+	umask(022);
+	keep_only((int[]){ gate, error_fd, job.cwd_fd }, 3);
+	drop_privileges();
+	must(prctl(PR_SET_DUMPABLE, 0, 0, 0, 0) == 0, "prctl(SET_DUMPABLE)");
+	child = syscall(SYS_clone, CLONE_PARENT | SIGCHLD, NULL, NULL, NULL, NULL);
+	must(child >= 0, "clone");
+	if (child == 0)
+		become_command(gate);
+	_exit(0);
+}
+
+/* What go_inside() has brought forth: our only child now.  Whatever it says itself is the
+ * container's.  0: it has not come to that, and has said why. */
+static pid_t find_command(pid_t between)
+{
+	char path[64], text[64] = "";
+	int status, fd;
+
+	must(waitpid(between, &status, 0) == between, "waitpid");
+	if (!WIFEXITED(status) || WEXITSTATUS(status))
+		return 0;
+	snprintf(path, sizeof path, "/proc/self/task/%d/children", getpid());
+	fd = open(path, O_RDONLY | O_CLOEXEC);
+	must(fd >= 0 && read(fd, text, sizeof text - 1) >= 0, path);
+	close(fd);
+	return atoi(text);
 }
 
 /* Waits until the child has given up its privileges, and lets it go on in the
@@ -396,14 +446,14 @@ int main(int argc, char **argv)
 	must(socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, gate) == 0, "socketpair");
 	if (other_user_namespace())
 		namespaces |= CLONE_NEWUSER;
-	must(setns(job.pidfd, namespaces) == 0, "setns");
 	child = fork(); /* setns(2) of a PID namespace is for children */
 	must(child >= 0, "fork");
-	if (child == 0) {
-		close(gate[0]);
-		become_command(gate[1]);
-	}
+	if (child == 0)
+		go_inside(gate[1], namespaces);
 	close(gate[1]);
+	child = find_command(child);
+	if (!child)
+		return EXIT_OURS;
 	let_go(child, gate[0]);
 	sigaddset(&wanted, SIGCHLD);
 	sigaddset(&wanted, SIGTERM);

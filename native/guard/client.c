@@ -124,13 +124,13 @@ static void guard_lost(struct avc_guard *guard)
 				   .at_ns = now_ns() };
 
 	if (guard->hung)
-		fail(&event.error, AVC_DEADLINE, 0, 0, "guard", "",
+		fail(&event.error, AVC_DEADLINE, 0, 0, "", "",
 		     "its guard gave no sign of life and was killed");
 	else if (WIFSIGNALED(guard->status))
-		fail(&event.error, AVC_GONE, 0, 0, "guard", "", "its guard was killed by signal %d",
+		fail(&event.error, AVC_GONE, 0, 0, "", "", "its guard was killed by signal %d",
 		     WTERMSIG(guard->status));
 	else
-		fail(&event.error, AVC_GONE, 0, 0, "guard", "", "its guard ended with status %d",
+		fail(&event.error, AVC_GONE, 0, 0, "", "", "its guard ended with status %d",
 		     WEXITSTATUS(guard->status));
 	queue_event(guard->engine, &event);
 }

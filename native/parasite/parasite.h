@@ -88,9 +88,6 @@ struct inj_control {
 	uint64_t nonce;       /* of the guard that made it                      */
 	struct inj_call runner __attribute__((aligned(64))); /* a live thread of the app */
 	struct inj_call holder __attribute__((aligned(64)));
-	/* Timeouts of rewound calls, which the kernel reads from here instead of
-	 * from where the app had them (see rewind.c): { seconds, nanoseconds }. */
-	int64_t timeout[64][2] __attribute__((aligned(64)));
 	/* What is left of the app's timers (timers.c). */
 	struct inj_timer timer[INJ_TIMERS_MAX];
 };

@@ -130,7 +130,7 @@ def examine(path: Path) -> tuple[Defaults, list[Problem]]:
         return Defaults(), [Problem(error.place, error.why)]
     try:
         document = {} if root is None else _plain(root)
-    except RecursionError:  # an anchor inside itself
+    except RecursionError:
         return Defaults(), [Problem(Place(str(path), 1), "nested too deeply")]
     problems = list(_repetitions(root, path))
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from avckpt.containers.cgroup import groups_of
 from avckpt.errors import TargetGone
 from avckpt.supervision.inside import OUTPUT_BYTES, Done, _sealed_program, run_inside
 
-from testkit.harness import Container, ContainerFactory, Podman, wait_until
+from testkit.harness import ROOT, Container, ContainerFactory, Podman, wait_until
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root")
 
@@ -167,6 +168,34 @@ def test_a_container_can_hold_only_what_has_no_privileges(container: ContainerFa
         asyncio.run(look())
     finally:
         os.close(pidfd)
+
+
+def test_nothing_of_the_sidecars_is_in_reach(container: ContainerFactory, tmp_path: Path) -> None:
+    """A container with CAP_SYS_PTRACE takes over what comes into its PID namespace, as soon as it is there."""
+    options = ["--cap-drop", "all", "--cap-add", "SYS_PTRACE", "--security-opt", "seccomp=unconfined"]
+    victims = ROOT / "tests/victims"
+    subprocess.run(["make", "-s", "-C", str(victims), "STATIC=1", "build-static/intruder"], check=True)
+    made = container("sleep", "1000", options=[*options, "--volume", f"{victims}/build-static:/victims:ro"])
+    pidfd = os.pidfd_open(made.pid)
+
+    async def run_many() -> None:
+        while intruder.poll() is None:
+            await run_inside(pidfd, ["true"], timeout_s=10)
+
+    with (
+        (tmp_path / "said").open("w") as out,
+        subprocess.Popen(
+            ["podman", "exec", made.name, "/victims/intruder", "60", "--count", "300", "--command"], stdout=out
+        ) as intruder,
+    ):
+        try:
+            asyncio.run(run_many())
+        finally:
+            intruder.kill()
+            os.close(pidfd)
+    said = (tmp_path / "said").read_text()
+    assert said.count("looked at") == 300
+    assert "GAIN" not in said, said
 
 
 def test_a_directory_that_its_user_may_not_enter(

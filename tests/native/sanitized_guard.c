@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * sanitized_guard INIT_PID INTERVAL_MS COMMANDS: guards one container with an
- * engine built with ASan and UBSan, so that a test sees what they find.  Prints
- * one word per event; sends COMMANDS checkpoint commands; stops the guard on
- * SIGTERM, frees everything (LeakSanitizer looks at the end) and ends with 0.
+ * sanitized_guard GUARD INIT_PID INTERVAL_MS COMMANDS: the daemon's side, built with ASan and
+ * UBSan as the program GUARD is, guards one container, so that a test sees what they find.
+ * Prints one word per event; sends COMMANDS checkpoint commands; stops the guard on SIGTERM,
+ * frees everything (LeakSanitizer looks at the end, in both) and ends with 0.
  */
 #include <poll.h>
 #include <signal.h>
@@ -24,7 +24,7 @@ static void on_term(int signal)
 
 static const char *const names[] = { "?",           "attached", "checkpoint", "missed",
 				     "unprotected", "died",     "restored",   "gave-up",
-				     "ended",       "refused",  "dropped" };
+				     "ended",       "refused",  "dropped",    "guard-lost" };
 
 int main(int argc, char **argv)
 {
@@ -41,20 +41,20 @@ int main(int argc, char **argv)
 	struct pollfd news = { .events = POLLIN };
 	int ended = 0;
 
-	if (argc != 4)
+	if (argc != 5)
 		return 2;
 	sigaction(SIGTERM, &action, NULL);
 	setvbuf(stdout, NULL, _IOLBF, 0);
-	config.interval_ns = strtoull(argv[2], NULL, 10) * 1000000;
-	config.init_pidfd = (int)syscall(SYS_pidfd_open, atoi(argv[1]), 0);
-	engine = avc_engine_new(&error);
-	if (!engine || avc_engine_probe(&error))
+	config.interval_ns = strtoull(argv[3], NULL, 10) * 1000000;
+	config.init_pidfd = (int)syscall(SYS_pidfd_open, atoi(argv[2]), 0);
+	engine = avc_engine_new(argv[1], &error);
+	if (!engine || avc_engine_probe(argv[1], &error))
 		goto failed;
 	guard = avc_guard_start(engine, &config, 7, &error);
 	if (!guard)
 		goto failed;
 	news.fd = avc_engine_event_fd(engine);
-	for (int i = 0; i < atoi(argv[3]); i++)
+	for (int i = 0; i < atoi(argv[4]); i++)
 		if (avc_guard_command(guard, AVC_COMMAND_CHECKPOINT, (uint64_t)i + 1, &error))
 			goto failed;
 	while (!stop && !ended) {

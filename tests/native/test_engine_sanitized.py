@@ -19,6 +19,7 @@ from testkit.guarded import Victim
 from testkit.harness import ROOT, wait_until
 
 SOURCE = Path(__file__).with_name("sanitized_guard.c")
+GUARD = ROOT / "native/build-san/avckpt-guard"
 FLAGS = [
     "-std=gnu11",
     "-D_GNU_SOURCE",
@@ -33,7 +34,7 @@ FLAGS = [
 def guard_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run(["make", "-s", "-C", str(ROOT / "native"), "SANITIZE=1"], check=True, timeout=300)
     program = tmp_path_factory.mktemp("sanitized") / "guard"
-    library = ROOT / "native/build-san/libavckpt.a"
+    library = ROOT / "native/build-san/libavckpt-client.a"
     subprocess.run(
         ["cc", *FLAGS, f"-I{ROOT}/native/include", str(SOURCE), str(library), "-o", str(program)],
         check=True,
@@ -67,7 +68,7 @@ def guarding(program: Path, victim: Victim, interval_ms: int, commands: int, out
     environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=1:detect_stack_use_after_return=0"}
     with output.open("wb") as file:
         popen = subprocess.Popen(
-            [program, str(victim.pid), str(interval_ms), str(commands)],
+            [program, GUARD, str(victim.pid), str(interval_ms), str(commands)],
             stdout=file,
             stderr=subprocess.STDOUT,
             env=environment,
@@ -83,6 +84,7 @@ def guarding(program: Path, victim: Victim, interval_ms: int, commands: int, out
     assert "Sanitizer" not in guard.said, guard.said
     assert "runtime error" not in guard.said, guard.said
     assert status == 0, guard.said
+    assert guard.count("guard-lost") == 0, guard.said
 
 
 @pytest.mark.parametrize(

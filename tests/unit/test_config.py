@@ -76,7 +76,7 @@ def test_no_file_is_no_mistake(path: Path) -> None:
         ("default:\n  interval: 3s\n", "1: default: unknown key; known are defaults and names"),
         ("- interval\n", "1: the file: not a mapping"),
         ("defaults:\n  interval: [3s\nnames:\n", "3: not YAML: while parsing a flow sequence"),
-        ("defaults: &a\n  keep: [*a]\n", "1: nested too deeply"),
+        ("defaults: &a\n  keep: [*a]\n", "1: an anchor that holds itself"),
         ("defaults:\n  restore.on: unhealthy\n  keep: 1\n", "3: keep: 1: too few for avckpt.restore.on=unhealthy"),
         (
             "defaults:\n  restore.on: unhealthy\nnames:\n  a: {interval: 1s}\n  b:\n    keep: 1\n",

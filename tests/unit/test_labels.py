@@ -10,7 +10,17 @@ import string
 from pathlib import Path
 
 import pytest
-from avckpt_hooks.shared.labels import LABELS, RESTORES_MAX, LabelError, Notify, Policy, RestoreOn, merge, parse_policy
+from avckpt_hooks.shared.labels import (
+    LABELS,
+    RESTORES_MAX,
+    LabelError,
+    Notify,
+    Policy,
+    RestoreOn,
+    merge,
+    parse_policy,
+    shown,
+)
 
 ON = {"avckpt.enable": "true"}
 
@@ -145,7 +155,7 @@ def test_how_a_container_wants_to_be_notified(text: str, means: Notify) -> None:
 
 def test_the_engine_takes_every_number_of_restores_that_a_label_may_ask_for() -> None:
     """More would be a container that runs unprotected."""
-    source = (Path(__file__).parents[2] / "native" / "engine" / "guard.h").read_text()
+    source = (Path(__file__).parents[2] / "native" / "engine" / "base" / "base.h").read_text()
     assert f"#define RESTORES_MAX {RESTORES_MAX}\n" in source
     assert parse_policy({**ON, "avckpt.restore.max": f"{RESTORES_MAX}/1s"}).restore_max == RESTORES_MAX
 
@@ -223,3 +233,20 @@ def test_merge_keeps_what_is_stamped_to_itself(key: str) -> None:
     assert merge({}, {key: "of an earlier start"}) == {}
     with pytest.raises(LabelError, match="avckpt sets this itself"):
         merge({key: "mine"}, {})
+
+
+@pytest.mark.parametrize(
+    ("value", "means"),
+    [
+        ("exec:/bin/told --password=x", "exec:/bin/told ..."),
+        ("exec: /bin/told --password=x", "exec: ..."),
+        ("exec:/bin/told", "exec:/bin/told"),
+        ("signal:USR1", "signal:USR1"),
+    ],
+)
+def test_of_a_command_only_the_program_is_shown(value: str, means: str) -> None:
+    """Its arguments may be secret, and errors go to the journal."""
+    assert shown(value) == means
+    error = LabelError("avckpt.notify", value, "wrong", "allowed: right")
+    assert "password" not in str(error)
+    assert f"avckpt.notify={means}" in str(error)

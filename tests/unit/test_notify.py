@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import pytest
 from avckpt.containers.protected import Protected
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 from avckpt.policy import config_of_labels
 from avckpt.supervision.notify import Notifier
 from avckpt_hooks.shared.labels import Notify

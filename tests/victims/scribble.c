@@ -8,35 +8,15 @@
  */
 #include <pthread.h>
 
-#include "parasite.h"
-#include "victim.h"
+#include "parasite_place.h"
 
-#define FIRST_PAD (UINT64_C(32) << 40)
 #define FAR_TOO_MANY 0x00ffffff
-
-/* NULL: there is none yet. */
-static struct inj_control *find_parasite(void)
-{
-	struct inj_control *found = NULL;
-	FILE *maps = fopen("/proc/self/maps", "re");
-	char line[512];
-	uint64_t start;
-
-	must(maps != NULL, "/proc/self/maps");
-	while (!found && fgets(line, sizeof(line), maps))
-		if (sscanf(line, "%lx-%*x r-x", &start) == 1 && start >= FIRST_PAD &&
-		    start % (UINT64_C(64) << 20) == 0)
-			found = (struct inj_control *)(start + INJ_CODE_BYTES);
-	fclose(maps);
-	return found;
-}
 
 static void *scribble(void *unused)
 {
-	struct inj_control *control;
+	struct inj_control *control =
+		(struct inj_control *)(await_parasite().start + INJ_CODE_BYTES);
 
-	while (!(control = find_parasite()) || control->magic != INJ_MAGIC)
-		usleep(1000);
 	count(0, 1);
 	for (;;)
 		__atomic_store_n(&control->runner.count, FAR_TOO_MANY, __ATOMIC_RELAXED);

@@ -11,6 +11,7 @@
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
  *   proc.c          /proc
+ *   pagemap.c       which pages of a process are there
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
  */
@@ -155,6 +156,15 @@ int mapping_protection(const struct mapping *m);
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
+
 /* What is of interest in /proc/PID/status. */
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
@@ -171,7 +181,9 @@ int proc_status(pid_t tid, struct proc_status *status);
 /* "/proc/PID/NAME" opened, or -1 with errno. */
 int proc_open(pid_t pid, const char *name, int flags);
 /* What is mapped there (proc(5), map_files), or -1 with errno.  Needs CAP_CHECKPOINT_RESTORE or
- * CAP_SYS_ADMIN. */
+ * CAP_SYS_ADMIN.  For writing only of who stands still, with all that share its memory (a template):
+ * another could map something else meanwhile, which it may only read; and only if it was open for
+ * writing there, too. */
 int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags);
 /* Whether that was open for writing, and not for reading alone: the link says so (fs/proc/base.c,
  * proc_map_files_instantiate()). */
@@ -180,6 +192,26 @@ bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
+
+/* ---- pagemap.c ------------------------------------------------------------------------ */
+
+/* An entry, of one page. */
+#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
+#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
+#define PAGEMAP_FILE (UINT64_C(1) << 61)
+#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
+#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
+/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE (Linux 6.13); the headers may be older. */
+#define GUARD_INSTALL 102
+#define GUARD_REMOVE 103
+
+/* A guard page without a mapping of its own (madvise(2)); one of the process's own. */
+bool page_is_guard(uint64_t entry);
+bool page_is_own(uint64_t entry);
+/* Calls fn for every stretch in which there are pages of no file, or guard pages; for all of it
+ * if the kernel cannot tell (before Linux 6.7).  Stops when fn does not return 0.  0 or -1. */
+int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
+		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
 
 /* ---- rt_priority.c -------------------------------------------------------------------- */
 

@@ -40,16 +40,20 @@ static struct mapped_path mapped_path(pid_t pid, avc_remote start, avc_remote en
 	return path;
 }
 
-int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
-{
-	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
-}
-
 bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end)
 {
 	struct stat st;
 
 	return lstat(mapped_path(pid, start, end).text, &st) == 0 && st.st_mode & S_IWUSR;
+}
+
+int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
+{
+	if ((flags & O_ACCMODE) != O_RDONLY && !proc_mapped_for_writing(pid, start, end)) {
+		errno = EACCES;
+		return -1;
+	}
+	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
 }
 
 /* From the start, also of one that was read before; what is read is terminated. */
@@ -467,6 +471,25 @@ pid_t proc_pidfd_pid(int pidfd)
 int proc_pidfd_open(pid_t pid)
 {
 	return (int)syscall(SYS_pidfd_open, pid, 0);
+}
+
+int proc_sched(pid_t tid, struct proc_sched *sched)
+{
+	char buf[4096];
+	const char *ran, *switches, *migrations;
+	unsigned long long ms, ns;
+
+	if (proc_read(tid, "sched", buf, sizeof buf) <= 0)
+		return -1;
+	ran = strstr(buf, "\nse.exec_start");
+	switches = strstr(buf, "\nnr_switches");
+	migrations = strstr(buf, "\nse.nr_migrations");
+	if (!ran || !switches || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
+	    sscanf(switches, " %*s : %lu", &sched->switches) != 1 ||
+	    sscanf(migrations, " %*s : %lu", &sched->migrations) != 1)
+		return -1;
+	sched->ran_ns = ms * NS_PER_MS + ns;
+	return 0;
 }
 
 /* A task gets the flag before it closes anything (kernel/exit.c, do_exit()). */

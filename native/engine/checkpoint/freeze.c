@@ -131,7 +131,7 @@ static int keep(struct image *image, bool strict, struct mem_seen *seen, struct 
 	if (process->descendant) {
 		if (strict)
 			image->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
-		if (memory_prepare(process->memory, &image->memory, seen, err))
+		if (memory_prepare(process, &image->memory, seen, err))
 			return -1;
 		/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */
 		memory_copy_own(process, image->memory);
@@ -264,6 +264,7 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 		    freeze_await_clone(image->process, &image->template, err))
 			return -1;
 		image->vm_pages = image->process->clone_pages;
+		image->taken_ns = generation->taken_ns;
 	}
 	return 0;
 }

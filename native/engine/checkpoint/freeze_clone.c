@@ -76,21 +76,6 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 	return 0;
 }
 
-static bool anybody_uses(const struct process *process, avc_remote base, size_t bytes)
-{
-	for (uint32_t i = 0; i < process->thread_count; i++) {
-		const struct thread *t = &process->threads[i];
-
-		for (unsigned int n = 0; n < 6; n++)
-			if (arch_syscall_arg(&t->regs, n) - base < bytes)
-				return true;
-		/* What we took for the app's own timeout (rewind.c). */
-		if (t->rewound.argument >= 0 && t->rewound.original - base < bytes)
-			return true;
-	}
-	return false;
-}
-
 /* ECHILD, if it has none: the one question that needs no look at each thread. */
 static const struct inj_syscall *ask_for_children(struct inj_call *call)
 {
@@ -120,8 +105,6 @@ static void drop_old_parasites(struct process *process, struct inj_call *call)
 		const avc_remote base = process->old_parasite[process->old_parasites - 1].base;
 		const size_t bytes = process->old_parasite[process->old_parasites - 1].bytes;
 
-		if (anybody_uses(process, base, bytes))
-			return;
 		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
 		process->clone_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 	}

@@ -75,10 +75,7 @@ static int quieten(struct image *image, struct avc_error *err)
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
-			  PTRACE_O_SUSPEND_SECCOMP)) ||
-	    arch_regs_get(pid, &image->base))
+	if (parasite_own(&process->parasite, pid) || arch_regs_get(pid, &image->base))
 		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
 	memset(call->out, 0, sizeof call->out);
 	memcpy(call->out, "avckpt-tmpl", 12);
@@ -213,10 +210,12 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	if (image->headless)
 		fill_ended(image);
 	image->sandboxed = status.seccomp == 1 || status.seccomp_filters > process->plain_filters;
-	if (memory_finish(process, image, status.locked_kb, &setup, err))
+	if (status.seccomp == 1)
+		process->parasite.seccomp = SECCOMP_SUPERVISED;
+	if (memory_finish(image, status.locked_kb, &setup, err))
 		return -1;
 	pending_setup(process, &setup);
-	if (attributes_keep(process, image, err))
+	if (attributes_keep(image, err))
 		return -1;
 	timers_setup(process, &setup);
 	if (process->descendant)
@@ -302,6 +301,7 @@ int generation_finish(struct generation *generation, struct avc_error *err)
 		*err = again;
 	if (again.code || restore_plan_check(generation, err))
 		return -1;
+	memory_note_left(generation->image, generation->images, &generation->image[0].notice);
 	/* Not before its size was compared with the app's. */
 	for (uint32_t i = 0; i < generation->images; i++)
 		if (generation->image[i].process)

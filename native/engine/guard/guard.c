@@ -267,14 +267,30 @@ static bool any_lost(const struct avc_guard *guard)
 	return false;
 }
 
+/* Calls of the app's that a checkpoint has interrupted.  When the first of those that are
+ * left is to be ended. */
+static uint64_t end_waits(struct avc_guard *guard)
+{
+	uint64_t due = UINT64_MAX;
+
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		waits_end(guard->tree.process[i], guard->timer);
+		if (guard->tree.process[i]->due_ns < due)
+			due = guard->tree.process[i]->due_ns;
+	}
+	return due;
+}
+
 static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
+	const uint64_t waits_ns = end_waits(guard);
 	const uint64_t now = now_ns();
 	const uint64_t check_ns = guard_exec_check_due(guard);
 	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
 							     : tracee_ending_due();
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
-	const uint64_t due = guard->next_ns < sooner_ns ? guard->next_ns : sooner_ns;
+	const uint64_t soon_ns = waits_ns < sooner_ns ? waits_ns : sooner_ns;
+	const uint64_t due = guard->next_ns < soon_ns ? guard->next_ns : soon_ns;
 	uint64_t ns = due > now ? due - now : 0;
 	struct timespec timeout;
 	nfds_t n = 0;
@@ -334,6 +350,7 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
+	last_pid_forget();
 	guard_drop_all(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
@@ -459,6 +476,7 @@ static void guard_free(struct avc_guard *guard)
 	files_written_free(guard->written);
 	process_free_room(&guard->main);
 	tree_free(&guard->tree);
+	mem_others_free(guard->main.others);
 	free(guard->fds);
 	free(guard);
 }
@@ -487,7 +505,9 @@ int guard_run(int socket)
 	guard = guard_new(socket, &start, init_pidfd);
 	if (!guard)
 		return GUARD_UNTOLD;
-	if (!process_make_room(&guard->main) || tree_init(&guard->tree, &guard->main)) {
+	guard->main.others = mem_others_new();
+	if (!process_make_room(&guard->main) || !guard->main.others ||
+	    tree_init(&guard->tree, &guard->main)) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {

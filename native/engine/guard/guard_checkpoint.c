@@ -254,6 +254,7 @@ void guard_work_ahead(struct avc_guard *guard)
 	guard->ahead_ns = UINT64_MAX;
 	if (!guard->count)
 		return;
+	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
 	if (drop_old_spare(guard))
 		; /* which has to end first */
@@ -272,7 +273,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	struct image *main = &freeze->generation->image[0];
 
 	if (prepare_files(guard, err) ||
-	    memory_prepare(main->process->memory, &main->memory, &freeze->seen, err))
+	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
 	if (guard->config.files == AVC_FILES_STRICT)
 		watch_files(guard, main);
@@ -283,6 +284,9 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 			touch_slot(&process->parasite, main->slot, process->thread_count);
 	}
 	wait_quiescent(guard, &freeze->generation->quiescent);
+	for (uint32_t i = 0; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process)
+			waits_prepare(guard->tree.entry[i].process);
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);
 	return 0;
@@ -313,6 +317,39 @@ static void settle_files(struct avc_guard *guard, struct generation *fresh)
 				    before ? before->images : 0);
 }
 
+static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_event *event,
+		   struct avc_error *err)
+{
+	struct generation *fresh = freeze->generation;
+	int result;
+
+	if (prepare_freeze(guard, freeze, err)) {
+		generation_drop(fresh);
+		return -1;
+	}
+	result = freeze_tree(freeze, err);
+	event->freeze_ns = freeze->freeze_ns;
+	event->stop_ns = freeze->stop_ns;
+	event->clone_ns = freeze->clone_ns;
+	event->threads = generation_threads(fresh);
+	if (result || finish(guard, fresh, err)) {
+		abandon(guard, fresh);
+		return -1;
+	}
+	event->error = *generation_notice(fresh);
+	settle_files(guard, fresh);
+	fresh->number = ++guard->number;
+	fresh->clone_ns = freeze->clone_ns;
+	begin_ahead(guard, fresh);
+	guard_keep_generation(guard, fresh);
+	init_channel_arm(&guard->channel, true);
+	event->generation = fresh->number;
+	event->generations = guard->count;
+	event->quiescent = fresh->quiescent;
+	guard_tend_tree(guard);
+	return 0;
+}
+
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
 	struct generation fresh;
@@ -324,31 +361,9 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 
 	if (generation_new(&fresh, &guard->main, guard_free_slot(guard), err))
 		return -1;
-	if (prepare_freeze(guard, &freeze, err)) {
-		generation_drop(&fresh);
-		return -1;
-	}
-	result = freeze_tree(&freeze, err);
-	event->freeze_ns = freeze.freeze_ns;
-	event->stop_ns = freeze.stop_ns;
-	event->clone_ns = freeze.clone_ns;
-	event->threads = generation_threads(&fresh);
-	if (result || finish(guard, &fresh, err)) {
-		abandon(guard, &fresh);
-		return -1;
-	}
-	event->error = *generation_notice(&fresh);
-	settle_files(guard, &fresh);
-	fresh.number = ++guard->number;
-	fresh.clone_ns = freeze.clone_ns;
-	begin_ahead(guard, &fresh);
-	guard_keep_generation(guard, &fresh);
-	init_channel_arm(&guard->channel, true);
-	event->generation = fresh.number;
-	event->generations = guard->count;
-	event->quiescent = fresh.quiescent;
-	guard_tend_tree(guard);
-	return 0;
+	result = take_by(guard, &freeze, event, err);
+	mem_seen_free(&freeze.seen);
+	return result;
 }
 
 /* A limit of processes, or of memory, leaves no room for a template: spares have to go, and

@@ -80,7 +80,7 @@ int guard_probe(struct avc_error *err)
 	result = probe_child(child, err);
 	if (!result) {
 		fd = proc_open_mapped(child, (avc_remote)page, (avc_remote)page + ARCH_PAGE_BYTES,
-				      O_RDWR);
+				      O_RDONLY);
 		if (fd < 0)
 			result = fail_errno(err, 0, "probe", "open(map_files)",
 					    "needs CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN");

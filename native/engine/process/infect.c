@@ -3,13 +3,20 @@
  * Parasite and holder are brought into the live app through its main thread; the
  * other threads run on meanwhile.
  *
- * To get the first mapping, the thread makes two system calls (mmap, mprotect)
- * from a stub in the zero padding behind some executable mapping, the vDSO's as
- * a rule.  The stub ends by loading the thread's own registers, so it gets home
- * without us.
+ * The parasite is memory that the guard makes (parasite.c), so that what the app does to its own
+ * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a
+ * process with the same memory, from a stub in the zero padding behind some executable mapping, the
+ * vDSO's as a rule.  The porter takes leave of the app's descriptors, so that no number is taken
+ * for a moment that the app could miss; in a table of its own it is sent the memory over a socket,
+ * maps it, and is killed.  It makes one system call at a time, of which every register is set from
+ * outside.
+ *
+ * The stub ends by loading the thread's own registers, so it gets home without us, and a porter
+ * that we can not tell what to do ends by itself.
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/close_range.h>
 #include <sched.h>
 #include <signal.h>
 #include <stdio.h>
@@ -20,6 +27,7 @@
 #include <sys/ptrace.h>
 #include <sys/random.h>
 #include <sys/resource.h>
+#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/uio.h>
 #include <sys/wait.h>
@@ -101,12 +109,11 @@ static int survey(struct process *process, avc_remote pc, avc_remote *cave, stru
 
 		if (sscanf(line, "%lx-%lx %4s", &start, &end, mode) != 3)
 			continue;
-		if (strstr(line, "/dev/zero (deleted)")) {
+		if (strstr(line, "/memfd:" PARASITE_NAME " (deleted)")) {
 			if (!strcmp(mode, "r-xs") && end - start == INJ_CODE_BYTES) {
 				code = start;
 				code_end = end;
 			} else {
-				/* In one piece until its first pages are made executable. */
 				note_old_pad(process, code && start == code_end ? code : start,
 					     end);
 				code = 0;
@@ -129,48 +136,138 @@ static int survey(struct process *process, avc_remote pc, avc_remote *cave, stru
 	return 0;
 }
 
-/* One system call from the stub.  The thread is in a plain trap stop before and
- * after; its own registers are put back by the caller. */
-static int stub_syscall(struct thread *thread, avc_remote cave, long nr, const uint64_t arg[6],
-			long *result, struct avc_error *err)
+static int step_failed(const struct stop *stop, pid_t tid, struct avc_error *err)
 {
-	const uint64_t all = ~UINT64_C(0);
-	const pid_t tid = thread->tid;
+	if (stop->kind == STOP_DEADLINE)
+		return fail(err, AVC_DEADLINE, 0, tid, "infect", "",
+			    "it did not get to run in time");
+	return fail(err, AVC_GONE, 0, tid, "infect", "", "it has ended");
+}
+
+/* To the next entry into a system call, exit from one, or new task.  Other stops may come in
+ * between: job control, or SIGSTOP, which can not be blocked. */
+static int step(pid_t tid, struct stop *stop, struct avc_error *err)
+{
+	do {
+		if (seccomp_go_on(tid, stop))
+			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
+		*stop = tracee_wait(tid, 0);
+		if (stop->kind == STOP_EXIT || stop->kind == STOP_DYING ||
+		    stop->kind == STOP_DEADLINE)
+			return step_failed(stop, tid, err);
+	} while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK);
+	return 0;
+}
+
+/* From stop to stop, to the exit from a call `nr` that will not be made again.  1: on the way it
+ * has brought forth *child. */
+static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_error *err)
+{
+	struct stop stop = { .kind = STOP_OTHER };
 	struct arch_regs regs;
 
-	arch_stub_call(&regs, &thread->regs, cave, nr, arg);
-	if (thread_suspend_seccomp(thread, err))
-		return -1;
-	if (arch_regs_set(tid, &regs) || ptrace(PTRACE_SETSIGMASK, tid, sizeof all, &all))
-		return fail_errno(err, tid, "infect", "ptrace(SETREGS)", "it has gone");
+	for (;;) {
+		if (step(tid, &stop, err))
+			return -1;
+		if (stop.kind == STOP_FORK && child) {
+			*child = stop.message;
+			return 1;
+		}
+		if (stop.kind == STOP_FORK || tracee_enters_call(tid))
+			continue;
+		if (arch_regs_get(tid, &regs))
+			return fail_errno(err, tid, "infect", "ptrace(GETREGS)", "it has gone");
+		*result = arch_syscall_result(&regs);
+		/* -ERESTARTSYS and its like (include/linux/errno.h): for a SIGSTOP. */
+		if (arch_syscall_nr(&regs) == nr && (*result > -512 || *result < -516))
+			return 0;
+	}
+}
+
+struct porter {
+	pid_t pid;
+	avc_remote cave;
+	const struct arch_regs *base;
+};
+
+/* The main thread makes it, and stays in the event's stop. */
+static int make_porter(struct process *process, struct thread *thread, struct porter *porter,
+		       struct avc_error *err)
+{
+	const uint64_t all = ~UINT64_C(0);
+	/* The main process' is init's child.  Another's is its own, of which nobody is told: all of
+	 * that process stands still until the stub has waited for it. */
+	const uint64_t kin = process->descendant ? 0 : CLONE_PARENT | SIGCHLD;
+	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | kin };
+	struct arch_regs regs;
+	long refused;
+	int born;
+
+	arch_stub_call(&regs, &thread->regs, porter->cave, SYS_clone, arg);
+	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
+	    arch_regs_set(thread->tid, &regs) ||
+	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
+		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
 	thread->borrowed_for = NULL;
-	/* Entry and exit.  Other stops may come in between: job control, or SIGSTOP,
-	 * which can not be blocked. */
-	for (int stops = 0, signal = 0; stops < 2;) {
-		struct stop stop;
-
-		if (ptrace(PTRACE_SYSCALL, tid, NULL, (long)signal))
-			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
-		stop = tracee_wait(tid, 0);
-		signal = stop.kind == STOP_SIGNAL ? stop.signal : 0;
-		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
-			return fail(err, AVC_GONE, 0, tid, "infect", "", "it has ended");
-		if (stop.kind == STOP_DEADLINE) {
-			thread->stopped = false;
-			return fail(err, AVC_DEADLINE, 0, tid, "infect", "",
-				    "it did not get to run in time");
-		}
-		stops += stop.kind == STOP_SYSCALL;
-	}
-	if (arch_regs_get(tid, &regs))
-		return fail_errno(err, tid, "infect", "ptrace(GETREGS)", "it has gone");
-	*result = arch_syscall_result(&regs);
-	if (tracee_settle(tid, err)) {
-		/* It runs: in the stub, which must stay, and home. */
-		thread->stopped = false;
+	born = step_over(thread->tid, SYS_clone, &refused, &porter->pid, err);
+	if (born < 0) {
+		process->lost = true;
+		thread->stopped = false; /* it runs: in the stub, which must stay, and home */
 		return -1;
 	}
+	if (!born) {
+		if (tracee_settle(thread->tid, err)) {
+			thread->stopped = false;
+			return -1;
+		}
+		return fail(err, AVC_KERNEL, (int)-refused, process->pid, "infect", "clone",
+			    "it may not have another process: %s", strerror((int)-refused));
+	}
+	if (tracee_await(porter->pid, NULL, err) != STOP_TRAP)
+		return -1;
+	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    seccomp_supervise(porter->pid, 0, (long)TRACE_OPTIONS_OURS))
+		return fail_errno(err, porter->pid, "infect", "ptrace(SETOPTIONS)", "it has ended");
+	return 0;
+}
+
+/* The porter is gone: the main thread out of the stub's calls, to where it can be sent home. */
+static int leave_stub(struct thread *thread, struct avc_error *err)
+{
+	long result;
+
+	/* It is inside of clone(2) still. */
+	if (step_over(thread->tid, SYS_clone, &result, NULL, err) == 0 &&
+	    step_over(thread->tid, ARCH_STUB_WAIT, &result, NULL, err) == 0 &&
+	    tracee_settle(thread->tid, err) == 0)
+		return 0;
+	thread->stopped = false;
+	return -1;
+}
+
+static int porter_call(const struct porter *porter, long nr, const uint64_t arg[6], long *result,
+		       struct avc_error *err)
+{
+	struct arch_regs regs;
+
+	arch_stub_call(&regs, porter->base, porter->cave, nr, arg);
+	if (arch_regs_set(porter->pid, &regs))
+		return fail_errno(err, porter->pid, "infect", "ptrace(SETREGS)", "it has gone");
+	return step_over(porter->pid, nr, result, NULL, err);
+}
+
+/* One that must not fail. */
+static int porter_must(const struct porter *porter, const char *name, const char *problem, long nr,
+		       const uint64_t arg[6], struct avc_error *err)
+{
+	long result;
+
+	if (porter_call(porter, nr, arg, &result, err))
+		return -1;
+	if (result < 0 && result > -4096)
+		return fail(err, AVC_UNSUPPORTED, (int)-result, porter->pid, "infect", name, "%s",
+			    problem);
 	return 0;
 }
 
@@ -200,34 +297,115 @@ static int check_room(const struct process *process, size_t bytes, struct avc_er
 		    bytes / 1024);
 }
 
-static int make_pad(struct process *process, struct thread *thread, avc_remote cave, uint32_t slots,
-		    uint32_t threads_max, struct avc_error *err)
+/* The other end of a socket of the porter's, whose own one is descriptor 0: the first of a table
+ * that it shares with nobody. */
+static int open_channel(const struct porter *porter, avc_remote scratch, struct avc_error *err)
+{
+	const uint64_t leave[6] = { 0, ~0u, CLOSE_RANGE_UNSHARE };
+	const uint64_t pair[6] = { AF_UNIX, SOCK_STREAM, 0, scratch };
+	const uint64_t ours[6] = { 1 };
+	int pidfd, channel;
+
+	if (porter_must(porter, "close_range", "it needs a table of descriptors of its own",
+			SYS_close_range, leave, err) ||
+	    porter_must(porter, "socketpair", "it may not have a socket", SYS_socketpair, pair,
+			err))
+		return -1;
+	pidfd = proc_pidfd_open(porter->pid);
+	channel = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 1);
+	close_fd(&pidfd);
+	if (channel < 0)
+		return fail_errno(err, porter->pid, "infect", "pidfd_getfd", "it was killed");
+	if (porter_must(porter, "close", "its end of a socket can not be closed", SYS_close, ours,
+			err))
+		close_fd(&channel);
+	return channel;
+}
+
+/* One part of the parasite; it comes as descriptor 1.  If somebody has changed the letter
+ * meanwhile, it comes not at all, or is not there to be mapped. */
+static int bring(const struct process *process, const struct porter *porter, int channel, int fd,
+		 avc_remote scratch, const uint64_t map[6], struct avc_error *err)
+{
+	const uint64_t receive[6] = { 0, scratch, MSG_CMSG_CLOEXEC | MSG_DONTWAIT };
+	const uint64_t received[6] = { 1 };
+	struct fd_letter letter;
+
+	fd_letter_write(&letter, scratch);
+	if (pwrite(process->mem_fd, &letter, sizeof letter, (off_t)scratch) != sizeof letter)
+		return fail_errno(err, process->pid, "infect", "write(mem)", "it has ended");
+	if (fd_send(channel, fd))
+		return fail_errno(err, process->pid, "infect", "sendmsg",
+				  "the parasite can not be handed over");
+	return porter_must(porter, "recvmsg", "the parasite can not be handed over", SYS_recvmsg,
+			   receive, err) ||
+			       porter_must(porter, "mmap",
+					   map[2] & PROT_EXEC
+						   ? "it may not have new executable memory"
+						   : "it may not map the parasite",
+					   SYS_mmap, map, err) ||
+			       porter_must(porter, "close", "a descriptor can not be closed",
+					   SYS_close, received, err)
+		       ? -1
+		       : 0;
+}
+
+/* All of the place first: what comes into it then takes no other mapping's.  Its first page holds
+ * the letters until the code comes there. */
+static int bring_parasite(struct process *process, const struct porter *porter,
+			  struct avc_error *err)
 {
 	struct parasite *parasite = &process->parasite;
-	uint64_t arg[6] = { where_to_map(process),  parasite_layout(parasite, slots, threads_max),
-			    PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS | MAP_NORESERVE,
-			    (uint64_t)-1,           0 };
-	long base, result;
+	const size_t data_bytes = parasite->bytes - INJ_CODE_BYTES;
+	const uint64_t place[6] = { where_to_map(process), parasite->bytes, PROT_NONE,
+				    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, (uint64_t)-1 };
+	uint64_t scratch[6] = { 0, ARCH_PAGE_BYTES, PROT_READ | PROT_WRITE };
+	uint64_t code[6] = { 0, INJ_CODE_BYTES, PARASITE_CODE_PROT, PARASITE_FLAGS_OVER, 1 };
+	uint64_t data[6] = { 0, data_bytes, PARASITE_DATA_PROT, PARASITE_FLAGS_OVER, 1 };
+	int channel, result;
+	long base;
 
-	if (check_room(process, parasite->bytes, err))
-		return -1;
-	if (stub_syscall(thread, cave, SYS_mmap, arg, &base, err))
+	if (porter_call(porter, SYS_mmap, place, &base, err))
 		return -1;
 	if (base < 0 && base > -4096)
 		return fail(err, AVC_UNSUPPORTED, (int)-base, process->pid, "infect", "mmap",
 			    "it may not map %zu kB more memory", parasite->bytes / 1024);
-	if (parasite_open(parasite, process->pid, (avc_remote)base, parasite->bytes, process->nonce,
-			  err))
+	parasite->base = scratch[0] = code[0] = (uint64_t)base;
+	data[0] = (uint64_t)base + INJ_CODE_BYTES;
+	if (porter_must(porter, "mprotect", "it may not have new memory", SYS_mprotect, scratch,
+			err))
 		return -1;
-	arg[0] = (uint64_t)base;
-	arg[1] = INJ_CODE_BYTES;
-	arg[2] = PROT_READ | PROT_EXEC;
-	if (stub_syscall(thread, cave, SYS_mprotect, arg, &result, err))
+	channel = open_channel(porter, scratch[0], err);
+	if (channel < 0)
 		return -1;
-	if (result < 0)
-		return fail(err, AVC_UNSUPPORTED, (int)-result, process->pid, "infect", "mprotect",
-			    "it may not have new executable memory");
-	return 0;
+	result = bring(process, porter, channel, parasite->data_fd, scratch[0], data, err) ||
+				 bring(process, porter, channel, parasite->code_fd, scratch[0],
+				       code, err)
+			 ? -1
+			 : 0;
+	close_fd(&channel);
+	return result;
+}
+
+static int make_pad(struct process *process, struct thread *thread, avc_remote cave, uint32_t slots,
+		    uint32_t threads_max, struct avc_error *err)
+{
+	struct porter porter = { .cave = cave, .base = &thread->regs };
+	int result;
+
+	if (check_room(process, parasite_layout(&process->parasite, slots, threads_max), err) ||
+	    parasite_make(&process->parasite, process->nonce, err))
+		return -1;
+	result = make_porter(process, thread, &porter, err);
+	if (!result)
+		result = bring_parasite(process, &porter, err);
+	if (porter.pid) {
+		tracee_kill(porter.pid);
+		seccomp_let_be(porter.pid);
+		if (leave_stub(thread, err))
+			result = -1;
+	}
+	return result;
 }
 
 /* The main thread, stopped, with everything read that borrowing it needs. */
@@ -243,6 +421,7 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 		return NULL;
 	}
 	t->seen = true;
+	rewind_prepare(t);
 	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;
@@ -271,6 +450,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	while (threads_max < threads)
 		threads_max *= 2;
 	parasite_close(&process->parasite);
+	process->parasite.inside = process->inside;
 	memory_forget(process->memory);
 	if (getrandom(&process->nonce, sizeof process->nonce, 0) < 0)
 		return fail_errno(err, 0, "infect", "getrandom", "no random number");
@@ -465,7 +645,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
-		process->lost = process->lost || (result && err->code != AVC_LIMIT);
+		process->lost = process->lost || (result && err->code != AVC_KERNEL);
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
@@ -482,8 +662,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(holder, &base))
+	if (parasite_own(&process->parasite, holder) || arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
@@ -503,7 +682,7 @@ static int clone_by(struct process *process, pid_t tid, const struct arch_regs *
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(&process->parasite, *child))
 		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -539,12 +718,12 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
-		process->lost = process->lost || err->code != AVC_LIMIT;
+		process->lost = process->lost || err->code != AVC_KERNEL;
 		thread_runs_on(thread, err);
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||
-	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    parasite_own(&process->parasite, between) ||
 	    arch_regs_get(between, &process->holder_base))
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");

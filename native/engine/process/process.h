@@ -6,6 +6,7 @@
  *   stop.c          ... stopped, let go
  *   infect.c        parasite and holder brought into it
  *   support.c       what can not be protected; quiescence
+ *   waits.c         calls that are to be ended
  *   tree.c          all of them
  */
 #ifndef AVCKPT_PROCESS_H
@@ -141,5 +142,13 @@ void tree_sweep(struct tree *tree);
 void tree_let_go(struct process *process);
 /* Of all but the main process, which is the caller's. */
 void tree_free(struct tree *tree);
+
+/* ---- waits.c ---------------------------------------------------------------------- */
+
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct process *process);
+/* Ends the calls that were rewound and whose time is up; the next one's is at
+ * process->due_ns (UINT64_MAX: none). */
+void waits_end(struct process *process, timer_t timer);
 
 #endif

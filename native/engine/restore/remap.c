@@ -69,9 +69,7 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
  * in an overlay a copy would be made. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
-	const int fd = m->shared && proc_mapped_for_writing(template, m->start, m->end)
-			       ? proc_open_mapped(template, m->start, m->end, O_RDWR)
-			       : -1;
+	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
 
 	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }
@@ -218,10 +216,6 @@ static int map_new(const struct remap *r, struct syscall_batch *batch, struct av
 		       ? -1
 		       : 0;
 }
-
-/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE; the headers may be older. */
-#define GUARD_INSTALL 102
-#define GUARD_REMOVE 103
 
 static int advice_of(enum page what)
 {

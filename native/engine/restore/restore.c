@@ -88,7 +88,7 @@ static int send_off(const struct image *image, pid_t child, struct sandbox **san
 	if (!image->headless)
 		arch_tls_set(&regs, parasite_thread(parasite, image->slot, 0)->tls);
 	if ((image->sandboxed || image->stop_signal) && arch_regs_set(child, &regs) == 0) {
-		*sandbox = sandbox_begin(child, err);
+		*sandbox = sandbox_begin(child, image->process->inside, err);
 		if (*sandbox)
 			return 0;
 		tracee_kill(child);
@@ -270,6 +270,30 @@ void restore_note(const struct image *image, pid_t pid, struct avc_error *notes)
 
 /* ---- all of it --------------------------------------------------------------------- */
 
+/* It serves all processes that ask for numbers: those that are no zombies. */
+static struct last_pid *start_helper(const struct restore *restore, struct avc_error *err)
+{
+	const struct generation *generation = restore->generation;
+	struct last_pid_slot *slot = calloc(generation->images, sizeof *slot);
+	struct last_pid *helper = NULL;
+	uint32_t count = 0;
+
+	if (!slot) {
+		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		return NULL;
+	}
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+
+		if (image->process)
+			slot[count++] = (struct last_pid_slot){ &image->process->parasite,
+								image->slot };
+	}
+	helper = last_pid_start(restore->channel->init_pidfd, slot, count, err);
+	free(slot);
+	return helper;
+}
+
 /* To fork takes so long that the number would be somebody else's in the end. */
 static int make_spare_first(struct restore *restore, struct avc_error *err)
 {
@@ -361,8 +385,7 @@ int restore_app(struct restore *restore, struct avc_error *err)
 
 	restore->pid = 0;
 	restore->pidfd = -1;
-	restore->helper = last_pid_start(restore->channel->pidns_fd,
-					 parasite_slot(&main->process->parasite, main->slot), err);
+	restore->helper = start_helper(restore, err);
 	if (!restore->helper)
 		return -1;
 	tracee_deadline_set(restore->timer, FORK_NS);
@@ -373,7 +396,7 @@ int restore_app(struct restore *restore, struct avc_error *err)
 		fd_table_free(&generation->image[i].table);
 	if (!result) {
 		restore_note(main, restore->pid, &restore->notes);
-		result = memory_put_back(main->memory, restore->pid, &restore->notes, err) ||
+		result = memory_put_back(main, restore->pid, &restore->notes, err) ||
 					 restore->ready(restore->arg, err)
 				 ? -1
 				 : 0;

@@ -101,7 +101,7 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 		return -1;
 	if (tracee_settle(batch->pid, err) || tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(batch->parasite, *child))
 		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
 	return 0;
 }
@@ -242,7 +242,7 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
 	}
-	if (ptrace(PTRACE_CONT, batch->pid, NULL, 0L))
+	if (seccomp_go_on(batch->pid, NULL))
 		return fail_errno(err, batch->pid, "restore", "ptrace(CONT)", "it was killed");
 	for (;;) {
 		const struct stop stop = tracee_wait(batch->pid, 0);
@@ -253,8 +253,7 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 			return fail(err, AVC_DEADLINE, 0, batch->pid, "restore", "",
 				    "it did not end again");
 		if (stop.kind != STOP_DYING)
-			ptrace(PTRACE_CONT, batch->pid, NULL,
-			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+			seccomp_go_on(batch->pid, &stop);
 	}
 }
 
@@ -480,8 +479,7 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 	batch->inside = slot->pid;
 	batch->notes = &restored->restore->notes;
 	syscall_batch_enter(batch, parasite, image->slot);
-	if (forked->pidfd < 0 || ptrace(PTRACE_SETOPTIONS, pid, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(pid, &batch->base))
+	if (forked->pidfd < 0 || parasite_own(parasite, pid) || arch_regs_get(pid, &batch->base))
 		return fail_errno(err, pid, "restore", "ptrace(GETREGS)", "it was killed");
 	if (slot->session_leader)
 		syscall_batch_add(batch, SYS_setsid, 0, 0, 0, 0, 0, 0);
@@ -561,7 +559,7 @@ static int await_one(struct restore_tree *restored, uint32_t index, struct avc_e
 	if (restore_await(image, forked->pid, forked->sandbox, err))
 		return -1;
 	restore_note(image, forked->pid, notes);
-	return memory_put_back(image->memory, forked->pid, notes, err);
+	return memory_put_back(image, forked->pid, notes, err);
 }
 
 /* It asks nothing of us while it puts itself together: no numbers for threads, no

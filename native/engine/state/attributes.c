@@ -354,8 +354,9 @@ static bool same_scheduling(const struct scheduling *a, const struct scheduling 
 	return !memcmp(a, b, sizeof *a);
 }
 
-int attributes_keep(const struct process *process, struct image *image, struct avc_error *err)
+int attributes_keep(struct image *image, struct avc_error *err)
 {
+	const struct process *process = image->process;
 	struct attributes *kept = calloc(1, sizeof *kept + image->threads * sizeof kept->thread[0]);
 	struct scheduling inherited;
 

@@ -12,6 +12,7 @@
 #include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+#include <sys/statfs.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -28,7 +29,7 @@
 void init_channel_init(struct init_channel *channel)
 {
 	*channel = (struct init_channel){
-		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .pidns_fd = -1
+		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1
 	};
 }
 
@@ -57,37 +58,79 @@ static int find_ctl(pid_t init)
 	return found;
 }
 
-static int open_fd_of(pid_t init, int number, int flags, bool pipe)
+#define PIPEFS_MAGIC_ 0x50495045 /* linux/magic.h */
+#define TMPFS_MAGIC_ 0x01021994
+
+/* What the container shows us is looked at before it is opened: by a duplicate of its own
+ * descriptor, which gives us no more rights than it has, and which it can not exchange for another
+ * meanwhile.  Then it is opened anew, for O_NONBLOCK and flock(2) are of the open file. */
+static int reopen(int *theirs, int flags)
 {
-	char name[32];
-	struct stat st;
+	char path[32];
 	int fd;
 
-	snprintf(name, sizeof name, "fd/%d", number);
-	fd = proc_open(init, name, flags | O_NONBLOCK);
-	if (fd >= 0 && pipe && (fstat(fd, &st) || !S_ISFIFO(st.st_mode))) {
-		close(fd);
-		errno = EPROTO;
-		return -1;
-	}
+	snprintf(path, sizeof path, "/proc/self/fd/%d", *theirs);
+	fd = open(path, flags | O_CLOEXEC | O_NONBLOCK);
+	close_fd(theirs);
 	return fd;
+}
+
+static int reject(int *theirs)
+{
+	close_fd(theirs);
+	errno = EPROTO;
+	return -1;
+}
+
+/* init's end of a pipe, or the other one; it must be the kernel's own and not a file with a name,
+ * which the container may have been given to read only. */
+static int open_pipe_of(const struct init_channel *channel, int number, int flags)
+{
+	int theirs = proc_borrow_fd(channel->init_pidfd, number);
+	struct statfs fs;
+	struct stat st;
+
+	if (theirs < 0)
+		return -1;
+	if (fstat(theirs, &st) || !S_ISFIFO(st.st_mode) || fstatfs(theirs, &fs) ||
+	    fs.f_type != PIPEFS_MAGIC_)
+		return reject(&theirs);
+	return reopen(&theirs, flags);
+}
+
+/* A memfd that can not shrink under our mapping (SIGBUS), and not one of huge pages, of which there
+ * may be none (SIGBUS).  Files of a tmpfs have seals, too, but never these. */
+static int open_ctl_of(const struct init_channel *channel, int number)
+{
+	int theirs = proc_borrow_fd(channel->init_pidfd, number), seals;
+	struct statfs fs;
+	struct stat st;
+
+	if (theirs < 0)
+		return -1;
+	seals = fcntl(theirs, F_GET_SEALS);
+	if (seals < 0 || !(seals & F_SEAL_SHRINK) ||
+	    (fcntl(theirs, F_GETFL) & O_ACCMODE) != O_RDWR || fstat(theirs, &st) ||
+	    fstatfs(theirs, &fs) || fs.f_type != TMPFS_MAGIC_ ||
+	    st.st_size < (off_t)sizeof(struct avc_ctl))
+		return reject(&theirs);
+	return reopen(&theirs, O_RDWR);
 }
 
 static int connect_all(struct init_channel *channel, int number, struct avc_error *err)
 {
 	const struct avc_ctl *ctl;
-	struct stat st;
 
-	channel->ctl_fd = open_fd_of(channel->init, number, O_RDWR, false);
+	channel->ctl_fd = open_ctl_of(channel, number);
+	if (channel->ctl_fd < 0 && errno == EPROTO)
+		return fail(err, AVC_PROTOCOL, 0, channel->init, "attach", "",
+			    "its control page is not one of avckpt-init's");
 	if (channel->ctl_fd < 0)
-		return fail_errno(err, channel->init, "attach", "open(fd)",
+		return fail_errno(err, channel->init, "attach", "pidfd_getfd",
 				  "its control page can not be opened");
 	if (flock(channel->ctl_fd, LOCK_EX | LOCK_NB))
 		return fail(err, AVC_BUSY, errno, channel->init, "attach", "flock",
 			    "another avckpt guards it already");
-	if (fstat(channel->ctl_fd, &st) || st.st_size < (off_t)sizeof *ctl)
-		return fail(err, AVC_PROTOCOL, 0, channel->init, "attach", "",
-			    "its control page is too small");
 	channel->ctl = mmap(NULL, sizeof *ctl, PROT_READ | PROT_WRITE, MAP_SHARED, channel->ctl_fd,
 			    0);
 	if (channel->ctl == MAP_FAILED) {
@@ -101,10 +144,9 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 			err, AVC_PROTOCOL, 0, channel->init, "attach", "",
 			"avckpt-init speaks version %u, this is version %u: restart the container",
 			ctl->version, (unsigned int)AVC_CTL_VERSION);
-	channel->report_fd = open_fd_of(channel->init, ctl->report_fd, O_RDONLY, true);
-	channel->verdict_fd = open_fd_of(channel->init, ctl->verdict_fd, O_WRONLY, true);
-	channel->pidns_fd = proc_open(channel->init, "ns/pid", O_RDONLY);
-	if (channel->report_fd < 0 || channel->verdict_fd < 0 || channel->pidns_fd < 0)
+	channel->report_fd = open_pipe_of(channel, ctl->report_fd, O_RDONLY);
+	channel->verdict_fd = open_pipe_of(channel, ctl->verdict_fd, O_WRONLY);
+	if (channel->report_fd < 0 || channel->verdict_fd < 0)
 		return fail_errno(err, channel->init, "attach", "open(fd)",
 				  "its pipes can not be opened");
 	channel->init_inside = ctl->init_pid;
@@ -113,7 +155,7 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 
 int init_channel_open(struct init_channel *channel, struct avc_error *err)
 {
-	int number, pidfd = channel->init_pidfd;
+	int number, theirs, pidfd = channel->init_pidfd;
 	uint64_t magic = 0;
 
 	channel->init = proc_pidfd_pid(pidfd);
@@ -124,12 +166,15 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 	if (number < 0 || pidfd_ended(pidfd))
 		return 0;
 	/* The magic is written last: before that the page is not to be trusted. */
-	channel->ctl_fd = open_fd_of(channel->init, number, O_RDONLY, false);
-	if (channel->ctl_fd >= 0 && pread(channel->ctl_fd, &magic, sizeof magic, 0) < 0)
-		magic = 0;
-	close_fd(&channel->ctl_fd);
-	if (magic != AVC_CTL_MAGIC)
+	theirs = proc_borrow_fd(pidfd, number);
+	if (theirs < 0)
 		return 0;
+	if (fcntl(theirs, F_GET_SEALS) >= 0 && pread(theirs, &magic, sizeof magic, 0) >= 0 &&
+	    magic != AVC_CTL_MAGIC) {
+		close_fd(&theirs);
+		return 0;
+	}
+	close_fd(&theirs);
 	if (connect_all(channel, number, err) == 0)
 		return 1;
 	init_channel_close(channel);
@@ -146,7 +191,6 @@ void init_channel_close(struct init_channel *channel)
 	close_fd(&channel->ctl_fd); /* lets the lock go */
 	close_fd(&channel->report_fd);
 	close_fd(&channel->verdict_fd);
-	close_fd(&channel->pidns_fd);
 }
 
 pid_t init_channel_app(const struct init_channel *channel)

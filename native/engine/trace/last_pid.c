@@ -2,56 +2,323 @@
  *
  * The next PID of another PID namespace.
  *
- * /proc/sys/kernel/ns_last_pid (pid_namespaces(7)) acts on the namespace of the
- * task that writes it, so somebody has to be inside.  The helper is a task of our
- * own that shares our memory, lives for the length of one restore, and makes
- * nothing but raw system calls: it shares this thread's TLS, errno included.
+ * /proc/sys/kernel/ns_last_pid acts on the namespace of the task that writes it, so
+ * somebody has to be inside: avckpt-pid (lastpid/lastpid.c), for the length of one restore,
+ * with nothing of ours.  It is started ahead of time, outside, for that takes longer than
+ * what it does.
  */
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/futex.h>
+#include <poll.h>
 #include <sched.h>
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/prctl.h>
+#include <sys/mman.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include "lastpid.h"
 #include "syscall.h"
 #include "trace.h"
 
+/* Its program, as the Makefile has built it. */
+__asm__(".pushsection .rodata\n"
+	"lastpid_program: .incbin \"avckpt-pid\"\n"
+	"lastpid_program_end:\n"
+	".popsection\n");
+extern const uint8_t lastpid_program[] __asm__("lastpid_program");
+extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end");
+
+#ifndef MFD_EXEC
+#define MFD_EXEC 0x10U /* since Linux 6.3 */
+#endif
 #define STACK_BYTES 16384
-/* Requests come in quick succession, for a restore is a matter of microseconds:
- * look at the word for a while before sleeping on it.  Only for a while, and only
- * if there is a CPU for both: on a busy machine the other side could not run. */
-#define HELPER_SPINS 4000
+#define HIGH_FD 16 /* above those that it gets                                       */
 #define ENGINE_SPINS 100
 #define SLICE_NS (20 * (long)NS_PER_MS)
+#define END_MS 1000
 
 struct last_pid {
 	pid_t task;
-	int fd;
-	struct inj_slot *slot; /* want, have: requests, ours and the new process' */
-	int32_t error;
-	int32_t before; /* what it was, to be put back at the end          */
-	uint32_t stop;
+	int pidfd, socket;
+	struct lastpid_page *page;
+	struct inj_slot **slot;
+	uint32_t count;
+};
+
+/* ---- its process ------------------------------------------------------------------- */
+
+struct birth {
+	int program_fd, fd[LASTPID_FDS];
+	int error;
 	uint8_t stack[STACK_BYTES] __attribute__((aligned(16)));
 };
 
-static int32_t write_last_pid(int fd, int32_t value)
+/* In the new task, which has our memory until it executes its program, and we wait. */
+#if defined(__SANITIZE_ADDRESS__)
+__attribute__((no_sanitize("address", "undefined")))
+#endif
+static int
+become(void *arg)
 {
-	char text[12], *p = text + sizeof text;
-	long r;
+	static const char *const nothing[] = { NULL };
+	struct birth *birth = arg;
+	long high[LASTPID_FDS], program;
 
-	do {
-		*--p = (char)('0' + value % 10);
-		value /= 10;
-	} while (value);
-	r = raw_syscall(SYS_pwrite64, (uint64_t)fd, (uint64_t)p, (uint64_t)(text + sizeof text - p),
-			0, 0, 0);
-	return r < 0 ? (int32_t)r : 0;
+	program = raw_syscall(SYS_fcntl, (uint64_t)birth->program_fd, F_DUPFD_CLOEXEC, HIGH_FD, 0,
+			      0, 0);
+	for (int i = 0; i < LASTPID_FDS; i++)
+		high[i] = raw_syscall(SYS_fcntl, (uint64_t)birth->fd[i], F_DUPFD_CLOEXEC, HIGH_FD,
+				      0, 0, 0);
+	for (int i = 0; i < LASTPID_FDS; i++)
+		raw_syscall(SYS_dup3, (uint64_t)high[i], (uint64_t)i, 0, 0, 0, 0);
+	raw_syscall(SYS_dup3, (uint64_t)program, LASTPID_FDS, O_CLOEXEC, 0, 0, 0);
+	raw_syscall(SYS_close_range, LASTPID_FDS + 1, ~UINT32_C(0), 0, 0, 0, 0);
+	birth->error = (int)-raw_syscall(SYS_execveat, LASTPID_FDS, (uint64_t) "",
+					 (uint64_t)nothing, (uint64_t)nothing, AT_EMPTY_PATH, 0);
+	return 1;
+}
+
+/* Nobody can write to it, not even through /proc/PID/exe.  -1 with errno. */
+static int sealed_program(void)
+{
+	const size_t bytes = (size_t)(lastpid_program_end - lastpid_program);
+	int fd = memfd_create("avckpt-pid", MFD_CLOEXEC | MFD_ALLOW_SEALING | MFD_EXEC);
+
+	if (fd < 0 && errno == EINVAL)
+		fd = memfd_create("avckpt-pid", MFD_CLOEXEC | MFD_ALLOW_SEALING);
+	if (fd >= 0 &&
+	    (write(fd, lastpid_program, bytes) != (ssize_t)bytes ||
+	     fcntl(fd, F_ADD_SEALS, F_SEAL_WRITE | F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)))
+		close_fd(&fd);
+	return fd;
+}
+
+/* Nobody can take it from under us. */
+static int shared_page(struct lastpid_page **page)
+{
+	int fd = memfd_create("avckpt-pid", MFD_CLOEXEC | MFD_ALLOW_SEALING);
+	void *map = MAP_FAILED;
+
+	if (fd >= 0 && ftruncate(fd, ARCH_PAGE_BYTES) == 0 &&
+	    fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL) == 0)
+		map = mmap(NULL, ARCH_PAGE_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	if (map == MAP_FAILED)
+		close_fd(&fd);
+	else
+		*page = map;
+	return fd;
+}
+
+static void helper_free(struct last_pid *helper)
+{
+	if (helper->page)
+		munmap(helper->page, ARCH_PAGE_BYTES);
+	close_fd(&helper->pidfd);
+	close_fd(&helper->socket);
+	free(helper->slot);
+	free(helper);
+}
+
+static void birth_free(struct birth *birth)
+{
+	close_fd(&birth->program_fd);
+	close_fd(&birth->fd[LASTPID_SOCKET]);
+	close_fd(&birth->fd[LASTPID_FILE]);
+	close_fd(&birth->fd[LASTPID_PAGE]);
+	free(birth);
+}
+
+static int give_birth(struct last_pid *helper, struct birth *birth, int init_pidfd,
+		      struct avc_error *err)
+{
+	int ends[2];
+
+	birth->fd[LASTPID_INIT] = init_pidfd;
+	birth->fd[LASTPID_FILE] = open("/proc/sys/kernel/ns_last_pid", O_RDWR | O_CLOEXEC);
+	if (birth->fd[LASTPID_FILE] < 0)
+		return fail_errno(err, 0, "restore", "open(ns_last_pid)",
+				  "needs CONFIG_CHECKPOINT_RESTORE and a writable /proc/sys");
+	birth->program_fd = sealed_program();
+	birth->fd[LASTPID_PAGE] = shared_page(&helper->page);
+	if (birth->program_fd < 0 || birth->fd[LASTPID_PAGE] < 0)
+		return fail_errno(err, 0, "restore", "memfd_create", "no memory for the helper");
+	if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, ends))
+		return fail_errno(err, 0, "restore", "socketpair", "no descriptors");
+	helper->socket = ends[0];
+	birth->fd[LASTPID_SOCKET] = ends[1];
+	/* No exit signal: nobody but us is to hear of it. */
+	helper->task = clone(become, birth->stack + STACK_BYTES, CLONE_VM | CLONE_VFORK, birth);
+	if (helper->task < 0) {
+		helper->task = 0;
+		return fail_errno(err, 0, "restore", "clone", "no helper for the next PID");
+	}
+	helper->pidfd = proc_pidfd_open(helper->task);
+	if (birth->error || helper->pidfd < 0) {
+		errno = birth->error ? birth->error : errno;
+		return fail_errno(err, 0, "restore", "execveat", "no helper for the next PID");
+	}
+	return 0;
+}
+
+/* What is in the container's namespace does not outlive the one outside: it has asked to be
+ * killed with it, unless it was taken over before it could. */
+static void kill_inside(const struct last_pid *helper)
+{
+	pid_t children[4];
+	const int count = proc_children(helper->task, children, 4);
+
+	for (int i = 0; i < count; i++) {
+		int pidfd = proc_pidfd_open(children[i]);
+		struct proc_stat stat;
+
+		/* Still its child: that is whom the pidfd stands for. */
+		if (pidfd >= 0 && proc_stat(children[i], &stat) == 0 && stat.parent == helper->task)
+			syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
+		close_fd(&pidfd);
+	}
+}
+
+static void helper_end(struct last_pid *helper)
+{
+	struct pollfd ending = { .fd = helper->pidfd, .events = POLLIN };
+
+	if (helper->task && (helper->pidfd < 0 || poll(&ending, 1, END_MS) != 1)) {
+		kill_inside(helper);
+		kill(helper->task, SIGKILL); /* our child, not reaped: the number is its own */
+	}
+	if (helper->task)
+		while (waitpid(helper->task, NULL, __WALL | __WNOTHREAD) < 0 && errno == EINTR)
+			;
+	helper_free(helper);
+}
+
+static struct last_pid *helper_new(int init_pidfd, struct avc_error *err)
+{
+	struct last_pid *helper = calloc(1, sizeof *helper);
+	struct birth *birth = NULL;
+	int result = -1;
+
+	if (helper && posix_memalign((void **)&birth, 64, sizeof *birth))
+		birth = NULL;
+	if (!birth) {
+		free(helper);
+		fail_errno(err, 0, "restore", "calloc", "out of memory");
+		return NULL;
+	}
+	memset(birth, 0, offsetof(struct birth, stack));
+	helper->pidfd = helper->socket = birth->program_fd = -1;
+	for (int i = 0; i < LASTPID_FDS; i++)
+		birth->fd[i] = -1;
+	result = give_birth(helper, birth, init_pidfd, err);
+	birth_free(birth);
+	if (result) {
+		close_fd(&helper->socket); /* it ends, if it is there */
+		helper_end(helper);
+		return NULL;
+	}
+	return helper;
+}
+
+/* ---- one that waits ------------------------------------------------------------------ */
+
+static struct last_pid *waiting; /* this process guards one container */
+
+void last_pid_prepare(int init_pidfd)
+{
+	struct avc_error later = { 0 };
+
+	if (!waiting)
+		waiting = helper_new(init_pidfd, &later); /* last_pid_start() tells why not */
+}
+
+void last_pid_forget(void)
+{
+	if (!waiting)
+		return;
+	close_fd(&waiting->socket);
+	helper_end(waiting);
+	waiting = NULL;
+}
+
+/* ---- a restore ------------------------------------------------------------------------- */
+
+static int send_slots(struct last_pid *helper, const struct last_pid_slot *slot, uint32_t count,
+		      bool last)
+{
+	struct lastpid_message message = { .count = count, .go = last };
+	union {
+		char bytes[CMSG_SPACE(LASTPID_MESSAGE_SLOTS * sizeof(int))];
+		struct cmsghdr align;
+	} control = { { 0 } };
+	struct iovec data = { &message, sizeof message };
+	struct msghdr head = { .msg_iov = &data,
+			       .msg_iovlen = 1,
+			       .msg_control = &control,
+			       .msg_controllen = CMSG_SPACE(count * sizeof(int)) };
+	struct cmsghdr *rights = CMSG_FIRSTHDR(&head);
+
+	rights->cmsg_level = SOL_SOCKET;
+	rights->cmsg_type = SCM_RIGHTS;
+	rights->cmsg_len = CMSG_LEN(count * sizeof(int));
+	for (uint32_t i = 0; i < count; i++) {
+		struct inj_slot *const at = parasite_slot(slot[i].parasite, slot[i].number);
+
+		message.offset[i] = (uint64_t)((uint8_t *)at - slot[i].parasite->map) -
+				    INJ_CODE_BYTES;
+		memcpy(CMSG_DATA(rights) + i * sizeof(int), &slot[i].parasite->data_fd,
+		       sizeof(int));
+		at->want = at->have = 0;
+		helper->slot[helper->count++] = at;
+	}
+	return sendmsg(helper->socket, &head, MSG_NOSIGNAL) == (ssize_t)sizeof message ? 0 : -1;
+}
+
+/* It has to get a CPU when we do. */
+static void lend_priority(const struct last_pid *helper)
+{
+	struct sched_param own;
+	const int policy = sched_getscheduler(0);
+
+	if (policy > SCHED_OTHER && sched_getparam(0, &own) == 0)
+		(void)sched_setscheduler(helper->task, policy, &own);
+}
+
+struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
+				struct avc_error *err)
+{
+	struct last_pid *helper = waiting ? waiting : helper_new(init_pidfd, err);
+	int result = 0;
+
+	waiting = NULL;
+	if (!helper)
+		return NULL;
+	helper->slot = calloc(count, sizeof(struct inj_slot *));
+	if (!helper->slot)
+		result = fail_errno(err, 0, "restore", "calloc", "out of memory");
+	lend_priority(helper);
+	for (uint32_t i = 0; !result && i < count; i += LASTPID_MESSAGE_SLOTS) {
+		const uint32_t left = count - i;
+		const bool last = left <= LASTPID_MESSAGE_SLOTS;
+
+		if (send_slots(helper, slot + i, last ? left : LASTPID_MESSAGE_SLOTS, last))
+			result = fail_errno(err, 0, "restore", "sendmsg", "the helper has ended");
+	}
+	if (!result)
+		return helper;
+	close_fd(&helper->socket);
+	helper_end(helper);
+	return NULL;
+}
+
+static struct inj_slot *served(const struct last_pid *helper)
+{
+	const uint32_t i = __atomic_load_n(&helper->page->serving, __ATOMIC_RELAXED);
+
+	return helper->slot[i < helper->count ? i : 0];
 }
 
 /* Sleeps while *word == value, a slice at most. */
@@ -59,110 +326,20 @@ static void sleep_on(uint32_t *word, uint32_t value)
 {
 	const struct timespec slice = { .tv_nsec = SLICE_NS };
 
-	raw_syscall(SYS_futex, (uint64_t)word, FUTEX_WAIT, value, (uint64_t)&slice, 0, 0);
+	syscall(SYS_futex, word, FUTEX_WAIT, value, &slice, NULL, 0);
 }
 
 static void wake(uint32_t *word)
 {
-	raw_syscall(SYS_futex, (uint64_t)word, FUTEX_WAKE, INT32_MAX, 0, 0, 0);
-}
-
-static int32_t read_last_pid(int fd)
-{
-	char text[12];
-	int32_t value = 0;
-	long n = raw_syscall(SYS_pread64, (uint64_t)fd, (uint64_t)text, sizeof text, 0, 0, 0);
-
-	for (long i = 0; i < n && text[i] >= '0' && text[i] <= '9'; i++)
-		value = value * 10 + (text[i] - '0');
-	return value;
-}
-
-#if defined(__SANITIZE_ADDRESS__)
-__attribute__((no_sanitize("address", "undefined")))
-#endif
-static int
-serve(void *arg)
-{
-	struct last_pid *helper = arg;
-	uint32_t spins = 0;
-
-	raw_syscall(SYS_prctl, PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0, 0);
-	helper->before = read_last_pid(helper->fd);
-	while (!__atomic_load_n(&helper->stop, __ATOMIC_ACQUIRE)) {
-		struct inj_slot *slot = __atomic_load_n(&helper->slot, __ATOMIC_ACQUIRE);
-		const uint32_t want = __atomic_load_n(&slot->want, __ATOMIC_ACQUIRE);
-
-		if (want != slot->have) {
-			if (slot->last_pid > 0)
-				helper->error = write_last_pid(helper->fd, slot->last_pid);
-			__atomic_store_n(&slot->have, want, __ATOMIC_RELEASE);
-			wake(&slot->have);
-			spins = 0;
-		} else if (++spins < HELPER_SPINS) {
-			cpu_relax();
-		} else {
-			sleep_on(&slot->want, want);
-		}
-	}
-	/* Numbers go on from where they were.  Else the next templates would get
-	 * those of short-lived threads that older generations still name. */
-	if (helper->before > 0)
-		write_last_pid(helper->fd, helper->before);
-	return 0;
-}
-
-struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err)
-{
-	struct last_pid *helper = NULL;
-	int own = open("/proc/self/ns/pid", O_RDONLY | O_CLOEXEC);
-
-	if (posix_memalign((void **)&helper, 64, sizeof *helper))
-		helper = NULL;
-	if (!helper || own < 0) {
-		fail_errno(err, 0, "restore", "open(ns/pid)", "no helper");
-		goto out;
-	}
-	memset(helper, 0, offsetof(struct last_pid, stack));
-	helper->slot = slot;
-	slot->want = slot->have = 0;
-	helper->fd = open("/proc/sys/kernel/ns_last_pid", O_RDWR | O_CLOEXEC);
-	if (helper->fd < 0) {
-		fail_errno(err, 0, "restore", "open(ns_last_pid)",
-			   "needs CONFIG_CHECKPOINT_RESTORE and a writable /proc/sys");
-		goto out;
-	}
-	if (setns(pidns_fd, CLONE_NEWPID)) {
-		fail_errno(err, 0, "restore", "setns",
-			   "the container's PID namespace can not be entered");
-		goto out;
-	}
-	/* No exit signal: nobody but this thread is to hear of it. */
-	helper->task = clone(serve, helper->stack + STACK_BYTES, CLONE_VM | CLONE_FILES | CLONE_FS,
-			     helper);
-	if (helper->task < 0) {
-		helper->task = 0;
-		fail_errno(err, 0, "restore", "clone",
-			   "no helper in the container's PID namespace");
-	}
-	if (setns(own, CLONE_NEWPID))
-		fail_errno(err, 0, "restore", "setns", "the way back into our own PID namespace");
-out:
-	close_fd(&own);
-	if (helper && !helper->task) {
-		if (helper->fd > 0)
-			close(helper->fd);
-		free(helper);
-		helper = NULL;
-	}
-	return helper;
+	syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 {
 	const uint64_t end = now_ns() + NS_PER_S;
-	struct inj_slot *slot = helper->slot;
+	struct inj_slot *slot = served(helper);
 	uint32_t want, have;
+	int32_t error;
 
 	slot->last_pid = value;
 	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
@@ -173,40 +350,43 @@ int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 			cpu_relax();
 			continue;
 		}
-		if (now_ns() > end)
+		if (now_ns() > end || pidfd_ended(helper->pidfd))
 			return fail(err, AVC_KERNEL, ETIMEDOUT, 0, "restore", "write(ns_last_pid)",
-				    "the helper does not answer");
+				    "the helper does not answer (setns(2) into the container takes "
+				    "CAP_SYS_ADMIN and CAP_SYS_CHROOT)");
 		sleep_on(&slot->have, have);
 	}
-	if (helper->error)
+	error = __atomic_load_n(&helper->page->error, __ATOMIC_RELAXED);
+	if (error)
 		return fail(
-			err, AVC_DENIED, -helper->error, 0, "restore", "write(ns_last_pid)",
+			err, AVC_DENIED, error, 0, "restore", "write(ns_last_pid)",
 			"the next PID can not be chosen (CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN is needed)");
 	return 0;
 }
 
+/* It may be asleep on the word of the slot that it serves.  Woken up it has nothing to write. */
+static void rouse(struct inj_slot *slot)
+{
+	slot->last_pid = 0;
+	__atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
+	wake(&slot->want);
+}
+
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot)
 {
-	struct inj_slot *before = helper->slot;
+	struct inj_slot *before = served(helper);
 
-	slot->want = slot->have = 0;
-	__atomic_store_n(&helper->slot, slot, __ATOMIC_RELEASE);
-	/* It may be asleep on the other one's word.  Woken up it has nothing to write. */
-	before->last_pid = 0;
-	__atomic_add_fetch(&before->want, 1, __ATOMIC_ACQ_REL);
-	wake(&before->want);
+	for (uint32_t i = 0; i < helper->count; i++)
+		if (helper->slot[i] == slot)
+			__atomic_store_n(&helper->page->serving, i, __ATOMIC_RELEASE);
+	rouse(before);
 }
 
 void last_pid_stop(struct last_pid *helper)
 {
 	if (!helper)
 		return;
-	__atomic_store_n(&helper->stop, 1, __ATOMIC_RELEASE);
-	/* Another value, so that it can not fall asleep on the old one just now. */
-	__atomic_add_fetch(&helper->slot->want, 1, __ATOMIC_ACQ_REL);
-	wake(&helper->slot->want);
-	while (waitpid(helper->task, NULL, __WALL | __WNOTHREAD) < 0 && errno == EINTR)
-		;
-	close(helper->fd);
-	free(helper);
+	__atomic_store_n(&helper->page->stop, 1, __ATOMIC_RELEASE);
+	rouse(served(helper));
+	helper_end(helper);
 }

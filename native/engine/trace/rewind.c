@@ -9,186 +9,219 @@
  * while the thread is stopped: if a signal with a handler *is* pending, the kernel
  * makes EINTR of it again, as it should; if none is, the call is made again.
  *
- * A relative timeout would begin again with every checkpoint and never end.  So at
- * the second stop in the same call, what has passed since the first is taken off:
- *   - a timeout in a register is an int: its unused upper half is marked, so that a
- *     call we rewound is told from a new one with the same arguments;
- *   - a timeout in memory is passed in a cell of the parasite instead, which marks it too;
- *   - a timeout of a socket (SO_RCVTIMEO, SO_SNDTIMEO) can not be changed for one
- *     call: when it has passed, the call is answered as the kernel would have done
- *     it.  Here the upper half of the descriptor is the mark.
+ * A call that is made again begins its timeout again.  No argument is shortened for
+ * that: the app may keep its arguments in registers from one call to the next, and
+ * would find the shorter one there.  The call is made again just as it was, and the
+ * guard ends it when its time is up: it stops the thread and answers what the kernel
+ * would have answered (rewind_end_due()).
+ *
+ * For that, a call that was rewound has to be told from the next one with the same
+ * arguments.  It is marked where the app cannot see it: the kernel takes the number of
+ * a call from the lower half of a register whose upper half it only keeps
+ * (arch_call_mark()), and which the result of the call overwrites.
+ *
+ * When the guard dies:
+ *   - before the result is changed, the call answers the EINTR that the kernel gave it.
+ *     The kernel leaves no other way: it wakes the call before it stops the thread, and
+ *     lets the thread go on by itself as soon as there is no tracer;
+ *   - after that, the call begins its timeout once more, and ends late.
+ * Nothing of the app's has changed in either case.
  */
 #include <errno.h>
 #include <string.h>
+#include <sys/ptrace.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/time.h>
+#include <sys/uio.h>
 #include <unistd.h>
 
 #include "trace.h"
 
 #define ERESTARTNOHAND 514 /* include/linux/errno.h */
 #define ERESTART_RESTARTBLOCK 516
-#define MARK UINT64_C(0x6176636b) /* upper half of a rewound int timeout */
+#define FDS_PER_WORD 64
+#define FD_WORDS_MAX 16384 /* of an fd_set: a million descriptors */
 
-enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, RECEIVE, SEND };
+enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND };
 
 /* Calls that answer EINTR to a stop, have done nothing when they do, and may be
  * made again.  Never close(2). */
 static const struct rewindable {
 	long nr;
 	enum timeout timeout;
-	int argument;
+	unsigned int argument;
+	int answer; /* when its time is up */
 } rewindable[] = {
-	{ SYS_epoll_wait, MILLISECONDS, 3 },
-	{ SYS_epoll_pwait, MILLISECONDS, 3 },
-	{ SYS_epoll_pwait2, TIMESPEC, 3 },
-	{ SYS_semop, NO_TIMEOUT, -1 },
-	{ SYS_semtimedop, TIMESPEC, 3 },
-	{ SYS_rt_sigtimedwait, TIMESPEC, 2 },
-	{ SYS_io_getevents, TIMESPEC, 4 },
-	{ SYS_io_pgetevents, TIMESPEC, 4 },
+	{ SYS_epoll_wait, MILLISECONDS, 3, 0 },
+	{ SYS_epoll_pwait, MILLISECONDS, 3, 0 },
+	{ SYS_epoll_pwait2, TIMESPEC, 3, 0 },
+	{ SYS_semop, NO_TIMEOUT, 0, 0 },
+	{ SYS_semtimedop, TIMESPEC, 3, -EAGAIN },
+	{ SYS_rt_sigtimedwait, TIMESPEC, 2, -EAGAIN },
+	{ SYS_io_getevents, TIMESPEC, 4, 0 },
+	{ SYS_io_pgetevents, TIMESPEC, 4, 0 },
+	/* If they cannot write what is left of the timeout (fs/select.c,
+	 * poll_select_finish()): it is in read-only memory, or the program has the
+	 * personality STICKY_TIMEOUTS. */
+	{ SYS_ppoll, TIMESPEC, 2, 0 },
+	{ SYS_pselect6, TIMESPEC, 4, 0 },
+	{ SYS_select, TIMEVAL, 4, 0 },
 	/* Sockets with SO_RCVTIMEO or SO_SNDTIMEO (socket(7)). */
-	{ SYS_read, RECEIVE, 0 },
-	{ SYS_readv, RECEIVE, 0 },
-	{ SYS_preadv2, RECEIVE, 0 },
-	{ SYS_recvfrom, RECEIVE, 0 },
-	{ SYS_recvmsg, RECEIVE, 0 },
-	{ SYS_recvmmsg, RECEIVE, 0 },
-	{ SYS_accept, RECEIVE, 0 },
-	{ SYS_accept4, RECEIVE, 0 },
-	{ SYS_connect, SEND, 0 },
-	{ SYS_write, SEND, 0 },
-	{ SYS_writev, SEND, 0 },
-	{ SYS_pwritev2, SEND, 0 },
-	{ SYS_sendfile, SEND, 0 },
-	{ SYS_sendto, SEND, 0 },
-	{ SYS_sendmsg, SEND, 0 },
-	{ SYS_sendmmsg, SEND, 0 },
+	{ SYS_read, RECEIVE, 0, -EAGAIN },
+	{ SYS_readv, RECEIVE, 0, -EAGAIN },
+	{ SYS_preadv2, RECEIVE, 0, -EAGAIN },
+	{ SYS_recvfrom, RECEIVE, 0, -EAGAIN },
+	{ SYS_recvmsg, RECEIVE, 0, -EAGAIN },
+	{ SYS_recvmmsg, RECEIVE, 0, -EAGAIN },
+	{ SYS_accept, RECEIVE, 0, -EAGAIN },
+	{ SYS_accept4, RECEIVE, 0, -EAGAIN },
+	{ SYS_connect, SEND, 0, -EINPROGRESS },
+	{ SYS_write, SEND, 0, -EAGAIN },
+	{ SYS_writev, SEND, 0, -EAGAIN },
+	{ SYS_pwritev2, SEND, 0, -EAGAIN },
+	{ SYS_sendfile, SEND, 0, -EAGAIN },
+	{ SYS_sendto, SEND, 0, -EAGAIN },
+	{ SYS_sendmsg, SEND, 0, -EAGAIN },
+	{ SYS_sendmmsg, SEND, 0, -EAGAIN },
+	/* From a socket, or into one. */
+	{ SYS_splice, RECEIVE, 0, -EAGAIN },
+	{ SYS_splice, SEND, 2, -EAGAIN },
 };
 
-static const struct rewindable *lookup(long nr)
+/* ---- how long a call may take --------------------------------------------------------- */
+
+/* In ns; 0: for ever. */
+static uint64_t time_in_memory(const struct process *process, avc_remote pointer, uint64_t unit_ns)
 {
-	for (size_t i = 0; i < sizeof rewindable / sizeof *rewindable; i++)
-		if (rewindable[i].nr == nr)
-			return &rewindable[i];
-	return NULL;
+	int64_t time[2];
+
+	if (!pointer || pread(process->mem_fd, time, sizeof time, (off_t)pointer) != sizeof time ||
+	    time[0] < 0 || time[1] < 0 || time[0] > INT32_MAX) /* as good as for ever */
+		return 0;
+	return (uint64_t)time[0] * NS_PER_S + (uint64_t)time[1] * unit_ns;
 }
 
-static bool same_call(const struct thread *t, uint64_t value)
-{
-	const struct rewound *r = &t->rewound;
-
-	return r->nr == arch_syscall_nr(&t->regs) && r->argument >= 0 &&
-	       r->pc == arch_pc(&t->regs) && r->sp == arch_sp(&t->regs) && r->value == value;
-}
-
-/* Remembers what the argument was before it becomes `value`. */
-static void replace(struct thread *t, int argument, uint64_t value, bool same, uint64_t at)
-{
-	const uint64_t before = arch_syscall_arg(&t->regs, (unsigned int)argument);
-
-	t->rewound = (struct rewound){
-		.nr = arch_syscall_nr(&t->regs),
-		.pc = arch_pc(&t->regs),
-		.sp = arch_sp(&t->regs),
-		.argument = argument,
-		.original = same ? t->rewound.original : before,
-		.value = value,
-		.at_ns = at,
-	};
-	arch_syscall_arg_set(&t->regs, (unsigned int)argument, value);
-}
-
-static void milliseconds(struct thread *t, int argument, uint64_t now)
-{
-	const uint64_t value = arch_syscall_arg(&t->regs, (unsigned int)argument);
-	const bool same = same_call(t, value);
-	int32_t left = (int32_t)value;
-	uint64_t at = now;
-
-	if (left <= 0)
-		return; /* for ever, or not at all */
-	if (same) {
-		/* Whole milliseconds only; the rest counts next time. */
-		const uint64_t passed = (now - t->rewound.at_ns) / NS_PER_MS;
-
-		at = t->rewound.at_ns + passed * NS_PER_MS;
-		left = passed < (uint64_t)left ? left - (int32_t)passed : 0;
-	}
-	replace(t, argument, MARK << 32 | (uint32_t)left, same, at);
-}
-
-static int take_cell(struct process *process, struct thread *t)
-{
-	if (t->timeout_cell < 0 && ~process->cells_used) {
-		t->timeout_cell = __builtin_ctzll(~process->cells_used);
-		process->cells_used |= UINT64_C(1) << t->timeout_cell;
-	}
-	return t->timeout_cell;
-}
-
-static void timespec(struct process *process, struct thread *t, int argument, uint64_t now)
-{
-	const uint64_t pointer = arch_syscall_arg(&t->regs, (unsigned int)argument);
-	const bool same = same_call(t, pointer);
-	struct avc_error gone = { 0 };
-	int64_t left[2], *cell;
-	int64_t ns;
-
-	/* Without a parasite, or with all cells taken, it begins again in full. */
-	if (!pointer || !process->infected || parasite_check(process, t->tid, &gone) ||
-	    take_cell(process, t) < 0)
-		return;
-	cell = process->parasite.control->timeout[t->timeout_cell];
-	if (same) {
-		ns = cell[0] * (int64_t)NS_PER_S + cell[1] - (int64_t)(now - t->rewound.at_ns);
-		left[0] = ns > 0 ? ns / (int64_t)NS_PER_S : 0;
-		left[1] = ns > 0 ? ns % (int64_t)NS_PER_S : 0;
-	} else if (pread(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left) {
-		return;
-	}
-	if (left[0] > INT32_MAX)
-		return; /* for practical purposes for ever */
-	memcpy(cell, left, sizeof left);
-	replace(t, argument, parasite_remote(&process->parasite, cell), same, now);
-}
-
-/* What a socket of the app's allows a call to take; 0: for ever, or no socket. */
-static uint64_t socket_timeout(const struct process *process, int app_fd, enum timeout kind)
+static uint64_t socket_timeout(int fd, int option)
 {
 	struct timeval tv = { 0 };
 	socklen_t bytes = sizeof tv;
-	int fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, app_fd, 0);
 
-	if (fd < 0)
+	if (getsockopt(fd, SOL_SOCKET, option, &tv, &bytes))
 		return 0;
-	if (getsockopt(fd, SOL_SOCKET, kind == RECEIVE ? SO_RCVTIMEO : SO_SNDTIMEO, &tv, &bytes))
-		tv = (struct timeval){ 0 };
-	close(fd);
 	return (uint64_t)tv.tv_sec * NS_PER_S + (uint64_t)tv.tv_usec * 1000;
 }
 
-/* False: its time is up, it is not to be made again. */
-static bool socket_wait(const struct process *process, struct thread *t, enum timeout kind,
-			uint64_t now)
+static bool is_unix_socket(int fd)
 {
-	const uint64_t fd = arch_syscall_arg(&t->regs, 0);
+	int domain = 0;
+	socklen_t bytes = sizeof domain;
+
+	return getsockopt(fd, SOL_SOCKET, SO_DOMAIN, &domain, &bytes) == 0 && domain == AF_UNIX;
+}
+
+static uint64_t time_of_socket(const struct process *process, int app_fd, enum timeout kind,
+			       int *answer)
+{
+	int fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, app_fd, 0);
 	uint64_t limit;
 
-	if (same_call(t, fd)) {
-		if (now - t->rewound.at_ns < t->rewound.limit_ns)
-			return true;
-		arch_syscall_arg_set(&t->regs, 0, t->rewound.original);
-		return false;
-	}
-	limit = socket_timeout(process, (int)fd, kind);
-	if (limit) {
-		replace(t, 0, MARK << 32 | (uint32_t)fd, false, now);
-		t->rewound.limit_ns = limit;
-	}
-	return true;
+	if (fd < 0)
+		return 0;
+	limit = socket_timeout(fd, kind == RECEIVE ? SO_RCVTIMEO : SO_SNDTIMEO);
+	if (*answer == -EINPROGRESS && is_unix_socket(fd))
+		*answer = -EAGAIN;
+	close(fd);
+	return limit;
 }
+
+static uint64_t time_of_call(const struct process *process, const struct arch_regs *regs,
+			     const struct rewindable *call, int *answer)
+{
+	const uint64_t argument = arch_syscall_arg(regs, call->argument);
+	const int32_t ms = (int32_t)argument;
+
+	*answer = call->answer;
+	switch (call->timeout) {
+	case MILLISECONDS:
+		return ms > 0 ? (uint64_t)ms * NS_PER_MS : 0;
+	case TIMESPEC:
+		return time_in_memory(process, argument, 1);
+	case TIMEVAL:
+		return time_in_memory(process, argument, 1000);
+	case RECEIVE:
+	case SEND:
+		return time_of_socket(process, (int)argument, call->timeout, answer);
+	case NO_TIMEOUT:
+		break;
+	}
+	return 0;
+}
+
+static bool has_timeout(long nr)
+{
+	for (size_t i = 0; i < sizeof rewindable / sizeof *rewindable; i++)
+		if (rewindable[i].nr == nr && rewindable[i].timeout != NO_TIMEOUT)
+			return true;
+	return false;
+}
+
+/* False: the call is none of those.  *limit_ns: 0, it may take for ever. */
+static bool look_up(const struct process *process, const struct arch_regs *regs, uint64_t *limit_ns,
+		    int *answer)
+{
+	bool found = false;
+
+	*limit_ns = 0;
+	for (size_t i = 0; !*limit_ns && i < sizeof rewindable / sizeof *rewindable; i++)
+		if (rewindable[i].nr == arch_syscall_nr(regs)) {
+			*limit_ns = time_of_call(process, regs, &rewindable[i], answer);
+			found = true;
+		}
+	return found;
+}
+
+/* ---- the end of a call's time --------------------------------------------------------- */
+
+/* select(2) tells with its sets that nothing is ready. */
+static void clear_sets(const struct thread *thread)
+{
+	static const uint64_t zero[FD_WORDS_MAX];
+	const struct arch_regs *regs = &thread->regs;
+	const int64_t n = (int32_t)arch_syscall_arg(regs, 0);
+	const size_t words = n <= 0 ? 0 : (size_t)(n + FDS_PER_WORD - 1) / FDS_PER_WORD;
+	const struct iovec from = { (void *)zero,
+				    (words < FD_WORDS_MAX ? words : FD_WORDS_MAX) * sizeof *zero };
+
+	for (unsigned int i = 1; i <= 3; i++) {
+		const struct iovec to = { (void *)arch_syscall_arg(regs, i), from.iov_len };
+
+		if (to.iov_base)
+			(void)!process_vm_writev(thread->tid, &from, 1, &to, 1, 0);
+	}
+}
+
+/* In this order: if the guard dies in between, the call is made again. */
+static void answer_late(struct thread *thread)
+{
+	const long nr = arch_syscall_nr(&thread->regs);
+	uint64_t mask;
+
+	/* epoll_pwait(2) and others: a signal that comes now is too late for the mask that
+	 * was in force for as long as the call.  What is read here is the thread's own, and
+	 * written back it is in force again (kernel/ptrace.c). */
+	if (ptrace(PTRACE_GETSIGMASK, thread->tid, sizeof mask, &mask) ||
+	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof mask, &mask))
+		return;
+	if (nr == SYS_select || nr == SYS_pselect6)
+		clear_sets(thread);
+	if (arch_result_set(thread->tid, thread->rewound.answer))
+		return;
+	arch_result_note(&thread->regs, thread->rewound.answer);
+	thread->rewound = (struct rewound){ 0 };
+}
+
+/* ---- which call it is ------------------------------------------------------------------ */
 
 /* restart_syscall(2) is what the kernel makes of nanosleep, clock_nanosleep, poll
  * and futex when it takes them up again.  In another process it means nothing, so
@@ -248,32 +281,88 @@ static void note_call(const struct process *process, struct thread *t)
 	t->call = now;
 }
 
+static bool is_rewound(const struct thread *thread)
+{
+	return thread->rewound.mark && thread->rewound.mark == arch_call_mark(&thread->regs);
+}
+
+/* See is_about_to_restart(); of a call that was rewound. */
+static bool is_about_to_rewind(const struct thread *thread)
+{
+	return thread->rewound.mark && arch_result_mark(&thread->regs) == thread->rewound.mark;
+}
+
+/* The kernel does not tell how much of its timeout an interrupted call had left.  It tells
+ * when a thread ran last: for one that slept in the call, that was when the call began. */
+void rewind_prepare(struct thread *thread)
+{
+	struct sleeper *s = &thread->sleeper;
+	struct proc_stat stat;
+
+	s->known = (has_timeout(thread->call.nr) || !thread->stopped_ns) &&
+		   proc_sched(thread->tid, &s->sched) == 0 && proc_stat(thread->tid, &stat) == 0 &&
+		   stat.state == 'S';
+}
+
+/* For how long a thread that has just stopped was in its call, at least; 0: nobody knows.  It
+ * was, if it has run only once since, to stop, and on the same CPU, for the clocks of different
+ * ones differ.  They are not those that people set their clocks by, either: a thousandth less
+ * is sure not to be too much. */
+static uint64_t waited_ns(struct thread *thread)
+{
+	const struct sleeper *s = &thread->sleeper;
+	struct proc_sched now;
+
+	if (!s->known || proc_sched(thread->tid, &now) || now.switches != s->sched.switches + 1 ||
+	    now.migrations != s->sched.migrations || now.ran_ns < s->sched.ran_ns)
+		return 0;
+	return (now.ran_ns - s->sched.ran_ns) / 1000 * 999;
+}
+
+/* A call that answers EINTR to a stop is from now on watched. */
+static void begin_watch(const struct process *process, struct thread *thread, uint64_t now)
+{
+	uint64_t limit_ns;
+	int answer;
+
+	thread->rewound = (struct rewound){ 0 };
+	if (!look_up(process, &thread->regs, &limit_ns, &answer))
+		return;
+	thread->rewound = (struct rewound){ .mark = (uint32_t)now | 1,
+					    .answer = answer,
+					    .due_ns = UINT64_MAX };
+	if (limit_ns)
+		thread->rewound.due_ns = now + limit_ns - waited_ns(thread);
+}
+
 void rewind_call(struct process *process, struct thread *thread)
 {
-	const struct rewindable *call;
+	struct arch_regs *regs = &thread->regs;
+	struct rewound *r = &thread->rewound;
 	const uint64_t now = now_ns();
 
 	thread->stopped_ns = now;
 	note_call(process, thread);
-	if (arch_syscall_nr(&thread->regs) < 0 || arch_syscall_result(&thread->regs) != -EINTR)
+	if (arch_syscall_nr(regs) < 0 || is_about_to_rewind(thread))
 		return;
-	call = lookup(arch_syscall_nr(&thread->regs));
-	if (!call)
+	if (arch_syscall_result(regs) == -EINTR) {
+		if (!is_rewound(thread))
+			begin_watch(process, thread, now);
+		/* The result first: a guard that dies before the mark is set leaves a wait
+		 * that is too long, not one that fails. */
+		if (!r->mark || arch_result_set(thread->tid, -ERESTARTNOHAND))
+			return; /* another call, or it was killed */
+		arch_result_note(regs, -ERESTARTNOHAND);
+		if (arch_call_mark_set(thread->tid, regs, r->mark))
+			return;
+	} else if (arch_syscall_result(regs) != -ERESTARTNOHAND || !is_rewound(thread)) {
 		return;
-	/* The result first: a tracer that dies before the timeout is mended leaves
-	 * a wait that is too long, not one that fails. */
-	if (arch_result_set(thread->tid, -ERESTARTNOHAND))
-		return;
-	arch_result_note(&thread->regs, -ERESTARTNOHAND);
-	if (call->timeout == MILLISECONDS)
-		milliseconds(thread, call->argument, now);
-	else if (call->timeout == TIMESPEC)
-		timespec(process, thread, call->argument, now);
-	else if (call->timeout == NO_TIMEOUT)
-		return;
-	else if (!socket_wait(process, thread, call->timeout, now))
-		arch_result_note(&thread->regs, call->nr == SYS_connect ? -EINPROGRESS : -EAGAIN);
-	(void)arch_regs_set(thread->tid, &thread->regs); /* it was killed: no matter */
+	} /* else stopped again before it has run: as it was left */
+	r->runs_known = false;
+	if (now >= r->due_ns)
+		answer_late(thread);
+	else if (r->due_ns < process->due_ns)
+		process->due_ns = r->due_ns;
 }
 
 /* ppoll, pselect and select write what is left of their timeout to the app's memory
@@ -290,6 +379,8 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 	if ((nr != SYS_ppoll && nr != SYS_pselect6 && nr != SYS_select) ||
 	    arch_syscall_result(regs) != -ERESTARTNOHAND)
 		return;
+	if (is_rewound(thread))
+		return; /* it could not write that */
 	pointer = arch_syscall_arg(regs, nr == SYS_ppoll ? 2 : 4);
 	if (!pointer || pread(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left ||
 	    left[0] > INT32_MAX)
@@ -304,21 +395,14 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 
 void rewind_original(const struct thread *thread, struct arch_regs *regs)
 {
-	const struct rewound *r = &thread->rewound;
-
+	if (is_about_to_rewind(thread))
+		arch_result_note(regs, (int32_t)arch_syscall_result(regs));
 	if (arch_syscall_nr(regs) == SYS_restart_syscall)
 		arch_syscall_nr_set(regs, thread->call.nr);
 	/* See is_about_to_restart(): otherwise it stands where note_call() found it. */
 	if (arch_syscall_result(regs) == SYS_restart_syscall &&
 	    thread->call.pc == arch_pc(regs) + ARCH_SYSCALL_BYTES)
 		arch_result_note(regs, thread->call.nr);
-	/* In the call, or just before it is made again. */
-	if (r->argument >= 0 &&
-	    (r->nr == arch_syscall_nr(regs) ||
-	     (arch_syscall_nr(regs) < 0 && r->nr == arch_syscall_result(regs) &&
-	      r->pc == arch_pc(regs) + ARCH_SYSCALL_BYTES && r->sp == arch_sp(regs))) &&
-	    r->value == arch_syscall_arg(regs, (unsigned int)r->argument))
-		arch_syscall_arg_set(regs, (unsigned int)r->argument, r->original);
 	/* Its signal is sent again (pending.c), and cuts the call short as it would
 	 * have done.  (Whether -ERESTARTSYS becomes EINTR is for sigaction's flags to
 	 * say: those calls are made again.) */
@@ -326,11 +410,4 @@ void rewind_original(const struct thread *thread, struct arch_regs *regs)
 	    (arch_syscall_result(regs) == -ERESTARTNOHAND ||
 	     arch_syscall_result(regs) == -ERESTART_RESTARTBLOCK))
 		arch_result_note(regs, -EINTR);
-}
-
-void rewind_forget(struct process *process, struct thread *thread)
-{
-	if (thread->timeout_cell >= 0)
-		process->cells_used &= ~(UINT64_C(1) << thread->timeout_cell);
-	thread->timeout_cell = -1;
 }

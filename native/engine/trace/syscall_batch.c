@@ -83,7 +83,9 @@ static int await_end(const struct syscall_batch *batch, const struct inj_syscall
 		default:
 			break;
 		}
-		if (ptrace(PTRACE_CONT, batch->pid, NULL, (long)signal))
+		if (stop.kind == STOP_SIGNAL && !signal)
+			stop.kind = STOP_OTHER;
+		if (seccomp_go_on(batch->pid, &stop))
 			return fail_errno(err, batch->pid, "run injected code", "ptrace(CONT)",
 					  "it has gone");
 	}
@@ -294,13 +296,16 @@ int syscall_batch_change_parasite(struct syscall_batch *batch, const struct proc
 {
 	const struct parasite *parasite = &process->parasite;
 
-	if (syscall_batch_give(batch, parasite->fd, err))
+	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
 			  PARASITE_FLAGS, 1, 0);
+	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	if (syscall_batch_give(batch, parasite->data_fd, err))
+		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
 			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1,
-			  INJ_CODE_BYTES);
+			  0);
 	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
 	if (syscall_batch_flush(batch, err))
 		return -1;

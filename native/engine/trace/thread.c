@@ -27,11 +27,7 @@ struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *
 		return NULL;
 	}
 	t = &process->threads[process->thread_count++];
-	*t = (struct thread){ .tid = tid,
-			      .call.nr = -1,
-			      .rewound = { .nr = -1, .argument = -1 },
-			      .timeout_cell = -1,
-			      .block = -1 };
+	*t = (struct thread){ .tid = tid, .call.nr = -1, .block = -1 };
 	return t;
 }
 
@@ -42,8 +38,6 @@ void threads_forget_unseen(struct process *process)
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (process->threads[i].seen || process->threads[i].attached)
 			process->threads[kept++] = process->threads[i];
-		else
-			rewind_forget(process, &process->threads[i]);
 	process->thread_count = kept;
 }
 
@@ -207,7 +201,7 @@ static bool straggle(struct process *process, struct thread *thread)
 	case STOP_SYSCALL:
 		/* Not a place to change registers: let it come to a better one. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
-		ptrace(PTRACE_CONT, tid, NULL, 0L);
+		seccomp_go_on(tid, &stop);
 		return true;
 	default:
 		break;
@@ -218,7 +212,7 @@ static bool straggle(struct process *process, struct thread *thread)
 		if (process->waiting && thread->borrowed &&
 		    parasite_contains(&process->parasite, arch_pc(&now)) &&
 		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
-			ptrace(PTRACE_CONT, tid, NULL, 0L);
+			seccomp_go_on(tid, NULL);
 			return true;
 		}
 		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {

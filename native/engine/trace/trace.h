@@ -36,15 +36,19 @@ struct call {
 	uint64_t arg[3];
 };
 
-/* What is remembered of an interrupted call between two stops (rewind.c). */
+/* What is remembered of a call that was rewound (rewind.c). */
 struct rewound {
-	long nr; /* -1: nothing                                      */
-	avc_remote pc, sp;
-	int argument;      /* which one is the timeout, -1: none was changed   */
-	uint64_t original; /* that argument as the app passed it               */
-	uint64_t value;    /* and as we left it                                */
-	uint64_t at_ns;
-	uint64_t limit_ns; /* of a socket: how long the call may take          */
+	uint32_t mark; /* of that call; 0: none                            */
+	int answer;    /* when its time is up                              */
+	uint64_t due_ns;
+	uint64_t runs;            /* how often the thread had run when it was waiting again */
+	bool runs_known, waiting; /* waits.c                                        */
+};
+
+/* A thread that slept, as far as one can tell from outside, just before it was stopped. */
+struct sleeper {
+	bool known;
+	struct proc_sched sched;
 };
 
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
@@ -81,6 +85,13 @@ struct questions {
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
 };
 
+/* How injected code gets along with the app's seccomp filters (seccomp.c). */
+enum seccomp_way {
+	SECCOMP_NONE,      /* there are none                                       */
+	SECCOMP_IN_FORCE,  /* they let pass what it calls                          */
+	SECCOMP_SUPERVISED /* they do not                                          */
+};
+
 struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
@@ -89,6 +100,8 @@ struct thread {
 	int block;       /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
 	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
+	uint32_t filters_known;              /* of seccomp, when they were looked at last       */
+	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has been at this stop                      */
 	struct arch_regs regs; /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
@@ -110,26 +123,32 @@ struct thread {
 	char name[16];
 	struct creds creds;
 	struct scheduling scheduling; /* at this freeze                         */
-	int timeout_cell;             /* of inj_control.timeout, -1: none                 */
 	struct call call;
 	struct rewound rewound;
+	struct sleeper sleeper;
 	uint64_t stopped_ns;
 	bool signalled; /* was just about to run a handler                  */
 };
 
 struct parasite {
 	avc_remote base; /* 0: none                                          */
+	enum seccomp_way seccomp;
+	pid_t inside; /* the process it was brought into, as that knows it     */
 	size_t bytes;
 	uint8_t *map; /* our view of the same pages                       */
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
-	int fd; /* of those pages                                              */
+	/* The guard's own memory, not the app's: the code, sealed, so that nobody can write it; and
+	 * the rest, which the app can write as well. */
+	int code_fd, data_fd;
 };
+#define PARASITE_NAME "avckpt-parasite"
 /* How it is mapped in two parts. */
 #define PARASITE_CODE_PROT (PROT_READ | PROT_EXEC)
 #define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
 #define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
+#define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
 
 /* How far a freeze has come with a process. */
 enum freeze_stage {
@@ -153,7 +172,7 @@ struct process {
 	int holder_pidfd;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
-	uint64_t cells_used; /* bit mask over inj_control.timeout               */
+	uint64_t due_ns; /* when the first of its calls is to be ended (waits.c)   */
 	uint64_t nonce;
 	/* Parasites that a guard which died left behind; they go with the second
 	 * checkpoint, when no thread can be in them any more. */
@@ -177,9 +196,10 @@ struct process {
 	struct pending *pending;
 	struct timers *timers;
 	struct memory *memory;
-	uint64_t shm_bytes;     /* shared memory that is rolled back, at most       */
-	uint32_t plain_filters; /* seccomp filters of init: the container's        */
-	pid_t init;             /* avckpt-init                                      */
+	struct mem_others *others; /* of the main one, and so of all             */
+	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
+	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
+	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool tcp_moved;    /* bytes of connections are to be counted           */
@@ -263,10 +283,12 @@ void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
 /* Of the i-th of them, to be watched; -1: there are no more. */
 int tracee_ending_pidfd(uint32_t i);
+/* Whether STOP_SYSCALL is of one that enters a system call, and not of one that leaves it. */
+bool tracee_enters_call(pid_t tid);
 /* Is this thread the one that traces it? */
 bool tracee_is_ours(pid_t tid);
 /* Holders, and processes that are being made: never to run on without us. */
-#define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | PTRACE_O_SUSPEND_SECCOMP | TRACE_OPTIONS_APP)
+#define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | TRACE_OPTIONS_APP)
 #define TRACE_OPTIONS_APP \
 	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
 
@@ -297,20 +319,38 @@ int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 /* ---- rewind.c --------------------------------------------------------------------- */
 
 /* A thread that just stopped: remembers which call it is in.  If that was only interrupted
- * by us, the thread is set to make it again, with what is left of its timeout. */
+ * by us, the thread is set to make it again, or, when the call's time is up, to answer that. */
 void rewind_call(struct process *process, struct thread *thread);
 /* Just before it goes on: takes off what the stop has added to a wait. */
 void rewind_count_stop(const struct process *process, const struct thread *thread);
-/* Registers as the app had them, before rewind_call() changed a timeout or the
- * kernel made restart_syscall(2) of the call. */
+/* Registers as the app had them, before rewind_call() marked the call or the kernel made
+ * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
-void rewind_forget(struct process *process, struct thread *thread);
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
+
+/* ---- seccomp.c -------------------------------------------------------------------- */
+
+/* Looks at a stopped thread's filters, of which the first `containers` are the container's; *known:
+ * how many there were the last time.  Who is supervised stays so.  0, or -1 with errno. */
+int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known,
+		 enum seccomp_way *way) warn_unused;
+/* From now on, until seccomp_let_be(): `options` are those it has else, `inside` the number of its
+ * process as that knows it. */
+int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
+void seccomp_let_be(pid_t tid);
+bool seccomp_is_supervised(pid_t tid);
+/* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
+void seccomp_at_call(pid_t tid, pid_t inside, long options);
+/* ptrace(PTRACE_CONT) for whoever runs injected code: from `stop`, with its signal if it is one;
+ * NULL: it was told of before. */
+long seccomp_go_on(pid_t tid, const struct stop *stop);
 
 /* ---- parasite.c ------------------------------------------------------------------- */
 
-/* Maps the pages at `base` of process `pid` here and fills in code and control. */
-int parasite_open(struct parasite *parasite, pid_t pid, avc_remote base, size_t bytes,
-		  uint64_t nonce, struct avc_error *err) warn_unused;
+/* Makes the memory for a layout, with code and control filled in; it is in no process yet. */
+int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err) warn_unused;
 size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max);
 void parasite_close(struct parasite *parasite);
 struct inj_slot *parasite_slot(const struct parasite *parasite, uint32_t slot);
@@ -356,8 +396,8 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
 bool parasite_is_old(const struct process *process, avc_remote address);
-/* Until it is let go: it runs only what is ours meanwhile. */
-int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
+/* Options for a task of ours, which is stopped, with the memory of the parasite's process. */
+int parasite_own(const struct parasite *parasite, pid_t tid) warn_unused;
 /* May this stopped thread be borrowed?  What of that is to be read in its memory. */
 int thread_vet(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 /* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:
@@ -487,11 +527,21 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 
 /* ---- last_pid.c ------------------------------------------------------------------- */
 
-/* Starts a helper task inside the PID namespace; it serves the slot's requests
- * until last_pid_stop().  last_pid_set() is the engine's own request. */
-struct last_pid *last_pid_start(int pidns_fd, struct inj_slot *slot, struct avc_error *err);
+/* A slot whose requests the helper serves. */
+struct last_pid_slot {
+	const struct parasite *parasite;
+	uint32_t number;
+};
+/* Starts the helper of the next restore, which waits for it; best effort. */
+void last_pid_prepare(int init_pidfd);
+void last_pid_forget(void);
+/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as the process that
+ * is restored in the first slot asks, or in that of last_pid_serve().  last_pid_set() is the
+ * engine's own request. */
+struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
+				struct avc_error *err);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
-/* From now on those of another slot. */
+/* From now on those of another one of the slots. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 
@@ -501,7 +551,6 @@ struct init_channel {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
-	int pidns_fd;        /* of the container                                 */
 	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
 	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
 };

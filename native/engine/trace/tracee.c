@@ -20,6 +20,8 @@
 #include "trace.h"
 
 #define TICK_NS (2 * (long)NS_PER_MS)
+#define PTRACE_GET_SYSCALL_INFO_ 0x420e /* since Linux 5.3 */
+#define SYSCALL_INFO_ENTRY 1
 
 #ifndef sigev_notify_thread_id
 #define sigev_notify_thread_id _sigev_un._tid
@@ -156,7 +158,6 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 {
 	for (;;) {
 		struct stop stop = tracee_wait(tid, 0);
-		int signal = 0;
 
 		switch (stop.kind) {
 		case STOP_TRAP:
@@ -172,8 +173,6 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 				*child = stop.message;
 			break;
 		case STOP_SIGNAL:
-			signal = stop.signal;
-			break;
 		case STOP_SYSCALL:
 		case STOP_NONE:
 		case STOP_OTHER:
@@ -188,8 +187,7 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 		}
 		/* Any stop takes a pending interrupt away (kernel/signal.c, ptrace_stop):
 		 * without a new one it would just run on. */
-		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
-		    ptrace(PTRACE_CONT, tid, NULL, (long)signal)) {
+		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, &stop)) {
 			fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 			return STOP_OTHER;
 		}
@@ -198,7 +196,7 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 
 int tracee_settle(pid_t tid, struct avc_error *err)
 {
-	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || ptrace(PTRACE_CONT, tid, NULL, 0L))
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
@@ -207,8 +205,17 @@ int tracee_halt(pid_t tid, struct avc_error *err)
 {
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(INTERRUPT)", "it has gone");
-	(void)ptrace(PTRACE_CONT, tid, NULL, 0L); /* refused if it runs */
+	(void)seccomp_go_on(tid, NULL); /* refused if it runs */
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
+}
+
+bool tracee_enters_call(pid_t tid)
+{
+	/* struct ptrace_syscall_info of <linux/ptrace.h>, which does not go with <sys/ptrace.h>. */
+	uint8_t info[88] = { 0 };
+
+	return ptrace(PTRACE_GET_SYSCALL_INFO_, tid, sizeof info, info) > 0 &&
+	       info[0] == SYSCALL_INFO_ENTRY;
 }
 
 bool tracee_is_ours(pid_t tid)

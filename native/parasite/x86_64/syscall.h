@@ -8,6 +8,9 @@
 
 #include <stdint.h>
 
+/* seccomp(2): <linux/audit.h> */
+#define RAW_AUDIT_ARCH AUDIT_ARCH_X86_64
+
 static inline long raw_syscall(long nr, uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e,
 			       uint64_t f)
 {

@@ -43,6 +43,15 @@ int arch_result_set(pid_t tid, long result)
 	return r == -1 ? -1 : 0;
 }
 
+int arch_call_mark_set(pid_t tid, struct arch_regs *regs, uint32_t mark)
+{
+	regs->r.orig_rax = (uint64_t)mark << 32 | (uint32_t)regs->r.orig_rax;
+	return ptrace(PTRACE_POKEUSER, tid, offsetof(struct user, regs.orig_rax),
+		      regs->r.orig_rax) == -1
+		       ? -1
+		       : 0;
+}
+
 uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned int n)
 {
 	const struct user_regs_struct *r = &regs->r;
@@ -352,6 +361,28 @@ static void put_mov(struct writer *w, unsigned int reg, uint64_t value)
 	put(w, &value, sizeof value);
 }
 
+/* What comes after the system call: a task that it has made ends at once, and who made one waits
+ * for it, whether or not it is its child (ECHILD).  Nothing is written to memory. */
+/* clang-format off */
+static const uint8_t stub_start[] = {
+	0x0f, 0x05,                   /*    syscall                       */
+	0x85, 0xc0,                   /*    test %eax, %eax               */
+	0x74, 0x17,                   /*    jz 1f                         */
+	0x78, 0x20,                   /*    js 2f                         */
+	0x89, 0xc7,                   /*    mov %eax, %edi                */
+	0xb8, SYS_wait4, 0, 0, 0,     /*    wait4(it, NULL, __WALL, NULL) */
+	0x31, 0xf6,
+	0xba, 0, 0, 0, 0x40,
+	0x45, 0x31, 0xd2,
+	0x0f, 0x05,
+	0xeb, 0x0b,                   /*    jmp 2f                        */
+	0x31, 0xff,                   /* 1: exit(0)                       */
+	0xb8, SYS_exit, 0, 0, 0,
+	0x0f, 0x05,
+	0xeb, 0xf5,                   /*    jmp 1b                        */
+};                                    /* 2:                               */
+/* clang-format on */
+
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask)
 {
 	static const uint8_t syscall_insn[2] = { 0x0f, 0x05 };
@@ -364,7 +395,7 @@ size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sig
 	uint64_t rip = r->rip;
 	int32_t disp = 0;
 
-	put(&w, syscall_insn, 2);
+	put(&w, stub_start, sizeof stub_start);
 	/* rt_sigprocmask(SIG_SETMASK, &mask, NULL, 8), the stack pointer being
 	 * the app's own all the time: a signal may come as soon as it returns. */
 	put_mov(&w, 0, SYS_rt_sigprocmask);
@@ -398,12 +429,7 @@ size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sig
 
 bool arch_is_stub(const uint8_t *code)
 {
-	/* The system call, and what comes after it: as arch_stub_build() has it. */
-	static const uint8_t start[] = {
-		0x0f, 0x05, 0x48, 0xb8, SYS_rt_sigprocmask, 0, 0, 0, 0, 0, 0, 0, 0x48, 0xbf, 2, 0
-	};
-
-	return memcmp(code, start, sizeof start) == 0;
+	return memcmp(code, stub_start, sizeof stub_start) == 0;
 }
 
 void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub, long nr,

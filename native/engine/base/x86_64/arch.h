@@ -6,6 +6,7 @@
 #ifndef AVCKPT_ARCH_H
 #define AVCKPT_ARCH_H
 
+#include <linux/audit.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -15,6 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
+#define ARCH_AUDIT AUDIT_ARCH_X86_64           /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
@@ -30,10 +32,24 @@ int arch_regs_set(pid_t tid, const struct arch_regs *regs);
 /* Sets the result of the system call the stopped thread is in, nothing else. */
 int arch_result_set(pid_t tid, long result);
 
-/* The system call a stopped thread is in, -1 if it is in none. */
+/* The system call a stopped thread is in, -1 if it is in none.  The kernel has it from the
+ * lower half of rax (arch/x86/entry/entry_64.S, do_syscall_64()). */
 static inline long arch_syscall_nr(const struct arch_regs *regs)
 {
-	return (long)regs->r.orig_rax;
+	return (int32_t)regs->r.orig_rax;
+}
+/* A mark on a call that is to be made again: it stays on that call over all stops, and
+ * nobody but us sees it.  It is the upper half of rax, which the kernel keeps beside the
+ * number and loads again with it, and which holds the result when the call returns. */
+static inline uint32_t arch_call_mark(const struct arch_regs *regs)
+{
+	return (uint32_t)(regs->r.orig_rax >> 32);
+}
+int arch_call_mark_set(pid_t tid, struct arch_regs *regs, uint32_t mark);
+/* The same of a thread that is just about to make the call. */
+static inline uint32_t arch_result_mark(const struct arch_regs *regs)
+{
+	return (uint32_t)(regs->r.rax >> 32);
 }
 static inline void arch_syscall_nr_set(struct arch_regs *regs, long nr)
 {
@@ -128,9 +144,10 @@ bool arch_frame_needs_room(const void *frame);
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
 			    uint64_t sigmask, const uint64_t altstack[3]);
 
-/* A stub that makes one system call (registers preset by arch_stub_call) and
- * then goes back to `regs` by itself, signal mask included.  Writes at most
- * ARCH_STUB_BYTES to `code`, position dependent on `address`. */
+/* A stub that makes one system call (registers preset by arch_stub_call), clone(2) as a rule, and
+ * then goes back to `regs` by itself, signal mask included.  A new task ends; who made it waits for
+ * it before it goes home, by ARCH_STUB_WAIT.  Writes at most ARCH_STUB_BYTES to `code`. */
+#define ARCH_STUB_WAIT SYS_wait4
 #define ARCH_STUB_BYTES 224
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
 /* Whether `code` is what arch_stub_build() has written once. */

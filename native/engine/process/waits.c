@@ -1,0 +1,86 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Calls whose time is up.  A call that a checkpoint has interrupted was made again just
+ * as it was (rewind.c), and would take its whole timeout once more.
+ */
+#include <stdio.h>
+
+#include "process.h"
+
+#define END_DEADLINE_NS (20 * NS_PER_MS)
+#define LOOKS_MAX 64 /* of some 50 us, before a checkpoint */
+
+/* How often a thread has been given a CPU; 0: the kernel does not count. */
+static uint64_t runs_of(pid_t tid)
+{
+	char buf[96];
+	unsigned long long on_cpu, waited, runs;
+
+	return proc_read(tid, "schedstat", buf, sizeof buf) > 0 &&
+			       sscanf(buf, "%llu %llu %llu", &on_cpu, &waited, &runs) == 3
+		       ? runs
+		       : 0;
+}
+
+/* The thread is back in its call by now, or about to be: that takes it one more run.  If it
+ * has run more often when the time is up, it has been woken, and is in another call as a
+ * rule, which is not to be disturbed.  If it is still in the same one, the next checkpoint
+ * ends that. */
+static bool is_waiting(struct thread *thread)
+{
+	return runs_of(thread->tid) - thread->rewound.runs <= 1;
+}
+
+/* To be stopped is all it takes (rewind_call()). */
+static void end(struct process *process, struct thread *thread, timer_t timer)
+{
+	struct avc_error gone = { 0 };
+
+	rt_priority_begin();
+	tracee_deadline_set(timer, END_DEADLINE_NS);
+	if (thread_stop(process, thread, &gone) == 0 && thread_await(process, thread, &gone) == 0)
+		thread_release(thread); /* or threads_tend_stragglers() does it, later */
+	tracee_deadline_clear(timer);
+	rt_priority_end();
+}
+
+void waits_prepare(struct process *process)
+{
+	uint32_t looks = 0;
+
+	for (uint32_t i = 0; i < process->thread_count && looks < LOOKS_MAX; i++) {
+		rewind_prepare(&process->threads[i]);
+		looks += process->threads[i].sleeper.known;
+	}
+}
+
+void waits_end(struct process *process, timer_t timer)
+{
+	const uint64_t now = now_ns();
+	uint64_t due = UINT64_MAX;
+
+	if (process->due_ns == UINT64_MAX)
+		return;
+	for (uint32_t i = 0; i < process->thread_count; i++) { /* may grow */
+		struct thread *t = &process->threads[i];
+		struct rewound *r = &t->rewound;
+
+		if (!r->mark || r->due_ns == UINT64_MAX || t->attached)
+			continue;
+		if (!r->runs_known) {
+			r->runs = runs_of(t->tid);
+			r->runs_known = true;
+			r->waiting = true;
+		}
+		if (!r->waiting)
+			continue;
+		if (r->due_ns > now) {
+			due = r->due_ns < due ? r->due_ns : due;
+			continue;
+		}
+		r->waiting = false;
+		if (is_waiting(t))
+			end(process, t, timer);
+	}
+	process->due_ns = due;
+}
