@@ -92,16 +92,18 @@ def test_the_wait_before_the_first_stop_counts(interval_s: float, tmp_path: Path
     """
     seconds, n = 0.25, 16
     late = []
-    with Victim(f"eintr epoll_wait {seconds} --quiet", tmp_path) as victim:
-        with GuardProcess(config(interval_s), [victim.pid]) as guard:
-            guard.wait("checkpoint")
-            for _ in range(n):
-                victim.board.set_counter(LONGEST, 0)
-                # One that was begun since, and was stopped (with the longer interval: or not).
-                since = guard.mark()
-                guard.wait("checkpoint", since=since)
-                calls = victim.see().counter[0]
-                wait_until(lambda: victim.see().counter[0] > calls, 5, "the call ends", 0.001)
-                late.append(victim.see().counter[LONGEST] / 1e9 - seconds)
-            victim.check()
+    with (
+        Victim(f"eintr epoll_wait {seconds} --quiet", tmp_path) as victim,
+        GuardProcess(config(interval_s), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint")
+        for _ in range(n):
+            victim.board.set_counter(LONGEST, 0)
+            # One that was begun since, and was stopped (with the longer interval: or not).
+            since = guard.mark()
+            guard.wait("checkpoint", since=since)
+            calls = victim.see().counter[0]
+            wait_until(lambda calls=calls: victim.see().counter[0] > calls, 5, "the call ends", 0.001)  # type: ignore[misc]
+            late.append(victim.see().counter[LONGEST] / 1e9 - seconds)
+        victim.check()
     assert sorted(late)[n // 2] < 0.02 * SLOWNESS, late

@@ -166,13 +166,16 @@ struct proc_sched {
 int proc_sched(pid_t tid, struct proc_sched *sched);
 
 /* What is of interest in /proc/PID/status. */
+#define STATUS_GROUPS 64
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
 	pid_t tracer;            /* a thread, in our namespace; 0: none              */
 	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
-	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	int group_count;         /* supplementary; those beyond are not known   */
+	uint32_t groups[STATUS_GROUPS];
+	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };

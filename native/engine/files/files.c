@@ -635,6 +635,48 @@ struct linux_dirent64 {
 	char d_name[];
 };
 
+static int by_object(const void *a, const void *b)
+{
+	const struct file *x = *(const struct file *const *)a, *y = *(const struct file *const *)b;
+
+	if (x->dev != y->dev)
+		return x->dev < y->dev ? -1 : 1;
+	return (x->ino > y->ino) - (x->ino < y->ino);
+}
+
+void files_missing_sort(struct files_missing *missing)
+{
+	if (missing->count)
+		qsort(missing->file, missing->count, sizeof(void *), by_object);
+}
+
+/* A program may have opened thousands since, which are only to be closed. */
+static bool is_of_interest(const struct look *look, const char *name)
+{
+	const struct files_missing *missing = look->files->missing;
+	struct file key = { 0 };
+	const struct file *wanted = &key;
+	struct statx st;
+
+	if (!missing || files_find(look->known, atoi(name)))
+		return true;
+	if (!missing->count || statx(look->fd_dir, name, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT,
+				     STATX_TYPE | STATX_INO, &st))
+		return false;
+	key.dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+	key.ino = st.stx_ino;
+	return (missing->port && S_ISSOCK(st.stx_mode)) ||
+	       bsearch(&wanted, missing->file, missing->count, sizeof wanted, by_object);
+}
+
+static int walk_known(struct look *look, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < look->known->count; i++)
+		if (look_at(look, look->known->file[i].fd, err))
+			return -1;
+	return 0;
+}
+
 static int walk(struct look *look, struct avc_error *err)
 {
 	char buf[16384] __attribute__((aligned(8)));
@@ -651,7 +693,8 @@ static int walk(struct look *look, struct avc_error *err)
 			const struct linux_dirent64 *entry = (struct linux_dirent64 *)(buf + at);
 
 			at += entry->d_reclen;
-			if (entry->d_name[0] != '.' && look_at(look, atoi(entry->d_name), err))
+			if (entry->d_name[0] != '.' && is_of_interest(look, entry->d_name) &&
+			    look_at(look, atoi(entry->d_name), err))
 				return -1;
 		}
 	}
@@ -681,7 +724,8 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	files->count = 0;
 	clock_gettime(CLOCK_REALTIME, &now);
 	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
-	result = walk(&look, err);
+	result = files->missing && !files->missing->count ? walk_known(&look, err)
+							  : walk(&look, err);
 	close(look.fd_dir);
 	if (result) {
 		for (uint32_t i = 0; i < files->count; i++)
@@ -796,6 +840,7 @@ void files_capture(struct image *image, const struct image *parent, bool several
  * there before it may be of either side, and is left alone at a restore. */
 void files_settle(struct image *image)
 {
+	file_rights_read(&image->files->rights, image->process->pid);
 	for (uint32_t i = 0; i < image->files->count; i++) {
 		struct file *f = &image->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };

@@ -184,6 +184,13 @@ static void take_line(struct file *file, const char *key, const char *value, uin
 		add_mark(file, value, room);
 }
 
+uint64_t file_count(int fd)
+{
+	struct file file = { .fd = fd, .kind = FILE_EVENTFD };
+
+	return file_read_info(getpid(), &file) ? file.count : 0;
+}
+
 static const struct {
 	enum file_kind kind;
 	const char *key;
