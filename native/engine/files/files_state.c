@@ -32,7 +32,7 @@
 #include "files.h"
 
 #define CONTENT_MAX (1 << 20)
-#define DRAIN_READS 16384       /* more than the small messages that a socket has room for */
+#define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
 #define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */

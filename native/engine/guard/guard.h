@@ -31,7 +31,7 @@ struct avc_guard {
 	struct init_channel channel;
 	bool attached, unprotected;
 	struct process main; /* the app's main process                         */
-	struct tree tree;    /* and the others                                 */
+	struct tree tree;    /* it and the others                              */
 	struct pollfd *fds;  /* room for wait_for_news()                       */
 	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */

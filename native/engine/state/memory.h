@@ -117,12 +117,7 @@ void areas_free(struct areas *areas);
 void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags);
 /* Were the areas that were copied those that there are?  Of the long file only as
  * often as it is worth it, and when the layout has changed. */
-int areas_check(struct process *process, const struct generation *generation,
-		struct avc_error *err) warn_unused;
-/* When all processes are known: -1 if several of them have shared memory that is not rolled back
- * with them.  One that went back would wait for what another one had done. */
-int areas_check_unkept(const struct process *main, const struct generation *generation,
-		       struct avc_error *err) warn_unused;
+int areas_check(const struct image *image, struct avc_error *err) warn_unused;
 /* A descriptor of that process, open for writing, of what the area is; -1: none. */
 int area_find_descriptor(pid_t pid, const struct area *area);
 
@@ -131,8 +126,7 @@ int area_find_descriptor(pid_t pid, const struct area *area);
 /* While the process is stopped. */
 void wiped_copy(const struct process *process, struct mem_image *image);
 /* Puts it into the template, which is stopped, and forgets it. */
-int wiped_fill(struct process *process, struct generation *generation, struct setup *setup,
-	       struct avc_error *err) warn_unused;
+int wiped_fill(const struct image *image, struct setup *setup, struct avc_error *err) warn_unused;
 void wiped_free(struct wiped *wiped);
 
 /* ---- memory_others.c -------------------------------------------------------- */

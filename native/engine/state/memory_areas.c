@@ -344,27 +344,27 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	return result;
 }
 
-static int check_layout(struct process *process, const struct generation *generation,
-			struct avc_error *err)
+static int check_layout(const struct image *image, struct avc_error *err)
 {
+	struct process *process = image->process;
 	struct memory *memory = process->memory;
 	struct survey survey = { .process = process };
 	const uint64_t start = now_ns();
 	int result;
 
-	if (proc_mappings(generation->template, "maps", hash_mapping, &survey))
-		return fail_errno(err, generation->template, "keep memory", "read(maps)",
+	if (proc_mappings(image->template, "maps", hash_mapping, &survey))
+		return fail_errno(err, image->template, "keep memory", "read(maps)",
 				  "it was killed");
 	if (survey.layout == memory->layout &&
 	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
 		return 0;
 	survey = (struct survey){
 		.process = process,
-		.template = generation->template,
+		.template = image->template,
 		.memory = memory,
-		.since = generation->taken_ns,
+		.since = image->taken_ns,
 	};
-	result = read_areas(&survey, &generation->image->areas, err);
+	result = read_areas(&survey, &image->memory->areas, err);
 	memory->layout = result ? 0 : survey.layout;
 	areas_free(&survey.areas);
 	areas_free(&survey.foreign);
@@ -440,20 +440,16 @@ static const struct unkept *find_common(const struct unkept_list *list)
 	return NULL;
 }
 
-int areas_check_unkept(const struct process *main, const struct generation *generation,
-		       struct avc_error *err)
+int memory_check_unkept(const struct image *image, uint32_t images, struct avc_error *err)
 {
 	struct unkept_list list = { 0 };
 	const struct unkept *common;
-	bool added = add_unkept(&list, main, generation->image);
+	bool added = true;
 	int result = 0;
 
-	for (uint32_t i = 0; added && i < generation->branches; i++) {
-		const struct branch *branch = &generation->branch[i];
-
-		if (branch->process)
-			added = add_unkept(&list, branch->process, branch->image->image);
-	}
+	for (uint32_t i = 0; added && i < images; i++)
+		if (image[i].process)
+			added = add_unkept(&list, image[i].process, image[i].memory);
 	if (!added) {
 		result = fail_errno(err, 0, "keep memory", "realloc", "out of memory");
 	} else if (list.count) {
@@ -470,17 +466,18 @@ int areas_check_unkept(const struct process *main, const struct generation *gene
 	return result;
 }
 
-int areas_check(struct process *process, const struct generation *generation, struct avc_error *err)
+int areas_check(const struct image *image, struct avc_error *err)
 {
-	const int result = check_layout(process, generation, err);
+	struct process *process = image->process;
+	const int result = check_layout(image, err);
 
-	generation->image->kinds = process->memory->kinds;
-	if (!result && generation->image->too_much)
+	image->memory->kinds = process->memory->kinds;
+	if (!result && image->memory->too_much)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			    "more than %u MB of its memory are wiped in a clone (MADV_WIPEONFORK), "
 			    "which is too much to copy",
 			    WIPED_MAX >> 20);
-	if (!result && !generation->image->whole)
+	if (!result && !image->memory->whole)
 		return fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
 			    "its shared or MADV_WIPEONFORK memory cannot be read");
 	return result;

@@ -150,6 +150,13 @@ struct parasite {
 #define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
 #define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
 
+/* How far a freeze has come with a process. */
+enum freeze_stage {
+	FREEZE_RUNS,    /* or not all of its threads are known to be stopped        */
+	FREEZE_STOPPED, /* all of it                                            */
+	FREEZE_BEGUN    /* and it is being read, cloned and asked                     */
+};
+
 /* A live process of the app. */
 struct process {
 	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
@@ -202,15 +209,13 @@ struct process {
 	uint64_t start;               /* when it began; tells it from one with its number */
 	uint32_t images;              /* generations that have one of it                  */
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	enum freeze_stage stage;      /* in this freeze                                    */
 	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
 	long clone_pages;             /* its size when that began                         */
 	long anon_pages;              /* of its last template; 0: none yet                */
-	bool closing;                 /* by its holder: generation_close_tables()      */
 	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
-	bool frozen;                  /* stopped in this freeze                            */
-	bool begun;                   /* and read, and asked                               */
 	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
 	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
