@@ -350,12 +350,14 @@ int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
 	if (!cloned || result)
 		return -1;
 	process->checkpoints++;
-	if (pending_deadly(process->pending))
-		return fail(err, AVC_GONE, 0, process->pid, "freeze", "",
-			    "it is just being ended by signal %d",
-			    pending_deadly(process->pending));
 	for (uint32_t i = 0; i < generation->branches; i++)
 		if (generation->branch[i].process)
 			generation->branch[i].process->checkpoints++;
+	if (pending_check(process, err))
+		return -1;
+	for (uint32_t i = 0; i < generation->branches; i++)
+		if (generation->branch[i].process &&
+		    pending_check(generation->branch[i].process, err))
+			return -1;
 	return 0;
 }
