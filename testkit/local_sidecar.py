@@ -18,8 +18,9 @@ from avckpt.artifacts import hooks_source, init_binary
 from avckpt.cli.client import Client
 from avckpt.containers.process import has_ended
 from avckpt.errors import SidecarUnreachable
+from avckpt_hooks import VERSION
 
-from testkit.harness import Completed, avckpt_command, run, wait_until
+from testkit.harness import ROOT, Completed, avckpt_command, run, wait_until
 from testkit.procfs import children_of, inside
 
 QUICK = {"avckpt.enable": "true", "avckpt.interval": "100ms"}
@@ -45,7 +46,7 @@ class Container:
 
     def hook(self, stage: str, labels: dict[str, str] | None = None) -> str:
         """Runs a real hook as the OCI runtime would; returns what it had to tell."""
-        annotations = {**(labels or {}), "avckpt.version": "0.1.0", "avckpt.name": self.name}
+        annotations = {**(labels or {}), "avckpt.version": VERSION, "avckpt.name": self.name}
         state = {"ociVersion": "1.0.2", "id": self.id, "pid": self.init_pid, "bundle": "/b", "annotations": annotations}
         # A hook tells the program that called it, on that one's standard error:
         # here a shell, which must stay to be told.
@@ -135,20 +136,25 @@ class LocalSidecar:
             raise AssertionError(f"{error}; it is {last}; log:\n{self.log}") from None
         return last
 
-    def container(self, name: str, argv: Sequence[str], container_id: str | None = None) -> Container:
-        """Starts avckpt-init with a program; nobody is told of it yet."""
+    def container(
+        self, name: str, argv: Sequence[str], container_id: str | None = None, *, init: bool = True
+    ) -> Container:
+        """Starts avckpt-init with a program, or the program alone; nobody is told of it yet."""
         output = self.run_dir.parent / f"{name}-{len(self.containers)}.out"
+        command = (str(init_binary()), "--wait-ms", "2000", "--") if init else ()
         # unshare stays as the parent, so that the container has an exit status to wait for.
         with output.open("wb") as out:
             process = subprocess.Popen(
-                ["unshare", "--pid", "--fork", "--mount-proc", str(init_binary()), "--wait-ms", "2000", "--", *argv],
+                ["unshare", "--pid", "--fork", "--mount-proc", *command, *argv],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=out,
+                cwd=ROOT,
             )
         init_pid = wait_until(lambda: next(iter(children_of(process.pid)), 0), 5, "init starts")
         pidfd = os.pidfd_open(init_pid)
-        wait_until(lambda: children_of(init_pid), 5, "the application starts")
+        if init:
+            wait_until(lambda: children_of(init_pid), 5, "the application starts")
         made = Container(
             container_id or f"{len(self.containers) + 1:x}".rjust(2, "c") * 32,
             name,

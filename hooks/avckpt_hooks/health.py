@@ -17,7 +17,7 @@ import os
 import time
 
 from avckpt_hooks import podman
-from avckpt_hooks.shared import protocol, tell
+from avckpt_hooks.shared import files, protocol, tell
 
 TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
 if TYPE_CHECKING:
@@ -58,26 +58,19 @@ def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
             "healthcheck": config.get("Healthcheck"),
             "startup_healthcheck": config.get("StartupHealthCheck"),
         }
-    except (podman.Unknown, ValueError, LookupError, AttributeError) as error:
+    except (podman.Unknown, ValueError, LookupError, AttributeError, RecursionError) as error:
         answer = {"healthcheck": None, "error": str(error)}
         if _has_ended(container):
             return
         tell.journal(f"avckpt: container {container[:12]}: its health check can not be found out: {error}")
     path = protocol.health_path(container)
-    os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
-    temporary = f"{path}.{os.getpid()}"
-    try:
-        with open(temporary, "w") as file:
-            json.dump(answer, file)
-        os.replace(temporary, path)
-        if _has_ended(container):  # and the poststop hook was here already
+    content = json.dumps(answer).encode()
+    if len(content) > protocol.MAX_BYTES:
+        content = json.dumps({"healthcheck": None, "error": "its health check is too long"}).encode()
+    files.write_private(path, content)
+    if _has_ended(container):  # and the poststop hook was here already
+        with contextlib.suppress(FileNotFoundError):
             os.unlink(path)
-    except FileNotFoundError:
-        return
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
 
 
 def _has_ended(container: str) -> bool:

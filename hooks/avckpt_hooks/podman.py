@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _ID_LENGTH = 64
 _TIMEOUT_S = 20.0
+_MOST_BYTES = 16 << 20
+"""Of what a program says: labels and health checks are an image's, which may say anything."""
 _SIGKILL = 9  # importing signal takes 4 ms
 _DEFAULT_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
@@ -199,7 +201,7 @@ def _last_id(path: str) -> str | None:
 def _cmdline(pid: int) -> list[str]:
     try:
         with open(f"/proc/{pid}/cmdline", "rb") as file:
-            return [os.fsdecode(word) for word in file.read().split(b"\0")[:-1]]
+            return [os.fsdecode(word) for word in file.read(_MOST_BYTES).split(b"\0")[:-1]]
     except OSError:
         return []
 
@@ -209,7 +211,7 @@ def _environment(pid: int) -> dict[str, str]:
     env: dict[str, str] = {}
     try:
         with open(f"/proc/{pid}/environ", "rb") as file:
-            for entry in file.read().split(b"\0"):
+            for entry in file.read(_MOST_BYTES).split(b"\0"):
                 name, equals, value = os.fsdecode(entry).partition("=")
                 if equals and name and value:
                     env[name] = value
@@ -261,7 +263,7 @@ def _run(program: str, argv: list[str], env: dict[str, str], deadline: float) ->
     finally:
         os.close(out_end)
         os.close(err_end)
-    texts = {out: b"", err: b""}
+    texts = {out: bytearray(), err: bytearray()}
     poll = select.poll()
     for fd in texts:
         poll.register(fd, select.POLLIN)
@@ -271,11 +273,14 @@ def _run(program: str, argv: list[str], env: dict[str, str], deadline: float) ->
             wait_s = deadline - time.monotonic()
             ready = poll.poll(wait_s * 1000) if wait_s > 0 else []
             if not ready:
-                os.kill(pid, _SIGKILL)
+                os.kill(pid, _SIGKILL)  # our child, which nobody else waits for: the number is its own
                 raise Unknown(f"podman {_asked(argv)} took too long")
             for fd, _ in ready:
                 part = os.read(fd, 65536)
                 texts[fd] += part
+                if len(texts[fd]) > _MOST_BYTES:
+                    os.kill(pid, _SIGKILL)
+                    raise Unknown(f"podman {_asked(argv)} says too much")
                 if not part:
                     poll.unregister(fd)
                     open_fds -= 1
@@ -286,4 +291,4 @@ def _run(program: str, argv: list[str], env: dict[str, str], deadline: float) ->
     if status != 0:
         lines = texts[err].decode(errors="replace").strip().splitlines()
         raise Unknown(f"podman {_asked(argv)}: {lines[-1] if lines else 'failed'}")
-    return texts[out]
+    return bytes(texts[out])

@@ -8,12 +8,11 @@ without a sidecar the container runs on, unprotected.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import sys
 
-from avckpt_hooks.shared import protocol, tell
+from avckpt_hooks.shared import files, protocol, tell
 
 TYPE_CHECKING = False  # typing.TYPE_CHECKING, without the 7 ms that importing it takes
 if TYPE_CHECKING:
@@ -96,16 +95,5 @@ def write_record(registration: protocol.Register) -> None:
     With the PID namespace that its PID is of: a sidecar without --pid=host is in
     another one, and must not take the container for one that has ended.
     """
-    path = protocol.record_path(registration.id)
-    os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
-    temporary = f"{path}.{os.getpid()}"
     record = {**registration.record(), "pid_namespace": os.stat("/proc/self/ns/pid").st_ino}
-    try:
-        with open(temporary, "w") as file:
-            json.dump(record, file)
-            file.write("\n")
-        os.replace(temporary, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+    files.write_private(protocol.record_path(registration.id), json.dumps(record).encode() + b"\n")

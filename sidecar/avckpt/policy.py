@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from avckpt_hooks.shared.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy
+from avckpt_hooks.shared.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy, shown
 
 from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Tcp
@@ -32,7 +32,8 @@ class Change:
     after: str
 
     def __str__(self) -> str:
-        return f"{self.setting} {self.before or 'none'} -> {self.after or 'none'}"
+        before, after = (shown(text) if text else "none" for text in (self.before, self.after))
+        return f"{self.setting} {before} -> {after}"
 
 
 @dataclass(frozen=True)
@@ -86,11 +87,6 @@ def settings_of(labels: Mapping[str, str]) -> Settings:
         raise LabelsWrong(str(error)) from error
     said = {key: value.strip() for key, value in labels.items() if key in LABELS}
     return Settings(said, policy, guard_config(policy))
-
-
-def config_of_labels(labels: Mapping[str, str]) -> GuardConfig:
-    """The engine's part of what the labels say.  Raises LabelsWrong."""
-    return settings_of(labels).config
 
 
 def changes(before: Settings, after: Settings) -> list[Change]:

@@ -11,9 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
+from avckpt_hooks.shared.files import TooLong, read_bounded
 
 _MERGE = "tag:yaml.org,2002:merge"
 _PLAIN = ("int", "float", "bool", "null")
+
+
+FILE_BYTES = 1 << 20
+VALUES_MOST = 100_000
+"""Keys and values of a file when every alias is replaced by what it stands for."""
 
 
 @dataclass(frozen=True, order=True)
@@ -37,15 +43,23 @@ class Unreadable(Exception):
 
 
 def read(path: Path) -> yaml.Node | None:
-    """The root of the only document in `path`; None: the file is empty.  Raises Unreadable."""
+    """The root of the only document in `path`; None: the file is empty.  Raises Unreadable.
+
+    What is returned may be walked without a thought of its aliases: expanded it
+    is not endless, and not larger than `VALUES_MOST`.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(str(path), FILE_BYTES).decode()
+    except TooLong as error:
+        raise Unreadable(Place(str(path), 1), f"longer than {FILE_BYTES} bytes") from error
     except OSError as error:
         raise Unreadable(Place(str(path), 1), error.strerror or str(error)) from error
     except UnicodeDecodeError as error:
         raise Unreadable(Place(str(path), 1), f"not UTF-8: {error.reason}") from error
     try:
-        return yaml.compose(text, Loader=yaml.SafeLoader)
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        _expanded(root, path, {})
+        return root
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark is not None else 1
@@ -55,6 +69,29 @@ def read(path: Path) -> yaml.Node | None:
         raise Unreadable(Place(str(path), 1), f"not YAML: {error}") from error
     except RecursionError as error:
         raise Unreadable(Place(str(path), 1), "nested too deeply") from error
+
+
+def _expanded(node: yaml.Node | None, path: Path, known: dict[int, int]) -> int:
+    """How many nodes this one is without aliases; each is counted once, so that counting takes no longer than reading.
+
+    Raises Unreadable where there are too many.
+    """
+    if node is None:
+        return 0
+    count = known.get(id(node))
+    if count == 0:
+        raise Unreadable(place_of(node, path), "an anchor that holds itself")
+    if count is None:
+        known[id(node)] = 0
+        count = 1
+        if isinstance(node, yaml.SequenceNode):
+            count += sum(_expanded(item, path, known) for item in node.value)
+        elif isinstance(node, yaml.MappingNode):
+            count += sum(_expanded(each, path, known) for pair in node.value for each in pair)
+        if count > VALUES_MOST:
+            raise Unreadable(place_of(node, path), f"with its aliases replaced more than {VALUES_MOST} values")
+        known[id(node)] = count
+    return count
 
 
 def place_of(node: yaml.Node, path: Path) -> Place:
@@ -68,7 +105,21 @@ def entries(node: yaml.Node | None) -> list[tuple[yaml.ScalarNode, yaml.Node]]:
     A key that is written twice in one mapping comes twice.  What the mapping
     says itself comes after what it merges in, and hides it.
     """
-    return _entries(node, ())
+    if not isinstance(node, yaml.MappingNode):
+        return []
+    own = []
+    merged: dict[str, tuple[yaml.ScalarNode, yaml.Node]] = {}
+    for key, value in node.value:
+        if key.tag == _MERGE:
+            sources = value.value if isinstance(value, yaml.SequenceNode) else [value]
+            for source in sources:
+                for name, what in entries(source):
+                    # Of several, the first wins.
+                    merged.setdefault(name.value, (name, what))
+        elif isinstance(key, yaml.ScalarNode):
+            own.append((key, value))
+    hidden = {key.value for key, _ in own}
+    return [entry for name, entry in merged.items() if name not in hidden] + own
 
 
 def lookup(node: yaml.Node | None, key: str) -> yaml.Node | None:
@@ -95,23 +146,3 @@ def text_of(node: yaml.Node) -> str:
     except (yaml.YAMLError, ValueError):
         return str(node.value)
     return "" if value is None else str(value)
-
-
-def _entries(node: yaml.Node | None, above: tuple[int, ...]) -> list[tuple[yaml.ScalarNode, yaml.Node]]:
-    # An anchor may be merged into itself, and nobody else would notice.
-    if not isinstance(node, yaml.MappingNode) or id(node) in above:
-        return []
-    above = (*above, id(node))
-    own = []
-    merged: dict[str, tuple[yaml.ScalarNode, yaml.Node]] = {}
-    for key, value in node.value:
-        if key.tag == _MERGE:
-            sources = value.value if isinstance(value, yaml.SequenceNode) else [value]
-            for source in sources:
-                for name, what in _entries(source, above):
-                    # Of several, the first wins.
-                    merged.setdefault(name.value, (name, what))
-        elif isinstance(key, yaml.ScalarNode):
-            own.append((key, value))
-    hidden = {key.value for key, _ in own}
-    return [entry for name, entry in merged.items() if name not in hidden] + own

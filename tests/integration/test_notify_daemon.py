@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -159,8 +160,9 @@ def test_a_command_runs_inside_with_the_event(local: LocalSidecar, tmp_path: Pat
 @pytest.mark.parametrize(
     ("command", "why"),
     [
-        ("sh -c 'echo one; echo two >&2; exit 3'", ": exited with status 3: two"),
-        ("/no/such/program --x", "/no/such/program --x: exited with status 127"),
+        ("sh -c 'echo one; echo two >&2; exit 3'", " sh: exited with status 3: two"),
+        # What a program is given may be secret; whoever reads the log need not be allowed to know it.
+        ("/no/such/program --password=x", "/no/such/program: exited with status 127"),
         ("sh -c 'kill -SEGV $$'", ": exited with status 139"),
     ],
 )
@@ -171,6 +173,27 @@ def test_a_command_that_fails_is_told(local: LocalSidecar, command: str, why: st
     (event,) = told(local, "notify_failed")
     assert why in event["message"]
     assert not ended(web)
+
+
+def test_an_environment_without_an_end(local: LocalSidecar) -> None:
+    """A process says itself where its environment is; one without avckpt-init is the application."""
+    odd = local.container("odd", [sys.executable, "-m", "testkit.odd_environ", "300"], init=False)
+    wait_until(lambda: "set" in odd.output.read_text(), 10, "it has such an environment")
+    assert odd.hook("prestart", {"avckpt.group": "chain", "avckpt.notify": "exec:true"}) == ""
+    local.wait_for(odd, state="listening")
+    assert local.process is not None
+    status = Path(f"/proc/{local.process.pid}/status")
+    web = protected(local, "web", IN_GROUP)
+    before_kb = high_water_kb(status)
+    crash(local, web)
+    wait_until(lambda: told(local, "notify_failed"), 5, "the failure is told")
+    assert "its environment is longer than" in told(local, "notify_failed")[0]["message"]
+    assert high_water_kb(status) < before_kb + 50_000
+
+
+def high_water_kb(status: Path) -> int:
+    """The most memory a process ever had."""
+    return int(status.read_text().partition("VmHWM:")[2].split()[0])
 
 
 def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_path: Path) -> None:

@@ -101,7 +101,10 @@ def restored(victim: Victim, guard: GuardProcess) -> Json:
     return event
 
 
-KINDS = ["guard", "unguard", "sealed", "droppable", "growing", "attached", "readable", "readonly", "unmoved"]
+KINDS = [
+    *("guard", "unguard", "sealed", "droppable", "growing", "attached", "readable", "readonly", "unmoved"),
+    *("shielded", "described", "scattered", "wiped", "reserved"),
+]
 
 
 @pytest.mark.parametrize(
@@ -139,6 +142,51 @@ def test_what_was_sealed_since_can_not_go_back_and_is_told(where: str, tmp_path:
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         assert "sealed" in restored(victim, guard)["error"]["message"]
+
+
+@pytest.fixture
+def visible(tmp_path: Path) -> Iterator[Path]:
+    """A folder that the victim and everybody else have in /dev/shm."""
+    folder = Path("/dev/shm") / f"avckpt-test-{tmp_path.name}-{os.getpid()}"
+    folder.mkdir()
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_what_it_can_not_write_is_not_rolled_back(where: str, visible: Path, tmp_path: Path) -> None:
+    """A reader that dies takes nothing back of what the writer has written since."""
+    with (
+        Victim(f"regions viewed {visible} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        assert "error" not in guard.command("checkpoint")
+        (visible / "map").write_bytes(b"now\0")
+        assert "error" not in restored(victim, guard)
+        assert (visible / "map").read_bytes() == b"now\0"
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_what_others_wrote_since_is_not_taken_back(where: str, visible: Path, tmp_path: Path) -> None:
+    """They have neither mapped it nor is it open any more when the application dies."""
+    with (
+        Victim(f"regions published {visible} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        assert "error" not in guard.command("checkpoint")
+        with (visible / "map").open("r+b") as file:
+            file.write(b"now\0")
+        assert "have been written as files since" in restored(victim, guard)["error"]["message"]
+        assert (visible / "map").read_bytes()[:4] == b"now\0"
+
+
+def test_what_others_have_open_for_writing_is_theirs_and_told(visible: Path, tmp_path: Path) -> None:
+    with (
+        Victim(f"regions published {visible}", tmp_path) as victim,
+        (visible / "map").open("r+b"),
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        assert "shared memory are also others'" in guard.command("checkpoint")["error"]["message"]
 
 
 @pytest.fixture

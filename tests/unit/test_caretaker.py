@@ -13,7 +13,7 @@ import pytest
 from avckpt.containers.protected import Protected
 from avckpt.engine import Guard
 from avckpt.policy import settings_of
-from avckpt.supervision import caretaker
+from avckpt.supervision import caretaker, pressure
 from avckpt.supervision.caretaker import Caretaker
 
 SLOW_S = 0.5
@@ -49,7 +49,7 @@ def test_the_event_loop_goes_on_and_one_is_read_at_a_time(monkeypatch: pytest.Mo
         return 1 << 30
 
     monkeypatch.setattr(caretaker, "HostPressure", Short)
-    monkeypatch.setattr(caretaker, "held_bytes", slow)
+    monkeypatch.setattr(pressure, "held_bytes", slow)
     settings = settings_of({})
     wards = [Ward(Protected(f"{n}" * 64, f"c{n}", n, os.getpid(), settings.config, 0.0)) for n in (1, 2)]
 

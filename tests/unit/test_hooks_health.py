@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import stat
 from pathlib import Path
 
 import pytest
@@ -31,3 +32,20 @@ def test_both_checks_are_written_down(startup: dict[str, object] | None) -> None
         "healthcheck": CHECK,
         "startup_healthcheck": startup,
     }
+
+
+def test_they_are_for_root_only() -> None:
+    """They are commands; also where an earlier version has left them readable."""
+    path = Path(protocol.health_path(ID))
+    path.parent.mkdir(mode=0o755)
+    path.touch(mode=0o644)
+    health.write_answer(ID, lambda deadline: json.dumps([{"Config": {"Healthcheck": CHECK}}]).encode())
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_one_that_is_too_long_is_not_taken_over() -> None:
+    check = {"Test": ["CMD-SHELL", "x" * 200_000]}
+    health.write_answer(ID, lambda deadline: json.dumps([{"Config": {"Healthcheck": check}}]).encode())
+    said = json.loads(Path(protocol.health_path(ID)).read_bytes())
+    assert said == {"healthcheck": None, "error": "its health check is too long"}

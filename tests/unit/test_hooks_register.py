@@ -9,6 +9,7 @@ import resource
 import select
 import signal
 import socket
+import stat
 import struct
 import subprocess
 import threading
@@ -80,6 +81,29 @@ def answer(listener: socket.socket, reply: Callable[[socket.socket, Any, int | N
     thread = threading.Thread(target=serve)
     thread.start()
     return thread
+
+
+def modes(folder: Path) -> tuple[int, set[int]]:
+    """Those of a folder and of what is in it."""
+    files = {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()}
+    return stat.S_IMODE(folder.stat().st_mode), files
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_the_record_is_for_root_only(run_dir: Path, process: subprocess.Popen[bytes], is_there: bool) -> None:
+    """It holds labels; also where an earlier version has left it readable."""
+    folder = run_dir / "containers"
+    if is_there:
+        folder.mkdir(mode=0o755)
+        (folder / f"{ID}.json").write_text("{}")
+        (folder / f"{ID}.json").chmod(0o644)
+    call("prestart", state_of(process))
+    assert modes(folder) == (0o700, {0o600})
+
+
+def test_a_request_that_is_nested_too_deeply() -> None:
+    with pytest.raises(protocol.ProtocolError, match="not JSON"):
+        protocol.decode_request(b"[" * 100_000)
 
 
 def test_prestart_registers_with_a_pidfd(listener: socket.socket, process: subprocess.Popen[bytes]) -> None:

@@ -10,7 +10,17 @@ import string
 from pathlib import Path
 
 import pytest
-from avckpt_hooks.shared.labels import LABELS, RESTORES_MAX, LabelError, Notify, Policy, RestoreOn, merge, parse_policy
+from avckpt_hooks.shared.labels import (
+    LABELS,
+    RESTORES_MAX,
+    LabelError,
+    Notify,
+    Policy,
+    RestoreOn,
+    merge,
+    parse_policy,
+    shown,
+)
 
 ON = {"avckpt.enable": "true"}
 
@@ -223,3 +233,20 @@ def test_merge_keeps_what_is_stamped_to_itself(key: str) -> None:
     assert merge({}, {key: "of an earlier start"}) == {}
     with pytest.raises(LabelError, match="avckpt sets this itself"):
         merge({key: "mine"}, {})
+
+
+@pytest.mark.parametrize(
+    ("value", "means"),
+    [
+        ("exec:/bin/told --password=x", "exec:/bin/told ..."),
+        ("exec: /bin/told --password=x", "exec: ..."),
+        ("exec:/bin/told", "exec:/bin/told"),
+        ("signal:USR1", "signal:USR1"),
+    ],
+)
+def test_of_a_command_only_the_program_is_shown(value: str, means: str) -> None:
+    """Its arguments may be secret, and errors go to the journal."""
+    assert shown(value) == means
+    error = LabelError("avckpt.notify", value, "wrong", "allowed: right")
+    assert "password" not in str(error)
+    assert f"avckpt.notify={means}" in str(error)

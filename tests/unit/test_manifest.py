@@ -196,7 +196,7 @@ def test_labels_under_deploy_are_not_the_containers(path: Path) -> None:
         ("- a\n", "v.yaml:1: not a mapping: is this a Compose file?"),
         ("defaults: {}\n", "v.yaml:1: no services: is this a Compose file?"),
         ("", "v.yaml:1: no services: is this a Compose file?"),
-        ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", ""),
+        ("services: &s\n  a: {<<: *s, labels: &l {<<: *l}}\n", "v.yaml:1: an anchor that holds itself"),
         ("services: {a: , b: 3, c: [1], d: {labels: }, 5: {labels: {1: 2}}}\n", ""),
     ],
 )

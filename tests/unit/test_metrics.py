@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from avckpt.containers.protected import State
+from avckpt.containers.protected import Protected, State
 from avckpt.errors import DeadlineMissed
-from avckpt.events.metrics import Held, Metrics
-from avckpt.events.record import Cause, EventRecord, Kind, Outcome
+from avckpt.events.metrics import Metrics
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind, Reason
+from avckpt.policy import settings_of
 from prometheus_client.parser import text_string_to_metric_families
 
 
@@ -31,15 +33,15 @@ def test_events_are_counted_by_container_reason_and_outcome() -> None:
         EventRecord(
             Kind.RESTORED,
             container="web",
-            reason=Cause.SIGNAL,
-            outcome=Outcome.RESTORED,
+            reason=Reason.SIGNAL,
+            outcome=Reason.RESTORED,
             restore_s=0.004,
             freeze_s=0.002,
         )
     )
-    metrics.take(EventRecord(Kind.GAVE_UP, container="db", reason=Cause.EXIT, outcome=Outcome.LIMIT))
+    metrics.take(EventRecord(Kind.GAVE_UP, container="db", reason=Reason.EXIT, outcome=Reason.LIMIT))
     metrics.take(EventRecord(Kind.NOTIFY_FAILED, container="db"))
-    metrics.take(EventRecord(Kind.DIED, container="db", reason=Cause.EXIT))
+    metrics.take(EventRecord(Kind.DIED, container="db", reason=Reason.EXIT))
     text = metrics.render([])
     assert value(text, "avckpt_checkpoints_total", container="web") == 3
     assert value(text, "avckpt_checkpoints_missed_total", container="web", reason="deadline") == 1
@@ -53,13 +55,23 @@ def test_events_are_counted_by_container_reason_and_outcome() -> None:
     assert value(text, "avckpt_notifications_total", container="db", outcome="failed") == 1
 
 
+def container(name: str, state: State, generations: int) -> Protected:
+    made = Protected(name[0] * 64, name, 1, 1, settings_of({}).config, 0.0, state=state)
+    made.generations, made.memory_bytes = generations, 1000
+    return made
+
+
 def test_gauges_are_of_live_containers_only() -> None:
     metrics = Metrics()
-    text = metrics.render([Held("web", 0, 0, 2, State.PROTECTED), Held("db", 0, 0, 0, State.UNPROTECTED)])
+    web, db = container("web", State.PROTECTED, 2), container("db", State.UNPROTECTED, 0)
+    text = metrics.render([web, db])
     assert value(text, "avckpt_generations", container="web") == 2
     assert value(text, "avckpt_protected", container="web") == 1
+    assert value(text, "avckpt_generations_memory_bytes", container="web") == 1000
+    assert value(text, "avckpt_generations_memory_bytes", container="db") == 0
     assert value(text, "avckpt_protected", container="db") == 0
-    text = metrics.render([Held("web", 0, 0, 2, State.RESTORING)])
+    web.state = State.RESTORING
+    text = metrics.render([web])
     assert value(text, "avckpt_protected", container="web") == 0
     assert value(text, "avckpt_protected", container="db") is None
 

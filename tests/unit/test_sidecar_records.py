@@ -6,13 +6,14 @@ from __future__ import annotations
 import json
 import os
 import resource
+import stat
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from avckpt.containers.process import has_ended, open_pidfd, pid_of, start_time
-from avckpt.containers.records import NOT_SEEN, Records, remove_if
+from avckpt.containers.records import NOT_SEEN, Records, keep_private, remove_if
 from avckpt.errors import TargetGone
 from avckpt_hooks.shared.protocol import Register
 
@@ -73,7 +74,9 @@ def test_an_ended_one_is_not(tmp_path: Path, sleeper: subprocess.Popen[bytes]) -
     os.close(pidfd)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"version": 1, "id": "../../etc/passwd"}', '{"version": 99}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"version": 1, "id": "../../etc/passwd"}', '{"version": 99}', "[" * 99_999, " " * 999_999]
+)
 def test_what_is_no_record_is_left_alone(tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / ("b" * 64 + ".json")
     path.write_text(text)
@@ -197,3 +200,15 @@ def test_start_time_survives_a_wild_name(tmp_path: Path) -> None:
             assert start_time(process.pid) >= start_time(os.getpid())
         finally:
             process.kill()
+
+
+def test_what_an_earlier_version_left_is_made_private(tmp_path: Path) -> None:
+    folder = tmp_path / "containers"
+    folder.mkdir(mode=0o755)
+    path = record(folder, "a", 1, 1)
+    path.chmod(0o644)
+    keep_private(folder)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    keep_private(tmp_path / "health")
+    assert stat.S_IMODE((tmp_path / "health").stat().st_mode) == 0o700

@@ -16,6 +16,14 @@
  *   divided    the same, the first half protected from writing
  *   readonly   a file that was not open for writing, mapped shared
  *   unmoved    memory that nobody may unmap or protect otherwise (mseal(2))
+ *   viewed     a file of FOLDER mapped shared that was not open for writing; others write to it
+ *   published  the same, mapped for writing
+ *   shielded   shared memory that is protected from writing, but for the moments of a change
+ *   described  a memfd mapped for reading only, and written by a descriptor
+ *   scattered  hundreds of areas of shared memory
+ *   wiped      guard pages in memory that is wiped in forks (MADV_WIPEONFORK), and a page of it
+ *              that is protected from reading
+ *   reserved   gigabytes of such memory, of which little was ever touched
  */
 #include <sys/ipc.h>
 #include <sys/shm.h>
@@ -325,6 +333,128 @@ static void unmoved_setup(void)
 	*at = 7;
 }
 
+/* ---- whose it is ------------------------------------------------------------------------- */
+
+/* The test writes "now" into the file. */
+static void viewed_setup(void)
+{
+	at = map(1, PROT_READ, MAP_SHARED, make_file("map", "then", O_RDONLY | O_CLOEXEC));
+}
+
+static void published_setup(void)
+{
+	const int f = make_file("map", "then", O_RDWR | O_CLOEXEC);
+
+	at = map(1, PROT_READ | PROT_WRITE, MAP_SHARED, f);
+	close(f);
+}
+
+static void shielded_setup(void)
+{
+	at = map(2, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1);
+	strcpy(at, "then");
+	must(!mprotect(at, PAGE, PROT_READ), "mprotect");
+}
+
+static void shielded_disturb(void)
+{
+	must(!mprotect(at, PAGE, PROT_READ | PROT_WRITE), "mprotect");
+	strcpy(at, "now");
+	must(!mprotect(at, PAGE, PROT_READ), "mprotect");
+}
+
+static void described_disturb(void)
+{
+	must(pwrite(fd[0], "now", 4, 0) == 4, "pwrite");
+}
+
+/* ---- much of it ---------------------------------------------------------------------------- */
+
+enum { AREAS = 300 };
+static int *area[AREAS];
+
+/* With a gap between them, or the kernel makes one of them. */
+static void scattered_setup(void)
+{
+	for (int i = 0; i < AREAS; i++) {
+		area[i] = (int *)map(1, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1);
+		map(1, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+		*area[i] = i;
+	}
+}
+
+static void scattered_disturb(void)
+{
+	for (int i = 0; i < AREAS; i++)
+		*area[i] = -1;
+}
+
+static void scattered_verify(void)
+{
+	for (int i = 0; i < AREAS; i++)
+		CHECK(*area[i] == i, "area %d holds %d", i, *area[i]);
+}
+
+static void wiped_setup(void)
+{
+	at = map(GUARDED_PAGES, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1);
+	memset(at, 7, GUARDED_PAGES * PAGE);
+	must(!madvise(at, GUARDED_PAGES * PAGE, MADV_WIPEONFORK), "MADV_WIPEONFORK");
+	install(at);
+	must(!mprotect(at, PAGE, PROT_NONE), "mprotect");
+}
+
+static void wiped_disturb(void)
+{
+	must(!madvise(at, GUARDED_PAGES * PAGE, MADV_GUARD_REMOVE), "MADV_GUARD_REMOVE");
+	memset(at + PAGE, 8, (GUARDED_PAGES - 1) * PAGE);
+}
+
+static void wiped_verify(void)
+{
+	CHECK(!is_readable(at), "the page is not protected any more");
+	must(!mprotect(at, PAGE, PROT_READ | PROT_WRITE), "mprotect");
+	for (int i = 0; i < GUARDED_PAGES; i++) {
+		const bool guard = i >= GUARD && i < GUARD + GUARDS;
+
+		CHECK(is_readable(at + i * PAGE) == !guard,
+		      "page %d is a guard no more, or is one now", i);
+		CHECK(guard || at[i * PAGE] == 7, "page %d holds %d", i, at[i * PAGE]);
+	}
+	must(!mprotect(at, PAGE, PROT_NONE), "mprotect");
+}
+
+enum { RESERVED_PAGES = 1 << 20, TOUCHED = 3 };
+static const size_t touched[TOUCHED] = { 0, 5000, RESERVED_PAGES - 1 };
+
+static void reserved_write(char value)
+{
+	for (int i = 0; i < TOUCHED; i++)
+		at[touched[i] * PAGE] = value;
+}
+
+static void reserved_setup(void)
+{
+	at = map(RESERVED_PAGES, PROT_READ | PROT_WRITE,
+		 MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1);
+	must(!madvise(at, (size_t)RESERVED_PAGES * PAGE, MADV_WIPEONFORK), "MADV_WIPEONFORK");
+	reserved_write(7);
+}
+
+static void reserved_disturb(void)
+{
+	reserved_write(8);
+	at[PAGE] = 8;
+}
+
+static void reserved_verify(void)
+{
+	for (int i = 0; i < TOUCHED; i++)
+		CHECK(at[touched[i] * PAGE] == 7, "page %zu holds %d", touched[i],
+		      at[touched[i] * PAGE]);
+	CHECK(!at[PAGE], "a page that was never touched holds %d", at[PAGE]);
+}
+
 static void unmoved_verify(void)
 {
 	CHECK(*at == 7, "it holds %d", *at);
@@ -343,6 +473,13 @@ static const struct scenario scenarios[] = {
 	{ "readable", readable_setup, nothing, readable_verify },
 	{ "divided", divided_setup, nothing, divided_verify },
 	{ "readonly", readonly_setup, nothing, readonly_verify },
+	{ "viewed", viewed_setup, nothing, expect_now },
+	{ "published", published_setup, nothing, expect_now },
+	{ "shielded", shielded_setup, shielded_disturb, expect_then },
+	{ "described", changed_setup, described_disturb, expect_then },
+	{ "scattered", scattered_setup, scattered_disturb, scattered_verify },
+	{ "wiped", wiped_setup, wiped_disturb, wiped_verify },
+	{ "reserved", reserved_setup, reserved_disturb, reserved_verify },
 	{ "unmoved", unmoved_setup, nothing, unmoved_verify },
 };
 

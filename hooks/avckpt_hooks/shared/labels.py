@@ -36,8 +36,8 @@ class LabelError(ValueError):
     """A label that can not be honoured.  The text is one line for a person."""
 
     def __init__(self, key: str, value: str | None, why: str, allowed: str) -> None:
-        shown = _shorten(key) if value is None else f"{_shorten(key)}={_shorten(value)}"
-        super().__init__(f"label {shown}: {why}; {allowed}")
+        setting = shown(key) if value is None else f"{shown(key)}={shown(value)}"
+        super().__init__(f"label {setting}: {why}; {allowed}")
         self.key = key
         self.value = value
         self.why = why
@@ -87,8 +87,8 @@ class Policy:
     """Shared memory of the application's own that is rolled back with it, at most."""
     files: str = "rewind"
     """Regular files at a restore: rewind, keep or strict."""
-    tcp: str = "keep"
-    """Established TCP connections at a restore: keep, reset, reset-moved or messages."""
+    tcp: str = "reset-moved"
+    """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
     notify: Notify | None = None
@@ -155,7 +155,7 @@ def merge(labels: Mapping[str, str], annotations: Mapping[str, str]) -> dict[str
             raise LabelError(
                 key,
                 merged[key],
-                f"the annotation of the same name says {_shorten(value)}",
+                f"the annotation of the same name says {shown(value)}",
                 "give one of them, or the same value to both",
             )
     return merged
@@ -224,7 +224,7 @@ def _parse_restore_on(text: str) -> dict[str, Any]:
                 raise ValueError(f"{word} is not an exit code that can mean failure (1 to 255)")
             statuses.add(status)
         elif word not in ("signal", "exit", "unhealthy"):
-            raise ValueError(f"{_shorten(word)} is unknown" if word else "an entry is empty")
+            raise ValueError(f"{shown(word)} is unknown" if word else "an entry is empty")
     restore_on = RestoreOn("signal" in words, "exit" in words, frozenset(statuses), "unhealthy" in words)
     return {"restore_on": restore_on}
 
@@ -303,7 +303,7 @@ def _signal_number(text: str) -> int:
         number = int(getattr(signal.Signals, name, 0))
     # Below SIGRTMIN two real-time signals belong to the C library.
     if number not in signal.valid_signals() or signal.SIGSYS < number < signal.SIGRTMIN:
-        raise ValueError(f"{_shorten(text)} is no signal")
+        raise ValueError(f"{shown(text)} is no signal")
     if number in (signal.SIGKILL, signal.SIGSTOP):
         raise ValueError("nobody can be told by that signal, it can not be caught")
     return number
@@ -327,9 +327,9 @@ LABELS: dict[str, Label] = {
         _parse_restore_max,
     ),
     "avckpt.tcp": Label(
-        "keep",
-        "keep, reset, reset-moved or messages",
-        _one_of("tcp", "keep", "reset", "reset-moved", "messages"),
+        "reset-moved",
+        "reset-moved, reset, keep or messages",
+        _one_of("tcp", "reset-moved", "reset", "keep", "messages"),
     ),
     "avckpt.files": Label("rewind", "rewind, keep or strict", _one_of("files", "rewind", "keep", "strict")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
@@ -363,8 +363,15 @@ def _unknown(key: str) -> LabelError:
     return LabelError(key, None, "unknown label", "known are " + ", ".join(sorted(LABELS)))
 
 
-def _shorten(text: str) -> str:
-    """One printable word or two of a value, whatever somebody put into it."""
-    shown = "".join(c if c.isprintable() else "?" for c in text)
-    shown = shown if len(shown) <= 60 else shown[:57] + "..."
-    return shown or '""'
+def shown(text: str) -> str:
+    """One printable word or two of a value, whatever somebody put into it.
+
+    Of a command only the program: its arguments may be secrets, and messages end
+    up in logs that others read.
+    """
+    if text.startswith("exec:"):
+        program, *arguments = text.split(None, 1)
+        text = f"{program} ..." if arguments else program
+    printable = "".join(c if c.isprintable() else "?" for c in text)
+    printable = printable if len(printable) <= 60 else printable[:57] + "..."
+    return printable or '""'

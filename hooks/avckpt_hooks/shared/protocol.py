@@ -257,7 +257,7 @@ def _encode(message: dict[str, object]) -> bytes:
 def _decode(packet: bytes) -> dict[str, object]:
     try:
         data = json.loads(packet)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ProtocolError(f"not JSON: {packet[:80]!r}") from error
     if not isinstance(data, dict):
         raise ProtocolError(f"not a JSON object: {packet[:80]!r}")

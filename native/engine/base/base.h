@@ -10,7 +10,9 @@
  *   error.c         what went wrong
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
+ *   budget.c        what one checkpoint or restore may cost
  *   proc.c          /proc
+ *   pagemap.c       which pages of a process are there
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
  */
@@ -55,6 +57,22 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 int heartbeat_open(int fd) warn_unused;
 /* We get on: the daemon kills a guard of which it has not heard for seconds. */
 void heartbeat(void);
+
+/* ---- budget.c --------------------------------------------------------------- */
+
+/* Of a checkpoint or restore.  `working` is called now and then, NULL: nothing. */
+void budget_begin(void (*working)(void *arg), void *arg);
+/* From now on there is so much time; 0: as much as it takes. */
+void budget_deadline(uint64_t ns);
+/* It is over for that reason, in words that stay. */
+void budget_exceed(enum avc_code code, const char *what);
+/* Memory that is to be kept: whether there is room, and if so takes it.  budget_has() only asks. */
+bool budget_has(uint64_t bytes);
+bool budget_take(uint64_t bytes);
+/* We get on.  False when the budget is exceeded. */
+bool budget_step(void);
+/* -1 with that code and the reason in words when it is. */
+int budget_check(pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- config.c -------------------------------------------------------------- */
 
@@ -155,14 +173,26 @@ int mapping_protection(const struct mapping *m);
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
+
 /* What is of interest in /proc/PID/status. */
+#define STATUS_GROUPS 64
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
 	pid_t tracer;            /* a thread, in our namespace; 0: none              */
 	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
-	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	int group_count;         /* supplementary; those beyond are not known   */
+	uint32_t groups[STATUS_GROUPS];
+	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };
@@ -182,6 +212,26 @@ bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
+
+/* ---- pagemap.c ------------------------------------------------------------------------ */
+
+/* An entry, of one page. */
+#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
+#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
+#define PAGEMAP_FILE (UINT64_C(1) << 61)
+#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
+#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
+/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE (Linux 6.13); the headers may be older. */
+#define GUARD_INSTALL 102
+#define GUARD_REMOVE 103
+
+/* A guard page without a mapping of its own (madvise(2)); one of the process's own. */
+bool page_is_guard(uint64_t entry);
+bool page_is_own(uint64_t entry);
+/* Calls fn for every stretch in which there are pages of no file, or guard pages; for all of it
+ * if the kernel cannot tell (before Linux 6.7).  Stops when fn does not return 0.  0 or -1. */
+int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
+		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
 
 /* ---- rt_priority.c -------------------------------------------------------------------- */
 

@@ -137,7 +137,7 @@ static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen
 
 	if (strict)
 		branch->image->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
-	if (memory_prepare(process->memory, &branch->image->image, seen, err))
+	if (memory_prepare(process, &branch->image->image, seen, err))
 		return -1;
 	branch->image->threads = process->blocks;
 	/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */

@@ -103,38 +103,16 @@ const struct mapping *mappings_find(const struct mappings *maps, const char *nam
 
 /* ---- pages -------------------------------------------------------------------------- */
 
-#define PAGEMAP_PRESENT (UINT64_C(1) << 63)
-#define PAGEMAP_SWAPPED (UINT64_C(1) << 62)
-#define PAGEMAP_FILE (UINT64_C(1) << 61)
-#define PAGEMAP_GUARD (UINT64_C(1) << 58) /* since Linux 6.15                   */
-#define PAGEMAP_FRAME ((UINT64_C(1) << 55) - 1)
-/* Where it stands in the page table: a swap entry of the last type, which is none, with
- * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
-#define GUARD_MARKER (UINT64_C(4) << 5 | 31)
-
-/* A guard page without a mapping of its own (madvise(2), Linux 6.13). */
-static bool is_guard(uint64_t frame)
-{
-	return frame & PAGEMAP_GUARD ||
-	       (frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED | PAGEMAP_FRAME)) ==
-		       (PAGEMAP_SWAPPED | GUARD_MARKER);
-}
-
-static bool is_own(uint64_t frame)
-{
-	return frame & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(frame & PAGEMAP_FILE);
-}
-
 /* Of a private mapping.  What is of a file is there by itself. */
 static enum page compare(uint64_t want, uint64_t is)
 {
-	if (is_guard(want))
-		return is_guard(is) ? PAGE_SAME : PAGE_GUARD;
-	if (is_guard(is))
-		return is_own(want) ? PAGE_OPEN_COPY : PAGE_OPEN;
-	if (!is_own(want))
-		return is_own(is) ? PAGE_DROP : PAGE_SAME;
-	if (is_own(is) && want & PAGEMAP_FRAME &&
+	if (page_is_guard(want))
+		return page_is_guard(is) ? PAGE_SAME : PAGE_GUARD;
+	if (page_is_guard(is))
+		return page_is_own(want) ? PAGE_OPEN_COPY : PAGE_OPEN;
+	if (!page_is_own(want))
+		return page_is_own(is) ? PAGE_DROP : PAGE_SAME;
+	if (page_is_own(is) && want & PAGEMAP_FRAME &&
 	    !((want ^ is) & (PAGEMAP_FRAME | PAGEMAP_PRESENT | PAGEMAP_SWAPPED)))
 		return PAGE_SAME;
 	return PAGE_COPY;

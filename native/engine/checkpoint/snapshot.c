@@ -6,34 +6,15 @@
  * A page that two templates share stays shared, and one that they do not share stays so,
  * whatever the kernel does with its frame meanwhile.
  */
-#include <errno.h>
 #include <fcntl.h>
 #include <stdlib.h>
-#include <sys/ioctl.h>
 #include <unistd.h>
 
 #include "checkpoint.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
-/* Runtimes reserve terabytes of which they use little: those are not read page by page. */
+/* Runtimes reserve terabytes of which they use little: beyond that, what is empty is not read. */
 #define SPARSE_BYTES (UINT64_C(4) << 30)
-#define REGIONS 64
-
-/* Linux 6.7, Documentation/admin-guide/mm/pagemap.rst; the headers may be older. */
-struct scan_region {
-	uint64_t start, end, categories;
-};
-
-struct scan {
-	uint64_t size, flags, start, end, walk_end, vec, vec_len, max_pages;
-	uint64_t category_inverted, category_mask, category_anyof_mask, return_mask;
-};
-
-#define SCAN _IOWR('f', 16, struct scan)
-#define SCAN_FILE (1u << 2)
-#define SCAN_PRESENT (1u << 3)
-#define SCAN_SWAPPED (1u << 4)
-
 static int add_mapping(const struct mapping *m, void *arg)
 {
 	struct mappings *maps = arg;
@@ -115,33 +96,16 @@ static int read_extent(struct snapshot *snapshot, struct pages *pages, avc_remot
 		       : -1;
 }
 
-/* Only where there is something; 1 if the kernel can not tell. */
-static int read_sparse(struct snapshot *snapshot, struct pages *pages, const struct mapping *m)
+struct sparse {
+	struct snapshot *snapshot;
+	struct pages *pages;
+};
+
+static int read_sparse(avc_remote start, avc_remote end, void *arg)
 {
-	struct scan_region region[REGIONS];
-	avc_remote start = m->start;
+	const struct sparse *sparse = arg;
 
-	while (start < m->end) {
-		struct scan scan = {
-			.size = sizeof scan,
-			.start = start,
-			.end = m->end,
-			.vec = (uint64_t)(uintptr_t)region,
-			.vec_len = REGIONS,
-			.category_inverted = SCAN_FILE,
-			.category_mask = SCAN_FILE,
-			.category_anyof_mask = SCAN_PRESENT | SCAN_SWAPPED,
-		};
-		const int found = ioctl(snapshot->pagemap, SCAN, &scan);
-
-		if (found < 0)
-			return errno == ENOTTY || errno == EINVAL ? 1 : -1;
-		for (int i = 0; i < found; i++)
-			if (read_extent(snapshot, pages, region[i].start, region[i].end))
-				return -1;
-		start = scan.walk_end;
-	}
-	return 0;
+	return read_extent(sparse->snapshot, sparse->pages, start, end);
 }
 
 /* Of a private mapping of the snapshot's. */
@@ -149,15 +113,17 @@ const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mappi
 				   struct avc_error *err)
 {
 	struct pages *pages = &snapshot->pages[m - snapshot->maps.map];
-	int result = 1;
+	struct sparse sparse = { snapshot, pages };
+	int result;
 
 	if (pages->known)
 		return pages;
 	if (snapshot->pagemap < 0)
 		snapshot->pagemap = proc_open(snapshot->template, "pagemap", O_RDONLY);
-	if (m->end - m->start >= SPARSE_BYTES)
-		result = read_sparse(snapshot, pages, m);
-	if (result == 1)
+	snapshot->read_bytes += m->end - m->start;
+	if (snapshot->read_bytes >= SPARSE_BYTES)
+		result = pagemap_walk(snapshot->pagemap, m->start, m->end, read_sparse, &sparse);
+	else
 		result = read_extent(snapshot, pages, m->start, m->end);
 	if (result) {
 		fail_errno(err, snapshot->template, "restore memory", "read(pagemap)",

@@ -134,6 +134,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
+	budget_begin(NULL, NULL);
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
 	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
@@ -485,6 +486,7 @@ static void guard_free(struct avc_guard *guard)
 	files_written_free(guard->written);
 	process_free_room(&guard->main);
 	tree_free(&guard->tree);
+	mem_others_free(guard->main.others);
 	free(guard->fds);
 	free(guard);
 }
@@ -513,7 +515,9 @@ int guard_run(int socket)
 	guard = guard_new(socket, &start, init_pidfd);
 	if (!guard)
 		return GUARD_UNTOLD;
-	if (!process_make_room(&guard->main) || !guard->tree.entry || !guard->tree.process) {
+	guard->main.others = mem_others_new();
+	if (!process_make_room(&guard->main) || !guard->main.others || !guard->tree.entry ||
+	    !guard->tree.process) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {

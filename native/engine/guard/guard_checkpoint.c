@@ -9,7 +9,8 @@
 #include "guard.h"
 
 #define SPARE_NS (NS_PER_S / 2)
-#define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
+#define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
+#define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
@@ -280,16 +281,15 @@ void guard_work_ahead(struct avc_guard *guard)
 		guard->ahead_ns = now_ns();
 }
 
-static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+static int take_seen(struct avc_guard *guard, struct mem_seen *seen, struct avc_event *event,
+		     struct avc_error *err)
 {
 	struct process *process = &guard->main;
 	struct generation fresh = { .pidfd = -1, .slot = guard_free_slot(guard) };
-	struct mem_seen seen = { 0 };
 	struct freeze_times times;
 	int result;
 
-	if (prepare_files(guard, err) ||
-	    memory_prepare(process->memory, &fresh.image, &seen, err)) {
+	if (prepare_files(guard, err) || memory_prepare(process, &fresh.image, seen, err)) {
 		generation_drop(&fresh);
 		return -1;
 	}
@@ -301,10 +301,18 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 			touch_slot(&guard->tree.entry[i].process->parasite, fresh.slot,
 				   guard->tree.entry[i].process->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
+	waits_prepare(process);
+	for (uint32_t i = 1; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process)
+			waits_prepare(guard->tree.entry[i].process);
+	budget_deadline(READ_NS);
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);
 	result = freeze_tree(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
-			     &seen, &times, err);
+			     seen, &times, err);
+	budget_deadline(0);
+	if (!result)
+		result = budget_check(process->pid, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
@@ -340,6 +348,15 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	return 0;
 }
 
+static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
+{
+	struct mem_seen seen = { 0 };
+	const int result = take_seen(guard, &seen, event, err);
+
+	mem_seen_free(&seen);
+	return result;
+}
+
 /* A limit of processes, or of memory, leaves no room for a template: spares have to go, and
  * those that were to go a little later. */
 static bool make_way(struct avc_guard *guard, const struct avc_error *err)
@@ -362,6 +379,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
+		budget_begin(NULL, NULL);
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
 		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))

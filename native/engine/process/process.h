@@ -42,6 +42,8 @@ struct tree {
 	const void *arg;
 };
 
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h, since Linux 6.9 */
+
 /* ---- process.c ----------------------------------------------------------------- */
 
 void process_init(struct process *process);
@@ -150,6 +152,8 @@ void tree_free(struct tree *tree);
 
 /* ---- waits.c ---------------------------------------------------------------------- */
 
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct process *process);
 /* Ends the calls that were rewound and whose time is up; the next one's is at
  * process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);

@@ -143,6 +143,7 @@ static struct process *process_new(const struct tree *tree)
 	process_init(process);
 	process->descendant = true;
 	process->shm_bytes = main->shm_bytes;
+	process->others = main->others;
 	process->tcp_moved = main->tcp_moved;
 	process->plain_filters = main->plain_filters;
 	process->init = main->init;

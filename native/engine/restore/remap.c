@@ -217,10 +217,6 @@ static int map_new(const struct remap *r, struct syscall_batch *batch, struct av
 		       : 0;
 }
 
-/* MADV_GUARD_INSTALL, MADV_GUARD_REMOVE; the headers may be older. */
-#define GUARD_INSTALL 102
-#define GUARD_REMOVE 103
-
 static int advice_of(enum page what)
 {
 	switch (what) {

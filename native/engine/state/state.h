@@ -8,7 +8,7 @@
  *   process_attrs.c what only a template can tell: signal handlers, limits, directories
  *   pending.c       signals that have not been delivered
  *   timers.c        interval timers, POSIX timers
- *   memory.c        memory that a clone does not carry as it is
+ *   memory*.c       memory that a clone does not carry as it is
  *   sandbox.c       restoring an app that has a seccomp filter of its own
  */
 #ifndef AVCKPT_STATE_H
@@ -170,7 +170,7 @@ void process_attrs_setup_limits(const struct branch *branch, struct setup *setup
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
 /* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
-struct sandbox *sandbox_begin(pid_t child, struct avc_error *err);
+struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err);
 /* Waits while *state is INJ_IDLE; false when it ended or was too late. */
 bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
 /* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where
@@ -181,19 +181,30 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 
 /* ---- memory.c ------------------------------------------------------------------ */
 
-/* Shared memory that an image of the same checkpoint has: one is enough. */
-struct mem_seen {
-	uint32_t count;
-	struct {
-		uint64_t device, inode, offset, bytes;
-	} area[256];
+/* Shared memory that an image of the same checkpoint has: one is enough; and what all of them have
+ * taken of what they may. */
+#define WIPED_MAX (16u << 20)     /* bytes of MADV_WIPEONFORK memory                 */
+#define WIPED_RUNS_MAX (1u << 14) /* stretches of it, and guard pages within          */
+struct mem_key {
+	uint64_t device, inode, offset, bytes;
 };
+struct mem_seen {
+	uint32_t count, room;
+	struct mem_key *key;
+	uint64_t shared_bytes, wiped_bytes;
+	uint32_t runs;
+};
+void mem_seen_free(struct mem_seen *seen);
+
+/* memory_others.c: who else has shared memory of the application's; one for all its processes. */
+struct mem_others *mem_others_new(void);
+void mem_others_free(struct mem_others *others);
 
 struct memory *memory_new(void);
 void memory_forget(struct memory *memory); /* it is another program         */
 void memory_free(struct memory *memory);
 /* Room for what is to be copied in the freeze. */
-int memory_prepare(struct memory *memory, struct mem_image **image, struct mem_seen *seen,
+int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
 void mem_image_free(struct mem_image *image);
 /* What only "smaps" tells of a mapping and a restore has to know, as of the checkpoint: enum
@@ -215,7 +226,7 @@ extern const char memory_private_huge_pages[];
 int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
 		  struct setup *setup, struct avc_error *err) warn_unused;
 /* At a restore, before anything runs; *notes: what can not be written. */
-int memory_put_back(const struct mem_image *image, pid_t pid, struct avc_error *notes,
-		    struct avc_error *err) warn_unused;
+int memory_put_back(const struct process *process, const struct generation *image, pid_t pid,
+		    struct avc_error *notes, struct avc_error *err) warn_unused;
 
 #endif

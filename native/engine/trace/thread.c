@@ -227,7 +227,7 @@ static bool straggle(struct process *process, struct thread *thread)
 	case STOP_SYSCALL:
 		/* Not a place to change registers: let it come to a better one. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
-		ptrace(PTRACE_CONT, tid, NULL, 0L);
+		seccomp_go_on(tid, &stop);
 		return true;
 	default:
 		break;
@@ -238,7 +238,7 @@ static bool straggle(struct process *process, struct thread *thread)
 		if (process->waiting && thread->borrowed &&
 		    parasite_contains(&process->parasite, arch_pc(&now)) &&
 		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
-			ptrace(PTRACE_CONT, tid, NULL, 0L);
+			seccomp_go_on(tid, NULL);
 			return true;
 		}
 		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {

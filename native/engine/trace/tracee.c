@@ -172,7 +172,6 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 {
 	for (;;) {
 		struct stop stop = wait_ticking(tid, 0, tick);
-		int signal = 0;
 
 		switch (stop.kind) {
 		case STOP_TRAP:
@@ -188,8 +187,6 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 				*child = stop.message;
 			break;
 		case STOP_SIGNAL:
-			signal = stop.signal;
-			break;
 		case STOP_SYSCALL:
 		case STOP_NONE:
 		case STOP_OTHER:
@@ -204,8 +201,7 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 		}
 		/* Any stop takes a pending interrupt away (kernel/signal.c, ptrace_stop):
 		 * without a new one it would just run on. */
-		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
-		    ptrace(PTRACE_CONT, tid, NULL, (long)signal)) {
+		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, &stop)) {
 			fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 			return STOP_OTHER;
 		}
@@ -214,7 +210,7 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 
 int tracee_settle(pid_t tid, struct avc_error *err)
 {
-	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || ptrace(PTRACE_CONT, tid, NULL, 0L))
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
@@ -223,7 +219,7 @@ int tracee_halt(pid_t tid, struct avc_error *err)
 {
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(INTERRUPT)", "it has gone");
-	(void)ptrace(PTRACE_CONT, tid, NULL, 0L); /* refused if it runs */
+	(void)seccomp_go_on(tid, NULL); /* refused if it runs */
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
 

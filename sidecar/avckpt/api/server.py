@@ -41,11 +41,11 @@ from avckpt.errors import (
 )
 from avckpt.events.feed import Feed
 from avckpt.events.history import History
-from avckpt.events.metrics import CONTENT_TYPE, Held, Metrics
+from avckpt.events.metrics import CONTENT_TYPE, Metrics
 from avckpt.events.record import EventRecord
 from avckpt.guard import Command
 from avckpt.policy import Reloaded
-from avckpt.supervision.pressure import held_bytes, templates_of
+from avckpt.supervision.pressure import held_by
 
 log = logging.getLogger("avckpt")
 
@@ -92,7 +92,6 @@ class ApiServer:
     def __init__(self, backend: Backend, path: Path) -> None:
         self._backend = backend
         self._path = path
-        self._rendering = asyncio.Lock()
         self.app = app = web.Application(middlewares=[_errors_as_json])
         app.add_routes(
             [
@@ -136,7 +135,7 @@ class ApiServer:
         containers += registry.live()
         if _flag(request, "memory", "1"):
             for container in containers:
-                await asyncio.to_thread(_look_at_memory, container)
+                await held_by(container)
         rows = [container.to_json() for container in containers]
         return web.json_response({"containers": rows})
 
@@ -189,9 +188,9 @@ class ApiServer:
         return web.json_response(document())
 
     async def _metrics(self, request: web.Request) -> web.Response:
-        live = [Held.of(container) for container in self._backend.registry.live()]
-        async with self._rendering:
-            text = await asyncio.get_running_loop().run_in_executor(None, self._backend.metrics.render, live)
+        for container in self._backend.registry.live():
+            await held_by(container)
+        text = self._backend.metrics.render(self._backend.registry.live())
         return web.Response(body=text, headers={"Content-Type": CONTENT_TYPE})
 
 
@@ -224,12 +223,6 @@ def _since(request: web.Request) -> float | None:
     if not math.isfinite(since):
         raise web.HTTPBadRequest(reason=f"since is {printable(text)[:40]}, not seconds since 1970")
     return since
-
-
-def _look_at_memory(container: Protected) -> None:
-    """Finds out what its generations hold: only when somebody asks, as it walks page tables."""
-    if container.generations:
-        container.memory_bytes = held_bytes(container.app_pid, templates_of(container.init_pid))
 
 
 def _flag(request: web.Request, name: str, default: str = "0") -> bool:

@@ -10,17 +10,31 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from avckpt_hooks.shared.protocol import Register
+from avckpt_hooks.shared.files import make_private, read_bounded
+from avckpt_hooks.shared.protocol import MAX_BYTES, Register
 
 from avckpt.containers.process import open_pidfd
 from avckpt.errors import Denied, TargetGone
 
 log = logging.getLogger("avckpt")
 
+RECORD_BYTES = 2 * MAX_BYTES
+"""The hook registers what it has written, in a packet."""
 PID_MOST = 1 << 22
 """PID_MAX_LIMIT, include/linux/threads.h."""
 OWN_NAMESPACE = os.stat("/proc/self/ns/pid").st_ino
 NOT_SEEN = "the sidecar does not see the host's processes: start it with --pid=host"
+
+
+def keep_private(directory: Path) -> None:
+    """Takes from others what they may do with the files that hooks leave in a directory, and makes it.
+
+    Earlier versions left them readable by everybody.  Raises OSError.
+    """
+    make_private(str(directory))
+    for path in directory.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # its container has just stopped
+            path.chmod(0o600)
 
 
 class Records:
@@ -77,7 +91,7 @@ def _open(path: Path) -> tuple[Register, int] | None:
 
     Raises OSError, and what _parse() does.
     """
-    text = path.read_bytes()
+    text = read_bounded(str(path), RECORD_BYTES)
     record = _parse(text)
     try:
         return record, open_pidfd(record.pid, record.starttime)
@@ -88,7 +102,10 @@ def _open(path: Path) -> tuple[Register, int] | None:
 
 def _parse(text: bytes) -> Register:
     """Raises ValueError when it is no record, Denied when its PID is one of a PID namespace that we do not see."""
-    data = json.loads(text)
+    try:
+        data = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
     record = Register.from_record(data)
     if not 0 < record.pid <= PID_MOST:
         raise ValueError(f"its pid is {record.pid}")

@@ -109,6 +109,7 @@ class History:
             if self._fd < 0:
                 flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
                 self._fd = os.open(self._path, flags, 0o600)
+                os.fchmod(self._fd, 0o600)
             written = os.write(self._fd, line)
         except OSError as error:
             self._complain(error)

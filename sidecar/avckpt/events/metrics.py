@@ -4,40 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from avckpt.containers.protected import Protected, State
-from avckpt.events.record import EventRecord, Kind
-from avckpt.supervision.pressure import held_bytes, templates_of
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 
 Metric = TypeVar("Metric", Counter, Histogram)
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 FREEZE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25)
 RESTORE_BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
-
-
-@dataclass(frozen=True)
-class Held:
-    """A live container, as `render()` needs it; a copy, since it is read in another thread."""
-
-    container: str
-    init_pid: int
-    app_pid: int
-    generations: int
-    state: State
-
-    def memory_bytes(self) -> int:
-        """What giving all its generations up would free, as `avckpt ps` has it."""
-        return held_bytes(self.app_pid, templates_of(self.init_pid)) if self.generations else 0
-
-    @classmethod
-    def of(cls, container: Protected) -> Held:
-        return cls(container.label, container.init_pid, container.app_pid, container.generations, container.state)
 
 
 class Metrics:
@@ -101,17 +81,14 @@ class Metrics:
             for metric, labels in self._labels.pop(gone):
                 metric.remove(*labels)
 
-    def render(self, live: Iterable[Held]) -> bytes:
-        """The text that Prometheus reads.
-
-        Takes milliseconds for each GB that application and templates map: not for the event loop's thread.
-        """
+    def render(self, live: Iterable[Protected]) -> bytes:
+        """The text that Prometheus reads, with what the generations of each held at the last look."""
         for gauge in (self._generations, self._memory, self._protected):
             gauge.clear()
-        for held in live:
-            self._generations.labels(held.container).set(held.generations)
-            self._memory.labels(held.container).set(held.memory_bytes())
-            self._protected.labels(held.container).set(held.state is State.PROTECTED)
+        for container in live:
+            self._generations.labels(container.label).set(container.generations)
+            self._memory.labels(container.label).set(container.memory_bytes if container.generations else 0)
+            self._protected.labels(container.label).set(container.state is State.PROTECTED)
         return generate_latest(self._registry)
 
     def _counter(self, name: str, text: str, *labels: str) -> Counter:

@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -28,9 +27,8 @@ from avckpt.supervision.pressure import (
     Advice,
     Allowance,
     HostPressure,
-    held_bytes,
+    held_by,
     now_s,
-    templates_of,
 )
 
 log = logging.getLogger("avckpt")
@@ -59,10 +57,6 @@ class Caretaker(Generic[W]):
         self._host: HostPressure | None = None
         self._looking: asyncio.Task[None] | None = None
         self._relieving: asyncio.Task[None] | None = None
-        # What generations hold is read here, one process at a time: that waits for
-        # each one's mmap_lock, which takes long just when memory is short, while
-        # hooks have a second to be answered.
-        self._reader = ThreadPoolExecutor(1, "memory")
 
     def start(self) -> None:
         """Begins to watch the host's memory."""
@@ -113,7 +107,6 @@ class Caretaker(Generic[W]):
             if self._host.fd is not None:
                 asyncio.get_running_loop().remove_reader(self._host.fd)
             self._host.close()
-        self._reader.shutdown(wait=False)
 
     def _watch_health(self, care: _Care[W]) -> None:
         ward, tell = care.ward, self._tell
@@ -150,18 +143,8 @@ class Caretaker(Generic[W]):
         used = care.groups.memory_used_bytes() if limit is not None else None
         if used is None or limit is None:
             return care.allowance.come_back(now_s())
-        held = await self._held(care) if care.allowance.near_limit(used, limit) else 0
+        held = await held_by(care.ward.container) if care.allowance.near_limit(used, limit) else 0
         return care.allowance.advise(used, limit, held, now_s())
-
-    async def _held(self, care: _Care[W]) -> int:
-        """What giving all its generations up would free."""
-        container = care.ward.container
-        if not container.generations:
-            return 0
-        init_pid, app_pid = container.init_pid, container.app_pid
-        return await asyncio.get_running_loop().run_in_executor(
-            self._reader, lambda: held_bytes(app_pid, templates_of(init_pid))
-        )
 
     def _host_is_short(self) -> None:
         # Pressure that lasts is told every second; to look who holds most may take longer.
@@ -172,7 +155,7 @@ class Caretaker(Generic[W]):
     async def _relieve(self) -> None:
         most, held_most = None, LEAST_WORTH_BYTES
         for care in list(self._cares.values()):
-            held = await self._held(care)
+            held = await held_by(care.ward.container)
             if held >= held_most:
                 most, held_most = care, held
         if most is None:

@@ -24,13 +24,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from avckpt_hooks.shared.files import read_bounded
+from avckpt_hooks.shared.protocol import MAX_BYTES
 from avckpt_hooks.shared.tell import printable
 
 from avckpt.containers.cgroup import groups_of
 from avckpt.containers.process import age_s
 from avckpt.containers.protected import Protected
 from avckpt.errors import AvckptError, TargetGone, of_any
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command
 from avckpt.supervision.inside import Done, run_inside
 
@@ -156,7 +159,7 @@ async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
     why = "the hooks did not find it out"
     while time.monotonic() < deadline:
         try:
-            said = json.loads(answer.read_bytes())
+            said = json.loads(read_bounded(str(answer), MAX_BYTES))
             has_startup_check = bool(said.get("startup_healthcheck"))
             check = health_check_of(said.get("healthcheck"), has_startup_check=has_startup_check)
             if check is not None and check.interval_s:
@@ -169,7 +172,7 @@ async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
             pass  # not yet
         except OSError as error:  # no descriptors left, for example: it may work in a moment
             why = f"{answer} can not be read: {error.strerror}"
-        except (ValueError, AttributeError) as error:
+        except (ValueError, AttributeError, RecursionError) as error:
             why = f"{answer} can not be read: {error}"
             break
         await asyncio.sleep(LOOK_S)

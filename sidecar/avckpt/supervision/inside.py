@@ -26,11 +26,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from avckpt_hooks.shared.files import TooLong, read_bounded
+
 from avckpt.artifacts import inside_binary
 from avckpt.containers.cgroup import groups_of
+from avckpt.containers.looks import look
 from avckpt.containers.process import has_ended, pid_of, status
 from avckpt.errors import AvckptError, KernelError, TargetGone
 
+ENVIRONMENT_BYTES = 1 << 20
+"""A process says itself where its environment is, and how long (PR_SET_MM); execve(2) would allow it 6 MB."""
 OUTPUT_BYTES = 4096
 """How much of a command's output is kept; the rest is read and thrown away."""
 GRACE_S = 2.0
@@ -73,9 +78,12 @@ async def run_inside(
     try:
         credentials, groups = _credentials(pid)
         procs = [str(path) for path in groups_of(pid).procs if os.access(path, os.W_OK)]
-        environment = _with(Path(f"/proc/{pid}/environ").read_bytes(), env or {})
+        environ = await look("environment", pid, lambda: read_bounded(f"/proc/{pid}/environ", ENVIRONMENT_BYTES))
     except (FileNotFoundError, ProcessLookupError) as error:
         raise TargetGone("the container has ended", pid=pid) from error
+    except TooLong as error:
+        raise AvckptError(f"its environment is longer than {ENVIRONMENT_BYTES} bytes", pid=pid) from error
+    environment = _with(environ, env or {})
     with contextlib.ExitStack() as undo:
         stdin_fd = _memory_file(undo, "avckpt-stdin", stdin)
         env_fd = _memory_file(undo, "avckpt-env", environment)

@@ -11,6 +11,7 @@ import asyncio
 import json
 import os
 import signal
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -21,18 +22,21 @@ from typing import Protocol
 from avckpt_hooks.shared.labels import Notify
 from avckpt_hooks.shared.tell import printable
 
+from avckpt.containers.looks import look
 from avckpt.containers.process import has_ended, pid_of
 from avckpt.containers.process import status as status_of
 from avckpt.containers.protected import Protected
 from avckpt.errors import AvckptError, Busy, TargetGone, of_any
-from avckpt.events.record import EXPECTED, EventRecord, Kind
-from avckpt.events.vocabulary import signal_name
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import EXPECTED, Kind, signal_name
 from avckpt.supervision.inside import run_inside
 
 EXEC_TIMEOUT_S = 5.0
 """A command that runs for longer is killed."""
 APP_TIMEOUT_S = 5.0
 """How long a receiver that is being restored itself is waited for."""
+SHOWN = 160
+"""Characters of a program's name, and of what it said."""
 BACKLOG = 16
 """Notifications that wait for one receiver; what comes on top is dropped, and said."""
 
@@ -135,7 +139,6 @@ async def _deliver(receiver: _Receiver, how: Notify, record: EventRecord) -> str
     if how.signal:
         app = await _app_of(receiver)
         try:
-            await _settled(pid_of(app))
             await _send(app, how.signal)
         finally:
             os.close(app)
@@ -147,13 +150,14 @@ async def _deliver(receiver: _Receiver, how: Notify, record: EventRecord) -> str
         stdin=json.dumps(record.to_json()).encode() + b"\n",
         env=environment_of(record),
     )
-    words = printable(" ".join(how.command))
+    # Not its arguments: whoever reads the log may not be allowed to read the label.
+    program = printable(how.command[0])[:SHOWN]
     said = _one_line(done.output)
     if done.timed_out:
-        raise AvckptError(f"{words}: killed after {EXEC_TIMEOUT_S:g} s{said}")
+        raise AvckptError(f"{program}: killed after {EXEC_TIMEOUT_S:g} s{said}")
     if done.status:
-        raise AvckptError(f"{words}: exited with status {done.status}{said}")
-    return f"by {words}"
+        raise AvckptError(f"{program}: exited with status {done.status}{said}")
+    return f"by {program}"
 
 
 def environment_of(record: EventRecord) -> Mapping[str, str]:
@@ -202,7 +206,29 @@ def _open_app(container: Protected, init_pidfd: int) -> int:
     return pidfd
 
 
-async def _settled(pid: int) -> None:
+async def _send(app: int, number: int) -> None:
+    """Sends a signal unless it would kill the application: who asks for one must be prepared for it."""
+    pid = pid_of(app)
+    if not await look("threads", pid, lambda: _is_ready(pid, number)):
+        raise AvckptError(f"its application does not handle {signal_name(number)}, which would end it: it was not sent")
+    try:
+        signal.pidfd_send_signal(app, number)
+    except ProcessLookupError as error:
+        raise TargetGone("its application has just ended") from error
+
+
+def _is_ready(pid: int, number: int) -> bool:
+    """Waits until it has settled; whether a signal would not kill it.  In a thread of its own."""
+    _settle(pid)
+    for _ in range(_TRIES):
+        if _is_prepared(pid, number):
+            return True
+        # It may just have been on its way into or out of sigwait(3).
+        time.sleep(0.05)
+    return False
+
+
+def _settle(pid: int) -> None:
     """Waits, 100 ms at most, until the application's main thread is in a system call.
 
     A restored thread makes the call again in which it was.  A signal that comes
@@ -213,24 +239,7 @@ async def _settled(pid: int) -> None:
         with suppress(OSError):
             if not Path(f"/proc/{pid}/syscall").read_text().startswith("running"):
                 return
-        await asyncio.sleep(0.01)
-
-
-async def _send(app: int, number: int) -> None:
-    """Sends a signal unless it would kill the application: who asks for one must be prepared for it."""
-    tries = 3
-    while not await _is_prepared(pid_of(app), number):
-        tries -= 1
-        if not tries:
-            raise AvckptError(
-                f"its application does not handle {signal_name(number)}, which would end it: it was not sent"
-            )
-        # It may just have been on its way into or out of sigwait(3).
-        await asyncio.sleep(0.05)
-    try:
-        signal.pidfd_send_signal(app, number)
-    except ProcessLookupError as error:
-        raise TargetGone("its application has just ended") from error
+        time.sleep(0.01)
 
 
 _HARMLESS = frozenset({signal.SIGCHLD, signal.SIGURG, signal.SIGWINCH, signal.SIGCONT})
@@ -238,11 +247,12 @@ _HARMLESS = frozenset({signal.SIGCHLD, signal.SIGURG, signal.SIGWINCH, signal.SI
 
 _RT_SIGTIMEDWAIT = {"x86_64": "128", "aarch64": "137"}
 
+_TRIES = 3
 _LOOKS = 4
 _BETWEEN_LOOKS_S = 0.003
 
 
-async def _is_prepared(pid: int, number: int) -> bool:
+def _is_prepared(pid: int, number: int) -> bool:
     """Whether a signal is caught or ignored, or taken care of by every thread: blocked or waited for."""
     if number in _HARMLESS:
         return True
@@ -256,9 +266,9 @@ async def _is_prepared(pid: int, number: int) -> bool:
         return False
     # A thread that the guard has stopped, or that was restored this instant, has every
     # signal blocked for a moment; one that blocks it itself does so at every look.
-    for look in range(_LOOKS):
-        if look:
-            await asyncio.sleep(_BETWEEN_LOOKS_S)
+    for again in range(_LOOKS):
+        if again:
+            time.sleep(_BETWEEN_LOOKS_S)
         if not all(_is_blocked(tid, bit) or _waits_for(tid, bit) for tid in threads):
             return False
     return True
@@ -294,5 +304,5 @@ def _status(pid: int) -> dict[str, str]:
 def _one_line(output: str) -> str:
     """The end of what a command said, as an addition to a message."""
     last = output.strip().rpartition("\n")[2]
-    shown = printable(last)[:160]
+    shown = printable(last)[:SHOWN]
     return f": {shown}" if shown else ""

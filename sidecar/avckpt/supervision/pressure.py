@@ -18,6 +18,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from avckpt.containers.looks import look
+from avckpt.containers.protected import Protected
+from avckpt.errors import DeadlineMissed
+
 NEAR = 0.90
 """Of the limit: from here on generations are given up."""
 BACK_AFTER_S = 15.0
@@ -140,6 +144,22 @@ def held_bytes(app_pid: int, template_pids: Iterable[int]) -> int:
     # application has mapped, it would keep.
     shares = sum(each.get("Pss_Anon", 0) for each in (app, *templates))
     return max(shares - app.get("Anonymous", 0), 0)
+
+
+async def held_by(container: Protected) -> int:
+    """The same for a container, for its `memory_bytes`, too; without anybody else waiting for it.
+
+    Of one that cannot be looked at within a second it is what the last look found that came back.
+    """
+    if container.generations:
+        app_pid, init_pid = container.app_pid, container.init_pid
+
+        def find_out() -> None:
+            container.memory_bytes = held_bytes(app_pid, templates_of(init_pid))
+
+        with contextlib.suppress(DeadlineMissed):
+            await look("memory", init_pid, find_out)
+    return container.memory_bytes if container.generations else 0
 
 
 def templates_of(init_pid: int) -> list[int]:

@@ -44,6 +44,9 @@ COMPOSE_NAMES = (
 )
 """Without that, all of these that are there, later ones over earlier ones: so does podman-compose 1.6."""
 
+EXTENDS_MOST = 50
+"""Services that one extends, one by way of the other."""
+
 
 class Kind(enum.Enum):
     """Where a service says it."""
@@ -230,6 +233,10 @@ class _Reader:
         self._read: set[Path] = set()
         self._roots: dict[Path, yaml.Node | None] = {}
         self._resolved: set[int] = set()
+        self._others: dict[Path, dict[str, tuple[yaml.ScalarNode, yaml.Node]]] = {}
+        """Services of files that are only extended, by name."""
+        self._bases: dict[tuple[Path, str], Service] = {}
+        """Those of them that are extended."""
 
     def read(self, path: Path) -> None:
         """Adds the services of a file, and the files it includes to the queue."""
@@ -264,6 +271,11 @@ class _Reader:
         if (path, name) in above:
             self._complain(service.place, f"extends itself, by way of {name}", service.name)
             return
+        if len(above) >= EXTENDS_MOST:
+            self._complain(
+                service.place, f"extends more than {EXTENDS_MOST} services, one by way of the other", service.name
+            )
+            return
         base = self._base(service, path, name)
         if base is None:
             return
@@ -276,10 +288,16 @@ class _Reader:
     def _base(self, service: Service, path: Path, name: str) -> Service | None:
         if path == Path(service.place.file) and name in self._manifest.services:
             return self._manifest.services[name]
+        if (path, name) in self._bases:
+            return self._bases[path, name]
         root = self._root(path, service.place, service.name)
-        for key, node in yamlfile.entries(yamlfile.lookup(root, "services") or root):
-            if key.value == name:
-                return self._service(name, yamlfile.place_of(key, path), node, path)
+        if path not in self._others:
+            there = yamlfile.entries(yamlfile.lookup(root, "services") or root)
+            self._others[path] = {key.value: (key, node) for key, node in reversed(there)}
+        if name in self._others[path]:
+            key, node = self._others[path][name]
+            base = self._bases[path, name] = self._service(name, yamlfile.place_of(key, path), node, path)
+            return base
         if root is not None:
             where = "" if path == Path(service.place.file) else f" in {path}"
             self._complain(service.place, f"extends {name}, and there is no such service{where}", service.name)

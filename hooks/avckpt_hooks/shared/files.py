@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that only root may read: a record holds labels, a health check holds commands, and both may hold secrets."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+
+
+class TooLong(ValueError):
+    """There is more in a file than anybody may have meant to put there."""
+
+
+def make_private(directory: str) -> None:
+    """Makes `directory`, or takes away what others may do in one that is there.  Raises OSError."""
+    os.makedirs(directory, mode=0o700, exist_ok=True)
+    if stat.S_IMODE(os.stat(directory).st_mode) != 0o700:
+        os.chmod(directory, 0o700)
+
+
+def write_private(path: str, content: bytes) -> None:
+    """Writes a file at once or not at all, in a directory that is made private, too.  Raises OSError."""
+    make_private(os.path.dirname(path))
+    temporary = f"{path}.{os.getpid()}"
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(temporary)  # of an earlier process with our number
+    # The mode is there from the start: whoever opens a file while it is readable goes on reading it.
+    fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        with open(fd, "wb") as file:
+            file.write(content)
+        os.replace(temporary, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def read_bounded(path: str, most_bytes: int) -> bytes:
+    """What is in a file, at most so much of it.  Raises TooLong, OSError."""
+    with open(path, "rb", buffering=0) as file:
+        content = bytearray()
+        # One byte more than there may be, and /proc gives a page or so at a time.
+        while len(content) <= most_bytes:
+            part = file.read(most_bytes + 1 - len(content))
+            if not part:
+                return bytes(content)
+            content += part
+    raise TooLong(f"{path} is longer than {most_bytes} bytes")

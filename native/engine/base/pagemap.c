@@ -1,0 +1,72 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Which pages of a process are there: /proc/PID/pagemap
+ * (Documentation/admin-guide/mm/pagemap.rst).
+ */
+#include <errno.h>
+#include <sys/ioctl.h>
+
+#include "base.h"
+
+#define REGIONS 64
+
+/* Linux 6.7; the headers may be older. */
+struct scan_region {
+	uint64_t start, end, categories;
+};
+
+struct scan {
+	uint64_t size, flags, start, end, walk_end, vec, vec_len, max_pages;
+	uint64_t category_inverted, category_mask, category_anyof_mask, return_mask;
+};
+
+#define SCAN _IOWR('f', 16, struct scan)
+#define SCAN_FILE (1u << 2)
+#define SCAN_PRESENT (1u << 3)
+#define SCAN_SWAPPED (1u << 4)
+
+/* Where it stands in the page table: a swap entry of the last type, which is none, with
+ * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
+#define GUARD_MARKER (UINT64_C(4) << 5 | 31)
+
+bool page_is_guard(uint64_t entry)
+{
+	return entry & PAGEMAP_GUARD ||
+	       (entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED | PAGEMAP_FRAME)) ==
+		       (PAGEMAP_SWAPPED | GUARD_MARKER);
+}
+
+bool page_is_own(uint64_t entry)
+{
+	return entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(entry & PAGEMAP_FILE);
+}
+
+int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
+		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg)
+{
+	struct scan_region region[REGIONS];
+
+	while (start < end) {
+		struct scan scan = {
+			.size = sizeof scan,
+			.start = start,
+			.end = end,
+			.vec = (uint64_t)(uintptr_t)region,
+			.vec_len = REGIONS,
+			.category_inverted = SCAN_FILE,
+			.category_mask = SCAN_FILE,
+			.category_anyof_mask = SCAN_PRESENT | SCAN_SWAPPED,
+		};
+		const int found = ioctl(pagemap, SCAN, &scan);
+
+		if (found < 0 && (errno == ENOTTY || errno == EINVAL))
+			return fn(start, end, arg);
+		if (found < 0)
+			return -1;
+		for (int i = 0; i < found; i++)
+			if (fn(region[i].start, region[i].end, arg))
+				return -1;
+		start = scan.walk_end;
+	}
+	return 0;
+}

@@ -1,0 +1,383 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Which areas of a process a clone does not carry, as its template shows them.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <unistd.h>
+
+#include "memory.h"
+
+#define AREAS_MAX 4096
+
+bool areas_add(struct areas *areas, const struct area *area)
+{
+	if (!make_room(&areas->area, areas->count, &areas->room, sizeof *areas->area))
+		return false;
+	areas->area[areas->count++] = *area;
+	return true;
+}
+
+bool areas_copy(struct areas *to, const struct areas *from)
+{
+	to->count = to->room = 0;
+	to->area = malloc((from->count + 1) * sizeof *to->area);
+	if (!to->area)
+		return false;
+	to->room = from->count + 1;
+	to->count = from->count;
+	if (from->count)
+		memcpy(to->area, from->area, from->count * sizeof *to->area);
+	return true;
+}
+
+void areas_free(struct areas *areas)
+{
+	free(areas->area);
+	*areas = (struct areas){ 0 };
+}
+
+struct survey {
+	const struct process *process;
+	pid_t template;
+	struct memory *memory;
+	struct areas areas, foreign;
+	uint64_t layout, shared_bytes, since;
+	uint64_t left_bytes, others_bytes;
+	bool private_huge, too_many;
+};
+
+static uint64_t hash(uint64_t h, uint64_t value)
+{
+	h = (h ^ value) * UINT64_C(0x9E3779B97F4A7C15);
+	return h ^ h >> 29;
+}
+
+static bool is_pad(const struct process *process, avc_remote at)
+{
+	if (parasite_contains(&process->parasite, at))
+		return true;
+	for (uint32_t i = 0; i < process->old_parasites; i++)
+		if (at - process->old_parasite[i].base < process->old_parasite[i].bytes)
+			return true;
+	return false;
+}
+
+/* Only its descendants can have it, too. */
+static bool is_shared(const struct mapping *m)
+{
+	return m->shared && (!strcmp(m->name, "/dev/zero (deleted)") ||
+			     !strcmp(m->name, "/anon_hugepage (deleted)"));
+}
+
+/* By its name the app may say that it is to stay as it is. */
+static bool has_name(const struct mapping *m)
+{
+	const char *name = NULL;
+
+	if (!strncmp(m->name, "/dev/shm/", 9))
+		name = m->name + 9;
+	else if (!strncmp(m->name, "/memfd:", 7))
+		name = m->name + 7;
+	return m->shared && m->inode && name && strncmp(name, "avckpt-kept", 11) != 0;
+}
+
+/* Whoever has the file system can open it. */
+static bool is_as_file(const struct mapping *m)
+{
+	return has_name(m) && !strncmp(m->name, "/dev/shm/", 9);
+}
+
+static int hash_mapping(const struct mapping *m, void *arg)
+{
+	struct survey *survey = arg;
+
+	survey->layout = hash(hash(hash(survey->layout, m->start), m->end),
+			      m->inode ^ m->offset << 8 ^
+				      (uint64_t)(m->shared ? 1 + mapping_protection(m) : 0));
+	return 0;
+}
+
+static uint32_t advice_of(const struct mapping *m)
+{
+	/* The kernel itself has marked those. */
+	if (m->flags & (MAPPING_DEVICE | MAPPING_DROPPABLE))
+		return 0;
+	return m->flags & (MAPPING_HUGE | MAPPING_SMALL | MAPPING_DONTDUMP | MAPPING_MERGEABLE);
+}
+
+void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags)
+{
+	if (!flags || m->start >= ARCH_USER_END)
+		return;
+	if (marks->count && marks->area[marks->count - 1].end == m->start &&
+	    marks->area[marks->count - 1].flags == flags) {
+		marks->area[marks->count - 1].end = m->end;
+		return;
+	}
+	if (marks->count == MARKS_MAX)
+		return;
+	marks->area[marks->count].start = m->start;
+	marks->area[marks->count].end = m->end;
+	marks->area[marks->count++].flags = flags;
+}
+
+/* A file, or a device.  It is not opened to find out whether it can be: that breaks leases, and may
+ * take its time. */
+static bool has_path(const struct mapping *m)
+{
+	static const char *const others[] = { "/memfd:", "/secretmem", "/dmabuf:" };
+
+	for (size_t i = 0; i < sizeof others / sizeof *others; i++)
+		if (!strncmp(m->name, others[i], strlen(others[i])))
+			return false;
+	return m->name[0] == '/';
+}
+
+/* A restored process that does not have it from its parent would have to map it itself, of what
+ * is behind it: not of a socket's ring (packet(7)), of memfd_secret(2), or for writing of a memfd
+ * that is sealed. */
+static bool is_only_here(pid_t template, const struct mapping *m)
+{
+	int fd, seals;
+
+	if (!m->shared || !m->inode || has_path(m))
+		return false;
+	fd = proc_open_mapped(template, m->start, m->end, O_RDONLY | O_NONBLOCK);
+	if (fd < 0)
+		return errno == ENXIO;
+	seals = fcntl(fd, F_GET_SEALS); /* -1: it knows none */
+	close(fd);
+	return m->mode[1] == 'w' && seals > 0 && seals & (F_SEAL_WRITE | F_SEAL_FUTURE_WRITE);
+}
+
+static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
+{
+	const uint32_t kind = m->flags &
+			      (MAPPING_DROPPABLE | MAPPING_GROWING | MAPPING_SEALED | MAPPING_KEYS);
+
+	if (kind && mapping_is_special(m))
+		return kind | MAPPING_SPECIAL;
+	return survey->process->descendant && is_only_here(survey->template, m)
+		       ? kind | MAPPING_ONLY_HERE
+		       : kind;
+}
+
+static int find_area(const struct mapping *m, void *arg)
+{
+	struct survey *survey = arg;
+	struct area area;
+	/* What the kernel may drop at any time (vDSO getrandom's state) may be
+	 * wiped as well, and is better so: nothing random comes twice. */
+	const bool wiped = (m->flags & (MAPPING_WIPEONFORK | MAPPING_DROPPABLE)) ==
+			   MAPPING_WIPEONFORK;
+
+	hash_mapping(m, arg);
+	if (!is_pad(survey->process, m->start)) {
+		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
+		if (survey->process->descendant)
+			marks_add(&survey->memory->advised, m, advice_of(m));
+	}
+	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
+	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->process, m->start))
+		return 0;
+	if (survey->areas.count == AREAS_MAX) {
+		survey->too_many = true;
+		return 0;
+	}
+	area = (struct area){
+		.start = m->start,
+		.end = m->end,
+		.offset = m->offset,
+		.inode = m->inode,
+		.device = m->device,
+		.wiped = wiped,
+		.named = !wiped && has_name(m),
+		.as_file = !wiped && is_as_file(m),
+		.protection = (uint8_t)mapping_protection(m),
+		.way = m->mode[1] == 'w' ? WAY_MAPPING : WAY_NONE,
+	};
+	return areas_add(&survey->areas, &area) ? 0 : -1;
+}
+
+/* ---- what of it is to be rolled back ----------------------------------------------------- */
+
+static bool same_object(const struct area *a, const struct area *b)
+{
+	return a->inode == b->inode && a->device == b->device;
+}
+
+static bool is_known(const struct memory *memory, const struct area *wanted)
+{
+	for (uint32_t i = 0; i < memory->areas.count; i++)
+		if (same_object(&memory->areas.area[i], wanted))
+			return true;
+	for (uint32_t i = 0; i < memory->foreign.count; i++)
+		if (same_object(&memory->foreign.area[i], wanted))
+			return true;
+	return false;
+}
+
+/* Of what is new, nobody knows yet whether others have it, too. */
+static void look_for_others(const struct survey *survey)
+{
+	bool known = true;
+
+	for (uint32_t i = 0; known && i < survey->areas.count; i++)
+		known = !survey->areas.area[i].named ||
+			is_known(survey->memory, &survey->areas.area[i]);
+	others_look(survey->process->others, survey->process, &survey->areas,
+		    known ? 0 : survey->since);
+}
+
+/* By the mapping, by its file, or by a descriptor; not with rights that the application has not. */
+static enum area_way way_of(pid_t template, const struct area *a)
+{
+	if (a->wiped || a->way == WAY_MAPPING)
+		return a->way;
+	if (proc_mapped_for_writing(template, a->start, a->end))
+		return WAY_PROTECT;
+	return area_find_descriptor(template, a) >= 0 ? WAY_FILE : WAY_NONE;
+}
+
+/* One that is too large does not keep small ones from being rolled back. */
+static bool is_to_be_kept(struct survey *survey, struct area *a)
+{
+	if (a->wiped)
+		return true;
+	if (a->named && others_have(survey->process->others, a)) {
+		survey->others_bytes += area_bytes(a);
+		/* It is looked for again, if there is no memory to remember it in. */
+		(void)areas_add(&survey->foreign, a);
+		return false;
+	}
+	a->way = way_of(survey->template, a);
+	if (a->way == WAY_NONE)
+		return false;
+	if (survey->shared_bytes + area_bytes(a) > survey->process->shm_bytes) {
+		survey->left_bytes += area_bytes(a);
+		return false;
+	}
+	survey->shared_bytes += area_bytes(a);
+	if (a->as_file)
+		others_watch(survey->process->others, survey->template, a);
+	return true;
+}
+
+static void sort_out(struct survey *survey)
+{
+	struct areas *areas = &survey->areas;
+	uint32_t kept = 0;
+
+	look_for_others(survey);
+	for (uint32_t i = 0; i < areas->count; i++)
+		if (is_to_be_kept(survey, &areas->area[i]))
+			areas->area[kept++] = areas->area[i];
+	areas->count = kept;
+}
+
+static bool same_area(const struct area *a, const struct area *b)
+{
+	return a->start == b->start && a->end == b->end && a->offset == b->offset &&
+	       same_object(a, b) && a->wiped == b->wiped && a->way == b->way &&
+	       a->protection == b->protection;
+}
+
+static bool same_areas(const struct areas *a, const struct areas *b)
+{
+	if (a->count != b->count)
+		return false;
+	for (uint32_t i = 0; i < a->count; i++)
+		if (!same_area(&a->area[i], &b->area[i]))
+			return false;
+	return true;
+}
+
+/* Takes what was found for what is there from now on. */
+static int remember(struct survey *survey, struct avc_error *err)
+{
+	struct memory *memory = survey->memory;
+
+	areas_free(&memory->areas);
+	memory->areas = survey->areas;
+	survey->areas = (struct areas){ 0 };
+	return fail(err, AVC_RETRY, 0, survey->process->pid, "keep memory", "",
+		    "it has new shared or MADV_WIPEONFORK memory");
+}
+
+static int read_areas(struct survey *survey, const struct areas *copied, struct avc_error *err)
+{
+	struct memory *memory = survey->memory;
+	const pid_t pid = survey->process->pid;
+	const uint64_t start = now_ns();
+	int result = 0;
+
+	memory->advised.count = memory->kinds.count = 0;
+	if (proc_mappings(survey->template, "smaps", find_area, survey))
+		return fail_errno(err, survey->template, "keep memory", "read(smaps)",
+				  "it was killed");
+	sort_out(survey);
+	memory->read_ns = now_ns();
+	memory->cost_ns = memory->read_ns - start;
+	memory->left_bytes = survey->left_bytes;
+	memory->others_bytes = survey->others_bytes;
+	areas_free(&memory->foreign);
+	memory->foreign = survey->foreign;
+	survey->foreign = (struct areas){ 0 };
+	if (survey->private_huge)
+		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "", "%s",
+			      memory_private_huge_pages);
+	else if (survey->too_many)
+		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "",
+			      "it has more than %d areas of shared or MADV_WIPEONFORK memory",
+			      AREAS_MAX);
+	else if (!same_areas(&survey->areas, copied))
+		result = remember(survey, err);
+	return result;
+}
+
+static int check_layout(struct process *process, const struct generation *generation,
+			struct avc_error *err)
+{
+	struct memory *memory = process->memory;
+	struct survey survey = { .process = process };
+	const uint64_t start = now_ns();
+	int result;
+
+	if (proc_mappings(generation->template, "maps", hash_mapping, &survey))
+		return fail_errno(err, generation->template, "keep memory", "read(maps)",
+				  "it was killed");
+	if (survey.layout == memory->layout &&
+	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
+		return 0;
+	survey = (struct survey){
+		.process = process,
+		.template = generation->template,
+		.memory = memory,
+		.since = generation->taken_ns,
+	};
+	result = read_areas(&survey, &generation->image->areas, err);
+	memory->layout = result ? 0 : survey.layout;
+	areas_free(&survey.areas);
+	areas_free(&survey.foreign);
+	return result;
+}
+
+int areas_check(struct process *process, const struct generation *generation, struct avc_error *err)
+{
+	const int result = check_layout(process, generation, err);
+
+	generation->image->kinds = process->memory->kinds;
+	if (!result && generation->image->too_much)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
+			    "more than %u MB of its memory are wiped in a clone (MADV_WIPEONFORK), "
+			    "which is too much to copy",
+			    WIPED_MAX >> 20);
+	if (!result && !generation->image->whole)
+		return fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
+			    "its shared or MADV_WIPEONFORK memory cannot be read");
+	return result;
+}

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work that a container may hold up for as long as it likes, kept away from everybody else's.
+
+What /proc tells of a process's memory (environ, smaps_rollup, mem) waits for its
+mmap_lock, which a process can hold for seconds, the longer the shorter memory is.
+So each look has a thread of its own and is waited for no longer than `WAIT_S`. One
+that does not come back costs a thread until its process ends, and the next look at
+the same thing fails at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from avckpt.errors import DeadlineMissed
+
+T = TypeVar("T")
+
+WAIT_S = 1.0
+
+_under_way: dict[tuple[str, int], tuple[float, asyncio.Future[Any]]] = {}
+"""What is looked at, and for whom; since when (the loop's time)."""
+
+
+async def look(what: str, pid: int, function: Callable[[], T]) -> T:
+    """What `function` returns, or raises; `what` of `pid` it looks at is looked at once at a time.
+
+    Raises DeadlineMissed when that takes longer than WAIT_S.
+    """
+    loop = asyncio.get_running_loop()
+    since, future = _under_way.get((what, pid), (loop.time(), None))
+    if future is None or future.get_loop() is not loop:
+        future = in_own_thread(function)
+        entry = _under_way[what, pid] = (since, future)
+
+        def forget(_: object) -> None:
+            if _under_way.get((what, pid)) is entry:
+                del _under_way[what, pid]
+
+        future.add_done_callback(forget)
+    wait_s = since + WAIT_S - loop.time()
+    if wait_s > 0:
+        await asyncio.wait([future], timeout=wait_s)
+    if not future.done():
+        raise DeadlineMissed(f"its {what} can not be read within {WAIT_S:g} s", pid=pid)
+    result: T = future.result()
+    return result
+
+
+def in_own_thread(function: Callable[[], T]) -> asyncio.Future[T]:
+    """What `function` returns, or raises, in a thread that nobody else's work waits for.
+
+    Precondition: an event loop runs.  Raises RuntimeError when there can be no more threads.
+    """
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+
+    def settle(result: T | None, error: BaseException | None) -> None:
+        if future.done():
+            return  # whoever asked has been cancelled
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(result)  # type: ignore[arg-type]
+
+    def run() -> None:
+        result, failed = None, None
+        try:
+            result = function()
+        except BaseException as error:  # noqa: BLE001 - it is raised where it is waited for
+            failed = error
+        with contextlib.suppress(RuntimeError):  # the loop has been closed
+            loop.call_soon_threadsafe(settle, result, failed)
+
+    threading.Thread(target=run, name="avckpt-look", daemon=True).start()
+    return future

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a container can make the guard spend on it: memory, descriptors, time."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import SLOWNESS
+
+CHILDREN = 40
+PATIENCE_S = 30.0 * SLOWNESS
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def guard_of(peer: GuardProcess, cookie: int = 1) -> int:
+    """The process that protects that container."""
+    return peer.guards[cookie - 1]
+
+
+def fds(pid: int) -> int:
+    """How many descriptors it has."""
+    return len(os.listdir(f"/proc/{pid}/fd"))
+
+
+def memory_kb(pid: int) -> int:
+    """The most that a process had at any time."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmHWM:")).split()[1])
+
+
+def test_shared_memory_costs_no_descriptors(tmp_path: Path) -> None:
+    """Neither for the areas of a process, nor for each generation again."""
+    with (
+        Victim("crowd shared 1 1", tmp_path) as small,
+        Victim(f"crowd shared {CHILDREN} 60", tmp_path) as crowd,
+        GuardProcess(config(shm_bytes=64_000_000), [small.pid, crowd.pid]) as guard,
+    ):
+        counts = []
+        for cookie in (1, 2):
+            guard.wait("attached", cookie=cookie)
+            before = fds(guard_of(guard, cookie))
+            for _ in range(3):
+                taken = guard.command("checkpoint", cookie, PATIENCE_S)
+                assert taken["kind"] == "checkpoint", taken
+            counts.append(fds(guard_of(guard, cookie)) - before)
+        # What each process and each template takes.
+        assert counts[1] < (CHILDREN + 1) * counts[0]
+
+
+def test_shared_memory_is_bounded_for_all_processes_together(tmp_path: Path) -> None:
+    with (
+        Victim(f"crowd shared {CHILDREN} 60", tmp_path) as crowd,
+        GuardProcess(config(shm_bytes=1_000_000), [crowd.pid]) as guard,
+    ):
+        told = guard.command("checkpoint", timeout_s=PATIENCE_S)["error"]["message"]
+        assert "more than avckpt.shm allows" in told
+
+
+def test_memory_that_was_never_touched_costs_nothing(tmp_path: Path) -> None:
+    with (
+        Victim(f"crowd wiped {CHILDREN} 4", tmp_path) as crowd,
+        GuardProcess(config(), [crowd.pid]) as guard,
+    ):
+        guard.wait("attached")
+        before = memory_kb(guard_of(guard))
+        for _ in range(2):
+            taken = guard.command("checkpoint", timeout_s=PATIENCE_S)
+            assert taken["kind"] == "checkpoint", taken
+        assert memory_kb(guard_of(guard)) - before < CHILDREN << 10
+
+
+def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
+    """Names alone would be 200 MB; it is told in words, and the guard lives on."""
+    with (
+        Victim(f"crowd named 4 18000 {tmp_path}", tmp_path) as crowd,
+        GuardProcess(config(), [crowd.pid]) as guard,
+    ):
+        told = guard.command("checkpoint", timeout_s=PATIENCE_S)
+        assert told["kind"] == "unprotected"
+        assert "more than 128 MB" in told["error"]["message"]
+        assert memory_kb(guard_of(guard)) < 400 << 10
+        crowd.wait_beats()
