@@ -360,8 +360,9 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 	for (uint32_t i = 0; i < generation->images; i++)
 		if (generation->image[i].process)
 			generation->image[i].process->checkpoints++;
-	if (pending_deadly(main->pending))
-		return fail(err, AVC_GONE, 0, main->pid, "freeze", "",
-			    "it is just being ended by signal %d", pending_deadly(main->pending));
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process &&
+		    pending_check(generation->image[i].process, err))
+			return -1;
 	return 0;
 }

@@ -17,6 +17,7 @@
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
 #define MISSES_UNTIL_UNPROTECTED 3
+#define REPORT_NS (60 * NS_PER_S) /* that a crash reporter may take                       */
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
@@ -404,6 +405,27 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
+/* Being traced by a process of the app's own, as one is that crashes while the reporter that it
+ * has started for that (breakpad, gdb) looks into it.  One that lives like that is not
+ * protected, though. */
+static bool is_being_reported(struct avc_guard *guard, const struct avc_error *err)
+{
+	struct proc_status status = { 0 };
+	struct proc_stat stat;
+	pid_t pid;
+
+	if (err->code != AVC_BUSY || !guard->count || proc_status(err->pid, &status))
+		return false;
+	for (pid = status.tracer; pid > 1 && pid != guard->channel.init; pid = stat.parent)
+		if (proc_stat(pid, &stat))
+			return true; /* it has just ended */
+	if (pid != guard->channel.init)
+		return false;
+	if (!guard->reported_ns)
+		guard->reported_ns = now_ns();
+	return now_ns() - guard->reported_ns < REPORT_NS;
+}
+
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
@@ -425,6 +447,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	if (take(guard, &event, &error) == 0) {
 		guard->misses = 0;
+		guard->reported_ns = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
@@ -444,6 +467,10 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	 * stay good for a while. */
 	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
 		   error.code == AVC_BUSY;
+	if (is_being_reported(guard, &error)) {
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
 	if (hopeless && error.pid != guard->main.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);

@@ -59,14 +59,21 @@ struct image {
 /* Among all images of a checkpoint; NULL: it has none. */
 struct image *image_find(struct image *image, uint32_t images, const struct process *process);
 
+/* What a crash is known by. */
+#define SIGNAL_BIT(signal) (UINT64_C(1) << ((signal)-1))
+#define FATAL_SIGNALS                                                                         \
+	(SIGNAL_BIT(SIGSEGV) | SIGNAL_BIT(SIGBUS) | SIGNAL_BIT(SIGFPE) | SIGNAL_BIT(SIGILL) | \
+	 SIGNAL_BIT(SIGABRT) | SIGNAL_BIT(SIGTRAP) | SIGNAL_BIT(SIGSYS))
+
 /* ---- pending.c ------------------------------------------------------------------ */
 
 struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
  * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
 int pending_read(struct process *process, struct avc_error *err) warn_unused;
-/* One that the app dies of as soon as it runs again; 0: none. */
-int pending_deadly(const struct pending *pending);
+/* -1 if there is one that the process dies of as soon as it runs again, or reports its own
+ * crash. */
+int pending_check(const struct process *process, struct avc_error *err) warn_unused;
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */

@@ -127,6 +127,10 @@ struct thread {
 	struct rewound rewound;
 	struct sleeper sleeper;
 	uint64_t stopped_ns;
+	struct {
+		avc_remote pc, sp;
+		uint64_t sigmask;
+	} looked_at;    /* when it was in no handler (dying.c)                     */
 	bool signalled; /* was just about to run a handler                  */
 };
 
@@ -213,6 +217,10 @@ struct process {
 	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
 	long clone_pages;             /* its size when that began                         */
 	long anon_pages;              /* of its last template; 0: none yet                */
+	uint64_t caught;              /* fatal signals that it has had handlers for        */
+	uint64_t uncaught;            /* and has not any more                              */
+	uint64_t dying_ns;            /* since when it has been in one                     */
+	bool alive;                   /* that was too long ago: it lives there             */
 	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
