@@ -242,7 +242,7 @@ def test_a_queue_has_an_end(local: LocalSidecar) -> None:
     client = Client(local.run_dir)
 
     def restores() -> int:
-        return max(row["restores"] for row in client.containers() if row["id"] == web.id)
+        return max(int(row["restores"]) for row in client.containers() if row["id"] == web.id)
 
     def dropped() -> bool:
         return any("are waiting for it already" in event["message"] for event in told(local, "notify_failed"))
