@@ -336,7 +336,6 @@ static void let_go(struct freeze *freeze)
 int freeze_tree(struct freeze *freeze, struct avc_error *err)
 {
 	struct generation *generation = freeze->generation;
-	const struct process *main = tree_main(freeze->tree);
 	uint64_t start;
 	int result;
 
