@@ -32,7 +32,7 @@
 #include "files.h"
 
 #define CONTENT_MAX (1 << 20)
-#define DRAIN_READS 16384       /* more than the small messages that a socket has room for */
+#define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
 #define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
@@ -151,7 +151,7 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	file->tcp_state = info.head.tcpi_state;
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
 	file->tcp_taken = info.bytes_received - (uint64_t)unread;
-	file->tcp_coming = file_is_coming(fd);
+	file->tcp_coming = file_was_coming(&info.head, unread);
 	file->tcp_going = file_is_going(fd);
 }
 
@@ -661,8 +661,8 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 
 bool file_tcp_moved(const struct file *want, const struct file *now)
 {
-	return !want->tcp_counted || !now->tcp_counted ||
-	       want->tcp_written != now->tcp_written || want->tcp_taken != now->tcp_taken;
+	return !want->tcp_counted || !now->tcp_counted || want->tcp_written != now->tcp_written ||
+	       want->tcp_taken != now->tcp_taken;
 }
 
 /* connect(2) to nothing resets it, shutdown(2) makes it read as closed. */

@@ -352,6 +352,48 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 	return remote + xstate_room();
 }
 
+#define USER_SS 0x2b
+#define FLAG_FIXED 0x002 /* of eflags: always 1 */
+#define FLAGS_KNOWN 0x3fffff
+#define XSTATE_NEAR 4096
+
+/* arch/x86/kernel/signal_64.c, x64_setup_rt_frame(): what it puts there is the same for every
+ * program. */
+static bool is_signal_frame(const struct frame *f, avc_remote at)
+{
+	return !(f->uc_flags &
+		 ~(uint64_t)(UC_FP_XSTATE | UC_SIGCONTEXT_SS | UC_STRICT_RESTORE_SS)) &&
+	       !f->uc_link && f->cs == USER_CS && f->ss == USER_SS && f->eflags & FLAG_FIXED &&
+	       !(f->eflags & ~(uint64_t)FLAGS_KNOWN) &&
+	       (!f->fpstate || (f->fpstate % 64 == 0 && f->fpstate - at < XSTATE_NEAR));
+}
+
+static uint32_t signal_of(const struct frame *f)
+{
+	const uint32_t signal = *(const uint32_t *)f->siginfo;
+
+	return signal <= 64 ? signal : 0;
+}
+
+bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, size_t *next,
+			    struct arch_signal_frame *found)
+{
+	_Static_assert(sizeof(struct frame) <= ARCH_SIGNAL_FRAME_BYTES, "arch.h");
+
+	for (; *next + sizeof(struct frame) <= bytes; *next += 16) {
+		const struct frame *f = (const struct frame *)(stack + *next);
+
+		if (!is_signal_frame(f, at + *next))
+			continue;
+		found->at = at + *next;
+		found->sigmask = f->sigmask;
+		found->signal = (int)signal_of(f);
+		*next += 16;
+		return true;
+	}
+	return false;
+}
+
 /* ---- the stub ------------------------------------------------------------- */
 
 struct writer {
