@@ -37,9 +37,9 @@ class Files(enum.IntEnum):
 class Tcp(enum.IntEnum):
     """`enum avc_tcp`: established TCP connections at a restore."""
 
-    KEEP = 0
+    RESET_MOVED = 0
     RESET = 1
-    RESET_MOVED = 2
+    KEEP = 2
     MESSAGES = 3
 
 
@@ -64,7 +64,7 @@ class GuardConfig:
     freeze_deadline_s: float = 0.0
     """The longest the app is held to get it stopped; 0: the engine's default."""
     files: Files = Files.REWIND
-    tcp: Tcp = Tcp.KEEP
+    tcp: Tcp = Tcp.RESET_MOVED
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@
  *   code     it maps code of its own over that of the parasite
  *   setup    it writes it into what a process restored from it will call
  *
- * counter[0] says that it has found the parasite, counter[1] how often the call was made and
- * refused, counter[2] how often it was not.
+ * It begins at SIGUSR1, when there is one parasite only.  counter[0] says that it has found it,
+ * counter[1] how often the call was made and refused, counter[2] how often it was not.
  */
 #include <linux/filter.h>
 #include <linux/seccomp.h>
@@ -29,6 +29,13 @@
 static const char *folder, *where;
 static struct inj_setup fake;
 static volatile int64_t outcome = UNTOUCHED;
+static volatile sig_atomic_t asked;
+
+static void ask(int signal)
+{
+	(void)signal;
+	asked = 1;
+}
 
 static void confine(bool little)
 {
@@ -103,7 +110,7 @@ static void map_code(const struct place *place)
 
 	must(code != MAP_FAILED, "mmap");
 	memset(code, 0x90, INJ_CODE_BYTES); /* nop */
-	*at++ = 0xb8; /* mov $SYS_mkdir, %eax */
+	*at++ = 0xb8;                       /* mov $SYS_mkdir, %eax */
 	memcpy(at, &(uint32_t){ SYS_mkdir }, 4);
 	at += 4;
 	memcpy(at, (uint8_t[]){ 0x48, 0xbf }, 2); /* mov $folder, %rdi */
@@ -125,8 +132,8 @@ static void write_setup(const struct place *place)
 	const uint64_t slot_bytes = (place->bytes - INJ_SLOTS_OFFSET) / SLOTS;
 
 	for (unsigned int i = 0; i < SLOTS; i++) {
-		struct inj_slot *slot = (struct inj_slot *)(place->start + INJ_SLOTS_OFFSET +
-							    i * slot_bytes);
+		struct inj_slot *slot =
+			(struct inj_slot *)(place->start + INJ_SLOTS_OFFSET + i * slot_bytes);
 
 		if (slot->setup[INJ_AFTER] && slot->setup[INJ_AFTER] != (uint64_t)&fake)
 			slot->setup[INJ_AFTER] = (uint64_t)&fake;
@@ -139,13 +146,17 @@ static void write_setup(const struct place *place)
 
 static void *attack(void *unused)
 {
-	const struct place place = await_parasite();
-	struct inj_control *control = (struct inj_control *)(place.start + INJ_CODE_BYTES);
+	struct inj_control *control;
+	struct place place;
 
-	fake = (struct inj_setup){ .flags = INJ_MAY_FAIL,
-				   .call = { .nr = SYS_mkdir,
-					     .arg = { (uint64_t)folder, 0700 },
-					     .result = UNTOUCHED } };
+	while (!asked)
+		usleep(1000);
+	place = await_parasite();
+	control = (struct inj_control *)(place.start + INJ_CODE_BYTES);
+	fake = (struct inj_setup){
+		.flags = INJ_MAY_FAIL,
+		.call = { .nr = SYS_mkdir, .arg = { (uint64_t)folder, 0700 }, .result = UNTOUCHED }
+	};
 	count(0, 1);
 	if (!strcmp(where, "code"))
 		map_code(&place);
@@ -170,12 +181,13 @@ int main(int argc, char **argv)
 	victim_start(&argc, argv, 2, "WHERE FOLDER [--little]");
 	where = argv[1];
 	folder = argv[2];
+	signal(SIGUSR1, ask);
 	must(!pthread_create(&thread, NULL, attack, NULL), "pthread_create");
 	usleep(20000);
 	confine(little);
 	victim_ready();
 	for (;;) {
-		nap_us(1000);
+		usleep(1000);
 		beat();
 	}
 }

@@ -10,6 +10,7 @@
  *   error.c         what went wrong
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
+ *   budget.c        what one checkpoint or restore may cost
  *   proc.c          /proc
  *   pagemap.c       which pages of a process are there
  *   rt_priority.c   a CPU at once while an app waits for us
@@ -56,6 +57,22 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 int heartbeat_open(int fd) warn_unused;
 /* We get on: the daemon kills a guard of which it has not heard for seconds. */
 void heartbeat(void);
+
+/* ---- budget.c --------------------------------------------------------------- */
+
+/* Of a checkpoint or restore.  `working` is called now and then, NULL: nothing. */
+void budget_begin(void (*working)(void *arg), void *arg);
+/* From now on there is so much time; 0: as much as it takes. */
+void budget_deadline(uint64_t ns);
+/* It is over for that reason, in words that stay. */
+void budget_exceed(enum avc_code code, const char *what);
+/* Memory that is to be kept: whether there is room, and if so takes it.  budget_has() only asks. */
+bool budget_has(uint64_t bytes);
+bool budget_take(uint64_t bytes);
+/* We get on.  False when the budget is exceeded. */
+bool budget_step(void);
+/* -1 with that code and the reason in words when it is. */
+int budget_check(pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- config.c -------------------------------------------------------------- */
 
@@ -166,13 +183,16 @@ struct proc_sched {
 int proc_sched(pid_t tid, struct proc_sched *sched);
 
 /* What is of interest in /proc/PID/status. */
+#define STATUS_GROUPS 64
 struct proc_status {
 	int64_t locked_kb;       /* -1: it has no memory any more                    */
 	pid_t inside;            /* in the innermost PID namespace                   */
 	pid_t tracer;            /* a thread, in our namespace; 0: none              */
 	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
-	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	int group_count;         /* supplementary; those beyond are not known   */
+	uint32_t groups[STATUS_GROUPS];
+	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };

@@ -292,6 +292,7 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 	if (!maps)
 		return -1;
 	while (!result && getline(&line, &size, maps) > 0) {
+		heartbeat();
 		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
 			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
 				  MAPPING_KEYS;
@@ -326,6 +327,20 @@ static void parse_ids(const char *p, uint32_t id[4])
 	sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]);
 }
 
+static void parse_groups(const char *p, struct proc_status *status)
+{
+	char *next;
+
+	while (status->group_count < STATUS_GROUPS) {
+		const unsigned long group = strtoul(p, &next, 10);
+
+		if (next == p)
+			return;
+		status->groups[status->group_count++] = (uint32_t)group;
+		p = next;
+	}
+}
+
 #define LIMIT_NAME 26 /* columns: fs/proc/base.c, proc_pid_limits() */
 #define LIMIT_VALUE 21
 
@@ -355,6 +370,8 @@ int proc_status(pid_t tid, struct proc_status *status)
 			parse_ids(value, status->uid);
 		else if (!strncmp(line, "Gid:", 4))
 			parse_ids(value, status->gid);
+		else if (!strncmp(line, "Groups:", 7))
+			parse_groups(value, status);
 		else if (!strncmp(line, "NoNewPrivs:", 11))
 			status->no_new_privs = (uint32_t)atoi(value);
 		else if (!strncmp(line, "x86_Thread_features:", 20))

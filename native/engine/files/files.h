@@ -161,6 +161,16 @@ struct file_socket {
 	struct sockaddr_storage local, remote;
 };
 
+/* Of a process, as the checkpoint found it, in our own user namespace. */
+#define RIGHTS_GROUPS STATUS_GROUPS
+struct file_rights {
+	bool known;
+	uint32_t user, group;
+	uint64_t caps; /* effective                                             */
+	int group_count;
+	uint32_t groups[RIGHTS_GROUPS];
+};
+
 struct file {
 	int fd;
 	enum file_kind kind;
@@ -206,7 +216,8 @@ struct file {
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
-	int tcp_state; /* 0: no TCP                                                 */
+	bool tcp_counted;                /* these two are exact                    */
+	int tcp_state; /* 0: no connection over a network                           */
 	/* In the middle of a message, as far as can be told (files_stream.c)      */
 	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */
@@ -218,6 +229,13 @@ struct file {
 	struct file_video video;
 	/* The same open file description in `parent` of files_look(); NULL: not known to be */
 	const struct file *inherited;
+};
+
+/* What is not where it was. */
+struct files_missing {
+	uint32_t count;
+	const struct file **file; /* by dev and ino                              */
+	bool port;                /* one of them is a socket that listens            */
 };
 
 struct files {
@@ -233,6 +251,9 @@ struct files {
 	const struct files *parent;
 	pid_t parent_pid;
 	struct scratch *scratch; /* also only then                                 */
+	struct file_rights rights;
+	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
+	const struct files_missing *missing;
 };
 
 struct files_work;
@@ -247,6 +268,8 @@ enum files_depth {
 struct files *files_new(uint32_t room);
 int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
 	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
+/* Puts them in order. */
+void files_missing_sort(struct files_missing *missing);
 struct file *files_find(const struct files *files, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
 /* Finds out which of them are of the same open file description: `first` is the first of
@@ -266,8 +289,12 @@ bool files_is_closed(const struct files_held *held);
 /* fdinfo of a descriptor: O_CLOEXEC, locks, and what is in anonymous inodes.  True if
  * it says that it is of that kind. */
 bool file_read_info(pid_t pid, struct file *file);
+/* Of an eventfd of ours. */
+uint64_t file_count(int fd);
 
 /* files_state.c */
+/* So often a count is read at most, to bring it down to what it was. */
+#define FILE_COUNT_READS 1000
 void file_look_at_socket(int fd, struct file *file);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
 void files_find_peers(struct files *files, pid_t pid);
@@ -336,14 +363,29 @@ int file_look_at_video(int fd, struct file_video *video) warn_unused;
 const char *file_put_video(int fd, const struct file_video *want);
 void files_find_areas(struct files *files, pid_t pid);
 
+/* files_rights.c */
+/* Ours, while we have others. */
+struct file_rights_own {
+	uint32_t user, group;
+	int group_count;
+	uint32_t groups[RIGHTS_GROUPS];
+};
+void file_rights_read(struct file_rights *rights, pid_t pid);
+/* The calling thread opens files as that process would, until it gives that back; nothing else may
+ * be done in between.  -1: it cannot, and nothing has changed. */
+int file_rights_take(const struct file_rights *rights, struct file_rights_own *own) warn_unused;
+void file_rights_give_back(const struct file_rights_own *own);
+
 /* files_make.c */
 /* Of a pseudoterminal, the side that programs run on. */
 bool file_is_pts(const struct file *file);
+/* The file that it was, by its path: an O_PATH descriptor, or -1.  With our own rights if `rights` is
+ * NULL. */
+int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights);
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
  * may be set on success as well: what is not as it was. */
-/* The file that it was, by its path: an O_PATH descriptor, or -1. */
-int file_open_path(const struct file *want, pid_t init);
-int file_make(const struct file *want, pid_t template, pid_t init, const char **why);
+int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,
+	      const char **why);
 /* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
 int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
 /* A socket or pipe that reads as closed by the other side, after what was in it. */

@@ -55,7 +55,7 @@ int files_check_strict(const struct generation *generation, pid_t pid, int pidfd
 		if (!is_data(w))
 			continue;
 		n = n && files_same_object(w, n) ? n : NULL;
-		fd = n ? proc_borrow_fd(pidfd, n->fd) : file_open_path(w, init);
+		fd = n ? proc_borrow_fd(pidfd, n->fd) : file_open_path(w, init, NULL);
 		if (fd < 0 || fstat(fd, &st)) {
 			close_fd(&fd);
 			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",

@@ -134,6 +134,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
+	budget_begin(NULL, NULL);
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
 	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
@@ -378,12 +379,13 @@ static void guard_main(struct avc_guard *guard)
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 		ended = true;
 	}
+	tracee_know(guard_knows_tracee, guard);
 	while (!ended && !guard->stop) {
 		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
-		if (!straggling && !dying)
+		if (!straggling && !dying && !tracee_expects_strangers())
 			guard->stragglers_since_ns = now_ns();
 		if (!straggling)
 			guard->told_stragglers_ns = now_ns(); /* there are none */
@@ -391,7 +393,8 @@ static void guard_main(struct avc_guard *guard)
 			guard_kill_lost(guard);
 		if (dying)
 			guard_reap_unknown(guard);
-		wait_for_news(guard, straggling || dying);
+		tracee_release_strangers();
+		wait_for_news(guard, straggling || dying || tracee_expects_strangers());
 		if (guard->attached && init_channel_report(&guard->channel, &report)) {
 			guard_app_died(guard, &report);
 			continue;

@@ -41,6 +41,8 @@ struct tree {
 	const void *arg;
 };
 
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h, since Linux 6.9 */
+
 /* ---- process.c ----------------------------------------------------------------- */
 
 void process_init(struct process *process);
@@ -128,6 +130,8 @@ int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether entry[i] has its parent's memory, and not its own: after vfork(2) until it has
  * executed a program. */
+/* Whether that is in one of their parasites: then it is none of the app's that is there. */
+bool tree_has_parasite(const struct tree *tree, avc_remote pc);
 bool tree_shares_memory(const struct tree *tree, uint32_t i);
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);

@@ -253,6 +253,9 @@ struct stop tracee_wait(pid_t tid, int options);
  * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
  * STOP_TRAP is an error. */
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
+/* The same; tick() is called now and then, as long as there is a deadline. */
+enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
+				  struct avc_error *err) warn_unused;
 /* The signal by which the one awaited last is stopped (job control); 0: it is not. */
 int tracee_group_signal(void);
 /* From a stop of another kind to a plain trap stop, on the kernel's way back to
@@ -260,6 +263,16 @@ int tracee_group_signal(void);
 int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
 /* The same of a task of ours of which it is not known whether it runs. */
 int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
+/* Where a tracee is, as soon as it is stopped; 0: it is not, after some milliseconds, or ended. */
+avc_remote tracee_pc(pid_t tid);
+/* Tracees of which we are not told: clone(2) with CLONE_PTRACE attaches a child to its parent's
+ * tracer, if there is one by then; but whether to tell it is decided at the call's beginning
+ * (kernel/fork.c, kernel_clone()).  One that is not known() is let go as soon as it has stopped. */
+void tracee_know(bool (*known)(pid_t tid, const void *arg), const void *arg);
+void tracee_release_strangers(void);
+/* One may come; for a second it is to be looked for. */
+void tracee_expect_strangers(void);
+bool tracee_expects_strangers(void);
 /* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
  * that a thread has brought forth when it was killed is a tracee nobody heard of. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);

@@ -156,7 +156,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
 /* Whether `code` is what arch_stub_build() has written once. */
 bool arch_is_stub(const uint8_t *code);
-void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub, long nr,
-		    const uint64_t arg[6]);
+/* `last`: the task ends after the call, and does not go back. */
+void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub,
+		    bool last, long nr, const uint64_t arg[6]);
 
 #endif
