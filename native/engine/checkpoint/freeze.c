@@ -315,12 +315,13 @@ int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
 				 ? -1
 				 : 0;
 	}
-	if (!result && !has_all_holders(tree))
-		result = clone_missing(tree, generation, err);
+	/* While main threads are in their parasites: see parasite_will(). */
 	if (!result) {
 		capture_files(process, generation);
 		result = see_alive(tree, err);
 	}
+	if (!result && !has_all_holders(tree))
+		result = clone_missing(tree, generation, err);
 	/* Also what was begun before something failed. */
 	main_thread = thread_find(process, process->pid);
 	if (process->cloning &&

@@ -611,7 +611,7 @@ static void keep_content(const struct look *look, struct file *f)
 		return;
 	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
 	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
-		file_keep_content(f->ours, f, look->files->scratch);
+		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
 }
 
 static void drop_ours(struct file *f)
@@ -829,10 +829,12 @@ int files_capture(struct process *process, struct generation *generation, bool s
 	image->parent = parent;
 	image->parent_pid = parent_pid;
 	image->scratch = scratch;
+	image->process = process;
 	result = files_look(image, process->pid, process->pidfd, FILES_FROZEN,
 			    process->files_before, process->init, err);
 	image->parent = NULL; /* may be gone before this one */
 	image->scratch = NULL;
+	image->process = NULL;
 	for (uint32_t i = 0; i < image->count; i++)
 		image->file[i].inherited = NULL;
 	if (result)
