@@ -104,6 +104,14 @@ def test_checkpoint(tmp_path: Path, command: str, known: bool) -> None:
             assert guard.command("checkpoint")["kind"] == "checkpoint", "the next guard protects it"
 
 
+def wait_goes_on_or_ends(victim: Victim) -> None:
+    """Whichever it is, it is soon."""
+    beats = victim.see().beats
+    wait_until(
+        lambda: victim.popen.poll() is not None or victim.see().beats > beats + 3, PATIENCE_S, "it goes on, or ends"
+    )
+
+
 @pytest.mark.parametrize("command", ["steady", "steady --in-child"])
 def test_restore(tmp_path: Path, command: str) -> None:
     """Nobody can finish it: then init ends at once, and nothing is left of the application."""
@@ -118,11 +126,7 @@ def test_restore(tmp_path: Path, command: str) -> None:
                     return
                 assert killed
             # Its own application, or init's end: with what it died of, or restored just in time.
-            wait_until(
-                lambda v=victim, b=victim.see().beats: v.popen.poll() is not None or v.see().beats > b + 3,
-                PATIENCE_S,
-                "it goes on, or ends",
-            )
+            wait_goes_on_or_ends(victim)
             if victim.popen.poll() is None:
                 victim.check()
             else:
