@@ -69,7 +69,8 @@ machine-build: setup-build
 	@$(MAKE) -s -C native SANITIZE=1
 	@$(MAKE) -s -C tests/victims
 
-lint: setup-build ## ruff, mypy --strict, layers of the engine; shellcheck and clang-format, where installed
+lint: setup-build ## ruff, mypy --strict, layers of the engine, shellcheck, clang-format; a missing tool is a failure
+	@scripts/setup-system.sh lint
 	@scripts/lint.sh
 
 test-sqlite: setup ## kill SQLite under write load in containers, strict and rewind (KILLS=200; about an hour)

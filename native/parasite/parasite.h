@@ -212,6 +212,7 @@ void inj_restore(struct inj_slot *slot);
 void inj_end(void) __attribute__((noreturn));
 
 /* Of arch/ARCH/parasite.S. */
+void inj_enter(struct inj_call *call, uint64_t stack) __attribute__((noreturn));
 void inj_go_home(void) __attribute__((noreturn));
 long inj_clone(uint64_t flags, uint64_t stack, uint64_t a, uint64_t b, uint64_t c);
 long inj_spawn(uint64_t flags, uint64_t stack, uint64_t tls, struct inj_thread *thread,

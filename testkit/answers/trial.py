@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from avckpt.policy import config_of_labels
+from avckpt.policy import settings_of
 
 from testkit.answers.clients import Clients
 from testkit.answers.servers import SERVERS, backend, wait_answers
@@ -41,7 +41,7 @@ class Outcome:
 def run(server: str, requests: int, folder: Path, labels: Mapping[str, str] | None = None, seed: int = 1) -> Outcome:
     """Kills the main process again and again until there are so many answers, or a wrong one."""
     rng = random.Random(seed)
-    config = config_of_labels({**OFTEN, **(labels or {})})
+    config = settings_of({**OFTEN, **(labels or {})}).config
     port, kills = free_port(), 0
     with (
         backend() as behind,

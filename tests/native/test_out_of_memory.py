@@ -35,7 +35,7 @@ def group() -> Iterator[MemoryGroup]:
 def test_a_leak_is_restored(rate: int, trial: int, group: MemoryGroup, tmp_path: Path) -> None:
     with (
         Victim(f"leak {rate} {BASE_MB}", tmp_path, preexec=group.enter) as victim,
-        GuardProcess(config(0.5), [victim.pid]) as guard,
+        GuardProcess(config(0.5, memory_limit_bytes=LIMIT_BYTES), [victim.pid]) as guard,
     ):
         guard.wait("checkpoint", count=2)
         os.kill(victim.app, signal.SIGUSR1)

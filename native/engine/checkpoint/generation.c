@@ -85,7 +85,6 @@ static int quieten(struct process *process, struct generation *generation,
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	generation->dumpable = dumpable->result;
-	proc_set_oom_score_adj(pid, "1000");
 	return attributes ? hear_template(process, cloned, call, attributes, err) : 0;
 }
 

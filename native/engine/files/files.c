@@ -143,7 +143,7 @@ static char *read_name(const struct look *look, int fd)
 	if (n < 0)
 		return NULL;
 	name[n] = 0;
-	return strdup(name);
+	return budget_take((uint64_t)n) ? strdup(name) : NULL;
 }
 
 /* stdio that init has, too: then others read and write with the same offset. */
@@ -319,6 +319,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	bool silent;
 	int fd;
 
+	if (!budget_step() || !budget_take(sizeof *f))
+		return budget_check(look->pid, err);
 	if (files->count == files->room) {
 		if (look->depth != FILES_FROZEN) {
 			struct file *more = realloc(files->file, 2 * files->room * sizeof *more);
@@ -580,7 +582,9 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->rights_lost = from->rights_lost;
 	if (!from->content_bytes)
 		return;
-	f->content = malloc(from->content_bytes);
+	f->content = budget_has(from->content_bytes) && budget_take(from->content_bytes)
+			     ? malloc(from->content_bytes)
+			     : NULL;
 	f->content_lost |= !f->content;
 	if (!f->content)
 		return;
@@ -622,7 +626,8 @@ static void keep_contents(const struct look *look)
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
 
-		keep_content(look, f);
+		if (budget_step())
+			keep_content(look, f);
 		drop_ours(f);
 	}
 }

@@ -341,17 +341,32 @@ static void keep_messages(int fd, struct file *file)
 		n = more ? peek(fd, file, more + used + sizeof bytes, MESSAGE_MAX)
 			 : MESSAGE_MAX + 1;
 		/* An empty datagram can not be looked past; for others it is the end. */
-		file->content_lost |= n > MESSAGE_MAX ||
-				      (n > 0 && used + (size_t)n > CONTENT_MAX) ||
-				      (n == 0 && file->socket->type == SOCK_DGRAM);
+		file->content_lost |=
+			n > MESSAGE_MAX ||
+			(n > 0 && (used + (size_t)n > CONTENT_MAX || !budget_has((uint64_t)n))) ||
+			(n == 0 && file->socket->type == SOCK_DGRAM);
 		if (n <= 0 || file->content_lost)
 			break;
 		bytes = (uint32_t)n;
+		(void)budget_take(bytes);
 		memcpy(file->content + used, &bytes, sizeof bytes);
 		used += sizeof bytes + bytes;
 	}
 	file->content_bytes = (uint32_t)used;
 	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
+}
+
+/* There was room for the largest. */
+static void trim_messages(struct file *file)
+{
+	uint8_t *less = file->content_bytes ? realloc(file->content, file->content_bytes) : NULL;
+
+	if (!file->content_bytes) {
+		free(file->content);
+		file->content = NULL;
+	} else if (less) {
+		file->content = less;
+	}
 }
 
 void file_keep_content(int fd, struct file *file, struct scratch *scratch)
@@ -363,12 +378,14 @@ void file_keep_content(int fd, struct file *file, struct scratch *scratch)
 		return;
 	if (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM) {
 		keep_messages(fd, file);
+		trim_messages(file);
 		return;
 	}
-	if (bytes > CONTENT_MAX) {
+	if (bytes > CONTENT_MAX || !budget_has((uint64_t)bytes)) {
 		file->content_lost = true;
 		return;
 	}
+	(void)budget_take((uint64_t)bytes);
 	file->content = malloc((size_t)bytes);
 	if (!file->content) {
 		file->content_lost = true;
@@ -392,17 +409,18 @@ static int reopen(int fd, int flags)
 	return open(path, flags | O_NONBLOCK | O_CLOEXEC);
 }
 
-static void drain(int fd, const struct file *want)
+/* False if there is no end of it: somebody outside of the application goes on writing. */
+static bool drain(int fd, const struct file *want)
 {
 	char buf[65536];
 	int reads = 0;
 	ssize_t n;
 
-	/* Somebody outside of the application may go on writing. */
 	do {
 		n = want->kind == FILE_PIPE ? read(fd, buf, sizeof buf)
 					    : recv(fd, buf, sizeof buf, MSG_DONTWAIT);
 	} while (n > 0 && ++reads < DRAIN_READS);
+	return n <= 0;
 }
 
 const char *file_put_content(int fd, int other_fd, const struct file *want)
@@ -413,9 +431,10 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	    out = pipe ? reopen(other_fd, O_WRONLY) : other_fd;
 	const char *problem = NULL;
 	uint32_t put = 0;
+	bool emptied;
 
-	if (in >= 0 && out >= 0) {
-		drain(in, want);
+	emptied = in >= 0 && out >= 0 && drain(in, want);
+	if (emptied) {
 		while (put < want->content_bytes) {
 			const uint8_t *from = want->content + put;
 			uint32_t bytes = want->content_bytes - put;
@@ -434,7 +453,7 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 			put += (uint32_t)n;
 		}
 	}
-	if (put < want->content_bytes || in < 0 || out < 0)
+	if (put < want->content_bytes || !emptied)
 		problem = "what was in it could not be put back";
 	else if (want->rights_lost)
 		problem = "descriptors that were on their way through it are lost";

@@ -9,7 +9,8 @@
 #include "guard.h"
 
 #define SPARE_NS (NS_PER_S / 2)
-#define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
+#define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
+#define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
@@ -303,10 +304,14 @@ static int take_seen(struct avc_guard *guard, struct mem_seen *seen, struct avc_
 	for (uint32_t i = 1; i < guard->tree.count; i++)
 		if (guard->tree.entry[i].process)
 			waits_prepare(guard->tree.entry[i].process);
+	budget_deadline(READ_NS);
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);
 	result = freeze_tree(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
 			     seen, &times, err);
+	budget_deadline(0);
+	if (!result)
+		result = budget_check(process->pid, err);
 	event->freeze_ns = times.freeze_ns;
 	event->stop_ns = times.stop_ns;
 	event->clone_ns = times.clone_ns;
@@ -373,6 +378,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
+		budget_begin(NULL, NULL);
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
 		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))
@@ -400,6 +406,12 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		if (ticket)
 			guard_refuse(guard, ticket, AVC_BUSY,
 				     "memory is short, so no generation is held");
+		return;
+	}
+	if (guard_app_is_full(guard)) {
+		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
+		     "it fills the memory of its container: what it had before is kept");
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
 	if (take(guard, &event, &error) == 0) {

@@ -115,6 +115,12 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 	guard->main.childless = !generation->branches;
 }
 
+/* Of whatever takes its time. */
+static void say_working(void *channel)
+{
+	init_channel_working(channel);
+}
+
 /* The newest generation; when restores are used up, the one before it.  There were `had`
  * when the app died. */
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
@@ -133,6 +139,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		pid_t pid;
 
 		struct avc_error failed = { 0 }, notes = { 0 };
+
+		budget_begin(say_working, &guard->channel);
 
 		/* What was written since the newest was written since all others, also
 		 * where that can not be seen any more. */

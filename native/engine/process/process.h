@@ -41,6 +41,8 @@ struct tree {
 	const void *arg;
 };
 
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h, since Linux 6.9 */
+
 /* ---- process.c ----------------------------------------------------------------- */
 
 void process_init(struct process *process);

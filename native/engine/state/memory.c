@@ -221,7 +221,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 		/* Before it is read: what is written meanwhile was written since. */
 		if (a->as_file)
 			a->writes = others_writes(process->others, a);
-		image->whole &= copy_area(process->pid, a, to);
+		image->whole &= budget_step() && copy_area(process->pid, a, to);
 		to += area_room(a);
 	}
 }
@@ -534,6 +534,7 @@ int memory_put_back(const struct process *process, const struct generation *imag
 	for (uint32_t i = 0; !result && i < memory->areas.count; i++) {
 		struct area *a = &memory->areas.area[i];
 
+		(void)budget_step();
 		if (area_room(a) && a->kept)
 			result = put_back(process, image, a, pid, mem_fd, from, notes, err);
 		from += area_room(a);

@@ -16,7 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
-#define ARCH_AUDIT AUDIT_ARCH_X86_64 /* as seccomp filters know it (linux/audit.h) */
+#define ARCH_AUDIT AUDIT_ARCH_X86_64           /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
@@ -117,6 +117,10 @@ void arch_resume(struct arch_regs *regs);
 void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
 	       uint64_t arg);
 
+/* Likewise with two arguments, the stack as it is. */
+void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
+		uint64_t b);
+
 /* Fills in the context that inj_go_home() goes back to. */
 void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
 
@@ -152,7 +156,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
 /* Whether `code` is what arch_stub_build() has written once. */
 bool arch_is_stub(const uint8_t *code);
-void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub, long nr,
-		    const uint64_t arg[6]);
+/* `last`: the task ends after the call, and does not go back. */
+void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub,
+		    bool last, long nr, const uint64_t arg[6]);
 
 #endif
