@@ -5,7 +5,7 @@
  * It takes the process with the most points: its resident pages, and as many thousandths of what
  * may be used as its oom_score_adj says (mm/oom_kill.c, oom_badness()).
  *
- * - Older generations go first: 1000.
+ * - Older generations go first, the oldest before all others: 1000, or a little less.
  * - The newest one is there for an application that leaks until it is killed.  Without a limit it
  *   has the value of the application, which has more points, for it has grown since.
  * - With a limit it has as many points as the application has when that fills the limit by
@@ -22,6 +22,7 @@
 
 #define FIRST 1000
 #define OWN_MAX (FIRST - 1)
+#define STEP 2
 /* Of the limit, in percent: an app that has so much is killed; of one that has so much no
  * checkpoint is taken. */
 #define KILLED 95
@@ -84,14 +85,23 @@ static void rank_newest(struct generation *newest, long limit)
 	}
 }
 
+/* A newer one is larger, if the app grows. */
+static void rank_older(struct generation *older, uint32_t k, long oldest_pages, long limit)
+{
+	const long more = limit ? (older->anon_pages - oldest_pages) * FIRST / limit : 0;
+	const long value = FIRST - STEP * (long)k - (more > 0 ? more : 0);
+
+	for (uint32_t i = 0; i <= older->branches; i++)
+		if (image_of(older, i))
+			tell(image_of(older, i), (int)value);
+}
+
 void guard_rank_generations(struct avc_guard *guard)
 {
 	const long limit = (long)(guard->config.memory_limit_bytes / ARCH_PAGE_BYTES);
 
 	for (uint32_t k = 0; k + 1 < guard->count; k++)
-		for (uint32_t i = 0; i <= guard->generations[k].branches; i++)
-			if (image_of(&guard->generations[k], i))
-				tell(image_of(&guard->generations[k], i), FIRST);
+		rank_older(&guard->generations[k], k, guard->generations[0].anon_pages, limit);
 	if (guard->count)
 		rank_newest(&guard->generations[guard->count - 1], limit);
 }
