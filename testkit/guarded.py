@@ -192,7 +192,15 @@ class GuardProcess:
 class Victim(Init):
     """A program of tests/victims below avckpt-init, with its board."""
 
-    def __init__(self, command: str, folder: Path, *, options: Sequence[str] = (), with_board: bool = True) -> None:
+    def __init__(
+        self,
+        command: str,
+        folder: Path,
+        *,
+        options: Sequence[str] = (),
+        with_board: bool = True,
+        preexec: Callable[[], None] | None = None,
+    ) -> None:
         program, *args = command.split()
         self.command = command
         self.board = Board(folder / f"board-{Path(program).name}-{time.monotonic_ns()}")
@@ -201,7 +209,12 @@ class Victim(Init):
             args += ["--board", str(self.board.path)]
         self._file = self.output_path.open("wb")
         super().__init__(
-            [BUILD / program, *args], pid1=True, options=options, stdout=self._file.fileno(), stderr=subprocess.STDOUT
+            [BUILD / program, *args],
+            pid1=True,
+            options=options,
+            stdout=self._file.fileno(),
+            stderr=subprocess.STDOUT,
+            preexec=preexec,
         )
 
     def __enter__(self) -> Victim:
