@@ -18,8 +18,8 @@ from avckpt_hooks.shared.tell import printable
 
 from avckpt.artifacts import guard_binary
 from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
-from avckpt.events.vocabulary import Event, EventKind, Reason
-from avckpt.guard import Command, GuardConfig
+from avckpt.events.vocabulary import Kind, Reason
+from avckpt.guard import Command, Event, GuardConfig
 
 try:
     from avckpt._native import ffi, lib
@@ -199,9 +199,9 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
 
 def _event(e: Any) -> Event:
     return Event(
-        kind=EventKind(e.kind),
+        kind=Kind.of(e.kind),
         cookie=e.cookie,
-        reason=Reason(e.reason),
+        reason=Reason.of(e.reason) if e.reason else None,
         ticket=e.ticket,
         at_ns=e.at_ns,
         app_pid=e.app_pid,

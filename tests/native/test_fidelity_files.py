@@ -257,7 +257,7 @@ def test_connections_are_reset_on_demand(tmp_path: Path) -> None:
 def test_only_connections_that_moved_are_reset(tmp_path: Path) -> None:
     with (
         Victim("tcpecho 0", tmp_path) as victim,
-        GuardProcess(config(tcp=Tcp.RESET_MOVED), [victim.pid]) as guard,
+        GuardProcess(config(), [victim.pid]) as guard,
     ):
         still, moved = Client(victim), Client(victim)
         assert (still.ask("a"), moved.ask("b")) == ("1 a", "1 b")
@@ -272,8 +272,11 @@ def test_only_connections_that_moved_are_reset(tmp_path: Path) -> None:
         assert not still.is_reset()
 
 
-def test_connections_go_on_by_default(tmp_path: Path) -> None:
-    with Victim("tcpecho 0", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+def test_connections_go_on_on_demand(tmp_path: Path) -> None:
+    with (
+        Victim("tcpecho 0", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.KEEP), [victim.pid]) as guard,
+    ):
         client = Client(victim)
         assert client.ask("a") == "1 a"
         checkpoint(guard)

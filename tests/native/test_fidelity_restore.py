@@ -58,7 +58,7 @@ def test_restore_on_command(tmp_path: Path) -> None:
         wait_until(lambda: victim.see().counter[1] > at + 1000, 10, "it works")
         before = victim.see().counter[1]
         answer = guard.command("restore")
-        assert (answer["kind"], answer["reason"]) == ("restored", "command")
+        assert (answer["kind"], answer["reason"]) == ("restored", "manual")
         wait_until(lambda: victim.see().counter[1] < before, 5, "it has gone back")
         assert inside(victim.app) == pid
         victim.wait_beats(20)

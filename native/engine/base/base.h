@@ -173,6 +173,15 @@ int mapping_protection(const struct mapping *m);
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
+
 /* What is of interest in /proc/PID/status. */
 #define STATUS_GROUPS 64
 struct proc_status {

@@ -490,6 +490,25 @@ int proc_pidfd_open(pid_t pid)
 	return (int)syscall(SYS_pidfd_open, pid, 0);
 }
 
+int proc_sched(pid_t tid, struct proc_sched *sched)
+{
+	char buf[4096];
+	const char *ran, *switches, *migrations;
+	unsigned long long ms, ns;
+
+	if (proc_read(tid, "sched", buf, sizeof buf) <= 0)
+		return -1;
+	ran = strstr(buf, "\nse.exec_start");
+	switches = strstr(buf, "\nnr_switches");
+	migrations = strstr(buf, "\nse.nr_migrations");
+	if (!ran || !switches || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
+	    sscanf(switches, " %*s : %lu", &sched->switches) != 1 ||
+	    sscanf(migrations, " %*s : %lu", &sched->migrations) != 1)
+		return -1;
+	sched->ran_ns = ms * NS_PER_MS + ns;
+	return 0;
+}
+
 /* A task gets the flag before it closes anything (kernel/exit.c, do_exit()). */
 bool proc_is_exiting(pid_t tid)
 {

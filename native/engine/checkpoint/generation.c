@@ -50,10 +50,7 @@ static int quieten(struct process *process, struct generation *generation,
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
-			  PTRACE_O_SUSPEND_SECCOMP)) ||
-	    arch_regs_get(pid, &generation->base))
+	if (parasite_own(&process->parasite, pid) || arch_regs_get(pid, &generation->base))
 		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
 	memset(call->out, 0, sizeof call->out);
 	memcpy(call->out, "avckpt-tmpl", 12);
@@ -188,6 +185,8 @@ static int fill_slot(struct process *process, struct generation *generation,
 		fill_ended(process, generation);
 	generation->sandboxed = status.seccomp == 1 ||
 				status.seccomp_filters > process->plain_filters;
+	if (status.seccomp == 1)
+		process->parasite.seccomp = SECCOMP_SUPERVISED;
 	if (memory_finish(process, generation, status.locked_kb, &setup, err))
 		return -1;
 	pending_setup(process, &setup);

@@ -216,7 +216,8 @@ struct file {
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
-	int tcp_state; /* 0: no TCP                                                 */
+	bool tcp_counted;                /* these two are exact                    */
+	int tcp_state; /* 0: no connection over a network                           */
 	/* In the middle of a message, as far as can be told (files_stream.c)      */
 	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */

@@ -33,6 +33,7 @@
 
 #define CONTENT_MAX (1 << 20)
 #define DRAIN_READS 16384       /* more than the small messages that a socket has room for */
+#define TCP_TRIES 8
 #define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
 #define STATUS_FLAGS (O_APPEND | O_NONBLOCK | O_DIRECT | O_NOATIME)
@@ -101,6 +102,14 @@ void file_look_at_socket(int fd, struct file *file)
 	file->socket = s;
 }
 
+static bool is_connected(int fd)
+{
+	struct sockaddr_storage remote;
+	socklen_t bytes = sizeof remote;
+
+	return getpeername(fd, (struct sockaddr *)&remote, &bytes) == 0;
+}
+
 /* As linux/tcp.h has it; glibc's struct ends before. */
 struct tcp_info_tail {
 	struct tcp_info head;
@@ -109,18 +118,37 @@ struct tcp_info_tail {
 
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 {
-	struct tcp_info_tail info = { 0 };
+	struct tcp_info_tail info = { 0 }, before;
 	int unread = 0, unacknowledged = 0;
 	socklen_t bytes = sizeof info;
 
-	if (!s || s->protocol != IPPROTO_TCP || s->listening ||
-	    getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+	if (!s || s->type != SOCK_STREAM || s->listening ||
+	    (s->domain != AF_INET && s->domain != AF_INET6))
 		return;
+	if (s->protocol != IPPROTO_TCP) { /* MPTCP, SCTP */
+		if (is_connected(fd))
+			file->tcp_state = TCP_ESTABLISHED;
+		return;
+	}
+	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+		return;
+	/* The other side goes on: what comes, or is acknowledged, between two of these calls
+	 * would be in one figure and not in the other. */
+	for (int try = 0; try < TCP_TRIES; try++) {
+		before = info;
+		if (ioctl(fd, SIOCINQ, &unread))
+			unread = 0;
+		if (ioctl(fd, SIOCOUTQ, &unacknowledged))
+			unacknowledged = 0;
+		bytes = sizeof info;
+		if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+			return;
+		file->tcp_counted = info.bytes_acked == before.bytes_acked &&
+				    info.bytes_received == before.bytes_received;
+		if (file->tcp_counted)
+			break;
+	}
 	file->tcp_state = info.head.tcpi_state;
-	if (ioctl(fd, SIOCINQ, &unread))
-		unread = 0;
-	if (ioctl(fd, SIOCOUTQ, &unacknowledged))
-		unacknowledged = 0;
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
 	file->tcp_taken = info.bytes_received - (uint64_t)unread;
 	file->tcp_coming = file_is_coming(fd);
@@ -633,7 +661,8 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 
 bool file_tcp_moved(const struct file *want, const struct file *now)
 {
-	return want->tcp_written != now->tcp_written || want->tcp_taken != now->tcp_taken;
+	return !want->tcp_counted || !now->tcp_counted ||
+	       want->tcp_written != now->tcp_written || want->tcp_taken != now->tcp_taken;
 }
 
 /* connect(2) to nothing resets it, shutdown(2) makes it read as closed. */

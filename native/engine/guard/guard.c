@@ -379,12 +379,13 @@ static void guard_main(struct avc_guard *guard)
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 		ended = true;
 	}
+	tracee_know(guard_knows_tracee, guard);
 	while (!ended && !guard->stop) {
 		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
-		if (!straggling && !dying)
+		if (!straggling && !dying && !tracee_expects_strangers())
 			guard->stragglers_since_ns = now_ns();
 		if (!straggling)
 			guard->told_stragglers_ns = now_ns(); /* there are none */
@@ -392,7 +393,8 @@ static void guard_main(struct avc_guard *guard)
 			guard_kill_lost(guard);
 		if (dying)
 			guard_reap_unknown(guard);
-		wait_for_news(guard, straggling || dying);
+		tracee_release_strangers();
+		wait_for_news(guard, straggling || dying || tracee_expects_strangers());
 		if (guard->attached && init_channel_report(&guard->channel, &report)) {
 			guard_app_died(guard, &report);
 			continue;

@@ -102,6 +102,8 @@ void guard_await_spares(struct avc_guard *guard);
 /* Those that are just ending, for 50 ms at most. */
 void guard_wait_ended(void);
 void guard_reap_dead(struct avc_guard *guard);
+/* A tracee that is a thread of the app's, or ours (tracee_know()). */
+bool guard_knows_tracee(pid_t tid, const void *guard);
 void guard_reap_unknown(const struct avc_guard *guard);
 uint32_t guard_dispensable(const struct avc_guard *guard, bool probation);
 void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);

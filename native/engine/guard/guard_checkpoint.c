@@ -300,6 +300,10 @@ static int take_seen(struct avc_guard *guard, struct mem_seen *seen, struct avc_
 			touch_slot(&guard->tree.entry[i].process->parasite, fresh.slot,
 				   guard->tree.entry[i].process->thread_count);
 	wait_quiescent(guard, &fresh.quiescent);
+	waits_prepare(process);
+	for (uint32_t i = 1; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process)
+			waits_prepare(guard->tree.entry[i].process);
 	budget_deadline(READ_NS);
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);

@@ -129,15 +129,6 @@ void guard_await_spares(struct avc_guard *guard)
 	}
 }
 
-void guard_kill_lost(struct avc_guard *guard)
-{
-	guard_await_spares(guard);
-	init_channel_kill_lost(&guard->channel, guard_knows_process, guard);
-	guard->main.lost = false;
-	for (uint32_t i = 0; i < guard->tree.processes; i++)
-		guard->tree.process[i]->lost = false;
-}
-
 static bool has_thread(const struct process *process, pid_t tid)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++)
@@ -156,6 +147,33 @@ static bool is_known(pid_t tid, const void *arg)
 		if (has_thread(guard->tree.process[i], tid))
 			return true;
 	return false;
+}
+
+bool guard_knows_tracee(pid_t tid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	return is_known(tid, guard) || tree_has_parasite(&guard->tree, tracee_pc(tid));
+}
+
+/* What is not in a parasite is the app's (CLONE_PARENT, CLONE_PTRACE), or ends by itself
+ * (infect.c); it is let go. */
+static bool is_not_lost(pid_t pid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	return guard_knows_process(pid, guard) || is_known(pid, guard) || !tracee_is_ours(pid) ||
+	       !tree_has_parasite(&guard->tree, tracee_pc(pid));
+}
+
+void guard_kill_lost(struct avc_guard *guard)
+{
+	guard_await_spares(guard);
+	init_channel_kill_lost(&guard->channel, is_not_lost, guard);
+	tracee_release_strangers();
+	guard->main.lost = false;
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		guard->tree.process[i]->lost = false;
 }
 
 void guard_release(struct avc_guard *guard, struct process *process)

@@ -148,25 +148,23 @@ static int step_failed(const struct stop *stop, pid_t tid, struct avc_error *err
  * between: job control, or SIGSTOP, which can not be blocked. */
 static int step(pid_t tid, struct stop *stop, struct avc_error *err)
 {
-	*stop = (struct stop){ .kind = STOP_NONE };
-	while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK) {
-		if (ptrace(PTRACE_SYSCALL, tid, NULL,
-			   (long)(stop->kind == STOP_SIGNAL ? stop->signal : 0)))
+	do {
+		if (seccomp_go_on(tid, stop))
 			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
 		*stop = tracee_wait(tid, 0);
 		if (stop->kind == STOP_EXIT || stop->kind == STOP_DYING ||
 		    stop->kind == STOP_DEADLINE)
 			return step_failed(stop, tid, err);
-	}
+	} while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK);
 	return 0;
 }
 
-/* To the exit from a call `nr` that will not be made again.  1: on the way it has brought forth
- * *child. */
+/* From stop to stop, to the exit from a call `nr` that will not be made again.  1: on the way it
+ * has brought forth *child. */
 static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_error *err)
 {
+	struct stop stop = { .kind = STOP_OTHER };
 	struct arch_regs regs;
-	struct stop stop;
 
 	for (;;) {
 		if (step(tid, &stop, err))
@@ -206,9 +204,8 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	int born;
 
 	arch_stub_call(&regs, &thread->regs, porter->cave, SYS_clone, arg);
-	if (thread_suspend_seccomp(thread, err))
-		return -1;
-	if (arch_regs_set(thread->tid, &regs) ||
+	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
+	    arch_regs_set(thread->tid, &regs) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
@@ -229,7 +226,8 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	}
 	if (tracee_await(porter->pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS))
+	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    seccomp_supervise(porter->pid, 0, (long)TRACE_OPTIONS_OURS))
 		return fail_errno(err, porter->pid, "infect", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -403,6 +401,7 @@ static int make_pad(struct process *process, struct thread *thread, avc_remote c
 		result = bring_parasite(process, &porter, err);
 	if (porter.pid) {
 		tracee_kill(porter.pid);
+		seccomp_let_be(porter.pid);
 		if (leave_stub(thread, err))
 			result = -1;
 	}
@@ -422,6 +421,7 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 		return NULL;
 	}
 	t->seen = true;
+	rewind_prepare(t);
 	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;
@@ -450,6 +450,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	while (threads_max < threads)
 		threads_max *= 2;
 	parasite_close(&process->parasite);
+	process->parasite.inside = process->inside;
 	memory_forget(process->memory);
 	if (getrandom(&process->nonce, sizeof process->nonce, 0) < 0)
 		return fail_errno(err, 0, "infect", "getrandom", "no random number");
@@ -661,8 +662,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(holder, &base))
+	if (parasite_own(&process->parasite, holder) || arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
@@ -682,7 +682,7 @@ static int clone_by(struct process *process, pid_t tid, const struct arch_regs *
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(&process->parasite, *child))
 		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -723,7 +723,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||
-	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    parasite_own(&process->parasite, between) ||
 	    arch_regs_get(between, &process->holder_base))
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");

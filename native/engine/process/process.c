@@ -398,6 +398,7 @@ int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_n
 			again += !t->young;
 		}
 		tracee_deadline_set(timer, deadline_ns);
+		rewind_prepare(t);
 		if (thread_stop(process, t, &gone) || thread_await(process, t, &gone) ||
 		    check_unshared(process, t, &gone) || thread_ask(process, t, &gone))
 			t->known = false;

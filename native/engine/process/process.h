@@ -128,6 +128,8 @@ int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether entry[i] has its parent's memory, and not its own: after vfork(2) until it has
  * executed a program. */
+/* Whether that is in one of their parasites: then it is none of the app's that is there. */
+bool tree_has_parasite(const struct tree *tree, avc_remote pc);
 bool tree_shares_memory(const struct tree *tree, uint32_t i);
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);
@@ -137,6 +139,8 @@ void tree_free(struct tree *tree);
 
 /* ---- waits.c ---------------------------------------------------------------------- */
 
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct process *process);
 /* Ends the calls that were rewound and whose time is up; the next one's is at
  * process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);

@@ -51,13 +51,39 @@ static bool has_process(const struct tree *tree, pid_t pid)
 	return false;
 }
 
-/* A clone of ours: of a holder that is at it, or one of which we never heard. */
-static bool is_clone(const struct tree *tree, pid_t pid)
+bool tree_has_parasite(const struct tree *tree, avc_remote pc)
 {
+	bool found = parasite_contains(&tree->main->parasite, pc);
+
+	for (uint32_t i = 0; i < tree->processes; i++)
+		found |= parasite_contains(&tree->process[i]->parasite, pc);
+	return found;
+}
+
+/* A clone of ours: of a holder that is at it, or one of which we never heard.  What a thread of
+ * the app's has brought forth beside itself (CLONE_PARENT) may be a tracee, too.  1 or 0. */
+static int is_clone(const struct tree *tree, pid_t pid, struct avc_error *err)
+{
+	avc_remote pc;
+
 	if (has_process(tree, pid) || !tracee_is_ours(pid))
-		return false;
+		return 0;
+	pc = tracee_pc(pid);
+	if (!pc)
+		return fail(err, AVC_RETRY, 0, pid, "look at processes", "",
+			    "a process has just been made");
+	if (!tree_has_parasite(tree, pc))
+		return 0;
 	tree->main->lost |= !any_cloning(tree);
-	return true;
+	return 1;
+}
+
+/* A child of init's that is no process of the app's. */
+static int is_none(const struct tree *tree, pid_t pid, struct avc_error *err)
+{
+	return pid == tree->main->leader || tree->is_ours(pid, tree->arg)
+		       ? 1
+		       : is_clone(tree, pid, err);
 }
 
 /* A child hangs on the thread that forked it. */
@@ -69,11 +95,12 @@ static int look_at_task(pid_t tid, void *arg)
 	const int count = proc_children_of(look->task_dirfd, tid, children, CHILDREN_MAX);
 
 	for (int i = 0; i < count; i++) {
-		if (look->parent == PARENT_INIT &&
-		    (children[i] == tree->main->leader || tree->is_ours(children[i], tree->arg) ||
-		     is_clone(tree, children[i])))
-			continue;
-		if (add_entry(tree, children[i], look->parent, look->err))
+		const int none = look->parent == PARENT_INIT ? is_none(tree, children[i], look->err)
+							     : 0;
+
+		if (none < 0)
+			return -1;
+		if (!none && add_entry(tree, children[i], look->parent, look->err))
 			return -1;
 	}
 	return 0;

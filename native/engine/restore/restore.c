@@ -89,7 +89,7 @@ static int send_off(struct process *process, struct generation *generation, pid_
 		arch_tls_set(&regs, parasite_thread(parasite, generation->slot, 0)->tls);
 	if ((generation->sandboxed || generation->stop_signal) &&
 	    arch_regs_set(child, &regs) == 0) {
-		*sandbox = sandbox_begin(child, err);
+		*sandbox = sandbox_begin(child, process->inside, err);
 		if (*sandbox)
 			return 0;
 		tracee_kill(child);

@@ -118,7 +118,7 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 		return -1;
 	if (tracee_settle(batch->pid, err) || tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(batch->parasite, *child))
 		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
 	return 0;
 }
@@ -261,7 +261,7 @@ static int make_zombie(struct forked *forked, const struct branch *branch, struc
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
 	}
-	if (ptrace(PTRACE_CONT, batch->pid, NULL, 0L))
+	if (seccomp_go_on(batch->pid, NULL))
 		return fail_errno(err, batch->pid, "restore", "ptrace(CONT)", "it was killed");
 	for (;;) {
 		const struct stop stop = tracee_wait(batch->pid, 0);
@@ -272,8 +272,7 @@ static int make_zombie(struct forked *forked, const struct branch *branch, struc
 			return fail(err, AVC_DEADLINE, 0, batch->pid, "restore", "",
 				    "it did not end again");
 		if (stop.kind != STOP_DYING)
-			ptrace(PTRACE_CONT, batch->pid, NULL,
-			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+			seccomp_go_on(batch->pid, &stop);
 	}
 }
 
@@ -498,8 +497,7 @@ int restore_tree_make(struct restore_tree *restored, pid_t main_pid, struct avc_
 	first->batch.inside = slot->pid;
 	first->batch.notes = notes;
 	syscall_batch_enter(&first->batch, &restored->main->parasite, generation->slot);
-	if (first->pidfd < 0 ||
-	    ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)TRACE_OPTIONS_OURS) ||
+	if (first->pidfd < 0 || parasite_own(&restored->main->parasite, main_pid) ||
 	    arch_regs_get(main_pid, &first->batch.base))
 		return fail_errno(err, main_pid, "restore", "ptrace(GETREGS)", "it was killed");
 	if (slot->session_leader)

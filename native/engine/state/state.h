@@ -163,7 +163,7 @@ void process_attrs_setup_limits(const struct branch *branch, struct setup *setup
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
 /* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
-struct sandbox *sandbox_begin(pid_t child, struct avc_error *err);
+struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err);
 /* Waits while *state is INJ_IDLE; false when it ended or was too late. */
 bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
 /* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where

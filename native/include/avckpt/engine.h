@@ -31,9 +31,9 @@ enum avc_files {
 
 /* Established TCP connections at a restore. */
 enum avc_tcp {
-	AVC_TCP_KEEP = 0,        /* go on                                          */
+	AVC_TCP_RESET_MOVED = 0, /* those on which bytes moved since the checkpoint are reset */
 	AVC_TCP_RESET = 1,       /* are reset, and read as closed                  */
-	AVC_TCP_RESET_MOVED = 2, /* those on which bytes moved since the checkpoint */
+	AVC_TCP_KEEP = 2,        /* go on                                          */
 	AVC_TCP_MESSAGES = 3     /* those that it leaves in the middle of a message */
 };
 

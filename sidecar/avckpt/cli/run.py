@@ -29,7 +29,7 @@ from avckpt.engine import Engine, probe
 from avckpt.errors import AvckptError, LabelsWrong
 from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
-from avckpt.events.vocabulary import EventKind, signal_name
+from avckpt.events.vocabulary import Kind, signal_name
 from avckpt.guard import GuardConfig
 from avckpt.policy import settings_of
 
@@ -144,7 +144,7 @@ class _Supervisor:
             if line is None:
                 continue
             level, text = line
-            quiet = level < logging.WARNING or event.kind is EventKind.MISSED
+            quiet = level < logging.WARNING or event.kind is Kind.MISSED
             if self._verbose or not quiet:
                 say(f"{self._name}: {text}")
 

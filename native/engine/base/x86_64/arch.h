@@ -6,6 +6,7 @@
 #ifndef AVCKPT_ARCH_H
 #define AVCKPT_ARCH_H
 
+#include <linux/audit.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -15,6 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
+#define ARCH_AUDIT AUDIT_ARCH_X86_64 /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
