@@ -75,3 +75,16 @@ def test_memory_that_was_never_touched_costs_nothing(tmp_path: Path) -> None:
             taken = guard.command("checkpoint", timeout_s=PATIENCE_S)
             assert taken["kind"] == "checkpoint", taken
         assert memory_kb(guard_of(guard)) - before < CHILDREN << 10
+
+
+def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
+    """Names alone would be 200 MB; it is told in words, and the guard lives on."""
+    with (
+        Victim(f"crowd named 4 18000 {tmp_path}", tmp_path) as crowd,
+        GuardProcess(config(), [crowd.pid]) as guard,
+    ):
+        told = guard.command("checkpoint", timeout_s=PATIENCE_S)
+        assert told["kind"] == "unprotected"
+        assert "more than 128 MB" in told["error"]["message"]
+        assert memory_kb(guard_of(guard)) < 400 << 10
+        crowd.wait_beats()

@@ -10,6 +10,7 @@
  *   error.c         what went wrong
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
+ *   budget.c        what one checkpoint or restore may cost
  *   proc.c          /proc
  *   pagemap.c       which pages of a process are there
  *   rt_priority.c   a CPU at once while an app waits for us
@@ -56,6 +57,22 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 int heartbeat_open(int fd) warn_unused;
 /* We get on: the daemon kills a guard of which it has not heard for seconds. */
 void heartbeat(void);
+
+/* ---- budget.c --------------------------------------------------------------- */
+
+/* Of a checkpoint or restore.  `working` is called now and then, NULL: nothing. */
+void budget_begin(void (*working)(void *arg), void *arg);
+/* From now on there is so much time; 0: as much as it takes. */
+void budget_deadline(uint64_t ns);
+/* It is over for that reason, in words that stay. */
+void budget_exceed(enum avc_code code, const char *what);
+/* Memory that is to be kept: whether there is room, and if so takes it.  budget_has() only asks. */
+bool budget_has(uint64_t bytes);
+bool budget_take(uint64_t bytes);
+/* We get on.  False when the budget is exceeded. */
+bool budget_step(void);
+/* -1 with that code and the reason in words when it is. */
+int budget_check(pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- config.c -------------------------------------------------------------- */
 
@@ -195,6 +212,7 @@ bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
+int proc_oom_score_adj(pid_t pid);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */
 

@@ -292,6 +292,7 @@ int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *m
 	if (!maps)
 		return -1;
 	while (!result && getline(&line, &size, maps) > 0) {
+		heartbeat();
 		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
 			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
 				  MAPPING_KEYS;
@@ -526,6 +527,13 @@ bool pidfd_ended(int pidfd)
 int proc_borrow_fd(int pidfd, int fd)
 {
 	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
+}
+
+int proc_oom_score_adj(pid_t pid)
+{
+	char text[16];
+
+	return proc_read(pid, "oom_score_adj", text, sizeof text) > 0 ? atoi(text) : 0;
 }
 
 void proc_set_oom_score_adj(pid_t pid, const char *value)

@@ -124,6 +124,7 @@ struct pages {
 struct snapshot {
 	pid_t template;
 	int pagemap;
+	uint64_t read_bytes; /* of the mappings whose pages are known           */
 	struct mappings maps;
 	struct pages *pages; /* by mapping, of those that were asked for              */
 };

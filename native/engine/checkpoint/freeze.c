@@ -290,10 +290,11 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err) ||
 	    keep_all(generation, &freeze->seen, err))
 		return -1;
-	if (!has_all_holders(freeze->tree) && clone_missing(freeze, err))
-		return -1;
+	/* While main threads are in their parasites: see parasite_will(). */
 	capture_files(generation);
-	return see_alive(freeze->tree, err);
+	if (see_alive(freeze->tree, err))
+		return -1;
+	return has_all_holders(freeze->tree) ? 0 : clone_missing(freeze, err);
 }
 
 /* Also what was begun before something failed: *template is set as soon as the main process is
@@ -336,7 +337,6 @@ static void let_go(struct freeze *freeze)
 int freeze_tree(struct freeze *freeze, struct avc_error *err)
 {
 	struct generation *generation = freeze->generation;
-	const struct process *main = tree_main(freeze->tree);
 	uint64_t start;
 	int result;
 
@@ -360,8 +360,9 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 	for (uint32_t i = 0; i < generation->images; i++)
 		if (generation->image[i].process)
 			generation->image[i].process->checkpoints++;
-	if (pending_deadly(main->pending))
-		return fail(err, AVC_GONE, 0, main->pid, "freeze", "",
-			    "it is just being ended by signal %d", pending_deadly(main->pending));
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process &&
+		    pending_check(generation->image[i].process, err))
+			return -1;
 	return 0;
 }

@@ -39,6 +39,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 {
 	uint32_t next = 1;
 
+	dying_begin(process);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
 
@@ -62,7 +63,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old parasite");
 		t->block = t->tid == process->leader ? 0 : (int)next++;
-		if (thread_read(t, err))
+		if (thread_read(t, err) || dying_check(process, t, err))
 			return -1;
 		if (arch_frame_read_xstate(t->tid, parasite_frame(&process->parasite, slot,
 								  (uint32_t)t->block)))
@@ -72,6 +73,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 		    thread_ask(process, t, err))
 			return -1;
 	}
+	dying_end(process);
 	process->blocks = next;
 	return 0;
 }

@@ -110,7 +110,6 @@ static int quieten(struct image *image, struct avc_error *err)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	image->dumpable = dumpable->result;
-	proc_set_oom_score_adj(pid, "1000");
 	return attributes ? hear_template(process, cloned, call, attributes, err) : 0;
 }
 
@@ -299,7 +298,8 @@ int generation_finish(struct generation *generation, struct avc_error *err)
 	}
 	if (again.code)
 		*err = again;
-	if (again.code || restore_plan_check(generation, err))
+	if (again.code || memory_check_unkept(generation->image, generation->images, err) ||
+	    restore_plan_check(generation, err))
 		return -1;
 	memory_note_left(generation->image, generation->images, &generation->image[0].notice);
 	/* Not before its size was compared with the app's. */

@@ -143,7 +143,7 @@ static char *read_name(const struct look *look, int fd)
 	if (n < 0)
 		return NULL;
 	name[n] = 0;
-	return strdup(name);
+	return budget_take((uint64_t)n) ? strdup(name) : NULL;
 }
 
 /* stdio that init has, too: then others read and write with the same offset. */
@@ -319,6 +319,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	bool silent;
 	int fd;
 
+	if (!budget_step() || !budget_take(sizeof *f))
+		return budget_check(look->pid, err);
 	if (files->count == files->room) {
 		if (look->depth != FILES_FROZEN) {
 			struct file *more = realloc(files->file, 2 * files->room * sizeof *more);
@@ -580,7 +582,9 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->rights_lost = from->rights_lost;
 	if (!from->content_bytes)
 		return;
-	f->content = malloc(from->content_bytes);
+	f->content = budget_has(from->content_bytes) && budget_take(from->content_bytes)
+			     ? malloc(from->content_bytes)
+			     : NULL;
 	f->content_lost |= !f->content;
 	if (!f->content)
 		return;
@@ -607,7 +611,7 @@ static void keep_content(const struct look *look, struct file *f)
 		return;
 	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
 	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
-		file_keep_content(f->ours, f, look->files->scratch);
+		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
 }
 
 static void drop_ours(struct file *f)
@@ -622,7 +626,8 @@ static void keep_contents(const struct look *look)
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
 
-		keep_content(look, f);
+		if (budget_step())
+			keep_content(look, f);
 		drop_ours(f);
 	}
 }
@@ -824,10 +829,12 @@ void files_capture(struct image *image, const struct image *parent, bool several
 	files->parent = parent ? parent->files : NULL;
 	files->parent_pid = parent ? parent->process->pid : 0;
 	files->scratch = scratch;
+	files->process = process;
 	result = files_look(files, process->pid, process->pidfd, FILES_FROZEN,
 			    process->files_before, process->init, &image->files_error);
 	files->parent = NULL; /* may be gone before this one */
 	files->scratch = NULL;
+	files->process = NULL;
 	for (uint32_t i = 0; i < files->count; i++)
 		files->file[i].inherited = NULL;
 	if (result)

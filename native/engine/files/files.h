@@ -248,12 +248,14 @@ struct files {
 	const struct files *parent;
 	pid_t parent_pid;
 	struct scratch *scratch; /* also only then                                 */
+	struct process *process; /* likewise                                       */
 	struct file_rights rights;
 	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
 	const struct files_missing *missing;
 };
 
 struct files_work;
+struct tcp_info;
 
 enum files_depth {
 	FILES_BEFORE, /* everything about what stays the same; the app runs         */
@@ -297,7 +299,7 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socke
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(const struct files *files, const struct file *file);
-void file_keep_content(int fd, struct file *file, struct scratch *scratch);
+void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
@@ -338,6 +340,7 @@ void files_connect_again(struct files_work *work);
 /* files_stream.c */
 /* Whether bytes are just coming in; whether some that were to go out did not fit. */
 bool file_is_coming(int fd);
+bool file_was_coming(const struct tcp_info *info, int unread);
 bool file_is_going(int fd);
 /* Looks at epoll sets for who waits to write on. */
 void files_find_going(struct files *files);

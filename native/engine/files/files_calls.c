@@ -15,10 +15,18 @@
 
 const struct file_watch *files_find_watch(const struct file *epoll, int fd)
 {
-	for (uint32_t i = 0; epoll && i < epoll->watch_count; i++)
-		if (epoll->watch[i].fd == fd)
-			return &epoll->watch[i];
-	return NULL;
+	uint32_t low = 0, high = epoll ? epoll->watch_count : 0;
+
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+
+		if (epoll->watch[middle].fd < fd)
+			low = middle + 1;
+		else
+			high = middle;
+	}
+	return epoll && low < epoll->watch_count && epoll->watch[low].fd == fd ? &epoll->watch[low]
+									       : NULL;
 }
 
 /* Has to be registered again?  An edge that came since the checkpoint is gone, and a

@@ -260,6 +260,7 @@ static void join(const struct tables *tables)
 		for (uint32_t k = 0; k < work->want->count; k++) {
 			const struct file *w = &work->want->file[k];
 
+			(void)budget_step();
 			if (is_pair(w) && work->lost[k] &&
 			    work->local[files_leader(work->want, w)] < 0)
 				join_lost(tables, work, w);
@@ -309,6 +310,7 @@ static void put_contents(const struct tables *tables)
 			int fd = -1, other_fd = -1, bytes = 0;
 			bool found;
 
+			(void)budget_step();
 			if (!(is_pair(w) || (w->kind == FILE_PIPE && w->ended)) ||
 			    (w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY) ||
 			    !is_first(tables, i, w) || !find_end(tables, w, same_end, &fd))

@@ -11,6 +11,8 @@
 
 #include "files.h"
 
+#define TEXT_MAX (8u << 20) /* about 100,000 descriptors, or 60,000 files, that are watched  */
+
 /* All of a file of /proc, NUL at the end; NULL if it can not be had.  `first` is used
  * when it is large enough. */
 static char *read_all(int fd, char *first, size_t first_bytes)
@@ -26,6 +28,12 @@ static char *read_all(int fd, char *first, size_t first_bytes)
 		if (n == 0)
 			break;
 		used += (size_t)n;
+		if (used > TEXT_MAX) {
+			budget_exceed(
+				AVC_UNSUPPORTED,
+				"it watches more by one epoll or inotify descriptor than can be kept");
+			goto failed;
+		}
 		if (room - used < 512) {
 			char *more = realloc(text == first ? NULL : text, 4 * room);
 
@@ -55,7 +63,9 @@ static void add_lock(struct file *file, const char *line)
 	if (sscanf(line, "%*d: %15s %15s %15s %*d %*s %lld %23s", kind, mode, way, &start, end) !=
 	    5)
 		return;
-	more = realloc(file->lock, (file->lock_count + 1) * sizeof *more);
+	more = budget_take(sizeof *more)
+		       ? realloc(file->lock, (file->lock_count + 1) * sizeof *more)
+		       : NULL;
 	if (!more)
 		return;
 	file->lock = more;
@@ -84,7 +94,9 @@ static void add_watch(struct file *file, const char *line, uint32_t *room)
 	watch.data = data;
 	if (file->watch_count == *room) {
 		const uint32_t wanted = *room ? 2 * *room : 32;
-		struct file_watch *more = realloc(file->watch, wanted * sizeof *more);
+		struct file_watch *more = budget_take((wanted - *room) * sizeof *more)
+						  ? realloc(file->watch, wanted * sizeof *more)
+						  : NULL;
 
 		if (!more)
 			return;
@@ -119,7 +131,9 @@ static void add_mark(struct file *file, const char *line, uint32_t *room)
 			mark.handle_bytes = 0;
 	if (file->mark_count == *room) {
 		const uint32_t wanted = *room ? 2 * *room : 8;
-		struct file_mark *more = realloc(file->mark, wanted * sizeof *more);
+		struct file_mark *more = budget_take((wanted - *room) * sizeof *more)
+						 ? realloc(file->mark, wanted * sizeof *more)
+						 : NULL;
 
 		if (!more)
 			return;
@@ -184,6 +198,31 @@ static void take_line(struct file *file, const char *key, const char *value, uin
 		add_mark(file, value, room);
 }
 
+/* The kernel has an order of its own; there may be tens of thousands to be compared. */
+static int by_number(const void *a, const void *b)
+{
+	const struct file_watch *x = a, *y = b;
+
+	if (x->fd != y->fd)
+		return x->fd < y->fd ? -1 : 1;
+	return (x->data > y->data) - (x->data < y->data);
+}
+
+static int by_wd(const void *a, const void *b)
+{
+	const struct file_mark *x = a, *y = b;
+
+	return (x->wd > y->wd) - (x->wd < y->wd);
+}
+
+static void sort_watched(struct file *file)
+{
+	if (file->watch_count)
+		qsort(file->watch, file->watch_count, sizeof *file->watch, by_number);
+	if (file->mark_count)
+		qsort(file->mark, file->mark_count, sizeof *file->mark, by_wd);
+}
+
 uint64_t file_count(int fd)
 {
 	struct file file = { .fd = fd, .kind = FILE_EVENTFD };
@@ -235,6 +274,7 @@ bool file_read_info(pid_t pid, struct file *file)
 		for (size_t i = 0; i < sizeof telling / sizeof *telling; i++)
 			told |= file->kind == telling[i].kind && !strcmp(line, telling[i].key);
 	}
+	sort_watched(file);
 	if (file->kind == FILE_TIMERFD)
 		timer_deadline(file, left_ns);
 	if (text != first)

@@ -209,6 +209,7 @@ static void find_moved(struct files_work *work)
 		if (files_leader(work->want, w) != i || work->source[i] >= 0 ||
 		    (!(w->mode & S_IFMT) && !w->id))
 			continue;
+		(void)budget_step();
 		for (uint32_t k = 0; k < work->now->count && work->source[i] < 0; k++)
 			if (work->claimed_by[k] < 0 &&
 			    files_leader(work->now, &work->now->file[k]) == k &&
@@ -317,6 +318,7 @@ static void make_lost(struct files_work *work)
 
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
+		(void)budget_step();
 		work->local[group] = file_make(w, work->image->template, work->init,
 					       &work->want->rights, &why);
 		files_note(work, w, why);
@@ -655,6 +657,7 @@ static void put_states(struct files_work *work)
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
 		int fd;
 
+		(void)budget_step();
 		if (files_leader(work->want, w) != i)
 			continue;
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&

@@ -134,6 +134,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
+	budget_begin(NULL, NULL);
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
 	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,

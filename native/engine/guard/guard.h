@@ -41,9 +41,10 @@ struct avc_guard {
 	uint64_t
 		dying_until_ns; /* when it was found dying, some time more: see guard_reap_unknown() */
 	uint32_t misses;        /* in a row, of one that is unsupported     */
-	bool cramped;           /* there is no room for spares              */
-	uint64_t ahead_ns;      /* when to guard_work_ahead(); UINT64_MAX: never  */
-	uint32_t room;          /* generations that may be held now         */
+	uint64_t reported_ns; /* since when it has been traced by one of its own; 0: it is not */
+	bool cramped;         /* there is no room for spares              */
+	uint64_t ahead_ns;    /* when to guard_work_ahead(); UINT64_MAX: never  */
+	uint32_t room;        /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
 	/* Of the process that runs now. */
@@ -113,6 +114,14 @@ void guard_choose_generation(struct avc_guard *guard, bool used_up);
 void guard_note_written(struct avc_guard *guard);
 int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		       int pidfd, struct avc_error *err) warn_unused;
+
+/* ---- guard_memory.c ------------------------------------------------------- */
+
+/* Tells the OOM killer whom of ours to take, and when.  After each change of what is held. */
+void guard_rank_generations(struct avc_guard *guard);
+/* Whether the app fills its container's memory by itself: to go back to now would be to be
+ * killed again at once. */
+bool guard_app_is_full(const struct avc_guard *guard);
 
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 

@@ -9,13 +9,15 @@
 #include "guard.h"
 
 #define SPARE_NS (NS_PER_S / 2)
-#define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
+#define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
+#define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
 #define MISSES_UNTIL_UNPROTECTED 3
+#define REPORT_NS (60 * NS_PER_S) /* that a crash reporter may take                       */
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
@@ -287,6 +289,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	for (uint32_t i = 0; i < guard->tree.count; i++)
 		if (guard->tree.entry[i].process)
 			waits_prepare(guard->tree.entry[i].process);
+	budget_deadline(READ_NS);
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);
 	return 0;
@@ -328,6 +331,9 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 		return -1;
 	}
 	result = freeze_tree(freeze, err);
+	budget_deadline(0);
+	if (!result)
+		result = budget_check(guard->main.pid, err);
 	event->freeze_ns = freeze->freeze_ns;
 	event->stop_ns = freeze->stop_ns;
 	event->clone_ns = freeze->clone_ns;
@@ -388,6 +394,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
+		budget_begin(NULL, NULL);
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
 		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))
@@ -396,6 +403,27 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 			err->code = AVC_DEADLINE;
 		return -1;
 	}
+}
+
+/* Being traced by a process of the app's own, as one is that crashes while the reporter that it
+ * has started for that (breakpad, gdb) looks into it.  One that lives like that is not
+ * protected, though. */
+static bool is_being_reported(struct avc_guard *guard, const struct avc_error *err)
+{
+	struct proc_status status = { 0 };
+	struct proc_stat stat;
+	pid_t pid;
+
+	if (err->code != AVC_BUSY || !guard->count || proc_status(err->pid, &status))
+		return false;
+	for (pid = status.tracer; pid > 1 && pid != guard->channel.init; pid = stat.parent)
+		if (proc_stat(pid, &stat))
+			return true; /* it has just ended */
+	if (pid != guard->channel.init)
+		return false;
+	if (!guard->reported_ns)
+		guard->reported_ns = now_ns();
+	return now_ns() - guard->reported_ns < REPORT_NS;
 }
 
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
@@ -417,8 +445,15 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 				     "memory is short, so no generation is held");
 		return;
 	}
+	if (guard_app_is_full(guard)) {
+		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
+		     "it fills the memory of its container: what it had before is kept");
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
 	if (take(guard, &event, &error) == 0) {
 		guard->misses = 0;
+		guard->reported_ns = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
@@ -438,6 +473,10 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	 * stay good for a while. */
 	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
 		   error.code == AVC_BUSY;
+	if (is_being_reported(guard, &error)) {
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
 	if (hopeless && error.pid != guard->main.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);

@@ -152,6 +152,12 @@ static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 	guard_emit(guard, event);
 }
 
+/* Of whatever takes its time. */
+static void say_working(void *channel)
+{
+	init_channel_working(channel);
+}
+
 /* The newest generation; when restores are used up, the one before it.  There were `had`
  * when the app died. */
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
@@ -176,6 +182,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					   .ready = say_restored,
 					   .arg = guard };
 		struct avc_error failed = { 0 };
+
+		budget_begin(say_working, &guard->channel);
 
 		/* What was written since the newest was written since all others, also
 		 * where that can not be seen any more. */

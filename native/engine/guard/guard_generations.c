@@ -26,6 +26,7 @@ void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 	guard->count--;
 	memmove(&guard->generations[i], &guard->generations[i + 1],
 		(guard->count - i) * sizeof *guard->generations);
+	guard_rank_generations(guard);
 }
 
 void guard_drop_all(struct avc_guard *guard)
@@ -388,6 +389,7 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 	while (guard->count >= guard->room)
 		guard_drop_generation(guard, guard_dispensable(guard, probation));
 	guard->generations[guard->count++] = *fresh;
+	guard_rank_generations(guard);
 	/* Only a health check can say that a process does not hang. */
 	if (!guard->vouching)
 		guard->proved = true;

@@ -7,6 +7,7 @@
  *   infect.c        parasite and holder brought into it
  *   support.c       what can not be protected; quiescence
  *   waits.c         calls that are to be ended
+ *   dying.c         in its own handler of a fatal signal
  *   tree.c          all of them
  */
 #ifndef AVCKPT_PROCESS_H
@@ -40,6 +41,8 @@ struct tree {
 	bool (*is_ours)(pid_t pid, const void *arg);
 	const void *arg;
 };
+
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h, since Linux 6.9 */
 
 static inline struct process *tree_main(const struct tree *tree)
 {
@@ -81,6 +84,16 @@ int process_take_stock(struct process *process, struct avc_error *err) warn_unus
 /* Gets known every thread that is not yet, one at a time, before a freeze. */
 int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
 		     struct avc_error *err) warn_unused;
+
+/* ---- dying.c ------------------------------------------------------------------- */
+
+/* Before a freeze: of which fatal signals it has handlers. */
+void dying_note_caught(struct process *process);
+/* In a freeze: before its threads are checked, and when none was in a handler. */
+void dying_begin(struct process *process);
+void dying_end(struct process *process);
+/* Of a stopped thread that was read: AVC_RETRY, it is in the handler of a fatal signal. */
+int dying_check(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 
 /* ---- stop.c --------------------------------------------------------------------- */
 

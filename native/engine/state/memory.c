@@ -46,6 +46,7 @@ void memory_forget(struct memory *memory)
 {
 	areas_free(&memory->areas);
 	areas_free(&memory->foreign);
+	areas_free(&memory->unkept);
 	*memory = (struct memory){ 0 };
 }
 
@@ -220,7 +221,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 		/* Before it is read: what is written meanwhile was written since. */
 		if (a->as_file)
 			a->writes = others_writes(process->others, a);
-		image->whole &= copy_area(process->pid, a, to);
+		image->whole &= budget_step() && copy_area(process->pid, a, to);
 		to += area_room(a);
 	}
 }
@@ -536,6 +537,7 @@ int memory_put_back(const struct image *image, pid_t pid, struct avc_error *note
 	for (uint32_t i = 0; !result && i < memory->areas.count; i++) {
 		struct area *a = &memory->areas.area[i];
 
+		(void)budget_step();
 		if (area_room(a) && a->kept)
 			result = put_back(&putting, a, from, err);
 		from += area_room(a);

@@ -64,6 +64,7 @@ struct memory {
 	} hole[HOLES_MAX];
 	struct areas areas;
 	struct areas foreign; /* of others, too; by what they are, not where        */
+	struct areas unkept;  /* beyond the limit, or not writable here; likewise    */
 	uint64_t layout;      /* a hash of the mappings when the areas were read */
 	uint64_t read_ns, cost_ns;
 	uint64_t left_bytes;   /* shared memory beyond the limit                  */

@@ -83,8 +83,9 @@ static int copy_stretch(avc_remote start, avc_remote end, void *arg)
 								    : ENTRIES;
 		const size_t bytes = pages * sizeof *entry;
 
-		if (pread(copying->pagemap, entry, bytes, (off_t)(start / PAGE * sizeof *entry)) !=
-		    (ssize_t)bytes)
+		if (!budget_step() ||
+		    pread(copying->pagemap, entry, bytes, (off_t)(start / PAGE * sizeof *entry)) !=
+			    (ssize_t)bytes)
 			return -1;
 		for (size_t i = 0; i < pages; i++, start += PAGE)
 			if (page_is_guard(entry[i])

@@ -39,6 +39,9 @@ struct image {
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the process when it was taken                */
 	long anon_pages;       /* resident ones that are of no file                */
+	/* The OOM killer's: the app's own, and what it was told of the template (guard_memory.c) */
+	int oom_own, oom_told;
+	bool oom_known;
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
 	int stop_signal;       /* stopped by that (job control), 0: it was not     */
@@ -59,14 +62,21 @@ struct image {
 /* Among all images of a checkpoint; NULL: it has none. */
 struct image *image_find(struct image *image, uint32_t images, const struct process *process);
 
+/* What a crash is known by. */
+#define SIGNAL_BIT(signal) (UINT64_C(1) << ((signal)-1))
+#define FATAL_SIGNALS                                                                         \
+	(SIGNAL_BIT(SIGSEGV) | SIGNAL_BIT(SIGBUS) | SIGNAL_BIT(SIGFPE) | SIGNAL_BIT(SIGILL) | \
+	 SIGNAL_BIT(SIGABRT) | SIGNAL_BIT(SIGTRAP) | SIGNAL_BIT(SIGSYS))
+
 /* ---- pending.c ------------------------------------------------------------------ */
 
 struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
  * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
 int pending_read(struct process *process, struct avc_error *err) warn_unused;
-/* One that the app dies of as soon as it runs again; 0: none. */
-int pending_deadly(const struct pending *pending);
+/* -1 if there is one that the process dies of as soon as it runs again, or reports its own
+ * crash. */
+int pending_check(const struct process *process, struct avc_error *err) warn_unused;
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
@@ -180,6 +190,10 @@ int memory_learn(struct process *process, long missing_pages, struct avc_error *
 extern const char memory_private_huge_pages[];
 int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		  struct avc_error *err) warn_unused;
+/* When all of them are there: -1 if several processes have shared memory that is not rolled back
+ * with them.  One that went back would wait for what another one had done. */
+int memory_check_unkept(const struct image *image, uint32_t images,
+			struct avc_error *err) warn_unused;
 /* When all of a checkpoint are finished: what is more than may be kept. */
 void memory_note_left(const struct image *image, uint32_t images, struct avc_error *notice);
 /* At a restore, before anything runs; *notes: what can not be written. */
