@@ -151,9 +151,13 @@ class GuardProcess:
 
     def command(self, name: str, cookie: int = 1, timeout_s: float = PATIENCE_S) -> Json:
         """`checkpoint` or `restore`, once init was found; returns the answer."""
-        self.wait("attached", cookie=cookie)
-        ticket = self._say(f"{name} {cookie} %d")
+        ticket = self.say_command(name, cookie)
         return self.wait_for(lambda event: event.get("ticket") == ticket, f"answer to {name}", timeout_s=timeout_s)
+
+    def say_command(self, name: str, cookie: int = 1) -> int:
+        """The same without waiting for the answer, which has this ticket."""
+        self.wait("attached", cookie=cookie)
+        return self._say(f"{name} {cookie} %d")
 
     def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
         """`n` checkpoints back to back."""

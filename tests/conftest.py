@@ -44,10 +44,19 @@ def reset_if_ignored(number: int) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whatever takes the fixture `podman` is marked so."""
+    """Whatever takes the fixture `podman` is marked so; who excuses a failure says why.  Raises UsageError."""
     for item in items:
+        excuse = item.get_closest_marker("shared_machine")
+        if excuse is not None and not (len(excuse.args) == 1 and str(excuse.args[0]).strip()):
+            raise pytest.UsageError(f'{item.nodeid}: write @pytest.mark.shared_machine("why it may fail there")')
         if "podman" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.podman)
+
+
+def pytest_report_collectionfinish(items: list[pytest.Item]) -> str:
+    """How many tests may be retried: a number that should not grow."""
+    marked = sum(item.get_closest_marker("shared_machine") is not None for item in items)
+    return f"marked shared_machine (may be retried): {marked}"
 
 
 @pytest.hookimpl(wrapper=True)

@@ -26,9 +26,6 @@
 #define STOP_MS 15000     /* a guard may be in the middle of a restore                    */
 #define END_MS 1000       /* from the end of its socket to the end of the process         */
 #define STARVED_FACTOR 10 /* so much more patience with who only waits for a CPU          */
-#ifndef AVC_VERSION
-#define AVC_VERSION "0.1.0"
-#endif
 
 extern char **environ;
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,8 @@ from testkit.harness import wait_until
 from testkit.procfs import threads
 
 KILLS = 500
+PTRACE_CALLS = 40
+"""Of a checkpoint of one thread, and some."""
 NEVER_RESTARTED = {"epoll_wait", "epoll_pwait", "epoll_pwait2", "semop", "semtimedop", "sigtimedwait"}
 KINDS = 43
 UNWOKEN = [9, 10, 11, 19, 22, 38]
@@ -85,3 +89,17 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
             guard.wait("checkpoint", count=6)
             wait_until(lambda: parasites(victim.app) <= 2, 5, "old parasites go")
         victim.wait_beats(20)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("strace"), reason="strace is what kills the guard; it is not installed")
+def test_handlers_run_on_their_own_stack(tmp_path: Path) -> None:
+    """The guard dies before its 1st, 2nd, ... ptrace call: a borrowed thread goes home, and signals find it whole."""
+    with Victim("steady", tmp_path) as victim:
+        for nth in range(1, PTRACE_CALLS + 1):
+            with GuardProcess(config(0.02), [victim.pid]) as guard:
+                guard.wait("checkpoint")
+                kill = f"inject=ptrace:signal=KILL:when={nth}"
+                trace = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=ptrace", "-e", kill]
+                subprocess.run([*trace, "-p", str(guard.guards[0])], timeout=15, check=False, stderr=subprocess.DEVNULL)
+                victim.wait_beats(10)

@@ -7,6 +7,7 @@
  *   shared   MANY areas of shared memory of its own, of a page each
  *   wiped    MANY MB of memory that is wiped in forks (MADV_WIPEONFORK), never touched
  *   named    MANY descriptors of a file, made below the working folder, whose path has 3,000 characters
+ *   common   MANY MB of shared memory that all of them have
  */
 #include <sys/resource.h>
 #include <sys/stat.h>
@@ -45,7 +46,7 @@ static void have(const char *kind, size_t many)
 		     "MADV_WIPEONFORK");
 	else if (!strcmp(kind, "named"))
 		open_named(many);
-	else
+	else if (!strcmp(kind, "shared"))
 		for (size_t i = 0; i < many; i++) {
 			*(int *)map(4096, PROT_READ | PROT_WRITE, MAP_SHARED) = 1;
 			/* Between them, or the kernel makes one of them. */
@@ -62,6 +63,8 @@ int main(int argc, char **argv)
 	must(argc < 5 || !chdir(argv[4]), "chdir");
 	processes = atoi(argv[2]);
 	there = map(4096, PROT_READ | PROT_WRITE, MAP_SHARED);
+	if (!strcmp(argv[1], "common"))
+		map((size_t)atol(argv[3]) << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
 	for (int i = 0; i < processes; i++) {
 		const pid_t child = fork();
 

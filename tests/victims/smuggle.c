@@ -110,7 +110,7 @@ static void map_code(const struct place *place)
 
 	must(code != MAP_FAILED, "mmap");
 	memset(code, 0x90, INJ_CODE_BYTES); /* nop */
-	*at++ = 0xb8; /* mov $SYS_mkdir, %eax */
+	*at++ = 0xb8;                       /* mov $SYS_mkdir, %eax */
 	memcpy(at, &(uint32_t){ SYS_mkdir }, 4);
 	at += 4;
 	memcpy(at, (uint8_t[]){ 0x48, 0xbf }, 2); /* mov $folder, %rdi */
@@ -132,8 +132,8 @@ static void write_setup(const struct place *place)
 	const uint64_t slot_bytes = (place->bytes - INJ_SLOTS_OFFSET) / SLOTS;
 
 	for (unsigned int i = 0; i < SLOTS; i++) {
-		struct inj_slot *slot = (struct inj_slot *)(place->start + INJ_SLOTS_OFFSET +
-							    i * slot_bytes);
+		struct inj_slot *slot =
+			(struct inj_slot *)(place->start + INJ_SLOTS_OFFSET + i * slot_bytes);
 
 		if (slot->setup[INJ_AFTER] && slot->setup[INJ_AFTER] != (uint64_t)&fake)
 			slot->setup[INJ_AFTER] = (uint64_t)&fake;
@@ -153,10 +153,10 @@ static void *attack(void *unused)
 		usleep(1000);
 	place = await_parasite();
 	control = (struct inj_control *)(place.start + INJ_CODE_BYTES);
-	fake = (struct inj_setup){ .flags = INJ_MAY_FAIL,
-				   .call = { .nr = SYS_mkdir,
-					     .arg = { (uint64_t)folder, 0700 },
-					     .result = UNTOUCHED } };
+	fake = (struct inj_setup){
+		.flags = INJ_MAY_FAIL,
+		.call = { .nr = SYS_mkdir, .arg = { (uint64_t)folder, 0700 }, .result = UNTOUCHED }
+	};
 	count(0, 1);
 	if (!strcmp(where, "code"))
 		map_code(&place);

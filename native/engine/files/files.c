@@ -611,7 +611,7 @@ static void keep_content(const struct look *look, struct file *f)
 		return;
 	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
 	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
-		file_keep_content(f->ours, f, look->files->scratch);
+		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
 }
 
 static void drop_ours(struct file *f)
@@ -816,44 +816,45 @@ int files_prepare(struct process *process, struct avc_error *err)
 	return 0;
 }
 
-int files_capture(struct process *process, struct generation *generation, bool several,
-		  const struct files *parent, pid_t parent_pid, struct scratch *scratch,
-		  struct avc_error *err)
+void files_capture(struct image *image, const struct image *parent, bool several,
+		   struct scratch *scratch)
 {
-	struct files *image = process->files_image;
+	struct process *process = image->process;
+	struct files *files = process->files_image;
 	int result;
 
 	process->files_image = NULL;
-	image->several = several;
-	generation->files = image;
-	image->parent = parent;
-	image->parent_pid = parent_pid;
-	image->scratch = scratch;
-	result = files_look(image, process->pid, process->pidfd, FILES_FROZEN,
-			    process->files_before, process->init, err);
-	image->parent = NULL; /* may be gone before this one */
-	image->scratch = NULL;
-	for (uint32_t i = 0; i < image->count; i++)
-		image->file[i].inherited = NULL;
+	image->files = files;
+	files->several = several;
+	files->parent = parent ? parent->files : NULL;
+	files->parent_pid = parent ? parent->process->pid : 0;
+	files->scratch = scratch;
+	files->process = process;
+	result = files_look(files, process->pid, process->pidfd, FILES_FROZEN,
+			    process->files_before, process->init, &image->files_error);
+	files->parent = NULL; /* may be gone before this one */
+	files->scratch = NULL;
+	files->process = NULL;
+	for (uint32_t i = 0; i < files->count; i++)
+		files->file[i].inherited = NULL;
 	if (result)
-		return -1;
-	find_owners(process, image);
-	find_own_pidfds(process, image);
-	return 0;
+		return;
+	find_owners(process, files);
+	find_own_pidfds(process, files);
 }
 
 /* Nothing tells cheaply of flock(2): one that is there now, after the freeze, and was not
  * there before it may be of either side, and is left alone at a restore. */
-void files_settle(struct process *process, struct generation *generation)
+void files_settle(struct image *image)
 {
-	file_rights_read(&generation->files->rights, process->pid);
-	for (uint32_t i = 0; i < generation->files->count; i++) {
-		struct file *f = &generation->files->file[i];
+	file_rights_read(&image->files->rights, image->process->pid);
+	for (uint32_t i = 0; i < image->files->count; i++) {
+		struct file *f = &image->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };
 
 		if (f->kind != FILE_REGULAR || f->flags & O_PATH)
 			continue;
-		file_read_info(process->pid, &now);
+		file_read_info(image->process->pid, &now);
 		for (uint32_t k = 0; k < now.lock_count; k++)
 			f->lock_unsure |= now.lock[k].kind == LOCK_FLOCK_;
 		for (uint32_t k = 0; k < f->lock_count; k++)

@@ -145,7 +145,7 @@ static void list_limit(const struct files_work *work, struct setup *setup)
 {
 	uint64_t limit[LIMITS][2];
 
-	if (proc_limits(work->generation->template, limit) == 0)
+	if (proc_limits(work->image->template, limit) == 0)
 		setup_add(setup, INJ_OWNERS, "", INJ_LIMIT, RLIMIT_NOFILE,
 			  setup_data(setup, limit[RLIMIT_NOFILE], sizeof limit[RLIMIT_NOFILE]), 0,
 			  0, 0)
@@ -185,13 +185,13 @@ static void list_area(struct setup *setup, const struct file_area *area)
 
 void files_list_calls(struct files_work *work)
 {
-	struct inj_slot *slot = parasite_slot(&work->process->parasite, work->generation->slot);
+	struct inj_slot *slot = parasite_slot(&work->process->parasite, work->image->slot);
 	struct setup list, *setup = &list;
 
 	*setup = (struct setup){
 		.parasite = &work->process->parasite,
 		.slot = slot,
-		.memory = parasite_files(&work->process->parasite, work->generation->slot),
+		.memory = parasite_files(&work->process->parasite, work->image->slot),
 		.tail[INJ_DESCRIPTORS] = &slot->setup[INJ_DESCRIPTORS],
 		.tail[INJ_OWNERS] = &slot->setup[INJ_OWNERS],
 	};

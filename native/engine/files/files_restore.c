@@ -319,7 +319,7 @@ static void make_lost(struct files_work *work)
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
 		(void)budget_step();
-		work->local[group] = file_make(w, work->generation->template, work->init,
+		work->local[group] = file_make(w, work->image->template, work->init,
 					       &work->want->rights, &why);
 		files_note(work, w, why);
 		if (work->local[group] < 0)
@@ -342,8 +342,7 @@ static bool is_urgent(const struct files_work *work)
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
 static struct fd_letter *mail_of(const struct files_work *work)
 {
-	return (struct fd_letter *)(parasite_files(&work->process->parasite,
-						   work->generation->slot) +
+	return (struct fd_letter *)(parasite_files(&work->process->parasite, work->image->slot) +
 				    INJ_FILES_BYTES / 2);
 }
 
@@ -359,8 +358,7 @@ static struct inj_call *call_of(const struct files_work *work)
 {
 	return work->process->descendant
 		       ? &work->process->parasite.control->holder
-		       : &parasite_slot(&work->process->parasite, work->generation->slot)
-				  ->template_call;
+		       : &parasite_slot(&work->process->parasite, work->image->slot)->template_call;
 }
 
 /* What was listed becomes the task's next call. */
@@ -398,7 +396,7 @@ static int flush(struct files_work *work, struct avc_error *err)
 	if (call->count)
 		result = parasite_send(&process->parasite, work->table,
 				       process->descendant ? &process->holder_base
-							   : &work->generation->base,
+							   : &work->image->base,
 				       call, err) ||
 			 parasite_run(work->table, call, err);
 	if (!result)
@@ -611,9 +609,9 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	}
 	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
 	theirs = lowest_free(&numbers, work->want);
-	ours = proc_borrow_fd(work->generation->pidfd, ends[1]);
+	ours = proc_borrow_fd(work->image->pidfd, ends[1]);
 	if (ours < 0) {
-		fail_errno(err, work->generation->template, "restore descriptors", "pidfd_getfd",
+		fail_errno(err, work->image->template, "restore descriptors", "pidfd_getfd",
 			   "descriptors could not be handed over");
 		goto out;
 	}

@@ -373,7 +373,7 @@ static const char *connect_unix(const struct files_work *work, int fd, const str
 				 .address = &s->remote,
 				 .bytes = s->remote_bytes };
 
-	return call_there(&errand, work->generation->template, work->init)
+	return call_there(&errand, work->image->template, work->init)
 		       ? "it was closed since the checkpoint and can not be connected again"
 		       : NULL;
 }

@@ -31,7 +31,7 @@ struct avc_guard {
 	struct init_channel channel;
 	bool attached, unprotected;
 	struct process main; /* the app's main process                         */
-	struct tree tree;    /* and the others                                 */
+	struct tree tree;    /* it and the others                              */
 	struct pollfd *fds;  /* room for wait_for_news()                       */
 	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
@@ -41,9 +41,10 @@ struct avc_guard {
 	uint64_t
 		dying_until_ns; /* when it was found dying, some time more: see guard_reap_unknown() */
 	uint32_t misses;        /* in a row, of one that is unsupported     */
-	bool cramped;           /* there is no room for spares              */
-	uint64_t ahead_ns;      /* when to guard_work_ahead(); UINT64_MAX: never  */
-	uint32_t room;          /* generations that may be held now         */
+	uint64_t reported_ns; /* since when it has been traced by one of its own; 0: it is not */
+	bool cramped;         /* there is no room for spares              */
+	uint64_t ahead_ns;    /* when to guard_work_ahead(); UINT64_MAX: never  */
+	uint32_t room;        /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
 	/* Of the process that runs now. */

@@ -18,9 +18,8 @@
 
 #include "process.h"
 
-#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h */
-#define PIDFS_MAGIC 0xff     /* the same, PIDFS_IOCTL_MAGIC */
-#define ASK_AGAIN_AFTER 8    /* checkpoints */
+#define PIDFS_MAGIC 0xff  /* the same, PIDFS_IOCTL_MAGIC */
+#define ASK_AGAIN_AFTER 8 /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
 
 void process_init(struct process *process)

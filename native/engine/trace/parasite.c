@@ -175,6 +175,7 @@ void call_begin(struct inj_call *call, enum inj_after after)
 	call->done = 0;
 	call->pause = INJ_PAUSE_NONE;
 	call->count = 0;
+	call->wills = 0;
 	call->after = after;
 	call->park_ms = INJ_PARK_MS;
 }
@@ -191,6 +192,35 @@ struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_
 	call->count = i + 1;
 	*s = (struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, 0 }, .result = -ENOSYS };
 	return s;
+}
+
+int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
+		  uint64_t data, uint64_t e)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const struct thread *thread = thread_find(process, process->pid);
+	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
+
+	/* Supervised, its filters would judge what it does without us. */
+	if (!thread || !thread->borrowed || i >= INJ_WILLS_MAX ||
+	    process->parasite.seccomp == SECCOMP_SUPERVISED)
+		return -1;
+	call->will_data[i] = data;
+	call->will[i] = (struct inj_syscall){
+		.nr = nr,
+		.arg = { a, b, c, parasite_remote(&process->parasite, &call->will_data[i]), e }
+	};
+	__atomic_store_n(&call->wills, i + 1, __ATOMIC_RELEASE);
+	return 0;
+}
+
+void parasite_will_done(struct process *process)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
+
+	if (i && i <= INJ_WILLS_MAX)
+		__atomic_store_n(&call->wills, i - 1, __ATOMIC_RELEASE);
 }
 
 /* A thread of the app has others waiting for it, and goes home after INJ_PARK_MS.
@@ -234,6 +264,7 @@ static long options_of(const struct parasite *parasite, bool ours);
 static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
 		   const struct arch_regs *base, struct inj_call *call, struct avc_error *err)
 {
+	const avc_remote stack = parasite_remote(parasite, call->stack + sizeof call->stack);
 	struct arch_regs regs;
 
 	if (parasite->seccomp != SECCOMP_SUPERVISED)
@@ -241,9 +272,12 @@ static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
 	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours)))
 		return fail(err, AVC_UNSUPPORTED, 0, tid, "run injected code", "",
 			    "it has too many processes under seccomp filters of its own");
-	arch_call(&regs, base, parasite->base + INJ_RUN_OFFSET,
-		  parasite_remote(parasite, call->stack + sizeof call->stack),
-		  parasite_remote(parasite, call));
+	if (ours)
+		arch_call(&regs, base, parasite->base + INJ_RUN_OFFSET, stack,
+			  parasite_remote(parasite, call));
+	else
+		arch_enter(&regs, base, parasite->base + INJ_ENTER_OFFSET,
+			   parasite_remote(parasite, call), stack);
 	if (arch_regs_set(tid, &regs))
 		return fail_errno(err, tid, "run injected code", "ptrace(SETREGS)", "it has gone");
 	return 0;
@@ -452,8 +486,8 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	home = thread->regs;
 	arch_resume(&home);
 	arch_home_set(&control->home, &home, thread->sigmask);
-	/* Registers first: if we die between the two, the thread is in the parasite
-	 * with its own mask and goes home with it.  The other way round it would
+	/* Registers first: if we die between the two, the thread enters the parasite with its
+	 * own mask, and blocks signals by itself (inj_enter()).  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
 	if (look_at_seccomp(process, thread, err) ||
 	    send_in(&process->parasite, thread->tid, false, &thread->regs, &control->runner, err))
@@ -464,6 +498,11 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
 				  "it has gone");
 	return 0;
+}
+
+static avc_remote homeward(const struct thread *thread)
+{
+	return thread->borrowed_for ? thread->borrowed_for->base + INJ_GO_HOME_OFFSET : 0;
 }
 
 int thread_give_back(struct thread *thread, struct avc_error *err)
@@ -479,8 +518,12 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}
-	/* The mask first, for the same reason. */
-	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
+	/* The mask before the registers, for the same reason.  But not while it has the stack of
+	 * the parasite, on which a handler would run if we died: it is sent home first, where it
+	 * would get with any mask. */
+	arch_enter(&now, &thread->regs, homeward(thread), 0, 0);
+	if ((thread->borrowed_for && arch_regs_set(thread->tid, &now)) ||
+	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
 	/* Strict mode is in force again when it is let go: nothing else comes in between. */

@@ -48,6 +48,8 @@ static const struct kind wanted[] = {
 	{ SYS_wait4, ANY },
 	{ SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD },
 	{ SYS_clone, CLONE_VM | CLONE_FILES },
+	{ SYS_clone,
+	  CLONE_VM | CLONE_FILES | CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD },
@@ -103,6 +105,7 @@ static const struct kind wanted[] = {
 	{ SYS_pidfd_open, ANY },
 	{ SYS_socketpair, ANY },
 	{ SYS_recvmsg, ANY },
+	{ SYS_setsockopt, ANY },
 };
 
 /* And a process that is being put together: one with filters of its own is supervised then in any

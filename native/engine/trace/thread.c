@@ -43,7 +43,7 @@ void threads_forget_unseen(struct process *process)
 	process->thread_count = kept;
 }
 
-/* EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
+/* 0: it is seized after all.  EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
  * has no memory any more, or is a zombie. */
 static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 {
@@ -58,6 +58,9 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
 				    "it is being traced by process %d", status.tracer);
 	}
+	/* Its tracer may have gone just now. */
+	if (errnum == EPERM && ptrace(PTRACE_SEIZE, tid, NULL, (long)TRACE_OPTIONS_APP) == 0)
+		return 0;
 	errno = errnum;
 	return fail_errno(err, tid, "stop", "ptrace(SEIZE)",
 			  "not allowed to trace it (CAP_SYS_PTRACE and CAP_SYS_ADMIN are needed)");
@@ -80,7 +83,8 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 			return 0;
 		}
 		errno = errnum;
-		return seize_failed(process->pid, thread->tid, err);
+		if (seize_failed(process->pid, thread->tid, err))
+			return -1;
 	}
 	thread->attached = true;
 	thread->stopped = false;

@@ -127,6 +127,10 @@ struct thread {
 	struct rewound rewound;
 	struct sleeper sleeper;
 	uint64_t stopped_ns;
+	struct {
+		avc_remote pc, sp;
+		uint64_t sigmask;
+	} looked_at;    /* when it was in no handler (dying.c)                     */
 	bool signalled; /* was just about to run a handler                  */
 };
 
@@ -149,6 +153,13 @@ struct parasite {
 #define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
 #define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
 #define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
+
+/* How far a freeze has come with a process. */
+enum freeze_stage {
+	FREEZE_RUNS,    /* or not all of its threads are known to be stopped        */
+	FREEZE_STOPPED, /* all of it                                            */
+	FREEZE_BEGUN    /* and it is being read, cloned and asked                     */
+};
 
 /* A live process of the app. */
 struct process {
@@ -202,15 +213,17 @@ struct process {
 	uint64_t start;               /* when it began; tells it from one with its number */
 	uint32_t images;              /* generations that have one of it                  */
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	enum freeze_stage stage;      /* in this freeze                                    */
 	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
 	long clone_pages;             /* its size when that began                         */
 	long anon_pages;              /* of its last template; 0: none yet                */
-	bool closing;                 /* by its holder: generation_close_tables()      */
+	uint64_t caught;              /* fatal signals that it has had handlers for        */
+	uint64_t uncaught;            /* and has not any more                              */
+	uint64_t dying_ns;            /* since when it has been in one                     */
+	bool alive;                   /* that was too long ago: it lives there             */
 	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
-	bool frozen;                  /* stopped in this freeze                            */
-	bool begun;                   /* and read, and asked                               */
 	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
 	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
@@ -276,6 +289,9 @@ bool tracee_expects_strangers(void);
 /* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
  * that a thread has brought forth when it was killed is a tracee nobody heard of. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
+/* To a tracee (a process).  Its number is nobody else's as long as we have not waited for its
+ * end, and it is ours no more after that. */
+void tracee_signal(pid_t pid, int signal);
 /* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
 void tracee_kill(pid_t pid);
 /* The same some milliseconds later, and without waiting for its end: the kernel takes some 10 ms
@@ -399,6 +415,13 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 /* The same; `meanwhile` is called once while the kernel clones. */
 int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* While the main thread is in its parasite: a call that it makes before it goes home if we are not
+ * there any more, with the address of `data` as its fourth argument.  For what we are about to
+ * change in what is the app's; that must not be changed if this fails.  The last one has been
+ * undone: parasite_will_done(). */
+int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
+		  uint64_t data, uint64_t e) warn_unused;
+void parasite_will_done(struct process *process);
 /* exec puts another program in its place, at any moment, and the parasite is gone: whether it
  * is there, in a stopped thread.  If not, the process is not infected any more. */
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
