@@ -18,9 +18,7 @@ from testkit.harness import CommandFailed, ContainerFactory, Podman, Sidecar
 
 CONTAINERS = pytest.StashKey[ContainerFactory]()
 REAL = {
-    folder: pytest.mark.shared_machine(
-        "real processes: init waits 2 s for its guard, and nobody may get a CPU for as long"
-    )
+    folder: pytest.mark.shared_machine("real processes: nobody may get a CPU for as long as init waits for its guard")
     for folder in ("native", "platform", "integration")
 }
 """Folders of tests whose every test is excused; to be narrowed to the tests that need it."""

@@ -706,7 +706,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
-		process->lost = process->lost || (result && err->code != AVC_KERNEL);
+		process->lost = process->lost || (result && err->code != AVC_LIMIT);
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
@@ -779,7 +779,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
-		process->lost = process->lost || err->code != AVC_KERNEL;
+		process->lost = process->lost || err->code != AVC_LIMIT;
 		thread_runs_on(thread, err);
 		return -1;
 	}
