@@ -219,15 +219,16 @@ class Daemon:
                 changed = tuple(change for change in changed if change.setting in ("group", "notify"))
             if not changed:
                 return None
+            config = dataclasses.replace(after.config, memory_limit_bytes=container.config.memory_limit_bytes)
             if watch.guard is not None:
-                watch.guard.configure(after.config)
+                watch.guard.configure(config)
         except TargetGone:
             return None  # it is ending at this moment
         except AvckptError as error:
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail="goes on with its old settings", error=error))
             return Reloaded(container.label, (), str(error))
         watch.settings = after
-        container.config = after.config
+        container.config = config
         container.group = after.policy.group
         self.caretaker.change(watch, after.policy)
         outcome = Reloaded(container.label, changed)

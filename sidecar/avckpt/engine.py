@@ -187,6 +187,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.quiesce_ns = _ns("quiesce", config.quiesce_s)
     c.restore_window_ns = _ns("restore window", config.restore_window_s)
     c.shm_bytes = config.shm_bytes
+    c.memory_limit_bytes = config.memory_limit_bytes
     c.restore_max = config.restore_max
     c.restore_on_signal = config.restore_on_signal
     c.restore_on_exit = config.restore_on_exit

@@ -61,6 +61,8 @@ class GuardConfig:
     """How long to look for a quiescent moment."""
     shm_bytes: int = 4_000_000
     """Shared memory of the application's own that is rolled back with it, at most."""
+    memory_limit_bytes: int = 0
+    """Of the container, with swap; 0: none known."""
     freeze_deadline_s: float = 0.0
     """The longest the app is held to get it stopped; 0: the engine's default."""
     files: Files = Files.REWIND

@@ -297,6 +297,8 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
     ):
         checkpoint(guard)
         restored(victim, guard, looks=False)
+        # All holders are there again, and the second generation.
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
         fds = guard.fds()
         for n in range(40):
             if n % 10 == 9:
@@ -309,7 +311,7 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
             assert "error" not in event, event
         disturb(victim)
         restored(victim, guard)
-        # The second generation's, of each process; and what is open for a moment, while the next holder is made.
+        # What is open for a moment, while the next holder is made.
         processes = 1 + len(below(victim.app))
         wait_until(lambda: guard.fds() <= fds + 2 * processes, 5, "no descriptor is left open")
 

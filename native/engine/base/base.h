@@ -210,6 +210,7 @@ bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
+int proc_oom_score_adj(pid_t pid);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */
 

@@ -529,6 +529,13 @@ int proc_borrow_fd(int pidfd, int fd)
 	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
 }
 
+int proc_oom_score_adj(pid_t pid)
+{
+	char text[16];
+
+	return proc_read(pid, "oom_score_adj", text, sizeof text) > 0 ? atoi(text) : 0;
+}
+
 void proc_set_oom_score_adj(pid_t pid, const char *value)
 {
 	int fd = proc_open(pid, "oom_score_adj", O_WRONLY);

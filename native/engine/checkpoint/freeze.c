@@ -290,10 +290,11 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err) ||
 	    keep_all(generation, &freeze->seen, err))
 		return -1;
-	if (!has_all_holders(freeze->tree) && clone_missing(freeze, err))
-		return -1;
+	/* While main threads are in their parasites: see parasite_will(). */
 	capture_files(generation);
-	return see_alive(freeze->tree, err);
+	if (see_alive(freeze->tree, err))
+		return -1;
+	return has_all_holders(freeze->tree) ? 0 : clone_missing(freeze, err);
 }
 
 /* Also what was begun before something failed: *template is set as soon as the main process is

@@ -110,7 +110,6 @@ static int quieten(struct image *image, struct avc_error *err)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	image->dumpable = dumpable->result;
-	proc_set_oom_score_adj(pid, "1000");
 	return attributes ? hear_template(process, cloned, call, attributes, err) : 0;
 }
 

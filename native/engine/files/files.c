@@ -611,7 +611,7 @@ static void keep_content(const struct look *look, struct file *f)
 		return;
 	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
 	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
-		file_keep_content(f->ours, f, look->files->scratch);
+		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
 }
 
 static void drop_ours(struct file *f)
@@ -829,10 +829,12 @@ void files_capture(struct image *image, const struct image *parent, bool several
 	files->parent = parent ? parent->files : NULL;
 	files->parent_pid = parent ? parent->process->pid : 0;
 	files->scratch = scratch;
+	files->process = process;
 	result = files_look(files, process->pid, process->pidfd, FILES_FROZEN,
 			    process->files_before, process->init, &image->files_error);
 	files->parent = NULL; /* may be gone before this one */
 	files->scratch = NULL;
+	files->process = NULL;
 	for (uint32_t i = 0; i < files->count; i++)
 		files->file[i].inherited = NULL;
 	if (result)

@@ -248,6 +248,7 @@ struct files {
 	const struct files *parent;
 	pid_t parent_pid;
 	struct scratch *scratch; /* also only then                                 */
+	struct process *process; /* likewise                                       */
 	struct file_rights rights;
 	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
 	const struct files_missing *missing;
@@ -298,7 +299,7 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socke
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(const struct files *files, const struct file *file);
-void file_keep_content(int fd, struct file *file, struct scratch *scratch);
+void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);

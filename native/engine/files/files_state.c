@@ -321,13 +321,20 @@ static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 	return n;
 }
 
-/* Datagrams, or records: the kernel moves on with every look, if it is told where to begin. */
-static void keep_messages(int fd, struct file *file)
+/* Datagrams, or records: the kernel moves on with every look, if it is told where to begin.  It
+ * is told by an option of the app's own socket, which gets its value back also if we die. */
+static void keep_messages(struct process *process, int fd, struct file *file)
 {
 	const int first = 0, before = option(fd, SOL_SOCKET, SO_PEEK_OFF);
 	size_t used = 0;
 
+	if (parasite_will(process, SYS_setsockopt, (uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
+			  (uint64_t)(int64_t)before, sizeof before)) {
+		file->content_lost = true;
+		return;
+	}
 	if (setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &first, sizeof first)) {
+		parasite_will_done(process);
 		file->content_lost = true;
 		return;
 	}
@@ -354,6 +361,7 @@ static void keep_messages(int fd, struct file *file)
 	}
 	file->content_bytes = (uint32_t)used;
 	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
+	parasite_will_done(process);
 }
 
 /* There was room for the largest. */
@@ -369,7 +377,7 @@ static void trim_messages(struct file *file)
 	}
 }
 
-void file_keep_content(int fd, struct file *file, struct scratch *scratch)
+void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch)
 {
 	int bytes = 0;
 	ssize_t n;
@@ -377,7 +385,7 @@ void file_keep_content(int fd, struct file *file, struct scratch *scratch)
 	if (ioctl(fd, FIONREAD, &bytes) || bytes <= 0)
 		return;
 	if (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM) {
-		keep_messages(fd, file);
+		keep_messages(process, fd, file);
 		trim_messages(file);
 		return;
 	}

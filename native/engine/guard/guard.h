@@ -105,6 +105,14 @@ void guard_note_written(struct avc_guard *guard);
 int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		       int pidfd, struct avc_error *err) warn_unused;
 
+/* ---- guard_memory.c ------------------------------------------------------- */
+
+/* Tells the OOM killer whom of ours to take, and when.  After each change of what is held. */
+void guard_rank_generations(struct avc_guard *guard);
+/* Whether the app fills its container's memory by itself: to go back to now would be to be
+ * killed again at once. */
+bool guard_app_is_full(const struct avc_guard *guard);
+
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);

@@ -443,6 +443,12 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 				     "memory is short, so no generation is held");
 		return;
 	}
+	if (guard_app_is_full(guard)) {
+		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
+		     "it fills the memory of its container: what it had before is kept");
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
 	if (take(guard, &event, &error) == 0) {
 		guard->reported_ns = 0;
 		guard->unprotected = false;

@@ -27,6 +27,7 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 	policy_resize(&guard->policy, keep, config->keep);
 	while (guard->count > guard->policy.room)
 		guard_drop_generation(guard, policy_dispensable(&guard->policy));
+	guard_rank_generations(guard);
 	if (guard->attached)
 		guard->next_ns = policy_due_again(config, guard->next_ns, now_ns());
 }

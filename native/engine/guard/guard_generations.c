@@ -27,6 +27,7 @@ void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 	memmove(&guard->generations[i], &guard->generations[i + 1],
 		(guard->count - i) * sizeof *guard->generations);
 	policy_drop(&guard->policy, i);
+	guard_rank_generations(guard);
 }
 
 void guard_drop_all(struct avc_guard *guard)
@@ -338,6 +339,7 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 		guard_drop_generation(guard, policy_replaced(&guard->policy, &guard->config, now));
 	guard->generations[guard->count++] = *fresh;
 	policy_hold(&guard->policy, record);
+	guard_rank_generations(guard);
 }
 
 void guard_fall_back(struct avc_guard *guard, bool hung)

@@ -225,6 +225,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 						   : CLONE_PARENT | SIGCHLD;
 	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | kin };
 	const long options = (long)(porter->is_thread ? TRACE_OPTIONS_APP : TRACE_OPTIONS_OURS);
+	const struct sched_param first = { .sched_priority = 1 };
 	struct arch_regs regs;
 	long refused;
 	int born;
@@ -255,6 +256,8 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	if (ptrace(PTRACE_SETOPTIONS, porter->tid, NULL, options) ||
 	    seccomp_supervise(porter->tid, 0, options))
 		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
+	/* The main thread waits for it, and each of its calls is two turns.  Best effort. */
+	(void)sched_setscheduler(porter->tid, SCHED_FIFO, &first);
 	return 0;
 }
 
@@ -569,15 +572,14 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 
 	if (process->descendant && !can_be_thread())
 		return do_stopped(process, slots, timer, deadline_ns, err);
+	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	thread = stop_main(process, err);
-	if (!thread) {
-		tracee_deadline_clear(timer);
-		return -1;
-	}
-	result = infect_thread(process, thread, slots, err);
-	thread_release(thread);
+	result = thread ? infect_thread(process, thread, slots, err) : -1;
+	if (thread)
+		thread_release(thread);
 	tracee_deadline_clear(timer);
+	rt_priority_end();
 	return result;
 }
 
@@ -704,7 +706,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
-		process->lost = process->lost || (result && err->code != AVC_KERNEL);
+		process->lost = process->lost || (result && err->code != AVC_LIMIT);
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
@@ -777,7 +779,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
-		process->lost = process->lost || err->code != AVC_KERNEL;
+		process->lost = process->lost || err->code != AVC_LIMIT;
 		thread_runs_on(thread, err);
 		return -1;
 	}

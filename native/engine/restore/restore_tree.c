@@ -231,7 +231,7 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 		if (ptrace(PTRACE_SETSIGMASK, batch->pid, sizeof open_mask, &open_mask))
 			return fail_errno(err, batch->pid, "restore", "ptrace(SETSIGMASK)",
 					  "it was killed");
-		kill(batch->pid, signal);
+		tracee_signal(batch->pid, signal);
 	} else {
 		syscall_batch_add(batch, SYS_exit_group, (uint64_t)WEXITSTATUS(image->status), 0, 0,
 				  0, 0, 0);

@@ -92,7 +92,7 @@ void sandbox_end(struct sandbox *sandbox)
 	const uint64_t end = now_ns() + END_NS;
 	bool ended = false;
 
-	kill(sandbox->pid, SIGKILL);
+	tracee_signal(sandbox->pid, SIGKILL);
 	/* The first thread is reported when all the others have been waited for. */
 	while (!ended && now_ns() < end)
 		if (!pump(sandbox, &ended))
@@ -158,7 +158,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 			bring_home(tid);
 	}
 	if (stop_signal)
-		kill(sandbox->pid, stop_signal);
+		tracee_signal(sandbox->pid, stop_signal);
 	slot->running = slot->threads;
 	for (uint32_t i = 0; i < sandbox->count; i++) {
 		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);

@@ -39,10 +39,13 @@ struct image {
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the process when it was taken                */
 	long anon_pages;       /* resident ones that are of no file                */
-	bool sandboxed;        /* has seccomp filters of its own                   */
-	bool headless;         /* its main thread had ended                       */
-	int stop_signal;       /* stopped by that (job control), 0: it was not     */
-	int64_t dumpable;      /* prctl(2), PR_GET_DUMPABLE                        */
+	/* The OOM killer's: the app's own, and what it was told of the template (guard_memory.c) */
+	int oom_own, oom_told;
+	bool oom_known;
+	bool sandboxed;   /* has seccomp filters of its own                   */
+	bool headless;    /* its main thread had ended                       */
+	int stop_signal;  /* stopped by that (job control), 0: it was not     */
+	int64_t dumpable; /* prctl(2), PR_GET_DUMPABLE                        */
 	struct attributes *attributes;
 	struct process_attrs *attrs;  /* of one that its parent is to fork               */
 	struct mem_image *memory;     /* that is not in the template                     */

@@ -175,6 +175,7 @@ void call_begin(struct inj_call *call, enum inj_after after)
 	call->done = 0;
 	call->pause = INJ_PAUSE_NONE;
 	call->count = 0;
+	call->wills = 0;
 	call->after = after;
 	call->park_ms = INJ_PARK_MS;
 }
@@ -191,6 +192,35 @@ struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_
 	call->count = i + 1;
 	*s = (struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, 0 }, .result = -ENOSYS };
 	return s;
+}
+
+int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
+		  uint64_t data, uint64_t e)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const struct thread *thread = thread_find(process, process->pid);
+	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
+
+	/* Supervised, its filters would judge what it does without us. */
+	if (!thread || !thread->borrowed || i >= INJ_WILLS_MAX ||
+	    process->parasite.seccomp == SECCOMP_SUPERVISED)
+		return -1;
+	call->will_data[i] = data;
+	call->will[i] = (struct inj_syscall){
+		.nr = nr,
+		.arg = { a, b, c, parasite_remote(&process->parasite, &call->will_data[i]), e }
+	};
+	__atomic_store_n(&call->wills, i + 1, __ATOMIC_RELEASE);
+	return 0;
+}
+
+void parasite_will_done(struct process *process)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
+
+	if (i && i <= INJ_WILLS_MAX)
+		__atomic_store_n(&call->wills, i - 1, __ATOMIC_RELEASE);
 }
 
 /* A thread of the app has others waiting for it, and goes home after INJ_PARK_MS.

@@ -319,6 +319,24 @@ static uint64_t waited_ns(struct thread *thread)
 	return (now.ran_ns - s->sched.ran_ns) / 1000 * 999;
 }
 
+/* recvmmsg(2) that was interrupted when it had some of its messages answers how many, and
+ * leaves what interrupted it to the socket's next call (net/socket.c, do_recvmmsg()): which
+ * would fail with one of the kernel's own codes.  To ask for an error takes it away. */
+static void forget_error(const struct process *process, const struct arch_regs *regs)
+{
+	const long got = arch_syscall_result(regs);
+	int fd, error;
+	socklen_t bytes = sizeof error;
+
+	if (got <= 0 || got >= (int32_t)arch_syscall_arg(regs, 2))
+		return;
+	fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, (int)arch_syscall_arg(regs, 0), 0);
+	if (fd < 0)
+		return;
+	(void)getsockopt(fd, SOL_SOCKET, SO_ERROR, &error, &bytes);
+	close(fd);
+}
+
 /* A call that answers EINTR to a stop is from now on watched. */
 static void begin_watch(const struct process *process, struct thread *thread, uint64_t now)
 {
@@ -345,6 +363,8 @@ void rewind_call(struct process *process, struct thread *thread)
 	note_call(process, thread);
 	if (arch_syscall_nr(regs) < 0 || is_about_to_rewind(thread))
 		return;
+	if (arch_syscall_nr(regs) == SYS_recvmmsg)
+		forget_error(process, regs);
 	if (arch_syscall_result(regs) == -EINTR) {
 		if (!is_rewound(thread))
 			begin_watch(process, thread, now);

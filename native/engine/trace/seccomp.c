@@ -105,6 +105,7 @@ static const struct kind wanted[] = {
 	{ SYS_pidfd_open, ANY },
 	{ SYS_socketpair, ANY },
 	{ SYS_recvmsg, ANY },
+	{ SYS_setsockopt, ANY },
 };
 
 /* And a process that is being put together: one with filters of its own is supervised then in any

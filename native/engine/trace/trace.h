@@ -289,6 +289,9 @@ bool tracee_expects_strangers(void);
 /* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
  * that a thread has brought forth when it was killed is a tracee nobody heard of. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
+/* To a tracee (a process).  Its number is nobody else's as long as we have not waited for its
+ * end, and it is ours no more after that. */
+void tracee_signal(pid_t pid, int signal);
 /* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
 void tracee_kill(pid_t pid);
 /* The same some milliseconds later, and without waiting for its end: the kernel takes some 10 ms
@@ -412,6 +415,13 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 /* The same; `meanwhile` is called once while the kernel clones. */
 int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* While the main thread is in its parasite: a call that it makes before it goes home if we are not
+ * there any more, with the address of `data` as its fourth argument.  For what we are about to
+ * change in what is the app's; that must not be changed if this fails.  The last one has been
+ * undone: parasite_will_done(). */
+int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
+		  uint64_t data, uint64_t e) warn_unused;
+void parasite_will_done(struct process *process);
 /* exec puts another program in its place, at any moment, and the parasite is gone: whether it
  * is there, in a stopped thread.  If not, the process is not infected any more. */
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;

@@ -309,9 +309,15 @@ bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *
 	return waitpid(info.si_pid, NULL, __WALL | __WNOTHREAD | WNOHANG) == info.si_pid;
 }
 
+void tracee_signal(pid_t pid, int signal)
+{
+	if (tracee_is_ours(pid))
+		kill(pid, signal);
+}
+
 void tracee_kill(pid_t pid)
 {
-	kill(pid, SIGKILL);
+	tracee_signal(pid, SIGKILL);
 	for (;;) {
 		int status;
 		pid_t r = waitpid(pid, &status, __WALL | __WNOTHREAD);
@@ -357,7 +363,7 @@ static void end_until(uint64_t now)
 {
 	for (uint32_t i = 0; i < ending.count; i++)
 		if (ending.task[i].kill_ns && ending.task[i].kill_ns <= now) {
-			kill(ending.task[i].pid, SIGKILL);
+			syscall(SYS_pidfd_send_signal, ending.task[i].pidfd, SIGKILL, NULL, 0);
 			ending.task[i].kill_ns = 0;
 		}
 }

@@ -53,6 +53,7 @@ struct avc_config {
 	uint64_t restore_window_ns;
 	uint32_t restore_max;
 	uint64_t shm_bytes;             /* shared memory that is rolled back, at most */
+	uint64_t memory_limit_bytes;    /* of the container, with swap; 0: none known */
 	uint8_t restore_on_signal;      /* killed by a signal nobody asked for       */
 	uint8_t restore_on_exit;        /* any non-zero exit status                  */
 	uint8_t files;                  /* enum avc_files                            */
