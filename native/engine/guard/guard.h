@@ -38,13 +38,12 @@ struct avc_guard {
 	uint32_t count;
 	uint64_t number; /* of the last generation taken             */
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
-	uint64_t
-		dying_until_ns; /* when it was found dying, some time more: see guard_reap_unknown() */
-	uint32_t misses;        /* in a row, of one that is unsupported     */
-	uint64_t reported_ns; /* since when it has been traced by one of its own; 0: it is not */
-	bool cramped;         /* there is no room for spares              */
-	uint64_t ahead_ns;    /* when to guard_work_ahead(); UINT64_MAX: never  */
-	uint32_t room;        /* generations that may be held now         */
+	uint64_t dying_until_ns; /* it was found dying: guard_reap_unknown() until then    */
+	uint32_t misses;         /* in a row, of one that is unsupported     */
+	uint64_t reported_ns;    /* since when it has been traced by one of its own; 0: it is not */
+	bool cramped;            /* there is no room for spares              */
+	uint64_t ahead_ns;       /* when to guard_work_ahead(); UINT64_MAX: never  */
+	uint32_t room;           /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
 	/* Of the process that runs now. */
