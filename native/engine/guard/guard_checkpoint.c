@@ -240,7 +240,7 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	struct avc_error error = { 0 };
 
 	tracee_deadline_set(guard->timer, SPARE_NS);
-	/* A template that was killed is seen to by guard_reap_dead(), as soon as that can be seen. */
+	/* A template that was killed is seen to by guard_reap_dead(), as soon as that shows. */
 	if (spare_make(newest, &error) && error.code != AVC_GONE &&
 	    !pidfd_ended(newest->image[0].pidfd))
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);

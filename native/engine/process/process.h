@@ -120,8 +120,8 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
  * are init's.  If we die meanwhile it does again all by itself. */
 int process_adopt_no_more(struct process *process, struct avc_error *err) warn_unused;
 int process_adopt_again(struct process *process, struct avc_error *err) warn_unused;
-/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until what it has open is
- * closed and its memory gone. */
+/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until what it
+ * has open is closed and its memory gone. */
 int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		 struct avc_error *err) warn_unused;
 void process_unhold(struct process *process);

@@ -3,8 +3,8 @@
  * The kernel has no call that gives a process another parent, and a fork of a template is
  * init's child.  So only the main process is forked from its template; the others are
  * forked by their own restored parents, under their own numbers, and then made what their
- * templates are (become()): memory (remap.c), descriptors, signal handlers, credentials.  All of them
- * are tracees that rest in a parasite until everything is there.
+ * templates are (become()): memory (remap.c), descriptors, signal handlers, credentials.  All of
+ * them are tracees that rest in a parasite until everything is there.
  */
 #include <errno.h>
 #include <poll.h>
@@ -121,9 +121,10 @@ static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *
 
 /* A child of the host's, with the number if nobody else has taken it.  `copy`: a child of the
  * host's that is as it came out of fork(2), and gives its memory to this one; 0: there is none. */
-static int fork_once(struct restore_tree *restored, struct forked *host, const struct image *image,
-		     pid_t copy, struct chores *chores, pid_t *child, struct avc_error *err)
+static int fork_once(struct forked *host, const struct image *image, pid_t copy,
+		     struct chores *chores, pid_t *child, struct avc_error *err)
 {
+	struct restore_tree *restored = chores->restored;
 	struct inj_call *runner = &host->batch.parasite->control->runner;
 	const bool orphan = image->parent == PARENT_INIT;
 	/* Siblings' numbers often follow each other; to ask takes two wake-ups. */
@@ -180,7 +181,7 @@ static int fork_host(struct restore_tree *restored, struct forked *host, const s
 		if (i)
 			note_end(restored, image);
 		*child = 0;
-		made = fork_once(restored, host, image, copy, chores, child, &failed) == 0;
+		made = fork_once(host, image, copy, chores, child, &failed) == 0;
 		if (made && proc_inside(*child) == image->inside) {
 			restored->last_number = image->inside;
 			return copy ? take_back(&host->batch, copy, err) : 0;

@@ -539,7 +539,7 @@ struct fd_channel {
 };
 
 /* Closes what it has from its parent; from here on it can be given descriptors, each to be
- * number 1 until that is closed.  By the `fd_channel` that it has from its parent, if any, or its own. */
+ * number 1 until that is closed: by the channel that it has from its parent, if any, or its own. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
 				  struct avc_error *err) warn_unused;
 /* Of the main process, for its children, who have it from the fork: to make one takes longer than
