@@ -288,9 +288,10 @@ void proc_unescape(char *text)
 
 bool proc_parse_mount(char *line, struct proc_mount *mount)
 {
+	char *const end = line + strcspn(line, "\n");
 	char *rest = line, *device, *word;
 
-	line[strcspn(line, "\n")] = 0;
+	*end = 0;
 	(void)strsep(&rest, " "); /* its id    */
 	(void)strsep(&rest, " "); /* and its parent's   */
 	device = strsep(&rest, " ");
@@ -302,7 +303,7 @@ bool proc_parse_mount(char *line, struct proc_mount *mount)
 	while (word && strcmp(word, "-"));
 	mount->type = strsep(&rest, " ");
 	(void)strsep(&rest, " "); /* what is mounted          */
-	mount->details = rest ? rest : "";
+	mount->details = rest ? rest : end;
 	if (!mount->type || sscanf(device, "%u:%u", &mount->major, &mount->minor) != 2)
 		return false;
 	proc_unescape(mount->point);
