@@ -50,6 +50,9 @@ test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
+sweep: setup-build ## kill the guard before each of its system calls, one run each: nobody notices (half an hour)
+	@AVCKPT_SWEEP=all $(VENV)/python -m pytest tests/native/test_engine_sweep.py $(PYTEST_ARGS) $(if $(T),-k "$(T)")
+
 test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp
 	@scripts/setup-programs.sh
 	@$(VENV)/python -m bench.programs --rounds $(ROUNDS)
@@ -69,7 +72,8 @@ machine-build: setup-build
 	@$(MAKE) -s -C native SANITIZE=1
 	@$(MAKE) -s -C tests/victims
 
-lint: setup-build ## ruff, mypy --strict, layers of the engine; shellcheck and clang-format, where installed
+lint: setup-build ## ruff, mypy --strict, layers of the engine, shellcheck, clang-format; a missing tool is a failure
+	@scripts/setup-system.sh lint
 	@scripts/lint.sh
 
 test-sqlite: setup ## kill SQLite under write load in containers, strict and rewind (KILLS=200; about an hour)
@@ -117,5 +121,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test test-programs test-trees test-kernels machine-build test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
+.PHONY: help setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
 .DEFAULT_GOAL := help

@@ -64,4 +64,6 @@ setup(
     package_data={"avckpt": ["py.typed"], "avckpt_hooks": ["py.typed"]},
     cffi_modules=["native/bind/build_native.py:ffibuilder"],
     cmdclass={"build_ext": BuildExt, "build_py": BuildPy},
+    # The binding is built against the stable ABI: one wheel for every Python from this one on.
+    options={"bdist_wheel": {"py_limited_api": "cp39"}},
 )

@@ -35,8 +35,8 @@ from typing import Any
 
 from avckpt.engine import Engine
 from avckpt.errors import AvckptError
-from avckpt.events.vocabulary import Event, EventKind
-from avckpt.guard import GuardConfig
+from avckpt.events.vocabulary import Kind
+from avckpt.guard import Event, GuardConfig
 from avckpt.supervision.pressure import templates_of
 from rich.console import Console
 
@@ -164,7 +164,7 @@ class Protected:
     def take_events(self) -> None:
         """To be called now and then.  Raises BenchFailed when the server is not protected any more."""
         while self._engine is not None and (event := self._engine.next_event()) is not None:
-            if event.kind not in (EventKind.ATTACHED, EventKind.CHECKPOINT, EventKind.MISSED):
+            if event.kind not in (Kind.ATTACHED, Kind.CHECKPOINT, Kind.MISSED):
                 raise BenchFailed(f"{event.kind.name}: {event.error}")
             self.events.append(event)
 
@@ -213,7 +213,7 @@ def _cell(
     way: Way, latencies: Sequence[float], before: Seen, after: Seen, events: Sequence[Event], took_s: float, load: float
 ) -> Cell:
     pages, ns, faults = (after.counter[n] - before.counter[n] for n in (1, 2, 3))
-    taken = [event for event in events if event.kind is EventKind.CHECKPOINT]
+    taken = [event for event in events if event.kind is Kind.CHECKPOINT]
     freezes = [event.freeze_s * 1e3 for event in taken]
     if way.kind == "fork":
         # The server's own account: its longest fork(2), no median.
@@ -228,7 +228,7 @@ def _cell(
         quantiles_us={str(q): round(latencies[int(q * len(latencies))], 1) for q in QUANTILES},
         worst_us=round(latencies[-1], 1),
         checkpoints=after.counter[5] - before.counter[5] if way.kind == "fork" else len(taken),
-        missed=sum(event.kind is EventKind.MISSED for event in events),
+        missed=sum(event.kind is Kind.MISSED for event in events),
         quiescent=sum(event.quiescent for event in taken),
         freeze_ms=round(statistics.median(freezes), 3) if freezes else 0.0,
         freeze_worst_ms=round(max(freezes), 3) if freezes else 0.0,

@@ -135,8 +135,7 @@ def plot_memory(memory: list[Json], path: Path) -> None:
 
 
 def _save(figure: Any, path: Path) -> None:
-    for suffix in (".png", ".svg"):
-        figure.savefig(path.with_suffix(suffix), dpi=110)
+    figure.savefig(path.with_suffix(".png"), dpi=110)
     plt.close(figure)
 
 
@@ -152,4 +151,4 @@ def show(results: Json, path: Path) -> None:
     text = "\n".join(parts)
     path.with_suffix(".md").write_text(text)
     print(text)
-    print(f"written: {path}, {path.with_suffix('.md')}, cost-latency and cost-memory (.png, .svg) beside them")
+    print(f"written: {path}, {path.with_suffix('.md')}, cost-latency and cost-memory (.png) beside them")

@@ -138,8 +138,7 @@ def plot(results: Json, key: str, title: str, path: Path) -> None:
     axes.legend(ncols=4, fontsize="small", loc="upper left")
     low, high = axes.get_ylim()
     axes.set_ylim(low, high * 8)
-    for suffix in (".png", ".svg"):
-        figure.savefig(path.with_suffix(suffix), dpi=110)
+    figure.savefig(path.with_suffix(".png"), dpi=110)
     plt.close(figure)
 
 
@@ -156,4 +155,4 @@ def show(results: Json, path: Path) -> None:
         plot(results, "freeze_ms", "freeze: the server stands still at a checkpoint", path.with_name("peers-freeze"))
         plot(results, "outage_ms", "outage: from kill -9 to the next answer", path.with_name("peers-outage"))
     print(text)
-    print(f"written: {path}, {path.with_suffix('.md')}, peers-freeze and peers-outage (.png, .svg) beside them")
+    print(f"written: {path}, {path.with_suffix('.md')}, peers-freeze and peers-outage (.png) beside them")

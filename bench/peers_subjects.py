@@ -286,7 +286,8 @@ class AvckptPodman(InContainer):
         self.container = self._factory.protected(
             *self.command(PROGRAMS_INSIDE, BOARDS_INSIDE),
             options=self._options(),
-            labels={"interval": NO_CHECKPOINTS, "restore.max": "64/1s"},
+            # Its client has numbers in its requests, and asks without waiting for answers.
+            labels={"interval": NO_CHECKPOINTS, "restore.max": "64/1s", "tcp": "keep"},
         )
         # The first one also comes after an interval, so by command.
         self._sidecar.wait_for(self.container, lambda entry: entry["app_pid"] > 0, "its application", 60.0)

@@ -76,6 +76,7 @@ class Case:
 
 
 HEAR = (("notify.self", "signal:USR1"),)
+KEEP = (("tcp", "keep"),)
 RESET = (("tcp", "reset"),)
 CASES = (
     Case("ddsperf", "none", "ddsperf -i {domain} pong", "ddsperf -i {domain} ping {rate}Hz"),
@@ -106,12 +107,14 @@ CASES = (
         "none",
         f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447",
         f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+        KEEP,
     ),
     Case(
         "zenoh",
         "skip",
         f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447 --after-restore skip",
         f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+        KEEP,
     ),
     Case(
         "zenoh",

@@ -61,7 +61,7 @@ def table(trials: Sequence[Trial]) -> str:
 
 
 def draw(trials: Sequence[Trial], stem: Path) -> None:
-    """STEM.png and STEM.svg: the outage against the checkpoint's age."""
+    """STEM.png: the outage against the checkpoint's age."""
     figure, panels = pyplot.subplots(1, 2, figsize=(11, 4.6), sharex=True, sharey=True)
     plain = [t for t in trials if t.remedy in ("none", "best-effort")]
     mended = [t for t in trials if t.remedy not in ("none", "best-effort")]
@@ -81,6 +81,5 @@ def draw(trials: Sequence[Trial], stem: Path) -> None:
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("the peer hears nothing for, ms")
     figure.tight_layout()
-    for suffix in (".png", ".svg"):
-        figure.savefig(stem.with_suffix(suffix), dpi=120)
+    figure.savefig(stem.with_suffix(".png"), dpi=120)
     pyplot.close(figure)

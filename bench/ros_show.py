@@ -202,8 +202,7 @@ def _plotting() -> Any:
 def _save(figure: Any, folder: Path, name: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     figure.tight_layout()
-    for kind in ("png", "svg"):
-        figure.savefig(folder / f"{name}.{kind}", dpi=110)
+    figure.savefig(folder / f"{name}.png", dpi=110)
 
 
 def show(path: Path) -> None:

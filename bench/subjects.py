@@ -15,8 +15,8 @@ from types import TracebackType
 
 from avckpt.artifacts import init_binary
 from avckpt.engine import Engine
-from avckpt.events.vocabulary import Event, EventKind
-from avckpt.guard import Command, GuardConfig
+from avckpt.events.vocabulary import Kind
+from avckpt.guard import Command, Event, GuardConfig
 
 from testkit.board import Board
 from testkit.harness import ROOT, wait_until
@@ -171,7 +171,7 @@ class Guarded:
             os.close(pidfd)
 
     def __enter__(self) -> Guarded:
-        self._wait(EventKind.ATTACHED)
+        self._wait(Kind.ATTACHED)
         return self
 
     def __exit__(
@@ -183,14 +183,14 @@ class Guarded:
         """Takes one; the event has its times."""
         self._tickets += 1
         self._guard.command(Command.CHECKPOINT, self._tickets)
-        return self._wait(EventKind.CHECKPOINT)
+        return self._wait(Kind.CHECKPOINT)
 
     def kill(self, app_pid: int) -> Recovery:
         """Kills the application, and waits until it beats again."""
         self._idle.board.forget_gap()
         killed_ns = time.monotonic_ns()
         os.kill(app_pid, signal.SIGKILL)
-        event = self._wait(EventKind.RESTORED)
+        event = self._wait(Kind.RESTORED)
         # The gap is measured by the victim itself, from beat to beat.
         eventually(lambda: self._beats_since(event.died_ns), "the victim beats again after a restore", 0.0005)
         return Recovery(
@@ -204,7 +204,7 @@ class Guarded:
         self._idle.check()
         return self._idle.board.see().gap_end_ns > died_ns
 
-    def _wait(self, kind: EventKind) -> Event:
+    def _wait(self, kind: Kind) -> Event:
         """The next event of this kind; DIED is passed over, anything else is a failure."""
         deadline = time.monotonic() + PATIENCE_S
         while True:
@@ -215,5 +215,5 @@ class Guarded:
                     raise BenchFailed(f"the engine does not answer: no {kind.name} within {PATIENCE_S:g} s")
             elif event.kind is kind:
                 return event
-            elif event.kind is not EventKind.DIED:
+            elif event.kind is not Kind.DIED:
                 raise BenchFailed(f"{event.kind.name} instead of {kind.name}: {event.error}")

@@ -206,7 +206,8 @@ def start_tracker(podman: Podman, stack: ExitStack, sidecar: Sidecar) -> tuple[C
         container = factory.protected(
             *("python3", "/tracker.py", str(inside)),
             name=NAME,
-            labels={"interval": INTERVAL},
+            # Its client numbers its questions, and has a time limit for each.
+            labels={"interval": INTERVAL, "tcp": "keep"},
             options=[network, "--volume", f"{ROOT}/examples/tracker.py:/tracker.py:ro"],
         )
         container.wait_for_log("started as PID")

@@ -23,14 +23,7 @@ check "ruff format" .venv/bin/ruff format --check --diff .
 mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests testkit bench 2>/dev/null)
 check "mypy --strict" .venv/bin/mypy "${typed[@]}"
 check "layers of the engine" make -s -C native layers
-if have shellcheck; then
-	check "shellcheck" shellcheck -x "${shell[@]}"
-else
-	note "shellcheck is not installed: shell scripts were not checked"
-fi
-if have clang-format; then
-	check "clang-format" clang-format --dry-run --Werror "${c[@]}"
-else
-	note "clang-format is not installed: the C code's style was not checked"
-fi
+# What is not checked is not right: a missing tool is a failure.
+check "shellcheck" shellcheck -x "${shell[@]}"
+check "clang-format" clang-format --dry-run --Werror "${c[@]}"
 exit "$status"

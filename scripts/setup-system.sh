@@ -57,7 +57,8 @@ check_versions() {
 }
 
 # need | Debian's package | check | what for.  "optional" is installed where apt
-# can, and its absence elsewhere is no more than a remark.
+# can, and its absence elsewhere is no more than a remark; "lint" is needed for
+# `setup-system.sh lint` only.
 NEEDS="
 required|podman|have podman|runs the containers
 required|conmon|has_conmon|watches a container's main process for Podman
@@ -74,6 +75,8 @@ required|iproute2|have ip|looks at the host's network
 optional|netavark|has_netavark|bridge networks for containers
 optional|iptables|have iptables|bridge networks for containers (Podman 4)
 optional|nftables|have nft|bridge networks for containers (Podman 5)
+lint|clang-format|have clang-format|checks the C code's style
+lint|shellcheck|have shellcheck|checks the shell scripts
 optional|runc|have runc|the tests run on both OCI runtimes
 optional|g++|have c++|compiles the C++ program that the tests kill and restore
 optional|cyclonedds-dev|has_cyclonedds|a test of ROS 2's transport
@@ -85,8 +88,9 @@ check_versions
 missing_required=() missing_optional=()
 while IFS='|' read -r need package check why; do
 	[ -n "$need" ] || continue
+	if [ "$need" = lint ] && [ "${1:-}" != lint ]; then continue; fi
 	if ! $check; then
-		if [ "$need" = required ]; then missing_required+=("$package"); else missing_optional+=("$package"); fi
+		if [ "$need" != optional ]; then missing_required+=("$package"); else missing_optional+=("$package"); fi
 		note "missing: $package - $why"
 	fi
 done <<<"$NEEDS"

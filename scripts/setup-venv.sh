@@ -15,7 +15,7 @@ mkdir -p "$STAMPS"
 # The interpreter is part of the key: after an upgrade of the system's Python an
 # old environment does not start any more.
 version=$("$PYTHON" -c 'import sys; print(sys.version, sys.base_prefix)')
-key=$(content_key pyproject.toml setup.py -- "$version" "$ROOT")
+key=$(content_key pyproject.toml setup.py hooks/avckpt_hooks/__init__.py -- "$version" "$ROOT")
 
 if [ ! -x .venv/bin/python ] || ! .venv/bin/python -c '' 2>/dev/null; then
 	rm -rf .venv "$STAMPS/venv"

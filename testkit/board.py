@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 
 MAGIC = 0x31445242544356
-LAYOUT = struct.Struct("<9Q32Q")
+LAYOUT = struct.Struct("<9Q64Q")
 GAP_OFFSET = 5 * 8
 COUNTERS_OFFSET = 9 * 8
 VIOLATION_STATUS = 99

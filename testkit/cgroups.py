@@ -56,3 +56,39 @@ def freezer(version: int) -> Cgroup:
     if version == 1:
         return Cgroup(["freezer"], "freezer.state", go="THAWED", wait="FROZEN")
     return Cgroup(["", "unified"], "cgroup.freeze", go="0", wait="1")
+
+
+class MemoryGroup:
+    """A group with a limit for memory; what is started with `preexec=group.enter` is in it.  A context manager."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        roots = [Path("/sys/fs/cgroup/memory"), Path("/sys/fs/cgroup")]
+        knobs = ["memory.limit_in_bytes", "memory.max"]
+        self._folder = Path()
+        self._limit_bytes = limit_bytes
+        for root, knob in zip(roots, knobs):
+            folder = root / f"avckpt-test-{os.getpid()}"
+            with contextlib.suppress(OSError):
+                folder.mkdir()
+            if (folder / knob).exists():
+                self._folder = folder
+                (folder / knob).write_text(str(limit_bytes))
+                return
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        pytest.skip("no control group with a limit for memory can be made here")
+
+    def __enter__(self) -> MemoryGroup:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        wait_until(self._removed, 10, "the cgroup is empty")
+
+    def enter(self) -> None:
+        """This process, from now on."""
+        (self._folder / "cgroup.procs").write_text(str(os.getpid()))
+
+    def _removed(self) -> bool:
+        with contextlib.suppress(OSError):
+            self._folder.rmdir()
+        return not self._folder.exists()

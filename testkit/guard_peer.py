@@ -24,8 +24,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from avckpt.engine import Engine
-from avckpt.events.vocabulary import Event, EventKind
-from avckpt.guard import Command, GuardConfig
+from avckpt.events.vocabulary import Kind
+from avckpt.guard import Command, Event, GuardConfig
 
 
 def config_of_json(text: str) -> GuardConfig:
@@ -50,7 +50,7 @@ class Burst:
     def take(self, event: Event) -> None:
         """Counts the answer to one of them."""
         self.left -= 1
-        if event.kind is EventKind.CHECKPOINT:
+        if event.kind is Kind.CHECKPOINT:
             self.taken += 1
             self.freeze_s.append(event.freeze_s)
         else:

@@ -151,9 +151,13 @@ class GuardProcess:
 
     def command(self, name: str, cookie: int = 1, timeout_s: float = PATIENCE_S) -> Json:
         """`checkpoint` or `restore`, once init was found; returns the answer."""
-        self.wait("attached", cookie=cookie)
-        ticket = self._say(f"{name} {cookie} %d")
+        ticket = self.say_command(name, cookie)
         return self.wait_for(lambda event: event.get("ticket") == ticket, f"answer to {name}", timeout_s=timeout_s)
+
+    def say_command(self, name: str, cookie: int = 1) -> int:
+        """The same without waiting for the answer, which has this ticket."""
+        self.wait("attached", cookie=cookie)
+        return self._say(f"{name} {cookie} %d")
 
     def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
         """`n` checkpoints back to back."""
@@ -188,7 +192,15 @@ class GuardProcess:
 class Victim(Init):
     """A program of tests/victims below avckpt-init, with its board."""
 
-    def __init__(self, command: str, folder: Path, *, options: Sequence[str] = (), with_board: bool = True) -> None:
+    def __init__(
+        self,
+        command: str,
+        folder: Path,
+        *,
+        options: Sequence[str] = (),
+        with_board: bool = True,
+        preexec: Callable[[], None] | None = None,
+    ) -> None:
         program, *args = command.split()
         self.command = command
         self.board = Board(folder / f"board-{Path(program).name}-{time.monotonic_ns()}")
@@ -197,7 +209,12 @@ class Victim(Init):
             args += ["--board", str(self.board.path)]
         self._file = self.output_path.open("wb")
         super().__init__(
-            [BUILD / program, *args], pid1=True, options=options, stdout=self._file.fileno(), stderr=subprocess.STDOUT
+            [BUILD / program, *args],
+            pid1=True,
+            options=options,
+            stdout=self._file.fileno(),
+            stderr=subprocess.STDOUT,
+            preexec=preexec,
         )
 
     def __enter__(self) -> Victim:

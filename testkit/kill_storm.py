@@ -20,13 +20,13 @@ from collections import Counter
 from pathlib import Path
 
 from avckpt.engine import Engine
-from avckpt.events.vocabulary import EventKind
+from avckpt.events.vocabulary import Kind
 from avckpt.guard import GuardConfig
 
 from testkit.guard_peer import config_of_json
 from testkit.procfs import children_of
 
-KINDS = (EventKind.ATTACHED, EventKind.CHECKPOINT, EventKind.MISSED, EventKind.UNPROTECTED)
+KINDS = (Kind.ATTACHED, Kind.CHECKPOINT, Kind.MISSED, Kind.UNPROTECTED)
 LEAVE_S = 3.0
 
 
@@ -53,9 +53,7 @@ def wait_gone(inits: list[int]) -> list[str]:
         time.sleep(0.001)
 
 
-def round_of_guards(
-    engine: Engine, guard_config: GuardConfig, inits: list[int], patience_s: float
-) -> Counter[EventKind]:
+def round_of_guards(engine: Engine, guard_config: GuardConfig, inits: list[int], patience_s: float) -> Counter[Kind]:
     """Guards of all of them, killed after some time; what they said until then."""
     guards = []
     for cookie, pid in enumerate(inits, 1):
@@ -65,12 +63,12 @@ def round_of_guards(
     time.sleep(patience_s)
     for guard in guards:
         os.kill(guard.pid, signal.SIGKILL)  # our children, not reaped yet
-    seen: Counter[EventKind] = Counter()
-    while seen[EventKind.GUARD_LOST] < len(guards):
+    seen: Counter[Kind] = Counter()
+    while seen[Kind.GUARD_LOST] < len(guards):
         select.select([engine.event_fd], [], [], 10.0)
         while (event := engine.next_event()) is not None:
             seen[event.kind] += 1
-            if event.kind is EventKind.UNPROTECTED:
+            if event.kind is Kind.UNPROTECTED:
                 print(event, file=sys.stderr, flush=True)
     for guard in guards:
         guard.stop()
@@ -83,14 +81,14 @@ def main() -> None:
     kills, max_ms, seed = int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
     inits = [int(pid) for pid in sys.argv[5:]]
     rng = random.Random(seed)
-    totals: Counter[EventKind] = Counter()
+    totals: Counter[Kind] = Counter()
     hit = 0
     left: list[str] = []
     with Engine() as engine:
         for _ in range(kills):
             seen = round_of_guards(engine, guard_config, inits, rng.uniform(0.0, max_ms) / 1000)
             totals += seen
-            hit += seen[EventKind.CHECKPOINT] > 0
+            hit += seen[Kind.CHECKPOINT] > 0
             left += wait_gone(inits)
     said = {kind.name.lower(): totals[kind] for kind in KINDS}
     print(json.dumps({"kills": kills, "hit": hit, "left": left, **said}))

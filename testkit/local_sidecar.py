@@ -18,6 +18,7 @@ from avckpt.artifacts import hooks_source, init_binary
 from avckpt.cli.client import Client
 from avckpt.containers.process import has_ended
 from avckpt.errors import SidecarUnreachable
+from avckpt_hooks import VERSION
 
 from testkit.harness import ROOT, Completed, avckpt_command, run, wait_until
 from testkit.procfs import children_of, inside
@@ -45,7 +46,7 @@ class Container:
 
     def hook(self, stage: str, labels: dict[str, str] | None = None) -> str:
         """Runs a real hook as the OCI runtime would; returns what it had to tell."""
-        annotations = {**(labels or {}), "avckpt.version": "0.1.0", "avckpt.name": self.name}
+        annotations = {**(labels or {}), "avckpt.version": VERSION, "avckpt.name": self.name}
         state = {"ociVersion": "1.0.2", "id": self.id, "pid": self.init_pid, "bundle": "/b", "annotations": annotations}
         # A hook tells the program that called it, on that one's standard error:
         # here a shell, which must stay to be told.

@@ -25,7 +25,7 @@ from testkit.procfs import below
 IMAGE = "localhost/avckpt-trees:latest"
 LONG = os.environ.get("AVCKPT_LONG") == "1"
 """`make test-trees`."""
-LABELS = {"interval": "100ms", "restore.max": "64/1s", "tcp": "reset-moved"}
+LABELS = {"interval": "100ms", "restore.max": "64/1s"}
 RESTORE_S = 30.0
 
 

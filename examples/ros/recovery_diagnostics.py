@@ -40,6 +40,7 @@ LEVELS = {
     "checkpoint": OK,
     "missed": WARN,
     "unprotected": ERROR,
+    "guard_lost": ERROR,
     "died": ERROR,
     "restored": WARN,
     "gave_up": ERROR,

@@ -8,3 +8,4 @@ library only, and nothing imported that the stage at hand does not use.
 from __future__ import annotations
 
 VERSION = "0.1.0"
+"""Of everything: package, sidecar and native code take it from this line."""

@@ -27,9 +27,6 @@
 #define END_MS 1000       /* from the end of its socket to the end of the process         */
 #define EVENTS_AT_ONCE 64 /* that are taken from one of them before it is the others' turn */
 #define STARVED_FACTOR 10 /* so much more patience with who only waits for a CPU          */
-#ifndef AVC_VERSION
-#define AVC_VERSION "0.1.0"
-#endif
 
 extern char **environ;
 

@@ -381,12 +381,18 @@ static bool within_stop_time(uint64_t then_ns, uint64_t at_ns)
  * status by which shells and their kin say so. */
 static bool was_wanted(int status, uint64_t at_ns)
 {
+	static const int fatal[] = { SIGABRT, SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGTRAP, SIGSYS };
 	int sig = WIFSIGNALED(status) ? WTERMSIG(status) : WEXITSTATUS(status) - 128;
 
 	if (within_stop_time(self.stop_ns, at_ns))
 		return true;
 	if (WIFSIGNALED(status) && within_stop_time(self.sent_ns[sig], at_ns))
 		return true;
+	/* These mean nothing else: who handles one tears down, and ends with a status of
+	 * its own. */
+	for (size_t i = 0; WIFEXITED(status) && i < sizeof(fatal) / sizeof(*fatal); i++)
+		if (within_stop_time(self.sent_ns[fatal[i]], at_ns))
+			return true;
 	return self.fd[TTY] >= 0 && (sig == SIGINT || sig == SIGQUIT || sig == SIGHUP);
 }
 

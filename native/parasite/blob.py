@@ -7,7 +7,7 @@ usage: blob.py ELF BINARY
 import subprocess
 import sys
 
-ENTRIES = ("inj_run", "inj_restore", "inj_end", "inj_sigreturn")
+ENTRIES = ("inj_run", "inj_enter", "inj_go_home", "inj_restore", "inj_end", "inj_sigreturn")
 
 
 def main() -> None:

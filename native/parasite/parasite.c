@@ -165,6 +165,7 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 	 * tracer any more, a thread of the app finds home by itself. */
 	if (call->after == INJ_AFTER_HOME) {
 		park(call->park_ms);
+		make_list(call->will, call->wills < INJ_WILLS_MAX ? call->wills : INJ_WILLS_MAX);
 		inj_go_home();
 	}
 	for (;;)

@@ -29,6 +29,7 @@
 #define INJ_TIMERS_MAX 64
 #define INJ_CPU_WORDS 16 /* 1024 CPUs */
 #define INJ_CALLS_MAX 96
+#define INJ_WILLS_MAX 4
 #define INJ_STACK_BYTES 4096
 #define INJ_SETUP_BYTES (512 * 1024)
 /* The same for INJ_DESCRIPTORS and INJ_OWNERS, and as much again for lists of calls
@@ -77,6 +78,11 @@ struct inj_call {
 	uint32_t after;   /* enum inj_after                                      */
 	uint32_t park_ms; /* INJ_AFTER_HOME: how long it waits for the tracer    */
 	struct inj_syscall call[INJ_CALLS_MAX];
+	/* INJ_AFTER_HOME: what a thread that finds no tracer any more does before it goes home:
+	 * the tracer's own changes to what is the app's are undone. */
+	uint32_t wills;
+	struct inj_syscall will[INJ_WILLS_MAX];
+	uint64_t will_data[INJ_WILLS_MAX];
 	uint8_t out[512]; /* where calls may leave results                      */
 	uint8_t stack[INJ_STACK_BYTES] __attribute__((aligned(64)));
 };
@@ -212,6 +218,7 @@ void inj_restore(struct inj_slot *slot);
 void inj_end(void) __attribute__((noreturn));
 
 /* Of arch/ARCH/parasite.S. */
+void inj_enter(struct inj_call *call, uint64_t stack) __attribute__((noreturn));
 void inj_go_home(void) __attribute__((noreturn));
 long inj_clone(uint64_t flags, uint64_t stack, uint64_t a, uint64_t b, uint64_t c);
 long inj_spawn(uint64_t flags, uint64_t stack, uint64_t tls, struct inj_thread *thread,

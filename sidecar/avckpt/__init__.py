@@ -1,4 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """avckpt: containers that live through crashes."""
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from avckpt_hooks import VERSION as __version__
+
+__all__ = ["__version__"]

@@ -8,9 +8,8 @@
       "*_lidar_*":
         interval: 100ms
 
-Keys are those of the labels, without their prefix.  pydantic checks the shape,
-the labels' own parser every value, so that the file and a label can never
-disagree on what is allowed.
+Keys are those of the labels, without their prefix.  The labels' own parser checks
+every value, so that the file and a label can never disagree on what is allowed.
 """
 
 from __future__ import annotations
@@ -21,13 +20,10 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Optional
 
 import yaml
-from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, parse_policy
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, create_model
+from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, parse_policy, shown
 
 from avckpt import yamlfile
 from avckpt.errors import ConfigError
@@ -128,72 +124,74 @@ def examine(path: Path) -> tuple[Defaults, list[Problem]]:
         if isinstance(error.__cause__, FileNotFoundError):
             return Defaults(), []
         return Defaults(), [Problem(error.place, error.why)]
-    try:
-        document = {} if root is None else _plain(root)
-    except RecursionError:
-        return Defaults(), [Problem(Place(str(path), 1), "nested too deeply")]
-    problems = list(_repetitions(root, path))
-    try:
-        checked = _model().model_validate(document)
-    except ValidationError as error:
-        problems += [_problem(dict(found), root, path) for found in error.errors()]
-        return Defaults(), sorted(problems, key=lambda problem: problem.place)
-    said = checked.model_dump(by_alias=True, exclude_unset=True)
-    defaults = Defaults(
-        _prefixed(said.get("defaults")),
-        tuple((pattern, _prefixed(settings)) for pattern, settings in (said.get("names") or {}).items()),
+    reader = _Reader(path)
+    defaults = reader.whole(root)
+    problems = reader.wrong or list(_contradictions(defaults, root, path))
+    return Defaults() if reader.wrong else defaults, sorted(
+        problems + reader.repeated, key=lambda problem: problem.place
     )
-    problems += _contradictions(defaults, root, path)
-    return defaults, sorted(problems, key=lambda problem: problem.place)
 
 
-@lru_cache(maxsize=1)
-def _model() -> type[BaseModel]:
-    """The shape of the file; made from the table of labels, so that it knows them all."""
-    fields: dict[str, Any] = {}
-    for number, key in enumerate(sorted(LABELS)):
-        if key != ENABLE:
-            value = Annotated[str, StringConstraints(strip_whitespace=True), AfterValidator(partial(_check, key))]
-            fields[f"label_{number}"] = (Optional[value], Field(None, alias=key[len(PREFIX) :]))
-    settings = create_model("Settings", __config__=ConfigDict(extra="forbid", strict=True), **fields)
-    whole: dict[str, Any] = {
-        "defaults": (Optional[settings], None),
-        "names": (Optional[dict[str, Optional[settings]]], None),  # type: ignore[valid-type]
-    }
-    return create_model("File", __config__=ConfigDict(extra="forbid", strict=True), **whole)
+@dataclass
+class _Reader:
+    """Takes a file apart, and remembers what is wrong with it."""
 
-
-def _check(key: str, value: str) -> str:
-    """Has a value parsed as that of the label `key`."""
-    try:
-        parse_policy({key: value})
-    except LabelError as error:
-        raise ValueError(f"{error.why}; {error.allowed}") from None
-    return value
-
-
-def _plain(node: yaml.Node) -> object:
-    """The document as dictionaries, lists and text: a value is what a label would say."""
-    if isinstance(node, yaml.MappingNode):
-        return {key.value: _plain(value) for key, value in yamlfile.entries(node)}
-    if isinstance(node, yaml.SequenceNode):
-        return [_plain(item) for item in node.value]
-    return None if node.tag.endswith(":null") else str(node.value)
-
-
-def _prefixed(settings: Mapping[str, str | None] | None) -> dict[str, str]:
-    return {PREFIX + key: value for key, value in (settings or {}).items() if value is not None}
-
-
-def _repetitions(root: yaml.Node | None, path: Path) -> Iterator[Problem]:
+    path: Path
+    wrong: list[Problem] = field(default_factory=list)
+    repeated: list[Problem] = field(default_factory=list)
     """YAML lets the last one win; a person who wrote both should be told."""
-    for node in _mappings(root):
-        seen: dict[str, int] = {}
-        for key, _ in yamlfile.entries(node):
-            if key.value in seen:
-                place = yamlfile.place_of(key, path)
-                yield Problem(place, f"{key.value}: given in line {seen[key.value]} already; remove one of them")
-            seen[key.value] = key.start_mark.line + 1
+
+    def whole(self, root: yaml.Node | None) -> Defaults:
+        common: dict[str, str] = {}
+        by_name: list[tuple[str, Mapping[str, str]]] = []
+        for key, (place, node) in self._mapping("the file", Place(str(self.path), 1), root).items():
+            if key == "defaults":
+                common = self._settings(key, place, node)
+            elif key == "names":
+                patterns = self._mapping(key, place, node)
+                by_name = [(name, self._settings(f"{key}.{name}", *found)) for name, found in patterns.items()]
+            else:
+                self._complain(place, f"{key}: unknown key; known are defaults and names")
+        return Defaults(common, tuple(by_name))
+
+    def _mapping(self, called: str, place: Place, node: yaml.Node | None) -> dict[str, tuple[Place, yaml.Node]]:
+        found: dict[str, tuple[Place, yaml.Node]] = {}
+        if not isinstance(node, yaml.MappingNode) and not _is_null(node):
+            self._complain(place, f"{called}: not a mapping")
+        for key, value in yamlfile.entries(node):
+            here = yamlfile.place_of(key, self.path)
+            if key.value in found:
+                first = found[key.value][0].line
+                self.repeated.append(Problem(here, f"{key.value}: given in line {first} already; remove one of them"))
+            found[key.value] = here, value
+        return found
+
+    def _settings(self, called: str, place: Place, node: yaml.Node) -> dict[str, str]:
+        """Label by label, with its prefix."""
+        settings = {}
+        for key, (here, value) in self._mapping(called, place, node).items():
+            label = PREFIX + key
+            if label not in LABELS or label == ENABLE:
+                self._complain(here, f"{called}.{key}: {_unknown(key)}")
+            elif _is_null(value):
+                continue
+            elif not isinstance(value, yaml.ScalarNode):
+                self._complain(here, f"{called}.{key}: not a single value")
+            else:
+                text = settings[label] = str(value.value).strip()
+                try:
+                    parse_policy({label: text})
+                except LabelError as error:
+                    said = shown(text) if text else "an empty value"
+                    self._complain(here, f"{called}.{key}: {said}: {error.why}; {error.allowed}")
+        return settings
+
+    def _complain(self, place: Place, message: str) -> None:
+        self.wrong.append(Problem(place, message))
+
+
+def _is_null(node: yaml.Node | None) -> bool:
+    return node is None or node.tag.endswith(":null")
 
 
 def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> Iterator[Problem]:
@@ -208,47 +206,13 @@ def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> I
             node = yamlfile.lookup(names, pattern) if error.key in settings else common
             key = error.key[len(PREFIX) :]
             places = [yamlfile.place_of(found, path) for found, _ in yamlfile.entries(node) if found.value == key]
-            problem = Problem(max(places), f"{key}: {error.value}: {error.why}; {error.allowed}")
+            problem = Problem(max(places), f"{key}: {shown(error.value or '')}: {error.why}; {error.allowed}")
             if problem not in seen:
                 seen.add(problem)
                 yield problem
 
 
-def _mappings(root: yaml.Node | None) -> Iterator[yaml.Node | None]:
-    yield root
-    yield yamlfile.lookup(root, "defaults")
-    names = yamlfile.lookup(root, "names")
-    yield names
-    for _, settings in yamlfile.entries(names):
-        yield settings
-
-
-def _problem(found: dict[str, Any], root: yaml.Node | None, path: Path) -> Problem:
-    """One of pydantic's errors in our words, with its line."""
-    where: tuple[object, ...] = found["loc"]
-    place, node = (Place(str(path), 1), root)
-    for step in where:
-        for key, value in yamlfile.entries(node):
-            if key.value == step:
-                place, node = yamlfile.place_of(key, path), value
-    called = ".".join(str(step) for step in where)
-    kind = found["type"]
-    if kind == "extra_forbidden":
-        why = _unknown(where)
-    elif kind == "value_error":
-        shown = found["input"] if len(found["input"]) <= 60 else found["input"][:57] + "..."
-        return Problem(place, f"{called}: {shown or 'an empty value'}: {found['ctx']['error']}")
-    elif kind == "string_type":
-        why = "not a single value"
-    else:
-        why = "not a mapping"
-    return Problem(place, f"{called}: {why}" if called else f"the file: {why}")
-
-
-def _unknown(where: tuple[object, ...]) -> str:
-    key = str(where[-1])
-    if len(where) == 1:
-        return "unknown key; known are defaults and names"
+def _unknown(key: str) -> str:
     if key == "enable":
         return "can not be a default: a container is protected when its own label says avckpt.enable=true"
     if key.startswith(PREFIX):

@@ -53,9 +53,9 @@ from avckpt.events.feed import Feed
 from avckpt.events.history import History
 from avckpt.events.journal import Journal
 from avckpt.events.metrics import Metrics
-from avckpt.events.record import Cause, EventRecord, Kind, of_guard
-from avckpt.events.vocabulary import Event, EventKind, why_not_restored
-from avckpt.guard import Command
+from avckpt.events.record import EventRecord, of_guard
+from avckpt.events.vocabulary import Kind, Reason, why_not_restored
+from avckpt.guard import Command, Event
 from avckpt.policy import Reloaded, Settings, changes, settings_of
 from avckpt.supervision.caretaker import Caretaker
 from avckpt.supervision.notify import Notifier
@@ -82,7 +82,7 @@ class Watch:
     pidfd: int
     labels: Mapping[str, str]
     settings: Settings
-    rolling_back: Cause | None = None
+    rolling_back: Reason | None = None
     """Why a roll back was commanded whose answer has not come yet."""
     freezes_s: dict[int, float] = field(default_factory=dict)
     """Freeze times of the generations that may still be held, by number."""
@@ -168,8 +168,8 @@ class Daemon:
             self._engine.close()
             self.history.close()
 
-    async def command(self, name: str, command: Command, cause: Cause = Cause.MANUAL) -> tuple[Protected, EventRecord]:
-        """Gives a command to a container and waits for the answer; `cause` is why a roll back is asked for.
+    async def command(self, name: str, command: Command) -> tuple[Protected, EventRecord]:
+        """Gives a command to a container and waits for the answer.
 
         Raises NoSuchContainer, Ambiguous, Unprotected, NothingToRestore,
         DeadlineMissed, TargetGone, or the engine's own error.
@@ -185,7 +185,7 @@ class Daemon:
         self._answers[ticket] = (container.cookie, answer)
         try:
             if command is Command.RESTORE:
-                watch.rolling_back = cause
+                watch.rolling_back = Reason.COMMAND
             watch.guard.command(command, ticket)
             event, record = await asyncio.wait_for(answer, COMMAND_TIMEOUT_S)
         except asyncio.TimeoutError as error:
@@ -219,15 +219,16 @@ class Daemon:
                 changed = tuple(change for change in changed if change.setting in ("group", "notify"))
             if not changed:
                 return None
+            config = dataclasses.replace(after.config, memory_limit_bytes=container.config.memory_limit_bytes)
             if watch.guard is not None:
-                watch.guard.configure(after.config)
+                watch.guard.configure(config)
         except TargetGone:
             return None  # it is ending at this moment
         except AvckptError as error:
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail="goes on with its old settings", error=error))
             return Reloaded(container.label, (), str(error))
         watch.settings = after
-        container.config = after.config
+        container.config = config
         container.group = after.policy.group
         self.caretaker.change(watch, after.policy)
         outcome = Reloaded(container.label, changed)
@@ -385,13 +386,13 @@ class Daemon:
             container = watch.container
             at = time.time() - (time.monotonic_ns() - event.at_ns) / 1e9
             container.apply(event, at)
-            if event.kind is EventKind.ENDED:
+            if event.kind is Kind.ENDED:
                 # The container's own end is told once it is known.
                 if watch.guard is not None and not has_ended(watch.pidfd):
                     self._lose_guard(watch, watch.guard)
                 continue
             record = self.tell(watch, self._record(watch, event, at))
-            if event.kind is EventKind.GUARD_LOST and watch.guard is not None:
+            if event.kind is Kind.GUARD_LOST and watch.guard is not None:
                 self._replace_guard(watch, watch.guard)
             _, answer = self._answers.get(event.ticket, (0, None))
             if answer is not None and not answer.done():
@@ -420,11 +421,11 @@ class Daemon:
                 answer.set_exception(TargetGone(f"{container.label}: {why}"))
 
     def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
-        if event.kind is EventKind.CHECKPOINT:
+        if event.kind is Kind.CHECKPOINT:
             watch.freezes_s[event.generation] = event.freeze_s
             while len(watch.freezes_s) > watch.container.config.keep:
                 del watch.freezes_s[min(watch.freezes_s)]
-        freeze_s = watch.freezes_s.get(event.generation) if event.kind is EventKind.RESTORED else None
+        freeze_s = watch.freezes_s.get(event.generation) if event.kind is Kind.RESTORED else None
         return of_guard(event, at=at, freeze_s=freeze_s, commanded=watch.rolling_back)
 
     # The end of a container, or of the sidecar
@@ -457,11 +458,11 @@ class Daemon:
 
 def check_answer(label: str, event: Event) -> None:
     """Raises what the answer to a command says went wrong, with the container's name."""
-    if event.kind in (EventKind.CHECKPOINT, EventKind.RESTORED):
+    if event.kind in (Kind.CHECKPOINT, Kind.RESTORED):
         return
-    if event.kind is EventKind.GAVE_UP:
+    if event.kind is Kind.GAVE_UP:
         raise AvckptError(f"{label} was not restored and ended: {why_not_restored(event.reason, event.error)}")
-    if event.kind is EventKind.UNPROTECTED:
+    if event.kind is Kind.UNPROTECTED:
         raise Unprotected(f"{label} runs unprotected: {event.error}")
     if event.error is None:
         raise AvckptError(f"{label}: answered with {event.kind.name.lower()}")

@@ -18,8 +18,8 @@ from avckpt_hooks.shared.tell import printable
 
 from avckpt.artifacts import guard_binary
 from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
-from avckpt.events.vocabulary import Event, EventKind, Reason
-from avckpt.guard import Command, GuardConfig
+from avckpt.events.vocabulary import Kind, Reason
+from avckpt.guard import Command, Event, GuardConfig
 
 try:
     from avckpt._native import ffi, lib
@@ -187,6 +187,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.quiesce_ns = _ns("quiesce", config.quiesce_s)
     c.restore_window_ns = _ns("restore window", config.restore_window_s)
     c.shm_bytes = config.shm_bytes
+    c.memory_limit_bytes = config.memory_limit_bytes
     c.restore_max = config.restore_max
     c.restore_on_signal = config.restore_on_signal
     c.restore_on_exit = config.restore_on_exit
@@ -199,9 +200,9 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
 
 def _event(e: Any) -> Event:
     return Event(
-        kind=EventKind(e.kind),
+        kind=Kind.of(e.kind),
         cookie=e.cookie,
-        reason=Reason(e.reason),
+        reason=Reason.of(e.reason) if e.reason else None,
         ticket=e.ticket,
         at_ns=e.at_ns,
         app_pid=e.app_pid,

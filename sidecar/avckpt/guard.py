@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a guard is told: configuration and commands, the plain data of `avckpt/engine.h`.
+"""What a guard is told and what it tells: the plain data of `avckpt/engine.h`.
 
-What it tells is in `avckpt.events.vocabulary`.  Nothing here needs the native library.
+Nothing here needs the native library, so that what decides on events can be
+read and tested without it.
 """
 
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from avckpt.errors import AvckptError
+from avckpt.events.vocabulary import Kind, Reason
 
 
 class Command(enum.IntEnum):
@@ -33,9 +37,9 @@ class Files(enum.IntEnum):
 class Tcp(enum.IntEnum):
     """`enum avc_tcp`: established TCP connections at a restore."""
 
-    KEEP = 0
+    RESET_MOVED = 0
     RESET = 1
-    RESET_MOVED = 2
+    KEEP = 2
     MESSAGES = 3
 
 
@@ -57,7 +61,52 @@ class GuardConfig:
     """How long to look for a quiescent moment."""
     shm_bytes: int = 4_000_000
     """Shared memory of the application's own that is rolled back with it, at most."""
+    memory_limit_bytes: int = 0
+    """Of the container, with swap; 0: none known."""
     freeze_deadline_s: float = 0.0
     """The longest the app is held to get it stopped; 0: the engine's default."""
     files: Files = Files.REWIND
-    tcp: Tcp = Tcp.KEEP
+    tcp: Tcp = Tcp.RESET_MOVED
+
+
+@dataclass(frozen=True)
+class Event:
+    """`struct avc_event`.  `_s` is a duration in seconds, `_ns` an instant of CLOCK_MONOTONIC."""
+
+    kind: Kind
+    cookie: int
+    reason: Reason | None = None
+    ticket: int = 0
+    at_ns: int = 0
+    app_pid: int = 0
+    app_pid_inside: int = 0
+    wait_status: int = 0
+    threads: int = 0
+    generation: int = 0
+    generations: int = 0
+    attempt: int = 0
+    quiescent: bool = False
+    restores: int = 0
+    freeze_s: float = 0.0
+    stop_s: float = 0.0
+    clone_s: float = 0.0
+    died_ns: int = 0
+    restore_s: float = 0.0
+    fork_s: float = 0.0
+    threads_s: float = 0.0
+    age_s: float = 0.0
+    error: AvckptError | None = None
+
+    def to_json(self) -> dict[str, object]:
+        """The fields that say something, for programs."""
+        data: dict[str, object] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value and field.name not in ("kind", "reason", "error", "cookie"):
+                data[field.name] = value
+        data["kind"] = self.kind.value
+        if self.reason is not None:
+            data["reason"] = self.reason.value
+        if self.error is not None:
+            data["error"] = self.error.to_json()
+        return data

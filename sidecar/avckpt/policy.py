@@ -89,11 +89,6 @@ def settings_of(labels: Mapping[str, str]) -> Settings:
     return Settings(said, policy, guard_config(policy))
 
 
-def config_of_labels(labels: Mapping[str, str]) -> GuardConfig:
-    """The engine's part of what the labels say.  Raises LabelsWrong."""
-    return settings_of(labels).config
-
-
 def changes(before: Settings, after: Settings) -> list[Change]:
     """What is different, in alphabetical order; 3s and 3000ms are not."""
     found = []

@@ -43,6 +43,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
 	struct proc_stat stat;
 	struct proc_status status;
+	struct proc_sched sched;
 	uint64_t limit[LIMITS][2];
 	pid_t children[16];
 	long pages, anonymous;
@@ -58,6 +59,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 		break;
 	case 'S':
 		(void)proc_parse_status(text, &status);
+		break;
+	case 'r':
+		(void)proc_parse_sched(text, &sched);
 		break;
 	case 'v':
 		if (proc_parse_statm(text, &pages, &anonymous) == 0)

@@ -19,7 +19,8 @@ from typing import Any
 import pytest
 from avckpt.cli.client import Client
 from avckpt.events.history import History
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 from jsonschema import Draft202012Validator
 from prometheus_client.parser import text_string_to_metric_families
 

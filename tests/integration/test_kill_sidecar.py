@@ -72,7 +72,6 @@ def test_a_crash_while_the_sidecar_is_dead_is_as_without_avckpt(
     os.kill(app, signal.SIGUSR1)
     assert victim.container.wait() == 128 + signal.SIGSEGV
     assert time.monotonic() - started < 2 * SLOWNESS
-    assert "was not restored" in victim.container.logs()
 
 
 def test_podmans_restart_policy_while_the_sidecar_is_dead(

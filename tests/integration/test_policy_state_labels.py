@@ -89,7 +89,7 @@ def test_offsets_and_shared_memory(
     sidecar: Sidecar, container: ContainerFactory, labels: dict[str, str], offset: int, count: int
 ) -> None:
     port = free_port()
-    keeper = start(container, port, **labels)
+    keeper = start(container, port, **{"tcp": "keep", **labels})
     with connected(port) as client:
         client.ask("write")
         started = client.ask("count")[2]
@@ -98,16 +98,19 @@ def test_offsets_and_shared_memory(
         assert client.ask("count") == (20, 2, started)
         os.kill(sidecar.app_pid(keeper), signal.SIGKILL)
         sidecar.wait_restores(keeper, 1)
-        # The same connection, by default.
+        # The same connection.
         assert client.ask("look") == (offset, count, started)
 
 
 @pytest.mark.parametrize(
-    ("how", "moved", "lives"), [("reset", False, False), ("reset-moved", True, False), ("reset-moved", False, True)]
+    ("labels", "moved", "lives"),
+    [({"tcp": "reset"}, False, False), ({}, True, False), ({}, False, True), ({"tcp": "keep"}, True, True)],
 )
-def test_connections(sidecar: Sidecar, container: ContainerFactory, how: str, moved: bool, lives: bool) -> None:
+def test_connections(
+    sidecar: Sidecar, container: ContainerFactory, labels: dict[str, str], moved: bool, lives: bool
+) -> None:
     port = free_port()
-    keeper = start(container, port, tcp=how)
+    keeper = start(container, port, **labels)
     with connected(port) as client:
         started = client.ask("look")[2]
         take_checkpoint(sidecar.avckpt, keeper.name)

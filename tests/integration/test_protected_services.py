@@ -97,7 +97,7 @@ def test_an_asyncio_server_keeps_its_connection(sidecar: Sidecar, container: Con
     made = container.protected(
         "python3",
         *("-c", ASYNCIO_SERVER),
-        labels={"interval": "100ms", "restore.max": "60/60s"},
+        labels={"interval": "100ms", "restore.max": "60/60s", "tcp": "keep"},
         options=[f"--network={network}"],
     )
     peer = Peer(made.ip or "127.0.0.1", 7000)
@@ -127,7 +127,7 @@ def test_redis_keeps_its_client_and_its_data(sidecar: Sidecar, container: Contai
     made = container.protected(
         "redis-server",
         *("--save", "", "--appendonly", "no", "--protected-mode", "no", "--bind", "0.0.0.0"),
-        labels={"interval": "1h"},
+        labels={"interval": "1h", "tcp": "keep"},
         options=["--user", "1000:1000", "--workdir", "/tmp"],
     )
     peer = Peer(made.ip, 6379)

@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 
 import pytest
-from harness import SLOWNESS
-from native.guarded import GuardProcess, Victim, children_of, config
+
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import SLOWNESS
 
 CHILDREN = 40
 PATIENCE_S = 30.0 * SLOWNESS
@@ -21,7 +22,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 def guard_of(peer: GuardProcess, cookie: int = 1) -> int:
     """The process that protects that container."""
-    return sorted(children_of(peer.pid))[cookie - 1]
+    return peer.guards[cookie - 1]
 
 
 def fds(pid: int) -> int:
@@ -74,3 +75,16 @@ def test_memory_that_was_never_touched_costs_nothing(tmp_path: Path) -> None:
             taken = guard.command("checkpoint", timeout_s=PATIENCE_S)
             assert taken["kind"] == "checkpoint", taken
         assert memory_kb(guard_of(guard)) - before < CHILDREN << 10
+
+
+def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
+    """Names alone would be 200 MB; it is told in words, and the guard lives on."""
+    with (
+        Victim(f"crowd named 4 18000 {tmp_path}", tmp_path) as crowd,
+        GuardProcess(config(), [crowd.pid]) as guard,
+    ):
+        told = guard.command("checkpoint", timeout_s=PATIENCE_S)
+        assert told["kind"] == "unprotected"
+        assert "more than 128 MB" in told["error"]["message"]
+        assert memory_kb(guard_of(guard)) < 400 << 10
+        crowd.wait_beats()

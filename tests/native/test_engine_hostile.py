@@ -93,6 +93,35 @@ def test_the_code_can_not_be_written(tmp_path: Path) -> None:
         hostile.wait_beats(3)
 
 
+@pytest.mark.parametrize("filters", ["", "--little"])
+@pytest.mark.parametrize("where", ["lists", "code", "setup"])
+def test_a_seccomp_filter_holds_for_what_runs_in_it(tmp_path: Path, where: str, filters: str) -> None:
+    """Code of ours that the application changes makes no call that the application's own filter refuses."""
+    folder = tmp_path / "smuggled"
+    with (
+        Victim(f"smuggle {where} {folder} {filters}", tmp_path) as hostile,
+        Victim("idle 1 1", tmp_path) as peaceful,
+        GuardProcess(config(0.02), [hostile.pid, peaceful.pid]) as guard,
+    ):
+        guard.wait("checkpoint", cookie=1, count=3)  # what attempts have left behind is gone by then
+        hostile.kill_app(signal.SIGUSR1)
+        wait_until(lambda: hostile.see().counter[0], 15, "the application has found the parasite")
+        # The newest checkpoint may be younger than the last time that the application got a CPU.
+        for _ in range(10 if where == "setup" else 0):
+            guard.wait("checkpoint", cookie=1, since=guard.mark(), count=2)
+            since = guard.mark()
+            hostile.kill_app()
+            guard.wait("restored", cookie=1, since=since)
+            hostile.wait_beats(3)
+            if hostile.see().counter[1] or folder.exists():
+                break
+        wait_until(lambda: hostile.see().counter[1] or folder.exists(), 15, "the call was made, and refused")
+        assert not folder.exists()
+        assert not lost(guard)
+        guard.wait("checkpoint", cookie=2, since=guard.mark(), count=3)
+        peaceful.wait_beats(3)
+
+
 @pytest.mark.parametrize("kind", FOLLY)
 def test_what_init_shows_is_looked_at_first(tmp_path: Path, kind: str) -> None:
     """Whoever runs in init's place has the guard open and map what it may open and map itself, and nothing else."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,8 +16,11 @@ from testkit.harness import wait_until
 from testkit.procfs import threads
 
 KILLS = 500
+PTRACE_CALLS = 40
+"""Of a checkpoint of one thread, and some."""
 NEVER_RESTARTED = {"epoll_wait", "epoll_pwait", "epoll_pwait2", "semop", "semtimedop", "sigtimedwait"}
-UNWOKEN = [9, 10, 11, 19]
+KINDS = 43
+UNWOKEN = [9, 10, 11, 19, 22, 38]
 CALLS_OF_READ = 8 + 12
 """On the board of eintr.c; see there."""
 
@@ -64,11 +69,13 @@ def test_blocked_calls_go_on(tmp_path: Path) -> None:
         said = storm(config(0.002), 60, 40, 2, victim, signals)
         assert said["left"] == []
         signals.wait_beats(20)
-        calls = victim.see().counter[8:28]
+        calls = victim.see().counter[8 : 8 + KINDS]
         wait_until(lambda: victim.see().counter[CALLS_OF_READ] > calls[12] + 3, 5, "a few wake-ups")
-        later = victim.see().counter[8:28]
-        assert [n for n in range(20) if later[n] == calls[n]] == UNWOKEN
+        later = victim.see().counter[8 : 8 + KINDS]
+        assert [n for n in range(KINDS) if later[n] == calls[n]] == UNWOKEN
         answered = set(re.findall(r"(\w+) answered (\w+)", victim.said))
+        # All registers, masks and stacks are what they were.
+        assert victim.said.count("VIOLATION") == len(re.findall(r"answered", victim.said))
         assert answered <= {(call, "EINTR") for call in NEVER_RESTARTED}
         assert victim.popen.poll() is None
 
@@ -82,3 +89,17 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
             guard.wait("checkpoint", count=6)
             wait_until(lambda: parasites(victim.app) <= 2, 5, "old parasites go")
         victim.wait_beats(20)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("strace"), reason="strace is what kills the guard; it is not installed")
+def test_handlers_run_on_their_own_stack(tmp_path: Path) -> None:
+    """The guard dies before its 1st, 2nd, ... ptrace call: a borrowed thread goes home, and signals find it whole."""
+    with Victim("steady", tmp_path) as victim:
+        for nth in range(1, PTRACE_CALLS + 1):
+            with GuardProcess(config(0.02), [victim.pid]) as guard:
+                guard.wait("checkpoint")
+                kill = f"inject=ptrace:signal=KILL:when={nth}"
+                trace = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=ptrace", "-e", kill]
+                subprocess.run([*trace, "-p", str(guard.guards[0])], timeout=15, check=False, stderr=subprocess.DEVNULL)
+                victim.wait_beats(10)

@@ -17,7 +17,7 @@ import pytest
 from avckpt.guard import Files, Tcp
 
 from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, since_linux
-from testkit.harness import wait_until
+from testkit.harness import SLOWNESS, wait_until
 from testkit.meddle import get_fd
 from testkit.procfs import below
 from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
@@ -33,7 +33,7 @@ def built(init_built: None, victims_built: Path) -> None:
     "scenario",
     [
         *("opened", "closed", "replaced", "deleted", "offset", "lost", "full"),
-        *("content", "events", "timer", "epoll", "watched", "flags", "locks"),
+        *("content", "events", "semaphores", "timer", "epoll", "watched", "flags", "locks"),
     ],
 )
 def test_as_at_the_checkpoint(scenario: str, where: str, tmp_path: Path) -> None:
@@ -88,6 +88,40 @@ def test_a_file_that_is_gone_reads_as_empty_and_is_told(tmp_path: Path) -> None:
         error = event["error"]["detail"]
         assert "gone (deleted)" in error
         assert "is not there any more" in error
+
+
+def test_only_what_the_application_may_open_is_opened_again(tmp_path: Path) -> None:
+    """Its user is nobody, the guard's is root."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        with (
+            Victim(f"descriptors revoked {folder}", tmp_path) as victim,
+            GuardProcess(config(), [victim.pid]) as guard,
+        ):
+            checkpoint(guard)
+            os.chmod(f"{folder}/revoked", 0o600)
+            disturb(victim)
+            error = restored(victim, guard)["error"]["detail"]
+            assert "revoked" in error
+            assert "can not be opened again" in error or "is not there any more" in error
+            assert "more)" not in error
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_thousands_opened_since_are_closed(where: str, tmp_path: Path) -> None:
+    """Nobody looks at them: that would take a second."""
+    with (
+        Victim(f"descriptors many {tmp_path} {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        took_s = []
+        for _ in range(KILLS):
+            disturb(victim)
+            event = restored(victim, guard)
+            assert "error" not in event, event
+            took_s.append(event["restore_s"])
+        assert min(took_s) < 0.3 * SLOWNESS
 
 
 def test_offsets_stay_with_keep(tmp_path: Path) -> None:
@@ -223,7 +257,7 @@ def test_connections_are_reset_on_demand(tmp_path: Path) -> None:
 def test_only_connections_that_moved_are_reset(tmp_path: Path) -> None:
     with (
         Victim("tcpecho 0", tmp_path) as victim,
-        GuardProcess(config(tcp=Tcp.RESET_MOVED), [victim.pid]) as guard,
+        GuardProcess(config(), [victim.pid]) as guard,
     ):
         still, moved = Client(victim), Client(victim)
         assert (still.ask("a"), moved.ask("b")) == ("1 a", "1 b")
@@ -238,8 +272,11 @@ def test_only_connections_that_moved_are_reset(tmp_path: Path) -> None:
         assert not still.is_reset()
 
 
-def test_connections_go_on_by_default(tmp_path: Path) -> None:
-    with Victim("tcpecho 0", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+def test_connections_go_on_on_demand(tmp_path: Path) -> None:
+    with (
+        Victim("tcpecho 0", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.KEEP), [victim.pid]) as guard,
+    ):
         client = Client(victim)
         assert client.ask("a") == "1 a"
         checkpoint(guard)
@@ -260,6 +297,8 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
     ):
         checkpoint(guard)
         restored(victim, guard, looks=False)
+        # All holders are there again, and the second generation.
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
         fds = guard.fds()
         for n in range(40):
             if n % 10 == 9:
@@ -272,7 +311,7 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
             assert "error" not in event, event
         disturb(victim)
         restored(victim, guard)
-        # The second generation's, of each process; and what is open for a moment, while the next holder is made.
+        # What is open for a moment, while the next holder is made.
         processes = 1 + len(below(victim.app))
         wait_until(lambda: guard.fds() <= fds + 2 * processes, 5, "no descriptor is left open")
 

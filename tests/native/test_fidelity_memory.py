@@ -83,6 +83,18 @@ def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) 
         assert not guard.wait("checkpoint", cookie=1).get("error")
 
 
+@pytest.mark.parametrize(("megabytes", "kind"), [(8, "unprotected"), (2, "checkpoint")])
+def test_more_shared_memory_than_allowed_of_several_processes(megabytes: int, kind: str, tmp_path: Path) -> None:
+    """Refused: those that went back would wait for what the others have in it."""
+    with Victim(f"crowd common 2 {megabytes}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        answer = guard.command("checkpoint")
+        assert answer["kind"] == kind, answer
+        if kind == "unprotected":
+            assert "8192 kB" in answer["error"]["message"]
+            assert "several of its processes share memory" in answer["error"]["message"]
+        victim.wait_beats()
+
+
 def test_small_shared_memory_is_rolled_back_beside_a_large_one(tmp_path: Path) -> None:
     with Victim("mappings 64 --large", tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
         assert "65536 kB of shared memory" in guard.wait("checkpoint")["error"]["message"]

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Tcp
 
 from testkit.family import look
 from testkit.guarded import GuardProcess, Victim, config, parasites
@@ -58,7 +59,7 @@ def test_restore_on_command(tmp_path: Path) -> None:
         wait_until(lambda: victim.see().counter[1] > at + 1000, 10, "it works")
         before = victim.see().counter[1]
         answer = guard.command("restore")
-        assert (answer["kind"], answer["reason"]) == ("restored", "command")
+        assert (answer["kind"], answer["reason"]) == ("restored", "manual")
         wait_until(lambda: victim.see().counter[1] < before, 5, "it has gone back")
         assert inside(victim.app) == pid
         victim.wait_beats(20)
@@ -161,7 +162,10 @@ def mappings(pid: int) -> int:
 @pytest.fixture
 def echo(tmp_path: Path) -> Iterator[tuple[Victim, GuardProcess, socket.socket]]:
     """tcpecho, its guard, and a connection to it."""
-    with Victim("tcpecho 0", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+    with (
+        Victim("tcpecho 0", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.KEEP), [victim.pid]) as guard,
+    ):
         peer = socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5)
         with contextlib.closing(peer):
             yield victim, guard, peer

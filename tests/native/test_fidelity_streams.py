@@ -93,7 +93,10 @@ def test_what_is_left_of_a_message_is_read_away(tmp_path: Path) -> None:
 
 def test_without_it_the_stream_is_lost(tmp_path: Path) -> None:
     """What the test above would see if nothing were done."""
-    with Victim("stream", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+    with (
+        Victim("stream", tmp_path) as victim,
+        GuardProcess(config(tcp=Tcp.KEEP), [victim.pid]) as guard,
+    ):
         client = start(victim, guard)
         kill_inside_a_message(victim, guard, client)
         wait_until(lambda: victim.see().counter[3] > 0, 20, "it takes the rest for a message")

@@ -425,6 +425,17 @@ def test_death_by_the_very_signal_that_was_sent_is_final(init: Phoenix, guard: G
     assert guard.ctl().stop_asked_ns == 0
 
 
+@pytest.mark.parametrize("sig", [signal.SIGABRT, signal.SIGINT])
+def test_tearing_down_for_a_signal_that_was_sent_is_final(init: Phoenix, guard: Guard, sig: int) -> None:
+    """It ends in its own time, and with a status of its own."""
+    assert init.app.ask("catch") == "caught"
+    init.kill(sig)
+    assert init.app.hear().startswith(f"signal {int(sig)}")
+    init.app.say("exit 1")
+    assert init.end() == 1
+    assert guard.report().flags == STOP_ASKED
+
+
 def test_other_death_after_another_signal_is_not_final(init: Phoenix, guard: Guard) -> None:
     assert init.app.ask("catch") == "caught"
     init.kill(signal.SIGHUP)

@@ -29,9 +29,14 @@ Start = Callable[..., "subprocess.Popen[str]"]
 TIMED = [
     *("epoll_wait", "epoll_pwait", "epoll_pwait2", "poll", "ppoll", "select", "pselect", "futex", "futex_abs"),
     *("nanosleep", "clock_nanosleep", "clock_nanosleep_abs", "accept", "recv", "sigtimedwait", "semtimedop"),
-    "io_getevents",
+    *("io_getevents", "io_pgetevents", "ppoll_const", "select_const", "pselect_const", "accept_old", "connect"),
+    *("read_socket", "readv", "preadv2", "recvmsg", "recvmmsg", "send", "write", "writev", "pwritev2", "sendmsg"),
+    *("sendmmsg", "sendfile", "splice"),
 ]
-WOKEN = [kind for kind in TIMED if "sleep" not in kind and kind != "io_getevents"] + ["read", "semop", "msgrcv"]
+WOKEN = [
+    *(kind for kind in TIMED if "sleep" not in kind and "getevents" not in kind),
+    *("read", "semop", "msgrcv", "flock", "fcntl"),
+]
 
 
 @pytest.fixture

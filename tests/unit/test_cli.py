@@ -18,6 +18,9 @@ from avckpt.errors import NothingToRestore
 from avckpt.guard import Command
 from click.testing import CliRunner, Result
 
+from scripts.man import page
+from testkit.harness import ROOT
+
 
 @pytest.fixture(autouse=True)
 def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -161,3 +164,7 @@ def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     for heavy in ("rich", "aiohttp", "asyncio", "cffi", "podman", "_cffi_backend"):
         assert f"'{heavy}'" not in loaded
+
+
+def test_the_man_page_is_that_of_this_command_line() -> None:
+    assert (ROOT / "docs/avckpt.1").read_text() == page(), "run: python -m scripts.man > docs/avckpt.1"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from avckpt.config import Configuration, Defaults, examine, read
 from avckpt.errors import ConfigError, LabelsWrong
-from avckpt.policy import changes, config_of_labels, settings_of
+from avckpt.policy import changes, settings_of
 from avckpt_hooks.shared.labels import LABELS
 
 ENABLED = {"avckpt.enable": "true"}
@@ -40,13 +40,13 @@ def test_labels_win_over_names_and_names_over_defaults(path: Path) -> None:
     path.write_text(GOOD)
     defaults = read(path)
     enable = {"avckpt.enable": "true"}
-    assert config_of_labels(defaults.under(enable, "planner")).interval_s == 0.5
-    assert config_of_labels(defaults.under(enable, "rear_lidar_1")).interval_s == 0.1
+    assert settings_of(defaults.under(enable, "planner")).config.interval_s == 0.5
+    assert settings_of(defaults.under(enable, "rear_lidar_1")).config.interval_s == 0.1
     # Of two patterns, the later.
-    both = config_of_labels(defaults.under(enable, "front_lidar_1"))
+    both = settings_of(defaults.under(enable, "front_lidar_1")).config
     assert (both.interval_s, both.restore_max, both.keep, both.restore_on_exit) == (0.2, 20, 3, False)
     labelled = defaults.under({**enable, "avckpt.interval": "1s", "avckpt.restore.on": "exit"}, "front_lidar_1")
-    own = config_of_labels(labelled)
+    own = settings_of(labelled).config
     assert (own.interval_s, own.restore_on_signal, own.restore_on_exit, own.restore_max) == (1.0, False, True, 20)
 
 

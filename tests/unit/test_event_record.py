@@ -9,11 +9,12 @@ from dataclasses import fields
 
 import pytest
 from avckpt.errors import DeadlineMissed, KernelError, NothingToRestore
-from avckpt.events.record import Cause, EventRecord, Kind, Outcome, of_guard
-from avckpt.events.vocabulary import GAVE_UP_WORDS, Event, EventKind, Reason
+from avckpt.events.record import EventRecord, of_guard
+from avckpt.events.vocabulary import GAVE_UP_WORDS, Kind, Reason
+from avckpt.guard import Event
 
 RESTORED = Event(
-    EventKind.RESTORED,
+    Kind.RESTORED,
     7,
     reason=Reason.SIGNAL,
     at_ns=5_000_000_000,
@@ -39,8 +40,8 @@ def test_a_restore_has_everything_that_is_asked_of_it() -> None:
         group="chain",
         at=1000.0,
         monotonic_s=5.0,
-        reason=Cause.SIGNAL,
-        outcome=Outcome.RESTORED,
+        reason=Reason.SIGNAL,
+        outcome=Reason.RESTORED,
         wait_status=signal.SIGSEGV | 0x80,
         generation=4,
         generations=2,
@@ -64,8 +65,8 @@ def test_through_json_and_back(kind: Kind) -> None:
         id="ab" * 32,
         at=1.25,
         seq=12,
-        reason=Cause.EXIT,
-        outcome=Outcome.FAILED,
+        reason=Reason.EXIT,
+        outcome=Reason.FAILED,
         wait_status=3 << 8,
         generation=4,
         age_s=1.5,
@@ -113,30 +114,30 @@ def test_what_is_no_event_is_refused(data: dict[str, object]) -> None:
 @pytest.mark.parametrize(
     ("wait_status", "reason", "commanded", "cause"),
     [
-        (signal.SIGKILL, Reason.SIGNAL, None, Cause.SIGNAL),
-        (3 << 8, Reason.EXIT, None, Cause.EXIT),
-        (signal.SIGKILL, Reason.COMMAND, None, Cause.MANUAL),
-        (signal.SIGKILL, Reason.COMMAND, Cause.MANUAL, Cause.MANUAL),
-        (signal.SIGKILL, Reason.COMMAND, Cause.UNHEALTHY, Cause.UNHEALTHY),
+        (signal.SIGKILL, Reason.SIGNAL, None, Reason.SIGNAL),
+        (3 << 8, Reason.EXIT, None, Reason.EXIT),
+        (signal.SIGKILL, Reason.COMMAND, None, Reason.COMMAND),
+        (signal.SIGKILL, Reason.COMMAND, Reason.COMMAND, Reason.COMMAND),
+        (signal.SIGKILL, Reason.COMMAND, Reason.UNHEALTHY, Reason.UNHEALTHY),
     ],
 )
-def test_why_it_died(wait_status: int, reason: Reason, commanded: Cause | None, cause: Cause) -> None:
-    event = Event(EventKind.RESTORED, 1, reason=reason, wait_status=wait_status)
+def test_why_it_died(wait_status: int, reason: Reason, commanded: Reason | None, cause: Reason) -> None:
+    event = Event(Kind.RESTORED, 1, reason=reason, wait_status=wait_status)
     assert of_guard(event, commanded=commanded).reason is cause
 
 
 @pytest.mark.parametrize("reason", list(GAVE_UP_WORDS))
 def test_every_way_to_give_up_is_an_outcome_of_that_name(reason: Reason) -> None:
-    record = of_guard(Event(EventKind.GAVE_UP, 1, reason=reason, wait_status=9))
+    record = of_guard(Event(Kind.GAVE_UP, 1, reason=reason, wait_status=9))
     assert record.outcome is not None
     assert record.outcome.name == reason.name
-    assert record.reason is Cause.SIGNAL
+    assert record.reason is Reason.SIGNAL
 
 
 def test_messages() -> None:
-    unhealthy = of_guard(RESTORED, commanded=Cause.UNHEALTHY)
+    unhealthy = of_guard(RESTORED, commanded=Reason.UNHEALTHY)
     assert unhealthy.message.startswith("unhealthy, rolled back, restored in 6.0 ms from generation 4 (1.5 s old)")
-    nothing = Event(EventKind.GAVE_UP, 1, reason=Reason.EMPTY, wait_status=9, error=NothingToRestore("none"))
+    nothing = Event(Kind.GAVE_UP, 1, reason=Reason.EMPTY, wait_status=9, error=NothingToRestore("none"))
     assert of_guard(nothing).message == "not restored (killed by SIGKILL): no checkpoint was held"
-    missed = of_guard(Event(EventKind.MISSED, 1, generations=2, freeze_s=0.05, error=DeadlineMissed("too slow")))
+    missed = of_guard(Event(Kind.MISSED, 1, generations=2, freeze_s=0.05, error=DeadlineMissed("too slow")))
     assert (missed.message, missed.freeze_s) == ("checkpoint missed: too slow", 0.05)

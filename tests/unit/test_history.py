@@ -16,7 +16,8 @@ from pathlib import Path
 
 import pytest
 from avckpt.events.history import History
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ from __future__ import annotations
 from avckpt.containers.protected import Protected, State
 from avckpt.errors import DeadlineMissed
 from avckpt.events.metrics import Metrics
-from avckpt.events.record import Cause, EventRecord, Kind, Outcome
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind, Reason
 from avckpt.policy import settings_of
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -32,15 +33,15 @@ def test_events_are_counted_by_container_reason_and_outcome() -> None:
         EventRecord(
             Kind.RESTORED,
             container="web",
-            reason=Cause.SIGNAL,
-            outcome=Outcome.RESTORED,
+            reason=Reason.SIGNAL,
+            outcome=Reason.RESTORED,
             restore_s=0.004,
             freeze_s=0.002,
         )
     )
-    metrics.take(EventRecord(Kind.GAVE_UP, container="db", reason=Cause.EXIT, outcome=Outcome.LIMIT))
+    metrics.take(EventRecord(Kind.GAVE_UP, container="db", reason=Reason.EXIT, outcome=Reason.LIMIT))
     metrics.take(EventRecord(Kind.NOTIFY_FAILED, container="db"))
-    metrics.take(EventRecord(Kind.DIED, container="db", reason=Cause.EXIT))
+    metrics.take(EventRecord(Kind.DIED, container="db", reason=Reason.EXIT))
     text = metrics.render([])
     assert value(text, "avckpt_checkpoints_total", container="web") == 3
     assert value(text, "avckpt_checkpoints_missed_total", container="web", reason="deadline") == 1

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import pytest
 from avckpt.containers.protected import Protected
-from avckpt.events.record import EventRecord, Kind
-from avckpt.policy import config_of_labels
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
+from avckpt.policy import settings_of
 from avckpt.supervision.notify import Notifier
 from avckpt_hooks.shared.labels import Notify
 
@@ -34,7 +35,7 @@ class Listening:
 def friend() -> Iterator[Protected]:
     """A container in group `chain`; its main process ends with the test."""
     with subprocess.Popen(["sleep", "60"]) as process:
-        made = Protected("ab" * 32, "friend", 1, process.pid, config_of_labels({}), 0.0, group="chain")
+        made = Protected("ab" * 32, "friend", 1, process.pid, settings_of({}).config, 0.0, group="chain")
         made.listen()
         yield made
         process.kill()

@@ -11,7 +11,8 @@ from avckpt.api.openapi import document
 from avckpt.api.server import ApiServer, Backend
 from avckpt.containers.protected import Protected
 from avckpt.errors import KernelError
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 from avckpt.guard import GuardConfig
 from openapi_spec_validator import OpenAPIV31SpecValidator
 

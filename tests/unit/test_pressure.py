@@ -25,12 +25,16 @@ LIMIT = 100 * MB
 
 
 def test_near_the_limit_the_oldest_goes() -> None:
-    assert Allowance().advise(89 * MB, LIMIT, 0, 0.0) is Advice.KEEP
-    assert Allowance().advise(90 * MB, LIMIT, 20 * MB, 0.0) is Advice.DROP_OLDEST
+    assert Allowance().advise(89 * MB, LIMIT, 0, 2, 0.0) is Advice.KEEP
+    assert Allowance().advise(90 * MB, LIMIT, 20 * MB, 2, 0.0) is Advice.DROP_OLDEST
+
+
+def test_the_newest_one_does_not_go() -> None:
+    assert Allowance().advise(95 * MB, LIMIT, 20 * MB, 1, 0.0) is Advice.KEEP
 
 
 def test_what_would_free_nothing_is_kept() -> None:
-    assert Allowance().advise(95 * MB, LIMIT, MB // 2, 0.0) is Advice.KEEP
+    assert Allowance().advise(95 * MB, LIMIT, MB // 2, 2, 0.0) is Advice.KEEP
 
 
 def test_it_comes_back_and_later_if_that_was_too_early() -> None:
@@ -38,9 +42,9 @@ def test_it_comes_back_and_later_if_that_was_too_early() -> None:
     now = 1000.0
     waited = []
     for _ in range(8):
-        assert allowance.advise(95 * MB, LIMIT, 20 * MB, now) is Advice.DROP_OLDEST
+        assert allowance.advise(95 * MB, LIMIT, 20 * MB, 2, now) is Advice.DROP_OLDEST
         given_up = now
-        while allowance.advise(70 * MB, LIMIT, 0, now) is not Advice.REFILL:
+        while allowance.advise(70 * MB, LIMIT, 0, 2, now) is not Advice.REFILL:
             now += 1
         waited.append(now - given_up)
         now += 1
@@ -49,14 +53,14 @@ def test_it_comes_back_and_later_if_that_was_too_early() -> None:
     assert max(waited) == BACK_AFTER_MOST_S
     # A long time of peace: as at first.
     now += 3 * BACK_AFTER_MOST_S
-    allowance.advise(95 * MB, LIMIT, 20 * MB, now)
-    assert allowance.advise(70 * MB, LIMIT, 0, now + BACK_AFTER_S) is Advice.REFILL
+    allowance.advise(95 * MB, LIMIT, 20 * MB, 2, now)
+    assert allowance.advise(70 * MB, LIMIT, 0, 2, now + BACK_AFTER_S) is Advice.REFILL
 
 
 def test_it_does_not_come_back_while_it_is_near() -> None:
     allowance = Allowance()
-    allowance.advise(95 * MB, LIMIT, 20 * MB, 0.0)
-    assert allowance.advise(91 * MB, LIMIT, 0, 10 * BACK_AFTER_S) is Advice.KEEP
+    allowance.advise(95 * MB, LIMIT, 20 * MB, 2, 0.0)
+    assert allowance.advise(91 * MB, LIMIT, 0, 2, 10 * BACK_AFTER_S) is Advice.KEEP
     assert allowance.short
 
 

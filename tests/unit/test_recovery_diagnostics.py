@@ -14,8 +14,9 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from avckpt.events.record import EXPECTED, EventRecord, Kind, Outcome, of_guard
-from avckpt.events.vocabulary import Event, EventKind, Reason
+from avckpt.events.record import EventRecord, of_guard
+from avckpt.events.vocabulary import EXPECTED, Kind, Reason
+from avckpt.guard import Event
 
 from testkit.harness import wait_until
 
@@ -41,7 +42,7 @@ def event(kind: Kind, at: float = 1000.0, **more: Any) -> dict[str, Any]:
 
 
 def restored(at: float = 1000.0) -> dict[str, Any]:
-    guard = Event(EventKind.RESTORED, 1, reason=Reason.SIGNAL, wait_status=11, restore_s=0.006, age_s=1.5, generation=4)
+    guard = Event(Kind.RESTORED, 1, reason=Reason.SIGNAL, wait_status=11, restore_s=0.006, age_s=1.5, generation=4)
     record = of_guard(guard, container="lidar", id="ab" * 32, group="chain", at=at)
     told: dict[str, Any] = json.loads(json.dumps(record.to_json()))
     return told
@@ -63,8 +64,8 @@ def test_every_kind_has_a_level(node: ModuleType) -> None:
 
 def test_an_end_that_was_meant_is_no_error(node: ModuleType) -> None:
     assert set(node.MEANT) == {outcome.value for outcome in EXPECTED}
-    assert node.status_of(event(Kind.GAVE_UP, outcome=Outcome.STOPPED)).level == node.STALE
-    assert node.status_of(event(Kind.GAVE_UP, outcome=Outcome.LIMIT)).level == node.ERROR
+    assert node.status_of(event(Kind.GAVE_UP, outcome=Reason.STOPPED)).level == node.STALE
+    assert node.status_of(event(Kind.GAVE_UP, outcome=Reason.LIMIT)).level == node.ERROR
 
 
 def test_the_board_over_time(node: ModuleType) -> None:

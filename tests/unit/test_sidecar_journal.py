@@ -10,20 +10,21 @@ import signal
 import pytest
 from avckpt.errors import AvckptError, DeadlineMissed, KernelError, Unsupported
 from avckpt.events.journal import SELDOM_S, Journal
-from avckpt.events.record import EventRecord, Kind, of_guard
-from avckpt.events.vocabulary import Event, EventKind, Reason
+from avckpt.events.record import EventRecord, of_guard
+from avckpt.events.vocabulary import Kind, Reason
+from avckpt.guard import Event
 
 
 def missed(at_s: float) -> EventRecord:
-    return of_guard(Event(EventKind.MISSED, 1, at_ns=int(at_s * 1e9), error=DeadlineMissed("a thread did not stop")))
+    return of_guard(Event(Kind.MISSED, 1, at_ns=int(at_s * 1e9), error=DeadlineMissed("a thread did not stop")))
 
 
 def unprotected(why: str) -> EventRecord:
-    return of_guard(Event(EventKind.UNPROTECTED, 1, error=Unsupported(why)))
+    return of_guard(Event(Kind.UNPROTECTED, 1, error=Unsupported(why)))
 
 
 def checkpoint(generation: int) -> EventRecord:
-    return of_guard(Event(EventKind.CHECKPOINT, 1, generation=generation, threads=3, freeze_s=0.00123, quiescent=True))
+    return of_guard(Event(Kind.CHECKPOINT, 1, generation=generation, threads=3, freeze_s=0.00123, quiescent=True))
 
 
 def test_only_the_first_checkpoint_is_worth_a_line() -> None:
@@ -66,7 +67,7 @@ def test_the_checkpoint_after_the_last_generation_was_given_up_is_told(reason: R
     journal = Journal()
     journal.line(checkpoint(1))
     journal.line(checkpoint(2))
-    dropped = Event(EventKind.DROPPED, 1, reason=reason, generation=1, generations=1)
+    dropped = Event(Kind.DROPPED, 1, reason=reason, generation=1, generations=1)
     assert (journal.line(of_guard(dropped)) or (0, ""))[0] == level
     assert (journal.line(checkpoint(3)) or (0, ""))[0] == logging.DEBUG
     assert (journal.line(of_guard(dataclasses.replace(dropped, generations=0))) or (0, ""))[0] == level
@@ -114,12 +115,12 @@ def test_protection_that_comes_back_is_said() -> None:
 
 def test_a_death_and_its_restore() -> None:
     journal = Journal()
-    assert journal.line(of_guard(Event(EventKind.DIED, 1, wait_status=signal.SIGSEGV))) == (
+    assert journal.line(of_guard(Event(Kind.DIED, 1, wait_status=signal.SIGSEGV))) == (
         logging.INFO,
         "died: killed by SIGSEGV",
     )
     restored = Event(
-        EventKind.RESTORED,
+        Kind.RESTORED,
         1,
         wait_status=signal.SIGSEGV,
         restore_s=0.0061,
@@ -135,7 +136,7 @@ def test_a_death_and_its_restore() -> None:
 
 
 def test_a_rollback_on_command_is_no_crash() -> None:
-    line = Journal().line(of_guard(Event(EventKind.RESTORED, 1, reason=Reason.COMMAND, wait_status=signal.SIGKILL)))
+    line = Journal().line(of_guard(Event(Kind.RESTORED, 1, reason=Reason.COMMAND, wait_status=signal.SIGKILL)))
     assert line is not None
     assert line[1].startswith("rolled back on command, restored in ")
 
@@ -150,7 +151,7 @@ def test_a_rollback_on_command_is_no_crash() -> None:
     ],
 )
 def test_a_restore_that_did_not_happen(reason: Reason, level: int, words: str) -> None:
-    line = Journal().line(of_guard(Event(EventKind.GAVE_UP, 1, wait_status=1 << 8, reason=reason)))
+    line = Journal().line(of_guard(Event(Kind.GAVE_UP, 1, wait_status=1 << 8, reason=reason)))
     assert line is not None
     assert line[0] == level
     assert words in line[1]
@@ -159,6 +160,6 @@ def test_a_restore_that_did_not_happen(reason: Reason, level: int, words: str) -
 
 def test_a_failed_restore_names_the_error() -> None:
     error: AvckptError = KernelError("the PID was taken", operation="restore", syscall="clone", errno=11)
-    line = Journal().line(of_guard(Event(EventKind.GAVE_UP, 1, wait_status=9, reason=Reason.FAILED, error=error)))
+    line = Journal().line(of_guard(Event(Kind.GAVE_UP, 1, wait_status=9, reason=Reason.FAILED, error=error)))
     assert line is not None
     assert "restore: the PID was taken (clone: Resource temporarily unavailable)" in line[1]

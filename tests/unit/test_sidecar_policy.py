@@ -7,11 +7,11 @@ import pytest
 from avckpt.cli.run import config_of_run
 from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Tcp
-from avckpt.policy import config_of_labels
+from avckpt.policy import settings_of
 
 
 def test_defaults_are_those_of_the_label_table() -> None:
-    assert config_of_labels({"avckpt.enable": "true"}) == GuardConfig(
+    assert settings_of({"avckpt.enable": "true"}).config == GuardConfig(
         interval_s=3.0,
         keep=2,
         restore_on_signal=True,
@@ -24,7 +24,7 @@ def test_defaults_are_those_of_the_label_table() -> None:
 
 
 def test_every_label_arrives() -> None:
-    config = config_of_labels(
+    config = settings_of(
         {
             "avckpt.enable": "true",
             "avckpt.interval": "250ms",
@@ -38,7 +38,7 @@ def test_every_label_arrives() -> None:
             "avckpt.name": "web",
             "io.podman.annotations.foo": "bar",
         }
-    )
+    ).config
     assert config == GuardConfig(
         interval_s=0.25,
         keep=7,
@@ -55,7 +55,7 @@ def test_every_label_arrives() -> None:
 
 def test_a_wrong_label_is_one_line() -> None:
     with pytest.raises(LabelsWrong, match=r"^label avckpt\.keep=none: .*whole number") as caught:
-        config_of_labels({"avckpt.enable": "true", "avckpt.keep": "none"})
+        settings_of({"avckpt.enable": "true", "avckpt.keep": "none"})
     assert "\n" not in str(caught.value)
 
 

@@ -9,8 +9,8 @@ import signal
 import pytest
 from avckpt.containers.protected import Protected, State
 from avckpt.errors import DeadlineMissed, NothingToRestore, Unsupported
-from avckpt.events.vocabulary import Event, EventKind, Reason, describe_wait_status, signal_name
-from avckpt.guard import GuardConfig
+from avckpt.events.vocabulary import Kind, Reason, describe_wait_status, signal_name
+from avckpt.guard import Event, GuardConfig
 
 CONFIG = GuardConfig(
     interval_s=3.0,
@@ -23,9 +23,9 @@ CONFIG = GuardConfig(
     quiesce_s=0.02,
 )
 S = 1_000_000_000
-ATTACHED = Event(EventKind.ATTACHED, 1, app_pid=4711, app_pid_inside=2)
+ATTACHED = Event(Kind.ATTACHED, 1, app_pid=4711, app_pid_inside=2)
 CHECKPOINT = Event(
-    EventKind.CHECKPOINT,
+    Kind.CHECKPOINT,
     1,
     app_pid=4711,
     app_pid_inside=2,
@@ -35,11 +35,11 @@ CHECKPOINT = Event(
     freeze_s=0.0025,
     quiescent=True,
 )
-MISSED = Event(EventKind.MISSED, 1, generations=1, error=DeadlineMissed("thread 4712 did not stop", pid=4712))
-UNPROTECTED = Event(EventKind.UNPROTECTED, 1, error=Unsupported("it has an io_uring"))
-DIED = Event(EventKind.DIED, 1, wait_status=signal.SIGKILL, reason=Reason.SIGNAL)
+MISSED = Event(Kind.MISSED, 1, generations=1, error=DeadlineMissed("thread 4712 did not stop", pid=4712))
+UNPROTECTED = Event(Kind.UNPROTECTED, 1, error=Unsupported("it has an io_uring"))
+DIED = Event(Kind.DIED, 1, wait_status=signal.SIGKILL, reason=Reason.SIGNAL)
 RESTORED = Event(
-    EventKind.RESTORED,
+    Kind.RESTORED,
     1,
     wait_status=signal.SIGKILL,
     reason=Reason.SIGNAL,
@@ -50,7 +50,7 @@ RESTORED = Event(
     restore_s=0.006,
     age_s=1.5,
 )
-GAVE_UP = Event(EventKind.GAVE_UP, 1, wait_status=3 << 8, reason=Reason.POLICY)
+GAVE_UP = Event(Kind.GAVE_UP, 1, wait_status=3 << 8, reason=Reason.POLICY)
 
 
 def protected(*events: Event) -> Protected:
@@ -120,12 +120,12 @@ def test_a_restore_is_remembered() -> None:
 
 def test_what_keeps_crashing_is_said_whatever_the_time_of_day() -> None:
     """The clock is set from 1970 to now between a crash and the next checkpoint."""
-    died = Event(EventKind.DIED, 1, at_ns=100 * S, wait_status=signal.SIGKILL)
-    restored = Event(EventKind.RESTORED, 1, at_ns=100 * S, attempt=2, generations=1)
+    died = Event(Kind.DIED, 1, at_ns=100 * S, wait_status=signal.SIGKILL)
+    restored = Event(Kind.RESTORED, 1, at_ns=100 * S, attempt=2, generations=1)
     container = protected(ATTACHED, CHECKPOINT, died, restored)
-    container.apply(Event(EventKind.CHECKPOINT, 1, at_ns=101 * S), 1.8e9)
+    container.apply(Event(Kind.CHECKPOINT, 1, at_ns=101 * S), 1.8e9)
     assert container.reason == "keeps crashing: restore 2 of 5 within 60 s"
-    container.apply(Event(EventKind.CHECKPOINT, 1, at_ns=161 * S), 1.8e9)
+    container.apply(Event(Kind.CHECKPOINT, 1, at_ns=161 * S), 1.8e9)
     assert container.reason == ""
 
 
@@ -139,9 +139,7 @@ def test_the_end_says_how_it_ended() -> None:
 
 def test_an_end_with_nothing_held_says_so_once() -> None:
     nothing = NothingToRestore("no generation is held", operation="restore")
-    container = protected(
-        ATTACHED, DIED, Event(EventKind.GAVE_UP, 1, wait_status=9, reason=Reason.EMPTY, error=nothing)
-    )
+    container = protected(ATTACHED, DIED, Event(Kind.GAVE_UP, 1, wait_status=9, reason=Reason.EMPTY, error=nothing))
     assert container.reason == "killed by SIGKILL; no checkpoint was held"
 
 

@@ -1,12 +1,17 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- *   crowd KIND PROCESSES MANY
+ *   crowd KIND PROCESSES MANY [FOLDER]
  *
  * PROCESSES children, each with much of what a checkpoint might have to keep:
  *
  *   shared   MANY areas of shared memory of its own, of a page each
  *   wiped    MANY MB of memory that is wiped in forks (MADV_WIPEONFORK), never touched
+ *   named    MANY descriptors of a file, made below the working folder, whose path has 3,000 characters
+ *   common   MANY MB of shared memory that all of them have
  */
+#include <sys/resource.h>
+#include <sys/stat.h>
+
 #include "victim.h"
 
 static void *map(size_t bytes, int protection, int flags)
@@ -17,13 +22,31 @@ static void *map(size_t bytes, int protection, int flags)
 	return at;
 }
 
+static void open_named(size_t many)
+{
+	struct rlimit limit;
+	char name[251];
+
+	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
+	limit.rlim_cur = limit.rlim_max;
+	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	memset(name, 'n', sizeof name - 1);
+	name[sizeof name - 1] = 0;
+	for (int depth = 0; depth < 12; depth++)
+		must((!mkdir(name, 0700) || errno == EEXIST) && !chdir(name), "mkdir");
+	for (size_t i = 0; i < many; i++)
+		must(open(name, O_RDWR | O_CREAT, 0600) >= 0, "open");
+}
+
 static void have(const char *kind, size_t many)
 {
 	if (!strcmp(kind, "wiped"))
 		must(!madvise(map(many << 20, PROT_READ | PROT_WRITE, MAP_PRIVATE), many << 20,
 			      MADV_WIPEONFORK),
 		     "MADV_WIPEONFORK");
-	else
+	else if (!strcmp(kind, "named"))
+		open_named(many);
+	else if (!strcmp(kind, "shared"))
 		for (size_t i = 0; i < many; i++) {
 			*(int *)map(4096, PROT_READ | PROT_WRITE, MAP_SHARED) = 1;
 			/* Between them, or the kernel makes one of them. */
@@ -36,9 +59,12 @@ int main(int argc, char **argv)
 	volatile uint64_t *there;
 	int processes;
 
-	victim_start(&argc, argv, 3, "KIND PROCESSES MANY");
+	victim_start(&argc, argv, 3, "KIND PROCESSES MANY [FOLDER]");
+	must(argc < 5 || !chdir(argv[4]), "chdir");
 	processes = atoi(argv[2]);
 	there = map(4096, PROT_READ | PROT_WRITE, MAP_SHARED);
+	if (!strcmp(argv[1], "common"))
+		map((size_t)atol(argv[3]) << 20, PROT_READ | PROT_WRITE, MAP_SHARED);
 	for (int i = 0; i < processes; i++) {
 		const pid_t child = fork();
 

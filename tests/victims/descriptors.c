@@ -5,6 +5,7 @@
  *   descriptors SCENARIO FOLDER     see scenario.h
  */
 #include <arpa/inet.h>
+#include <grp.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
@@ -168,6 +169,88 @@ static void deleted_verify(void)
 {
 	expect_text(fd[0], "still here", "a deleted file");
 	lseek(fd[0], 0, SEEK_SET);
+}
+
+/* ---- more than can be undone one by one ----------------------------------------------- */
+
+enum { SEMAPHORES = 60, COUNTED = 5 };
+static const uint64_t enormous = UINT64_C(1) << 40;
+
+static void semaphores_setup(void)
+{
+	const uint64_t counted = COUNTED;
+
+	for (int i = 0; i < SEMAPHORES; i++) {
+		fd[i] = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC | (i % 2 ? 0 : EFD_SEMAPHORE));
+		must(fd[i] >= 0 && (i % 3 || write(fd[i], &counted, 8) == 8), "eventfd");
+	}
+}
+
+static void semaphores_disturb(void)
+{
+	for (int i = 0; i < SEMAPHORES; i++)
+		must(write(fd[i], &enormous, 8) == 8, "write");
+}
+
+static void semaphores_verify(void)
+{
+	for (int i = 0; i < SEMAPHORES; i++) {
+		const uint64_t counted = i % 3 ? 0 : COUNTED;
+		uint64_t value, sum = 0;
+
+		while (sum <= COUNTED && read(fd[i], &value, 8) == 8)
+			sum += value;
+		CHECK(sum == counted, "eventfd %d holds %lu and not %lu", i, sum, counted);
+		must(!counted || write(fd[i], &counted, 8) == 8, "write");
+	}
+}
+
+enum { MANY = 19000 };
+
+/* Not one after the other either. */
+static void many_disturb(void)
+{
+	struct rlimit limit;
+
+	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
+	limit.rlim_cur = limit.rlim_max;
+	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
+	for (int i = 0; i < MANY; i++)
+		must(open("/dev/null", O_RDONLY) >= 0, "open");
+	for (int i = 100; i < MANY; i += 1000)
+		close(i);
+}
+
+static void many_verify(void)
+{
+	for (int i = 10; i < MANY; i++)
+		CHECK(!is_open(i), "descriptor %d is still open", i);
+}
+
+/* ---- what it may not open any more --------------------------------------------------- */
+
+/* The test takes everybody's rights to the first file away. */
+static void revoked_setup(void)
+{
+	fd[0] = make_file("revoked", "0123456789", O_RDWR);
+	fd[1] = make_file("allowed", "0123456789", O_RDWR);
+	must(!fchmod(fd[0], 0666) && !fchmod(fd[1], 0666), "fchmod");
+	must(!setgroups(0, NULL) && !setresgid(65534, 65534, 65534) &&
+		     !setresuid(65534, 65534, 65534),
+	     "setresuid");
+}
+
+static void revoked_disturb(void)
+{
+	close(fd[0]);
+	close(fd[1]);
+}
+
+static void revoked_verify(void)
+{
+	lseek(fd[1], 0, SEEK_SET);
+	expect_text(fd[1], "0123456789", "a file that it may open");
+	CHECK(read(fd[0], scratch, 10) == 0, "a file that it may not open any more is open again");
 }
 
 /* ---- gone for good: reads as empty, and is told ------------------------------------------ */
@@ -841,6 +924,9 @@ static const struct scenario scenarios[] = {
 	{ "closed", closed_setup, closed_disturb, closed_verify },
 	{ "replaced", replaced_setup, replaced_disturb, replaced_verify },
 	{ "deleted", deleted_setup, deleted_disturb, deleted_verify },
+	{ "semaphores", semaphores_setup, semaphores_disturb, semaphores_verify },
+	{ "many", nothing, many_disturb, many_verify },
+	{ "revoked", revoked_setup, revoked_disturb, revoked_verify },
 	{ "gone", gone_setup, deleted_disturb, gone_verify },
 	{ "offset", offset_setup, offset_disturb, offset_verify },
 	{ "keep", offset_setup, offset_disturb, keep_verify },

@@ -50,7 +50,7 @@ struct board {
 	uint64_t gap_end_ns; /* when that gap ended */
 	uint64_t violations;
 	uint64_t ready;       /* 1 once set up */
-	uint64_t counter[32]; /* each victim's own */
+	uint64_t counter[64]; /* each victim's own */
 };
 
 static struct board private_board;

@@ -87,8 +87,8 @@ class Policy:
     """Shared memory of the application's own that is rolled back with it, at most."""
     files: str = "rewind"
     """Regular files at a restore: rewind, keep or strict."""
-    tcp: str = "keep"
-    """Established TCP connections at a restore: keep, reset, reset-moved or messages."""
+    tcp: str = "reset-moved"
+    """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
     notify: Notify | None = None
@@ -327,9 +327,9 @@ LABELS: dict[str, Label] = {
         _parse_restore_max,
     ),
     "avckpt.tcp": Label(
-        "keep",
-        "keep, reset, reset-moved or messages",
-        _one_of("tcp", "keep", "reset", "reset-moved", "messages"),
+        "reset-moved",
+        "reset-moved, reset, keep or messages",
+        _one_of("tcp", "reset-moved", "reset", "keep", "messages"),
     ),
     "avckpt.files": Label("rewind", "rewind, keep or strict", _one_of("files", "rewind", "keep", "strict")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),

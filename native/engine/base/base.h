@@ -10,6 +10,7 @@
  *   error.c         what went wrong
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
+ *   budget.c        what one checkpoint or restore may cost
  *   proc.c          /proc
  *   proc_text.c     what its texts say
  *   pagemap.c       which pages of a process are there
@@ -59,6 +60,22 @@ int heartbeat_open(int fd) warn_unused;
 /* We get on: the daemon kills a guard of which it has not heard for seconds. */
 void heartbeat(void);
 
+/* ---- budget.c --------------------------------------------------------------- */
+
+/* Of a checkpoint or restore.  `working` is called now and then, NULL: nothing. */
+void budget_begin(void (*working)(void *arg), void *arg);
+/* From now on there is so much time; 0: as much as it takes. */
+void budget_deadline(uint64_t ns);
+/* It is over for that reason, in words that stay. */
+void budget_exceed(enum avc_code code, const char *what);
+/* Memory that is to be kept: whether there is room, and if so takes it.  budget_has() only asks. */
+bool budget_has(uint64_t bytes);
+bool budget_take(uint64_t bytes);
+/* We get on.  False when the budget is exceeded. */
+bool budget_step(void);
+/* -1 with that code and the reason in words when it is. */
+int budget_check(pid_t pid, struct avc_error *err) warn_unused;
+
 /* ---- config.c -------------------------------------------------------------- */
 
 #define RESTORES_MAX 64
@@ -80,8 +97,9 @@ struct proc_stat {
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
-/* All of one, however long the application makes it, as a string: in `first` if that is large
- * enough, else allocated.  NULL with errno. */
+/* All of one, as a string: in `first` if that is large enough, else allocated, for the application
+ * makes it as long as it likes.  NULL with errno; EFBIG: that is too long. */
+#define PROC_TEXT_MAX (8u << 20) /* about 100,000 descriptors, or 60,000 files, that are watched  */
 char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes);
 int proc_stat(pid_t pid, struct proc_stat *stat);
 /* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
@@ -161,7 +179,17 @@ int mapping_protection(const struct mapping *m);
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
+/* A task as the scheduler sees it (/proc/PID/sched). */
+struct proc_sched {
+	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t switches, migrations;
+};
+
+/* -1: the kernel does not tell, or it has ended. */
+int proc_sched(pid_t tid, struct proc_sched *sched);
+
 /* What is of interest in /proc/PID/status. */
+#define STATUS_GROUPS 64
 struct proc_status {
 	int64_t locked_kb; /* -1: it has no memory any more                    */
 	pid_t inside;      /* in the innermost PID namespace                   */
@@ -170,7 +198,9 @@ struct proc_status {
 	uint64_t ignored;  /* likewise                                         */
 	uint32_t umask;
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
-	uint64_t caps[5];        /* inheritable, permitted, effective, bounding, ambient */
+	int group_count;         /* supplementary; those beyond are not known   */
+	uint32_t groups[STATUS_GROUPS];
+	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
 	bool shadow_stack; /* x86: CET                                        */
 };
@@ -190,6 +220,7 @@ bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
+int proc_oom_score_adj(pid_t pid);
 
 /* ---- proc_text.c -------------------------------------------------------------------- */
 
@@ -197,6 +228,7 @@ void proc_set_oom_score_adj(pid_t pid, const char *value);
 int proc_parse_stat(const char *text, struct proc_stat *stat);
 int proc_parse_statm(const char *text, long *pages, long *anonymous);
 int proc_parse_status(const char *text, struct proc_status *status);
+int proc_parse_sched(const char *text, struct proc_sched *sched);
 int proc_parse_limits(const char *text, uint64_t limit[LIMITS][2]);
 int proc_parse_children(const char *text, pid_t *children, int max);
 int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *mapping, void *arg),

@@ -82,7 +82,7 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size)
 
 char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
 {
-	int fd = proc_open(pid, name, O_RDONLY);
+	int fd = proc_open(pid, name, O_RDONLY), saved;
 	size_t room = first_bytes, used = 0;
 	char *text = first;
 	ssize_t n = -1;
@@ -93,6 +93,11 @@ char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
 		used += (size_t)n;
 		if (used < room - 1)
 			continue;
+		if (used > PROC_TEXT_MAX) {
+			errno = EFBIG;
+			n = -1;
+			break;
+		}
 		more = realloc(text == first ? NULL : text, 4 * room);
 		if (!more) {
 			n = -1;
@@ -103,6 +108,7 @@ char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
 		text = more;
 		room *= 4;
 	}
+	saved = errno;
 	close_fd(&fd);
 	if (n == 0) {
 		text[used] = 0;
@@ -110,6 +116,7 @@ char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
 	}
 	if (text != first)
 		free(text);
+	errno = saved;
 	return NULL;
 }
 
@@ -341,6 +348,13 @@ int proc_pidfd_open(pid_t pid)
 	return (int)syscall(SYS_pidfd_open, pid, 0);
 }
 
+int proc_sched(pid_t tid, struct proc_sched *sched)
+{
+	char buf[4096];
+
+	return proc_read(tid, "sched", buf, sizeof buf) <= 0 ? -1 : proc_parse_sched(buf, sched);
+}
+
 /* A task gets the flag before it closes anything (kernel/exit.c, do_exit()). */
 bool proc_is_exiting(pid_t tid)
 {
@@ -359,6 +373,13 @@ bool pidfd_ended(int pidfd)
 int proc_borrow_fd(int pidfd, int fd)
 {
 	return (int)syscall(SYS_pidfd_getfd, pidfd, fd, 0);
+}
+
+int proc_oom_score_adj(pid_t pid)
+{
+	char text[16];
+
+	return proc_read(pid, "oom_score_adj", text, sizeof text) > 0 ? atoi(text) : 0;
 }
 
 void proc_set_oom_score_adj(pid_t pid, const char *value)

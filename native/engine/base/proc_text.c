@@ -54,6 +54,25 @@ int proc_parse_statm(const char *text, long *pages, long *anonymous)
 	return 0;
 }
 
+int proc_parse_sched(const char *text, struct proc_sched *sched)
+{
+	/* In front is the name, as it is, line feeds included: too short for both this and a key. */
+	const char *rest = strstr(text, "\n------"), *ran, *switches, *migrations;
+	unsigned long long ms, ns;
+
+	if (!rest)
+		return not_understood();
+	ran = strstr(rest, "\nse.exec_start");
+	switches = strstr(rest, "\nnr_switches");
+	migrations = strstr(rest, "\nse.nr_migrations");
+	if (!ran || !switches || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
+	    sscanf(switches, " %*s : %lu", &sched->switches) != 1 ||
+	    sscanf(migrations, " %*s : %lu", &sched->migrations) != 1)
+		return not_understood();
+	sched->ran_ns = ms * NS_PER_MS + ns;
+	return 0;
+}
+
 int proc_parse_children(const char *text, pid_t *children, int max)
 {
 	int count = 0;
@@ -126,6 +145,7 @@ int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *
 	int result = 0;
 
 	while (!result && getline(&line, &size, text) > 0) {
+		heartbeat();
 		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
 			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
 				  MAPPING_KEYS;
@@ -176,6 +196,20 @@ static bool parse_ids(const char *p, uint32_t id[4])
 	return sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]) == 4;
 }
 
+static void parse_groups(const char *p, struct proc_status *status)
+{
+	char *next;
+
+	while (status->group_count < STATUS_GROUPS) {
+		const unsigned long group = strtoul(p, &next, 10);
+
+		if (next == p)
+			return;
+		status->groups[status->group_count++] = (uint32_t)group;
+		p = next;
+	}
+}
+
 /* Which of the above the line is. */
 static uint32_t parse_status_line(const char *line, size_t length, struct proc_status *status)
 {
@@ -213,6 +247,8 @@ static uint32_t parse_status_line(const char *line, size_t length, struct proc_s
 		}
 	if (!strncmp(line, "VmLck:", 6))
 		status->locked_kb = strtoll(value, NULL, 10);
+	else if (!strncmp(line, "Groups:", 7) && !status->group_count)
+		parse_groups(value, status);
 	else if (!strncmp(line, "Umask:", 6))
 		status->umask = (uint32_t)strtoul(value, NULL, 8);
 	else if (!strncmp(line, "NoNewPrivs:", 11))

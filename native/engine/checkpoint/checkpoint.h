@@ -14,29 +14,75 @@
 
 #include "process.h"
 
+/* A fork of a template, for the next restore (spare.c). */
+struct spare {
+	pid_t pid; /* 0: none                                           */
+	int pidfd;
+	bool tried;    /* it was begun to make one                               */
+	bool unwanted; /* it was one process too many for a restore              */
+	/* What the template has been told to do for it and has not done yet. */
+	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
+	struct scheduling scheduling; /* the template's own                        */
+	bool aside;                   /* it has another policy for as long         */
+};
+
+/* What is saved of an app at one instant. */
+struct generation {
+	uint64_t number; /* 0: not whole yet                                  */
+	/* Of each process: the main one's first, parents before their children. */
+	struct image *image;
+	uint32_t images;
+	uint64_t taken_ns;
+	uint64_t clone_ns; /* what the clones of it took                      */
+	bool quiescent;
+	/* Taken from a process that had been restored lately: of the same lineage
+	 * as what that one was restored from, and as suspect. */
+	uint32_t lineage;
+	uint32_t crashes;          /* of its lineage, soon after a restore             */
+	uint32_t lost;             /* restores from it that came to nothing            */
+	bool seen;                 /* held when the app was healthy; again so: vouched */
+	bool vouched;              /* the app was healthy well after it was taken      */
+	char written[FILES_NAME];  /* avckpt.files=strict: what was written since; "": none */
+	struct spare spare;        /* of the main process                              */
+	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                   */
+};
+
 /* ---- freeze.c ------------------------------------------------------------------ */
 
-struct freeze_times {
+/* One checkpoint. */
+struct freeze {
+	struct tree *tree;
+	struct generation *generation; /* which has an image of the main process          */
+	timer_t timer;
+	uint64_t deadline_ns;
+	struct mem_seen seen; /* the shared memory that is prepared for already   */
+	/* What it took. */
 	uint64_t freeze_ns, stop_ns, clone_ns;
 };
 
-/* Takes one checkpoint into *generation (slot and number given by the caller); `seen`: the
- * shared memory that is prepared for already.
- * On return the app runs, whatever happened. */
-int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
-		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
-		struct avc_error *err) warn_unused;
+/* On return the app runs, whatever happened. */
+int freeze_tree(struct freeze *freeze, struct avc_error *err) warn_unused;
 
 /* ---- generation.c -------------------------------------------------------------- */
 
-/* After the app runs again: finishes the template and its slot. */
-int generation_finish(struct process *process, struct generation *generation,
-		      struct avc_error *err) warn_unused;
+/* With an image of the main process, and of no other one yet. */
+int generation_new(struct generation *generation, struct process *main, uint32_t slot,
+		   struct avc_error *err) warn_unused;
+/* Room for so many images. */
+int generation_make_room(struct generation *generation, uint32_t images,
+			 struct avc_error *err) warn_unused;
+/* After the app runs again: finishes templates and slots. */
+int generation_finish(struct generation *generation, struct avc_error *err) warn_unused;
 void generation_drop(struct generation *generation);
+/* That of this process; NULL: there is none. */
+struct image *generation_image(const struct generation *generation, const struct process *process);
 /* Of all its processes. */
 uint32_t generation_threads(const struct generation *generation);
+/* What could not be read, or can not be put back; the first of it. */
+const struct avc_error *generation_notice(const struct generation *generation);
+int generation_files_error(const struct generation *generation, struct avc_error *err) warn_unused;
 /* Closes what the template of a process that has ended still has open. */
-void generation_close_files(struct process *process, struct generation *image);
+void generation_close_files(const struct image *image);
 /* The same of all processes but the main one, once they are restored and have tables of
  * their own: before they go on, for what they close is to be closed. */
 void generation_close_tables(const struct generation *generation);
@@ -45,15 +91,12 @@ void generation_close_tables(const struct generation *generation);
 
 /* Makes one for a generation that is whole, if the kernel lets it, and if it comes to that
  * before the deadline.  -1: nothing can be restored from the generation any more. */
-int spare_make(struct process *process, struct generation *generation,
-	       struct avc_error *err) warn_unused;
+int spare_make(struct generation *generation, struct avc_error *err) warn_unused;
 /* While the app is dead: at the template's own priority, and until it is there or refused. */
-int spare_make_now(struct process *process, struct generation *generation,
-		   struct avc_error *err) warn_unused;
+int spare_make_now(struct generation *generation, struct avc_error *err) warn_unused;
 /* Before the template is used for anything else: waits until it has done what it had not at
  * the deadline of spare_make().  -1: it has not, AVC_DEADLINE, or as above. */
-int spare_await(struct process *process, struct generation *generation,
-		struct avc_error *err) warn_unused;
+int spare_await(struct generation *generation, struct avc_error *err) warn_unused;
 bool spare_is_there(struct generation *generation);
 /* There may be one that only the kernel knows of (init_channel_kill_lost). */
 bool spare_is_unknown(const struct generation *generation);
@@ -81,6 +124,7 @@ struct pages {
 struct snapshot {
 	pid_t template;
 	int pagemap;
+	uint64_t read_bytes; /* of the mappings whose pages are known           */
 	struct mappings maps;
 	struct pages *pages; /* by mapping, of those that were asked for              */
 };
@@ -118,8 +162,8 @@ void remap_free(struct remap *plan);
  * spend on it, about. */
 int restore_plan_begin(struct generation *generation, uint64_t ahead_ns,
 		       struct avc_error *err) warn_unused;
-/* Who is to fork a branch's process: another branch, or PARENT_MAIN. */
-int restore_plan_host(const struct generation *generation, uint32_t index);
+/* Whose process is to fork that of an image, not the main one's: the place of its image. */
+uint32_t restore_plan_host(const struct generation *generation, uint32_t index);
 /* How it is made of that fork; NULL on error. */
 const struct remap *restore_plan_of(struct generation *generation, uint32_t index,
 				    struct avc_error *err);

@@ -48,133 +48,123 @@ static pid_t group_inside(const struct tree *tree, pid_t group)
 
 /* Now, while all stand still: right after, it may be in another group, or who leads its
  * group may be gone, and nobody know what number that one had inside. */
-static void keep_place(const struct tree *tree, const struct proc_stat *stat,
-		       struct generation *image)
+static void keep_place(const struct tree *tree, const struct tree_entry *entry, struct image *image)
 {
+	const struct proc_stat *stat = &entry->stat;
+
+	image->pid = entry->pid;
+	image->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
 	image->stat = *stat;
+	image->session = number_inside(tree, stat->session);
+	/* The main process's may have been made by who starts the container. */
+	image->group = entry == tree->entry ? group_inside(tree, stat->group)
+					    : number_inside(tree, stat->group);
 	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
+	image->exit_signal = stat->exit_signal;
 }
 
-static int keep_place_of_main(const struct tree *tree, struct generation *generation,
-			      struct avc_error *err)
+/* Those that were found are the images, in the same order. */
+static int make_images(const struct tree *tree, struct generation *generation,
+		       struct avc_error *err)
 {
-	struct proc_stat stat;
-
-	if (proc_stat_of(tree->main->stat_fd, &stat))
-		return fail_errno(err, tree->main->pid, "freeze", "read(stat)", "it has ended");
-	keep_place(tree, &stat, generation);
-	generation->group = group_inside(tree, stat.group);
-	return 0;
-}
-
-/* The entries that were there are the branches, in the same order. */
-static int make_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
-{
+	const uint32_t slot = generation->image[0].slot;
 	int index[PROCESSES_MAX];
 
-	index[0] = PARENT_MAIN;
-	generation->branch = calloc(tree->count, sizeof *generation->branch);
-	if (!generation->branch)
-		return fail_errno(err, 0, "freeze", "calloc", "out of memory");
+	if (proc_stat_of(tree_main(tree)->stat_fd, &tree->entry[0].stat))
+		return fail_errno(err, tree_main(tree)->pid, "freeze", "read(stat)",
+				  "it has ended");
+	if (generation_make_room(generation, tree->count, err))
+		return -1;
+	keep_place(tree, &tree->entry[0], &generation->image[0]);
+	index[0] = 0;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		const struct tree_entry *entry = &tree->entry[i];
-		struct branch *branch = &generation->branch[generation->branches];
+		struct image *image = &generation->image[generation->images];
 
-		index[i] = (int)generation->branches;
+		index[i] = (int)generation->images;
 		if (!entry->pid)
 			continue;
-		branch->parent = entry->parent == PARENT_INIT ? PARENT_INIT : index[entry->parent];
-		branch->pid = entry->pid;
-		branch->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
-		branch->process = entry->process;
-		branch->session = number_inside(tree, entry->stat.session);
-		branch->group = number_inside(tree, entry->stat.group);
-		branch->exit_signal = entry->stat.exit_signal;
+		*image = (struct image){
+			.process = entry->process,
+			.parent = entry->parent == PARENT_INIT ? PARENT_INIT : index[entry->parent],
+			.pidfd = -1,
+			.slot = slot,
+		};
+		keep_place(tree, entry, image);
 		if (entry->ended) {
-			if (branch->parent == PARENT_INIT || branch->inside <= 0)
+			if (image->parent == PARENT_INIT || image->inside <= 0)
 				continue; /* init is just about to wait for it */
-			branch->status = entry->stat.exit_status;
-			memcpy(branch->name, entry->stat.name, sizeof branch->name);
+			image->status = entry->stat.exit_status;
+			memcpy(image->name, entry->stat.name, sizeof image->name);
 		} else {
-			branch->image = calloc(1, sizeof *branch->image);
-			if (!branch->image)
-				return fail_errno(err, 0, "freeze", "calloc", "out of memory");
-			branch->image->pidfd = -1;
-			branch->image->slot = generation->slot;
-			keep_place(tree, &entry->stat, branch->image);
 			entry->process->images++;
 		}
-		generation->branches++;
+		generation->images++;
 	}
 	return 0;
 }
 
-static int find_branches(struct tree *tree, struct generation *generation, struct avc_error *err)
+static int find_others(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
-	if (tree->count <= 1)
-		return 0;
 	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
 	for (uint32_t i = 1; i < tree->count; i++)
 		if (tree->entry[i].process && !tree->entry[i].process->infected &&
 		    tree_shares_memory(tree, i))
 			return fail(err, AVC_UNSUPPORTED, 0, tree->entry[i].pid, "check", "",
 				    "a child process has its parent's memory (CLONE_VM)");
-	if (make_branches(tree, generation, err))
+	if (make_images(tree, generation, err))
 		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process &&
-		    prepare_stopped(tree, generation->branch[i].process, err))
+	for (uint32_t i = 1; i < generation->images; i++)
+		if (generation->image[i].process &&
+		    prepare_stopped(tree, generation->image[i].process, err))
 			return -1;
 	return 0;
 }
 
 /* ---- what is read of them all ------------------------------------------------------------- */
 
-static int keep_branch(struct branch *branch, bool strict, struct mem_seen *seen,
-		       struct avc_error *err)
+/* What the main process needs for that was prepared before the freeze (guard_checkpoint.c). */
+static int keep(struct image *image, bool strict, struct mem_seen *seen, struct avc_error *err)
 {
-	struct process *process = branch->process;
+	struct process *process = image->process;
 
-	if (strict)
-		branch->image->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
-	if (memory_prepare(process, &branch->image->image, seen, err))
-		return -1;
-	branch->image->threads = process->blocks;
-	/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */
-	memory_copy_own(process, branch->image->image);
-	memory_copy_shared(process, branch->image->image);
-	files_mapped_copy(branch->image->mapped);
+	if (process->descendant) {
+		if (strict)
+			image->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
+		if (memory_prepare(process, &image->memory, seen, err))
+			return -1;
+		/* Has to wait for its clone; few have any (MADV_WIPEONFORK). */
+		memory_copy_own(process, image->memory);
+	}
+	image->threads = process->blocks;
+	memory_copy_shared(process, image->memory);
+	files_mapped_copy(image->mapped);
 	return 0;
 }
 
-static int keep_branches(struct generation *generation, struct mem_seen *seen,
-			 struct avc_error *err)
+static int keep_all(struct generation *generation, struct mem_seen *seen, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process &&
-		    keep_branch(&generation->branch[i], generation->mapped != NULL, seen, err))
+	const bool strict = generation->image[0].mapped != NULL;
+
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process && keep(&generation->image[i], strict, seen, err))
 			return -1;
 	return 0;
 }
 
 /* The tables do not change while the kernel clones: nobody runs. */
-static void capture_files(struct process *process, struct generation *generation)
+static void capture_files(struct generation *generation)
 {
 	struct scratch scratch = { -1, -1, 0 };
 
-	files_capture(process, generation, generation->branches > 0, NULL, 0, &scratch,
-		      &generation->files_error);
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
-		const struct branch *parent = branch->parent >= 0
-						      ? &generation->branch[branch->parent]
-						      : NULL;
+	for (uint32_t i = 0; i < generation->images; i++) {
+		struct image *image = &generation->image[i];
+		/* An orphan has most in common with the main process, if with anybody. */
+		const struct image *parent =
+			i ? &generation->image[image->parent < 0 ? 0 : image->parent] : NULL;
 
-		if (branch->process)
-			files_capture(branch->process, branch->image, true,
-				      parent ? parent->image->files : generation->files,
-				      parent ? parent->process->pid : process->pid, &scratch,
-				      &branch->image->files_error);
+		if (image->process)
+			files_capture(image, parent, generation->images > 1, &scratch);
 	}
 	scratch_close(&scratch);
 }
@@ -187,7 +177,7 @@ static int see_alive(const struct tree *tree, struct avc_error *err)
 		const struct process *process = tree->entry[i].process;
 		struct arch_regs ignored;
 
-		if (process && !process->asked && !(i == 0 && process->cloning) &&
+		if (process && !process->asked && !(!process->descendant && process->cloning) &&
 		    arch_regs_get(process->pid, &ignored))
 			return fail_errno(err, process->pid, "freeze", "ptrace(GETREGS)",
 					  "it has ended");
@@ -243,14 +233,16 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 
 /* Their main threads make the holders, and have to be at rest for that, as well as those of
  * the processes above them. */
-static int clone_missing(struct tree *tree, struct generation *generation, struct avc_error *err)
+static int clone_missing(struct freeze *freeze, struct avc_error *err)
 {
-	struct thread *main_thread = thread_find(tree->main, tree->main->pid);
+	struct tree *tree = freeze->tree;
+	struct process *main = tree_main(tree);
 
-	/* First who waits in its parasite for us: how long the main process takes is not known yet. */
+	/* First who waits in its parasite for us: how long the main process takes is not known
+	 * yet. */
 	if (freeze_hear_all(tree, err) ||
-	    freeze_await_app_clone(tree->main, main_thread, generation, err) ||
-	    freeze_rest_app(main_thread, err) || make_holders_missing(tree, err))
+	    freeze_await_clone(main, &freeze->generation->image[0].template, err) ||
+	    freeze_rest_main(thread_find(main, main->pid), err) || make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
@@ -263,99 +255,114 @@ static int clone_missing(struct tree *tree, struct generation *generation, struc
 
 static int await_clones(struct generation *generation, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
+	for (uint32_t i = 0; i < generation->images; i++) {
+		struct image *image = &generation->image[i];
 
-		if (!branch->process)
+		if (!image->process)
 			continue;
-		if (freeze_await_clone(branch->process, &branch->image->template, err))
+		if (image->process->cloning &&
+		    freeze_await_clone(image->process, &image->template, err))
 			return -1;
-		branch->image->vm_pages = branch->process->clone_pages;
-		branch->image->taken_ns = generation->taken_ns;
+		image->vm_pages = image->process->clone_pages;
+		image->taken_ns = generation->taken_ns;
 	}
 	return 0;
 }
 
 /* ---- all of it ------------------------------------------------------------------------------ */
 
-int freeze_tree(struct tree *tree, timer_t timer, uint64_t deadline_ns,
-		struct generation *generation, struct mem_seen *seen, struct freeze_times *times,
-		struct avc_error *err)
+static int stop_and_begin(struct freeze *freeze, struct avc_error *err)
 {
-	struct process *process = tree->main;
+	const uint64_t start = now_ns();
+	const int result = freeze_stop_known(freeze->tree, err);
+
+	freeze->generation->taken_ns = now_ns();
+	freeze->stop_ns = freeze->generation->taken_ns - start;
+	return result || freeze_begin_known(freeze, err) || freeze_stop_others(freeze->tree, err)
+		       ? -1
+		       : 0;
+}
+
+static int read_and_clone(struct freeze *freeze, struct avc_error *err)
+{
+	struct generation *generation = freeze->generation;
+
+	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err) ||
+	    keep_all(generation, &freeze->seen, err))
+		return -1;
+	/* While main threads are in their parasites: see parasite_will(). */
+	capture_files(generation);
+	if (see_alive(freeze->tree, err))
+		return -1;
+	return has_all_holders(freeze->tree) ? 0 : clone_missing(freeze, err);
+}
+
+/* Also what was begun before something failed: *template is set as soon as the main process is
+ * cloned. */
+static int hear_and_await(struct freeze *freeze, int result, struct avc_error *err)
+{
+	struct process *main = tree_main(freeze->tree);
 	struct avc_error failed = { 0 };
-	struct thread *main_thread;
-	bool cloned;
+
+	if (main->cloning && freeze_await_clone(main, &freeze->generation->image[0].template,
+						result ? &failed : err))
+		result = -1;
+	if (freeze_hear_all(freeze->tree, result ? &failed : err))
+		result = -1;
+	if (!result)
+		result = await_clones(freeze->generation, err);
+	freeze_drop_clones(freeze->tree);
+	return result;
+}
+
+/* The main thread first: it would have to share the CPUs with everybody else. */
+static void let_go(struct freeze *freeze)
+{
+	struct process *main = tree_main(freeze->tree);
+	struct thread *main_thread = thread_find(main, main->pid);
+	struct avc_error ignored = { 0 };
+
+	if (main_thread) {
+		/* A frozen cgroup, at this very moment. */
+		tracee_deadline_set(freeze->timer, NS_PER_S);
+		if (freeze->generation->image[0].template && main_thread->borrowed)
+			(void)freeze_rest_main(main_thread,
+					       &ignored); /* or it is killed just now */
+		thread_let_go(main, main_thread);
+	}
+	for (uint32_t i = 0; i < freeze->tree->processes; i++)
+		process_let_go(freeze->tree->process[i]);
+}
+
+int freeze_tree(struct freeze *freeze, struct avc_error *err)
+{
+	struct generation *generation = freeze->generation;
 	uint64_t start;
 	int result;
 
-	*times = (struct freeze_times){ 0 };
-	generation->template = 0;
-	generation->pidfd = -1;
 	rt_priority_begin();
-	tracee_deadline_set(timer, deadline_ns);
+	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
 	start = now_ns();
-	result = freeze_stop_known(tree, err);
-	generation->taken_ns = now_ns();
-	times->stop_ns = generation->taken_ns - start;
-	if (!result)
-		result = freeze_begin_known(tree, generation, err) || freeze_stop_others(tree, err)
-				 ? -1
-				 : 0;
+	result = stop_and_begin(freeze, err);
 	/* The deadline is for getting things stopped; the clone of a big process takes its
 	 * time. */
-	tracee_deadline_set(timer, CLONE_NS);
-	if (!result) {
-		memory_copy_shared(process, generation->image);
-		files_mapped_copy(generation->mapped);
-		result = keep_place_of_main(tree, generation, err) ||
-					 find_branches(tree, generation, err) ||
-					 freeze_begin_others(tree, generation, err) ||
-					 keep_branches(generation, seen, err)
-				 ? -1
-				 : 0;
-	}
-	if (!result && !has_all_holders(tree))
-		result = clone_missing(tree, generation, err);
-	if (!result) {
-		capture_files(process, generation);
-		result = see_alive(tree, err);
-	}
-	/* Also what was begun before something failed. */
-	main_thread = thread_find(process, process->pid);
-	if (process->cloning &&
-	    freeze_await_app_clone(process, main_thread, generation, result ? &failed : err))
-		result = -1;
-	cloned = generation->template != 0;
-	if (freeze_hear_all(tree, result ? &failed : err))
-		result = -1;
+	tracee_deadline_set(freeze->timer, CLONE_NS);
 	if (!result)
-		result = await_clones(generation, err);
-	freeze_drop_clones(tree);
-	times->clone_ns = now_ns() - generation->taken_ns;
-	/* The image is whole.  The main thread first: it would have to share the CPUs with
-	 * everybody else. */
-	if (main_thread) {
-		tracee_deadline_set(timer, NS_PER_S); /* a frozen cgroup, at this very moment */
-		if (cloned && main_thread->borrowed)
-			(void)freeze_rest_app(main_thread, &failed); /* or it is killed just now */
-		thread_let_go(process, main_thread);
-	}
-	process_let_go(process);
-	for (uint32_t i = 0; i < tree->processes; i++)
-		process_let_go(tree->process[i]);
-	times->freeze_ns = now_ns() - start;
-	tracee_deadline_clear(timer);
+		result = read_and_clone(freeze, err);
+	result = hear_and_await(freeze, result, err);
+	freeze->clone_ns = now_ns() - generation->taken_ns;
+	let_go(freeze);
+	freeze->freeze_ns = now_ns() - start;
+	tracee_deadline_clear(freeze->timer);
 	rt_priority_end();
-	if (!cloned || result)
+	if (result)
 		return -1;
-	process->checkpoints++;
-	if (pending_deadly(process->pending))
-		return fail(err, AVC_GONE, 0, process->pid, "freeze", "",
-			    "it is just being ended by signal %d",
-			    pending_deadly(process->pending));
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process)
-			generation->branch[i].process->checkpoints++;
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process)
+			generation->image[i].process->checkpoints++;
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process &&
+		    pending_check(generation->image[i].process, err))
+			return -1;
 	return 0;
 }

@@ -23,22 +23,18 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err) warn_unused;
 /* ---- freeze_clone.c ----------------------------------------------------------------------- */
 
 /* As soon as everybody stands still who is known to be there: their clones begin, as far as
- * they do not take long, and they answer meanwhile what they are asked.  Whoever is found after that is stopped, too, and has
- * had nothing to do with the memory of the others.  (One that shares it is not protected:
- * find_branches().)  One that has no holder yet waits for the others. */
-int freeze_begin_known(struct tree *tree, struct generation *generation,
-		       struct avc_error *err) warn_unused;
+ * they do not take long, and they answer meanwhile what they are asked.  Whoever is found after
+ * that is stopped, too, and has had nothing to do with the memory of the others.  (One that shares
+ * it is not protected: find_others().)  One that has no holder yet waits for the others. */
+int freeze_begin_known(struct freeze *freeze, struct avc_error *err) warn_unused;
 /* Those that have been found since.  Without a holder they are only read and asked. */
-int freeze_begin_others(struct tree *tree, struct generation *generation,
-			struct avc_error *err) warn_unused;
-/* The clone of the main process, begun by now. */
-int freeze_await_app_clone(struct process *process, struct thread *main_thread,
-			   struct generation *generation, struct avc_error *err) warn_unused;
-/* After that its main thread has a few steps to go before it can be let go. */
-int freeze_rest_app(struct thread *main_thread, struct avc_error *err);
-/* The clone of another process: its holder shares the process' memory and descriptors. */
+int freeze_begin_others(struct freeze *freeze, struct avc_error *err) warn_unused;
+/* The main process is cloned by its own main thread, any other by its holder, which shares its
+ * memory and descriptors: nobody finds children that he has not made. */
 int freeze_start_clone(struct process *process, struct avc_error *err) warn_unused;
 int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err) warn_unused;
+/* The main thread that has cloned has a few steps to go before it can be let go. */
+int freeze_rest_main(struct thread *main_thread, struct avc_error *err);
 /* The answers of all others, also of those that were asked before one failed. */
 int freeze_hear_all(struct tree *tree, struct avc_error *err) warn_unused;
 /* Clones that nobody waits for any more: of a process that was killed meanwhile, and all of

@@ -39,6 +39,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 {
 	uint32_t next = 1;
 
+	dying_begin(process);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
 
@@ -62,7 +63,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in an old parasite");
 		t->block = t->tid == process->leader ? 0 : (int)next++;
-		if (thread_read(t, err))
+		if (thread_read(t, err) || dying_check(process, t, err))
 			return -1;
 		if (arch_frame_read_xstate(t->tid, parasite_frame(&process->parasite, slot,
 								  (uint32_t)t->block)))
@@ -72,6 +73,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 		    thread_ask(process, t, err))
 			return -1;
 	}
+	dying_end(process);
 	process->blocks = next;
 	return 0;
 }
@@ -94,8 +96,9 @@ static int hear_of_children(struct process *process, struct avc_error *err)
 		       : 0;
 }
 
-/* Parasites of guards that died, and of the process that forked this one. */
-static void drop_old_pads(struct process *process, long *vm_pages, struct inj_call *call)
+/* Those of guards that died, and of the process that forked this one.  Its clone is smaller by
+ * what they take. */
+static void drop_old_parasites(struct process *process, struct inj_call *call)
 {
 	if (!process->checkpoints)
 		return;
@@ -105,41 +108,36 @@ static void drop_old_pads(struct process *process, long *vm_pages, struct inj_ca
 		const size_t bytes = process->old_parasite[process->old_parasites - 1].bytes;
 
 		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
-		*vm_pages -= (long)(bytes / ARCH_PAGE_BYTES);
+		process->clone_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 	}
 }
 
-/* ---- the main process ------------------------------------------------------------------- */
+/* ---- clones ----------------------------------------------------------------------------- */
 
-static int start_app_clone(struct process *process, struct thread *main_thread, long *vm_pages,
-			   struct avc_error *err)
+static int start_own_clone(struct process *process, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
 
-	*vm_pages = proc_vm_pages(process->statm_fd, NULL);
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(process, call);
 	memory_dofork(process->memory, call);
-	drop_old_pads(process, vm_pages, call);
+	drop_old_parasites(process, call);
 	process->children = ask_for_children(call);
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
 	process->asked_ns = now_ns();
-	if (thread_borrow(process, main_thread, err) || parasite_start(main_thread->tid, err))
-		return -1;
-	process->cloning = true;
-	return 0;
+	return thread_borrow(process, thread, err) || parasite_start(thread->tid, err) ? -1 : 0;
 }
 
-int freeze_await_app_clone(struct process *process, struct thread *main_thread,
-			   struct generation *generation, struct avc_error *err)
+static int await_own_clone(struct process *process, pid_t *template, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
 
-	process->cloning = false;
-	if (parasite_await_clone(main_thread->tid, call, &generation->template, err)) {
+	if (parasite_await_clone(thread->tid, call, template, err)) {
 		process->lost |= err->code != AVC_LIMIT;
-		thread_runs_on(main_thread, err);
+		thread_runs_on(thread, err);
 		return -1;
 	}
 	/* After the timers were asked: one that has expired just now is found here. */
@@ -149,7 +147,7 @@ int freeze_await_app_clone(struct process *process, struct thread *main_thread,
 	return hear_of_children(process, err);
 }
 
-int freeze_rest_app(struct thread *main_thread, struct avc_error *err)
+int freeze_rest_main(struct thread *main_thread, struct avc_error *err)
 {
 	if (tracee_settle(main_thread->tid, err) == 0 && thread_give_back(main_thread, err) == 0)
 		return 0;
@@ -157,48 +155,27 @@ int freeze_rest_app(struct thread *main_thread, struct avc_error *err)
 	return -1;
 }
 
-static int begin_app(struct process *process, struct generation *generation, struct avc_error *err)
-{
-	struct thread *thread = thread_find(process, process->pid);
-
-	if (!thread || !thread->stopped)
-		return fail(err, AVC_DEADLINE, 0, process->pid, "freeze", "",
-			    "its main thread has just ended");
-	process->begun = true;
-	if (read_all(process, generation->slot, err))
-		return -1;
-	generation->threads = process->blocks;
-	memory_copy_own(process, generation->image);
-	return start_app_clone(process, thread, &generation->vm_pages, err);
-}
-
-/* ---- the others ------------------------------------------------------------------------- */
-
-int freeze_start_clone(struct process *process, struct avc_error *err)
+static int start_holders_clone(struct process *process, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->holder;
 
-	/* Before the holder runs, which maps something for a moment. */
-	process->clone_pages = proc_vm_pages(process->statm_fd, NULL);
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
 	memory_dofork(process->memory, call);
-	drop_old_pads(process, &process->clone_pages, call);
+	drop_old_parasites(process, call);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
 	if (parasite_send(&process->parasite, process->holder, &process->holder_base, call, err) ||
 	    parasite_start(process->holder, err))
 		return -1;
-	process->cloning = true;
 	process->lost = true; /* until we have heard of the clone */
 	return 0;
 }
 
-int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err)
+static int await_holders_clone(struct process *process, pid_t *template, struct avc_error *err)
 {
 	const struct inj_call *call = &process->parasite.control->holder;
 	struct thread *thread = thread_find(process, process->pid);
 
-	process->cloning = false;
 	if (parasite_await_clone(process->holder, call, template, err))
 		return -1;
 	process->lost = false;
@@ -206,6 +183,25 @@ int freeze_await_clone(struct process *process, pid_t *template, struct avc_erro
 		thread->creds.future_lock = (int32_t)call->call[0].result;
 	return 0;
 }
+
+int freeze_start_clone(struct process *process, struct avc_error *err)
+{
+	/* Before a holder runs, which maps something for a moment. */
+	process->clone_pages = proc_vm_pages(process->statm_fd, NULL);
+	if (process->descendant ? start_holders_clone(process, err) : start_own_clone(process, err))
+		return -1;
+	process->cloning = true;
+	return 0;
+}
+
+int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err)
+{
+	process->cloning = false;
+	return process->descendant ? await_holders_clone(process, template, err)
+				   : await_own_clone(process, template, err);
+}
+
+/* ---- questions --------------------------------------------------------------------------- */
 
 /* Timers only the process itself can tell of.  And young processes change what they are
  * all the time: a name, a user.  All are asked at the same time. */
@@ -281,16 +277,21 @@ int freeze_hear_all(struct tree *tree, struct avc_error *err)
 }
 
 /* It stands still: its clone begins, if it has a holder for that, and it answers meanwhile what
- * it is asked, which changes nothing of its memory. */
+ * it is asked, which changes nothing of its memory.  The main process is asked by the calls that
+ * clone it. */
 static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, struct avc_error *err)
 {
 	struct thread *thread = thread_find(process, process->pid);
 
 	if (!thread || !thread->stopped)
-		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "freeze", "",
-			    "its main thread has ended");
-	process->begun = true;
-	return read_all(process, slot, err) || thread_vet(process, thread, err) ||
+		return fail(err, process->descendant ? AVC_UNSUPPORTED : AVC_DEADLINE, 0,
+			    process->pid, "freeze", "", "its main thread has ended");
+	process->stage = FREEZE_BEGUN;
+	if (read_all(process, slot, err))
+		return -1;
+	if (!process->descendant)
+		return freeze_start_clone(process, err);
+	return thread_vet(process, thread, err) ||
 			       (process->holder && freeze_start_clone(process, err)) ||
 			       ask_begin(process, takes_ns, err)
 		       ? -1
@@ -328,38 +329,47 @@ static uint64_t clones_time_ns(const struct tree *tree)
 	return takes_ns;
 }
 
-int freeze_begin_known(struct tree *tree, struct generation *generation, struct avc_error *err)
+/* One that can be cloned at once, and of which it is known what that takes. */
+static bool is_ready(const struct process *process)
 {
+	return process->stage == FREEZE_STOPPED && !has_strangers(process) &&
+	       (!process->descendant ||
+		(process->holder && process->anon_pages && process->pid == process->leader));
+}
+
+int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
+{
+	const struct tree *tree = freeze->tree;
+	const struct image *main = &freeze->generation->image[0];
 	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
 	uint64_t takes_ns = 0;
 
-	if (!has_strangers(tree->main) && begin_app(tree->main, generation, err))
-		return -1;
-	for (uint32_t i = 1; i < tree->count; i++) {
+	/* Not while it is being cloned. */
+	memory_copy_own(main->process, main->memory);
+	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
 
-		if (!process || !process->frozen || !process->holder || !process->anon_pages ||
-		    process->pid != process->leader || has_strangers(process))
+		if (!process || !is_ready(process))
 			continue;
-		takes_ns += clone_time_ns(process->anon_pages);
+		takes_ns += process->descendant ? clone_time_ns(process->anon_pages) : 0;
 		if (takes_ns > CLONES_AHEAD_NS)
 			break;
-		if (begin(process, generation->slot, all_ns, err))
+		if (begin(process, main->slot, all_ns, err))
 			return -1;
 	}
 	return 0;
 }
 
-int freeze_begin_others(struct tree *tree, struct generation *generation, struct avc_error *err)
+int freeze_begin_others(struct freeze *freeze, struct avc_error *err)
 {
-	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
+	const struct generation *generation = freeze->generation;
+	const uint64_t all_ns = generation->images > 1 ? clones_time_ns(freeze->tree) : 0;
 
-	if (!tree->main->begun && begin_app(tree->main, generation, err))
-		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct process *process = generation->branch[i].process;
+	for (uint32_t i = 0; i < generation->images; i++) {
+		struct process *process = generation->image[i].process;
 
-		if (process && !process->begun && begin(process, generation->slot, all_ns, err))
+		if (process && process->stage < FREEZE_BEGUN &&
+		    begin(process, generation->image[i].slot, all_ns, err))
 			return -1;
 	}
 	return 0;

@@ -14,23 +14,21 @@
 
 int freeze_stop_known(struct tree *tree, struct avc_error *err)
 {
-	process_stop_begin(tree->main);
 	for (uint32_t i = 0; i < tree->processes; i++)
 		process_stop_begin(tree->process[i]);
 	/* So that they stop at the same time, and not one after the other. */
 	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->entry[i].process && tree->entry[i].process->infected)
 			process_interrupt(tree->entry[i].process);
-	if (process_stop_all(tree->main, err))
-		return -1;
-	for (uint32_t i = 1; i < tree->count; i++) {
+	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
 		struct avc_error failed = { 0 };
 
 		if (!process || !process->infected)
 			continue;
-		process->frozen = process_stop_all(process, &failed) == 0;
-		if (!process->frozen && failed.code != AVC_GONE) {
+		if (process_stop_all(process, &failed) == 0) {
+			process->stage = FREEZE_STOPPED;
+		} else if (!process->descendant || failed.code != AVC_GONE) {
 			*err = failed;
 			return -1;
 		}
@@ -42,7 +40,7 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 {
 	/* It had no other one at the last checkpoint; whether that is still so, the clone
 	 * will tell. */
-	if (tree->count <= 1 && tree->main->childless)
+	if (tree->count <= 1 && tree_main(tree)->childless)
 		return 0;
 	for (int looks = 0; looks < LOOKS; looks++) {
 		bool all = true;
@@ -57,11 +55,11 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 				all = false;
 				usleep(LOOK_US);
 			}
-			if (!t || t->frozen)
+			if (!t || t->stage >= FREEZE_STOPPED)
 				continue;
 			all = false;
 			if (process_stop_all(t, &failed) == 0) {
-				t->frozen = true;
+				t->stage = FREEZE_STOPPED;
 			} else if (failed.code != AVC_GONE) {
 				*err = failed;
 				return -1;
@@ -72,6 +70,6 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 		if (all)
 			return 0;
 	}
-	return fail(err, AVC_RETRY, 0, tree->main->pid, "freeze", "",
+	return fail(err, AVC_RETRY, 0, tree_main(tree)->pid, "freeze", "",
 		    "its processes come and go too fast");
 }

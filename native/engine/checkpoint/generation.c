@@ -22,6 +22,31 @@
 #define TEMPLATE_ATTRIBUTES 64
 #define RSEQ_FLAG_UNREGISTER_ 1 /* linux/rseq.h */
 
+int generation_make_room(struct generation *generation, uint32_t images, struct avc_error *err)
+{
+	struct image *more = realloc(generation->image, images * sizeof *more);
+
+	if (!more)
+		return fail_errno(err, 0, "freeze", "realloc", "out of memory");
+	generation->image = more;
+	return 0;
+}
+
+int generation_new(struct generation *generation, struct process *main, uint32_t slot,
+		   struct avc_error *err)
+{
+	*generation = (struct generation){ 0 };
+	if (generation_make_room(generation, 1, err))
+		return -1;
+	generation->image[generation->images++] = (struct image){
+		.process = main,
+		.parent = PARENT_INIT,
+		.pidfd = -1,
+		.slot = slot,
+	};
+	return 0;
+}
+
 /* A fork of the main thread has what that had at that instant, but for what fork(2) resets. */
 static int hear_template(struct process *process, struct thread *cloned,
 			 const struct inj_call *call, const struct inj_syscall *attributes,
@@ -39,27 +64,24 @@ static int hear_template(struct process *process, struct thread *cloned,
 	return thread_ask_others(process, cloned, &was, err);
 }
 
-static int quieten(struct process *process, struct generation *generation,
-		   const struct branch *branch, struct avc_error *err)
+static int quieten(struct image *image, struct avc_error *err)
 {
-	struct thread *cloned = branch ? NULL : thread_find(process, process->pid);
-	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
+	struct process *process = image->process;
+	struct thread *cloned = process->descendant ? NULL : thread_find(process, process->pid);
+	struct inj_slot *slot = parasite_slot(&process->parasite, image->slot);
 	struct inj_call *call = &slot->template_call;
 	const struct inj_syscall *rseq = NULL, *dumpable, *attributes = NULL;
-	const pid_t pid = generation->template;
+	const pid_t pid = image->template;
 
 	if (tracee_await(pid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, pid, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACEFORK | PTRACE_O_TRACESYSGOOD |
-			  PTRACE_O_SUSPEND_SECCOMP)) ||
-	    arch_regs_get(pid, &generation->base))
+	if (parasite_own(&process->parasite, pid) || arch_regs_get(pid, &image->base))
 		return fail_errno(err, pid, "keep template", "ptrace(SETOPTIONS)", "it was killed");
 	memset(call->out, 0, sizeof call->out);
 	memcpy(call->out, "avckpt-tmpl", 12);
 	call_begin(call, INJ_AFTER_PARK);
 	/* Out of the app's session or process group, or the number stays taken. */
-	if (branch || generation->stat.session == process->leader)
+	if (process->descendant || image->stat.session == process->leader)
 		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
 	else
 		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
@@ -81,26 +103,26 @@ static int quieten(struct process *process, struct generation *generation,
 	if (cloned && cloned->rseq)
 		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
 				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
-	if (parasite_send(&process->parasite, pid, &generation->base, call, err) ||
+	if (parasite_send(&process->parasite, pid, &image->base, call, err) ||
 	    parasite_run(pid, call, err))
 		return -1;
 	if (rseq && rseq->result)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
-	generation->dumpable = dumpable->result;
-	proc_set_oom_score_adj(pid, "1000");
+	image->dumpable = dumpable->result;
 	return attributes ? hear_template(process, cloned, call, attributes, err) : 0;
 }
 
 /* A main thread that has ended while others go on: it is there again until they are,
  * and ends again. */
-static void fill_ended(struct process *process, struct generation *generation)
+static void fill_ended(const struct image *image)
 {
-	struct inj_thread *block = parasite_thread(&process->parasite, generation->slot, 0);
+	const struct process *process = image->process;
+	struct inj_thread *block = parasite_thread(&process->parasite, image->slot, 0);
 
 	*block = (struct inj_thread){
 		.stack = parasite_remote(&process->parasite,
-					 parasite_stack(&process->parasite, generation->slot, 0)) -
+					 parasite_stack(&process->parasite, image->slot, 0)) -
 			 16,
 		.tid = process->inside,
 	};
@@ -109,29 +131,29 @@ static void fill_ended(struct process *process, struct generation *generation)
 }
 
 /* Fills the slot in from what freeze_tree() has read: one block per thread. */
-static int fill_slot(struct process *process, struct generation *generation,
-		     const struct branch *branch, struct avc_error *err)
+static int fill_slot(struct image *image, struct avc_error *err)
 {
+	struct process *process = image->process;
 	const struct parasite *parasite = &process->parasite;
-	struct inj_slot *slot = parasite_slot(parasite, generation->slot);
+	struct inj_slot *slot = parasite_slot(parasite, image->slot);
 	const struct thread *main_thread = thread_find(process, process->pid);
-	const struct proc_stat *stat = &generation->stat;
+	const struct proc_stat *stat = &image->stat;
 	struct proc_status status;
 	struct setup setup;
-	int mem_fd = proc_open(generation->template, "mem", O_RDONLY);
+	int mem_fd = proc_open(image->template, "mem", O_RDONLY);
 
 	if (mem_fd < 0)
-		return fail_errno(err, generation->template, "keep template", "open(mem)",
+		return fail_errno(err, image->template, "keep template", "open(mem)",
 				  "it was killed");
 	if (proc_status(process->pid, &status) &&
-	    (!branch || proc_status(generation->template, &status))) {
+	    (!process->descendant || proc_status(image->template, &status))) {
 		close(mem_fd);
 		return fail_errno(err, process->pid, "keep template", "open(status)",
 				  "it has ended");
 	}
-	generation->headless = process->pid != process->leader;
-	generation->stop_signal = main_thread->stop_signal;
-	setup_begin(&setup, parasite, generation->slot);
+	image->headless = process->pid != process->leader;
+	image->stop_signal = main_thread->stop_signal;
+	setup_begin(&setup, parasite, image->slot);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread t = process->threads[i];
 		const uint32_t b = (uint32_t)t.block;
@@ -140,8 +162,8 @@ static int fill_slot(struct process *process, struct generation *generation,
 
 		if (t.block < 0)
 			continue;
-		block = parasite_thread(parasite, generation->slot, b);
-		frame = parasite_frame(parasite, generation->slot, b);
+		block = parasite_thread(parasite, image->slot, b);
+		frame = parasite_frame(parasite, image->slot, b);
 
 		/* The borrowed thread's was seen to when it was borrowed; its own
 		 * memory has been run on since. */
@@ -153,7 +175,7 @@ static int fill_slot(struct process *process, struct generation *generation,
 			.frame = arch_frame_build(frame, parasite_remote(parasite, frame), &t.regs,
 						  t.sigmask, t.altstack),
 			.stack = parasite_remote(parasite,
-						 parasite_stack(parasite, generation->slot, b)) -
+						 parasite_stack(parasite, image->slot, b)) -
 				 16,
 			.tls = arch_tls(&t.regs),
 			.clear_tid = t.clear_tid,
@@ -171,7 +193,7 @@ static int fill_slot(struct process *process, struct generation *generation,
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		/* Of the one that was cloned, as it was then. */
 		memcpy(block->name,
-		       !branch && t.tid == process->pid
+		       !process->descendant && t.tid == process->pid
 			       ? (char *)slot->template_call.out + TEMPLATE_NAME
 			       : t.name,
 		       sizeof block->name);
@@ -184,133 +206,118 @@ static int fill_slot(struct process *process, struct generation *generation,
 		pending_setup_thread(process, &t, &setup);
 	}
 	close(mem_fd);
-	if (generation->headless)
-		fill_ended(process, generation);
-	generation->sandboxed = status.seccomp == 1 ||
-				status.seccomp_filters > process->plain_filters;
-	if (memory_finish(process, generation, status.locked_kb, &setup, err))
+	if (image->headless)
+		fill_ended(image);
+	image->sandboxed = status.seccomp == 1 || status.seccomp_filters > process->plain_filters;
+	if (status.seccomp == 1)
+		process->parasite.seccomp = SECCOMP_SUPERVISED;
+	if (memory_finish(image, status.locked_kb, &setup, err))
 		return -1;
 	pending_setup(process, &setup);
-	if (attributes_keep(process, generation, err))
+	if (attributes_keep(image, err))
 		return -1;
 	timers_setup(process, &setup);
-	if (branch)
-		process_attrs_setup_limits(branch, &setup);
+	if (process->descendant)
+		process_attrs_setup_limits(image, &setup);
 	/* A change of users takes it from the whole process, whichever thread it is. */
-	if (generation->dumpable == 0 || generation->dumpable == 1)
+	if (image->dumpable == 0 || image->dumpable == 1)
 		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
-			  (uint64_t)generation->dumpable, 0, 0, 0)
+			  (uint64_t)image->dumpable, 0, 0, 0)
 			->flags = INJ_MAY_FAIL;
 	if (setup.notice.code)
-		generation->notice = setup.notice;
-	slot->threads = generation->threads;
+		image->notice = setup.notice;
+	slot->threads = image->threads;
 	slot->pid = process->inside;
 	/* Nothing but the app's own group, or one whose leader is visible, can be
 	 * put back. */
-	slot->group = generation->group > 0 ? generation->group : process->inside;
+	slot->group = !process->descendant && image->group > 0 ? image->group : process->inside;
 	slot->session_leader = stat->session == process->leader;
 	slot->placed = process->descendant;
 	/* Of several processes: restore_tree.c. */
-	slot->tty_fd = !branch && stat->tty && stat->tty_group == stat->group
-			       ? files_find_device(generation->files, stat->tty)
+	slot->tty_fd = !process->descendant && stat->tty && stat->tty_group == stat->group
+			       ? files_find_device(image->files, stat->tty)
 			       : -1;
 	return setup_end(&setup, process->pid, err);
 }
 
-/* What has to be known before anything is filled in: what the others are made from. */
-static int begin_template(struct process *process, struct generation *generation,
-			  const struct branch *branch, struct avc_error *err)
+static int begin_template(struct image *image, struct avc_error *err)
 {
-	generation->pidfd = proc_pidfd_open(generation->template);
-	if (generation->pidfd < 0)
-		return fail_errno(err, generation->template, "keep template", "pidfd_open",
-				  "it was killed");
-	return quieten(process, generation, branch, err);
-}
-
-static int finish(struct process *process, struct generation *generation, struct branch *branch,
-		  struct avc_error *err)
-{
-	int statm_fd;
-	long pages;
-
-	statm_fd = proc_open(generation->template, "statm", O_RDONLY);
-	pages = proc_vm_pages(statm_fd, &generation->anon_pages);
-	process->anon_pages = generation->anon_pages;
-	close_fd(&statm_fd);
-	if (pages >= 0 && pages != generation->vm_pages)
-		return memory_learn(process, generation->vm_pages - pages, err);
-	if (branch && process_attrs_learn(branch, err))
+	/* The holder rests again. */
+	if (image->process->descendant && tracee_settle(image->process->holder, err))
 		return -1;
-	return fill_slot(process, generation, branch, err);
+	image->pidfd = proc_pidfd_open(image->template);
+	if (image->pidfd < 0)
+		return fail_errno(err, image->template, "keep template", "pidfd_open",
+				  "it was killed");
+	return quieten(image, err);
 }
 
 /* What only a process that makes another one its child has to know.  This one may have
  * ended meanwhile: a shell's children live for milliseconds. */
-static int finish_branch(struct branch *branch, struct avc_error *err)
+static int finish(struct image *image, struct avc_error *err)
 {
-	struct process *process = branch->process;
+	struct process *process = image->process;
+	int statm_fd;
+	long pages;
 
-	/* The holder rests again. */
-	return tracee_settle(process->holder, err) ||
-			       begin_template(process, branch->image, branch, err) ||
-			       finish(process, branch->image, branch, err)
-		       ? -1
-		       : 0;
+	statm_fd = proc_open(image->template, "statm", O_RDONLY);
+	pages = proc_vm_pages(statm_fd, &image->anon_pages);
+	process->anon_pages = image->anon_pages;
+	close_fd(&statm_fd);
+	if (pages >= 0 && pages != image->vm_pages)
+		return memory_learn(process, image->vm_pages - pages, err);
+	if (process->descendant && process_attrs_learn(image, err))
+		return -1;
+	return fill_slot(image, err);
 }
 
-int generation_finish(struct process *process, struct generation *generation, struct avc_error *err)
+int generation_finish(struct generation *generation, struct avc_error *err)
 {
-	const struct thread *main_thread = thread_find(process, process->pid);
+	struct process *main = generation->image[0].process;
+	const struct thread *main_thread = thread_find(main, main->pid);
 	struct avc_error again = { 0 };
 
-	if (generation->branches && !main_thread)
-		return fail(err, AVC_GONE, ESRCH, process->pid, "keep template", "",
-			    "it has ended");
-	if (begin_template(process, generation, NULL, err))
-		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
+	if (!main_thread)
+		return fail(err, AVC_GONE, ESRCH, main->pid, "keep template", "", "it has ended");
+	for (uint32_t i = 0; i < generation->images; i++) {
+		struct image *image = &generation->image[i];
 		struct avc_error failed = { 0 };
 
-		if (!branch->process)
+		if (!image->process)
 			continue;
-		branch->process->forebear = &main_thread->creds;
-		if (finish_branch(branch, &failed)) {
-			/* What was not as it was known is known now: of all of them. */
-			if (failed.code != AVC_RETRY) {
-				*err = failed;
-				return -1;
-			}
-			again = failed;
+		if (i)
+			image->process->forebear = &main_thread->creds;
+		if (begin_template(image, &failed) == 0 && finish(image, &failed) == 0)
 			continue;
+		/* What was not as it was known is known now: of all of them. */
+		if (failed.code != AVC_RETRY) {
+			*err = failed;
+			return -1;
 		}
-		if (branch->image->notice.code && !generation->notice.code)
-			generation->notice = branch->image->notice;
+		again = failed;
 	}
-	if (finish(process, generation, NULL, err))
-		return -1;
 	if (again.code)
 		*err = again;
-	if (again.code || restore_plan_check(generation, err))
+	if (again.code || memory_check_unkept(generation->image, generation->images, err) ||
+	    restore_plan_check(generation, err))
 		return -1;
+	memory_note_left(generation->image, generation->images, &generation->image[0].notice);
 	/* Not before its size was compared with the app's. */
-	files_unmap_areas(process, generation);
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process)
-			files_unmap_areas(generation->branch[i].process,
-					  generation->branch[i].image);
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process)
+			files_unmap_areas(&generation->image[i]);
 	return 0;
 }
 
-void generation_close_files(struct process *process, struct generation *image)
+void generation_close_files(const struct image *image)
 {
-	struct inj_call *call = &parasite_slot(&process->parasite, image->slot)->template_call;
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 	struct avc_error ignored = { 0 };
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
-	if (parasite_send(&process->parasite, image->template, &image->base, call, &ignored) ||
+	if (parasite_send(parasite, image->template, &image->base, call, &ignored) ||
 	    parasite_run(image->template, call, &ignored))
 		return; /* it was killed, and has nothing open any more */
 }
@@ -329,61 +336,78 @@ static bool start_closing(struct process *process)
 
 void generation_close_tables(const struct generation *generation)
 {
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct process *process = generation->branch[i].process;
+	bool closing[PROCESSES_MAX] = { false };
 
-		if (process)
-			process->closing = process->holder && start_closing(process);
+	for (uint32_t i = 1; i < generation->images; i++) {
+		struct process *process = generation->image[i].process;
+
+		closing[i] = process && process->holder && start_closing(process);
 	}
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct process *process = generation->branch[i].process;
+	for (uint32_t i = 1; i < generation->images; i++) {
+		struct process *process = generation->image[i].process;
 		struct avc_error gone = { 0 };
 
-		if (process && process->closing &&
+		if (closing[i] &&
 		    parasite_finish(process->holder, &process->parasite.control->holder, &gone))
 			continue; /* it was killed, and has nothing open any more */
 	}
 }
 
-static void image_drop(struct generation *image)
+static void image_drop(struct image *image)
 {
-	spare_drop(image);
 	if (image->template)
 		tracee_end(image->template, image->pidfd);
 	else
 		close_fd(&image->pidfd);
-	if (spare_is_unknown(image))
-		tracee_end_now(); /* the kernel has made one by now, or makes none */
-	mem_image_free(image->image);
+	mem_image_free(image->memory);
 	free(image->attributes);
+	process_attrs_forget(image);
 	files_free(image->files);
 	files_mapped_free(image->mapped);
+	if (image->process && image->process->descendant)
+		image->process->images--;
 }
 
 void generation_drop(struct generation *generation)
 {
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		struct branch *branch = &generation->branch[i];
-
-		process_attrs_forget(branch);
-		if (!branch->image)
-			continue;
-		image_drop(branch->image);
-		free(branch->image);
-		if (branch->process)
-			branch->process->images--;
-	}
+	spare_drop(generation);
+	for (uint32_t i = 0; i < generation->images; i++)
+		image_drop(&generation->image[i]);
+	if (spare_is_unknown(generation))
+		tracee_end_now(); /* the kernel has made one by now, or makes none */
 	restore_plan_free(generation->plan);
-	free(generation->branch);
-	image_drop(generation);
-	*generation = (struct generation){ .pidfd = -1 };
+	free(generation->image);
+	*generation = (struct generation){ 0 };
+}
+
+struct image *generation_image(const struct generation *generation, const struct process *process)
+{
+	return image_find(generation->image, generation->images, process);
 }
 
 uint32_t generation_threads(const struct generation *generation)
 {
-	uint32_t threads = generation->threads;
+	uint32_t threads = 0;
 
-	for (uint32_t i = 0; i < generation->branches; i++)
-		threads += generation->branch[i].image ? generation->branch[i].image->threads : 0;
+	for (uint32_t i = 0; i < generation->images; i++)
+		threads += generation->image[i].threads;
 	return threads;
+}
+
+const struct avc_error *generation_notice(const struct generation *generation)
+{
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].notice.code)
+			return &generation->image[i].notice;
+	return &generation->image[0].notice;
+}
+
+int generation_files_error(const struct generation *generation, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].files_error.code) {
+			*err = generation->image[i].files_error;
+			return -1;
+		}
+	return 0;
 }

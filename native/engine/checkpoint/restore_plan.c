@@ -17,30 +17,31 @@
 /* About what it takes to compare a page. */
 #define PAGE_NS 60
 
+/* Of one image. */
 struct plan_entry {
-	int host;                  /* a branch, or PARENT_MAIN                        */
+	uint32_t host;             /* of whose process it is forked; of the main one unused */
 	struct snapshot *snapshot; /* NULL: nobody has asked yet                      */
 	struct remap *plan;        /* the same                                        */
 };
 
 struct restore_plan {
-	struct snapshot *main;
 	uint64_t left_ns; /* to be spent ahead                                        */
 	uint32_t next;    /* to be looked at ahead                                    */
 	uint32_t entries;
-	struct plan_entry entry[]; /* by branch                                              */
+	struct plan_entry entry[]; /* by image                                       */
 };
 
 /* Who forks it: its parent; an orphan's is gone, and somebody of its session does. */
-static int host_of(const struct generation *generation, const struct branch *branch)
+static uint32_t host_of(const struct generation *generation, uint32_t index)
 {
-	if (branch->parent != PARENT_INIT)
-		return branch->parent;
-	for (uint32_t i = 0; i < generation->branches && &generation->branch[i] != branch; i++)
-		if (generation->branch[i].process &&
-		    generation->branch[i].session == branch->session)
-			return (int)i;
-	return PARENT_MAIN;
+	const struct image *image = &generation->image[index];
+
+	if (image->parent != PARENT_INIT)
+		return (uint32_t)image->parent;
+	for (uint32_t i = 1; i < index; i++)
+		if (generation->image[i].process && generation->image[i].session == image->session)
+			return i;
+	return 0;
 }
 
 int restore_plan_begin(struct generation *generation, uint64_t ahead_ns, struct avc_error *err)
@@ -49,56 +50,48 @@ int restore_plan_begin(struct generation *generation, uint64_t ahead_ns, struct 
 
 	if (generation->plan)
 		return 0;
-	all = calloc(1, sizeof *all + generation->branches * sizeof *all->entry);
+	all = calloc(1, sizeof *all + generation->images * sizeof *all->entry);
 	if (!all)
 		return fail_errno(err, 0, "restore memory", "calloc", "out of memory");
 	all->left_ns = ahead_ns;
-	all->entries = generation->branches;
-	for (uint32_t i = 0; i < all->entries; i++)
-		all->entry[i].host = host_of(generation, &generation->branch[i]);
+	all->next = 1;
+	all->entries = generation->images;
+	for (uint32_t i = 1; i < all->entries; i++)
+		all->entry[i].host = host_of(generation, i);
 	generation->plan = all;
 	return 0;
 }
 
-int restore_plan_host(const struct generation *generation, uint32_t index)
+uint32_t restore_plan_host(const struct generation *generation, uint32_t index)
 {
 	return generation->plan->entry[index].host;
 }
 
-static const struct generation *image_of(const struct generation *generation, int branch)
+static struct snapshot *look_at(const struct image *image, struct avc_error *err)
 {
-	return branch < 0 ? generation : generation->branch[branch].image;
+	return snapshot_new(image->template, image->memory, err);
 }
 
-static struct snapshot *look_at(const struct generation *generation, int branch,
-				struct avc_error *err)
-{
-	const struct generation *image = image_of(generation, branch);
-
-	return snapshot_new(image->template, image->image, err);
-}
-
-static struct snapshot *snapshot_of(struct generation *generation, int branch,
+static struct snapshot *snapshot_of(struct generation *generation, uint32_t index,
 				    struct avc_error *err)
 {
-	struct restore_plan *all = generation->plan;
-	struct snapshot **snapshot = branch < 0 ? &all->main : &all->entry[branch].snapshot;
+	struct snapshot **snapshot = &generation->plan->entry[index].snapshot;
 
 	if (!*snapshot)
-		*snapshot = look_at(generation, branch, err);
+		*snapshot = look_at(&generation->image[index], err);
 	return *snapshot;
 }
 
 /* What nobody is to be compared with any more needs no room. */
-static void rest(const struct generation *generation, int branch)
+static void rest(const struct generation *generation, uint32_t index)
 {
 	struct restore_plan *all = generation->plan;
 
-	for (uint32_t i = 0; i < all->entries; i++)
-		if (generation->branch[i].process && !all->entry[i].plan &&
-		    (all->entry[i].host == branch || (int)i == branch))
+	for (uint32_t i = 1; i < all->entries; i++)
+		if (generation->image[i].process && !all->entry[i].plan &&
+		    (all->entry[i].host == index || i == index))
 			return;
-	snapshot_rest(branch < 0 ? all->main : all->entry[branch].snapshot);
+	snapshot_rest(all->entry[index].snapshot);
 }
 
 const struct remap *restore_plan_of(struct generation *generation, uint32_t index,
@@ -109,12 +102,12 @@ const struct remap *restore_plan_of(struct generation *generation, uint32_t inde
 
 	if (entry->plan)
 		return entry->plan;
-	want = snapshot_of(generation, (int)index, err);
+	want = snapshot_of(generation, index, err);
 	is = want ? snapshot_of(generation, entry->host, err) : NULL;
 	if (!is)
 		return NULL;
-	entry->plan = remap_plan(generation->branch[index].process, want, is, err);
-	rest(generation, (int)index);
+	entry->plan = remap_plan(generation->image[index].process, want, is, err);
+	rest(generation, index);
 	rest(generation, entry->host);
 	return entry->plan;
 }
@@ -123,19 +116,18 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 {
 	int result = 0;
 
-	for (uint32_t i = 0; !result && i < generation->branches; i++) {
-		const struct branch *branch = &generation->branch[i];
-		const int host = host_of(generation, branch);
+	for (uint32_t i = 1; !result && i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+		const struct image *host = &generation->image[host_of(generation, i)];
 		struct snapshot *want, *is;
 
 		/* Few have anything of the kind. */
-		if (!branch->process ||
-		    (!mem_image_has(branch->image->image, MAPPING_ONLY_HERE) &&
-		     !mem_image_has(image_of(generation, host)->image, MAPPING_SEALED)))
+		if (!image->process || (!mem_image_has(image->memory, MAPPING_ONLY_HERE) &&
+					!mem_image_has(host->memory, MAPPING_SEALED)))
 			continue;
-		want = look_at(generation, (int)i, err);
-		is = want ? look_at(generation, host, err) : NULL;
-		result = is ? remap_check(branch->process, want, is, err) : -1;
+		want = look_at(image, err);
+		is = want ? look_at(host, err) : NULL;
+		result = is ? remap_check(image->process, want, is, err) : -1;
 		snapshot_free(want);
 		snapshot_free(is);
 	}
@@ -150,8 +142,7 @@ bool restore_plan_next(struct generation *generation)
 		return false;
 	while (all->next < all->entries) {
 		const uint32_t i = all->next++;
-		const struct branch *branch = &generation->branch[i];
-		const uint64_t pages = branch->image ? (uint64_t)branch->image->anon_pages : 0;
+		const uint64_t pages = (uint64_t)generation->image[i].anon_pages;
 		struct avc_error later = { 0 }; /* the restore will say it */
 
 		if (pages < WORTH_PAGES || pages * PAGE_NS > all->left_ns)
@@ -160,7 +151,6 @@ bool restore_plan_next(struct generation *generation)
 		(void)restore_plan_of(generation, i, &later);
 		return true;
 	}
-	snapshot_rest(all->main);
 	for (uint32_t i = 0; i < all->entries; i++)
 		snapshot_rest(all->entry[i].snapshot);
 	return false;
@@ -172,7 +162,5 @@ void restore_plan_free(struct restore_plan *all)
 		remap_free(all->entry[i].plan);
 		snapshot_free(all->entry[i].snapshot);
 	}
-	if (all)
-		snapshot_free(all->main);
 	free(all);
 }

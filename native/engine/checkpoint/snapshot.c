@@ -13,7 +13,7 @@
 #include "checkpoint.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
-/* Runtimes reserve terabytes of which they use little: those are not read page by page. */
+/* Runtimes reserve terabytes of which they use little: beyond that, what is empty is not read. */
 #define SPARSE_BYTES (UINT64_C(4) << 30)
 static int add_mapping(const struct mapping *m, void *arg)
 {
@@ -120,7 +120,8 @@ const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mappi
 		return pages;
 	if (snapshot->pagemap < 0)
 		snapshot->pagemap = proc_open(snapshot->template, "pagemap", O_RDONLY);
-	if (m->end - m->start >= SPARSE_BYTES)
+	snapshot->read_bytes += m->end - m->start;
+	if (snapshot->read_bytes >= SPARSE_BYTES)
 		result = pagemap_walk(snapshot->pagemap, m->start, m->end, read_sparse, &sparse);
 	else
 		result = read_extent(snapshot, pages, m->start, m->end);

@@ -43,49 +43,56 @@ static int step_back(pid_t pid, const struct scheduling *was)
 	return (int)syscall(SYS_sched_setattr, pid, was->attr, 0);
 }
 
-static struct inj_call *call_of(const struct process *process, const struct generation *generation)
+static const struct parasite *parasite_of(const struct generation *generation)
 {
-	return &parasite_slot(&process->parasite, generation->slot)->template_call;
+	return &generation->image[0].process->parasite;
 }
 
-static int begin_fork(struct process *process, struct generation *generation, struct avc_error *err)
+static struct inj_call *call_of(const struct generation *generation)
 {
-	const struct parasite *parasite = &process->parasite;
-	struct inj_call *call = call_of(process, generation);
+	return &parasite_slot(parasite_of(generation), generation->image[0].slot)->template_call;
+}
+
+static int begin_fork(struct generation *generation, struct avc_error *err)
+{
+	const struct parasite *parasite = parasite_of(generation);
+	struct inj_call *call = call_of(generation);
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
-	if (parasite_send(parasite, generation->template, &generation->base, call, err) ||
-	    parasite_start(generation->template, err))
+	if (parasite_send(parasite, generation->image[0].template, &generation->image[0].base, call,
+			  err) ||
+	    parasite_start(generation->image[0].template, err))
 		return -1;
 	generation->spare.work = SPARE_FORK;
 	return 0;
 }
 
-static int end_fork(struct process *process, struct generation *generation, struct avc_error *err)
+static int end_fork(struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 
-	if (parasite_await_clone(generation->template, call_of(process, generation), &spare->pid,
+	if (parasite_await_clone(generation->image[0].template, call_of(generation), &spare->pid,
 				 err)) {
-		process->lost |= err->code != AVC_LIMIT && err->code != AVC_DEADLINE;
+		generation->image[0].process->lost |= err->code != AVC_LIMIT &&
+						      err->code != AVC_DEADLINE;
 		return -1;
 	}
 	if (!tracee_is_ours(spare->pid)) {
 		/* The template was killed before it could tell, or init_channel_kill_lost() did not
 		 * know of the spare. */
 		spare->pid = 0;
-		process->lost = true;
+		generation->image[0].process->lost = true;
 	}
 	spare->pidfd = proc_pidfd_open(spare->pid);
 	spare->work = SPARE_REST;
 	return 0;
 }
 
-static bool name_spare(const struct process *process, const struct generation *generation)
+static bool name_spare(const struct generation *generation)
 {
-	const struct parasite *parasite = &process->parasite;
-	struct inj_call *call = call_of(process, generation);
+	const struct parasite *parasite = parasite_of(generation);
+	struct inj_call *call = call_of(generation);
 	const pid_t spare = generation->spare.pid;
 	struct avc_error gone = { 0 };
 
@@ -93,55 +100,53 @@ static bool name_spare(const struct process *process, const struct generation *g
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(parasite, call->out), 0, 0, 0);
 	return generation->spare.pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
-	       parasite_send(parasite, spare, &generation->base, call, &gone) == 0 &&
+	       parasite_send(parasite, spare, &generation->image[0].base, call, &gone) == 0 &&
 	       parasite_run(spare, call, &gone) == 0;
 }
 
-static int make(struct process *process, struct generation *generation, bool aside,
-		struct avc_error *err)
+static int make(struct generation *generation, bool aside, struct avc_error *err)
 {
 	generation->spare.tried = true;
 	generation->spare.aside = aside;
-	return begin_fork(process, generation, err) || spare_await(process, generation, err) ? -1
-											     : 0;
+	return begin_fork(generation, err) || spare_await(generation, err) ? -1 : 0;
 }
 
-int spare_make(struct process *process, struct generation *generation, struct avc_error *err)
+int spare_make(struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 
-	if (make(process, generation, step_aside(generation->template, &spare->scheduling), err) ==
+	if (make(generation, step_aside(generation->image[0].template, &spare->scheduling), err) ==
 	    0)
 		return 0;
 	/* A frozen cgroup, or others have the CPUs; spare_await() goes on with it. */
 	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
 }
 
-int spare_make_now(struct process *process, struct generation *generation, struct avc_error *err)
+int spare_make_now(struct generation *generation, struct avc_error *err)
 {
-	return make(process, generation, false, err);
+	return make(generation, false, err);
 }
 
-int spare_await(struct process *process, struct generation *generation, struct avc_error *err)
+int spare_await(struct generation *generation, struct avc_error *err)
 {
 	struct spare *spare = &generation->spare;
 	struct avc_error refused = { 0 };
 
 	if (!spare->work)
 		return 0;
-	if (spare->work == SPARE_FORK && end_fork(process, generation, &refused) &&
+	if (spare->work == SPARE_FORK && end_fork(generation, &refused) &&
 	    refused.code != AVC_LIMIT) {
 		*err = refused;
 		return -1;
 	}
-	if (spare->work == SPARE_REST && tracee_halt(generation->template, err))
+	if (spare->work == SPARE_REST && tracee_halt(generation->image[0].template, err))
 		return -1;
 	spare->work = SPARE_NO_WORK;
-	if (spare->pid && (!name_spare(process, generation) ||
+	if (spare->pid && (!name_spare(generation) ||
 			   (spare->aside && step_back(spare->pid, &spare->scheduling))))
 		spare_drop(generation);
-	if (spare->aside && step_back(generation->template, &spare->scheduling))
-		return fail_errno(err, generation->template, "make spare", "sched_setattr",
+	if (spare->aside && step_back(generation->image[0].template, &spare->scheduling))
+		return fail_errno(err, generation->image[0].template, "make spare", "sched_setattr",
 				  "its scheduling can not be put back");
 	return 0;
 }

@@ -143,7 +143,7 @@ static char *read_name(const struct look *look, int fd)
 	if (n < 0)
 		return NULL;
 	name[n] = 0;
-	return strdup(name);
+	return budget_take((uint64_t)n) ? strdup(name) : NULL;
 }
 
 /* stdio that init has, too: then others read and write with the same offset. */
@@ -319,6 +319,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	bool silent;
 	int fd;
 
+	if (!budget_step() || !budget_take(sizeof *f))
+		return budget_check(look->pid, err);
 	if (files->count == files->room) {
 		if (look->depth != FILES_FROZEN) {
 			struct file *more = realloc(files->file, 2 * files->room * sizeof *more);
@@ -580,7 +582,9 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->rights_lost = from->rights_lost;
 	if (!from->content_bytes)
 		return;
-	f->content = malloc(from->content_bytes);
+	f->content = budget_has(from->content_bytes) && budget_take(from->content_bytes)
+			     ? malloc(from->content_bytes)
+			     : NULL;
 	f->content_lost |= !f->content;
 	if (!f->content)
 		return;
@@ -607,7 +611,7 @@ static void keep_content(const struct look *look, struct file *f)
 		return;
 	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
 	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
-		file_keep_content(f->ours, f, look->files->scratch);
+		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
 }
 
 static void drop_ours(struct file *f)
@@ -622,7 +626,8 @@ static void keep_contents(const struct look *look)
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
 
-		keep_content(look, f);
+		if (budget_step())
+			keep_content(look, f);
 		drop_ours(f);
 	}
 }
@@ -634,6 +639,48 @@ struct linux_dirent64 {
 	unsigned char d_type;
 	char d_name[];
 };
+
+static int by_object(const void *a, const void *b)
+{
+	const struct file *x = *(const struct file *const *)a, *y = *(const struct file *const *)b;
+
+	if (x->dev != y->dev)
+		return x->dev < y->dev ? -1 : 1;
+	return (x->ino > y->ino) - (x->ino < y->ino);
+}
+
+void files_missing_sort(struct files_missing *missing)
+{
+	if (missing->count)
+		qsort(missing->file, missing->count, sizeof(void *), by_object);
+}
+
+/* A program may have opened thousands since, which are only to be closed. */
+static bool is_of_interest(const struct look *look, const char *name)
+{
+	const struct files_missing *missing = look->files->missing;
+	struct file key = { 0 };
+	const struct file *wanted = &key;
+	struct statx st;
+
+	if (!missing || files_find(look->known, atoi(name)))
+		return true;
+	if (!missing->count || statx(look->fd_dir, name, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT,
+				     STATX_TYPE | STATX_INO, &st))
+		return false;
+	key.dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+	key.ino = st.stx_ino;
+	return (missing->port && S_ISSOCK(st.stx_mode)) ||
+	       bsearch(&wanted, missing->file, missing->count, sizeof wanted, by_object);
+}
+
+static int walk_known(struct look *look, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < look->known->count; i++)
+		if (look_at(look, look->known->file[i].fd, err))
+			return -1;
+	return 0;
+}
 
 static int walk(struct look *look, struct avc_error *err)
 {
@@ -651,7 +698,8 @@ static int walk(struct look *look, struct avc_error *err)
 			const struct linux_dirent64 *entry = (struct linux_dirent64 *)(buf + at);
 
 			at += entry->d_reclen;
-			if (entry->d_name[0] != '.' && look_at(look, atoi(entry->d_name), err))
+			if (entry->d_name[0] != '.' && is_of_interest(look, entry->d_name) &&
+			    look_at(look, atoi(entry->d_name), err))
 				return -1;
 		}
 	}
@@ -681,7 +729,8 @@ int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth
 	files->count = 0;
 	clock_gettime(CLOCK_REALTIME, &now);
 	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
-	result = walk(&look, err);
+	result = files->missing && !files->missing->count ? walk_known(&look, err)
+							  : walk(&look, err);
 	close(look.fd_dir);
 	if (result) {
 		for (uint32_t i = 0; i < files->count; i++)
@@ -767,43 +816,45 @@ int files_prepare(struct process *process, struct avc_error *err)
 	return 0;
 }
 
-int files_capture(struct process *process, struct generation *generation, bool several,
-		  const struct files *parent, pid_t parent_pid, struct scratch *scratch,
-		  struct avc_error *err)
+void files_capture(struct image *image, const struct image *parent, bool several,
+		   struct scratch *scratch)
 {
-	struct files *image = process->files_image;
+	struct process *process = image->process;
+	struct files *files = process->files_image;
 	int result;
 
 	process->files_image = NULL;
-	image->several = several;
-	generation->files = image;
-	image->parent = parent;
-	image->parent_pid = parent_pid;
-	image->scratch = scratch;
-	result = files_look(image, process->pid, process->pidfd, FILES_FROZEN,
-			    process->files_before, process->init, err);
-	image->parent = NULL; /* may be gone before this one */
-	image->scratch = NULL;
-	for (uint32_t i = 0; i < image->count; i++)
-		image->file[i].inherited = NULL;
+	image->files = files;
+	files->several = several;
+	files->parent = parent ? parent->files : NULL;
+	files->parent_pid = parent ? parent->process->pid : 0;
+	files->scratch = scratch;
+	files->process = process;
+	result = files_look(files, process->pid, process->pidfd, FILES_FROZEN,
+			    process->files_before, process->init, &image->files_error);
+	files->parent = NULL; /* may be gone before this one */
+	files->scratch = NULL;
+	files->process = NULL;
+	for (uint32_t i = 0; i < files->count; i++)
+		files->file[i].inherited = NULL;
 	if (result)
-		return -1;
-	find_owners(process, image);
-	find_own_pidfds(process, image);
-	return 0;
+		return;
+	find_owners(process, files);
+	find_own_pidfds(process, files);
 }
 
 /* Nothing tells cheaply of flock(2): one that is there now, after the freeze, and was not
  * there before it may be of either side, and is left alone at a restore. */
-void files_settle(struct process *process, struct generation *generation)
+void files_settle(struct image *image)
 {
-	for (uint32_t i = 0; i < generation->files->count; i++) {
-		struct file *f = &generation->files->file[i];
+	file_rights_read(&image->files->rights, image->process->pid);
+	for (uint32_t i = 0; i < image->files->count; i++) {
+		struct file *f = &image->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };
 
 		if (f->kind != FILE_REGULAR || f->flags & O_PATH)
 			continue;
-		file_read_info(process->pid, &now);
+		file_read_info(image->process->pid, &now);
 		for (uint32_t k = 0; k < now.lock_count; k++)
 			f->lock_unsure |= now.lock[k].kind == LOCK_FLOCK_;
 		for (uint32_t k = 0; k < f->lock_count; k++)

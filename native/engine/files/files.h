@@ -39,28 +39,26 @@ struct scratch {
 	int in, out, bytes;
 };
 void scratch_close(struct scratch *scratch);
-/* During it: what is of this instant.  `several`: the app has other processes, which may
- * have the other ends of pipes.  `parent`: what process `parent_pid` has, of the same freeze, or
- * NULL. */
-int files_capture(struct process *process, struct generation *generation, bool several,
-		  const struct files *parent, pid_t parent_pid, struct scratch *scratch,
-		  struct avc_error *err);
+/* During it: what is of this instant, or why it could not be read.  `parent`: an image of the same
+ * freeze, of which it may have a lot in common, or NULL.  `several`: the app has other processes,
+ * which may have the other ends of pipes. */
+void files_capture(struct image *image, const struct image *parent, bool several,
+		   struct scratch *scratch);
 /* After it. */
-void files_settle(struct process *process, struct generation *generation);
+void files_settle(struct image *image);
 /* Of cameras, in the template (files_video.c). */
-void files_unmap_areas(struct process *process, const struct generation *generation);
+void files_unmap_areas(const struct image *image);
 /* The same for all processes: what they share of open files, and who of them is named.
- * `before`: the checkpoint before, or NULL. */
-void files_settle_family(const struct process *main, struct generation *generation,
-			 const struct generation *before);
+ * `before`: the checkpoint before, of so many. */
+void files_settle_family(struct image *image, uint32_t images, struct image *before,
+			 uint32_t befores);
 void files_forget(struct process *process);
 void files_free(struct files *files);
-/* Makes the tables of a dead app the generation's again: that of the main process, which
- * its templates hold, at once; of the others (table[], by branch) what is to be in them.
+/* Makes the tables of a dead app those of the images again: that of the main process, which
+ * its templates hold, at once; of the others it says in image.table what is to be in them.
  * Lists what the restored processes have to do themselves.  What could not be put back is
  * told in *notes; -1 is for what must not go on. */
-int files_restore(struct process *process, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct fd_table *table,
+int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
 /* A process that is to be restored opens its pidfds itself: as many descriptors as it takes, until
  * it puts its limit back after that. */
@@ -72,8 +70,8 @@ void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t ins
 		       struct avc_error *notes);
 /* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
  * that has the table as it is now, `holder` one that has the memory. */
-int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
-		       pid_t holder, struct avc_error *err) warn_unused;
+int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
+		       struct avc_error *err) warn_unused;
 
 /* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
  * out of memory. */
@@ -81,8 +79,7 @@ struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);
 /* While everything is stopped; NULL: nothing. */
 void files_mapped_copy(struct files_mapped *mapped);
 void files_mapped_free(struct files_mapped *mapped);
-int files_mapped_check(const struct generation *generation, pid_t holder,
-		       struct avc_error *err) warn_unused;
+int files_mapped_check(const struct image *image, pid_t holder, struct avc_error *err) warn_unused;
 
 /* files_written.c: what is written in the container's mount namespace. */
 struct files_written *files_written_new(void);
@@ -161,6 +158,16 @@ struct file_socket {
 	struct sockaddr_storage local, remote;
 };
 
+/* Of a process, as the checkpoint found it, in our own user namespace. */
+#define RIGHTS_GROUPS STATUS_GROUPS
+struct file_rights {
+	bool known;
+	uint32_t user, group;
+	uint64_t caps; /* effective                                             */
+	int group_count;
+	uint32_t groups[RIGHTS_GROUPS];
+};
+
 struct file {
 	int fd;
 	enum file_kind kind;
@@ -206,7 +213,8 @@ struct file {
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
-	int tcp_state; /* 0: no TCP                                                 */
+	bool tcp_counted;                /* these two are exact                    */
+	int tcp_state; /* 0: no connection over a network                           */
 	/* In the middle of a message, as far as can be told (files_stream.c)      */
 	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */
@@ -218,6 +226,13 @@ struct file {
 	struct file_video video;
 	/* The same open file description in `parent` of files_look(); NULL: not known to be */
 	const struct file *inherited;
+};
+
+/* What is not where it was. */
+struct files_missing {
+	uint32_t count;
+	const struct file **file; /* by dev and ino                              */
+	bool port;                /* one of them is a socket that listens            */
 };
 
 struct files {
@@ -233,9 +248,14 @@ struct files {
 	const struct files *parent;
 	pid_t parent_pid;
 	struct scratch *scratch; /* also only then                                 */
+	struct process *process; /* likewise                                       */
+	struct file_rights rights;
+	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
+	const struct files_missing *missing;
 };
 
 struct files_work;
+struct tcp_info;
 
 enum files_depth {
 	FILES_BEFORE, /* everything about what stays the same; the app runs         */
@@ -247,6 +267,8 @@ enum files_depth {
 struct files *files_new(uint32_t room);
 int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
 	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
+/* Puts them in order. */
+void files_missing_sort(struct files_missing *missing);
 struct file *files_find(const struct files *files, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
 /* Finds out which of them are of the same open file description: `first` is the first of
@@ -268,14 +290,18 @@ bool files_is_closed(const struct files_held *held);
 bool file_read_info(pid_t pid, struct file *file);
 /* The same of the text, which it changes. */
 bool file_parse_info(struct file *file, char *text);
+/* Of an eventfd of ours. */
+uint64_t file_count(int fd);
 
 /* files_state.c */
+/* So often a count is read at most, to bring it down to what it was. */
+#define FILE_COUNT_READS 1000
 void file_look_at_socket(int fd, struct file *file);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(const struct files *files, const struct file *file);
-void file_keep_content(int fd, struct file *file, struct scratch *scratch);
+void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
@@ -316,6 +342,7 @@ void files_connect_again(struct files_work *work);
 /* files_stream.c */
 /* Whether bytes are just coming in; whether some that were to go out did not fit. */
 bool file_is_coming(int fd);
+bool file_was_coming(const struct tcp_info *info, int unread);
 bool file_is_going(int fd);
 /* Looks at epoll sets for who waits to write on. */
 void files_find_going(struct files *files);
@@ -338,14 +365,29 @@ int file_look_at_video(int fd, struct file_video *video) warn_unused;
 const char *file_put_video(int fd, const struct file_video *want);
 void files_find_areas(struct files *files, pid_t pid);
 
+/* files_rights.c */
+/* Ours, while we have others. */
+struct file_rights_own {
+	uint32_t user, group;
+	int group_count;
+	uint32_t groups[RIGHTS_GROUPS];
+};
+void file_rights_read(struct file_rights *rights, pid_t pid);
+/* The calling thread opens files as that process would, until it gives that back; nothing else may
+ * be done in between.  -1: it cannot, and nothing has changed. */
+int file_rights_take(const struct file_rights *rights, struct file_rights_own *own) warn_unused;
+void file_rights_give_back(const struct file_rights_own *own);
+
 /* files_make.c */
 /* Of a pseudoterminal, the side that programs run on. */
 bool file_is_pts(const struct file *file);
+/* The file that it was, by its path: an O_PATH descriptor, or -1.  With our own rights if `rights` is
+ * NULL. */
+int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights);
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
  * may be set on success as well: what is not as it was. */
-/* The file that it was, by its path: an O_PATH descriptor, or -1. */
-int file_open_path(const struct file *want, pid_t init);
-int file_make(const struct file *want, pid_t template, pid_t init, const char **why);
+int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,
+	      const char **why);
 /* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
 int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
 /* A socket or pipe that reads as closed by the other side, after what was in it. */
@@ -355,7 +397,7 @@ int file_make_dead(const struct file *want, pid_t template);
 /* One restore of a table: from `now` to `want`. */
 struct files_work {
 	struct process *process;
-	struct generation *generation;
+	struct image *image;
 	const struct avc_config *config;
 	pid_t init;
 	/* A task that has the table as it was at the death: the template, or the holder;

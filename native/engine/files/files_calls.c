@@ -15,10 +15,18 @@
 
 const struct file_watch *files_find_watch(const struct file *epoll, int fd)
 {
-	for (uint32_t i = 0; epoll && i < epoll->watch_count; i++)
-		if (epoll->watch[i].fd == fd)
-			return &epoll->watch[i];
-	return NULL;
+	uint32_t low = 0, high = epoll ? epoll->watch_count : 0;
+
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+
+		if (epoll->watch[middle].fd < fd)
+			low = middle + 1;
+		else
+			high = middle;
+	}
+	return epoll && low < epoll->watch_count && epoll->watch[low].fd == fd ? &epoll->watch[low]
+									       : NULL;
 }
 
 /* Has to be registered again?  An edge that came since the checkpoint is gone, and a
@@ -137,7 +145,7 @@ static void list_limit(const struct files_work *work, struct setup *setup)
 {
 	uint64_t limit[LIMITS][2];
 
-	if (proc_limits(work->generation->template, limit) == 0)
+	if (proc_limits(work->image->template, limit) == 0)
 		setup_add(setup, INJ_OWNERS, "", INJ_LIMIT, RLIMIT_NOFILE,
 			  setup_data(setup, limit[RLIMIT_NOFILE], sizeof limit[RLIMIT_NOFILE]), 0,
 			  0, 0)
@@ -177,13 +185,13 @@ static void list_area(struct setup *setup, const struct file_area *area)
 
 void files_list_calls(struct files_work *work)
 {
-	struct inj_slot *slot = parasite_slot(&work->process->parasite, work->generation->slot);
+	struct inj_slot *slot = parasite_slot(&work->process->parasite, work->image->slot);
 	struct setup list, *setup = &list;
 
 	*setup = (struct setup){
 		.parasite = &work->process->parasite,
 		.slot = slot,
-		.memory = parasite_files(&work->process->parasite, work->generation->slot),
+		.memory = parasite_files(&work->process->parasite, work->image->slot),
 		.tail[INJ_DESCRIPTORS] = &slot->setup[INJ_DESCRIPTORS],
 		.tail[INJ_OWNERS] = &slot->setup[INJ_OWNERS],
 	};

@@ -16,15 +16,15 @@
 /* ---- after a checkpoint ---------------------------------------------------------- */
 
 /* What is of the same object as in the checkpoint before. */
-static const struct file *find_before(const struct generation *before, const struct file *f)
+static const struct file *find_before(const struct image *before, const struct file *f)
 {
 	const struct file *b = before && before->files ? files_find(before->files, f->fd) : NULL;
 
 	return b && files_same_object(f, b) ? b : NULL;
 }
 
-static uint32_t list_held(struct files_held *held, const struct generation *image,
-			  const struct generation *before)
+static uint32_t list_held(struct files_held *held, const struct image *image,
+			  const struct image *before)
 {
 	uint32_t count = 0;
 
@@ -40,14 +40,6 @@ static uint32_t list_held(struct files_held *held, const struct generation *imag
 		count++;
 	}
 	return count;
-}
-
-static const struct generation *image_of(const struct generation *generation,
-					 const struct process *process)
-{
-	const struct branch *branch = generation_branch(generation, process);
-
-	return branch ? branch->image : NULL;
 }
 
 /* What has been closed since the freeze (a worker does that when its parent has died) can not
@@ -66,49 +58,43 @@ static void group_closed(struct files_held *held, uint32_t count)
 	}
 }
 
-static pid_t inside_of(const struct process *main, const struct generation *generation, pid_t pid)
+static pid_t inside_of(const struct image *image, uint32_t images, pid_t pid)
 {
-	if (pid == main->leader)
-		return main->inside;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].pid == pid)
-			return generation->branch[i].inside;
+	for (uint32_t i = 0; i < images; i++)
+		if (image[i].pid == pid)
+			return image[i].inside;
 	return 0;
 }
 
 /* Pidfds and owners: what the process itself is called is known already (files.c). */
-static void name_others(const struct process *main, const struct generation *generation,
-			struct files *files)
+static void name_others(const struct image *image, uint32_t images, struct files *files)
 {
 	for (uint32_t i = 0; files && i < files->count; i++) {
 		struct file *f = &files->file[i];
 
 		if (f->kind == FILE_PIDFD && !f->pid_inside)
-			f->pid_inside = inside_of(main, generation, f->pid);
+			f->pid_inside = inside_of(image, images, f->pid);
 		if (f->owner && !f->owner_inside && f->owner_type == F_OWNER_PID)
-			f->owner_inside = inside_of(main, generation, f->owner);
+			f->owner_inside = inside_of(image, images, f->owner);
 	}
 }
 
 /* By the templates, which have the tables as the processes have them.  What a process has
  * put in a place since is found to be shared with nobody. */
-void files_settle_family(const struct process *main, struct generation *generation,
-			 const struct generation *before)
+void files_settle_family(struct image *image, uint32_t images, struct image *before,
+			 uint32_t befores)
 {
 	struct files_held *held = NULL;
 	uint32_t count;
 
-	name_others(main, generation, generation->files);
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].image)
-			name_others(main, generation, generation->branch[i].image->files);
+	for (uint32_t i = 0; i < images; i++)
+		name_others(image, images, image[i].files);
 	for (int pass = 0; pass < 2; pass++) {
-		count = list_held(held, generation, before);
-		for (uint32_t i = 0; i < generation->branches; i++)
-			if (generation->branch[i].image)
-				count += list_held(held ? held + count : NULL,
-						   generation->branch[i].image,
-						   image_of(before, generation->branch[i].process));
+		count = 0;
+		for (uint32_t i = 0; i < images; i++)
+			if (image[i].process)
+				count += list_held(held ? held + count : NULL, &image[i],
+						   image_find(before, befores, image[i].process));
 		if (!held)
 			held = calloc(count + 1, sizeof *held);
 		if (!held)
@@ -274,6 +260,7 @@ static void join(const struct tables *tables)
 		for (uint32_t k = 0; k < work->want->count; k++) {
 			const struct file *w = &work->want->file[k];
 
+			(void)budget_step();
 			if (is_pair(w) && work->lost[k] &&
 			    work->local[files_leader(work->want, w)] < 0)
 				join_lost(tables, work, w);
@@ -323,6 +310,7 @@ static void put_contents(const struct tables *tables)
 			int fd = -1, other_fd = -1, bytes = 0;
 			bool found;
 
+			(void)budget_step();
 			if (!(is_pair(w) || (w->kind == FILE_PIPE && w->ended)) ||
 			    (w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY) ||
 			    !is_first(tables, i, w) || !find_end(tables, w, same_end, &fd))
@@ -342,30 +330,29 @@ static void put_contents(const struct tables *tables)
 	}
 }
 
-int files_restore(struct process *process, struct generation *generation,
-		  const struct avc_config *config, pid_t init, struct fd_table *table,
+int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err)
 {
-	struct tables tables = { .work = calloc(generation->branches + 1, sizeof *tables.work) };
+	struct tables tables = { .work = calloc(images, sizeof *tables.work) };
 	int result = -1;
 
 	if (!tables.work)
 		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
-	for (int i = -1; i < (int)generation->branches; i++) {
-		const struct branch *branch = i < 0 ? NULL : &generation->branch[i];
-		struct generation *image = branch ? branch->image : generation;
+	for (uint32_t i = 0; i < images; i++) {
+		const struct process *process = image[i].process;
+		/* Of one that has ended before, nobody has the table. */
+		const bool held = process && process->descendant;
 
-		if (branch && !branch->process)
+		if (!process)
 			continue;
 		tables.work[tables.count++] = (struct files_work){
-			.process = branch ? branch->process : process,
-			.generation = image,
+			.process = image[i].process,
+			.image = &image[i],
 			.config = config,
 			.init = init,
-			/* Of one that has ended before, nobody has the table. */
-			.table = branch ? branch->process->holder : generation->template,
-			.table_pidfd = branch ? branch->process->holder_pidfd : generation->pidfd,
-			.want = image->files,
+			.table = held ? process->holder : image[i].template,
+			.table_pidfd = held ? process->holder_pidfd : image[i].pidfd,
+			.want = image[i].files,
 			.notes = notes,
 		};
 		if (files_work_begin(&tables.work[tables.count - 1], err))
@@ -383,13 +370,11 @@ int files_restore(struct process *process, struct generation *generation,
 			goto out;
 	}
 	put_contents(&tables);
-	for (uint32_t i = 0, k = 0; i < tables.count; i++) {
-		files_work_finish(&tables.work[i]);
-		if (!i)
-			continue;
-		while (!generation->branch[k].process)
-			k++;
-		if (files_work_table(&tables.work[i], &table[k++], err))
+	for (uint32_t i = 0; i < tables.count; i++) {
+		struct files_work *work = &tables.work[i];
+
+		files_work_finish(work);
+		if (work->process->descendant && files_work_table(work, &work->image->table, err))
 			goto out;
 	}
 	result = 0;

@@ -16,6 +16,13 @@ struct rooms {
 	uint32_t locks, watches, marks;
 };
 
+/* As make_room(), of what a checkpoint may have. */
+static bool take_room(void *array, uint32_t count, uint32_t *room, size_t bytes)
+{
+	return count < *room ||
+	       (budget_take((*room ? *room : 16) * bytes) && make_room(array, count, room, bytes));
+}
+
 /* "1: POSIX  ADVISORY  WRITE 14092 fe:00:2147490 5 14" */
 static void add_lock(struct file *file, const char *line, uint32_t *room)
 {
@@ -37,7 +44,7 @@ static void add_lock(struct file *file, const char *line, uint32_t *room)
 	lock.exclusive = !strcmp(way, "WRITE");
 	lock.start = start;
 	lock.end = strcmp(end, "EOF") ? atoll(end) : -1;
-	if (make_room(&file->lock, file->lock_count, room, sizeof lock))
+	if (take_room(&file->lock, file->lock_count, room, sizeof lock))
 		file->lock[file->lock_count++] = lock;
 }
 
@@ -49,7 +56,7 @@ static void add_watch(struct file *file, const char *line, uint32_t *room)
 	if (sscanf(line, " %d events: %x data: %llx", &watch.fd, &watch.events, &data) != 3)
 		return;
 	watch.data = data;
-	if (make_room(&file->watch, file->watch_count, room, sizeof watch))
+	if (take_room(&file->watch, file->watch_count, room, sizeof watch))
 		file->watch[file->watch_count++] = watch;
 }
 
@@ -84,7 +91,7 @@ static void add_mark(struct file *file, const char *line, uint32_t *room)
 	if (!at || mark.handle_bytes > sizeof mark.handle ||
 	    !parse_handle(line + at, mark.handle, mark.handle_bytes))
 		mark.handle_bytes = 0;
-	if (make_room(&file->mark, file->mark_count, room, sizeof mark))
+	if (take_room(&file->mark, file->mark_count, room, sizeof mark))
 		file->mark[file->mark_count++] = mark;
 }
 
@@ -143,6 +150,38 @@ static void take_line(struct file *file, const char *key, const char *value, str
 		add_mark(file, value, &room->marks);
 }
 
+/* The kernel has an order of its own; there may be tens of thousands to be compared. */
+static int by_number(const void *a, const void *b)
+{
+	const struct file_watch *x = a, *y = b;
+
+	if (x->fd != y->fd)
+		return x->fd < y->fd ? -1 : 1;
+	return (x->data > y->data) - (x->data < y->data);
+}
+
+static int by_wd(const void *a, const void *b)
+{
+	const struct file_mark *x = a, *y = b;
+
+	return (x->wd > y->wd) - (x->wd < y->wd);
+}
+
+static void sort_watched(struct file *file)
+{
+	if (file->watch_count)
+		qsort(file->watch, file->watch_count, sizeof *file->watch, by_number);
+	if (file->mark_count)
+		qsort(file->mark, file->mark_count, sizeof *file->mark, by_wd);
+}
+
+uint64_t file_count(int fd)
+{
+	struct file file = { .fd = fd, .kind = FILE_EVENTFD };
+
+	return file_read_info(getpid(), &file) ? file.count : 0;
+}
+
 static const struct {
 	enum file_kind kind;
 	const char *key;
@@ -178,6 +217,7 @@ bool file_parse_info(struct file *file, char *text)
 		for (size_t i = 0; i < sizeof telling / sizeof *telling; i++)
 			told |= file->kind == telling[i].kind && !strcmp(line, telling[i].key);
 	}
+	sort_watched(file);
 	if (file->kind == FILE_TIMERFD)
 		timer_deadline(file, left_ns);
 	return told;
@@ -190,6 +230,10 @@ bool file_read_info(pid_t pid, struct file *file)
 
 	snprintf(name, sizeof name, "fdinfo/%d", file->fd);
 	text = proc_text(pid, name, first, sizeof first);
+	if (!text && errno == EFBIG)
+		budget_exceed(
+			AVC_UNSUPPORTED,
+			"it watches more by one epoll or inotify descriptor than can be kept");
 	if (!text)
 		return false;
 	told = file_parse_info(file, text);

@@ -60,16 +60,20 @@ static int open_as(int fd, const struct file *want)
 }
 
 /* init's root is the container's; the app may have changed its own. */
-int file_open_path(const struct file *want, pid_t init)
+int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights)
 {
+	struct file_rights_own own;
 	struct open_how how = { .flags = O_PATH | O_CLOEXEC,
 				.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS };
 	int root = proc_open(init, "root", O_PATH | O_DIRECTORY), fd = -1;
 
 	if (root < 0)
 		return -1;
-	if (want->name[0] == '/')
+	if (want->name[0] == '/' && (!rights || !file_rights_take(rights, &own))) {
 		fd = (int)syscall(SYS_openat2, root, want->name, &how, sizeof how);
+		if (rights)
+			file_rights_give_back(&own);
+	}
 	close(root);
 	if (fd >= 0 && !is_the_one(fd, want)) {
 		close(fd);
@@ -133,22 +137,27 @@ static bool is_another_instance(const struct file *want)
 	return true;
 }
 
-static int make_named(const struct file *want, pid_t template, pid_t init, const char **why)
+static int make_named(const struct file *want, pid_t template, pid_t init,
+		      const struct file_rights *rights, const char **why)
 {
-	int found = file_open_path(want, init), fd = -1;
+	struct file_rights_own own;
+	int found = file_open_path(want, init, rights), fd = -1;
 
 	if (found < 0)
 		found = open_mapped(want, template);
-	if (found >= 0) {
+	if (found < 0) {
+		*why = "it was closed since the checkpoint and is not there any more";
+	} else if (file_rights_take(rights, &own)) {
+		*why = "it was closed since the checkpoint, and it is not known who may open it";
+	} else {
 		fd = open_as(found, want);
-		close(found);
+		file_rights_give_back(&own);
 		if (fd < 0)
 			*why = "it was closed since the checkpoint and can not be opened again";
 		else if (is_another_instance(want))
 			*why = "it was closed since the checkpoint: the device was opened anew";
-	} else {
-		*why = "it was closed since the checkpoint and is not there any more";
 	}
+	close_fd(&found);
 	return fd >= 0 ? fd : open_empty(want);
 }
 
@@ -292,7 +301,8 @@ static int make_pidfd(const struct file *want, pid_t init)
 	return fd;
 }
 
-int file_make(const struct file *want, pid_t template, pid_t init, const char **why)
+int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,
+	      const char **why)
 {
 	const int nonblock = want->flags & O_NONBLOCK;
 	int fd;
@@ -304,7 +314,7 @@ int file_make(const struct file *want, pid_t template, pid_t init, const char **
 	case FILE_DEVICE:
 	case FILE_FIFO:
 		fd = want->outside ? take_from_init(want, init) : -1;
-		return fd >= 0 ? fd : make_named(want, template, init, why);
+		return fd >= 0 ? fd : make_named(want, template, init, rights, why);
 	case FILE_PIPE:
 		fd = take_from_init(want, init);
 		return fd >= 0 ? fd : file_make_dead(want, template);

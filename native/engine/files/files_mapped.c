@@ -156,15 +156,15 @@ static int check_process(pid_t pid, struct check *check)
 		    "avckpt.files=strict: what files were mapped can not be told");
 }
 
-int files_mapped_check(const struct generation *generation, pid_t holder, struct avc_error *err)
+int files_mapped_check(const struct image *image, pid_t holder, struct avc_error *err)
 {
-	struct check check = { .mapped = generation->mapped, .err = err };
+	struct check check = { .mapped = image->mapped, .err = err };
 
-	if (!generation->mapped)
+	if (!image->mapped)
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
 			    "avckpt.files=strict: was set after the checkpoint");
 	/* The template has what was mapped then, the holder what was mapped at last. */
-	if (check_process(generation->template, &check) || check_process(holder, &check))
+	if (check_process(image->template, &check) || check_process(holder, &check))
 		return -1;
 	for (uint32_t i = 0; i < check.mapped->count; i++)
 		if (!is_unchanged(&check.mapped->area[i]))

@@ -144,6 +144,19 @@ static bool was_used(int fd, const struct file *w)
 	return file_socket_was_used(fd, w->socket);
 }
 
+static bool is_semaphore(const struct file *w)
+{
+	return w->kind == FILE_EVENTFD && w->semaphore;
+}
+
+/* Each read(2) takes one of it. */
+static bool counts_too_much(int fd, const struct file *w)
+{
+	const uint64_t count = file_count(fd);
+
+	return count > w->count && count - w->count > FILE_COUNT_READS;
+}
+
 /* It is there still, and of no use: another one is made. */
 static void give_up_useless(struct files_work *work)
 {
@@ -151,6 +164,7 @@ static void give_up_useless(struct files_work *work)
 		bool (*concerns)(const struct file *w);
 		bool (*is_useless)(int fd, const struct file *w);
 	} doubts[] = {
+		{ is_semaphore, counts_too_much },
 		{ file_is_pts, is_hung_up },
 		{ has_the_last, was_read },
 		{ has_node, is_deleted },
@@ -195,6 +209,7 @@ static void find_moved(struct files_work *work)
 		if (files_leader(work->want, w) != i || work->source[i] >= 0 ||
 		    (!(w->mode & S_IFMT) && !w->id))
 			continue;
+		(void)budget_step();
 		for (uint32_t k = 0; k < work->now->count && work->source[i] < 0; k++)
 			if (work->claimed_by[k] < 0 &&
 			    files_leader(work->now, &work->now->file[k]) == k &&
@@ -303,7 +318,9 @@ static void make_lost(struct files_work *work)
 
 		if (!work->lost[i] || work->local[group] >= 0)
 			continue;
-		work->local[group] = file_make(w, work->generation->template, work->init, &why);
+		(void)budget_step();
+		work->local[group] = file_make(w, work->image->template, work->init,
+					       &work->want->rights, &why);
 		files_note(work, w, why);
 		if (work->local[group] < 0)
 			files_note(work, w, "it can not be made again");
@@ -325,8 +342,7 @@ static bool is_urgent(const struct files_work *work)
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
 static struct fd_letter *mail_of(const struct files_work *work)
 {
-	return (struct fd_letter *)(parasite_files(&work->process->parasite,
-						   work->generation->slot) +
+	return (struct fd_letter *)(parasite_files(&work->process->parasite, work->image->slot) +
 				    INJ_FILES_BYTES / 2);
 }
 
@@ -342,8 +358,7 @@ static struct inj_call *call_of(const struct files_work *work)
 {
 	return work->process->descendant
 		       ? &work->process->parasite.control->holder
-		       : &parasite_slot(&work->process->parasite, work->generation->slot)
-				  ->template_call;
+		       : &parasite_slot(&work->process->parasite, work->image->slot)->template_call;
 }
 
 /* What was listed becomes the task's next call. */
@@ -381,7 +396,7 @@ static int flush(struct files_work *work, struct avc_error *err)
 	if (call->count)
 		result = parasite_send(&process->parasite, work->table,
 				       process->descendant ? &process->holder_base
-							   : &work->generation->base,
+							   : &work->image->base,
 				       call, err) ||
 			 parasite_run(work->table, call, err);
 	if (!result)
@@ -452,25 +467,33 @@ static bool is_new(const struct files_work *work, const struct file *n)
 	return !w || work->lost[files_index(work->want, w)];
 }
 
-/* In ranges: a program may have opened thousands since. */
+static int close_range_of(struct files_work *work, uint64_t first, uint64_t last,
+			  struct avc_error *err)
+{
+	return first > last ? 0 : inject(work, err, SYS_close_range, first, last, 0);
+}
+
+/* Whatever is not the checkpoint's, in ranges: a program may have opened thousands since, and nobody
+ * has looked at them. */
 static int close_new(struct files_work *work, struct avc_error *err)
 {
 	const struct files *now = work->now;
+	uint64_t next = 0;
+
+	if (!work->table)
+		return 0;
 
 	for (uint32_t i = 0; i < now->count; i++) {
-		const uint32_t first = i;
+		const uint64_t fd = (uint64_t)now->file[i].fd;
 
-		if (!is_new(work, &now->file[i]))
+		work->closed[i] = is_new(work, &now->file[i]);
+		if (work->closed[i])
 			continue;
-		work->closed[i] = true;
-		while (i + 1 < now->count && now->file[i + 1].fd == now->file[i].fd + 1 &&
-		       is_new(work, &now->file[i + 1]))
-			work->closed[++i] = true;
-		if (inject(work, err, SYS_close_range, (uint64_t)now->file[first].fd,
-			   (uint64_t)now->file[i].fd, 0))
+		if (fd && close_range_of(work, next, fd - 1, err))
 			return -1;
+		next = fd + 1;
 	}
-	return 0;
+	return close_range_of(work, next, UINT32_MAX, err);
 }
 
 /* Cheaper set than looked at; and by the template, for which a filter of system calls
@@ -586,9 +609,9 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	}
 	numbers.taken[ends[0]] = numbers.taken[ends[1]] = 1;
 	theirs = lowest_free(&numbers, work->want);
-	ours = proc_borrow_fd(work->generation->pidfd, ends[1]);
+	ours = proc_borrow_fd(work->image->pidfd, ends[1]);
 	if (ours < 0) {
-		fail_errno(err, work->generation->template, "restore descriptors", "pidfd_getfd",
+		fail_errno(err, work->image->template, "restore descriptors", "pidfd_getfd",
 			   "descriptors could not be handed over");
 		goto out;
 	}
@@ -634,6 +657,7 @@ static void put_states(struct files_work *work)
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
 		int fd;
 
+		(void)budget_step();
 		if (files_leader(work->want, w) != i)
 			continue;
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
@@ -670,6 +694,76 @@ static void *filled(uint32_t count, int value)
 	return array;
 }
 
+/* What they are that have no source. */
+static int find_missing(const struct files_work *work, struct files_missing *missing,
+			struct avc_error *err)
+{
+	missing->file = calloc(work->want->count + 1, sizeof *missing->file);
+	if (!missing->file)
+		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const struct file *w = &work->want->file[i];
+
+		if (files_leader(work->want, w) != i || work->source[i] >= 0)
+			continue;
+		missing->file[missing->count++] = w;
+		missing->port |= w->socket && w->socket->listening;
+	}
+	files_missing_sort(missing);
+	return 0;
+}
+
+static int look_once(struct files_work *work, const struct files_missing *missing,
+		     struct avc_error *err)
+{
+	int result = 0;
+
+	work->now->missing = missing;
+	if (work->table)
+		result = files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
+				    work->want, work->init, err);
+	work->now->missing = NULL;
+	if (result)
+		return -1;
+	work->claimed_by = filled(work->now->count, -1);
+	if (!work->claimed_by)
+		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+	find_staying(work);
+	return 0;
+}
+
+/* First at those numbers alone at which there was something, for all others are closed whatever they
+ * are.  But what is missing may be at any of them now; and where somebody waits to send a
+ * message may be known to an epoll set that is new. */
+static int look(struct files_work *work, struct avc_error *err)
+{
+	struct files_missing missing = { 0 };
+	int result;
+
+	if (work->config->tcp == AVC_TCP_MESSAGES)
+		return look_once(work, NULL, err);
+	if (look_once(work, &missing, err))
+		return -1;
+	if (find_missing(work, &missing, err))
+		return -1;
+	if (!missing.count) {
+		free(missing.file);
+		return 0;
+	}
+	free(work->claimed_by);
+	work->claimed_by = NULL;
+	files_free(work->now);
+	work->now = files_new(work->want->count + 64);
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		work->source[i] = -1;
+		work->lost[i] = false;
+	}
+	result = work->now ? look_once(work, &missing, err)
+			   : fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
+	free(missing.file);
+	return result;
+}
+
 int files_work_begin(struct files_work *work, struct avc_error *err)
 {
 	work->now = files_new(work->want->count + 64);
@@ -682,18 +776,15 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	if (work->table && work->process->descendant && work->process->doubtful &&
 	    tracee_halt(work->table, err))
 		return -1;
-	if (work->table && files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
-				      work->want, work->init, err))
+	if (look(work, err))
 		return -1;
 	if (work->config->tcp == AVC_TCP_MESSAGES) {
 		files_find_going(work->want);
 		files_find_going(work->now);
 	}
-	work->claimed_by = filled(work->now->count, -1);
 	work->closed = calloc(work->now->count + 1, sizeof *work->closed);
-	if (!work->claimed_by || !work->closed)
+	if (!work->closed)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
-	find_staying(work);
 	find_moved(work);
 	give_up_useless(work);
 	give_up_pidfds(work);

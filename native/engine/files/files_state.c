@@ -32,6 +32,8 @@
 #include "files.h"
 
 #define CONTENT_MAX (1 << 20)
+#define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
+#define TCP_TRIES 8
 #define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
 #define STATUS_FLAGS (O_APPEND | O_NONBLOCK | O_DIRECT | O_NOATIME)
@@ -100,6 +102,14 @@ void file_look_at_socket(int fd, struct file *file)
 	file->socket = s;
 }
 
+static bool is_connected(int fd)
+{
+	struct sockaddr_storage remote;
+	socklen_t bytes = sizeof remote;
+
+	return getpeername(fd, (struct sockaddr *)&remote, &bytes) == 0;
+}
+
 /* As linux/tcp.h has it; glibc's struct ends before. */
 struct tcp_info_tail {
 	struct tcp_info head;
@@ -108,21 +118,40 @@ struct tcp_info_tail {
 
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 {
-	struct tcp_info_tail info = { 0 };
+	struct tcp_info_tail info = { 0 }, before;
 	int unread = 0, unacknowledged = 0;
 	socklen_t bytes = sizeof info;
 
-	if (!s || s->protocol != IPPROTO_TCP || s->listening ||
-	    getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+	if (!s || s->type != SOCK_STREAM || s->listening ||
+	    (s->domain != AF_INET && s->domain != AF_INET6))
 		return;
+	if (s->protocol != IPPROTO_TCP) { /* MPTCP, SCTP */
+		if (is_connected(fd))
+			file->tcp_state = TCP_ESTABLISHED;
+		return;
+	}
+	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+		return;
+	/* The other side goes on: what comes, or is acknowledged, between two of these calls
+	 * would be in one figure and not in the other. */
+	for (int try = 0; try < TCP_TRIES; try++) {
+		before = info;
+		if (ioctl(fd, SIOCINQ, &unread))
+			unread = 0;
+		if (ioctl(fd, SIOCOUTQ, &unacknowledged))
+			unacknowledged = 0;
+		bytes = sizeof info;
+		if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
+			return;
+		file->tcp_counted = info.bytes_acked == before.bytes_acked &&
+				    info.bytes_received == before.bytes_received;
+		if (file->tcp_counted)
+			break;
+	}
 	file->tcp_state = info.head.tcpi_state;
-	if (ioctl(fd, SIOCINQ, &unread))
-		unread = 0;
-	if (ioctl(fd, SIOCOUTQ, &unacknowledged))
-		unacknowledged = 0;
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
 	file->tcp_taken = info.bytes_received - (uint64_t)unread;
-	file->tcp_coming = file_is_coming(fd);
+	file->tcp_coming = file_was_coming(&info.head, unread);
 	file->tcp_going = file_is_going(fd);
 }
 
@@ -292,13 +321,20 @@ static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 	return n;
 }
 
-/* Datagrams, or records: the kernel moves on with every look, if it is told where to begin. */
-static void keep_messages(int fd, struct file *file)
+/* Datagrams, or records: the kernel moves on with every look, if it is told where to begin.  It
+ * is told by an option of the app's own socket, which gets its value back also if we die. */
+static void keep_messages(struct process *process, int fd, struct file *file)
 {
 	const int first = 0, before = option(fd, SOL_SOCKET, SO_PEEK_OFF);
 	size_t used = 0;
 
+	if (parasite_will(process, SYS_setsockopt, (uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
+			  (uint64_t)(int64_t)before, sizeof before)) {
+		file->content_lost = true;
+		return;
+	}
 	if (setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &first, sizeof first)) {
+		parasite_will_done(process);
 		file->content_lost = true;
 		return;
 	}
@@ -312,20 +348,36 @@ static void keep_messages(int fd, struct file *file)
 		n = more ? peek(fd, file, more + used + sizeof bytes, MESSAGE_MAX)
 			 : MESSAGE_MAX + 1;
 		/* An empty datagram can not be looked past; for others it is the end. */
-		file->content_lost |= n > MESSAGE_MAX ||
-				      (n > 0 && used + (size_t)n > CONTENT_MAX) ||
-				      (n == 0 && file->socket->type == SOCK_DGRAM);
+		file->content_lost |=
+			n > MESSAGE_MAX ||
+			(n > 0 && (used + (size_t)n > CONTENT_MAX || !budget_has((uint64_t)n))) ||
+			(n == 0 && file->socket->type == SOCK_DGRAM);
 		if (n <= 0 || file->content_lost)
 			break;
 		bytes = (uint32_t)n;
+		(void)budget_take(bytes);
 		memcpy(file->content + used, &bytes, sizeof bytes);
 		used += sizeof bytes + bytes;
 	}
 	file->content_bytes = (uint32_t)used;
 	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
+	parasite_will_done(process);
 }
 
-void file_keep_content(int fd, struct file *file, struct scratch *scratch)
+/* There was room for the largest. */
+static void trim_messages(struct file *file)
+{
+	uint8_t *less = file->content_bytes ? realloc(file->content, file->content_bytes) : NULL;
+
+	if (!file->content_bytes) {
+		free(file->content);
+		file->content = NULL;
+	} else if (less) {
+		file->content = less;
+	}
+}
+
+void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch)
 {
 	int bytes = 0;
 	ssize_t n;
@@ -333,13 +385,15 @@ void file_keep_content(int fd, struct file *file, struct scratch *scratch)
 	if (ioctl(fd, FIONREAD, &bytes) || bytes <= 0)
 		return;
 	if (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM) {
-		keep_messages(fd, file);
+		keep_messages(process, fd, file);
+		trim_messages(file);
 		return;
 	}
-	if (bytes > CONTENT_MAX) {
+	if (bytes > CONTENT_MAX || !budget_has((uint64_t)bytes)) {
 		file->content_lost = true;
 		return;
 	}
+	(void)budget_take((uint64_t)bytes);
 	file->content = malloc((size_t)bytes);
 	if (!file->content) {
 		file->content_lost = true;
@@ -363,15 +417,18 @@ static int reopen(int fd, int flags)
 	return open(path, flags | O_NONBLOCK | O_CLOEXEC);
 }
 
-static void drain(int fd, const struct file *want)
+/* False if there is no end of it: somebody outside of the application goes on writing. */
+static bool drain(int fd, const struct file *want)
 {
 	char buf[65536];
+	int reads = 0;
 	ssize_t n;
 
 	do {
 		n = want->kind == FILE_PIPE ? read(fd, buf, sizeof buf)
 					    : recv(fd, buf, sizeof buf, MSG_DONTWAIT);
-	} while (n > 0);
+	} while (n > 0 && ++reads < DRAIN_READS);
+	return n <= 0;
 }
 
 const char *file_put_content(int fd, int other_fd, const struct file *want)
@@ -382,9 +439,10 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	    out = pipe ? reopen(other_fd, O_WRONLY) : other_fd;
 	const char *problem = NULL;
 	uint32_t put = 0;
+	bool emptied;
 
-	if (in >= 0 && out >= 0) {
-		drain(in, want);
+	emptied = in >= 0 && out >= 0 && drain(in, want);
+	if (emptied) {
 		while (put < want->content_bytes) {
 			const uint8_t *from = want->content + put;
 			uint32_t bytes = want->content_bytes - put;
@@ -403,7 +461,7 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 			put += (uint32_t)n;
 		}
 	}
-	if (put < want->content_bytes || in < 0 || out < 0)
+	if (put < want->content_bytes || !emptied)
 		problem = "what was in it could not be put back";
 	else if (want->rights_lost)
 		problem = "descriptors that were on their way through it are lost";
@@ -420,16 +478,24 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 
 static const char *put_count(int fd, const struct file *want, const struct file *now)
 {
-	uint64_t value;
+	uint64_t value, count;
 	struct iovec io = { &value, sizeof value };
 
 	if (now && now->count == want->count)
 		return NULL;
-	/* Down to 0 without ever waiting, whatever its flags are. */
-	for (int i = 0; i < 1000000; i++)
+	count = file_count(fd); /* another process that has it may have put it back */
+	if (count == want->count)
+		return NULL;
+	/* Without ever waiting, whatever its flags are.  A semaphore's goes down by one; one that is
+	 * far too high has been given up for a new one (files_restore.c). */
+	for (int i = 0; count > want->count && i < FILE_COUNT_READS; i++) {
 		if (preadv2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value)
-			break;
-	value = want->count;
+			return "its count could not be put back";
+		count -= value < count ? value : count;
+	}
+	if (count > want->count)
+		return "its count could not be put back";
+	value = want->count - count;
 	if (value && pwritev2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value &&
 	    write(fd, &value, sizeof value) < 0)
 		return "its count could not be put back";
@@ -603,7 +669,8 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 
 bool file_tcp_moved(const struct file *want, const struct file *now)
 {
-	return want->tcp_written != now->tcp_written || want->tcp_taken != now->tcp_taken;
+	return !want->tcp_counted || !now->tcp_counted || want->tcp_written != now->tcp_written ||
+	       want->tcp_taken != now->tcp_taken;
 }
 
 /* connect(2) to nothing resets it, shutdown(2) makes it read as closed. */

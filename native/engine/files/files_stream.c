@@ -25,24 +25,35 @@
 #define DRAIN_NS (100 * NS_PER_MS)
 
 /* For how long nothing has come in, at least. */
-static uint64_t silent_ns(int fd)
+static uint64_t silent_ns(const struct tcp_info *info)
+{
+	const uint64_t silent = info->tcpi_last_data_recv * NS_PER_MS;
+
+	if (info->tcpi_state != TCP_ESTABLISHED)
+		return UINT64_MAX;
+	return silent > TICK_NS ? silent - TICK_NS : 0;
+}
+
+static struct tcp_info info_of(int fd)
 {
 	struct tcp_info info = { 0 };
 	socklen_t bytes = sizeof info;
-	uint64_t silent;
 
-	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) ||
-	    info.tcpi_state != TCP_ESTABLISHED)
-		return UINT64_MAX;
-	silent = info.tcpi_last_data_recv * NS_PER_MS;
-	return silent > TICK_NS ? silent - TICK_NS : 0;
+	getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes);
+	return info;
+}
+
+bool file_was_coming(const struct tcp_info *info, int unread)
+{
+	return unread > 0 || silent_ns(info) < SILENCE_NS;
 }
 
 bool file_is_coming(int fd)
 {
+	const struct tcp_info info = info_of(fd);
 	int unread = 0;
 
-	return (ioctl(fd, FIONREAD, &unread) == 0 && unread > 0) || silent_ns(fd) < SILENCE_NS;
+	return file_was_coming(&info, ioctl(fd, FIONREAD, &unread) ? 0 : unread);
 }
 
 bool file_is_going(int fd)
@@ -73,7 +84,8 @@ void files_find_going(struct files *files)
 static bool drain(int fd)
 {
 	const uint64_t begun = now_ns();
-	const uint64_t silent = silent_ns(fd);
+	const struct tcp_info info = info_of(fd);
+	const uint64_t silent = silent_ns(&info);
 	uint64_t last = begun - (silent < begun ? silent : begun), now;
 
 	while ((now = now_ns()) - begun < DRAIN_NS) {

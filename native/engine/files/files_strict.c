@@ -31,20 +31,14 @@ static bool was_written(const struct files *want, const struct file *w, const st
 	       real_ns(&w->modified) + TICK_NS > want->taken_ns;
 }
 
-int files_check_strict(const struct generation *generation, pid_t pid, int pidfd, pid_t init,
-		       pid_t holder, struct avc_error *err)
+int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
+		       struct avc_error *err)
 {
-	const struct files *want = generation->files;
+	const struct files *want = image->files;
 	struct files *now = files_new(want->count + 64);
 	int result = -1;
 
-	if (generation->written[0]) {
-		fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
-		     "avckpt.files=strict: %.80s was written since the checkpoint",
-		     generation->written);
-		goto out;
-	}
-	if (!now || files_look(now, pid, pidfd, FILES_NOW, generation->files, init, err))
+	if (!now || files_look(now, pid, pidfd, FILES_NOW, image->files, init, err))
 		goto out;
 	for (uint32_t i = 0; i < want->count; i++) {
 		const struct file *w = &want->file[i];
@@ -55,7 +49,7 @@ int files_check_strict(const struct generation *generation, pid_t pid, int pidfd
 		if (!is_data(w))
 			continue;
 		n = n && files_same_object(w, n) ? n : NULL;
-		fd = n ? proc_borrow_fd(pidfd, n->fd) : file_open_path(w, init);
+		fd = n ? proc_borrow_fd(pidfd, n->fd) : file_open_path(w, init, NULL);
 		if (fd < 0 || fstat(fd, &st)) {
 			close_fd(&fd);
 			fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
@@ -81,7 +75,7 @@ int files_check_strict(const struct generation *generation, pid_t pid, int pidfd
 			goto out;
 		}
 	}
-	result = files_mapped_check(generation, holder, err);
+	result = files_mapped_check(image, holder, err);
 out:
 	files_free(now);
 	return result;

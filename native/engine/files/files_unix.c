@@ -153,6 +153,7 @@ struct errand {
 	const struct file_node *node; /* NULL: not known                           */
 	const struct sockaddr_storage *address;
 	socklen_t bytes;
+	const struct file_rights *rights; /* of the application, to connect        */
 	int root[2], folder[2];
 	int errnum;
 };
@@ -161,8 +162,21 @@ static int call(const struct errand *errand)
 {
 	const struct sockaddr *address = (const struct sockaddr *)errand->address;
 
-	return errand->connects ? connect(errand->fd, address, errand->bytes)
-				: bind(errand->fd, address, errand->bytes);
+	struct file_rights_own own;
+	int result, errnum;
+
+	if (!errand->connects)
+		return bind(errand->fd, address, errand->bytes);
+	/* To whatever is behind that name now. */
+	if (file_rights_take(errand->rights, &own)) {
+		errno = EPERM;
+		return -1;
+	}
+	result = connect(errand->fd, address, errand->bytes);
+	errnum = errno;
+	file_rights_give_back(&own);
+	errno = errnum;
+	return result;
 }
 
 /* A thread of its own, for it does not come back: root and folder are a thread's, once
@@ -351,13 +365,15 @@ int file_bind_unix(int fd, const struct file_socket *s, pid_t template, pid_t in
 	return *why ? -1 : 0;
 }
 
-static const char *connect_unix(int fd, const struct file_socket *s, pid_t template, pid_t init)
+static const char *connect_unix(const struct files_work *work, int fd, const struct file_socket *s)
 {
-	struct errand errand = {
-		.connects = true, .fd = fd, .address = &s->remote, .bytes = s->remote_bytes
-	};
+	struct errand errand = { .connects = true,
+				 .fd = fd,
+				 .rights = &work->want->rights,
+				 .address = &s->remote,
+				 .bytes = s->remote_bytes };
 
-	return call_there(&errand, template, init)
+	return call_there(&errand, work->image->template, work->init)
 		       ? "it was closed since the checkpoint and can not be connected again"
 		       : NULL;
 }
@@ -389,9 +405,7 @@ void files_connect_again(struct files_work *work)
 			continue;
 		fd = files_borrow_placed(work, w);
 		if (fd >= 0)
-			files_note(work, w,
-				   connect_unix(fd, w->socket, work->generation->template,
-						work->init));
+			files_note(work, w, connect_unix(work, fd, w->socket));
 		close_fd(&fd);
 	}
 }

@@ -216,10 +216,11 @@ void files_find_areas(struct files *files, pid_t pid)
 
 /* Something else is mapped in their place: nothing must come to be there, and where a camera is
  * lost for good, old pictures are black instead of deadly. */
-void files_unmap_areas(struct process *process, const struct generation *generation)
+void files_unmap_areas(const struct image *image)
 {
-	struct inj_call *call = &parasite_slot(&process->parasite, generation->slot)->template_call;
-	const struct files *files = generation->files;
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
+	const struct files *files = image->files;
 	struct avc_error ignored = { 0 };
 
 	for (uint32_t i = 0; i < files->areas;) {
@@ -228,9 +229,8 @@ void files_unmap_areas(struct process *process, const struct generation *generat
 			call_add(call, SYS_mmap, files->area[i].start, files->area[i].bytes,
 				 (uint64_t)files->area[i].protection,
 				 MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED | MAP_NORESERVE, ~0u);
-		if (parasite_send(&process->parasite, generation->template, &generation->base, call,
-				  &ignored) ||
-		    parasite_run(generation->template, call, &ignored))
+		if (parasite_send(parasite, image->template, &image->base, call, &ignored) ||
+		    parasite_run(image->template, call, &ignored))
 			return; /* it was killed, or they are mapped for some time more */
 	}
 }

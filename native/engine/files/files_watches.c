@@ -183,12 +183,24 @@ static int open_marked(const struct file_system *fs, const struct file_mark *mar
 
 static const struct file_mark *find_mark(const struct file *f, const struct file_mark *mark)
 {
-	for (uint32_t i = 0; f && i < f->mark_count; i++)
-		if (f->mark[i].wd == mark->wd && f->mark[i].dev == mark->dev &&
-		    f->mark[i].ino == mark->ino)
-			return &f->mark[i];
+	uint32_t low = 0, high = f ? f->mark_count : 0;
+
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+		const struct file_mark *m = &f->mark[middle];
+
+		if (m->wd == mark->wd)
+			return m->dev == mark->dev && m->ino == mark->ino ? m : NULL;
+		if (m->wd < mark->wd)
+			low = middle + 1;
+		else
+			high = middle;
+	}
 	return NULL;
 }
+
+/* More than the longest queue (fs.inotify.max_queued_events) holds. */
+#define READS_MAX 1024
 
 /* Reads what is in it, event by event, as long as there is one and it is without a name. */
 static void take_events(int fd, int bytes)
@@ -207,7 +219,7 @@ static void take_events(int fd, int bytes)
 static void remove_new(int fd, const struct file *want, const struct file *now)
 {
 	uint32_t kept = 0;
-	int before = 0, removed = 0;
+	int before = 0, removed = 0, reads = 0;
 	char buf[65536];
 
 	for (uint32_t i = 0; i < now->mark_count; i++)
@@ -220,8 +232,8 @@ static void remove_new(int fd, const struct file *want, const struct file *now)
 	if (!before)
 		take_events(fd, removed * (int)sizeof(struct inotify_event));
 	/* Nothing in it is of a watch that is known. */
-	while (before && !kept && ioctl(fd, FIONREAD, &before) == 0 && before &&
-	       read(fd, buf, sizeof buf) > 0)
+	while (before && !kept && ++reads < READS_MAX && ioctl(fd, FIONREAD, &before) == 0 &&
+	       before && read(fd, buf, sizeof buf) > 0)
 		;
 }
 
@@ -231,7 +243,7 @@ static uint32_t add_missing(int fd, const struct file *want, const struct file *
 	struct file_system fs = { .anchor = -1 };
 	uint32_t failed = 0;
 
-	for (uint32_t i = 0; i < want->mark_count; i++) {
+	for (uint32_t i = 0; i < want->mark_count && budget_step(); i++) {
 		const struct file_mark *mark = &want->mark[i], *is = find_mark(now, mark);
 		char path[40];
 		int at, wd;

@@ -134,6 +134,7 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 		guard_refuse(guard, ticket, AVC_GONE, "the application has been asked to stop");
 		return;
 	}
+	budget_begin(NULL, NULL);
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
 	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
@@ -252,7 +253,7 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 
 uint32_t guard_tend_stragglers(struct avc_guard *guard)
 {
-	uint32_t left = threads_tend_stragglers(&guard->main);
+	uint32_t left = 0;
 
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		left += threads_tend_stragglers(guard->tree.process[i]);
@@ -261,21 +262,18 @@ uint32_t guard_tend_stragglers(struct avc_guard *guard)
 
 static bool any_lost(const struct avc_guard *guard)
 {
-	bool lost = guard->main.lost;
-
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
-		lost |= guard->tree.process[i]->lost;
-	return lost;
+		if (guard->tree.process[i]->lost)
+			return true;
+	return false;
 }
 
 /* Calls of the app's that a checkpoint has interrupted.  When the first of those that are
  * left is to be ended. */
 static uint64_t end_waits(struct avc_guard *guard)
 {
-	uint64_t due;
+	uint64_t due = UINT64_MAX;
 
-	waits_end(&guard->main, guard->timer);
-	due = guard->main.due_ns;
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		waits_end(guard->tree.process[i], guard->timer);
 		if (guard->tree.process[i]->due_ns < due)
@@ -303,18 +301,19 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
-	watch(guard, &n, guard->main.holder_pidfd);
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
-		watch(guard, &n, guard->tree.process[i]->pidfd);
-		watch(guard, &n, guard->tree.process[i]->holder_pidfd);
+		const struct process *process = guard->tree.process[i];
+
+		/* Of the main process's end init tells. */
+		if (process->descendant)
+			watch(guard, &n, process->pidfd);
+		watch(guard, &n, process->holder_pidfd);
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
-		watch(guard, &n, guard->generations[i].pidfd);
 		if (guard->generations[i].spare.pid)
 			watch(guard, &n, guard->generations[i].spare.pidfd);
-		for (uint32_t k = 0; k < guard->generations[i].branches; k++)
-			if (guard->generations[i].branch[k].image)
-				watch(guard, &n, guard->generations[i].branch[k].image->pidfd);
+		for (uint32_t k = 0; k < guard->generations[i].images; k++)
+			watch(guard, &n, guard->generations[i].image[k].pidfd);
 	}
 	for (uint32_t i = 0; tracee_ending_pidfd(i) >= 0; i++)
 		watch(guard, &n, tracee_ending_pidfd(i));
@@ -354,13 +353,11 @@ static void let_go(struct avc_guard *guard)
 		init_channel_arm(&guard->channel, false);
 	last_pid_forget();
 	guard_drop_all(guard);
-	process_unhold(&guard->main);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
 	/* The end of this process detaches what is left. */
 	tracee_end_now();
-	while (((guard->main.threads && guard_tend_stragglers(guard)) || tracee_reap_ending()) &&
-	       now_ns() < end)
+	while ((guard_tend_stragglers(guard) || tracee_reap_ending()) && now_ns() < end)
 		usleep(200);
 	tree_free(&guard->tree);
 	process_close(&guard->main);
@@ -378,12 +375,13 @@ static void guard_main(struct avc_guard *guard)
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 		ended = true;
 	}
+	tracee_know(guard_knows_tracee, guard);
 	while (!ended && !guard->stop) {
 		const uint32_t straggling = guard_tend_stragglers(guard);
 		const bool dying = now_ns() < guard->dying_until_ns;
 		struct avc_report report;
 
-		if (!straggling && !dying)
+		if (!straggling && !dying && !tracee_expects_strangers())
 			guard->stragglers_since_ns = now_ns();
 		if (!straggling)
 			guard->told_stragglers_ns = now_ns(); /* there are none */
@@ -391,7 +389,8 @@ static void guard_main(struct avc_guard *guard)
 			guard_kill_lost(guard);
 		if (dying)
 			guard_reap_unknown(guard);
-		wait_for_news(guard, straggling || dying);
+		tracee_release_strangers();
+		wait_for_news(guard, straggling || dying || tracee_expects_strangers());
 		if (guard->attached && init_channel_report(&guard->channel, &report)) {
 			guard_app_died(guard, &report);
 			continue;
@@ -466,10 +465,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	init_channel_init(&guard->channel);
 	process_init(&guard->main);
 	guard->tree = (struct tree){
-		.main = &guard->main,
 		.slots = start->config.keep + 1,
-		.entry = calloc(PROCESSES_MAX, sizeof *guard->tree.entry),
-		.process = calloc(2 * PROCESSES_MAX, sizeof *guard->tree.process),
 		.is_ours = guard_owns,
 		.arg = guard,
 	};
@@ -513,8 +509,8 @@ int guard_run(int socket)
 	if (!guard)
 		return GUARD_UNTOLD;
 	guard->main.others = mem_others_new();
-	if (!process_make_room(&guard->main) || !guard->main.others || !guard->tree.entry ||
-	    !guard->tree.process) {
+	if (!process_make_room(&guard->main) || !guard->main.others ||
+	    tree_init(&guard->tree, &guard->main)) {
 		fail(&error, AVC_KERNEL, ENOMEM, 0, "start guard", "calloc", "out of memory");
 		guard_emit_error(guard, AVC_EVENT_UNPROTECTED, 0, &error);
 	} else {

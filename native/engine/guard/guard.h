@@ -31,7 +31,7 @@ struct avc_guard {
 	struct init_channel channel;
 	bool attached, unprotected;
 	struct process main; /* the app's main process                         */
-	struct tree tree;    /* and the others                                 */
+	struct tree tree;    /* it and the others                              */
 	struct pollfd *fds;  /* room for wait_for_news()                       */
 	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
@@ -41,9 +41,10 @@ struct avc_guard {
 	uint64_t
 		dying_until_ns; /* when it was found dying, some time more: see guard_reap_unknown() */
 	uint32_t misses;        /* in a row, of one that is unsupported     */
-	bool cramped;           /* there is no room for spares              */
-	uint64_t ahead_ns;      /* when to guard_work_ahead(); UINT64_MAX: never  */
-	uint32_t room;          /* generations that may be held now         */
+	uint64_t reported_ns; /* since when it has been traced by one of its own; 0: it is not */
+	bool cramped;         /* there is no room for spares              */
+	uint64_t ahead_ns;    /* when to guard_work_ahead(); UINT64_MAX: never  */
+	uint32_t room;        /* generations that may be held now         */
 	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
 	uint32_t restores, crash_restores;
 	/* Of the process that runs now. */
@@ -102,6 +103,8 @@ void guard_await_spares(struct avc_guard *guard);
 /* Those that are just ending, for 50 ms at most. */
 void guard_wait_ended(void);
 void guard_reap_dead(struct avc_guard *guard);
+/* A tracee that is a thread of the app's, or ours (tracee_know()). */
+bool guard_knows_tracee(pid_t tid, const void *guard);
 void guard_reap_unknown(const struct avc_guard *guard);
 uint32_t guard_dispensable(const struct avc_guard *guard, bool probation);
 void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
@@ -111,6 +114,14 @@ void guard_choose_generation(struct avc_guard *guard, bool used_up);
 void guard_note_written(struct avc_guard *guard);
 int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		       int pidfd, struct avc_error *err) warn_unused;
+
+/* ---- guard_memory.c ------------------------------------------------------- */
+
+/* Tells the OOM killer whom of ours to take, and when.  After each change of what is held. */
+void guard_rank_generations(struct avc_guard *guard);
+/* Whether the app fills its container's memory by itself: to go back to now would be to be
+ * killed again at once. */
+bool guard_app_is_full(const struct avc_guard *guard);
 
 /* ---- guard_checkpoint.c ---------------------------------------------------- */
 

@@ -9,13 +9,15 @@
 #include "guard.h"
 
 #define SPARE_NS (NS_PER_S / 2)
-#define INIT_REAPS_US 3000 /* what we have reaped is a zombie of init's until then           */
+#define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
+#define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_NS (1 * NS_PER_MS)
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
 #define MISSES_UNTIL_UNPROTECTED 3
+#define REPORT_NS (60 * NS_PER_S) /* that a crash reporter may take                       */
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
@@ -23,7 +25,6 @@
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
 {
 	guard_drop_all(guard);
-	process_unhold(&guard->main);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
 	if (!guard->unprotected || ticket)
@@ -76,7 +77,7 @@ static void touch_slot(const struct parasite *parasite, uint32_t slot, uint32_t 
 static void drop_images(struct avc_guard *guard, const struct process *process)
 {
 	for (uint32_t i = guard->count; i-- > 0;)
-		if (generation_branch(&guard->generations[i], process))
+		if (generation_image(&guard->generations[i], process))
 			guard_drop_generation(guard, i);
 }
 
@@ -182,34 +183,23 @@ static void abandon(struct avc_guard *guard, struct generation *fresh)
 	generation_drop(fresh);
 	tracee_end_now(); /* they have the tables of processes that are in no generation yet */
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
-		guard->tree.process[i]->doubtful |= guard->tree.process[i]->lost;
-	if (guard->tree.processes)
+		guard->tree.process[i]->doubtful |= guard->tree.process[i]->descendant &&
+						    guard->tree.process[i]->lost;
+	if (guard->tree.processes > 1)
 		guard_kill_lost(guard);
 	guard_let_ended_go(guard);
 }
 
-static int files_errors(const struct generation *generation, struct avc_error *err)
-{
-	if (generation->files_error.code) {
-		*err = generation->files_error;
-		return -1;
-	}
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process && files_errors(generation->branch[i].image, err))
-			return -1;
-	return 0;
-}
-
 /* avckpt.files=strict: from here on, nothing is written that is not seen. */
-static void watch_files(struct avc_guard *guard, struct generation *fresh)
+static void watch_files(struct avc_guard *guard, struct image *main)
 {
-	struct process *process = &guard->main;
+	struct process *process = main->process;
 
 	if (!guard->written)
 		guard->written = files_written_new();
 	if (guard->written)
-		files_written_watch(guard->written, process->pid, &fresh->notice);
-	fresh->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
+		files_written_watch(guard->written, process->pid, &main->notice);
+	main->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
 }
 
 /* What a restore can be spared of it is found out when nothing else is to be done. */
@@ -219,7 +209,7 @@ static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 	struct avc_error later = { 0 };
 
 	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
-	if (fresh->branches &&
+	if (fresh->images > 1 &&
 	    restore_plan_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX,
 			       &later))
 		guard->ahead_ns = UINT64_MAX; /* there is no memory for it */
@@ -252,8 +242,8 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 
 	tracee_deadline_set(guard->timer, SPARE_NS);
 	/* A template that was killed is seen to by guard_reap_dead(), as soon as that can be seen. */
-	if (spare_make(&guard->main, newest, &error) && error.code != AVC_GONE &&
-	    !pidfd_ended(newest->pidfd))
+	if (spare_make(newest, &error) && error.code != AVC_GONE &&
+	    !pidfd_ended(newest->image[0].pidfd))
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
 	tracee_deadline_clear(guard->timer);
 }
@@ -279,71 +269,106 @@ void guard_work_ahead(struct avc_guard *guard)
 		guard->ahead_ns = now_ns();
 }
 
-static int take_seen(struct avc_guard *guard, struct mem_seen *seen, struct avc_event *event,
-		     struct avc_error *err)
+/* What can be done before the app is stopped. */
+static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct avc_error *err)
 {
-	struct process *process = &guard->main;
-	struct generation fresh = { .pidfd = -1, .slot = guard_free_slot(guard) };
-	struct freeze_times times;
-	int result;
+	struct image *main = &freeze->generation->image[0];
 
-	if (prepare_files(guard, err) || memory_prepare(process, &fresh.image, seen, err)) {
-		generation_drop(&fresh);
+	if (prepare_files(guard, err) ||
+	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
-	}
 	if (guard->config.files == AVC_FILES_STRICT)
-		watch_files(guard, &fresh);
-	touch_slot(&process->parasite, fresh.slot, process->thread_count);
-	for (uint32_t i = 1; i < guard->tree.count; i++)
-		if (guard->tree.entry[i].process && guard->tree.entry[i].process->infected)
-			touch_slot(&guard->tree.entry[i].process->parasite, fresh.slot,
-				   guard->tree.entry[i].process->thread_count);
-	wait_quiescent(guard, &fresh.quiescent);
+		watch_files(guard, main);
+	for (uint32_t i = 0; i < guard->tree.count; i++) {
+		const struct process *process = guard->tree.entry[i].process;
+
+		if (process && process->infected)
+			touch_slot(&process->parasite, main->slot, process->thread_count);
+	}
+	wait_quiescent(guard, &freeze->generation->quiescent);
+	for (uint32_t i = 0; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process)
+			waits_prepare(guard->tree.entry[i].process);
+	budget_deadline(READ_NS);
 	/* What is written between here and the freeze counts as written after it. */
 	guard_note_written(guard);
-	result = freeze_tree(&guard->tree, guard->timer, guard->config.freeze_deadline_ns, &fresh,
-			     seen, &times, err);
-	event->freeze_ns = times.freeze_ns;
-	event->stop_ns = times.stop_ns;
-	event->clone_ns = times.clone_ns;
-	event->threads = generation_threads(&fresh);
-	if (!result)
-		result = files_errors(&fresh, err);
-	if (!result) {
-		tracee_deadline_set(guard->timer, NS_PER_S);
-		result = generation_finish(process, &fresh, err);
-		tracee_deadline_clear(guard->timer);
-	}
-	if (result) {
-		abandon(guard, &fresh);
+	return 0;
+}
+
+static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_error *err)
+{
+	int result;
+
+	if (generation_files_error(fresh, err))
+		return -1;
+	tracee_deadline_set(guard->timer, NS_PER_S);
+	result = generation_finish(fresh, err);
+	tracee_deadline_clear(guard->timer);
+	return result;
+}
+
+static void settle_files(struct avc_guard *guard, struct generation *fresh)
+{
+	const struct generation *before = guard->count ? &guard->generations[guard->count - 1]
+						       : NULL;
+
+	for (uint32_t i = 0; i < fresh->images; i++)
+		if (fresh->image[i].process)
+			files_settle(&fresh->image[i]);
+	if (fresh->images > 1)
+		files_settle_family(fresh->image, fresh->images, before ? before->image : NULL,
+				    before ? before->images : 0);
+}
+
+static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_event *event,
+		   struct avc_error *err)
+{
+	struct generation *fresh = freeze->generation;
+	int result;
+
+	if (prepare_freeze(guard, freeze, err)) {
+		generation_drop(fresh);
 		return -1;
 	}
-	event->error = fresh.notice;
-	files_settle(process, &fresh);
-	for (uint32_t i = 0; i < fresh.branches; i++)
-		if (fresh.branch[i].process)
-			files_settle(fresh.branch[i].process, fresh.branch[i].image);
-	if (fresh.branches)
-		files_settle_family(process, &fresh,
-				    guard->count ? &guard->generations[guard->count - 1] : NULL);
-	fresh.number = ++guard->number;
-	fresh.clone_ns = times.clone_ns;
-	begin_ahead(guard, &fresh);
-	guard_keep_generation(guard, &fresh);
+	result = freeze_tree(freeze, err);
+	budget_deadline(0);
+	if (!result)
+		result = budget_check(guard->main.pid, err);
+	event->freeze_ns = freeze->freeze_ns;
+	event->stop_ns = freeze->stop_ns;
+	event->clone_ns = freeze->clone_ns;
+	event->threads = generation_threads(fresh);
+	if (result || finish(guard, fresh, err)) {
+		abandon(guard, fresh);
+		return -1;
+	}
+	event->error = *generation_notice(fresh);
+	settle_files(guard, fresh);
+	fresh->number = ++guard->number;
+	fresh->clone_ns = freeze->clone_ns;
+	begin_ahead(guard, fresh);
+	guard_keep_generation(guard, fresh);
 	init_channel_arm(&guard->channel, true);
-	event->generation = fresh.number;
+	event->generation = fresh->number;
 	event->generations = guard->count;
-	event->quiescent = fresh.quiescent;
+	event->quiescent = fresh->quiescent;
 	guard_tend_tree(guard);
 	return 0;
 }
 
 static int take_once(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
-	struct mem_seen seen = { 0 };
-	const int result = take_seen(guard, &seen, event, err);
+	struct generation fresh;
+	struct freeze freeze = { .tree = &guard->tree,
+				 .generation = &fresh,
+				 .timer = guard->timer,
+				 .deadline_ns = guard->config.freeze_deadline_ns };
+	int result;
 
-	mem_seen_free(&seen);
+	if (generation_new(&fresh, &guard->main, guard_free_slot(guard), err))
+		return -1;
+	result = take_by(guard, &freeze, event, err);
+	mem_seen_free(&freeze.seen);
 	return result;
 }
 
@@ -369,6 +394,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 {
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
+		budget_begin(NULL, NULL);
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
 		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))
@@ -377,6 +403,27 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 			err->code = AVC_DEADLINE;
 		return -1;
 	}
+}
+
+/* Being traced by a process of the app's own, as one is that crashes while the reporter that it
+ * has started for that (breakpad, gdb) looks into it.  One that lives like that is not
+ * protected, though. */
+static bool is_being_reported(struct avc_guard *guard, const struct avc_error *err)
+{
+	struct proc_status status = { 0 };
+	struct proc_stat stat;
+	pid_t pid;
+
+	if (err->code != AVC_BUSY || !guard->count || proc_status(err->pid, &status))
+		return false;
+	for (pid = status.tracer; pid > 1 && pid != guard->channel.init; pid = stat.parent)
+		if (proc_stat(pid, &stat))
+			return true; /* it has just ended */
+	if (pid != guard->channel.init)
+		return false;
+	if (!guard->reported_ns)
+		guard->reported_ns = now_ns();
+	return now_ns() - guard->reported_ns < REPORT_NS;
 }
 
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
@@ -398,8 +445,15 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 				     "memory is short, so no generation is held");
 		return;
 	}
+	if (guard_app_is_full(guard)) {
+		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
+		     "it fills the memory of its container: what it had before is kept");
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
 	if (take(guard, &event, &error) == 0) {
 		guard->misses = 0;
+		guard->reported_ns = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
@@ -419,6 +473,10 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	 * stay good for a while. */
 	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
 		   error.code == AVC_BUSY;
+	if (is_being_reported(guard, &error)) {
+		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		return;
+	}
 	if (hopeless && error.pid != guard->main.pid && guard->count &&
 	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);

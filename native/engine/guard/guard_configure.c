@@ -37,6 +37,7 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 		guard->room = config->keep;
 	while (guard->count > guard->room)
 		guard_drop_generation(guard, guard_dispensable(guard, false));
+	guard_rank_generations(guard);
 	if (!guard->attached)
 		return;
 	next = guard_interval_end(guard);

@@ -85,34 +85,77 @@ static void release_new(struct avc_guard *guard, const struct generation *genera
 {
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->holder &&
-		    !generation_branch(generation, guard->tree.process[i]))
+		    !generation_image(generation, guard->tree.process[i]))
 			guard_release(guard, guard->tree.process[i]);
 }
 
-/* The other processes are those of the generation now; of what they had before they died
- * nothing is open any more (generation_close_tables()). */
+/* The processes are those of the generation now; of what the others had before they died nothing
+ * is open any more (generation_close_tables()). */
 static void adopt_family(struct avc_guard *guard, const struct generation *generation)
 {
 	struct tree *tree = &guard->tree;
 
 	for (uint32_t i = 0; i < tree->processes; i++)
-		tree_let_go(tree->process[i]);
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		const struct branch *branch = &generation->branch[i];
+		if (tree->process[i]->descendant)
+			tree_let_go(tree->process[i]);
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+		struct process *process = image->process;
 		struct avc_error gone = { 0 };
 		struct proc_stat stat;
 
-		if (!branch->process)
+		if (!process)
 			continue;
-		/* One that has died again already is seen to by the next checkpoint. */
-		if (proc_stat(branch->pid, &stat) == 0 &&
-		    process_open(branch->process, branch->pid, branch->inside, &gone) == 0) {
-			branch->process->infected = true;
-			branch->process->start = stat.start;
-		}
+		/* One that has died again already is seen to by the next checkpoint; of the main
+		 * one the next report tells. */
+		process->infected = proc_stat(image->pid, &stat) == 0 &&
+				    process_open(process, image->pid, image->inside, &gone) == 0;
+		if (process->infected)
+			process->start = stat.start;
 	}
 	tree->count = 0;
-	guard->main.childless = !generation->branches;
+	guard->main.childless = generation->images == 1;
+}
+
+static void note_restore(struct avc_guard *guard, const struct generation *generation,
+			 enum avc_reason reason)
+{
+	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
+	guard->restores++;
+	guard->lineage = generation->lineage;
+	guard->restored_from = generation->number;
+	guard->proved = false;
+	if (reason == AVC_REASON_COMMAND)
+		return;
+	guard->restored_ns = now_ns();
+	guard->restored_at[guard->crash_restores++ % RESTORES_MAX] = guard->restored_ns;
+}
+
+/* `error`: of a newer generation that would not. */
+static void tell_restored(struct avc_guard *guard, struct avc_event *event,
+			  const struct restore *restore, const struct avc_error *error)
+{
+	const struct generation *generation = restore->generation;
+
+	event->app_pid = restore->pid;
+	event->app_pid_inside = guard->main.inside;
+	event->restore_ns = restore->restore_ns;
+	event->fork_ns = restore->fork_ns;
+	event->threads_ns = restore->threads_ns;
+	event->threads = generation_threads(generation);
+	event->generation = generation->number;
+	event->generations = guard->count;
+	event->restores = guard->restores;
+	event->error = error->code ? *error : restore->notes;
+	event->age_ns = restore->died_ns - generation->taken_ns;
+	event->at_ns = now_ns();
+	guard_emit(guard, event);
+}
+
+/* Of whatever takes its time. */
+static void say_working(void *channel)
+{
+	init_channel_working(channel);
 }
 
 /* The newest generation; when restores are used up, the one before it.  There were `had`
@@ -121,23 +164,30 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		       enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
-	struct process *process = &guard->main;
-	const struct avc_config *config = &guard->config;
-	const uint32_t attempt = restores_within(guard, now_ns()) + 1;
 	bool ending = guard->count < had, again = false;
 
 	event.ticket = guard->restore_ticket;
+	event.reason = reason;
+	event.wait_status = report->status;
+	event.died_ns = report->reaped_ns;
+	event.attempt = restores_within(guard, now_ns()) + 1;
 	while (guard->count) {
 		struct generation *generation = &guard->generations[guard->count - 1];
-		struct restore_times times;
-		pid_t pid;
+		const struct image *image = &generation->image[0];
+		struct restore restore = { .generation = generation,
+					   .channel = &guard->channel,
+					   .config = &guard->config,
+					   .timer = guard->timer,
+					   .died_ns = report->reaped_ns,
+					   .ready = say_restored,
+					   .arg = guard };
+		struct avc_error failed = { 0 };
 
-		struct avc_error failed = { 0 }, notes = { 0 };
+		budget_begin(say_working, &guard->channel);
 
 		/* What was written since the newest was written since all others, also
 		 * where that can not be seen any more. */
-		if (guard_check_strict(guard, generation, generation->template, generation->pidfd,
-				       &failed)) {
+		if (guard_check_strict(guard, generation, image->template, image->pidfd, &failed)) {
 			*error = failed;
 			guard_drop_all(guard);
 			break;
@@ -147,64 +197,30 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		 * tables.  And they count where processes are limited, as a spare does. */
 		if (ending)
 			guard_wait_ended();
-		if (restore_app(process, generation, &guard->channel, config, guard->timer,
-				report->reaped_ns, say_restored, guard, &pid, &times, &notes,
-				&failed)) {
-			/* Perhaps because the spare was killed when it was needed, or was one
-			 * process too many.  The template is as good as before. */
-			if (generation->spare.pid && !again) {
-				spare_drop(generation);
-				generation->spare.unwanted = failed.errnum == EAGAIN;
-				again = true;
-			} else {
-				if (!error->code)
-					*error = failed;
-				guard_drop_generation(guard, guard->count - 1);
-				again = false;
-			}
-			ending = true;
-			guard_kill_lost(guard);
-			continue;
+		if (restore_app(&restore, &failed) == 0) {
+			adopt_family(guard, generation);
+			generation->spare.tried = false; /* that one is used up */
+			note_restore(guard, generation, reason);
+			tell_restored(guard, &event, &restore, error);
+			break;
 		}
-		/* If this fails it has died already: the next report tells. */
-		process->infected =
-			process_open(process, pid,
-				     parasite_slot(&process->parasite, generation->slot)->pid,
-				     &failed) == 0;
-		adopt_family(guard, generation);
-		generation->spare.tried = false; /* that one is used up */
-		guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
-		guard->restores++;
-		guard->lineage = generation->lineage;
-		guard->restored_from = generation->number;
-		guard->proved = false;
-		if (reason != AVC_REASON_COMMAND) {
-			guard->restored_ns = now_ns();
-			guard->restored_at[guard->crash_restores++ % RESTORES_MAX] =
-				guard->restored_ns;
+		/* Perhaps because the spare was killed when it was needed, or was one
+		 * process too many.  The template is as good as before. */
+		if (generation->spare.pid && !again) {
+			spare_drop(generation);
+			generation->spare.unwanted = failed.errnum == EAGAIN;
+			again = true;
+		} else {
+			if (!error->code)
+				*error = failed;
+			guard_drop_generation(guard, guard->count - 1);
+			again = false;
 		}
-		event.reason = reason;
-		event.app_pid = pid;
-		event.app_pid_inside = process->inside;
-		event.wait_status = report->status;
-		event.died_ns = report->reaped_ns;
-		event.restore_ns = times.restore_ns;
-		event.fork_ns = times.fork_ns;
-		event.threads_ns = times.threads_ns;
-		event.threads = generation_threads(generation);
-		event.generation = generation->number;
-		event.generations = guard->count;
-		event.attempt = attempt;
-		event.restores = guard->restores;
-		/* Of a newer generation that would not; or what is not as it was. */
-		event.error = error->code ? *error : notes;
-		event.age_ns = report->reaped_ns - generation->taken_ns;
-		event.at_ns = now_ns();
-		guard_emit(guard, &event);
-		break;
+		ending = true;
+		guard_kill_lost(guard);
 	}
 	/* It has the dead app's memory, and what was open is the restored one's. */
-	process_unhold_soon(process);
+	process_unhold_soon(&guard->main);
 	return guard->count > 0;
 }
 
@@ -212,15 +228,11 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
  * are not the main one only the holder keeps what they have open. */
 static void hold_all(struct avc_guard *guard)
 {
-	struct avc_error ignored = { 0 };
-
-	/* The next checkpoint tries again, and tells. */
-	if (process_hold(&guard->main, guard->timer, guard->config.freeze_deadline_ns, &ignored))
-		guard->dying_until_ns = now_ns() + DYING_NS;
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
+		struct avc_error ignored = { 0 };
 
-		ignored = (struct avc_error){ 0 };
+		/* The next checkpoint tries again, and tells. */
 		if (process->pid && !process->adopts &&
 		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;

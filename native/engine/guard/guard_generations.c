@@ -26,6 +26,7 @@ void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 	guard->count--;
 	memmove(&guard->generations[i], &guard->generations[i + 1],
 		(guard->count - i) * sizeof *guard->generations);
+	guard_rank_generations(guard);
 }
 
 void guard_drop_all(struct avc_guard *guard)
@@ -40,7 +41,7 @@ uint32_t guard_free_slot(const struct avc_guard *guard)
 		bool used = false;
 
 		for (uint32_t i = 0; i < guard->count; i++)
-			used |= guard->generations[i].slot == slot;
+			used |= guard->generations[i].image[0].slot == slot;
 		if (!used)
 			return slot;
 	}
@@ -74,7 +75,7 @@ bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->main.holder || tracee_is_ending(pid))
+	if (tracee_is_ending(pid))
 		return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->holder == pid)
@@ -82,11 +83,10 @@ bool guard_owns(pid_t pid, const void *arg)
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct generation *generation = &guard->generations[i];
 
-		if (generation->template == pid || generation->spare.pid == pid)
+		if (generation->spare.pid == pid)
 			return true;
-		for (uint32_t k = 0; k < generation->branches; k++)
-			if (generation->branch[k].image &&
-			    generation->branch[k].image->template == pid)
+		for (uint32_t k = 0; k < generation->images; k++)
+			if (generation->image[k].template == pid)
 				return true;
 	}
 	return false;
@@ -96,8 +96,6 @@ bool guard_knows_process(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (pid == guard->main.leader)
-		return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->leader == pid)
 			return true;
@@ -123,19 +121,10 @@ void guard_await_spares(struct avc_guard *guard)
 			continue;
 		tracee_deadline_set(guard->timer, LATE_SPARE_NS);
 		/* Or it is still on its way; who was killed is seen to by guard_reap_dead(). */
-		if (spare_await(&guard->main, &guard->generations[i], &late))
+		if (spare_await(&guard->generations[i], &late))
 			guard->main.lost |= late.code != AVC_DEADLINE;
 		tracee_deadline_clear(guard->timer);
 	}
-}
-
-void guard_kill_lost(struct avc_guard *guard)
-{
-	guard_await_spares(guard);
-	init_channel_kill_lost(&guard->channel, guard_knows_process, guard);
-	guard->main.lost = false;
-	for (uint32_t i = 0; i < guard->tree.processes; i++)
-		guard->tree.process[i]->lost = false;
 }
 
 static bool has_thread(const struct process *process, pid_t tid)
@@ -150,7 +139,7 @@ static bool is_known(pid_t tid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (guard_owns(tid, guard) || has_thread(&guard->main, tid))
+	if (guard_owns(tid, guard))
 		return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (has_thread(guard->tree.process[i], tid))
@@ -158,13 +147,39 @@ static bool is_known(pid_t tid, const void *arg)
 	return false;
 }
 
+bool guard_knows_tracee(pid_t tid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	return is_known(tid, guard) || tree_has_parasite(&guard->tree, tracee_pc(tid));
+}
+
+/* What is not in a parasite is the app's (CLONE_PARENT, CLONE_PTRACE), or ends by itself
+ * (infect.c); it is let go. */
+static bool is_not_lost(pid_t pid, const void *arg)
+{
+	const struct avc_guard *guard = arg;
+
+	return guard_knows_process(pid, guard) || is_known(pid, guard) || !tracee_is_ours(pid) ||
+	       !tree_has_parasite(&guard->tree, tracee_pc(pid));
+}
+
+void guard_kill_lost(struct avc_guard *guard)
+{
+	guard_await_spares(guard);
+	init_channel_kill_lost(&guard->channel, is_not_lost, guard);
+	tracee_release_strangers();
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		guard->tree.process[i]->lost = false;
+}
+
 void guard_release(struct avc_guard *guard, struct process *process)
 {
 	for (uint32_t i = 0; i < guard->count; i++) {
-		const struct branch *branch = generation_branch(&guard->generations[i], process);
+		const struct image *image = generation_image(&guard->generations[i], process);
 
-		if (branch)
-			generation_close_files(process, branch->image);
+		if (image)
+			generation_close_files(image);
 	}
 	tree_let_go(process);
 }
@@ -184,38 +199,50 @@ static bool found_executed(struct process *process, uint64_t now)
 	return process_has_executed(process);
 }
 
+/* What may be left in it by another program. */
+static bool has_ours(const struct process *process)
+{
+	return process->descendant ? process->pid && process->infected : process->holder != 0;
+}
+
+/* All that there is of the app is of a program that the main process does not run any more. */
+static void lose_program(struct avc_guard *guard)
+{
+	while (guard->count)
+		guard_lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
+	tracee_end_now(); /* they have the table that exec(2) has left */
+	process_unhold(&guard->main);
+	guard->main.infected = false; /* what was mapped there went with its memory */
+}
+
 /* One that executes another program closes what it has marked for that (O_CLOEXEC), and
  * somebody may be waiting for just that.  The kernel does not tell, so it is looked at: often
  * at first, for most do it at once if they do it at all. */
 void guard_let_executed_go(struct avc_guard *guard, bool all)
 {
-	struct process *main = &guard->main;
 	const uint64_t now = now_ns();
 
-	if (main->holder && (all || now >= main->exec_check_ns) && found_executed(main, now)) {
-		while (guard->count)
-			guard_lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
-		tracee_end_now(); /* they have the table that exec(2) has left */
-		process_unhold(main);
-		main->infected = false; /* what was mapped there went with its memory */
-	}
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
 
-		if (process->pid && process->infected && (all || now >= process->exec_check_ns) &&
-		    found_executed(process, now))
+		if (!has_ours(process) || (!all && now < process->exec_check_ns) ||
+		    !found_executed(process, now))
+			continue;
+		if (process->descendant)
 			guard_release(guard, process);
+		else
+			lose_program(guard);
 	}
 }
 
 uint64_t guard_exec_check_due(const struct avc_guard *guard)
 {
-	uint64_t due = guard->main.holder ? guard->main.exec_check_ns : UINT64_MAX;
+	uint64_t due = UINT64_MAX;
 
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
-		if (process->pid && process->infected && process->exec_check_ns < due)
+		if (has_ours(process) && process->exec_check_ns < due)
 			due = process->exec_check_ns;
 	}
 	return due;
@@ -231,7 +258,7 @@ void guard_let_ended_go(struct avc_guard *guard)
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
 
-		if (!process->pid || !pidfd_ended(process->pidfd))
+		if (!process->descendant || !process->pid || !pidfd_ended(process->pidfd))
 			continue;
 		if (!main->pid || pidfd_ended(main->pidfd) || proc_is_exiting(main->pid))
 			return;
@@ -258,10 +285,8 @@ void guard_reap_unknown(const struct avc_guard *guard)
 
 static bool has_ended(const struct generation *generation)
 {
-	if (pidfd_ended(generation->pidfd))
-		return true;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].image && pidfd_ended(generation->branch[i].image->pidfd))
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process && pidfd_ended(generation->image[i].pidfd))
 			return true;
 	return false;
 }
@@ -285,8 +310,6 @@ void guard_reap_dead(struct avc_guard *guard)
 		for (uint32_t i = guard->count; i-- > 0;)
 			if (has_ended(&guard->generations[i]))
 				events[count++] = lost_generation(guard, i, AVC_REASON_KILLED);
-		if (guard->main.holder && pidfd_ended(guard->main.holder_pidfd))
-			process_unhold(&guard->main);
 		for (uint32_t i = 0; i < guard->tree.processes; i++)
 			if (guard->tree.process[i]->holder &&
 			    pidfd_ended(guard->tree.process[i]->holder_pidfd))
@@ -366,6 +389,7 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 	while (guard->count >= guard->room)
 		guard_drop_generation(guard, guard_dispensable(guard, probation));
 	guard->generations[guard->count++] = *fresh;
+	guard_rank_generations(guard);
 	/* Only a health check can say that a process does not hang. */
 	if (!guard->vouching)
 		guard->proved = true;
@@ -421,8 +445,9 @@ void guard_choose_generation(struct avc_guard *guard, bool used_up)
  * good any more after a file was written. */
 void guard_note_written(struct avc_guard *guard)
 {
-	const struct files *known = guard->count ? guard->generations[guard->count - 1].files
-						 : NULL;
+	const struct files *known = guard->count
+					    ? guard->generations[guard->count - 1].image[0].files
+					    : NULL;
 	char name[FILES_NAME];
 
 	if (!guard->written || !files_written_since(guard->written, known, name))
@@ -439,16 +464,21 @@ int guard_check_strict(struct avc_guard *guard, const struct generation *generat
 	if (guard->config.files != AVC_FILES_STRICT)
 		return 0;
 	guard_note_written(guard);
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		const struct process *process = generation->branch[i].process;
+	if (generation->written[0])
+		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+			    "avckpt.files=strict: %.80s was written since the checkpoint",
+			    generation->written);
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+		const struct process *process = image->process;
 
 		/* What one that has ended before has written, guard_note_written() knows. */
-		if (process && process->holder &&
-		    files_check_strict(generation->branch[i].image, process->holder,
-				       process->holder_pidfd, guard->channel.init, process->holder,
-				       err))
+		if (!process || (process->descendant && !process->holder))
+			continue;
+		if (files_check_strict(image, process->descendant ? process->holder : pid,
+				       process->descendant ? process->holder_pidfd : pidfd,
+				       guard->channel.init, process->holder, err))
 			return -1;
 	}
-	return files_check_strict(generation, pid, pidfd, guard->channel.init, guard->main.holder,
-				  err);
+	return 0;
 }

@@ -4,12 +4,11 @@
  * other threads run on meanwhile.
  *
  * The parasite is memory that the guard makes (parasite.c), so that what the app does to its own
- * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a
- * process with the same memory, from a stub in the zero padding behind some executable mapping, the
- * vDSO's as a rule.  The porter takes leave of the app's descriptors, so that no number is taken
- * for a moment that the app could miss; in a table of its own it is sent the memory over a socket,
- * maps it, and is killed.  It makes one system call at a time, of which every register is set from
- * outside.
+ * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a task
+ * with the same memory, from a stub in the zero padding behind some executable mapping, the vDSO's
+ * as a rule.  The porter takes leave of the app's descriptors, so that no number is taken for a
+ * moment that the app could miss; in a table of its own it is sent the memory over a socket, maps
+ * it, and ends.  It makes one system call at a time, of which every register is set from outside.
  *
  * The stub ends by loading the thread's own registers, so it gets home without us, and a porter
  * that we can not tell what to do ends by itself.
@@ -90,9 +89,16 @@ static void note_old_pad(struct process *process, avc_remote base, avc_remote en
 
 struct survey {
 	struct process *process;
-	avc_remote pc, cave, code, code_end; /* code: of a parasite, its data follow     */
+	avc_remote pc, cave, pad, pad_end; /* pad: the one that is being gone through     */
 	bool in_stub;
 };
+
+/* Of a parasite that is there, or was being brought in (bring_parasite). */
+static bool is_of_pad(const struct mapping *m)
+{
+	return !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)") ||
+	       !strcmp(m->name, "/dev/zero (deleted)");
+}
 
 static int survey_mapping(const struct mapping *m, void *arg)
 {
@@ -100,17 +106,13 @@ static int survey_mapping(const struct mapping *m, void *arg)
 	struct process *process = survey->process;
 	const bool code = m->mode[2] == 'x' && !m->shared;
 
-	if (!strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)")) {
-		if (!strcmp(m->mode, "r-xs") && m->end - m->start == INJ_CODE_BYTES) {
-			survey->code = m->start;
-			survey->code_end = m->end;
-		} else {
-			note_old_pad(process,
-				     survey->code && m->start == survey->code_end ? survey->code
-										  : m->start,
-				     m->end);
-			survey->code = 0;
+	/* In pieces, one right behind the other. */
+	if (is_of_pad(m)) {
+		if (m->start != survey->pad_end || is_place_of_pads(m->start)) {
+			note_old_pad(process, survey->pad, survey->pad_end);
+			survey->pad = m->start;
 		}
+		survey->pad_end = m->end;
 	}
 	if (code && survey->pc < m->end && survey->pc >= m->end - CAVE_BYTES)
 		survey->in_stub = has_stub(process->mem_fd, m->end);
@@ -130,6 +132,7 @@ static int survey(struct process *process, avc_remote pc, avc_remote *cave, stru
 	process->old_parasites = 0;
 	if (proc_mappings(process->pid, "maps", survey_mapping, &survey))
 		return fail_errno(err, process->pid, "infect", "read(maps)", "it has ended");
+	note_old_pad(process, survey.pad, survey.pad_end);
 	*cave = survey.cave;
 	if (survey.in_stub || parasite_is_old(process, pc))
 		return fail(err, AVC_DEADLINE, 0, process->pid, "infect", "",
@@ -152,25 +155,23 @@ static int step_failed(const struct stop *stop, pid_t tid, struct avc_error *err
  * between: job control, or SIGSTOP, which can not be blocked. */
 static int step(pid_t tid, struct stop *stop, struct avc_error *err)
 {
-	*stop = (struct stop){ .kind = STOP_NONE };
-	while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK) {
-		if (ptrace(PTRACE_SYSCALL, tid, NULL,
-			   (long)(stop->kind == STOP_SIGNAL ? stop->signal : 0)))
+	do {
+		if (seccomp_go_on(tid, stop))
 			return fail_errno(err, tid, "infect", "ptrace(SYSCALL)", "it has gone");
 		*stop = tracee_wait(tid, 0);
 		if (stop->kind == STOP_EXIT || stop->kind == STOP_DYING ||
 		    stop->kind == STOP_DEADLINE)
 			return step_failed(stop, tid, err);
-	}
+	} while (stop->kind != STOP_SYSCALL && stop->kind != STOP_FORK);
 	return 0;
 }
 
-/* To the exit from a call `nr` that will not be made again.  1: on the way it has brought forth
- * *child. */
+/* From stop to stop, to the exit from a call `nr` that will not be made again.  1: on the way it
+ * has brought forth *child. */
 static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_error *err)
 {
+	struct stop stop = { .kind = STOP_OTHER };
 	struct arch_regs regs;
-	struct stop stop;
 
 	for (;;) {
 		if (step(tid, &stop, err))
@@ -190,34 +191,55 @@ static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_
 	}
 }
 
+/* The task that brings the parasite.  For the main process it is a child of init's.  Any child of
+ * another process its own threads could wait for (__WALL), even before the stub does: there it is a
+ * thread, which nobody waits for, and which ends by itself, for whoever kills it kills them all. */
 struct porter {
-	pid_t pid;
+	pid_t tid; /* 0: there is none                                     */
+	bool is_thread;
 	avc_remote cave;
 	const struct arch_regs *base;
 };
+
+static int open_pidfd(pid_t tid, bool is_thread)
+{
+	return (int)syscall(SYS_pidfd_open, tid, is_thread ? PIDFD_THREAD_ : 0);
+}
+
+/* A thread has descriptors of its own, which only a pidfd of its own gives (since Linux 6.9). */
+static bool can_be_thread(void)
+{
+	int pidfd = open_pidfd((pid_t)syscall(SYS_gettid), true);
+	const bool can = pidfd >= 0;
+
+	close_fd(&pidfd);
+	return can;
+}
 
 /* The main thread makes it, and stays in the event's stop. */
 static int make_porter(struct process *process, struct thread *thread, struct porter *porter,
 		       struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
-	/* The main process' is init's child.  Another's is its own, of which nobody is told: all of
-	 * that process stands still until the stub has waited for it. */
-	const uint64_t kin = process->descendant ? 0 : CLONE_PARENT | SIGCHLD;
+	const uint64_t kin = porter->is_thread
+				     ? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM
+			     : process->descendant ? 0
+						   : CLONE_PARENT | SIGCHLD;
 	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | kin };
+	const long options = (long)(porter->is_thread ? TRACE_OPTIONS_APP : TRACE_OPTIONS_OURS);
+	const struct sched_param first = { .sched_priority = 1 };
 	struct arch_regs regs;
 	long refused;
 	int born;
 
-	arch_stub_call(&regs, &thread->regs, porter->cave, SYS_clone, arg);
-	if (thread_suspend_seccomp(thread, err))
-		return -1;
-	if (arch_regs_set(thread->tid, &regs) ||
+	arch_stub_call(&regs, &thread->regs, porter->cave, false, SYS_clone, arg);
+	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
+	    arch_regs_set(thread->tid, &regs) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
 		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
 	thread->borrowed_for = NULL;
-	born = step_over(thread->tid, SYS_clone, &refused, &porter->pid, err);
+	born = step_over(thread->tid, SYS_clone, &refused, &porter->tid, err);
 	if (born < 0) {
 		process->lost = true;
 		thread->stopped = false; /* it runs: in the stub, which must stay, and home */
@@ -231,11 +253,39 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 		return fail(err, AVC_KERNEL, (int)-refused, process->pid, "infect", "clone",
 			    "it may not have another process: %s", strerror((int)-refused));
 	}
-	if (tracee_await(porter->pid, NULL, err) != STOP_TRAP)
+	if (tracee_await(porter->tid, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, porter->pid, NULL, (long)TRACE_OPTIONS_OURS))
-		return fail_errno(err, porter->pid, "infect", "ptrace(SETOPTIONS)", "it has ended");
+	if (ptrace(PTRACE_SETOPTIONS, porter->tid, NULL, options) ||
+	    seccomp_supervise(porter->tid, 0, options))
+		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
+	/* The main thread waits for it, and each of its calls is two turns.  Best effort. */
+	(void)sched_setscheduler(porter->tid, SCHED_FIFO, &first);
 	return 0;
+}
+
+/* False: it is still on its way out, through the stub. */
+static bool kill_porter(struct process *process, const struct porter *porter)
+{
+	const uint64_t arg[6] = { 0 };
+	struct stop stop = { .kind = STOP_NONE };
+	struct avc_error ignored = { 0 };
+	struct arch_regs regs;
+	struct thread *left;
+
+	if (!porter->is_thread)
+		tracee_kill(porter->tid);
+	arch_stub_call(&regs, porter->base, porter->cave, true, SYS_exit, arg);
+	if (porter->is_thread && arch_regs_set(porter->tid, &regs) == 0)
+		while (seccomp_go_on(porter->tid, &stop) == 0 && stop.kind != STOP_EXIT &&
+		       stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
+			stop = tracee_wait(porter->tid, 0);
+	seccomp_let_be(porter->tid);
+	if (!porter->is_thread || stop.kind == STOP_EXIT)
+		return true;
+	left = thread_add(process, porter->tid, &ignored);
+	if (left)
+		left->attached = true; /* it still has to be waited for */
+	return false;
 }
 
 /* The porter is gone: the main thread out of the stub's calls, to where it can be sent home. */
@@ -257,10 +307,10 @@ static int porter_call(const struct porter *porter, long nr, const uint64_t arg[
 {
 	struct arch_regs regs;
 
-	arch_stub_call(&regs, porter->base, porter->cave, nr, arg);
-	if (arch_regs_set(porter->pid, &regs))
-		return fail_errno(err, porter->pid, "infect", "ptrace(SETREGS)", "it has gone");
-	return step_over(porter->pid, nr, result, NULL, err);
+	arch_stub_call(&regs, porter->base, porter->cave, true, nr, arg);
+	if (arch_regs_set(porter->tid, &regs))
+		return fail_errno(err, porter->tid, "infect", "ptrace(SETREGS)", "it has gone");
+	return step_over(porter->tid, nr, result, NULL, err);
 }
 
 /* One that must not fail. */
@@ -272,7 +322,7 @@ static int porter_must(const struct porter *porter, const char *name, const char
 	if (porter_call(porter, nr, arg, &result, err))
 		return -1;
 	if (result < 0 && result > -4096)
-		return fail(err, AVC_UNSUPPORTED, (int)-result, porter->pid, "infect", name, "%s",
+		return fail(err, AVC_UNSUPPORTED, (int)-result, porter->tid, "infect", name, "%s",
 			    problem);
 	return 0;
 }
@@ -317,11 +367,11 @@ static int open_channel(const struct porter *porter, avc_remote scratch, struct 
 	    porter_must(porter, "socketpair", "it may not have a socket", SYS_socketpair, pair,
 			err))
 		return -1;
-	pidfd = proc_pidfd_open(porter->pid);
+	pidfd = open_pidfd(porter->tid, porter->is_thread);
 	channel = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 1);
 	close_fd(&pidfd);
 	if (channel < 0)
-		return fail_errno(err, porter->pid, "infect", "pidfd_getfd", "it was killed");
+		return fail_errno(err, porter->tid, "infect", "pidfd_getfd", "it was killed");
 	if (porter_must(porter, "close", "its end of a socket can not be closed", SYS_close, ours,
 			err))
 		close_fd(&channel);
@@ -364,7 +414,7 @@ static int bring_parasite(struct process *process, const struct porter *porter,
 	struct parasite *parasite = &process->parasite;
 	const size_t data_bytes = parasite->bytes - INJ_CODE_BYTES;
 	const uint64_t place[6] = { where_to_map(process), parasite->bytes, PROT_NONE,
-				    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, (uint64_t)-1 };
+				    MAP_SHARED | MAP_ANONYMOUS | MAP_NORESERVE, (uint64_t)-1 };
 	uint64_t scratch[6] = { 0, ARCH_PAGE_BYTES, PROT_READ | PROT_WRITE };
 	uint64_t code[6] = { 0, INJ_CODE_BYTES, PARASITE_CODE_PROT, PARASITE_FLAGS_OVER, 1 };
 	uint64_t data[6] = { 0, data_bytes, PARASITE_DATA_PROT, PARASITE_FLAGS_OVER, 1 };
@@ -394,9 +444,11 @@ static int bring_parasite(struct process *process, const struct porter *porter,
 }
 
 static int make_pad(struct process *process, struct thread *thread, avc_remote cave, uint32_t slots,
-		    uint32_t threads_max, struct avc_error *err)
+		    uint32_t threads_max, bool *stub_is_free, struct avc_error *err)
 {
-	struct porter porter = { .cave = cave, .base = &thread->regs };
+	struct porter porter = { .cave = cave,
+				 .base = &thread->regs,
+				 .is_thread = process->descendant && can_be_thread() };
 	int result;
 
 	if (check_room(process, parasite_layout(&process->parasite, slots, threads_max), err) ||
@@ -405,8 +457,8 @@ static int make_pad(struct process *process, struct thread *thread, avc_remote c
 	result = make_porter(process, thread, &porter, err);
 	if (!result)
 		result = bring_parasite(process, &porter, err);
-	if (porter.pid) {
-		tracee_kill(porter.pid);
+	if (porter.tid) {
+		*stub_is_free = kill_porter(process, &porter);
 		if (leave_stub(thread, err))
 			result = -1;
 	}
@@ -426,6 +478,7 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 		return NULL;
 	}
 	t->seen = true;
+	rewind_prepare(t);
 	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;
@@ -447,6 +500,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	uint8_t stub[ARCH_STUB_BYTES], zero[ARCH_STUB_BYTES] = { 0 };
 	uint32_t threads_max = 32, threads = process->thread_count * 2;
 	struct arch_regs home;
+	bool stub_is_free = true;
 	avc_remote cave;
 	size_t bytes;
 	int result;
@@ -454,6 +508,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	while (threads_max < threads)
 		threads_max *= 2;
 	parasite_close(&process->parasite);
+	process->parasite.inside = process->inside;
 	memory_forget(process->memory);
 	if (getrandom(&process->nonce, sizeof process->nonce, 0) < 0)
 		return fail_errno(err, 0, "infect", "getrandom", "no random number");
@@ -472,9 +527,10 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	if (pwrite(process->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
 		return fail_errno(err, process->pid, "infect", "write(mem)",
 				  "its code can not be written");
-	result = make_pad(process, thread, cave, slots, threads_max, err);
+	result = make_pad(process, thread, cave, slots, threads_max, &stub_is_free, err);
 	/* Nobody is in the stub any more: leave no trace. */
-	if (thread->stopped && (!thread->borrowed || thread_give_back(thread, err) == 0)) {
+	if (stub_is_free && thread->stopped &&
+	    (!thread->borrowed || thread_give_back(thread, err) == 0)) {
 		if (pwrite(process->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
 			err->undo_failures++;
 	}
@@ -485,21 +541,47 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	return result;
 }
 
+/* Of a process that is not the main one, while all of it stands still: the holder, or `slots` of a
+ * parasite.  Another thread may be waiting for children, of any kind (__WALL). */
+static int do_stopped(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
+		      struct avc_error *err)
+{
+	struct thread *thread;
+	int result;
+
+	rt_priority_begin();
+	tracee_deadline_set(timer, deadline_ns);
+	result = process_stop(process, err);
+	thread = thread_find(process, process->pid);
+	if (!result && (!thread || !thread->stopped))
+		result = fail(err, AVC_GONE, 0, process->pid, "infect", "", "it has ended");
+	if (!result)
+		result = thread_read(thread, err);
+	if (!result)
+		result = slots ? infect_thread(process, thread, slots, err)
+			       : process_hold_stopped(process, process->init, err);
+	process_let_go(process);
+	tracee_deadline_clear(timer);
+	rt_priority_end();
+	return result;
+}
+
 int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		   struct avc_error *err)
 {
 	struct thread *thread;
 	int result;
 
+	if (process->descendant && !can_be_thread())
+		return do_stopped(process, slots, timer, deadline_ns, err);
+	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	thread = stop_main(process, err);
-	if (!thread) {
-		tracee_deadline_clear(timer);
-		return -1;
-	}
-	result = infect_thread(process, thread, slots, err);
-	thread_release(thread);
+	result = thread ? infect_thread(process, thread, slots, err) : -1;
+	if (thread)
+		thread_release(thread);
 	tracee_deadline_clear(timer);
+	rt_priority_end();
 	return result;
 }
 
@@ -602,28 +684,6 @@ static int keep_holder(struct process *process, pid_t holder, int result, struct
 	return -1;
 }
 
-static int hold_descendant(struct process *process, timer_t timer, uint64_t deadline_ns,
-			   struct avc_error *err)
-{
-	struct thread *thread;
-	int result;
-
-	rt_priority_begin();
-	tracee_deadline_set(timer, deadline_ns);
-	/* All of it: another thread may be waiting for children, of any kind (__WALL). */
-	result = process_stop(process, err);
-	thread = thread_find(process, process->pid);
-	if (!result && (!thread || !thread->stopped))
-		result = fail(err, AVC_GONE, 0, process->pid, "make holder", "", "it has ended");
-	if (!result)
-		result = thread_read(thread, err) ||
-			 process_hold_stopped(process, process->init, err);
-	process_let_go(process);
-	tracee_deadline_clear(timer);
-	rt_priority_end();
-	return result;
-}
-
 int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		 struct avc_error *err)
 {
@@ -634,7 +694,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	int result;
 
 	if (process->descendant)
-		return hold_descendant(process, timer, deadline_ns, err);
+		return do_stopped(process, 0, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
 	thread = stop_main(process, err);
@@ -648,7 +708,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
-		process->lost = process->lost || (result && err->code != AVC_KERNEL);
+		process->lost = process->lost || (result && err->code != AVC_LIMIT);
 	}
 	if (!result)
 		result = tracee_settle(thread->tid, err);
@@ -665,8 +725,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
-	if (ptrace(PTRACE_SETOPTIONS, holder, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(holder, &base))
+	if (parasite_own(&process->parasite, holder) || arch_regs_get(holder, &base))
 		result = fail_errno(err, holder, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
@@ -686,7 +745,7 @@ static int clone_by(struct process *process, pid_t tid, const struct arch_regs *
 		return -1;
 	if (tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(&process->parasite, *child))
 		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
 	return 0;
 }
@@ -722,12 +781,12 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
-		process->lost = process->lost || err->code != AVC_KERNEL;
+		process->lost = process->lost || err->code != AVC_LIMIT;
 		thread_runs_on(thread, err);
 		return -1;
 	}
 	if (tracee_await(between, NULL, err) != STOP_TRAP ||
-	    ptrace(PTRACE_SETOPTIONS, between, NULL, (long)TRACE_OPTIONS_OURS) ||
+	    parasite_own(&process->parasite, between) ||
 	    arch_regs_get(between, &process->holder_base))
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");

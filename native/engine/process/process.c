@@ -18,9 +18,8 @@
 
 #include "process.h"
 
-#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h */
-#define PIDFS_MAGIC 0xff     /* the same, PIDFS_IOCTL_MAGIC */
-#define ASK_AGAIN_AFTER 8    /* checkpoints */
+#define PIDFS_MAGIC 0xff  /* the same, PIDFS_IOCTL_MAGIC */
+#define ASK_AGAIN_AFTER 8 /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
 
 void process_init(struct process *process)
@@ -398,6 +397,7 @@ int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_n
 			again += !t->young;
 		}
 		tracee_deadline_set(timer, deadline_ns);
+		rewind_prepare(t);
 		if (thread_stop(process, t, &gone) || thread_await(process, t, &gone) ||
 		    check_unshared(process, t, &gone) || thread_ask(process, t, &gone))
 			t->known = false;

@@ -7,6 +7,7 @@
  *   infect.c        parasite and holder brought into it
  *   support.c       what can not be protected; quiescence
  *   waits.c         calls that are to be ended
+ *   dying.c         in its own handler of a fatal signal
  *   tree.c          all of them
  */
 #ifndef AVCKPT_PROCESS_H
@@ -28,18 +29,25 @@ struct tree_entry {
 
 /* All processes of an app (tree.c). */
 struct tree {
-	struct process *main;
 	pid_t init;
-	uint32_t slots;           /* of a parasite                                         */
-	struct tree_entry *entry; /* parents before children                        */
+	uint32_t slots;           /* of a parasite                                        */
+	struct tree_entry *entry; /* who was found; parents before children            */
 	uint32_t count;
-	struct process **process; /* of those that are not the main process; those
-				 * that have ended as long as there are images of them */
+	/* The main one first, which stays whatever becomes of it; of the others those that have
+	 * ended as long as there are images of them. */
+	struct process **process;
 	uint32_t processes;
 	/* Is this child of init one of our own? */
 	bool (*is_ours)(pid_t pid, const void *arg);
 	const void *arg;
 };
+
+#define PIDFD_THREAD_ O_EXCL /* linux/pidfd.h, since Linux 6.9 */
+
+static inline struct process *tree_main(const struct tree *tree)
+{
+	return tree->process[0];
+}
 
 /* ---- process.c ----------------------------------------------------------------- */
 
@@ -76,6 +84,16 @@ int process_take_stock(struct process *process, struct avc_error *err) warn_unus
 /* Gets known every thread that is not yet, one at a time, before a freeze. */
 int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
 		     struct avc_error *err) warn_unused;
+
+/* ---- dying.c ------------------------------------------------------------------- */
+
+/* Before a freeze: of which fatal signals it has handlers. */
+void dying_note_caught(struct process *process);
+/* In a freeze: before its threads are checked, and when none was in a handler. */
+void dying_begin(struct process *process);
+void dying_end(struct process *process);
+/* Of a stopped thread that was read: AVC_RETRY, it is in the handler of a fatal signal. */
+int dying_check(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 
 /* ---- stop.c --------------------------------------------------------------------- */
 
@@ -122,21 +140,28 @@ bool process_is_quiescent(const struct process *process);
 
 /* ---- tree.c --------------------------------------------------------------------- */
 
+/* Of one whose main process is this.  -1: out of memory. */
+int tree_init(struct tree *tree, struct process *main) warn_unused;
 /* Looks who there is; new ones are opened. */
 int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
 /* Whether entry[i] or a process above it adopts orphans, or could not be asked whether it does. */
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether entry[i] has its parent's memory, and not its own: after vfork(2) until it has
  * executed a program. */
+/* Whether that is in one of their parasites: then it is none of the app's that is there. */
+bool tree_has_parasite(const struct tree *tree, avc_remote pc);
 bool tree_shares_memory(const struct tree *tree, uint32_t i);
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);
 /* It is gone, or another program: what it had open must not stay open by us. */
 void tree_let_go(struct process *process);
+/* Of all but the main process, which is the caller's. */
 void tree_free(struct tree *tree);
 
 /* ---- waits.c ---------------------------------------------------------------------- */
 
+/* Before a freeze: looks at those that may be waiting. */
+void waits_prepare(struct process *process);
 /* Ends the calls that were rewound and whose time is up; the next one's is at
  * process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);

@@ -66,8 +66,7 @@ void process_stop_begin(struct process *process)
 		process->threads[i].seen = false;
 		process->threads[i].block = -1;
 	}
-	process->frozen = false;
-	process->begun = false;
+	process->stage = FREEZE_RUNS;
 }
 
 /* Until all are stopped, for threads create threads meanwhile: then a walk finds them. */

@@ -187,6 +187,7 @@ int support_check(struct process *process, struct avc_error *err)
 	if (check_shadow_stack(process, err) || check_namespaces(process, err) ||
 	    check_descriptors(process, err) || check_mappings(process, err))
 		return -1;
+	dying_note_caught(process);
 	return process->descendant ? check_descendant(process, err) : 0;
 }
 

@@ -13,6 +13,16 @@
 
 #include "process.h"
 
+int tree_init(struct tree *tree, struct process *main)
+{
+	tree->entry = calloc(PROCESSES_MAX, sizeof *tree->entry);
+	tree->process = calloc(2 * PROCESSES_MAX, sizeof(struct process *));
+	if (!tree->entry || !tree->process)
+		return -1;
+	tree->process[tree->processes++] = main;
+	return 0;
+}
+
 /* ---- who there is --------------------------------------------------------------- */
 
 struct looking {
@@ -25,7 +35,7 @@ struct looking {
 static int add_entry(struct tree *tree, pid_t pid, int parent, struct avc_error *err)
 {
 	if (tree->count == PROCESSES_MAX)
-		return fail(err, AVC_UNSUPPORTED, 0, tree->main->pid, "look at processes", "",
+		return fail(err, AVC_UNSUPPORTED, 0, tree_main(tree)->pid, "look at processes", "",
 			    "it has more than %d processes", PROCESSES_MAX);
 	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->entry[i].pid == pid)
@@ -36,11 +46,10 @@ static int add_entry(struct tree *tree, pid_t pid, int parent, struct avc_error 
 
 static bool any_cloning(const struct tree *tree)
 {
-	bool cloning = tree->main->cloning;
-
 	for (uint32_t i = 0; i < tree->processes; i++)
-		cloning |= tree->process[i]->cloning;
-	return cloning;
+		if (tree->process[i]->cloning)
+			return true;
+	return false;
 }
 
 static bool has_process(const struct tree *tree, pid_t pid)
@@ -51,13 +60,38 @@ static bool has_process(const struct tree *tree, pid_t pid)
 	return false;
 }
 
-/* A clone of ours: of a holder that is at it, or one of which we never heard. */
-static bool is_clone(const struct tree *tree, pid_t pid)
+bool tree_has_parasite(const struct tree *tree, avc_remote pc)
 {
+	for (uint32_t i = 0; i < tree->processes; i++)
+		if (parasite_contains(&tree->process[i]->parasite, pc))
+			return true;
+	return false;
+}
+
+/* A clone of ours: of a holder that is at it, or one of which we never heard.  What a thread of
+ * the app's has brought forth beside itself (CLONE_PARENT) may be a tracee, too.  1 or 0. */
+static int is_clone(const struct tree *tree, pid_t pid, struct avc_error *err)
+{
+	avc_remote pc;
+
 	if (has_process(tree, pid) || !tracee_is_ours(pid))
-		return false;
-	tree->main->lost |= !any_cloning(tree);
-	return true;
+		return 0;
+	pc = tracee_pc(pid);
+	if (!pc)
+		return fail(err, AVC_RETRY, 0, pid, "look at processes", "",
+			    "a process has just been made");
+	if (!tree_has_parasite(tree, pc))
+		return 0;
+	tree_main(tree)->lost |= !any_cloning(tree);
+	return 1;
+}
+
+/* A child of init's that is no process of the app's. */
+static int is_none(const struct tree *tree, pid_t pid, struct avc_error *err)
+{
+	return pid == tree_main(tree)->leader || tree->is_ours(pid, tree->arg)
+		       ? 1
+		       : is_clone(tree, pid, err);
 }
 
 /* A child hangs on the thread that forked it. */
@@ -69,11 +103,12 @@ static int look_at_task(pid_t tid, void *arg)
 	const int count = proc_children_of(look->task_dirfd, tid, children, CHILDREN_MAX);
 
 	for (int i = 0; i < count; i++) {
-		if (look->parent == PARENT_INIT &&
-		    (children[i] == tree->main->leader || tree->is_ours(children[i], tree->arg) ||
-		     is_clone(tree, children[i])))
-			continue;
-		if (add_entry(tree, children[i], look->parent, look->err))
+		const int none = look->parent == PARENT_INIT ? is_none(tree, children[i], look->err)
+							     : 0;
+
+		if (none < 0)
+			return -1;
+		if (!none && add_entry(tree, children[i], look->parent, look->err))
 			return -1;
 	}
 	return 0;
@@ -108,7 +143,7 @@ static bool is_zombie(const struct proc_stat *stat)
 
 static struct process *process_new(const struct tree *tree)
 {
-	const struct process *main = tree->main;
+	const struct process *main = tree_main(tree);
 	struct process *process = malloc(sizeof *process);
 
 	if (!process)
@@ -163,7 +198,7 @@ static struct process *add_process(struct tree *tree, pid_t pid, uint64_t start,
 	struct process *process;
 
 	if (tree->processes == 2 * PROCESSES_MAX) {
-		fail(err, AVC_UNSUPPORTED, 0, tree->main->pid, "look at processes", "",
+		fail(err, AVC_UNSUPPORTED, 0, tree_main(tree)->pid, "look at processes", "",
 		     "it has had too many processes since the oldest generation");
 		return NULL;
 	}
@@ -177,7 +212,6 @@ static struct process *add_process(struct tree *tree, pid_t pid, uint64_t start,
 		return NULL;
 	}
 	process->start = start;
-	forget_thread(tree->main, pid);
 	for (uint32_t i = 0; i < tree->processes; i++)
 		forget_thread(tree->process[i], pid);
 	tree->process[tree->processes++] = process;
@@ -217,9 +251,9 @@ static int check_sharing(const struct tree *tree, const struct tree_entry *entry
 int tree_look(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
-	if (add_entry(tree, tree->main->leader, PARENT_INIT, err))
+	if (add_entry(tree, tree_main(tree)->leader, PARENT_INIT, err))
 		return -1;
-	tree->entry[0].process = tree->main;
+	tree->entry[0].process = tree_main(tree);
 	if (look_below_init(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
@@ -304,7 +338,8 @@ void tree_sweep(struct tree *tree)
 		struct process *process = tree->process[i];
 
 		/* One of which a thread is still ours has to be waited for. */
-		if (!process->pid && !process->images && !process->thread_count && !process->lost)
+		if (process->descendant && !process->pid && !process->images &&
+		    !process->thread_count && !process->lost)
 			process_free(process);
 		else
 			tree->process[kept++] = process;
@@ -314,7 +349,7 @@ void tree_sweep(struct tree *tree)
 
 void tree_free(struct tree *tree)
 {
-	for (uint32_t i = 0; i < tree->processes; i++)
+	for (uint32_t i = 1; i < tree->processes; i++)
 		process_free(tree->process[i]);
 	free(tree->process);
 	free(tree->entry);

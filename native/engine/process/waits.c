@@ -8,6 +8,7 @@
 #include "process.h"
 
 #define END_DEADLINE_NS (20 * NS_PER_MS)
+#define LOOKS_MAX 64 /* of some 50 us, before a checkpoint */
 
 /* How often a thread has been given a CPU; 0: the kernel does not count. */
 static uint64_t runs_of(pid_t tid)
@@ -41,6 +42,16 @@ static void end(struct process *process, struct thread *thread, timer_t timer)
 		thread_release(thread); /* or threads_tend_stragglers() does it, later */
 	tracee_deadline_clear(timer);
 	rt_priority_end();
+}
+
+void waits_prepare(struct process *process)
+{
+	uint32_t looks = 0;
+
+	for (uint32_t i = 0; i < process->thread_count && looks < LOOKS_MAX; i++) {
+		rewind_prepare(&process->threads[i]);
+		looks += process->threads[i].sleeper.known;
+	}
 }
 
 void waits_end(struct process *process, timer_t timer)

@@ -74,22 +74,21 @@ static void reset(const struct parasite *parasite, uint32_t slot_number)
 }
 
 /* A stopped process is sent to inj_restore() and let go. */
-static int send_off(struct process *process, struct generation *generation, pid_t child,
-		    struct sandbox **sandbox, struct avc_error *err)
+static int send_off(const struct image *image, pid_t child, struct sandbox **sandbox,
+		    struct avc_error *err)
 {
-	const struct parasite *parasite = &process->parasite;
+	const struct parasite *parasite = &image->process->parasite;
 	struct arch_regs regs;
 
 	/* Its stack is the first thread's, in the slot. */
-	arch_call(&regs, &generation->base, parasite->base + INJ_RESTORE_OFFSET,
-		  parasite_remote(parasite, parasite_stack(parasite, generation->slot, 0)),
-		  parasite_remote(parasite, parasite_slot(parasite, generation->slot)));
+	arch_call(&regs, &image->base, parasite->base + INJ_RESTORE_OFFSET,
+		  parasite_remote(parasite, parasite_stack(parasite, image->slot, 0)),
+		  parasite_remote(parasite, parasite_slot(parasite, image->slot)));
 	/* A holder, of which the template is a clone, has that of the time when it was made. */
-	if (!generation->headless)
-		arch_tls_set(&regs, parasite_thread(parasite, generation->slot, 0)->tls);
-	if ((generation->sandboxed || generation->stop_signal) &&
-	    arch_regs_set(child, &regs) == 0) {
-		*sandbox = sandbox_begin(child, err);
+	if (!image->headless)
+		arch_tls_set(&regs, parasite_thread(parasite, image->slot, 0)->tls);
+	if ((image->sandboxed || image->stop_signal) && arch_regs_set(child, &regs) == 0) {
+		*sandbox = sandbox_begin(child, image->process->inside, err);
 		if (*sandbox)
 			return 0;
 		tracee_kill(child);
@@ -105,14 +104,15 @@ static int send_off(struct process *process, struct generation *generation, pid_
 
 /* One fork of the template, or what is to have the memory of its spare.  If it is to have
  * children, it stays stopped. */
-static int fork_template(struct process *process, struct generation *generation, pid_t *pid,
-			 int *pidfd, bool again, struct sandbox **sandbox, struct avc_error *err)
+static int fork_template(struct restore *restore, bool again, struct avc_error *err)
 {
-	const struct parasite *parasite = &process->parasite;
-	struct inj_slot *slot = parasite_slot(parasite, generation->slot);
+	struct generation *generation = restore->generation;
+	const struct image *image = &generation->image[0];
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_slot *slot = parasite_slot(parasite, image->slot);
 	struct inj_call *call = &slot->template_call;
 	const bool spare = spare_is_there(generation);
-	const pid_t from = spare ? generation->spare.pid : generation->template;
+	const pid_t from = spare ? generation->spare.pid : image->template;
 	pid_t child = 0;
 
 	/* The first time there are calls of files_restore() before it. */
@@ -120,31 +120,27 @@ static int fork_template(struct process *process, struct generation *generation,
 		call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, (spare ? CLONE_VM : 0) | CLONE_FILES | CLONE_PARENT | SIGCHLD, 0,
 		 0, 0, 0);
-	if (parasite_send(parasite, from, &generation->base, call, err) ||
+	if (parasite_send(parasite, from, &image->base, call, err) ||
 	    parasite_run_clone(from, call, &child, err))
 		return -1;
 	if (tracee_await(child, NULL, err) != STOP_TRAP)
 		return -1;
-	close_fd(pidfd);
-	*pidfd = proc_pidfd_open(child);
-	if (*pidfd < 0) {
+	close_fd(&restore->pidfd);
+	restore->pidfd = proc_pidfd_open(child);
+	if (restore->pidfd < 0) {
 		fail_errno(err, child, "restore", "pidfd_open", "the new process was killed");
 		tracee_kill(child);
 		return -1;
 	}
-	files_lift_limit(generation->files, child);
-	if (generation->branches) {
-		if (proc_inside(child) == slot->pid) {
-			*pid = child;
-		} else {
-			tracee_kill(child);
-			slot->state = INJ_WRONG_PID;
-		}
+	files_lift_limit(image->files, child);
+	if (restore->tree && proc_inside(child) != slot->pid) {
+		tracee_kill(child);
+		slot->state = INJ_WRONG_PID;
 		return tracee_settle(from, err);
 	}
-	if (send_off(process, generation, child, sandbox, err))
+	if (!restore->tree && send_off(image, child, &restore->sandbox, err))
 		return -1;
-	*pid = child;
+	restore->pid = child;
 	/* The template can come to rest meanwhile. */
 	return tracee_settle(from, err);
 }
@@ -168,12 +164,11 @@ static int describe_failure(const struct parasite *parasite, const struct inj_sl
 
 /* Forks until the number that comes out is the app's; in a PID namespace that is
  * shared somebody else may fork in between. */
-static int rebuild(struct process *process, struct generation *generation, struct last_pid *helper,
-		   struct restore_tree *others, pid_t *pid, int *pidfd, struct sandbox **sandbox,
-		   struct restore_times *times, struct avc_error *notes, struct avc_error *err)
+static int rebuild(struct restore *restore, struct avc_error *err)
 {
-	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
-
+	const struct image *image = &restore->generation->image[0];
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_slot *slot = parasite_slot(parasite, image->slot);
 	const uint64_t end = now_ns() + TRY_NS;
 
 	for (int i = 0; i < TRIES || now_ns() < end; i++) {
@@ -184,29 +179,29 @@ static int rebuild(struct process *process, struct generation *generation, struc
 		if (i >= TRIES)
 			usleep(TRY_AGAIN_NS / 1000);
 		start = now_ns();
-		reset(&process->parasite, generation->slot);
-		if (last_pid_set(helper, slot->pid - 1, err) ||
-		    fork_template(process, generation, pid, pidfd, i > 0, sandbox, err))
+		reset(parasite, image->slot);
+		if (last_pid_set(restore->helper, slot->pid - 1, err) ||
+		    fork_template(restore, i > 0, err))
 			return -1;
-		times->fork_ns = now_ns() - start;
-		if (others && slot->state == INJ_IDLE) {
-			if (restore_tree_make(others, *pid, notes, err) ||
-			    send_off(process, generation, *pid, sandbox, err))
+		restore->fork_ns = now_ns() - start;
+		if (restore->tree && slot->state == INJ_IDLE) {
+			if (restore_tree_make(restore->tree, err) ||
+			    send_off(image, restore->pid, &restore->sandbox, err))
 				return -1;
-			times->fork_ns = now_ns() - start;
+			restore->fork_ns = now_ns() - start;
 		}
 		start = now_ns();
-		if (!await_state(slot, *sandbox))
-			return fail(err, AVC_KERNEL, ETIMEDOUT, *pid, "restore", "",
+		if (!await_state(slot, restore->sandbox))
+			return fail(err, AVC_KERNEL, ETIMEDOUT, restore->pid, "restore", "",
 				    "the new process does not answer");
-		times->threads_ns = now_ns() - start;
+		restore->threads_ns = now_ns() - start;
 		if (slot->state == INJ_READY)
 			return 0;
-		if (*sandbox)
-			sandbox_end(*sandbox);
-		*sandbox = NULL;
+		if (restore->sandbox)
+			sandbox_end(restore->sandbox);
+		restore->sandbox = NULL;
 		if (slot->state == INJ_FAILED)
-			return describe_failure(&process->parasite, slot, err);
+			return describe_failure(parasite, slot, err);
 	}
 	return fail(err, AVC_KERNEL, EEXIST, slot->pid, "restore", "clone",
 		    "the PID is taken by somebody else");
@@ -214,23 +209,26 @@ static int rebuild(struct process *process, struct generation *generation, struc
 
 /* ---- one of several ---------------------------------------------------------------- */
 
-int restore_start(struct process *process, struct generation *image, struct last_pid *helper,
-		  pid_t pid, struct sandbox **sandbox, struct avc_error *err)
+int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
+		  struct sandbox **sandbox, struct avc_error *err)
 {
-	reset(&process->parasite, image->slot);
-	last_pid_serve(helper, parasite_slot(&process->parasite, image->slot));
-	return send_off(process, image, pid, sandbox, err);
+	const struct parasite *parasite = &image->process->parasite;
+
+	reset(parasite, image->slot);
+	last_pid_serve(helper, parasite_slot(parasite, image->slot));
+	return send_off(image, pid, sandbox, err);
 }
 
-int restore_await(struct process *process, struct generation *image, pid_t pid,
-		  struct sandbox *sandbox, struct avc_error *err)
+int restore_await(const struct image *image, pid_t pid, struct sandbox *sandbox,
+		  struct avc_error *err)
 {
-	struct inj_slot *slot = parasite_slot(&process->parasite, image->slot);
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_slot *slot = parasite_slot(parasite, image->slot);
 
 	if (!await_state(slot, sandbox))
 		return fail(err, AVC_KERNEL, ETIMEDOUT, pid, "restore", "",
 			    "the new process does not answer");
-	return slot->state == INJ_READY ? 0 : describe_failure(&process->parasite, slot, err);
+	return slot->state == INJ_READY ? 0 : describe_failure(parasite, slot, err);
 }
 
 /* What was allowed to fail, and did: to be told. */
@@ -252,30 +250,31 @@ static void let_go(struct inj_slot *slot, enum inj_go stage)
 }
 
 /* As the others knew it: its main thread has ended, it is stopped. */
-void restore_go(struct process *process, struct generation *image, struct sandbox *sandbox)
+void restore_go(const struct image *image, struct sandbox *sandbox)
 {
-	struct inj_slot *slot = parasite_slot(&process->parasite, image->slot);
+	const struct parasite *parasite = &image->process->parasite;
 
 	if (sandbox)
-		sandbox_go(sandbox, &process->parasite, image->slot, image->stop_signal);
-	let_go(slot, INJ_GO_ALL);
+		sandbox_go(sandbox, parasite, image->slot, image->stop_signal);
+	let_go(parasite_slot(parasite, image->slot), INJ_GO_ALL);
 }
 
-void restore_note(struct process *process, struct generation *image, pid_t pid,
-		  struct avc_error *notes)
+void restore_note(const struct image *image, pid_t pid, struct avc_error *notes)
 {
-	note_failed(&process->parasite, image->slot, pid, notes);
-	files_check_calls(&process->parasite, image->slot,
-			  parasite_slot(&process->parasite, image->slot)->pid, notes);
+	const struct parasite *parasite = &image->process->parasite;
+
+	note_failed(parasite, image->slot, pid, notes);
+	files_check_calls(parasite, image->slot, parasite_slot(parasite, image->slot)->pid, notes);
 	attributes_put_back(image->attributes, pid, notes);
 }
 
+/* ---- all of it --------------------------------------------------------------------- */
+
 /* It serves all processes that ask for numbers: those that are no zombies. */
-static struct last_pid *start_helper(const struct process *process,
-				     const struct generation *generation,
-				     const struct init_channel *channel, struct avc_error *err)
+static struct last_pid *start_helper(const struct restore *restore, struct avc_error *err)
 {
-	struct last_pid_slot *slot = calloc(generation->branches + 1, sizeof *slot);
+	const struct generation *generation = restore->generation;
+	struct last_pid_slot *slot = calloc(generation->images, sizeof *slot);
 	struct last_pid *helper = NULL;
 	uint32_t count = 0;
 
@@ -283,112 +282,130 @@ static struct last_pid *start_helper(const struct process *process,
 		fail_errno(err, 0, "restore", "calloc", "out of memory");
 		return NULL;
 	}
-	slot[count++] = (struct last_pid_slot){ &process->parasite, generation->slot };
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		const struct branch *branch = &generation->branch[i];
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
 
-		if (branch->process)
-			slot[count++] = (struct last_pid_slot){ &branch->process->parasite,
-								branch->image->slot };
+		if (image->process)
+			slot[count++] = (struct last_pid_slot){ &image->process->parasite,
+								image->slot };
 	}
-	helper = last_pid_start(channel->init_pidfd, slot, count, err);
+	helper = last_pid_start(restore->channel->init_pidfd, slot, count, err);
 	free(slot);
 	return helper;
 }
 
-int restore_app(struct process *process, struct generation *generation,
-		struct init_channel *channel, const struct avc_config *config, timer_t timer,
-		uint64_t died_ns, int (*ready)(void *arg, struct avc_error *err), void *arg,
-		pid_t *pid, struct restore_times *times, struct avc_error *notes,
-		struct avc_error *err)
+/* To fork takes so long that the number would be somebody else's in the end. */
+static int make_spare_first(struct restore *restore, struct avc_error *err)
 {
-	struct inj_slot *slot = parasite_slot(&process->parasite, generation->slot);
-	struct last_pid *helper = start_helper(process, generation, channel, err);
-	struct sandbox *sandbox = NULL;
-	struct restore_tree *others = NULL;
-	struct fd_table *tables = calloc(generation->branches + 1, sizeof *tables);
-	int result, pidfd = -1;
-	uint64_t start, spare_ns;
+	struct generation *generation = restore->generation;
+	const uint64_t start = now_ns();
+	int result = spare_await(generation, err);
 
-	*pid = 0;
-	*times = (struct restore_times){ 0 };
-	if (!helper || !tables) {
-		last_pid_stop(helper);
-		free(tables);
-		return fail_errno(err, 0, "restore", "calloc", "out of memory");
-	}
-	tracee_deadline_set(timer, FORK_NS);
-	start = now_ns();
-	result = spare_await(process, generation, err);
-	/* To fork takes so long that the number would be somebody else's in the end. */
-	if (!result && generation->anon_pages >= COPIED_PAGES && !generation->spare.unwanted &&
-	    !spare_is_there(generation))
-		result = spare_make_now(process, generation, err);
-	spare_ns = now_ns() - start;
-	if (!result)
-		result = files_restore(process, generation, config, channel->init, tables, notes,
-				       err);
-	if (!result && generation->branches) {
-		others = restore_tree_new(process, generation, helper, channel, timer, tables, err);
-		result = others ? 0 : -1;
-	}
-	init_channel_working(channel);
-	if (!result)
-		result = rebuild(process, generation, helper, others, pid, &pidfd, &sandbox, times,
-				 notes, err);
-	if (!result && others)
-		result = restore_tree_start(others, notes, err);
-	if (!result)
-		generation_close_tables(generation);
-	tracee_deadline_clear(timer);
-	last_pid_stop(helper);
-	for (uint32_t i = 0; i < generation->branches; i++)
-		fd_table_free(&tables[i]);
-	free(tables);
-	if (!result)
-		restore_note(process, generation, *pid, notes);
-	if (!result)
-		result = memory_put_back(process, generation, *pid, notes, err);
-	if (!result)
-		result = ready(arg, err);
-	if (result) {
-		/* It waits for `go`: nothing of the app's has run.  The numbers it
-		 * holds must be free before another generation is tried. */
-		if (sandbox)
-			sandbox_end(sandbox);
-		if (pidfd >= 0) {
-			struct pollfd gone = { .fd = pidfd, .events = POLLIN };
+	if (!result && generation->image[0].anon_pages >= COPIED_PAGES &&
+	    !generation->spare.unwanted && !spare_is_there(generation))
+		result = spare_make_now(generation, err);
+	restore->fork_ns = now_ns() - start;
+	return result;
+}
 
-			syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
-			poll(&gone, 1, 1000);
-			close_fd(&pidfd);
-		}
-		if (others)
-			restore_tree_kill(others);
-		restore_tree_free(others);
-		*pid = 0;
+/* Until everything is there; nothing of the app's has run then. */
+static int make(struct restore *restore, struct avc_error *err)
+{
+	struct generation *generation = restore->generation;
+	uint64_t spare_ns;
+	int result;
+
+	if (make_spare_first(restore, err) ||
+	    files_restore(generation->image, generation->images, restore->config,
+			  restore->channel->init, &restore->notes, err))
 		return -1;
+	if (generation->images > 1) {
+		restore->tree = restore_tree_new(restore, err);
+		if (!restore->tree)
+			return -1;
 	}
-	if (others)
-		restore_tree_go(others);
-	if (!sandbox && generation->headless) {
+	init_channel_working(restore->channel);
+	spare_ns = restore->fork_ns;
+	result = rebuild(restore, err);
+	restore->fork_ns += spare_ns;
+	if (result || (restore->tree && restore_tree_start(restore->tree, err)))
+		return -1;
+	generation_close_tables(generation);
+	return 0;
+}
+
+/* The numbers it holds must be free before another generation is tried. */
+static void take_back(struct restore *restore)
+{
+	/* It waits for `go`. */
+	if (restore->sandbox)
+		sandbox_end(restore->sandbox);
+	if (restore->pidfd >= 0) {
+		struct pollfd gone = { .fd = restore->pidfd, .events = POLLIN };
+
+		syscall(SYS_pidfd_send_signal, restore->pidfd, SIGKILL, NULL, 0);
+		poll(&gone, 1, 1000);
+	}
+	if (restore->tree)
+		restore_tree_kill(restore->tree);
+	restore->pid = 0;
+}
+
+static void go(struct restore *restore)
+{
+	struct generation *generation = restore->generation;
+	const struct image *main = &generation->image[0];
+	struct inj_slot *slot = parasite_slot(&main->process->parasite, main->slot);
+
+	if (restore->tree)
+		restore_tree_go(restore->tree);
+	if (!restore->sandbox && main->headless) {
 		let_go(slot, INJ_GO_ENDED);
-		proc_await_end(*pid);
+		proc_await_end(restore->pid);
 	}
-	restore_go(process, generation, sandbox);
+	restore_go(main, restore->sandbox);
 	spare_drop(generation); /* it has the memory of what runs now */
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 
-		if (running == slot->threads || now_ns() > end || pidfd_ended(pidfd))
+		if (running == slot->threads || now_ns() > end || pidfd_ended(restore->pidfd))
 			break; /* or it has died again already */
 		wait_word(&slot->running, running, now_ns() + NS_PER_MS);
 	}
-	times->fork_ns += spare_ns;
-	times->restore_ns = now_ns() - died_ns;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		generation->branch[i].pid = restore_tree_pid(others, i);
-	restore_tree_free(others);
-	close_fd(&pidfd);
-	return 0;
+	restore->restore_ns = now_ns() - restore->died_ns;
+	for (uint32_t i = 0; i < generation->images; i++)
+		generation->image[i].pid = i ? restore_tree_pid(restore->tree, i) : restore->pid;
+}
+
+int restore_app(struct restore *restore, struct avc_error *err)
+{
+	struct generation *generation = restore->generation;
+	const struct image *main = &generation->image[0];
+	int result;
+
+	restore->pid = 0;
+	restore->pidfd = -1;
+	restore->helper = start_helper(restore, err);
+	if (!restore->helper)
+		return -1;
+	tracee_deadline_set(restore->timer, FORK_NS);
+	result = make(restore, err);
+	tracee_deadline_clear(restore->timer);
+	last_pid_stop(restore->helper);
+	for (uint32_t i = 0; i < generation->images; i++)
+		fd_table_free(&generation->image[i].table);
+	if (!result) {
+		restore_note(main, restore->pid, &restore->notes);
+		result = memory_put_back(main, restore->pid, &restore->notes, err) ||
+					 restore->ready(restore->arg, err)
+				 ? -1
+				 : 0;
+	}
+	if (result)
+		take_back(restore);
+	else
+		go(restore);
+	restore_tree_free(restore->tree);
+	close_fd(&restore->pidfd);
+	return result;
 }

@@ -18,52 +18,54 @@
  * later, also where others fork all the time.  What has more pages is copied first (spare.c). */
 #define COPIED_PAGES 16384
 
-struct restore_times {
+/* An app is made anew from a generation. */
+struct restore {
+	struct generation *generation;
+	struct init_channel *channel;
+	const struct avc_config *config;
+	timer_t timer;
+	uint64_t died_ns;
+	/* Called when everything is there, before anything runs: it sends the verdict. */
+	int (*ready)(void *arg, struct avc_error *err);
+	void *arg;
+	/* What came of it: the new main process, what it took, what is not as it was. */
+	pid_t pid;
 	uint64_t restore_ns, fork_ns, threads_ns;
-	struct avc_error notice; /* what could not be put back                  */
+	struct avc_error notes;
+	/* While it lasts. */
+	int pidfd;
+	struct last_pid *helper;
+	struct sandbox *sandbox;
+	struct restore_tree *tree; /* NULL: there is one process                       */
 };
 
-/* Makes the app anew from the generation; *notes is what is not as it was.  `ready` is called when everything is
- * there, before anything runs: it sends the verdict.  On success *pid is the new
- * main process. */
-int restore_app(struct process *process, struct generation *generation,
-		struct init_channel *channel, const struct avc_config *config, timer_t timer,
-		uint64_t died_ns, int (*ready)(void *arg, struct avc_error *err), void *arg,
-		pid_t *pid, struct restore_times *times, struct avc_error *notes,
-		struct avc_error *err) warn_unused;
+int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 
 /* Lets a stopped process that is what its template is put itself together; waits until
  * it has; tells what of it failed; lets it go. */
-int restore_start(struct process *process, struct generation *image, struct last_pid *helper,
-		  pid_t pid, struct sandbox **sandbox, struct avc_error *err) warn_unused;
-int restore_await(struct process *process, struct generation *image, pid_t pid,
-		  struct sandbox *sandbox, struct avc_error *err) warn_unused;
-void restore_note(struct process *process, struct generation *image, pid_t pid,
-		  struct avc_error *notes);
-void restore_go(struct process *process, struct generation *image, struct sandbox *sandbox);
+int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
+		  struct sandbox **sandbox, struct avc_error *err) warn_unused;
+int restore_await(const struct image *image, pid_t pid, struct sandbox *sandbox,
+		  struct avc_error *err) warn_unused;
+void restore_note(const struct image *image, pid_t pid, struct avc_error *notes);
+void restore_go(const struct image *image, struct sandbox *sandbox);
 
 /* ---- restore_tree.c ------------------------------------------------------------------------- */
 
-/* All processes of a generation, of which the main one is there; each is stopped.
- * `table`: of each branch. */
+/* All processes of a generation, of which the main one is there; each is stopped. */
 struct restore_tree;
-struct restore_tree *restore_tree_new(struct process *main, struct generation *generation,
-				      struct last_pid *helper, struct init_channel *channel,
-				      timer_t timer, const struct fd_table *table,
-				      struct avc_error *err);
+struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err);
 /* The main process (a stopped tracee) brings forth the others. */
-int restore_tree_make(struct restore_tree *tree, pid_t main_pid, struct avc_error *notes,
-		      struct avc_error *err) warn_unused;
+int restore_tree_make(struct restore_tree *tree, struct avc_error *err) warn_unused;
 /* They put themselves together, but for the main one. */
-int restore_tree_start(struct restore_tree *tree, struct avc_error *notes,
-		       struct avc_error *err) warn_unused;
+int restore_tree_start(struct restore_tree *tree, struct avc_error *err) warn_unused;
 void restore_tree_go(struct restore_tree *tree);
 void restore_tree_kill(struct restore_tree *tree);
 void restore_tree_free(struct restore_tree *tree);
-/* PID of a branch's process, when all of it is there. */
-pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t branch);
+/* PID of an image's process, when all of it is there. */
+pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t index);
 
 /* ---- remap.c ------------------------------------------------------------------------ */
 

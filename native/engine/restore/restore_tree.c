@@ -35,73 +35,56 @@ struct forked {
 };
 
 struct restore_tree {
-	struct process *main;
+	struct restore *restore;
 	struct generation *generation;
-	struct last_pid *helper;
-	struct init_channel *channel;
-	timer_t timer;
-	const struct fd_table *table; /* by branch                            */
 	struct copier *copier;
 	struct fd_channel fd_channel; /* of the main process's children                  */
 	uint64_t flush;               /* signals of children that ended (sigset_t)       */
 	pid_t last_number;            /* the number given out last; 0: not known          */
-	struct forked first;          /* the main process                              */
-	struct forked *forked;        /* by branch                                   */
+	struct forked forked[];       /* by image                                    */
 };
 
-struct restore_tree *restore_tree_new(struct process *main, struct generation *generation,
-				      struct last_pid *helper, struct init_channel *channel,
-				      timer_t timer, const struct fd_table *table,
-				      struct avc_error *err)
+struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err)
 {
-	struct restore_tree *restored = calloc(1, sizeof *restored);
+	struct generation *generation = restore->generation;
+	struct restore_tree *restored =
+		calloc(1, sizeof *restored + generation->images * sizeof *restored->forked);
 
-	if (restored && restore_plan_begin(generation, 0, err) == 0)
-		restored->copier = copier_new(err);
-	if (restored && restored->copier)
-		restored->forked = calloc(generation->branches + 1, sizeof *restored->forked);
-	if (!restored || !restored->forked) {
-		if (restored)
-			copier_free(restored->copier);
-		free(restored);
+	if (!restored) {
 		fail_errno(err, 0, "restore", "calloc", "out of memory");
 		return NULL;
 	}
-	restored->main = main;
+	restored->restore = restore;
 	restored->generation = generation;
-	restored->helper = helper;
-	restored->channel = channel;
-	restored->timer = timer;
-	restored->table = table;
 	restored->fd_channel = (struct fd_channel){ -1, -1 };
-	restored->first.pidfd = restored->first.batch.socket = -1;
-	for (uint32_t i = 0; i < generation->branches; i++)
+	for (uint32_t i = 0; i < generation->images; i++)
 		restored->forked[i].pidfd = restored->forked[i].batch.socket = -1;
+	if (restore_plan_begin(generation, 0, err) == 0)
+		restored->copier = copier_new(err);
+	if (!restored->copier) {
+		free(restored);
+		return NULL;
+	}
 	return restored;
-}
-
-static struct forked *forked_of(struct restore_tree *restored, int branch)
-{
-	return branch < 0 ? &restored->first : &restored->forked[branch];
 }
 
 /* What is done while a process forks, which takes its time if it is big: how the child
  * will differ from it is found out, and its last child is made what it is to be. */
 struct chores {
 	struct restore_tree *restored;
-	int child; /* -1: one that will be a zombie                            */
-	int last;  /* -1: none                                               */
+	uint32_t child; /* 0: one that will be a zombie                          */
+	uint32_t last;  /* 0: none                                             */
 	struct avc_error error;
 	int result;
 	bool done;
 };
 
 /* Has ended, or will, and its parent is told. */
-static void note_end(struct restore_tree *restored, const struct branch *branch)
+static void note_end(struct restore_tree *restored, const struct image *image)
 {
 	/* clone(2) takes any number of eight bits for a signal. */
-	if (branch->exit_signal > 0 && branch->exit_signal < NSIG)
-		restored->flush |= UINT64_C(1) << (branch->exit_signal - 1);
+	if (image->exit_signal > 0 && image->exit_signal < NSIG)
+		restored->flush |= UINT64_C(1) << (image->exit_signal - 1);
 }
 
 static void do_chores(void *arg);
@@ -118,7 +101,7 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 		return -1;
 	if (tracee_settle(batch->pid, err) || tracee_await(*child, NULL, err) != STOP_TRAP)
 		return -1;
-	if (ptrace(PTRACE_SETOPTIONS, *child, NULL, (long)TRACE_OPTIONS_OURS))
+	if (parasite_own(batch->parasite, *child))
 		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
 	return 0;
 }
@@ -138,15 +121,14 @@ static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *
 
 /* A child of the host's, with the number if nobody else has taken it.  `copy`: a child of the
  * host's that is as it came out of fork(2), and gives its memory to this one; 0: there is none. */
-static int fork_once(struct restore_tree *restored, struct forked *host,
-		     const struct branch *branch, pid_t copy, struct chores *chores, pid_t *child,
-		     struct avc_error *err)
+static int fork_once(struct restore_tree *restored, struct forked *host, const struct image *image,
+		     pid_t copy, struct chores *chores, pid_t *child, struct avc_error *err)
 {
 	struct inj_call *runner = &host->batch.parasite->control->runner;
-	const bool orphan = branch->parent == PARENT_INIT;
+	const bool orphan = image->parent == PARENT_INIT;
 	/* Siblings' numbers often follow each other; to ask takes two wake-ups. */
 	const bool follows = !orphan && restored->last_number &&
-			     restored->last_number + 1 == branch->inside;
+			     restored->last_number + 1 == image->inside;
 	struct syscall_batch from = host->batch;
 	int result;
 
@@ -157,9 +139,9 @@ static int fork_once(struct restore_tree *restored, struct forked *host,
 		return -1;
 	if (copy)
 		from.pid = copy;
-	result = (!follows && last_pid_set(restored->helper, branch->inside - 1, err)) ||
+	result = (!follows && last_pid_set(restored->restore->helper, image->inside - 1, err)) ||
 		 clone_task(&from, runner,
-			    ((uint64_t)branch->exit_signal & CSIGNAL) |
+			    ((uint64_t)image->exit_signal & CSIGNAL) |
 				    (copy ? CLONE_VM | CLONE_PARENT : 0),
 			    chores, child, err);
 	if (orphan && take_back(&host->batch, from.pid, err))
@@ -183,11 +165,10 @@ static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc
  * copy_process()), when everything is copied: what is big may never get it where others fork all
  * the time.  So the first that has another one is kept as a copy.  To give its memory away takes
  * no time. */
-static int fork_host(struct restore_tree *restored, struct forked *host,
-		     const struct branch *branch, struct chores *chores, pid_t *child,
-		     struct avc_error *err)
+static int fork_host(struct restore_tree *restored, struct forked *host, const struct image *image,
+		     struct chores *chores, pid_t *child, struct avc_error *err)
 {
-	const bool orphan = branch->parent == PARENT_INIT;
+	const bool orphan = image->parent == PARENT_INIT;
 	pid_t copy = 0;
 
 	for (int i = 0; i < TRIES; i++) {
@@ -197,11 +178,11 @@ static int fork_host(struct restore_tree *restored, struct forked *host,
 		if (i)
 			usleep(TRY_AGAIN_US);
 		if (i)
-			note_end(restored, branch);
+			note_end(restored, image);
 		*child = 0;
-		made = fork_once(restored, host, branch, copy, chores, child, &failed) == 0;
-		if (made && proc_inside(*child) == branch->inside) {
-			restored->last_number = branch->inside;
+		made = fork_once(restored, host, image, copy, chores, child, &failed) == 0;
+		if (made && proc_inside(*child) == image->inside) {
+			restored->last_number = image->inside;
 			return copy ? take_back(&host->batch, copy, err) : 0;
 		}
 		if (made && !copy && !orphan) {
@@ -220,18 +201,18 @@ static int fork_host(struct restore_tree *restored, struct forked *host,
 			continue;
 		/* One of them was killed, or is one too many where processes are limited. */
 		if ((copy && take_back(&host->batch, copy, err)) ||
-		    take_back_untold(&host->batch, branch->inside, err))
+		    take_back_untold(&host->batch, image->inside, err))
 			return -1;
 		copy = 0;
 	}
-	return fail(err, AVC_KERNEL, EEXIST, branch->inside, "restore", "clone",
-		    "PID %d is taken by somebody else", branch->inside);
+	return fail(err, AVC_KERNEL, EEXIST, image->inside, "restore", "clone",
+		    "PID %d is taken by somebody else", image->inside);
 }
 
 /* Ended, and not waited for: it ends again, and nobody waits for it. */
-static int make_zombie(struct forked *forked, const struct branch *branch, struct avc_error *err)
+static int make_zombie(struct forked *forked, const struct image *image, struct avc_error *err)
 {
-	const int signal = WIFSIGNALED(branch->status) ? WTERMSIG(branch->status) : 0;
+	const int signal = WIFSIGNALED(image->status) ? WTERMSIG(image->status) : 0;
 	const struct rlimit none = { 0, 0 };
 	const uint64_t open_mask = 0;
 	struct syscall_batch *batch = &forked->batch;
@@ -239,7 +220,7 @@ static int make_zombie(struct forked *forked, const struct branch *branch, struc
 	uint8_t *data = syscall_batch_data(batch, &remote);
 
 	memset(data, 0, 64);
-	memcpy(data + 32, branch->name, sizeof branch->name);
+	memcpy(data + 32, image->name, sizeof image->name);
 	syscall_batch_add(batch, SYS_prctl, PR_SET_NAME, remote + 32, 0, 0, 0, 0);
 	if (signal) {
 		syscall_batch_add(batch, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8, 0, 0);
@@ -250,10 +231,10 @@ static int make_zombie(struct forked *forked, const struct branch *branch, struc
 		if (ptrace(PTRACE_SETSIGMASK, batch->pid, sizeof open_mask, &open_mask))
 			return fail_errno(err, batch->pid, "restore", "ptrace(SETSIGMASK)",
 					  "it was killed");
-		kill(batch->pid, signal);
+		tracee_signal(batch->pid, signal);
 	} else {
-		syscall_batch_add(batch, SYS_exit_group, (uint64_t)WEXITSTATUS(branch->status), 0,
-				  0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_exit_group, (uint64_t)WEXITSTATUS(image->status), 0, 0,
+				  0, 0, 0);
 		call_begin(batch->call, INJ_AFTER_PARK);
 		call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list),
 			 batch->listed, 0, 0, 0);
@@ -261,7 +242,7 @@ static int make_zombie(struct forked *forked, const struct branch *branch, struc
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
 	}
-	if (ptrace(PTRACE_CONT, batch->pid, NULL, 0L))
+	if (seccomp_go_on(batch->pid, NULL))
 		return fail_errno(err, batch->pid, "restore", "ptrace(CONT)", "it was killed");
 	for (;;) {
 		const struct stop stop = tracee_wait(batch->pid, 0);
@@ -272,46 +253,45 @@ static int make_zombie(struct forked *forked, const struct branch *branch, struc
 			return fail(err, AVC_DEADLINE, 0, batch->pid, "restore", "",
 				    "it did not end again");
 		if (stop.kind != STOP_DYING)
-			ptrace(PTRACE_CONT, batch->pid, NULL,
-			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+			seccomp_go_on(batch->pid, &stop);
 	}
 }
 
 /* Session and group before it has children of its own.  What it has from its parent is
  * right as a rule. */
-static int place(struct forked *forked, const struct branch *branch, struct avc_error *err)
+static int place(struct forked *forked, const struct image *image, struct avc_error *err)
 {
 	struct syscall_batch *batch = &forked->batch;
 	struct proc_stat stat;
 
 	if (proc_stat(batch->pid, &stat))
 		return fail_errno(err, batch->pid, "restore", "open(stat)", "it was killed");
-	if (branch->session == branch->inside) {
+	if (image->session == image->inside) {
 		syscall_batch_add(batch, SYS_setsid, 0, 0, 0, 0, 0, 0);
 	} else {
-		if (branch->session > 0 && proc_inside(stat.session) != branch->session)
-			fail(batch->notes, AVC_UNSUPPORTED, 0, branch->inside, "restore", "",
+		if (image->session > 0 && proc_inside(stat.session) != image->session)
+			fail(batch->notes, AVC_UNSUPPORTED, 0, image->inside, "restore", "",
 			     "process %d is not in the session it was in, whose leader is gone",
-			     branch->inside);
-		if (branch->group == branch->inside)
+			     image->inside);
+		if (image->group == image->inside)
 			syscall_batch_add(batch, SYS_setpgid, 0, 0, 0, 0, 0, 0);
 	}
 	return 0;
 }
 
 /* The leader of a session gets its terminal before it has children, who inherit it. */
-static void take_terminal(struct syscall_batch *batch, const struct branch *branch)
+static void take_terminal(struct syscall_batch *batch, const struct image *image)
 {
-	const int fd = files_find_device(branch->image->files, branch->image->stat.tty);
+	const int fd = files_find_device(image->files, image->stat.tty);
 
-	if (!branch->image->stat.tty || branch->session != branch->inside)
+	if (!image->stat.tty || image->session != image->inside)
 		return;
 	syscall_batch_add(batch, SYS_ioctl, (uint64_t)fd, TIOCSCTTY, 0, 0, 0, 0);
 	syscall_batch_soften(batch, "the session that it leads has lost its terminal");
 }
 
 /* Whoever was in the foreground is there again; asked for by anybody in the session. */
-static int put_foreground(struct syscall_batch *batch, const struct generation *image,
+static int put_foreground(struct syscall_batch *batch, const struct image *image,
 			  struct avc_error *err)
 {
 	const int fd = files_find_device(image->files, image->stat.tty);
@@ -327,17 +307,17 @@ static int put_foreground(struct syscall_batch *batch, const struct generation *
 }
 
 /* When all are there: into groups that others lead. */
-static int join_group(struct forked *forked, const struct branch *branch, struct avc_error *err)
+static int join_group(struct forked *forked, const struct image *image, struct avc_error *err)
 {
 	struct syscall_batch *batch = &forked->batch;
 	struct proc_stat stat;
 
 	if (proc_stat(batch->pid, &stat))
 		return fail_errno(err, batch->pid, "restore", "open(stat)", "it was killed");
-	if (branch->group <= 0 || branch->group == branch->inside ||
-	    proc_inside(stat.group) == branch->group)
+	if (image->group <= 0 || image->group == image->inside ||
+	    proc_inside(stat.group) == image->group)
 		return 0;
-	syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)branch->group, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)image->group, 0, 0, 0, 0);
 	syscall_batch_soften(batch,
 			     "it is not in the process group it was in, whose leader is gone");
 	return syscall_batch_flush(batch, err);
@@ -345,22 +325,22 @@ static int join_group(struct forked *forked, const struct branch *branch, struct
 
 static int become(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
-	struct branch *branch = &restored->generation->branch[index];
+	struct image *image = &restored->generation->image[index];
 	struct forked *forked = &restored->forked[index];
 	struct syscall_batch *batch = &forked->batch;
 	const struct remap *plan = restore_plan_of(restored->generation, index, err);
-	const bool is_mains = restore_plan_host(restored->generation, index) == PARENT_MAIN;
+	const bool is_mains = restore_plan_host(restored->generation, index) == 0;
 
 	if (!plan ||
 	    syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL, err))
 		return -1;
-	if (syscall_batch_change_parasite(batch, branch->process, branch->image->slot, err) ||
+	if (syscall_batch_change_parasite(batch, image->process, image->slot, err) ||
 	    process_attrs_take_keys(batch, err) ||
 	    remap_apply(plan, batch, restored->copier, err) ||
-	    process_attrs_put(batch, branch, err) || place(forked, branch, err) ||
-	    syscall_batch_put_files(batch, &restored->table[index], err))
+	    process_attrs_put(batch, image, err) || place(forked, image, err) ||
+	    syscall_batch_put_files(batch, &image->table, err))
 		return -1;
-	take_terminal(batch, branch);
+	take_terminal(batch, image);
 	if (syscall_batch_flush(batch, err))
 		return -1;
 	close_fd(&batch->socket);
@@ -375,18 +355,17 @@ static void do_chores(void *arg)
 	if (chores->done)
 		return; /* the number was not the right one */
 	chores->done = true;
-	if (chores->child >= 0 &&
-	    !restore_plan_of(restored->generation, (uint32_t)chores->child, &chores->error))
+	if (chores->child && !restore_plan_of(restored->generation, chores->child, &chores->error))
 		chores->result = -1;
-	else if (chores->last >= 0)
-		chores->result = become(restored, (uint32_t)chores->last, &chores->error);
+	else if (chores->last)
+		chores->result = become(restored, chores->last, &chores->error);
 }
 
 /* How long all of it takes depends on how much there is: deadlines are for each step. */
 static void go_on(struct restore_tree *restored)
 {
-	tracee_deadline_set(restored->timer, STEP_NS);
-	init_channel_working(restored->channel);
+	tracee_deadline_set(restored->restore->timer, STEP_NS);
+	init_channel_working(restored->restore->channel);
 }
 
 static int finish_copies(struct restore_tree *restored, struct avc_error *err)
@@ -397,41 +376,41 @@ static int finish_copies(struct restore_tree *restored, struct avc_error *err)
 }
 
 /* What it has open is below that, with some for those that are only on their way. */
-static uint32_t files_of(const struct restore_tree *restored, uint32_t index)
+static uint32_t files_of(const struct image *image)
 {
-	const struct fd_table *table = &restored->table[index];
+	const struct fd_table *table = &image->table;
 
 	return (table->count ? (uint32_t)table->entry[table->count - 1].fd : 0) + FILES_SPARE;
 }
 
-/* `last` is the one that was forked last and is not yet what it is to be; -1: none. */
-static int make_member(struct restore_tree *restored, uint32_t index, int *last,
-		       struct avc_error *err)
+/* `last` is the one that was forked last and is not yet what it is to be; 0: none. */
+static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *last,
+		    struct avc_error *err)
 {
-	const struct branch *branch = &restored->generation->branch[index];
-	const int host = restore_plan_host(restored->generation, index);
-	struct forked *forked = &restored->forked[index], *by = forked_of(restored, host);
+	const struct image *image = &restored->generation->image[index];
+	const uint32_t host = restore_plan_host(restored->generation, index);
+	struct forked *forked = &restored->forked[index], *by = &restored->forked[host];
 	struct chores chores = { .restored = restored };
 
 	go_on(restored);
 	/* It has to be itself before it has children. */
-	if (*last >= 0 && host == *last) {
-		if (become(restored, (uint32_t)*last, err))
+	if (host && host == *last) {
+		if (become(restored, *last, err))
 			return -1;
-		*last = -1;
+		*last = 0;
 	}
 	/* ... and have all its memory. */
-	if (host >= 0 && finish_copies(restored, err))
+	if (host && finish_copies(restored, err))
 		return -1;
-	chores.child = branch->process ? (int)index : -1;
+	chores.child = image->process ? index : 0;
 	chores.last = *last;
-	*last = -1;
-	if (fork_host(restored, by, branch, &chores, &forked->pid, err))
+	*last = 0;
+	if (fork_host(restored, by, image, &chores, &forked->pid, err))
 		return -1;
 	forked->traced = true;
 	forked->batch = by->batch;
 	forked->batch.pid = forked->pid;
-	forked->batch.inside = branch->inside;
+	forked->batch.inside = image->inside;
 	forked->batch.socket = -1;
 	forked->pidfd = proc_pidfd_open(forked->pid);
 	if (forked->pidfd < 0)
@@ -440,25 +419,25 @@ static int make_member(struct restore_tree *restored, uint32_t index, int *last,
 		*err = chores.error;
 		return -1;
 	}
-	if (branch->process) {
-		process_attrs_lift_limits(forked->pid, branch, files_of(restored, index));
-		*last = (int)index;
+	if (image->process) {
+		process_attrs_lift_limits(forked->pid, image, files_of(image));
+		*last = index;
 		return 0;
 	}
-	return place(forked, branch, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
+	return place(forked, image, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
 }
 
 /* When nobody is to join a group that they lead any more. */
 static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < restored->generation->branches; i++) {
-		const struct branch *branch = &restored->generation->branch[i];
+	for (uint32_t i = 0; i < restored->generation->images; i++) {
+		const struct image *image = &restored->generation->image[i];
 		struct forked *forked = &restored->forked[i];
 
-		if (branch->process)
+		if (image->process)
 			continue;
-		note_end(restored, branch);
-		if (make_zombie(forked, branch, err))
+		note_end(restored, image);
+		if (make_zombie(forked, image, err))
 			return -1;
 		forked->traced = false;
 	}
@@ -484,109 +463,124 @@ static int flush_signals(struct restore_tree *restored, struct syscall_batch *ba
 	return 0;
 }
 
-int restore_tree_make(struct restore_tree *restored, pid_t main_pid, struct avc_error *notes,
-		      struct avc_error *err)
+/* Session and group before it has children; a descendant gets them in become(). */
+static int begin_main(struct restore_tree *restored, struct avc_error *err)
 {
-	struct generation *generation = restored->generation;
-	struct inj_slot *slot = parasite_slot(&restored->main->parasite, generation->slot);
-	struct forked *first = &restored->first;
-	int last = -1;
+	const struct image *image = &restored->generation->image[0];
+	const struct parasite *parasite = &image->process->parasite;
+	const pid_t pid = restored->restore->pid;
+	struct inj_slot *slot = parasite_slot(parasite, image->slot);
+	struct forked *forked = &restored->forked[0];
+	struct syscall_batch *batch = &forked->batch;
 
-	first->pid = first->batch.pid = main_pid;
-	first->traced = true;
-	first->pidfd = proc_pidfd_open(main_pid);
-	first->batch.inside = slot->pid;
-	first->batch.notes = notes;
-	syscall_batch_enter(&first->batch, &restored->main->parasite, generation->slot);
-	if (first->pidfd < 0 ||
-	    ptrace(PTRACE_SETOPTIONS, main_pid, NULL, (long)TRACE_OPTIONS_OURS) ||
-	    arch_regs_get(main_pid, &first->batch.base))
-		return fail_errno(err, main_pid, "restore", "ptrace(GETREGS)", "it was killed");
+	forked->pid = batch->pid = pid;
+	forked->traced = true;
+	forked->pidfd = proc_pidfd_open(pid);
+	batch->inside = slot->pid;
+	batch->notes = &restored->restore->notes;
+	syscall_batch_enter(batch, parasite, image->slot);
+	if (forked->pidfd < 0 || parasite_own(parasite, pid) || arch_regs_get(pid, &batch->base))
+		return fail_errno(err, pid, "restore", "ptrace(GETREGS)", "it was killed");
 	if (slot->session_leader)
-		syscall_batch_add(&first->batch, SYS_setsid, 0, 0, 0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_setsid, 0, 0, 0, 0, 0, 0);
 	else
-		syscall_batch_add(&first->batch, SYS_setpgid, 0, (uint64_t)slot->group, 0, 0, 0, 0);
-	if (syscall_batch_flush(&first->batch, err))
+		syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)slot->group, 0, 0, 0, 0);
+	if (syscall_batch_flush(batch, err))
 		return -1;
 	slot->placed = 1;
 	restored->last_number = slot->pid;
-	if (generation->branches > FEW &&
-	    syscall_batch_share_fd_channel(&first->batch, &restored->fd_channel, err))
-		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (make_member(restored, i, &last, err))
-			return -1;
-	if (last >= 0 && become(restored, (uint32_t)last, err))
-		return -1;
-	if (syscall_batch_unshare_fd_channel(&first->batch, &restored->fd_channel, err))
-		return -1;
-	if (finish_copies(restored, err))
-		return -1;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (join_group(&restored->forked[i], &generation->branch[i], err))
+	return 0;
+}
+
+/* Processes, when all are there. */
+static int join_up(struct restore_tree *restored, struct avc_error *err)
+{
+	const struct generation *generation = restored->generation;
+
+	for (uint32_t i = 1; i < generation->images; i++)
+		if (join_group(&restored->forked[i], &generation->image[i], err))
 			return -1;
 	if (end_zombies(restored, err))
 		return -1;
-	for (int i = -1; i < (int)generation->branches; i++)
-		if ((i < 0 || (generation->branch[i].process &&
-			       generation->branch[i].session == generation->branch[i].inside)) &&
-		    put_foreground(&forked_of(restored, i)->batch,
-				   i < 0 ? generation : generation->branch[i].image, err))
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+
+		if (image->process && (i == 0 || image->session == image->inside) &&
+		    put_foreground(&restored->forked[i].batch, image, err))
 			return -1;
-	for (int i = -1; restored->flush && i < (int)generation->branches; i++)
-		if ((i < 0 || generation->branch[i].process) &&
-		    flush_signals(restored, &forked_of(restored, i)->batch, err))
+	}
+	for (uint32_t i = 0; restored->flush && i < generation->images; i++)
+		if (generation->image[i].process &&
+		    flush_signals(restored, &restored->forked[i].batch, err))
 			return -1;
 	return 0;
 }
 
+int restore_tree_make(struct restore_tree *restored, struct avc_error *err)
+{
+	struct syscall_batch *mains = &restored->forked[0].batch;
+	uint32_t last = 0;
+
+	if (begin_main(restored, err))
+		return -1;
+	if (restored->generation->images > FEW + 1 &&
+	    syscall_batch_share_fd_channel(mains, &restored->fd_channel, err))
+		return -1;
+	for (uint32_t i = 1; i < restored->generation->images; i++)
+		if (make_one(restored, i, &last, err))
+			return -1;
+	if (last && become(restored, last, err))
+		return -1;
+	if (syscall_batch_unshare_fd_channel(mains, &restored->fd_channel, err) ||
+	    finish_copies(restored, err))
+		return -1;
+	return join_up(restored, err);
+}
+
 /* ---- off they go ------------------------------------------------------------------------- */
 
-static int start_member(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+static int start_one(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
-	struct branch *branch = &restored->generation->branch[index];
 	struct forked *forked = &restored->forked[index];
 
-	if (restore_start(branch->process, branch->image, restored->helper, forked->pid,
-			  &forked->sandbox, err))
+	if (restore_start(&restored->generation->image[index], restored->restore->helper,
+			  forked->pid, &forked->sandbox, err))
 		return -1;
 	forked->traced = false;
 	return 0;
 }
 
-static int await_member(struct restore_tree *restored, uint32_t index, struct avc_error *notes,
-			struct avc_error *err)
+static int await_one(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
-	struct branch *branch = &restored->generation->branch[index];
+	const struct image *image = &restored->generation->image[index];
 	struct forked *forked = &restored->forked[index];
+	struct avc_error *notes = &restored->restore->notes;
 
-	if (restore_await(branch->process, branch->image, forked->pid, forked->sandbox, err))
+	if (restore_await(image, forked->pid, forked->sandbox, err))
 		return -1;
-	restore_note(branch->process, branch->image, forked->pid, notes);
-	return memory_put_back(branch->process, branch->image, forked->pid, notes, err);
+	restore_note(image, forked->pid, notes);
+	return memory_put_back(image, forked->pid, notes, err);
 }
 
 /* It asks nothing of us while it puts itself together: no numbers for threads, no
  * permission for calls. */
-static bool is_on_its_own(const struct generation *image)
+static bool is_on_its_own(const struct image *image)
 {
 	return image->threads == 1 && !image->sandboxed && !image->stop_signal;
 }
 
-int restore_tree_start(struct restore_tree *restored, struct avc_error *notes,
-		       struct avc_error *err)
+int restore_tree_start(struct restore_tree *restored, struct avc_error *err)
 {
 	const struct generation *generation = restored->generation;
 
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process && is_on_its_own(generation->branch[i].image) &&
-		    start_member(restored, i, err))
+	for (uint32_t i = 1; i < generation->images; i++)
+		if (generation->image[i].process && is_on_its_own(&generation->image[i]) &&
+		    start_one(restored, i, err))
 			return -1;
-	for (uint32_t i = 0; i < generation->branches; i++)
-		if (generation->branch[i].process &&
-		    ((!is_on_its_own(generation->branch[i].image) &&
-		      start_member(restored, i, err)) ||
-		     await_member(restored, i, notes, err)))
+	for (uint32_t i = 1; i < generation->images; i++)
+		if (generation->image[i].process &&
+		    ((!is_on_its_own(&generation->image[i]) && start_one(restored, i, err)) ||
+		     await_one(restored, i, err)))
 			return -1;
 	return 0;
 }
@@ -595,21 +589,20 @@ void restore_tree_go(struct restore_tree *restored)
 {
 	/* First those that are stopped: their parents know it. */
 	for (int stopped = 1; stopped >= 0; stopped--)
-		for (uint32_t i = 0; i < restored->generation->branches; i++) {
-			struct branch *branch = &restored->generation->branch[i];
+		for (uint32_t i = 1; i < restored->generation->images; i++) {
+			const struct image *image = &restored->generation->image[i];
 
-			if (branch->process && !branch->image->stop_signal == !stopped)
-				restore_go(branch->process, branch->image,
-					   restored->forked[i].sandbox);
+			if (image->process && !image->stop_signal == !stopped)
+				restore_go(image, restored->forked[i].sandbox);
 		}
 }
 
-pid_t restore_tree_pid(const struct restore_tree *restored, uint32_t branch)
+pid_t restore_tree_pid(const struct restore_tree *restored, uint32_t index)
 {
-	return restored->forked[branch].pid;
+	return restored->forked[index].pid;
 }
 
-static void kill_member(struct forked *forked)
+static void kill_one(struct forked *forked)
 {
 	if (forked->sandbox)
 		sandbox_end(forked->sandbox);
@@ -623,10 +616,9 @@ static void kill_member(struct forked *forked)
 
 void restore_tree_kill(struct restore_tree *restored)
 {
-	for (uint32_t i = restored->generation->branches; i-- > 0;)
-		kill_member(&restored->forked[i]);
-	kill_member(&restored->first);
-	for (uint32_t i = 0; i < restored->generation->branches; i++) {
+	for (uint32_t i = restored->generation->images; i-- > 0;)
+		kill_one(&restored->forked[i]);
+	for (uint32_t i = 1; i < restored->generation->images; i++) {
 		struct pollfd gone = { .fd = restored->forked[i].pidfd, .events = POLLIN };
 
 		if (gone.fd >= 0)
@@ -638,13 +630,11 @@ void restore_tree_free(struct restore_tree *restored)
 {
 	if (!restored)
 		return;
-	for (uint32_t i = 0; i < restored->generation->branches; i++) {
+	for (uint32_t i = 0; i < restored->generation->images; i++) {
 		close_fd(&restored->forked[i].pidfd);
 		close_fd(&restored->forked[i].batch.socket);
 	}
 	copier_free(restored->copier);
 	close_fd(&restored->fd_channel.ours);
-	close_fd(&restored->first.pidfd);
-	free(restored->forked);
 	free(restored);
 }

@@ -354,14 +354,13 @@ static bool same_scheduling(const struct scheduling *a, const struct scheduling 
 	return !memcmp(a, b, sizeof *a);
 }
 
-int attributes_keep(const struct process *process, struct generation *generation,
-		    struct avc_error *err)
+int attributes_keep(struct image *image, struct avc_error *err)
 {
-	struct attributes *kept =
-		calloc(1, sizeof *kept + generation->threads * sizeof kept->thread[0]);
+	const struct process *process = image->process;
+	struct attributes *kept = calloc(1, sizeof *kept + image->threads * sizeof kept->thread[0]);
 	struct scheduling inherited;
 
-	generation->attributes = kept;
+	image->attributes = kept;
 	if (!kept)
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
@@ -370,7 +369,7 @@ int attributes_keep(const struct process *process, struct generation *generation
 	    !process->descendant) /* else it has its parent's */
 		return fail(err, AVC_GONE, ESRCH, process->pid, "keep template", "",
 			    "it has ended");
-	attributes_read_scheduling(generation->template, &inherited);
+	attributes_read_scheduling(image->template, &inherited);
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		const struct thread *t = &process->threads[i];
 

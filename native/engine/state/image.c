@@ -4,10 +4,10 @@
  */
 #include "state.h"
 
-struct branch *generation_branch(const struct generation *generation, const struct process *process)
+struct image *image_find(struct image *image, uint32_t images, const struct process *process)
 {
-	for (uint32_t i = 0; generation && i < generation->branches; i++)
-		if (generation->branch[i].process == process)
-			return &generation->branch[i];
+	for (uint32_t i = 0; i < images; i++)
+		if (image[i].process == process)
+			return &image[i];
 	return NULL;
 }

@@ -46,6 +46,7 @@ void memory_forget(struct memory *memory)
 {
 	areas_free(&memory->areas);
 	areas_free(&memory->foreign);
+	areas_free(&memory->unkept);
 	*memory = (struct memory){ 0 };
 }
 
@@ -220,7 +221,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 		/* Before it is read: what is written meanwhile was written since. */
 		if (a->as_file)
 			a->writes = others_writes(process->others, a);
-		image->whole &= copy_area(process->pid, a, to);
+		image->whole &= budget_step() && copy_area(process->pid, a, to);
 		to += area_room(a);
 	}
 }
@@ -390,29 +391,14 @@ static void seal_again(const struct memory *memory, struct setup *setup)
 				->flags = INJ_MAY_FAIL;
 }
 
-/* Of all processes, for the main one to tell. */
-static uint64_t bytes_left(const struct process *main, const struct generation *generation)
+int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
+		  struct avc_error *err)
 {
-	uint64_t bytes = main->memory->left_bytes + generation->image->left_bytes;
-
-	for (uint32_t i = 0; i < generation->branches; i++) {
-		const struct branch *branch = &generation->branch[i];
-
-		if (branch->process)
-			bytes += branch->process->memory->left_bytes +
-				 branch->image->image->left_bytes;
-	}
-	return bytes;
-}
-
-int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
-		  struct setup *setup, struct avc_error *err)
-{
+	struct process *process = image->process;
 	const struct thread *main_thread = thread_find(process, process->pid);
-	uint64_t left_bytes;
 
-	generation->image->seen = NULL; /* it was the freeze's                  */
-	if (areas_check(process, generation, err) || wiped_fill(process, generation, setup, err))
+	image->memory->seen = NULL; /* it was the freeze's                  */
+	if (areas_check(image, err) || wiped_fill(image, setup, err))
 		return -1;
 	lock_again(process, locked_kb, setup);
 	advise_again(process->memory, setup);
@@ -422,16 +408,25 @@ int memory_finish(struct process *process, struct generation *generation, int64_
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
 			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)
 			->flags = INJ_MAY_FAIL;
-	left_bytes = process->descendant ? 0 : bytes_left(process, generation);
-	if (left_bytes && !setup->notice.code)
-		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
-		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
-		     (unsigned long long)left_bytes / 1024);
 	if (process->memory->others_bytes && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 		     "%llu kB of shared memory are also others', outside of the container, and are not rolled back",
 		     (unsigned long long)process->memory->others_bytes / 1024);
 	return 0;
+}
+
+void memory_note_left(const struct image *image, uint32_t images, struct avc_error *notice)
+{
+	uint64_t left_bytes = 0;
+
+	for (uint32_t i = 0; i < images; i++)
+		if (image[i].process)
+			left_bytes += image[i].process->memory->left_bytes +
+				      image[i].memory->left_bytes;
+	if (left_bytes)
+		fail(notice, AVC_UNSUPPORTED, 0, image->process->pid, "keep memory", "",
+		     "%llu kB of shared memory are more than avckpt.shm allows, and are not rolled back",
+		     (unsigned long long)left_bytes / 1024);
 }
 
 /* Whether it is what the image has, by the memory of a process. */
@@ -465,14 +460,23 @@ static bool put_by_mapping(const struct area *a, int mem_fd, const uint8_t *from
 	return pwrite(mem_fd, from, a->kept, (off_t)a->start) == (ssize_t)a->kept;
 }
 
-static int protect(const struct process *process, const struct generation *image,
-		   const struct area *a, int protection, struct avc_error *err)
+/* One restore. */
+struct putting {
+	const struct image *image;
+	pid_t pid;
+	int mem_fd; /* of the template                                        */
+	struct avc_error *notes;
+};
+
+static int protect(const struct image *image, const struct area *a, int protection,
+		   struct avc_error *err)
 {
-	struct inj_call *call = &parasite_slot(&process->parasite, image->slot)->template_call;
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_mprotect, a->start, area_bytes(a), (uint64_t)protection, 0, 0);
-	return parasite_send(&process->parasite, image->template, &image->base, call, err) ||
+	return parasite_send(parasite, image->template, &image->base, call, err) ||
 			       parasite_run(image->template, call, err)
 		       ? -1
 		       : 0;
@@ -490,52 +494,54 @@ static bool put_by_file(const struct area *a, pid_t pid, const uint8_t *from)
 	return put;
 }
 
-static int put_back(const struct process *process, const struct generation *image, struct area *a,
-		    pid_t pid, int mem_fd, const uint8_t *from, struct avc_error *notes,
+static int put_back(const struct putting *putting, struct area *a, const uint8_t *from,
 		    struct avc_error *err)
 {
+	struct mem_others *others = putting->image->process->others;
 	const bool opened = a->way == WAY_PROTECT;
 	bool put = false;
 
-	if (a->as_file && others_writes(process->others, a) != a->writes) {
-		fail(notes, AVC_UNSUPPORTED, 0, pid, "restore", "",
+	if (a->as_file && others_writes(others, a) != a->writes) {
+		fail(putting->notes, AVC_UNSUPPORTED, 0, putting->pid, "restore", "",
 		     "%zu kB of shared memory have been written as files since, and are not rolled back",
 		     area_bytes(a) / 1024);
 		return 0;
 	}
-	if (opened && protect(process, image, a, PROT_READ | PROT_WRITE, err))
+	if (opened && protect(putting->image, a, PROT_READ | PROT_WRITE, err))
 		return -1;
 	if (a->way != WAY_FILE)
-		put = put_by_mapping(a, mem_fd, from);
-	if (opened && protect(process, image, a, a->protection, err))
+		put = put_by_mapping(a, putting->mem_fd, from);
+	if (opened && protect(putting->image, a, a->protection, err))
 		return -1;
 	if (!put) {
-		put = put_by_file(a, pid, from);
+		put = put_by_file(a, putting->pid, from);
 		if (a->as_file) /* that was us */
-			a->writes = others_writes(process->others, a);
+			a->writes = others_writes(others, a);
 	}
-	return put ? 0 : note_unless_equal(a, mem_fd, from, notes);
+	return put ? 0 : note_unless_equal(a, putting->mem_fd, from, putting->notes);
 }
 
-int memory_put_back(const struct process *process, const struct generation *image, pid_t pid,
-		    struct avc_error *notes, struct avc_error *err)
+int memory_put_back(const struct image *image, pid_t pid, struct avc_error *notes,
+		    struct avc_error *err)
 {
-	struct mem_image *memory = image->image;
+	struct putting putting = { .image = image, .pid = pid, .notes = notes };
+	struct mem_image *memory = image->memory;
 	const uint8_t *from = memory ? memory->data : NULL;
-	int mem_fd, result = 0;
+	int result = 0;
 
 	if (!memory || !memory->bytes)
 		return 0;
-	mem_fd = proc_open(image->template, "mem", O_RDWR);
-	if (mem_fd < 0)
+	putting.mem_fd = proc_open(image->template, "mem", O_RDWR);
+	if (putting.mem_fd < 0)
 		return fail_errno(err, image->template, "restore", "open(mem)", "it was killed");
 	for (uint32_t i = 0; !result && i < memory->areas.count; i++) {
 		struct area *a = &memory->areas.area[i];
 
+		(void)budget_step();
 		if (area_room(a) && a->kept)
-			result = put_back(process, image, a, pid, mem_fd, from, notes, err);
+			result = put_back(&putting, a, from, err);
 		from += area_room(a);
 	}
-	close_fd(&mem_fd);
+	close_fd(&putting.mem_fd);
 	return result;
 }

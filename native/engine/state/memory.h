@@ -64,6 +64,7 @@ struct memory {
 	} hole[HOLES_MAX];
 	struct areas areas;
 	struct areas foreign; /* of others, too; by what they are, not where        */
+	struct areas unkept;  /* beyond the limit, or not writable here; likewise    */
 	uint64_t layout;      /* a hash of the mappings when the areas were read */
 	uint64_t read_ns, cost_ns;
 	uint64_t left_bytes;   /* shared memory beyond the limit                  */
@@ -116,8 +117,7 @@ void areas_free(struct areas *areas);
 void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags);
 /* Were the areas that were copied those that there are?  Of the long file only as
  * often as it is worth it, and when the layout has changed. */
-int areas_check(struct process *process, const struct generation *generation,
-		struct avc_error *err) warn_unused;
+int areas_check(const struct image *image, struct avc_error *err) warn_unused;
 /* A descriptor of that process, open for writing, of what the area is; -1: none. */
 int area_find_descriptor(pid_t pid, const struct area *area);
 
@@ -126,8 +126,7 @@ int area_find_descriptor(pid_t pid, const struct area *area);
 /* While the process is stopped. */
 void wiped_copy(const struct process *process, struct mem_image *image);
 /* Puts it into the template, which is stopped, and forgets it. */
-int wiped_fill(struct process *process, struct generation *generation, struct setup *setup,
-	       struct avc_error *err) warn_unused;
+int wiped_fill(const struct image *image, struct setup *setup, struct avc_error *err) warn_unused;
 void wiped_free(struct wiped *wiped);
 
 /* ---- memory_others.c -------------------------------------------------------- */

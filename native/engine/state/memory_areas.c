@@ -44,10 +44,10 @@ struct survey {
 	const struct process *process;
 	pid_t template;
 	struct memory *memory;
-	struct areas areas, foreign;
+	struct areas areas, foreign, unkept;
 	uint64_t layout, shared_bytes, since;
 	uint64_t left_bytes, others_bytes;
-	bool private_huge, too_many;
+	bool private_huge, too_many, lost_some;
 };
 
 static uint64_t hash(uint64_t h, uint64_t value)
@@ -255,10 +255,10 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 		return false;
 	}
 	a->way = way_of(survey->template, a);
-	if (a->way == WAY_NONE)
-		return false;
-	if (survey->shared_bytes + area_bytes(a) > survey->process->shm_bytes) {
-		survey->left_bytes += area_bytes(a);
+	if (a->way == WAY_NONE ||
+	    survey->shared_bytes + area_bytes(a) > survey->process->shm_bytes) {
+		survey->left_bytes += a->way == WAY_NONE ? 0 : area_bytes(a);
+		survey->lost_some |= !areas_add(&survey->unkept, a);
 		return false;
 	}
 	survey->shared_bytes += area_bytes(a);
@@ -327,6 +327,11 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	areas_free(&memory->foreign);
 	memory->foreign = survey->foreign;
 	survey->foreign = (struct areas){ 0 };
+	areas_free(&memory->unkept);
+	memory->unkept = survey->unkept;
+	survey->unkept = (struct areas){ 0 };
+	if (survey->lost_some)
+		return fail_errno(err, 0, "keep memory", "realloc", "out of memory");
 	if (survey->private_huge)
 		result = fail(err, AVC_UNSUPPORTED, 0, pid, "keep memory", "", "%s",
 			      memory_private_huge_pages);
@@ -339,44 +344,140 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	return result;
 }
 
-static int check_layout(struct process *process, const struct generation *generation,
-			struct avc_error *err)
+static int check_layout(const struct image *image, struct avc_error *err)
 {
+	struct process *process = image->process;
 	struct memory *memory = process->memory;
 	struct survey survey = { .process = process };
 	const uint64_t start = now_ns();
 	int result;
 
-	if (proc_mappings(generation->template, "maps", hash_mapping, &survey))
-		return fail_errno(err, generation->template, "keep memory", "read(maps)",
+	if (proc_mappings(image->template, "maps", hash_mapping, &survey))
+		return fail_errno(err, image->template, "keep memory", "read(maps)",
 				  "it was killed");
 	if (survey.layout == memory->layout &&
 	    start - memory->read_ns < memory->cost_ns * SMAPS_SHARE)
 		return 0;
 	survey = (struct survey){
 		.process = process,
-		.template = generation->template,
+		.template = image->template,
 		.memory = memory,
-		.since = generation->taken_ns,
+		.since = image->taken_ns,
 	};
-	result = read_areas(&survey, &generation->image->areas, err);
+	result = read_areas(&survey, &image->memory->areas, err);
 	memory->layout = result ? 0 : survey.layout;
 	areas_free(&survey.areas);
 	areas_free(&survey.foreign);
+	areas_free(&survey.unkept);
 	return result;
 }
 
-int areas_check(struct process *process, const struct generation *generation, struct avc_error *err)
-{
-	const int result = check_layout(process, generation, err);
+/* ---- what several processes have ------------------------------------------------------------ */
 
-	generation->image->kinds = process->memory->kinds;
-	if (!result && generation->image->too_much)
+struct unkept {
+	uint64_t device, inode, bytes;
+	pid_t pid;
+	bool written;
+};
+
+struct unkept_list {
+	uint32_t count, room;
+	struct unkept *item;
+};
+
+static bool add_unkept(struct unkept_list *list, const struct process *process,
+		       const struct mem_image *image)
+{
+	const struct areas *of[] = { &process->memory->unkept, &image->areas };
+
+	for (uint32_t k = 0; k < 2; k++) {
+		for (uint32_t i = 0; i < of[k]->count; i++) {
+			const struct area *a = &of[k]->area[i];
+
+			if (of[k] == &image->areas && !a->left)
+				continue;
+			if (!make_room(&list->item, list->count, &list->room, sizeof *list->item))
+				return false;
+			list->item[list->count++] = (struct unkept){
+				.device = a->device,
+				.inode = a->inode,
+				.bytes = area_bytes(a),
+				.pid = process->pid,
+				.written = a->way != WAY_NONE,
+			};
+		}
+	}
+	return true;
+}
+
+static int compare_unkept(const void *a, const void *b)
+{
+	const struct unkept *x = a, *y = b;
+
+	if (x->device != y->device)
+		return x->device < y->device ? -1 : 1;
+	return (x->inode > y->inode) - (x->inode < y->inode);
+}
+
+/* The first one that several processes have, and one of them can write; NULL: none. */
+static const struct unkept *find_common(const struct unkept_list *list)
+{
+	const struct unkept *first = list->item;
+	bool several = false, written = false;
+
+	for (uint32_t i = 0; i < list->count; i++) {
+		const struct unkept *u = &list->item[i];
+
+		if (compare_unkept(first, u)) {
+			first = u;
+			several = written = false;
+		}
+		several |= u->pid != first->pid;
+		written |= u->written;
+		if (several && written)
+			return first;
+	}
+	return NULL;
+}
+
+int memory_check_unkept(const struct image *image, uint32_t images, struct avc_error *err)
+{
+	struct unkept_list list = { 0 };
+	const struct unkept *common;
+	bool added = true;
+	int result = 0;
+
+	for (uint32_t i = 0; added && i < images; i++)
+		if (image[i].process)
+			added = add_unkept(&list, image[i].process, image[i].memory);
+	if (!added) {
+		result = fail_errno(err, 0, "keep memory", "realloc", "out of memory");
+	} else if (list.count) {
+		qsort(list.item, list.count, sizeof *list.item, compare_unkept);
+		common = find_common(&list);
+		if (common)
+			result =
+				fail(err, AVC_UNSUPPORTED, 0, common->pid, "keep memory", "",
+				     "several of its processes share memory (one area has %llu kB) "
+				     "that is more than avckpt.shm allows",
+				     (unsigned long long)common->bytes / 1024);
+	}
+	free(list.item);
+	return result;
+}
+
+int areas_check(const struct image *image, struct avc_error *err)
+{
+	struct process *process = image->process;
+	const int result = check_layout(image, err);
+
+	image->memory->kinds = process->memory->kinds;
+	if (!result && image->memory->too_much)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			    "more than %u MB of its memory are wiped in a clone (MADV_WIPEONFORK), "
 			    "which is too much to copy",
 			    WIPED_MAX >> 20);
-	if (!result && !generation->image->whole)
+	if (!result && !image->memory->whole)
 		return fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
 			    "its shared or MADV_WIPEONFORK memory cannot be read");
 	return result;

@@ -83,8 +83,9 @@ static int copy_stretch(avc_remote start, avc_remote end, void *arg)
 								    : ENTRIES;
 		const size_t bytes = pages * sizeof *entry;
 
-		if (pread(copying->pagemap, entry, bytes, (off_t)(start / PAGE * sizeof *entry)) !=
-		    (ssize_t)bytes)
+		if (!budget_step() ||
+		    pread(copying->pagemap, entry, bytes, (off_t)(start / PAGE * sizeof *entry)) !=
+			    (ssize_t)bytes)
 			return -1;
 		for (size_t i = 0; i < pages; i++, start += PAGE)
 			if (page_is_guard(entry[i])
@@ -120,61 +121,58 @@ void wiped_free(struct wiped *wiped)
 	*wiped = (struct wiped){ 0 };
 }
 
-static int flush(struct process *process, struct generation *generation, struct inj_call *call,
-		 struct avc_error *err)
+static int flush(const struct image *image, struct inj_call *call, struct avc_error *err)
 {
-	if (call->count && (parasite_send(&process->parasite, generation->template,
-					  &generation->base, call, err) ||
-			    parasite_run(generation->template, call, err)))
+	if (call->count &&
+	    (parasite_send(&image->process->parasite, image->template, &image->base, call, err) ||
+	     parasite_run(image->template, call, err)))
 		return -1;
 	call_begin(call, INJ_AFTER_PARK);
 	return 0;
 }
 
-static int advise(struct process *process, struct generation *generation, struct inj_call *call,
-		  avc_remote start, avc_remote end, int advice, struct avc_error *err)
+static int advise(const struct image *image, struct inj_call *call, avc_remote start,
+		  avc_remote end, int advice, struct avc_error *err)
 {
-	if (call->count >= INJ_CALLS_MAX && flush(process, generation, call, err))
+	if (call->count >= INJ_CALLS_MAX && flush(image, call, err))
 		return -1;
 	call_add(call, SYS_madvise, start, end - start, (uint64_t)advice, 0, 0);
 	return 0;
 }
 
-int wiped_fill(struct process *process, struct generation *generation, struct setup *setup,
-	       struct avc_error *err)
+int wiped_fill(const struct image *image, struct setup *setup, struct avc_error *err)
 {
 	struct inj_call *call = &setup->slot->template_call;
-	struct mem_image *image = generation->image;
-	const uint8_t *from = image->wiped.bytes;
+	struct mem_image *memory = image->memory;
+	const uint8_t *from = memory->wiped.bytes;
 	int mem_fd = -1, result = 0;
 
 	call_begin(call, INJ_AFTER_PARK);
-	if (image->wiped.runs)
-		mem_fd = proc_open(generation->template, "mem", O_RDWR);
-	for (uint32_t i = 0; !result && i < image->wiped.runs; i++) {
-		const struct wiped_run *run = &image->wiped.run[i];
+	if (memory->wiped.runs)
+		mem_fd = proc_open(image->template, "mem", O_RDWR);
+	for (uint32_t i = 0; !result && i < memory->wiped.runs; i++) {
+		const struct wiped_run *run = &memory->wiped.run[i];
 		const size_t bytes = run->end - run->start;
 
 		if (run->guard) {
-			result = advise(process, generation, call, run->start, run->end,
-					GUARD_INSTALL, err);
+			result = advise(image, call, run->start, run->end, GUARD_INSTALL, err);
 		} else if (pwrite(mem_fd, from, bytes, (off_t)run->start) != (ssize_t)bytes) {
-			result = fail_errno(err, generation->template, "keep memory", "write(mem)",
+			result = fail_errno(err, image->template, "keep memory", "write(mem)",
 					    "it was killed");
 		} else {
 			from += bytes;
 		}
 	}
-	for (uint32_t i = 0; !result && i < image->areas.count; i++) {
-		const struct area *a = &image->areas.area[i];
+	for (uint32_t i = 0; !result && i < memory->areas.count; i++) {
+		const struct area *a = &memory->areas.area[i];
 
 		if (!a->wiped)
 			continue;
-		result = advise(process, generation, call, a->start, a->end, MADV_KEEPONFORK, err);
+		result = advise(image, call, a->start, a->end, MADV_KEEPONFORK, err);
 		setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise, a->start, area_bytes(a),
 			  MADV_WIPEONFORK, 0, 0);
 	}
 	close_fd(&mem_fd);
-	wiped_free(&image->wiped);
-	return result || flush(process, generation, call, err) ? -1 : 0;
+	wiped_free(&memory->wiped);
+	return result || flush(image, call, err) ? -1 : 0;
 }

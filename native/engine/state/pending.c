@@ -19,7 +19,8 @@
 struct pending {
 	uint32_t count;
 	bool too_many;
-	int deadly; /* 0: none                                             */
+	int deadly;  /* 0: none                                             */
+	bool caught; /* and there is a handler for it                       */
 	struct {
 		int block; /* of the thread, -1: of the process                    */
 		siginfo_t info;
@@ -105,11 +106,11 @@ static bool ends_by_default(int signal)
 }
 
 /* A process that has got a deadly signal and was stopped by us before it could die of
- * it: every restore of such an image would die at once. */
+ * it, or run its handler of a crash: every restore of such an image would die at once. */
 static int find_deadly(const struct process *process, const struct proc_status *status)
 {
 	const struct pending *pending = process->pending;
-	const uint64_t spared = status->caught | status->ignored;
+	const uint64_t spared = (status->caught & ~FATAL_SIGNALS) | status->ignored;
 
 	for (uint32_t k = 0; k < pending->count; k++) {
 		const int signal = pending->signal[k].info.si_signo;
@@ -134,6 +135,7 @@ int pending_read(struct process *process, struct avc_error *err)
 
 	pending->count = 0;
 	pending->deadly = 0;
+	pending->caught = false;
 	pending->too_many = false;
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
@@ -148,13 +150,22 @@ int pending_read(struct process *process, struct avc_error *err)
 	if (pending->count && !proc_status(process->pid, &status)) {
 		assign(process, &status);
 		pending->deadly = find_deadly(process, &status);
+		pending->caught = pending->deadly && status.caught & SIGNAL_BIT(pending->deadly);
 	}
 	return 0;
 }
 
-int pending_deadly(const struct pending *pending)
+int pending_check(const struct process *process, struct avc_error *err)
 {
-	return pending->deadly;
+	const struct pending *pending = process->pending;
+
+	if (!pending->deadly)
+		return 0;
+	/* Whoever handles it may go on after that. */
+	return pending->caught ? fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
+				      "it is about to handle signal %d", pending->deadly)
+			       : fail(err, AVC_GONE, 0, process->pid, "freeze", "",
+				      "it is just being ended by signal %d", pending->deadly);
 }
 
 bool pending_contains(const struct pending *pending, int signal, int timer)

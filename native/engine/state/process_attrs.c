@@ -156,20 +156,19 @@ static int64_t barriers_of(const struct inj_syscall *told, const struct inj_sysc
 	return registered;
 }
 
-int process_attrs_learn(struct branch *branch, struct avc_error *err)
+int process_attrs_learn(struct image *image, struct avc_error *err)
 {
-	const struct parasite *parasite = &branch->process->parasite;
-	struct generation *image = branch->image;
+	const struct parasite *parasite = &image->process->parasite;
 	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 	uint8_t *memory = parasite_files(parasite, image->slot) + INJ_FILES_BYTES / 2;
 	struct inj_syscall *list = (struct inj_syscall *)memory;
 	struct action *action = (struct action *)(list + SIGNALS + 8 + KEYS);
-	const struct thread *main_thread = thread_find(branch->process, branch->process->pid);
+	const struct thread *main_thread = thread_find(image->process, image->process->pid);
 	struct process_attrs *attrs = calloc(1, sizeof *attrs);
 	const struct inj_syscall *keys;
 	uint32_t n = 0;
 
-	branch->attrs = attrs;
+	image->attrs = attrs;
 	if (!attrs)
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	for (int i = 0; i < SIGNALS; i++)
@@ -203,17 +202,17 @@ int process_attrs_learn(struct branch *branch, struct avc_error *err)
 	attrs->state_permitted = main_thread->creds.state_permitted;
 	/* The template has limits of the time when the holder was made. */
 	if (read_mm(image->template, attrs) || read_status(image->template, attrs) ||
-	    (proc_limits(branch->process->pid, attrs->limit) &&
+	    (proc_limits(image->process->pid, attrs->limit) &&
 	     proc_limits(image->template, attrs->limit)))
 		return fail_errno(err, image->template, "keep template", "open(/proc)",
 				  "it was killed");
 	return 0;
 }
 
-void process_attrs_forget(struct branch *branch)
+void process_attrs_forget(struct image *image)
 {
-	free(branch->attrs);
-	branch->attrs = NULL;
+	free(image->attrs);
+	image->attrs = NULL;
 }
 
 /* ---- a restore ------------------------------------------------------------------------ */
@@ -270,20 +269,19 @@ void process_attrs_lift_limit(pid_t pid, int which, uint64_t least)
 	(void)prlimit(pid, which, &now, NULL);
 }
 
-void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files)
+void process_attrs_lift_limits(pid_t pid, const struct image *image, uint32_t files)
 {
 	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
 	for (int i = 0; i < LIMITS; i++)
 		process_attrs_lift_limit(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
-	process_attrs_lift_limit(pid, RLIMIT_NOFILE, branch->attrs->limit[RLIMIT_NOFILE][1]);
+	process_attrs_lift_limit(pid, RLIMIT_NOFILE, image->attrs->limit[RLIMIT_NOFILE][1]);
 }
 
-void process_attrs_setup_limits(const struct branch *branch, struct setup *setup)
+void process_attrs_setup_limits(const struct image *image, struct setup *setup)
 {
 	for (uint64_t i = 0; i < LIMITS; i++)
 		setup_add(setup, INJ_AFTER, "prlimit", INJ_LIMIT, i,
-			  setup_data(setup, branch->attrs->limit[i],
-				     sizeof branch->attrs->limit[i]),
+			  setup_data(setup, image->attrs->limit[i], sizeof image->attrs->limit[i]),
 			  0, 0, 0)
 			->flags = INJ_MAY_FAIL;
 }
@@ -372,13 +370,12 @@ static int free_keys(struct syscall_batch *batch, uint32_t kept, struct avc_erro
 	return 0;
 }
 
-int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
-		      struct avc_error *err)
+int process_attrs_put(struct syscall_batch *batch, const struct image *image, struct avc_error *err)
 {
-	const struct process_attrs *attrs = branch->attrs;
+	const struct process_attrs *attrs = image->attrs;
 	struct arguments *arguments = arguments_of(batch);
 
-	if (put_folders(batch, branch->image->template, err) || free_keys(batch, attrs->keys, err))
+	if (put_folders(batch, image->template, err) || free_keys(batch, attrs->keys, err))
 		return -1;
 	syscall_batch_add(batch, SYS_umask, attrs->umask, 0, 0, 0, 0, 0);
 	syscall_batch_add(batch, SYS_personality, attrs->personality, 0, 0, 0, 0, 0);

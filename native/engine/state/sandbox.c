@@ -2,10 +2,12 @@
  *
  * Restoring an app that has put itself under a seccomp filter, or into strict mode: what
  * a restored process calls to put itself together would be denied to it, or its end.  So
- * it stays traced, with seccomp suspended (PTRACE_O_SUSPEND_SECCOMP), until all is ready;
- * its own first call without us is rt_sigreturn(2).
+ * it stays traced and is supervised (seccomp.c) until all is ready; its own first call without us is
+ * rt_sigreturn(2).  What it goes through then lies in the parasite, where the app has had all the
+ * time to write what it likes: no more than what injected code may call comes of that.
  */
 #include <errno.h>
+#include <sched.h>
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
@@ -17,29 +19,29 @@
 #include "state.h"
 
 #define LOOK_US 50
+#define LOOKS_AT_ONCE 200
+#define SANDBOX_OPTIONS ((long)(PTRACE_O_EXITKILL | PTRACE_O_TRACECLONE | PTRACE_O_TRACESYSGOOD))
 #define END_NS NS_PER_S
 
 struct sandbox {
-	pid_t pid;
+	pid_t pid, inside;
 	uint32_t count;
 	pid_t tid[THREADS_MAX];
 };
 
-struct sandbox *sandbox_begin(pid_t child, struct avc_error *err)
+struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err)
 {
 	struct sandbox *sandbox = calloc(1, sizeof *sandbox);
 
-	if (!sandbox ||
-	    ptrace(PTRACE_SETOPTIONS, child, NULL,
-		   (long)(PTRACE_O_EXITKILL | PTRACE_O_TRACECLONE | PTRACE_O_TRACESYSGOOD |
-			  PTRACE_O_SUSPEND_SECCOMP)) ||
-	    ptrace(PTRACE_CONT, child, NULL, 0L)) {
+	if (!sandbox || ptrace(PTRACE_SETOPTIONS, child, NULL, SANDBOX_OPTIONS) ||
+	    ptrace(PTRACE_SYSCALL, child, NULL, 0L)) {
 		fail_errno(err, child, "restore", "ptrace(SETOPTIONS)",
 			   "the new process was killed");
 		free(sandbox);
 		return NULL;
 	}
 	sandbox->pid = child;
+	sandbox->inside = inside;
 	sandbox->tid[sandbox->count++] = child;
 	return sandbox;
 }
@@ -61,7 +63,9 @@ static bool pump(struct sandbox *sandbox, bool *ended)
 	if (status >> 16 == PTRACE_EVENT_CLONE &&
 	    ptrace(PTRACE_GETEVENTMSG, tid, NULL, &born) == 0 && sandbox->count < THREADS_MAX)
 		sandbox->tid[sandbox->count++] = (pid_t)born;
-	ptrace(PTRACE_CONT, tid, NULL, 0L);
+	if (WSTOPSIG(status) == (SIGTRAP | 0x80))
+		seccomp_at_call(tid, sandbox->inside, SANDBOX_OPTIONS);
+	ptrace(PTRACE_SYSCALL, tid, NULL, 0L);
 	return true;
 }
 
@@ -69,10 +73,15 @@ bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end)
 {
 	bool ended = false;
 
-	while (__atomic_load_n(state, __ATOMIC_ACQUIRE) == INJ_IDLE) {
+	/* It stops so often that to sleep would be most of the time. */
+	for (int looks = 0; __atomic_load_n(state, __ATOMIC_ACQUIRE) == INJ_IDLE;) {
 		if (ended || now_ns() > end)
 			return false;
-		if (!pump(sandbox, &ended))
+		if (pump(sandbox, &ended))
+			looks = 0;
+		else if (looks++ < LOOKS_AT_ONCE)
+			sched_yield();
+		else
 			usleep(LOOK_US);
 	}
 	return true;
@@ -83,7 +92,7 @@ void sandbox_end(struct sandbox *sandbox)
 	const uint64_t end = now_ns() + END_NS;
 	bool ended = false;
 
-	kill(sandbox->pid, SIGKILL);
+	tracee_signal(sandbox->pid, SIGKILL);
 	/* The first thread is reported when all the others have been waited for. */
 	while (!ended && now_ns() < end)
 		if (!pump(sandbox, &ended))
@@ -131,8 +140,10 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 		int block;
 
 		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
+		    seccomp_supervise(tid, sandbox->inside, SANDBOX_OPTIONS) ||
 		    tracee_await(tid, NULL, &ignored) != STOP_TRAP || arch_regs_get(tid, &now))
 			continue; /* it has left, or was killed */
+		seccomp_let_be(tid);
 		block = thread_of(parasite, slot_number, tid);
 		if (block < 0)
 			continue;
@@ -147,7 +158,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 			bring_home(tid);
 	}
 	if (stop_signal)
-		kill(sandbox->pid, stop_signal);
+		tracee_signal(sandbox->pid, stop_signal);
 	slot->running = slot->threads;
 	for (uint32_t i = 0; i < sandbox->count; i++) {
 		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);

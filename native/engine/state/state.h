@@ -18,83 +18,55 @@
 
 #define FILES_NAME 81 /* of a file, for people                                  */
 
-/* What a generation has of a process that is not the main one. */
-struct branch {
-	struct process *process;  /* NULL: it had ended, and nobody had waited for it */
-	struct generation *image; /* of this process alone                   */
-	int parent;               /* index of its parent's branch, or ...    */
+/* What is saved of one process. */
+struct image {
+	struct process *process; /* NULL: it had ended, and nobody had waited for it */
+	int parent;              /* the place of its parent's image, or ...         */
 	pid_t inside;
-	pid_t session, group;        /* inside; 0: outside of the app           */
-	struct process_attrs *attrs; /* process_attrs.c                                */
-	pid_t pid;                   /* as of the freeze; then as restored last */
-	int exit_signal;             /* struct proc_stat                       */
-	int status;                  /* of one that had ended, as from wait(2)  */
-	char name[16];               /* the same                                */
-};
-#define PARENT_MAIN (-1)
-#define PARENT_INIT (-2)
-
-struct restore_plan;
-
-/* A fork of a template, for the next restore (spare.c). */
-struct spare {
-	pid_t pid; /* 0: none                                           */
-	int pidfd;
-	bool tried;    /* it was begun to make one                               */
-	bool unwanted; /* it was one process too many for a restore              */
-	/* What the template has been told to do for it and has not done yet. */
-	enum { SPARE_NO_WORK, SPARE_FORK, SPARE_REST } work;
-	struct scheduling scheduling; /* the template's own                        */
-	bool aside;                   /* it has another policy for as long         */
-};
-
-/* Also the image of one process of several: then what is of the whole is unused. */
-struct generation {
-	uint64_t number; /* 0: unused                                        */
+	/* Of its session and group, and of the group in the foreground of its terminal; inside, 0:
+	 * outside of the app, or none that could be seen. */
+	pid_t session, group, tty_group;
+	pid_t pid;             /* as of the freeze; then as restored last          */
+	int exit_signal;       /* struct proc_stat                                */
+	int status;            /* of one that had ended, as from wait(2)           */
+	char name[16];         /* the same                                        */
+	struct proc_stat stat; /* as of the freeze                                */
 	pid_t template;
 	int pidfd;
-	struct spare spare;
 	uint32_t slot;
 	uint32_t threads;
 	uint64_t taken_ns;
-	uint64_t clone_ns; /* what the clones of it took                      */
-	bool quiescent;
-	/* Taken from a process that had been restored lately: of the same lineage
-	 * as what that one was restored from, and as suspect. */
-	uint32_t lineage;
-	uint32_t crashes;      /* of its lineage, soon after a restore             */
-	uint32_t lost;         /* restores from it that came to nothing            */
-	bool seen;             /* held when the app was healthy; again so: vouched */
-	bool vouched;          /* the app was healthy well after it was taken      */
 	struct arch_regs base; /* a user context of the template                */
-	long vm_pages;         /* of the app when it was taken                     */
+	long vm_pages;         /* of the process when it was taken                */
 	long anon_pages;       /* resident ones that are of no file                */
+	/* The OOM killer's: the app's own, and what it was told of the template (guard_memory.c) */
+	int oom_own, oom_told;
+	bool oom_known;
 	bool sandboxed;        /* has seccomp filters of its own                   */
 	bool headless;         /* its main thread had ended                       */
 	int stop_signal;       /* stopped by that (job control), 0: it was not     */
 	int64_t dumpable;      /* prctl(2), PR_GET_DUMPABLE                        */
-	struct proc_stat stat; /* as of the freeze                                */
-	/* The main process' group, and the one in the foreground of its terminal; inside,
-	 * 0: none that could be seen. */
-	pid_t group, tty_group;
 	struct attributes *attributes;
-	struct mem_image *image;      /* of memory that is not in the template       */
-	struct avc_error notice;      /* what of it can not be put back              */
+	struct process_attrs *attrs;  /* of one that its parent is to fork               */
+	struct mem_image *memory;     /* that is not in the template                     */
 	struct files *files;          /* descriptors                                     */
 	struct avc_error files_error; /* why they could not be read             */
-	/* avckpt.files=strict */
-	struct files_mapped *mapped; /* NULL: it was not strict                         */
-	char written[FILES_NAME];    /* a file that was written since; "": none         */
-	struct branch *branch;       /* the other processes, parents first        */
-	uint32_t branches;
-	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                */
+	struct files_mapped *mapped;  /* avckpt.files=strict; NULL: it was not             */
+	struct fd_table table;        /* at a restore: what it is to have open           */
+	struct avc_error notice;      /* what of it can not be put back              */
 };
+#define PARENT_INIT (-1)
 
 /* ---- image.c ---------------------------------------------------------------------- */
 
-/* That of a process that is not the main one, or NULL; `generation` may be NULL. */
-struct branch *generation_branch(const struct generation *generation,
-				 const struct process *process);
+/* Among all images of a checkpoint; NULL: it has none. */
+struct image *image_find(struct image *image, uint32_t images, const struct process *process);
+
+/* What a crash is known by. */
+#define SIGNAL_BIT(signal) (UINT64_C(1) << ((signal)-1))
+#define FATAL_SIGNALS                                                                         \
+	(SIGNAL_BIT(SIGSEGV) | SIGNAL_BIT(SIGBUS) | SIGNAL_BIT(SIGFPE) | SIGNAL_BIT(SIGILL) | \
+	 SIGNAL_BIT(SIGABRT) | SIGNAL_BIT(SIGTRAP) | SIGNAL_BIT(SIGSYS))
 
 /* ---- pending.c ------------------------------------------------------------------ */
 
@@ -102,8 +74,9 @@ struct pending *pending_new(void);
 /* While everything is stopped: those of all threads that are in the image.  Sets
  * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
 int pending_read(struct process *process, struct avc_error *err) warn_unused;
-/* One that the app dies of as soon as it runs again; 0: none. */
-int pending_deadly(const struct pending *pending);
+/* -1 if there is one that the process dies of as soon as it runs again, or reports its own
+ * crash. */
+int pending_check(const struct process *process, struct avc_error *err) warn_unused;
 /* Is there such a signal; of a POSIX timer, if timer >= 0? */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
@@ -137,35 +110,34 @@ int attributes_setup_thread(const struct process *process, const struct thread *
 			    struct avc_error *err) warn_unused;
 /* Of a stopped thread: its seccomp filters, whatever they say. */
 uint64_t attributes_read_filters(pid_t tid);
-int attributes_keep(const struct process *process, struct generation *generation,
-		    struct avc_error *err) warn_unused;
+int attributes_keep(struct image *image, struct avc_error *err) warn_unused;
 /* Before the restored threads go: what can be done from outside only. */
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
 
 /* ---- process_attrs.c ------------------------------------------------------------------------ */
 
 /* After the app runs again: what only the template can tell. */
-int process_attrs_learn(struct branch *branch, struct avc_error *err) warn_unused;
-void process_attrs_forget(struct branch *branch);
+int process_attrs_learn(struct image *image, struct avc_error *err) warn_unused;
+void process_attrs_forget(struct image *image);
 /* All protection keys, before its memory refers to some and while the kernel must not choose one
  * (pkeys(7), of what can only be executed).  process_attrs_put() frees those that it did not have. */
 int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err) warn_unused;
 /* A restored process gets it, with the batch's next flush. */
-int process_attrs_put(struct syscall_batch *batch, const struct branch *branch,
+int process_attrs_put(struct syscall_batch *batch, const struct image *image,
 		      struct avc_error *err) warn_unused;
 /* Until then nothing is limited: it may have more than it may have now, and its parent may have
  * lowered its own limits since.  Its descriptors are below `files`. */
-void process_attrs_lift_limits(pid_t pid, const struct branch *branch, uint32_t files);
+void process_attrs_lift_limits(pid_t pid, const struct image *image, uint32_t files);
 /* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
  * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
 void process_attrs_lift_limit(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
-void process_attrs_setup_limits(const struct branch *branch, struct setup *setup);
+void process_attrs_setup_limits(const struct image *image, struct setup *setup);
 
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
 /* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
-struct sandbox *sandbox_begin(pid_t child, struct avc_error *err);
+struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err);
 /* Waits while *state is INJ_IDLE; false when it ended or was too late. */
 bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
 /* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where
@@ -218,10 +190,16 @@ int memory_learn(struct process *process, long missing_pages, struct avc_error *
 /* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
  * pages is small, and whoever writes to a shared one when it is empty is killed. */
 extern const char memory_private_huge_pages[];
-int memory_finish(struct process *process, struct generation *generation, int64_t locked_kb,
-		  struct setup *setup, struct avc_error *err) warn_unused;
+int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
+		  struct avc_error *err) warn_unused;
+/* When all of them are there: -1 if several processes have shared memory that is not rolled back
+ * with them.  One that went back would wait for what another one had done. */
+int memory_check_unkept(const struct image *image, uint32_t images,
+			struct avc_error *err) warn_unused;
+/* When all of a checkpoint are finished: what is more than may be kept. */
+void memory_note_left(const struct image *image, uint32_t images, struct avc_error *notice);
 /* At a restore, before anything runs; *notes: what can not be written. */
-int memory_put_back(const struct process *process, const struct generation *image, pid_t pid,
-		    struct avc_error *notes, struct avc_error *err) warn_unused;
+int memory_put_back(const struct image *image, pid_t pid, struct avc_error *notes,
+		    struct avc_error *err) warn_unused;
 
 #endif

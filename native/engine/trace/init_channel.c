@@ -285,6 +285,22 @@ static bool may_run(const struct proc_stat *stat)
 	return (stat->state != 'Z' && stat->state != 'X') || stat->threads > 1;
 }
 
+/* A child of init's, if it is one still: 1 it runs, and has been sent SIGKILL; 0 it is a zombie; -1
+ * it is none. */
+static int kill_leftover(const struct init_channel *channel, pid_t pid)
+{
+	struct proc_stat stat;
+	/* First: then it stands for the process that is looked at, whoever has the number later. */
+	int pidfd = proc_pidfd_open(pid), result = -1;
+
+	if (proc_stat(pid, &stat) == 0 && stat.parent == channel->init)
+		result = may_run(&stat);
+	if (result > 0 && pidfd >= 0)
+		syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
+	close_fd(&pidfd);
+	return result;
+}
+
 int init_channel_kill_leftovers(struct init_channel *channel,
 				bool (*keep)(pid_t pid, const void *arg), void (*tend)(void *arg),
 				void *arg, struct avc_error *err)
@@ -302,17 +318,16 @@ int init_channel_kill_leftovers(struct init_channel *channel,
 
 		alive = 0;
 		for (int i = 0; i < count; i++) {
-			struct proc_stat stat;
+			const int runs = keep(children[i], arg)
+						 ? -1
+						 : kill_leftover(channel, children[i]);
 
-			if (keep(children[i], arg) || proc_stat(children[i], &stat) ||
-			    stat.parent != channel->init)
-				continue;
-			any = true; /* its number is not free before init has waited for it */
-			if (!may_run(&stat))
-				continue;
-			alive = children[i];
-			alive_ns = now;
-			kill(alive, SIGKILL);
+			/* Its number is not free before init has waited for it. */
+			any |= runs >= 0;
+			if (runs > 0) {
+				alive = children[i];
+				alive_ns = now;
+			}
 		}
 		/* A zombie's number may be needed, and may be not: that shows soon enough. */
 		if (!any || now - alive_ns > LEFTOVERS_NS)

@@ -175,6 +175,7 @@ void call_begin(struct inj_call *call, enum inj_after after)
 	call->done = 0;
 	call->pause = INJ_PAUSE_NONE;
 	call->count = 0;
+	call->wills = 0;
 	call->after = after;
 	call->park_ms = INJ_PARK_MS;
 }
@@ -193,6 +194,35 @@ struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_
 	return s;
 }
 
+int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
+		  uint64_t data, uint64_t e)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const struct thread *thread = thread_find(process, process->pid);
+	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
+
+	/* Supervised, its filters would judge what it does without us. */
+	if (!thread || !thread->borrowed || i >= INJ_WILLS_MAX ||
+	    process->parasite.seccomp == SECCOMP_SUPERVISED)
+		return -1;
+	call->will_data[i] = data;
+	call->will[i] = (struct inj_syscall){
+		.nr = nr,
+		.arg = { a, b, c, parasite_remote(&process->parasite, &call->will_data[i]), e }
+	};
+	__atomic_store_n(&call->wills, i + 1, __ATOMIC_RELEASE);
+	return 0;
+}
+
+void parasite_will_done(struct process *process)
+{
+	struct inj_call *call = &process->parasite.control->runner;
+	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
+
+	if (i && i <= INJ_WILLS_MAX)
+		__atomic_store_n(&call->wills, i - 1, __ATOMIC_RELEASE);
+}
+
 /* A thread of the app has others waiting for it, and goes home after INJ_PARK_MS.
  * Templates and holders stay, and a template that waits for a CPU is no reason to
  * restore an older one.
@@ -205,18 +235,23 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 	const uint64_t end = now_ns() + (call->after == INJ_AFTER_PARK ? PARKED_NS : HOMEWARD_NS);
 
 	while (!__atomic_load_n(word, __ATOMIC_ACQUIRE)) {
+		const bool supervised = seccomp_is_supervised(tid);
 		struct stop stop;
 
 		heartbeat();
-		syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
+		/* One that is supervised stops all the time. */
+		if (!supervised)
+			syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
 		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
 			break;
-		stop = tracee_wait(tid, WNOHANG);
+		tracee_watch(supervised ? word : NULL);
+		stop = tracee_wait(tid, supervised ? 0 : WNOHANG);
+		tracee_watch(NULL);
 		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING)
 			return fail(err, AVC_GONE, 0, tid, "run injected code", "", "it has ended");
-		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP)
-			ptrace(PTRACE_CONT, tid, NULL,
-			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+		if (stop.kind == STOP_SIGNAL || stop.kind == STOP_GROUP ||
+		    stop.kind == STOP_SYSCALL)
+			seccomp_go_on(tid, &stop);
 		if (now_ns() > end)
 			return fail(err, AVC_DEADLINE, 0, tid, "run injected code", "",
 				    "the task did not get to run in time");
@@ -224,22 +259,39 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 	return 0;
 }
 
-int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
-		  struct inj_call *call, struct avc_error *err)
+static long options_of(const struct parasite *parasite, bool ours);
+
+static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
+		   const struct arch_regs *base, struct inj_call *call, struct avc_error *err)
 {
+	const avc_remote stack = parasite_remote(parasite, call->stack + sizeof call->stack);
 	struct arch_regs regs;
 
-	arch_call(&regs, base, parasite->base + INJ_RUN_OFFSET,
-		  parasite_remote(parasite, call->stack + sizeof call->stack),
-		  parasite_remote(parasite, call));
+	if (parasite->seccomp != SECCOMP_SUPERVISED)
+		seccomp_let_be(tid);
+	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours)))
+		return fail(err, AVC_UNSUPPORTED, 0, tid, "run injected code", "",
+			    "it has too many processes under seccomp filters of its own");
+	if (ours)
+		arch_call(&regs, base, parasite->base + INJ_RUN_OFFSET, stack,
+			  parasite_remote(parasite, call));
+	else
+		arch_enter(&regs, base, parasite->base + INJ_ENTER_OFFSET,
+			   parasite_remote(parasite, call), stack);
 	if (arch_regs_set(tid, &regs))
 		return fail_errno(err, tid, "run injected code", "ptrace(SETREGS)", "it has gone");
 	return 0;
 }
 
+int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
+		  struct inj_call *call, struct avc_error *err)
+{
+	return send_in(parasite, tid, true, base, call, err);
+}
+
 int parasite_start(pid_t tid, struct avc_error *err)
 {
-	if (ptrace(PTRACE_CONT, tid, NULL, 0L))
+	if (seccomp_go_on(tid, NULL))
 		return fail_errno(err, tid, "run injected code", "ptrace(CONT)", "it has gone");
 	return 0;
 }
@@ -322,8 +374,7 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		default:
 			/* SIGSTOP, SIGCONT and job control make stops of their own
 			 * (ptrace(2), PTRACE_EVENT_STOP). */
-			if (ptrace(PTRACE_CONT, tid, NULL,
-				   (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
+			if (seccomp_go_on(tid, &stop))
 				return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
 		}
 	}
@@ -352,10 +403,30 @@ bool parasite_is_old(const struct process *process, avc_remote address)
 	return false;
 }
 
-int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err)
+static long options_of(const struct parasite *parasite, bool ours)
 {
-	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL,
-		   (long)(TRACE_OPTIONS_APP | PTRACE_O_SUSPEND_SECCOMP)))
+	return (long)((ours ? TRACE_OPTIONS_OURS : TRACE_OPTIONS_APP) |
+		      (parasite->seccomp == SECCOMP_NONE ? PTRACE_O_SUSPEND_SECCOMP : 0));
+}
+
+int parasite_own(const struct parasite *parasite, pid_t tid)
+{
+	return ptrace(PTRACE_SETOPTIONS, tid, NULL, options_of(parasite, true)) ? -1 : 0;
+}
+
+/* How the thread is going to be let run: it is borrowed next. */
+static int look_at_seccomp(struct process *process, struct thread *thread, struct avc_error *err)
+{
+	struct parasite *parasite = &process->parasite;
+
+	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as a checkpoint has found */
+		thread->seccomp = SECCOMP_SUPERVISED;
+	if (seccomp_look(thread->tid, process->plain_filters, &thread->filters_known,
+			 &thread->seccomp))
+		return fail_errno(err, thread->tid, "run injected code",
+				  "ptrace(SECCOMP_GET_FILTER)", "its filters can not be read");
+	parasite->seccomp = thread->seccomp;
+	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL, options_of(parasite, false)))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",
 				  "it has gone");
 	return 0;
@@ -415,11 +486,11 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	home = thread->regs;
 	arch_resume(&home);
 	arch_home_set(&control->home, &home, thread->sigmask);
-	/* Registers first: if we die between the two, the thread is in the parasite
-	 * with its own mask and goes home with it.  The other way round it would
+	/* Registers first: if we die between the two, the thread enters the parasite with its
+	 * own mask, and blocks signals by itself (inj_enter()).  The other way round it would
 	 * be in the app with every signal blocked, for ever. */
-	if (thread_suspend_seccomp(thread, err) ||
-	    parasite_send(&process->parasite, thread->tid, &thread->regs, &control->runner, err))
+	if (look_at_seccomp(process, thread, err) ||
+	    send_in(&process->parasite, thread->tid, false, &thread->regs, &control->runner, err))
 		return -1;
 	thread->borrowed = true;
 	thread->borrowed_for = &process->parasite;
@@ -427,6 +498,11 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETSIGMASK)",
 				  "it has gone");
 	return 0;
+}
+
+static avc_remote homeward(const struct thread *thread)
+{
+	return thread->borrowed_for ? thread->borrowed_for->base + INJ_GO_HOME_OFFSET : 0;
 }
 
 int thread_give_back(struct thread *thread, struct avc_error *err)
@@ -442,12 +518,16 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}
-	/* The mask first, for the same reason. */
-	if (ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
+	/* The mask before the registers, for the same reason.  But not while it has the stack of
+	 * the parasite, on which a handler would run if we died: it is sent home first, where it
+	 * would get with any mask. */
+	arch_enter(&now, &thread->regs, homeward(thread), 0, 0);
+	if ((thread->borrowed_for && arch_regs_set(thread->tid, &now)) ||
+	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
-	/* Its own seccomp filters are in force again when it is let go: nothing else
-	 * comes in between. */
+	/* Strict mode is in force again when it is let go: nothing else comes in between. */
+	seccomp_let_be(thread->tid);
 	thread->borrowed = false;
 	return 0;
 }

@@ -158,6 +158,14 @@ static uint64_t time_of_call(const struct process *process, const struct arch_re
 	return 0;
 }
 
+static bool has_timeout(long nr)
+{
+	for (size_t i = 0; i < sizeof rewindable / sizeof *rewindable; i++)
+		if (rewindable[i].nr == nr && rewindable[i].timeout != NO_TIMEOUT)
+			return true;
+	return false;
+}
+
 /* False: the call is none of those.  *limit_ns: 0, it may take for ever. */
 static bool look_up(const struct process *process, const struct arch_regs *regs, uint64_t *limit_ns,
 		    int *answer)
@@ -207,8 +215,10 @@ static void answer_late(struct thread *thread)
 		return;
 	if (nr == SYS_select || nr == SYS_pselect6)
 		clear_sets(thread);
-	if (arch_result_set(thread->tid, thread->rewound.answer) == 0)
-		arch_result_note(&thread->regs, thread->rewound.answer);
+	if (arch_result_set(thread->tid, thread->rewound.answer))
+		return;
+	arch_result_note(&thread->regs, thread->rewound.answer);
+	thread->rewound = (struct rewound){ 0 };
 }
 
 /* ---- which call it is ------------------------------------------------------------------ */
@@ -282,6 +292,51 @@ static bool is_about_to_rewind(const struct thread *thread)
 	return thread->rewound.mark && arch_result_mark(&thread->regs) == thread->rewound.mark;
 }
 
+/* The kernel does not tell how much of its timeout an interrupted call had left.  It tells
+ * when a thread ran last: for one that slept in the call, that was when the call began. */
+void rewind_prepare(struct thread *thread)
+{
+	struct sleeper *s = &thread->sleeper;
+	struct proc_stat stat;
+
+	s->known = (has_timeout(thread->call.nr) || !thread->stopped_ns) &&
+		   proc_sched(thread->tid, &s->sched) == 0 && proc_stat(thread->tid, &stat) == 0 &&
+		   stat.state == 'S';
+}
+
+/* For how long a thread that has just stopped was in its call, at least; 0: nobody knows.  It
+ * was, if it has run only once since, to stop, and on the same CPU, for the clocks of different
+ * ones differ.  They are not those that people set their clocks by, either: a thousandth less
+ * is sure not to be too much. */
+static uint64_t waited_ns(struct thread *thread)
+{
+	const struct sleeper *s = &thread->sleeper;
+	struct proc_sched now;
+
+	if (!s->known || proc_sched(thread->tid, &now) || now.switches != s->sched.switches + 1 ||
+	    now.migrations != s->sched.migrations || now.ran_ns < s->sched.ran_ns)
+		return 0;
+	return (now.ran_ns - s->sched.ran_ns) / 1000 * 999;
+}
+
+/* recvmmsg(2) that was interrupted when it had some of its messages answers how many, and
+ * leaves what interrupted it to the socket's next call (net/socket.c, do_recvmmsg()): which
+ * would fail with one of the kernel's own codes.  To ask for an error takes it away. */
+static void forget_error(const struct process *process, const struct arch_regs *regs)
+{
+	const long got = arch_syscall_result(regs);
+	int fd, error;
+	socklen_t bytes = sizeof error;
+
+	if (got <= 0 || got >= (int32_t)arch_syscall_arg(regs, 2))
+		return;
+	fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, (int)arch_syscall_arg(regs, 0), 0);
+	if (fd < 0)
+		return;
+	(void)getsockopt(fd, SOL_SOCKET, SO_ERROR, &error, &bytes);
+	close(fd);
+}
+
 /* A call that answers EINTR to a stop is from now on watched. */
 static void begin_watch(const struct process *process, struct thread *thread, uint64_t now)
 {
@@ -289,11 +344,13 @@ static void begin_watch(const struct process *process, struct thread *thread, ui
 	int answer;
 
 	thread->rewound = (struct rewound){ 0 };
-	if (look_up(process, &thread->regs, &limit_ns, &answer))
-		thread->rewound = (struct rewound){ .mark = (uint32_t)now | 1,
-						    .answer = answer,
-						    .due_ns = limit_ns ? now + limit_ns
-								       : UINT64_MAX };
+	if (!look_up(process, &thread->regs, &limit_ns, &answer))
+		return;
+	thread->rewound = (struct rewound){ .mark = (uint32_t)now | 1,
+					    .answer = answer,
+					    .due_ns = UINT64_MAX };
+	if (limit_ns)
+		thread->rewound.due_ns = now + limit_ns - waited_ns(thread);
 }
 
 void rewind_call(struct process *process, struct thread *thread)
@@ -306,6 +363,8 @@ void rewind_call(struct process *process, struct thread *thread)
 	note_call(process, thread);
 	if (arch_syscall_nr(regs) < 0 || is_about_to_rewind(thread))
 		return;
+	if (arch_syscall_nr(regs) == SYS_recvmmsg)
+		forget_error(process, regs);
 	if (arch_syscall_result(regs) == -EINTR) {
 		if (!is_rewound(thread))
 			begin_watch(process, thread, now);

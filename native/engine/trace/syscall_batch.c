@@ -83,7 +83,9 @@ static int await_end(const struct syscall_batch *batch, const struct inj_syscall
 		default:
 			break;
 		}
-		if (ptrace(PTRACE_CONT, batch->pid, NULL, (long)signal))
+		if (stop.kind == STOP_SIGNAL && !signal)
+			stop.kind = STOP_OTHER;
+		if (seccomp_go_on(batch->pid, &stop))
 			return fail_errno(err, batch->pid, "run injected code", "ptrace(CONT)",
 					  "it has gone");
 	}

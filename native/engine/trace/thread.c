@@ -3,7 +3,9 @@
  * A thread of the app: stopped, waited for, let go.
  */
 #include <errno.h>
+#include <sched.h>
 #include <sys/ptrace.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -41,7 +43,7 @@ void threads_forget_unseen(struct process *process)
 	process->thread_count = kept;
 }
 
-/* EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
+/* 0: it is seized after all.  EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
  * has no memory any more, or is a zombie. */
 static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 {
@@ -56,6 +58,9 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
 				    "it is being traced by process %d", status.tracer);
 	}
+	/* Its tracer may have gone just now. */
+	if (errnum == EPERM && ptrace(PTRACE_SEIZE, tid, NULL, (long)TRACE_OPTIONS_APP) == 0)
+		return 0;
 	errno = errnum;
 	return fail_errno(err, tid, "stop", "ptrace(SEIZE)",
 			  "not allowed to trace it (CAP_SYS_PTRACE and CAP_SYS_ADMIN are needed)");
@@ -78,7 +83,8 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 			return 0;
 		}
 		errno = errnum;
-		return seize_failed(process->pid, thread->tid, err);
+		if (seize_failed(process->pid, thread->tid, err))
+			return -1;
 	}
 	thread->attached = true;
 	thread->stopped = false;
@@ -101,10 +107,28 @@ static struct thread *adopt(struct process *process, pid_t tid, struct avc_error
 	return born;
 }
 
+/* Whether the call that it comes from has brought forth somebody that may be a tracee of ours
+ * (tracee_release_strangers()). */
+static bool has_stranger(const struct process *process, const struct thread *thread)
+{
+	const long nr = arch_syscall_nr(&thread->regs);
+	uint64_t flags = arch_syscall_arg(&thread->regs, 0);
+
+	if ((nr != SYS_clone && nr != SYS_clone3) || arch_syscall_result(&thread->regs) <= 0)
+		return false;
+	/* struct clone_args has them first. */
+	if (nr == SYS_clone3 &&
+	    pread(process->mem_fd, &flags, sizeof flags, (off_t)flags) != sizeof flags)
+		return false;
+	return flags & CLONE_PTRACE;
+}
+
 int thread_await(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	pid_t child = 0;
-	const enum stop_kind kind = tracee_await(thread->tid, &child, err);
+	/* It may be waiting for one that we do not know of (vfork(2)). */
+	const enum stop_kind kind = tracee_await_while(thread->tid, tracee_release_strangers,
+						       &child, err);
 
 	/* Whatever came of it: its new threads are found by the next walk, attached
 	 * already; new processes are not, which is how freeze_tree() tells them. */
@@ -126,6 +150,8 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 		thread->stopped = false;
 		return fail_errno(err, thread->tid, "stop", "ptrace(GETREGS)", "it has ended");
 	}
+	if (has_stranger(process, thread))
+		tracee_expect_strangers();
 	rewind_call(process, thread);
 	return 0;
 }
@@ -201,7 +227,7 @@ static bool straggle(struct process *process, struct thread *thread)
 	case STOP_SYSCALL:
 		/* Not a place to change registers: let it come to a better one. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
-		ptrace(PTRACE_CONT, tid, NULL, 0L);
+		seccomp_go_on(tid, &stop);
 		return true;
 	default:
 		break;
@@ -212,7 +238,7 @@ static bool straggle(struct process *process, struct thread *thread)
 		if (process->waiting && thread->borrowed &&
 		    parasite_contains(&process->parasite, arch_pc(&now)) &&
 		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
-			ptrace(PTRACE_CONT, tid, NULL, 0L);
+			seccomp_go_on(tid, NULL);
 			return true;
 		}
 		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {

@@ -45,6 +45,12 @@ struct rewound {
 	bool runs_known, waiting; /* waits.c                                        */
 };
 
+/* A thread that slept, as far as one can tell from outside, just before it was stopped. */
+struct sleeper {
+	bool known;
+	struct proc_sched sched;
+};
+
 /* struct sched_attr (sched_setattr(2)) as of version 0, and ioprio_get(2). */
 struct scheduling {
 	uint8_t attr[48] __attribute__((aligned(8)));
@@ -79,6 +85,13 @@ struct questions {
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
 };
 
+/* How injected code gets along with the app's seccomp filters (seccomp.c). */
+enum seccomp_way {
+	SECCOMP_NONE,      /* there are none                                       */
+	SECCOMP_IN_FORCE,  /* they let pass what it calls                          */
+	SECCOMP_SUPERVISED /* they do not                                          */
+};
+
 struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
@@ -87,6 +100,8 @@ struct thread {
 	int block;       /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
 	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
+	uint32_t filters_known;              /* of seccomp, when they were looked at last       */
+	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has been at this stop                      */
 	struct arch_regs regs; /* as of the stop, EINTR already mended          */
 	uint64_t sigmask;
@@ -110,12 +125,19 @@ struct thread {
 	struct scheduling scheduling; /* at this freeze                         */
 	struct call call;
 	struct rewound rewound;
+	struct sleeper sleeper;
 	uint64_t stopped_ns;
+	struct {
+		avc_remote pc, sp;
+		uint64_t sigmask;
+	} looked_at;    /* when it was in no handler (dying.c)                     */
 	bool signalled; /* was just about to run a handler                  */
 };
 
 struct parasite {
 	avc_remote base; /* 0: none                                          */
+	enum seccomp_way seccomp;
+	pid_t inside; /* the process it was brought into, as that knows it     */
 	size_t bytes;
 	uint8_t *map; /* our view of the same pages                       */
 	struct inj_control *control;
@@ -131,6 +153,13 @@ struct parasite {
 #define PARASITE_DATA_PROT (PROT_READ | PROT_WRITE)
 #define PARASITE_FLAGS (MAP_SHARED | MAP_FIXED_NOREPLACE | MAP_NORESERVE)
 #define PARASITE_FLAGS_OVER (MAP_SHARED | MAP_FIXED | MAP_NORESERVE)
+
+/* How far a freeze has come with a process. */
+enum freeze_stage {
+	FREEZE_RUNS,    /* or not all of its threads are known to be stopped        */
+	FREEZE_STOPPED, /* all of it                                            */
+	FREEZE_BEGUN    /* and it is being read, cloned and asked                     */
+};
 
 /* A live process of the app. */
 struct process {
@@ -184,15 +213,17 @@ struct process {
 	uint64_t start;               /* when it began; tells it from one with its number */
 	uint32_t images;              /* generations that have one of it                  */
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
+	enum freeze_stage stage;      /* in this freeze                                    */
 	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
 	long clone_pages;             /* its size when that began                         */
 	long anon_pages;              /* of its last template; 0: none yet                */
-	bool closing;                 /* by its holder: generation_close_tables()      */
+	uint64_t caught;              /* fatal signals that it has had handlers for        */
+	uint64_t uncaught;            /* and has not any more                              */
+	uint64_t dying_ns;            /* since when it has been in one                     */
+	bool alive;                   /* that was too long ago: it lives there             */
 	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
 	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
-	bool frozen;                  /* stopped in this freeze                            */
-	bool begun;                   /* and read, and asked                               */
 	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
 	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
@@ -235,6 +266,9 @@ struct stop tracee_wait(pid_t tid, int options);
  * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
  * STOP_TRAP is an error. */
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
+/* The same; tick() is called now and then, as long as there is a deadline. */
+enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
+				  struct avc_error *err) warn_unused;
 /* The signal by which the one awaited last is stopped (job control); 0: it is not. */
 int tracee_group_signal(void);
 /* From a stop of another kind to a plain trap stop, on the kernel's way back to
@@ -242,9 +276,22 @@ int tracee_group_signal(void);
 int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
 /* The same of a task of ours of which it is not known whether it runs. */
 int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
+/* Where a tracee is, as soon as it is stopped; 0: it is not, after some milliseconds, or ended. */
+avc_remote tracee_pc(pid_t tid);
+/* Tracees of which we are not told: clone(2) with CLONE_PTRACE attaches a child to its parent's
+ * tracer, if there is one by then; but whether to tell it is decided at the call's beginning
+ * (kernel/fork.c, kernel_clone()).  One that is not known() is let go as soon as it has stopped. */
+void tracee_know(bool (*known)(pid_t tid, const void *arg), const void *arg);
+void tracee_release_strangers(void);
+/* One may come; for a second it is to be looked for. */
+void tracee_expect_strangers(void);
+bool tracee_expects_strangers(void);
 /* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
  * that a thread has brought forth when it was killed is a tracee nobody heard of. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
+/* To a tracee (a process).  Its number is nobody else's as long as we have not waited for its
+ * end, and it is ours no more after that. */
+void tracee_signal(pid_t pid, int signal);
 /* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
 void tracee_kill(pid_t pid);
 /* The same some milliseconds later, and without waiting for its end: the kernel takes some 10 ms
@@ -265,7 +312,7 @@ bool tracee_enters_call(pid_t tid);
 /* Is this thread the one that traces it? */
 bool tracee_is_ours(pid_t tid);
 /* Holders, and processes that are being made: never to run on without us. */
-#define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | PTRACE_O_SUSPEND_SECCOMP | TRACE_OPTIONS_APP)
+#define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | TRACE_OPTIONS_APP)
 #define TRACE_OPTIONS_APP \
 	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
 
@@ -303,6 +350,26 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 /* Registers as the app had them, before rewind_call() marked the call or the kernel made
  * restart_syscall(2) of it. */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
+/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
+ * it sleeps. */
+void rewind_prepare(struct thread *thread);
+
+/* ---- seccomp.c -------------------------------------------------------------------- */
+
+/* Looks at a stopped thread's filters, of which the first `containers` are the container's; *known:
+ * how many there were the last time.  Who is supervised stays so.  0, or -1 with errno. */
+int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known,
+		 enum seccomp_way *way) warn_unused;
+/* From now on, until seccomp_let_be(): `options` are those it has else, `inside` the number of its
+ * process as that knows it. */
+int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
+void seccomp_let_be(pid_t tid);
+bool seccomp_is_supervised(pid_t tid);
+/* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
+void seccomp_at_call(pid_t tid, pid_t inside, long options);
+/* ptrace(PTRACE_CONT) for whoever runs injected code: from `stop`, with its signal if it is one;
+ * NULL: it was told of before. */
+long seccomp_go_on(pid_t tid, const struct stop *stop);
 
 /* ---- parasite.c ------------------------------------------------------------------- */
 
@@ -348,13 +415,20 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 /* The same; `meanwhile` is called once while the kernel clones. */
 int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
+/* While the main thread is in its parasite: a call that it makes before it goes home if we are not
+ * there any more, with the address of `data` as its fourth argument.  For what we are about to
+ * change in what is the app's; that must not be changed if this fails.  The last one has been
+ * undone: parasite_will_done(). */
+int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
+		  uint64_t data, uint64_t e) warn_unused;
+void parasite_will_done(struct process *process);
 /* exec puts another program in its place, at any moment, and the parasite is gone: whether it
  * is there, in a stopped thread.  If not, the process is not infected any more. */
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
 /* In what a guard that died left behind? */
 bool parasite_is_old(const struct process *process, avc_remote address);
-/* Until it is let go: it runs only what is ours meanwhile. */
-int thread_suspend_seccomp(const struct thread *thread, struct avc_error *err) warn_unused;
+/* Options for a task of ours, which is stopped, with the memory of the parasite's process. */
+int parasite_own(const struct parasite *parasite, pid_t tid) warn_unused;
 /* May this stopped thread be borrowed?  What of that is to be read in its memory. */
 int thread_vet(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 /* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:

@@ -104,7 +104,8 @@ static bool is_dying(pid_t tid)
 	return proc_stat(tid, &stat) || stat.state == 'Z' || stat.state == 'X';
 }
 
-struct stop tracee_wait(pid_t tid, int options)
+/* tick() is called now and then, as long as there is a deadline. */
+static struct stop wait_ticking(pid_t tid, int options, void (*tick)(void))
 {
 	struct stop stop = { .kind = STOP_OTHER };
 	unsigned long message = 0;
@@ -117,6 +118,8 @@ struct stop tracee_wait(pid_t tid, int options)
 			if (stop.kind == STOP_DYING || tracee_deadline_passed() ||
 			    (watched && __atomic_load_n(watched, __ATOMIC_ACQUIRE)))
 				return stop;
+			if (tick)
+				tick();
 			r = -2;
 		}
 	} while (r == -2);
@@ -147,6 +150,11 @@ struct stop tracee_wait(pid_t tid, int options)
 	return stop;
 }
 
+struct stop tracee_wait(pid_t tid, int options)
+{
+	return wait_ticking(tid, options, NULL);
+}
+
 static __thread int group_signal;
 
 int tracee_group_signal(void)
@@ -156,9 +164,14 @@ int tracee_group_signal(void)
 
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 {
+	return tracee_await_while(tid, NULL, child, err);
+}
+
+enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
+				  struct avc_error *err)
+{
 	for (;;) {
-		struct stop stop = tracee_wait(tid, 0);
-		int signal = 0;
+		struct stop stop = wait_ticking(tid, 0, tick);
 
 		switch (stop.kind) {
 		case STOP_TRAP:
@@ -174,8 +187,6 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 				*child = stop.message;
 			break;
 		case STOP_SIGNAL:
-			signal = stop.signal;
-			break;
 		case STOP_SYSCALL:
 		case STOP_NONE:
 		case STOP_OTHER:
@@ -190,8 +201,7 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 		}
 		/* Any stop takes a pending interrupt away (kernel/signal.c, ptrace_stop):
 		 * without a new one it would just run on. */
-		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
-		    ptrace(PTRACE_CONT, tid, NULL, (long)signal)) {
+		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, &stop)) {
 			fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 			return STOP_OTHER;
 		}
@@ -200,7 +210,7 @@ enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err)
 
 int tracee_settle(pid_t tid, struct avc_error *err)
 {
-	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || ptrace(PTRACE_CONT, tid, NULL, 0L))
+	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
@@ -209,7 +219,7 @@ int tracee_halt(pid_t tid, struct avc_error *err)
 {
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(INTERRUPT)", "it has gone");
-	(void)ptrace(PTRACE_CONT, tid, NULL, 0L); /* refused if it runs */
+	(void)seccomp_go_on(tid, NULL); /* refused if it runs */
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
 
@@ -230,6 +240,65 @@ bool tracee_is_ours(pid_t tid)
 		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) == 0;
 }
 
+#define PC_NS (20 * NS_PER_MS)
+#define PC_STEP_US 50
+
+avc_remote tracee_pc(pid_t tid)
+{
+	const uint64_t end = now_ns() + PC_NS;
+	struct arch_regs regs;
+
+	/* Only of what is stopped. */
+	while (arch_regs_get(tid, &regs)) {
+		if (now_ns() > end || is_dying(tid))
+			return 0;
+		usleep(PC_STEP_US);
+	}
+	return arch_pc(&regs);
+}
+
+/* ---- those that nobody knows of ----------------------------------------------------- */
+
+static struct {
+	bool (*known)(pid_t tid, const void *arg);
+	const void *arg;
+	uint64_t until_ns;
+} strangers;
+
+void tracee_know(bool (*known)(pid_t tid, const void *arg), const void *arg)
+{
+	strangers.known = known;
+	strangers.arg = arg;
+}
+
+void tracee_expect_strangers(void)
+{
+	strangers.until_ns = now_ns() + NS_PER_S;
+}
+
+bool tracee_expects_strangers(void)
+{
+	return now_ns() < strangers.until_ns;
+}
+
+void tracee_release_strangers(void)
+{
+	for (;;) {
+		siginfo_t info = { 0 };
+		struct stop stop;
+
+		if (!strangers.known ||
+		    waitid(P_ALL, 0, &info,
+			   WSTOPPED | WEXITED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) ||
+		    !info.si_pid || strangers.known(info.si_pid, strangers.arg))
+			return;
+		stop = tracee_wait(info.si_pid, WNOHANG);
+		if (stop.kind != STOP_EXIT)
+			ptrace(PTRACE_DETACH, info.si_pid, NULL,
+			       (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0));
+	}
+}
+
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg)
 {
 	siginfo_t info = { 0 };
@@ -240,9 +309,15 @@ bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *
 	return waitpid(info.si_pid, NULL, __WALL | __WNOTHREAD | WNOHANG) == info.si_pid;
 }
 
+void tracee_signal(pid_t pid, int signal)
+{
+	if (tracee_is_ours(pid))
+		kill(pid, signal);
+}
+
 void tracee_kill(pid_t pid)
 {
-	kill(pid, SIGKILL);
+	tracee_signal(pid, SIGKILL);
 	for (;;) {
 		int status;
 		pid_t r = waitpid(pid, &status, __WALL | __WNOTHREAD);
@@ -288,7 +363,7 @@ static void end_until(uint64_t now)
 {
 	for (uint32_t i = 0; i < ending.count; i++)
 		if (ending.task[i].kill_ns && ending.task[i].kill_ns <= now) {
-			kill(ending.task[i].pid, SIGKILL);
+			syscall(SYS_pidfd_send_signal, ending.task[i].pidfd, SIGKILL, NULL, 0);
 			ending.task[i].kill_ns = 0;
 		}
 }

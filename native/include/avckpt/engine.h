@@ -31,9 +31,9 @@ enum avc_files {
 
 /* Established TCP connections at a restore. */
 enum avc_tcp {
-	AVC_TCP_KEEP = 0,        /* go on                                          */
+	AVC_TCP_RESET_MOVED = 0, /* those on which bytes moved since the checkpoint are reset */
 	AVC_TCP_RESET = 1,       /* are reset, and read as closed                  */
-	AVC_TCP_RESET_MOVED = 2, /* those on which bytes moved since the checkpoint */
+	AVC_TCP_KEEP = 2,        /* go on                                          */
 	AVC_TCP_MESSAGES = 3     /* those that it leaves in the middle of a message */
 };
 
@@ -52,6 +52,7 @@ struct avc_config {
 	uint64_t restore_window_ns;
 	uint32_t restore_max;
 	uint64_t shm_bytes;             /* shared memory that is rolled back, at most */
+	uint64_t memory_limit_bytes;    /* of the container, with swap; 0: none known */
 	uint8_t restore_on_signal;      /* killed by a signal nobody asked for       */
 	uint8_t restore_on_exit;        /* any non-zero exit status                  */
 	uint8_t files;                  /* enum avc_files                            */

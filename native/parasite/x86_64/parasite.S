@@ -12,6 +12,31 @@
 
 	.text
 
+/* inj_enter(call, stack): inj_run(call) on that stack, by a thread of the app's.
+ *
+ * It comes with the app's own stack pointer, and leaves that only when all signals are
+ * blocked: the tracer blocks them as well, but may die before it has.  A handler never
+ * runs on the small stack in here. */
+	.globl	inj_enter
+	.type	inj_enter, @function
+inj_enter:
+	movq	%rdi, %rbx
+	movq	%rsi, %rbp
+	movl	$NR_RT_SIGPROCMASK, %eax
+	movl	$2, %edi			/* SIG_SETMASK */
+	leaq	all_signals(%rip), %rsi
+	xorl	%edx, %edx
+	movl	$8, %r10d
+	syscall
+	movq	%rbp, %rsp
+	xorl	%ebp, %ebp
+	movq	%rbx, %rdi
+	call	inj_run
+	ud2
+	.balign	8
+all_signals:
+	.quad	-1
+
 /* Go back to the context in `home`, signal mask included.
  *
  * The stack pointer is the app's own before any signal can come in again: a

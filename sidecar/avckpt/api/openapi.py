@@ -7,6 +7,7 @@ Tests hold it against the routes that are served and against real answers.
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -171,7 +172,7 @@ def _event() -> Json:
     types = field_types()
     properties: Json = {}
     for each in fields(EventRecord):
-        schema = _schema_of(types[each.name])
+        schema = _schema_of(types[each.name], each.metadata["values"])
         if "$ref" not in schema:
             schema["description"] = each.metadata["description"]
         properties[each.name] = schema
@@ -180,9 +181,9 @@ def _event() -> Json:
     return _object(properties, optional=tuple(name for name in properties if name not in always))
 
 
-def _schema_of(kind: type) -> Json:
+def _schema_of(kind: type, values: Iterable[enum.Enum] = ()) -> Json:
     if issubclass(kind, enum.Enum):
-        return {"type": "string", "enum": [member.value for member in kind]}
+        return {"type": "string", "enum": [member.value for member in values or kind]}
     names = {bool: "boolean", int: "integer", float: "number", str: "string"}
     return {"type": names[kind]} if kind in names else _ref("Error")
 

@@ -26,6 +26,7 @@ COLOURS = {
     "restored": "yellow",
     "gave_up": "red",
     "unprotected": "red",
+    "guard_lost": "red",
     "notify_failed": "red",
     "refused": "red",
     "checkpoint": "green",

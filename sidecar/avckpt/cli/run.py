@@ -21,15 +21,17 @@ import selectors
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from types import FrameType
 
 from avckpt.artifacts import init_binary
 from avckpt.cli.namespace import spawn_pid1
+from avckpt.containers.cgroup import groups_of
 from avckpt.engine import Engine, probe
 from avckpt.errors import AvckptError, LabelsWrong
 from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
-from avckpt.events.vocabulary import EventKind, signal_name
+from avckpt.events.vocabulary import Kind, signal_name
 from avckpt.guard import GuardConfig
 from avckpt.policy import settings_of
 
@@ -87,13 +89,22 @@ def run(config: GuardConfig, argv: list[str], *, verbose: bool) -> int:
             signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         pidfd = os.pidfd_open(pid)
         try:
-            _Supervisor(argv[0], pidfd, signals_fd, verbose).watch(config)
+            _Supervisor(argv[0], pidfd, signals_fd, verbose).watch(
+                replace(config, memory_limit_bytes=_memory_limit_bytes(pid))
+            )
             _, status = os.waitpid(pid, 0)
         finally:
             os.close(pidfd)
             if terminal is not None:
                 _take_back(terminal, pid)
     return os.WEXITSTATUS(status) if os.WIFEXITED(status) else 128 + os.WTERMSIG(status)
+
+
+def _memory_limit_bytes(pid: int) -> int:
+    try:
+        return groups_of(pid).memory_and_swap_bytes() or 0
+    except OSError:  # it has just ended
+        return 0
 
 
 class _Supervisor:
@@ -144,7 +155,7 @@ class _Supervisor:
             if line is None:
                 continue
             level, text = line
-            quiet = level < logging.WARNING or event.kind is EventKind.MISSED
+            quiet = level < logging.WARNING or event.kind is Kind.MISSED
             if self._verbose or not quiet:
                 say(f"{self._name}: {text}")
 

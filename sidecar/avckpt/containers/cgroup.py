@@ -93,6 +93,17 @@ class Groups:
         limit = int(text) if text.isdecimal() else UNLIMITED_BYTES
         return limit if limit < UNLIMITED_BYTES else None
 
+    def memory_and_swap_bytes(self) -> int | None:
+        """How much there is before the OOM killer comes: the hard limit, and what may be swapped; None: no limit."""
+        limit = self.memory_limit_bytes()
+        if limit is None or self.memory is None:
+            return None
+        text = _read(self.memory / ("memory.swap.max" if self.memory_version == 2 else "memory.memsw.limit_in_bytes"))
+        swap = int(text) if text.isdecimal() else (UNLIMITED_BYTES if text else 0)
+        if self.memory_version == 1:  # both together
+            swap = max(swap - limit, 0)
+        return limit + min(swap, _host_swap_bytes())
+
     def memory_used_bytes(self) -> int | None:
         """What counts against the limit and can not simply be given back: usage less clean file pages."""
         if self.memory is None:
@@ -168,6 +179,11 @@ def _mounts(owner: str) -> list[Mount]:
                 Mount(1, frozenset(o for o in named if not o.startswith("release_agent")), words[3], Path(words[4]))
             )
     return mounts
+
+
+def _host_swap_bytes() -> int:
+    fields = dict(line.split(":", 1) for line in _lines(Path("/proc/meminfo")))
+    return int(fields["SwapTotal"].split()[0]) * 1024
 
 
 def _lines(path: Path) -> list[str]:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
-from avckpt.events.vocabulary import DROPPED_WORDS, Event, EventKind, describe_wait_status, why_not_restored
-from avckpt.guard import GuardConfig
+from avckpt.events.vocabulary import Kind, describe_wait_status, why_dropped, why_not_restored
+from avckpt.guard import Event, GuardConfig
 
 
 class State(enum.Enum):
@@ -91,9 +91,9 @@ class Protected:
         if not self.generations:
             self.memory_bytes = 0
         kind = event.kind
-        if kind is EventKind.ATTACHED:
+        if kind is Kind.ATTACHED:
             self._to(State.STARTING, "no checkpoint yet")
-        elif kind is EventKind.CHECKPOINT:
+        elif kind is Kind.CHECKPOINT:
             self._to(State.PROTECTED, self._crashing(event.at_ns))
             self.checkpoints += 1
             self.generation = event.generation
@@ -101,17 +101,17 @@ class Protected:
             self.last_checkpoint_at = at
             self.last_freeze_s = event.freeze_s
             self.last_quiescent = event.quiescent
-        elif kind is EventKind.MISSED:
+        elif kind is Kind.MISSED:
             self.missed += 1
             self._suffer(f"checkpoint missed: {event.error}")
-        elif kind in (EventKind.UNPROTECTED, EventKind.GUARD_LOST):
+        elif kind in (Kind.UNPROTECTED, Kind.GUARD_LOST):
             self._to(State.UNPROTECTED, str(event.error))
-        elif kind is EventKind.DIED:
+        elif kind is Kind.DIED:
             self._to(State.RESTORING)
             self.last_death = describe_wait_status(event.wait_status)
             self.last_death_at = at
             self.last_death_ns = event.at_ns
-        elif kind is EventKind.RESTORED:
+        elif kind is Kind.RESTORED:
             self.restores = event.restores
             self.attempt = event.attempt
             self.generation = event.generation
@@ -119,13 +119,13 @@ class Protected:
             self.last_restore_s = event.restore_s
             self.last_restore_age_s = event.age_s
             self._to(State.PROTECTED, self._crashing(event.at_ns))
-        elif kind is EventKind.DROPPED:
+        elif kind is Kind.DROPPED:
             self.dropped += 1
-            self.last_dropped = f"generation {event.generation}: {DROPPED_WORDS.get(event.reason, '')}"
+            self.last_dropped = f"generation {event.generation}: {why_dropped(event.reason)}"
             if self.state is State.PROTECTED:
                 left = f"; {event.generations} left" if event.generations else ""
                 self._suffer(f"{self.last_dropped}{left}")
-        elif kind is EventKind.GAVE_UP:
+        elif kind is Kind.GAVE_UP:
             how = describe_wait_status(event.wait_status)
             self._to(State.ENDED, f"{how}; {why_not_restored(event.reason, event.error)}")
             self.generations = 0

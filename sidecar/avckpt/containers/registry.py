@@ -14,30 +14,27 @@ ENDED_KEPT = 32
 
 
 class Registry:
-    """Live containers by id, guards by cookie, and the last few that have ended."""
+    """Live containers by id, and the last few that have ended."""
 
     def __init__(self) -> None:
         self._live: dict[str, Protected] = {}
-        self._by_cookie: dict[int, Protected] = {}
+        self._cookies: set[int] = set()
         self._ended: deque[Protected] = deque(maxlen=ENDED_KEPT)
 
     def add(self, container: Protected) -> None:
-        """Takes in a container; an earlier run with the same id stays known by its cookie until it is `remove`d."""
+        """Takes in a container; an earlier run with the same id goes on until it is `remove`d."""
         self._live[container.id] = container
-        self._by_cookie[container.cookie] = container
+        self._cookies.add(container.cookie)
 
     def remove(self, container: Protected) -> None:
         """Moves a container that has ended to the ended ones."""
-        if self._by_cookie.pop(container.cookie, None) is None:
+        if container.cookie not in self._cookies:
             return
+        self._cookies.remove(container.cookie)
         # A restarted container has the same id: its new run may be there already.
         if self._live.get(container.id) is container:
             del self._live[container.id]
         self._ended.append(container)
-
-    def by_cookie(self, cookie: int) -> Protected | None:
-        """Whose guard it is; None when that run has been removed."""
-        return self._by_cookie.get(cookie)
 
     def by_id(self, container_id: str) -> Protected | None:
         """The live run of a container."""

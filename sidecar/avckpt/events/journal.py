@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import logging
 
-from avckpt.events.record import EXPECTED, EventRecord, Kind
-from avckpt.events.vocabulary import DROPPED_WORDS, Reason
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 
 SELDOM_S = 60.0
 """What may go wrong at every interval (a checkpoint, a health check) is told at most this often, of one container."""
@@ -14,6 +14,7 @@ SELDOM_S = 60.0
 LEVELS = {
     Kind.REGISTERED: logging.INFO,
     Kind.ATTACHED: logging.DEBUG,
+    Kind.GUARD_LOST: logging.WARNING,
     Kind.DIED: logging.INFO,
     Kind.RESTORED: logging.WARNING,
     Kind.GAVE_UP: logging.ERROR,
@@ -60,7 +61,7 @@ class Journal:
         if kind is Kind.CHECKPOINT:
             return self._checkpoint(record)
         was_held = self._held
-        if record.generations == 0:
+        if record.generations == 0 or kind is Kind.GUARD_LOST:
             self._held = False
         if kind is Kind.MISSED:
             # One that cost what was held is always told.
@@ -69,7 +70,7 @@ class Journal:
             return self._unhealthy.line(record)
         if kind is Kind.UNPROTECTED:
             return self._lost(record)
-        if kind is Kind.DROPPED and record.detail == DROPPED_WORDS[Reason.EXECUTED]:
+        if kind is Kind.DROPPED and record.reason is Reason.EXECUTED:
             return logging.INFO, record.message  # as the entry points of many images do
         if kind is Kind.GAVE_UP and record.outcome in EXPECTED:
             return logging.INFO, record.message

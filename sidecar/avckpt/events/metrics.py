@@ -10,7 +10,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from avckpt.containers.protected import Protected, State
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 
 Metric = TypeVar("Metric", Counter, Histogram)
 

@@ -14,74 +14,45 @@ from dataclasses import dataclass, field, fields
 from typing import Any, cast
 
 from avckpt.errors import AvckptError, from_json
-from avckpt.events.vocabulary import DROPPED_WORDS, Event, EventKind, Reason, describe_wait_status, why_not_restored
+from avckpt.events.vocabulary import (
+    CAUSES,
+    DROPPED_WORDS,
+    GAVE_UP_WORDS,
+    OUTCOMES,
+    Kind,
+    Reason,
+    describe_wait_status,
+    why_dropped,
+    why_not_restored,
+)
+from avckpt.guard import Event
 
 
-class Kind(str, enum.Enum):
-    """What happened."""
-
-    REGISTERED = "registered"
-    ATTACHED = "attached"
-    CHECKPOINT = "checkpoint"
-    MISSED = "missed"
-    UNPROTECTED = "unprotected"
-    DIED = "died"
-    RESTORED = "restored"
-    GAVE_UP = "gave_up"
-    DROPPED = "dropped"
-    HEALTH = "health"
-    CONFIGURED = "configured"
-    REFUSED = "refused"
-    ENDED = "ended"
-    NOTIFIED = "notified"
-    NOTIFY_FAILED = "notify_failed"
-
-
-class Cause(str, enum.Enum):
-    """Why an application died, or was rolled back."""
-
-    SIGNAL = "signal"
-    EXIT = "exit"
-    UNHEALTHY = "unhealthy"
-    MANUAL = "manual"
-
-
-class Outcome(str, enum.Enum):
-    """What followed."""
-
-    RESTORED = "restored"
-    CLEAN_EXIT = "clean_exit"
-    STOPPED = "stopped"
-    POLICY = "policy"
-    LIMIT = "limit"
-    FAILED = "failed"
-    EMPTY = "empty"
-
-
-EXPECTED = frozenset({Outcome.CLEAN_EXIT, Outcome.STOPPED})
-"""Ends that somebody meant."""
-
-
-def said(description: str, default: Any = None) -> Any:
-    """A field of EventRecord with its meaning."""
-    return field(default=default, metadata={"description": description})
+def said(description: str, default: Any = None, values: tuple[Reason, ...] = ()) -> Any:
+    """A field of EventRecord with its meaning, and the values it may have where these are not all of its type."""
+    return field(default=default, metadata={"description": description, "values": values})
 
 
 @dataclass(frozen=True)
 class EventRecord:
     """`_s` is a duration in seconds.  None: it means nothing for this kind."""
 
-    kind: Kind = field(metadata={"description": "what happened"})
+    kind: Kind = field(metadata={"description": "what happened", "values": ()})
     container: str = said("name of the container, or its short id where it has none", "")
     id: str = said("its id, 64 hex digits", "")
     group: str = said("its `avckpt.group`, empty: none", "")
     at: float = said("time of day, seconds since 1970", 0.0)
     monotonic_s: float = said("the same instant on CLOCK_MONOTONIC, for differences", 0.0)
     seq: int = said("number in the history, growing; 0: routine (every checkpoint), told once and not kept", 0)
-    reason: Cause | None = said("why the application died: `signal`, `exit`, `unhealthy` or `manual`")  # noqa: RUF009
-    outcome: Outcome | None = said(  # noqa: RUF009
+    reason: Reason | None = said(  # noqa: RUF009
+        "why the application died: `signal`, `exit`, `unhealthy` or `manual`; why a generation was dropped: `crashed`, "
+        "`unhealthy`, `memory`, `killed` (its template) or `executed` (another program)",
+        values=tuple(dict.fromkeys((*CAUSES, *DROPPED_WORDS))),
+    )
+    outcome: Reason | None = said(  # noqa: RUF009
         "what followed: `restored`, or why not: `clean_exit`, `stopped` (meant), `policy` (avckpt.restore.on), "
-        "`limit` (avckpt.restore.max), `failed`, `empty` (no generation held)"
+        "`limit` (avckpt.restore.max), `failed`, `empty` (no generation held)",
+        values=OUTCOMES,
     )
     wait_status: int | None = said("of the death, as from waitpid(2)")
     generation: int | None = said("number of the generation taken, restored or dropped, from 1")
@@ -146,7 +117,7 @@ def _value(name: str, kind: type, value: object) -> object:
     raise ValueError(f"{name} is {value!r}")
 
 
-_TYPES: dict[str, type] = {cls.__name__: cls for cls in (Kind, Cause, Outcome, AvckptError, str, int, float, bool)}
+_TYPES: dict[str, type] = {cls.__name__: cls for cls in (Kind, Reason, AvckptError, str, int, float, bool)}
 
 
 def field_types() -> dict[str, type]:
@@ -155,19 +126,6 @@ def field_types() -> dict[str, type]:
     return {each.name: _TYPES[str(each.type).partition(" ")[0]] for each in fields(EventRecord)}
 
 
-_KINDS = {
-    EventKind.ATTACHED: Kind.ATTACHED,
-    EventKind.CHECKPOINT: Kind.CHECKPOINT,
-    EventKind.MISSED: Kind.MISSED,
-    EventKind.UNPROTECTED: Kind.UNPROTECTED,
-    EventKind.DIED: Kind.DIED,
-    EventKind.RESTORED: Kind.RESTORED,
-    EventKind.GAVE_UP: Kind.GAVE_UP,
-    EventKind.ENDED: Kind.ENDED,
-    EventKind.REFUSED: Kind.REFUSED,
-    EventKind.DROPPED: Kind.DROPPED,
-    EventKind.GUARD_LOST: Kind.UNPROTECTED,
-}
 _DEATHS = frozenset({Kind.DIED, Kind.RESTORED, Kind.GAVE_UP})
 _COUNTED = frozenset({Kind.CHECKPOINT, Kind.RESTORED, Kind.DROPPED})
 
@@ -180,14 +138,14 @@ def of_guard(
     group: str = "",
     at: float = 0.0,
     freeze_s: float | None = None,
-    commanded: Cause | None = None,
+    commanded: Reason | None = None,
 ) -> EventRecord:
     """What a guard said, as a record.
 
     `freeze_s` is the freeze time of the generation that was restored, where it
     is known, and `commanded` why a roll back was asked for, if one was.
     """
-    kind = _KINDS[event.kind]
+    kind = event.kind
     restored = kind is Kind.RESTORED
     if kind is Kind.CHECKPOINT or kind is Kind.MISSED:
         freeze_s = event.freeze_s
@@ -199,7 +157,7 @@ def of_guard(
         group=group,
         at=at,
         monotonic_s=event.at_ns / 1e9,
-        reason=_cause(event, commanded) if kind in _DEATHS else None,
+        reason=event.reason if kind is Kind.DROPPED else _cause(event, commanded) if kind in _DEATHS else None,
         outcome=_outcome(event),
         wait_status=event.wait_status if kind in _DEATHS else None,
         generation=event.generation if counted else None,
@@ -214,27 +172,24 @@ def of_guard(
         quiescent=event.quiescent if kind is Kind.CHECKPOINT else None,
         app_pid=event.app_pid or None,
         app_pid_inside=event.app_pid_inside or None,
-        detail=DROPPED_WORDS.get(event.reason, "") if kind is Kind.DROPPED else "",
+        detail=why_dropped(event.reason) if kind is Kind.DROPPED else "",
         error=event.error,
     )
 
 
-def _cause(event: Event, commanded: Cause | None) -> Cause | None:
+def _cause(event: Event, commanded: Reason | None) -> Reason:
     if event.reason is Reason.COMMAND or commanded is not None:
-        return commanded or Cause.MANUAL
+        return commanded or Reason.COMMAND
     if event.reason is Reason.UNHEALTHY:
-        return Cause.UNHEALTHY
-    if event.wait_status & 0x7F:
-        return Cause.SIGNAL
-    return Cause.EXIT
+        return Reason.UNHEALTHY
+    return Reason.SIGNAL if event.wait_status & 0x7F else Reason.EXIT
 
 
-def _outcome(event: Event) -> Outcome | None:
-    if event.kind is EventKind.RESTORED:
-        return Outcome.RESTORED
-    if event.kind is EventKind.GAVE_UP:
-        # The engine's reasons to give up have the outcomes' names.
-        return Outcome.__members__.get(event.reason.name, Outcome.FAILED)
+def _outcome(event: Event) -> Reason | None:
+    if event.kind is Kind.RESTORED:
+        return Reason.RESTORED
+    if event.kind is Kind.GAVE_UP:
+        return event.reason if event.reason in GAVE_UP_WORDS else Reason.FAILED
     return None
 
 
@@ -242,16 +197,15 @@ def _outcome(event: Event) -> Outcome | None:
 
 
 def _death(record: EventRecord) -> str:
-    if record.reason is Cause.MANUAL and record.kind is not Kind.GAVE_UP:
+    if record.reason is Reason.COMMAND and record.kind is not Kind.GAVE_UP:
         return "rolled back on command"
-    if record.reason is Cause.UNHEALTHY and record.kind is not Kind.GAVE_UP:
+    if record.reason is Reason.UNHEALTHY and record.kind is not Kind.GAVE_UP:
         return "unhealthy, rolled back"
     return describe_wait_status(record.wait_status or 0)
 
 
 def _why_not(record: EventRecord) -> str:
-    outcome = record.outcome or Outcome.FAILED
-    return why_not_restored(Reason[outcome.name], record.error)
+    return why_not_restored(record.outcome or Reason.FAILED, record.error)
 
 
 def _checkpoint(record: EventRecord) -> str:
@@ -287,6 +241,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.CHECKPOINT: lambda record: f"checkpoint: {_checkpoint(record)}",
     Kind.MISSED: lambda record: f"checkpoint missed: {record.error}{_nothing_held(record)}",
     Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
+    Kind.GUARD_LOST: lambda record: f"runs unprotected: {record.error}",
     # Whether this is bad news is known only with what follows.
     Kind.DIED: lambda record: f"died: {describe_wait_status(record.wait_status or 0)}",
     Kind.RESTORED: _restored,

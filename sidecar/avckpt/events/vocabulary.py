@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a guard tells: the events of `avckpt/engine.h` as plain data, and their words.
+"""The words for what happens to a container, from the guard's numbers to the API's names.
 
-Nothing here needs the native library, so that what decides on events can be
-read and tested without it.
+Here alone stands which number of `avckpt/engine.h` is called what; logs, API, history and
+metrics use these names, and docs/events.md lists them.
 """
 
 from __future__ import annotations
@@ -10,46 +10,76 @@ from __future__ import annotations
 import enum
 import os
 import signal
-from dataclasses import dataclass, fields
+from typing import TypeVar
 
 from avckpt.errors import AvckptError
 
-
-class EventKind(enum.IntEnum):
-    """`enum avc_event_kind`."""
-
-    ATTACHED = 1
-    CHECKPOINT = 2
-    MISSED = 3
-    UNPROTECTED = 4
-    DIED = 5
-    RESTORED = 6
-    GAVE_UP = 7
-    ENDED = 8
-    REFUSED = 9
-    DROPPED = 10
-    GUARD_LOST = 11
+E = TypeVar("E", bound="_Named")
 
 
-class Reason(enum.IntEnum):
-    """`enum avc_reason`."""
+class _Named(str, enum.Enum):
+    """`value` is the name in the API, `number` the engine's; 0: the engine has no such thing."""
 
-    NONE = 0
-    SIGNAL = 1
-    EXIT = 2
-    COMMAND = 3
-    CLEAN_EXIT = 4
-    STOPPED = 5
-    POLICY = 6
-    LIMIT = 7
-    FAILED = 8
-    EMPTY = 9
-    UNHEALTHY = 10
-    MEMORY = 11
-    KILLED = 12
-    CRASHED = 13
-    EXECUTED = 14
+    number: int
 
+    def __new__(cls: type[E], value: str, number: int = 0) -> E:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.number = number
+        return member
+
+    @classmethod
+    def of(cls: type[E], number: int) -> E:
+        """The member with the engine's number.  Raises ValueError when there is none."""
+        for member in cls:
+            if member.number == number and number:
+                return member
+        raise ValueError(f"{number} is no {cls.__name__.lower()}")
+
+
+class Kind(_Named):
+    """What happened: `enum avc_event_kind`, and what the daemon tells itself."""
+
+    ATTACHED = "attached", 1
+    CHECKPOINT = "checkpoint", 2
+    MISSED = "missed", 3
+    UNPROTECTED = "unprotected", 4
+    DIED = "died", 5
+    RESTORED = "restored", 6
+    GAVE_UP = "gave_up", 7
+    ENDED = "ended", 8
+    REFUSED = "refused", 9
+    DROPPED = "dropped", 10
+    GUARD_LOST = "guard_lost", 11
+    REGISTERED = "registered"
+    HEALTH = "health"
+    CONFIGURED = "configured"
+    NOTIFIED = "notified"
+    NOTIFY_FAILED = "notify_failed"
+
+
+class Reason(_Named):
+    """Why, and what followed: `enum avc_reason`."""
+
+    SIGNAL = "signal", 1
+    EXIT = "exit", 2
+    COMMAND = "manual", 3
+    CLEAN_EXIT = "clean_exit", 4
+    STOPPED = "stopped", 5
+    POLICY = "policy", 6
+    LIMIT = "limit", 7
+    FAILED = "failed", 8
+    EMPTY = "empty", 9
+    UNHEALTHY = "unhealthy", 10
+    MEMORY = "memory", 11
+    KILLED = "killed", 12
+    CRASHED = "crashed", 13
+    EXECUTED = "executed", 14
+    RESTORED = "restored"
+
+
+CAUSES = (Reason.SIGNAL, Reason.EXIT, Reason.UNHEALTHY, Reason.COMMAND)
+"""Why an application died, or was rolled back."""
 
 GAVE_UP_WORDS = {
     Reason.CLEAN_EXIT: "it ended by itself",
@@ -70,56 +100,21 @@ DROPPED_WORDS = {
 }
 """Why a generation was given up before its time."""
 
-EXPECTED_ENDS = frozenset({Reason.CLEAN_EXIT, Reason.STOPPED})
+OUTCOMES = (Reason.RESTORED, *GAVE_UP_WORDS)
+"""What followed a death."""
+
+EXPECTED = frozenset({Reason.CLEAN_EXIT, Reason.STOPPED})
 """Ends that somebody meant: not worth a warning."""
 
 
-@dataclass(frozen=True)
-class Event:
-    """`struct avc_event`.  `_s` is a duration in seconds, `_ns` an instant of CLOCK_MONOTONIC."""
-
-    kind: EventKind
-    cookie: int
-    reason: Reason = Reason.NONE
-    ticket: int = 0
-    at_ns: int = 0
-    app_pid: int = 0
-    app_pid_inside: int = 0
-    wait_status: int = 0
-    threads: int = 0
-    generation: int = 0
-    generations: int = 0
-    attempt: int = 0
-    quiescent: bool = False
-    restores: int = 0
-    freeze_s: float = 0.0
-    stop_s: float = 0.0
-    clone_s: float = 0.0
-    died_ns: int = 0
-    restore_s: float = 0.0
-    fork_s: float = 0.0
-    threads_s: float = 0.0
-    age_s: float = 0.0
-    error: AvckptError | None = None
-
-    def to_json(self) -> dict[str, object]:
-        """The fields that say something, for the API; enums by their names in lower case."""
-        data: dict[str, object] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value and field.name not in ("kind", "reason", "error", "cookie"):
-                data[field.name] = value
-        data["kind"] = self.kind.name.lower()
-        if self.reason is not Reason.NONE:
-            data["reason"] = self.reason.name.lower()
-        if self.error is not None:
-            data["error"] = self.error.to_json()
-        return data
+def why_dropped(reason: Reason | None) -> str:
+    """Why a generation was given up, in words."""
+    return "" if reason is None else DROPPED_WORDS.get(reason, "")
 
 
-def why_not_restored(reason: Reason, error: AvckptError | None) -> str:
+def why_not_restored(reason: Reason | None, error: AvckptError | None) -> str:
     """Why a death was not followed by a restore, in words."""
-    words = GAVE_UP_WORDS.get(reason, reason.name.lower())
+    words = GAVE_UP_WORDS[reason if reason in GAVE_UP_WORDS else Reason.FAILED]
     if error is None or reason is Reason.EMPTY:
         return words
     return f"{words}: {error}"

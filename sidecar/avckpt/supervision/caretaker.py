@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -23,11 +23,11 @@ from avckpt.events.record import EventRecord
 from avckpt.guard import Command
 from avckpt.supervision.health import Ward, watch_health
 from avckpt.supervision.pressure import (
-    LEAST_WORTH_BYTES,
     Advice,
     Allowance,
     HostPressure,
     held_by,
+    is_worth_it,
     now_s,
 )
 
@@ -71,6 +71,7 @@ class Caretaker(Generic[W]):
         except OSError:  # it has just ended
             groups = Groups((), None, None)
         care = self._cares[ward.container.cookie] = _Care(ward, groups)
+        self._tell_limit(care)
         if policy.restore_on.unhealthy:
             self._watch_health(care)
         self._look_if_needed()
@@ -131,6 +132,7 @@ class Caretaker(Generic[W]):
             if self._host is not None and self._host.fd is None and self._host.is_high():
                 self._host_is_short()
             for care in list(self._cares.values()):
+                self._tell_limit(care)
                 advice = await self._advise(care)
                 if advice is Advice.DROP_OLDEST:
                     self._order(care, Command.DROP_OLDEST)
@@ -138,13 +140,23 @@ class Caretaker(Generic[W]):
                     self._order(care, Command.REFILL)
 
     async def _advise(self, care: _Care[W]) -> Advice:
-        # The limit may be another one each time (podman update --memory).
         limit = care.groups.memory_limit_bytes()
         used = care.groups.memory_used_bytes() if limit is not None else None
         if used is None or limit is None:
             return care.allowance.come_back(now_s())
-        held = await held_by(care.ward.container) if care.allowance.near_limit(used, limit) else 0
-        return care.allowance.advise(used, limit, held, now_s())
+        container = care.ward.container
+        held = await held_by(container) if care.allowance.near_limit(used, limit) else 0
+        return care.allowance.advise(used, limit, held, container.generations, now_s())
+
+    def _tell_limit(self, care: _Care[W]) -> None:
+        """Its guard ranks what it holds by it.  It may be another one each time (podman update --memory)."""
+        container, guard = care.ward.container, care.ward.guard
+        limit = care.groups.memory_and_swap_bytes() or 0
+        if guard is None or limit == container.config.memory_limit_bytes:
+            return
+        container.config = replace(container.config, memory_limit_bytes=limit)
+        with contextlib.suppress(AvckptError):  # it has ended
+            guard.configure(container.config)
 
     def _host_is_short(self) -> None:
         # Pressure that lasts is told every second; to look who holds most may take longer.
@@ -153,11 +165,14 @@ class Caretaker(Generic[W]):
             self._relieving.add_done_callback(_log_failure)
 
     async def _relieve(self) -> None:
-        most, held_most = None, LEAST_WORTH_BYTES
+        most, held_most = None, (False, 0)
         for care in list(self._cares.values()):
-            held = await held_by(care.ward.container)
-            if held >= held_most:
-                most, held_most = care, held
+            container = care.ward.container
+            held = await held_by(container)
+            # Older generations of everybody go before the newest of anybody.
+            rank = (container.generations > 1, held)
+            if is_worth_it(container, held) and rank > held_most:
+                most, held_most = care, rank
         if most is None:
             return
         most.allowance.gave_up(now_s())

@@ -32,7 +32,8 @@ from avckpt.containers.cgroup import groups_of
 from avckpt.containers.process import age_s
 from avckpt.containers.protected import Protected
 from avckpt.errors import AvckptError, TargetGone, of_any
-from avckpt.events.record import EventRecord, Kind
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command
 from avckpt.supervision.inside import Done, run_inside
 

@@ -27,8 +27,8 @@ from avckpt.containers.process import has_ended, pid_of
 from avckpt.containers.process import status as status_of
 from avckpt.containers.protected import Protected
 from avckpt.errors import AvckptError, Busy, TargetGone, of_any
-from avckpt.events.record import EXPECTED, EventRecord, Kind
-from avckpt.events.vocabulary import signal_name
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import EXPECTED, Kind, signal_name
 from avckpt.supervision.inside import run_inside
 
 EXEC_TIMEOUT_S = 5.0

@@ -29,6 +29,8 @@ BACK_AFTER_MOST_S = 600.0
 WORTH = 0.01
 """Of the limit (or of the host's memory / 100): generations that hold less are no help."""
 LEAST_WORTH_BYTES = 1 << 20
+NEWEST_WORTH = 0.25
+"""Of what the application has itself: a newest generation that holds less is kept when the host is short."""
 
 PSI = Path("/proc/pressure/memory")
 TRIGGERS = (b"some 150000 1000000", b"some 300000 2000000")
@@ -59,10 +61,14 @@ class Allowance:
         """Is it worth a look at what the generations hold?"""
         return used_bytes >= NEAR * limit_bytes
 
-    def advise(self, used_bytes: int, limit_bytes: int, held_bytes: int, now_s: float) -> Advice:
-        """For a container with a limit.  `held_bytes`: by its generations alone (0: not looked)."""
+    def advise(self, used_bytes: int, limit_bytes: int, held_bytes: int, generations: int, now_s: float) -> Advice:
+        """For a container with a limit.  `held_bytes`: by its generations alone (0: not looked).
+
+        The newest one is not given up: an application that leaks needs it in a moment, and the kernel takes it
+        where the application would have room without it (native/engine/guard/guard_memory.c).
+        """
         if self.near_limit(used_bytes, limit_bytes):
-            if held_bytes < max(WORTH * limit_bytes, LEAST_WORTH_BYTES):
+            if generations < 2 or held_bytes < max(WORTH * limit_bytes, LEAST_WORTH_BYTES):
                 return Advice.KEEP
             self.gave_up(now_s)
             return Advice.DROP_OLDEST
@@ -160,6 +166,22 @@ async def held_by(container: Protected) -> int:
         with contextlib.suppress(DeadlineMissed):
             await look("memory", init_pid, find_out)
     return container.memory_bytes if container.generations else 0
+
+
+def is_worth_it(container: Protected, held: int) -> bool:
+    """Whether a host that is short of memory gains by it if this container gives its oldest generation up."""
+    if container.generations > 1:
+        return held >= LEAST_WORTH_BYTES
+    return held >= max(NEWEST_WORTH * _own_bytes(container.app_pid), LEAST_WORTH_BYTES)
+
+
+def _own_bytes(pid: int) -> int:
+    """Memory of no file."""
+    try:
+        _, resident, of_files, *_ = Path(f"/proc/{pid}/statm").read_text().split()
+    except OSError:
+        return 0
+    return (int(resident) - int(of_files)) * os.sysconf("SC_PAGESIZE")
 
 
 def templates_of(init_pid: int) -> list[int]:

@@ -133,6 +133,18 @@ void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote 
 	regs->r.eflags &= ~(unsigned long long)FLAG_DF;
 }
 
+void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
+		uint64_t b)
+{
+	*regs = *base;
+	regs->r.rip = pc;
+	regs->r.rdi = a;
+	regs->r.rsi = b;
+	regs->r.rax = 0;
+	regs->r.orig_rax = -1ULL;
+	regs->r.eflags &= ~(unsigned long long)FLAG_DF;
+}
+
 /* What `add $1, %al; sahf` needs in %eax to bring the flags back. */
 static uint32_t flags_word(uint64_t eflags)
 {
@@ -340,6 +352,48 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 	return remote + xstate_room();
 }
 
+#define USER_SS 0x2b
+#define FLAG_FIXED 0x002 /* of eflags: always 1 */
+#define FLAGS_KNOWN 0x3fffff
+#define XSTATE_NEAR 4096
+
+/* arch/x86/kernel/signal_64.c, x64_setup_rt_frame(): what it puts there is the same for every
+ * program. */
+static bool is_signal_frame(const struct frame *f, avc_remote at)
+{
+	return !(f->uc_flags &
+		 ~(uint64_t)(UC_FP_XSTATE | UC_SIGCONTEXT_SS | UC_STRICT_RESTORE_SS)) &&
+	       !f->uc_link && f->cs == USER_CS && f->ss == USER_SS && f->eflags & FLAG_FIXED &&
+	       !(f->eflags & ~(uint64_t)FLAGS_KNOWN) &&
+	       (!f->fpstate || (f->fpstate % 64 == 0 && f->fpstate - at < XSTATE_NEAR));
+}
+
+static uint32_t signal_of(const struct frame *f)
+{
+	const uint32_t signal = *(const uint32_t *)f->siginfo;
+
+	return signal <= 64 ? signal : 0;
+}
+
+bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, size_t *next,
+			    struct arch_signal_frame *found)
+{
+	_Static_assert(sizeof(struct frame) <= ARCH_SIGNAL_FRAME_BYTES, "arch.h");
+
+	for (; *next + sizeof(struct frame) <= bytes; *next += 16) {
+		const struct frame *f = (const struct frame *)(stack + *next);
+
+		if (!is_signal_frame(f, at + *next))
+			continue;
+		found->at = at + *next;
+		found->sigmask = f->sigmask;
+		found->signal = (int)signal_of(f);
+		*next += 16;
+		return true;
+	}
+	return false;
+}
+
 /* ---- the stub ------------------------------------------------------------- */
 
 struct writer {
@@ -362,20 +416,23 @@ static void put_mov(struct writer *w, unsigned int reg, uint64_t value)
 }
 
 /* What comes after the system call: a task that it has made ends at once, and who made one waits
- * for it, whether or not it is its child (ECHILD).  Nothing is written to memory. */
+ * for it, whether or not it is its child (ECHILD).  And a call after which the task ends.  Nothing
+ * is written to memory. */
 /* clang-format off */
+#define STUB_LAST 29
 static const uint8_t stub_start[] = {
 	0x0f, 0x05,                   /*    syscall                       */
 	0x85, 0xc0,                   /*    test %eax, %eax               */
-	0x74, 0x17,                   /*    jz 1f                         */
-	0x78, 0x20,                   /*    js 2f                         */
+	0x74, 0x19,                   /*    jz 1f                         */
+	0x78, 0x22,                   /*    js 2f                         */
 	0x89, 0xc7,                   /*    mov %eax, %edi                */
 	0xb8, SYS_wait4, 0, 0, 0,     /*    wait4(it, NULL, __WALL, NULL) */
 	0x31, 0xf6,
 	0xba, 0, 0, 0, 0x40,
 	0x45, 0x31, 0xd2,
 	0x0f, 0x05,
-	0xeb, 0x0b,                   /*    jmp 2f                        */
+	0xeb, 0x0d,                   /*    jmp 2f                        */
+	0x0f, 0x05,                   /*    syscall (STUB_LAST)           */
 	0x31, 0xff,                   /* 1: exit(0)                       */
 	0xb8, SYS_exit, 0, 0, 0,
 	0x0f, 0x05,
@@ -432,11 +489,11 @@ bool arch_is_stub(const uint8_t *code)
 	return memcmp(code, stub_start, sizeof stub_start) == 0;
 }
 
-void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub, long nr,
-		    const uint64_t arg[6])
+void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub,
+		    bool last, long nr, const uint64_t arg[6])
 {
 	*regs = *base;
-	regs->r.rip = stub;
+	regs->r.rip = last ? stub + STUB_LAST : stub;
 	regs->r.orig_rax = -1ULL;
 	regs->r.rax = (unsigned long long)nr;
 	for (unsigned int i = 0; i < 6; i++)

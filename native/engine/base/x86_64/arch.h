@@ -6,6 +6,7 @@
 #ifndef AVCKPT_ARCH_H
 #define AVCKPT_ARCH_H
 
+#include <linux/audit.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -15,6 +16,7 @@
 #include "home.h"
 
 #define ARCH_NAME "x86-64"
+#define ARCH_AUDIT AUDIT_ARCH_X86_64           /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
 
@@ -115,6 +117,10 @@ void arch_resume(struct arch_regs *regs);
 void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
 	       uint64_t arg);
 
+/* Likewise with two arguments, the stack as it is. */
+void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
+		uint64_t b);
+
 /* Fills in the context that inj_go_home() goes back to. */
 void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
 
@@ -142,6 +148,18 @@ bool arch_frame_needs_room(const void *frame);
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
 			    uint64_t sigmask, const uint64_t altstack[3]);
 
+/* A signal frame that the kernel has made on a stack. */
+struct arch_signal_frame {
+	avc_remote at;    /* what the handler gets as its third argument            */
+	uint64_t sigmask; /* before the handler                                     */
+	int signal;       /* 0: it does not say                                        */
+};
+#define ARCH_SIGNAL_FRAME_BYTES 1024
+/* The next one in the `bytes` bytes of a stack that begin at `at` (a multiple of 16); *next is
+ * where to look on, at first 0.  What only looks like one is not told from one. */
+bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, size_t *next,
+			    struct arch_signal_frame *found);
+
 /* A stub that makes one system call (registers preset by arch_stub_call), clone(2) as a rule, and
  * then goes back to `regs` by itself, signal mask included.  A new task ends; who made it waits for
  * it before it goes home, by ARCH_STUB_WAIT.  Writes at most ARCH_STUB_BYTES to `code`. */
@@ -150,7 +168,8 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
 /* Whether `code` is what arch_stub_build() has written once. */
 bool arch_is_stub(const uint8_t *code);
-void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub, long nr,
-		    const uint64_t arg[6]);
+/* `last`: the task ends after the call, and does not go back. */
+void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub,
+		    bool last, long nr, const uint64_t arg[6]);
 
 #endif

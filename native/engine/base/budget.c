@@ -1,0 +1,72 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What one checkpoint or restore may cost.  How much there is to read and to keep is for the
+ * application to say, which may be hostile or broken: every loop that goes on for as long as it says
+ * asks here.  A guard is one process for one container, so there is one budget.
+ */
+#include "base.h"
+
+#define BYTES_MAX (UINT64_C(128) << 20)
+
+static struct {
+	uint64_t bytes, end_ns;
+	const char *exceeded; /* in words; NULL: nothing                        */
+	enum avc_code code;
+	void (*working)(void *arg);
+	void *arg;
+} budget;
+
+void budget_begin(void (*working)(void *arg), void *arg)
+{
+	budget.bytes = budget.end_ns = 0;
+	budget.exceeded = NULL;
+	budget.working = working;
+	budget.arg = arg;
+}
+
+void budget_deadline(uint64_t ns)
+{
+	budget.end_ns = ns ? now_ns() + ns : 0;
+}
+
+void budget_exceed(enum avc_code code, const char *what)
+{
+	if (budget.exceeded)
+		return;
+	budget.exceeded = what;
+	budget.code = code;
+}
+
+bool budget_has(uint64_t bytes)
+{
+	return budget.bytes + bytes <= BYTES_MAX;
+}
+
+bool budget_take(uint64_t bytes)
+{
+	if (!budget_has(bytes)) {
+		budget_exceed(AVC_UNSUPPORTED,
+			      "what is to be known of what it has open is more than 128 MB");
+		return false;
+	}
+	budget.bytes += bytes;
+	return true;
+}
+
+bool budget_step(void)
+{
+	heartbeat();
+	if (budget.working)
+		budget.working(budget.arg);
+	if (budget.end_ns && now_ns() > budget.end_ns)
+		budget_exceed(AVC_DEADLINE,
+			      "to read what it has takes longer than it may stand still");
+	return !budget.exceeded;
+}
+
+int budget_check(pid_t pid, struct avc_error *err)
+{
+	return budget.exceeded ? fail(err, budget.code, 0, pid, "keep within bounds", "", "%s",
+				      budget.exceeded)
+			       : 0;
+}

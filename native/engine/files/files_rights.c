@@ -1,0 +1,88 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Files are opened for an application as it could open them itself: by its user, its groups and
+ * its capabilities.  It had them open once, but that may be no reason any more: the mode has been
+ * changed since, or another file has the number of an inode that is gone.
+ */
+#include <grp.h>
+#include <linux/capability.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "files.h"
+
+static bool same_users(pid_t pid)
+{
+	char own[64], theirs[64];
+
+	return proc_link(getpid(), "ns/user", own, sizeof own) == 0 &&
+	       proc_link(pid, "ns/user", theirs, sizeof theirs) == 0 && !strcmp(own, theirs);
+}
+
+void file_rights_read(struct file_rights *rights, pid_t pid)
+{
+	struct proc_status status;
+
+	rights->known = false;
+	if (proc_status(pid, &status))
+		return;
+	rights->known = true;
+	rights->user = status.uid[3];
+	rights->group = status.gid[3];
+	/* In a user namespace of its own they are good for nothing outside. */
+	rights->caps = same_users(pid) ? status.caps[2] : 0;
+	rights->group_count = status.group_count;
+	memcpy(rights->groups, status.groups, sizeof rights->groups);
+}
+
+static int set_effective(uint64_t caps)
+{
+	struct __user_cap_header_struct header = { .version = _LINUX_CAPABILITY_VERSION_3 };
+	struct __user_cap_data_struct data[2];
+
+	if (syscall(SYS_capget, &header, data))
+		return -1;
+	data[0].effective = data[0].permitted & (uint32_t)caps;
+	data[1].effective = data[1].permitted & (uint32_t)(caps >> 32);
+	return (int)syscall(SYS_capset, &header, data);
+}
+
+/* The system calls, and not the library's functions: these would change all threads. */
+static void set_user(uint32_t user, uint32_t group)
+{
+	syscall(SYS_setfsgid, group);
+	syscall(SYS_setfsuid, user);
+}
+
+static bool is_user(uint32_t user, uint32_t group)
+{
+	/* -1 changes nothing, and both answer what there was. */
+	return (uint32_t)syscall(SYS_setfsuid, -1) == user &&
+	       (uint32_t)syscall(SYS_setfsgid, -1) == group;
+}
+
+int file_rights_take(const struct file_rights *rights, struct file_rights_own *own)
+{
+	if (!rights->known)
+		return -1;
+	own->user = (uint32_t)syscall(SYS_setfsuid, -1);
+	own->group = (uint32_t)syscall(SYS_setfsgid, -1);
+	own->group_count = (int)syscall(SYS_getgroups, RIGHTS_GROUPS, own->groups);
+	if (own->group_count < 0 || syscall(SYS_setgroups, rights->group_count, rights->groups))
+		return -1;
+	set_user(rights->user, rights->group);
+	if (set_effective(rights->caps) || !is_user(rights->user, rights->group)) {
+		file_rights_give_back(own);
+		return -1;
+	}
+	return 0;
+}
+
+/* The real user is still our own, and so are the permitted capabilities: all of this is allowed. */
+void file_rights_give_back(const struct file_rights_own *own)
+{
+	set_user(own->user, own->group);
+	(void)set_effective(~UINT64_C(0));
+	(void)syscall(SYS_setgroups, own->group_count, own->groups);
+}

@@ -1,0 +1,117 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Whom the OOM killer takes.
+ *
+ * It takes the process with the most points: its resident pages, and as many thousandths of what
+ * may be used as its oom_score_adj says (mm/oom_kill.c, oom_badness()).
+ *
+ * - Older generations go first, the oldest before all others: 1000, or a little less.
+ * - The newest one is there for an application that leaks until it is killed.  Without a limit it
+ *   has the value of the application, which has more points, for it has grown since.
+ * - With a limit it has as many points as the application has when that fills the limit by
+ *   itself, all but a twentieth.  So the kernel takes the application that has leaked so much,
+ *   and the template where the application would have room without it: it never dies of what
+ *   its template holds.
+ *
+ * Nobody gets less than the application's own value, which would take CAP_SYS_RESOURCE.
+ */
+#include <fcntl.h>
+#include <stdio.h>
+
+#include "guard.h"
+
+#define FIRST 1000
+#define OWN_MAX (FIRST - 1)
+#define STEP 2
+/* Of the limit, in percent: an app that has so much is killed; of one that has so much no
+ * checkpoint is taken. */
+#define KILLED 95
+#define FULL 90
+
+static void tell(struct image *image, int value)
+{
+	char text[16];
+
+	if (!image->template)
+		return;
+	if (image->oom_known && image->oom_told == value)
+		return;
+	if (!image->oom_known)
+		image->oom_own = proc_oom_score_adj(image->template);
+	if (value < image->oom_own)
+		value = image->oom_own;
+	image->oom_known = true;
+	image->oom_told = value;
+	snprintf(text, sizeof text, "%d", value);
+	proc_set_oom_score_adj(image->template, text);
+}
+
+/* The points of whichever process of the app has grown until all of them fill the limit. */
+static long points_wanted(const struct generation *generation, long limit)
+{
+	long least = generation->image[0].anon_pages, others = 0;
+
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+
+		if (!image->template)
+			continue;
+		others += image->anon_pages;
+		if (image->anon_pages < least)
+			least = image->anon_pages;
+	}
+	return limit * KILLED / 100 - (others - least);
+}
+
+static void rank_newest(struct generation *newest, long limit)
+{
+	const long points = limit ? points_wanted(newest, limit) : 0;
+
+	for (uint32_t i = 0; i < newest->images; i++) {
+		struct image *image = &newest->image[i];
+		long more = 0;
+
+		if (!image->oom_known)
+			tell(image, -FIRST); /* as it is */
+		if (points > image->anon_pages)
+			more = (points - image->anon_pages) * FIRST / limit;
+		more += image->oom_own;
+		tell(image, more > OWN_MAX ? OWN_MAX : (int)more);
+	}
+}
+
+/* A newer one is larger, if the app grows. */
+static void rank_older(struct generation *older, uint32_t k, long oldest_pages, long limit)
+{
+	const long grown = older->image[0].anon_pages - oldest_pages;
+	const long more = limit ? grown * FIRST / limit : 0;
+	const long value = FIRST - STEP * (long)k - (more > 0 ? more : 0);
+
+	for (uint32_t i = 0; i < older->images; i++)
+		tell(&older->image[i], (int)value);
+}
+
+void guard_rank_generations(struct avc_guard *guard)
+{
+	const long limit = (long)(guard->config.memory_limit_bytes / ARCH_PAGE_BYTES);
+
+	for (uint32_t k = 0; k + 1 < guard->count; k++)
+		rank_older(&guard->generations[k], k, guard->generations[0].image[0].anon_pages,
+			   limit);
+	if (guard->count)
+		rank_newest(&guard->generations[guard->count - 1], limit);
+}
+
+bool guard_app_is_full(const struct avc_guard *guard)
+{
+	const uint64_t limit = guard->config.memory_limit_bytes;
+	long pages = 0, anon = 0;
+	int fd;
+
+	if (!limit || !guard->main.pid)
+		return false;
+	fd = proc_open(guard->main.leader, "statm", O_RDONLY);
+	pages = fd < 0 ? 0 : proc_vm_pages(fd, &anon);
+	close_fd(&fd);
+	return pages && (uint64_t)anon * ARCH_PAGE_BYTES > limit / 100 * FULL;
+}

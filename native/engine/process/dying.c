@@ -1,0 +1,174 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A process that is already dying: one of its threads is in its own handler of a fatal signal,
+ * making a report, closing what it has open.  An image of that would die at every restore.
+ *
+ * Where a thread is in a handler, the kernel's signal frame lies above its stack pointer, and
+ * says what the thread had blocked before and (SA_SIGINFO) which signal it was.  Frames of handlers that
+ * have ended lie about as well: programs that live by faults (virtual machines, garbage
+ * collectors) leave many.  So a frame counts only
+ *   - on the alternate stack, if the thread is there now;
+ *   - if the thread has more signals blocked than before, as it has in a handler;
+ *   - if the signal was caught before and is not now: a handler that is to run once only.
+ * One without any of these signs (SA_NODEFER, nothing blocked, no stack of its own, installed
+ * for good) is not recognized.
+ */
+#include <signal.h>
+#include <unistd.h>
+
+#include "process.h"
+
+/* Of a stack, from its pointer upwards: more than handlers use; and of an alternate one, where
+ * the first frame is. */
+#define LOOK_BYTES (256 * 1024)
+#define LOOK_TOP_BYTES (32 * 1024)
+#define CHUNK_BYTES (16 * 1024)
+/* There are programs that live in their handlers: of calls that a filter traps (SIGSYS) and of
+ * breakpoints, or by the third sign. */
+#define PATIENCE_NS (10 * NS_PER_S)
+
+void dying_note_caught(struct process *process)
+{
+	struct proc_status status;
+
+	if (proc_status(process->pid, &status) == 0)
+		process->caught |= status.caught & FATAL_SIGNALS;
+}
+
+void dying_begin(struct process *process)
+{
+	struct proc_status status;
+
+	process->uncaught = 0;
+	process->alive = false;
+	if (process->caught && proc_status(process->pid, &status) == 0)
+		process->uncaught = process->caught & ~status.caught;
+}
+
+void dying_end(struct process *process)
+{
+	if (!process->alive)
+		process->dying_ns = 0;
+	process->caught &= ~process->uncaught;
+}
+
+static bool on_altstack(const struct thread *t, avc_remote address)
+{
+	return address - t->altstack[0] < t->altstack[2];
+}
+
+static bool is_single(uint64_t set)
+{
+	return set && !(set & (set - 1));
+}
+
+/* The fatal signal in whose handler the thread is by this frame, 0: none; *surely: and will not
+ * come back from it. */
+static int handled(const struct process *process, const struct thread *t,
+		   const struct arch_signal_frame *frame, bool *surely)
+{
+	const uint64_t bit = frame->signal ? SIGNAL_BIT(frame->signal) : 0;
+	const uint64_t more = t->sigmask & ~frame->sigmask;
+	const bool nested = !(frame->sigmask & ~t->sigmask);
+	uint64_t maybe = more & FATAL_SIGNALS & process->caught;
+
+	*surely = false;
+	if (bit & FATAL_SIGNALS) {
+		const bool alternate = on_altstack(t, arch_sp(&t->regs)) &&
+				       on_altstack(t, frame->at);
+
+		*surely = (alternate || (more && nested)) &&
+			  !(bit & (SIGNAL_BIT(SIGSYS) | SIGNAL_BIT(SIGTRAP)));
+		return alternate || (more && nested) || bit & process->uncaught ? frame->signal : 0;
+	}
+	/* Without SA_SIGINFO the kernel does not write there which one it is. */
+	if (!nested || more & bit)
+		return 0;
+	*surely = is_single(more) && !(more & (SIGNAL_BIT(SIGSYS) | SIGNAL_BIT(SIGTRAP)));
+	if (!maybe)
+		maybe = process->uncaught;
+	return maybe ? __builtin_ctzll(maybe) + 1 : 0;
+}
+
+/* The signal, 0: none. */
+static int look(const struct process *process, const struct thread *t, avc_remote from,
+		avc_remote end, bool *surely)
+{
+	/* Frames across the edge of a chunk are seen in the next one. */
+	static uint8_t chunk[CHUNK_BYTES + ARCH_SIGNAL_FRAME_BYTES] __attribute__((aligned(16)));
+
+	for (avc_remote at = from & ~UINT64_C(15); at < end; at += CHUNK_BYTES) {
+		const ssize_t n = pread(process->mem_fd, chunk, sizeof chunk, (off_t)at);
+		struct arch_signal_frame frame;
+		size_t next = 0;
+		int signal;
+
+		if (n <= 0)
+			return 0;
+		while (arch_signal_frame_find(chunk, (size_t)n, at, &next, &frame))
+			if ((signal = handled(process, t, &frame, surely)))
+				return signal;
+		if (n < (ssize_t)sizeof chunk)
+			return 0;
+	}
+	return 0;
+}
+
+/* Thread-local storage lies above the stack that a library has made; beyond is another one's. */
+static avc_remote stack_end(const struct thread *t)
+{
+	const avc_remote sp = arch_sp(&t->regs), tls = arch_tls(&t->regs);
+
+	if (on_altstack(t, sp) && t->altstack[0] + t->altstack[2] - sp < LOOK_BYTES)
+		return t->altstack[0] + t->altstack[2];
+	return tls > sp && tls - sp < LOOK_BYTES ? tls : sp + LOOK_BYTES;
+}
+
+static int find(const struct process *process, const struct thread *t, bool *surely)
+{
+	const avc_remote sp = arch_sp(&t->regs), top = t->altstack[0] + t->altstack[2];
+	const int signal = look(process, t, sp, stack_end(t), surely);
+
+	if (!signal && on_altstack(t, sp) && top - sp > LOOK_BYTES)
+		return look(process, t, top - LOOK_TOP_BYTES, top, surely);
+	return signal;
+}
+
+/* Threads stand still most of the time. */
+static bool was_looked_at(const struct thread *t)
+{
+	return t->looked_at.pc == arch_pc(&t->regs) && t->looked_at.sp == arch_sp(&t->regs) &&
+	       t->looked_at.sigmask == t->sigmask;
+}
+
+int dying_check(struct process *process, struct thread *t, struct avc_error *err)
+{
+	const uint64_t now = now_ns();
+	bool surely;
+	int signal;
+
+	if (!(t->sigmask & FATAL_SIGNALS && process->caught) && !process->uncaught &&
+	    !on_altstack(t, arch_sp(&t->regs)))
+		return 0;
+	if (!process->uncaught && was_looked_at(t))
+		return 0;
+	/* It may have another alternate stack by now. */
+	if (t->known && t->asked && thread_ask(process, t, err))
+		return -1;
+	signal = find(process, t, &surely);
+	if (!signal) {
+		t->looked_at.pc = arch_pc(&t->regs);
+		t->looked_at.sp = arch_sp(&t->regs);
+		t->looked_at.sigmask = t->sigmask;
+		return 0;
+	}
+	if (!process->dying_ns)
+		process->dying_ns = now;
+	if (!surely && now - process->dying_ns > PATIENCE_NS) {
+		process->alive = true;
+		return 0;
+	}
+	/* A fault that is mended takes no time: the next attempt is all right. */
+	return fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
+		    "it is in its own handler of signal %d", signal);
+}

@@ -1,0 +1,432 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Seccomp filters stay in force over injected code.  Those of the container let pass what it does;
+ * so do most that applications give themselves.  Where they do not, injected code is *supervised*:
+ * its tracer stops it at the entry to every system call, and suspends the filters
+ * (PTRACE_O_SUSPEND_SECCOMP) for that call alone, if it is one that injected code makes.  Nothing
+ * that the application has written is asked for that.  At the entry the registers are the kernel's:
+ * what the application does to the parasite, to its stack or its lists meanwhile, or puts in its
+ * place, leads to calls that its own filter judges, or to some of those below.
+ *
+ * Who has no filter at all has nothing that could be suspended but strict mode.  That is suspended
+ * for the first checkpoint, and supervised from then on.
+ */
+#include <errno.h>
+#include <linux/filter.h>
+#include <linux/seccomp.h>
+#include <sched.h>
+#include <signal.h>
+#include <stddef.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/mman.h>
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/syscall.h>
+
+#include "trace.h"
+
+#define ANY (~UINT64_C(0))
+#define FILTERS_MAX 16
+#define SUPERVISED_MAX 64
+
+/* A system call, with the first argument where a filter is likely to look at it. */
+struct kind {
+	long nr;
+	uint64_t arg; /* ANY: it differs                                       */
+};
+
+/* What injected code calls. */
+static const struct kind wanted[] = {
+	/* to get about */
+	{ SYS_futex, ANY },
+	{ SYS_ppoll, ANY },
+	{ SYS_nanosleep, ANY },
+	{ SYS_rt_sigprocmask, ANY },
+	{ SYS_exit, ANY },
+	{ SYS_exit_group, ANY },
+	{ SYS_wait4, ANY },
+	{ SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD },
+	{ SYS_clone, CLONE_VM | CLONE_FILES },
+	{ SYS_clone,
+	  CLONE_VM | CLONE_FILES | CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM },
+	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD },
+	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND },
+	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD },
+	{ SYS_clone, CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD |
+			     CLONE_SYSVSEM | CLONE_SETTLS },
+	{ SYS_setpgid, ANY },
+	{ SYS_setsid, ANY },
+	/* to ask */
+	{ SYS_prctl, PR_GET_TID_ADDRESS },
+	{ SYS_prctl, PR_GET_NAME },
+	{ SYS_prctl, PR_GET_DUMPABLE },
+	{ SYS_prctl, PR_GET_SECUREBITS },
+	{ SYS_prctl, PR_GET_NO_NEW_PRIVS },
+	{ SYS_prctl, PR_GET_TIMERSLACK },
+	{ SYS_prctl, PR_GET_SECCOMP },
+	{ SYS_prctl, PR_GET_PDEATHSIG },
+	{ SYS_prctl, PR_GET_CHILD_SUBREAPER },
+	{ SYS_prctl, PR_CAPBSET_READ },
+	{ SYS_gettid, ANY },
+	{ SYS_getpid, ANY },
+	{ SYS_sigaltstack, ANY },
+	{ SYS_getgroups, ANY },
+	{ SYS_getresuid, ANY },
+	{ SYS_getresgid, ANY },
+	{ SYS_setfsuid, ANY },
+	{ SYS_setfsgid, ANY },
+	{ SYS_capget, ANY },
+	{ SYS_get_mempolicy, ANY },
+	{ SYS_personality, 0xffffffff },
+	{ ARCH_STATE_CALL, ARCH_STATE_PERMITTED },
+	{ SYS_getitimer, ANY },
+	{ SYS_timer_gettime, ANY },
+	{ SYS_clock_gettime, ANY },
+	{ SYS_waitid, ANY },
+	{ SYS_mincore, ANY },
+	{ SYS_rseq, ANY },
+	{ SYS_prctl, PR_SET_NAME },
+	{ SYS_prctl, PR_SET_CHILD_SUBREAPER },
+	{ SYS_rt_sigaction, ANY },
+	/* memory and descriptors */
+	{ SYS_mmap, ANY },
+	{ SYS_munmap, ANY },
+	{ SYS_mprotect, ANY },
+	{ SYS_mremap, ANY },
+	{ SYS_madvise, ANY },
+	{ SYS_membarrier, ANY },
+	{ SYS_mlockall, ANY },
+	{ SYS_close, ANY },
+	{ SYS_close_range, ANY },
+	{ SYS_dup3, ANY },
+	{ SYS_fcntl, ANY },
+	{ SYS_epoll_ctl, ANY },
+	{ SYS_pidfd_open, ANY },
+	{ SYS_socketpair, ANY },
+	{ SYS_recvmsg, ANY },
+	{ SYS_setsockopt, ANY },
+};
+
+/* And a process that is being put together: one with filters of its own is supervised then in any
+ * case (sandbox.c). */
+static const struct kind wanted_to_restore[] = {
+	{ SYS_prctl, PR_SET_DUMPABLE },
+	{ SYS_prctl, PR_SET_KEEPCAPS },
+	{ SYS_prctl, PR_SET_SECUREBITS },
+	{ SYS_prctl, PR_SET_NO_NEW_PRIVS },
+	{ SYS_prctl, PR_SET_TIMERSLACK },
+	{ SYS_prctl, PR_SET_PDEATHSIG },
+	{ SYS_prctl, PR_CAPBSET_DROP },
+	{ SYS_prctl, PR_CAP_AMBIENT },
+	{ SYS_prctl, 77 /* PR_TIMER_CREATE_RESTORE_IDS */ },
+	{ SYS_set_tid_address, ANY },
+	{ SYS_set_robust_list, ANY },
+	{ SYS_rt_sigqueueinfo, ANY },
+	{ SYS_rt_tgsigqueueinfo, ANY },
+	{ SYS_tgkill, ANY },
+	{ SYS_sched_setaffinity, ANY },
+	{ SYS_set_mempolicy, ANY },
+	{ SYS_setgroups, ANY },
+	{ SYS_setresuid, ANY },
+	{ SYS_setresgid, ANY },
+	{ SYS_capset, ANY },
+	{ SYS_prlimit64, ANY },
+	{ SYS_setitimer, ANY },
+	{ SYS_timer_create, ANY },
+	{ SYS_timer_settime, ANY },
+	{ SYS_timer_delete, ANY },
+	{ SYS_mlock2, ANY },
+	{ SYS_listen, ANY },
+	{ SYS_ioctl, ANY }, /* TIOCSPGRP, TIOCSCTTY                            */
+	{ SYS_umask, ANY },
+	{ SYS_fchdir, ANY },
+	{ SYS_rt_sigtimedwait, ANY },
+	{ SYS_pkey_alloc, ANY },
+	{ SYS_pkey_free, ANY },
+	{ SYS_pkey_mprotect, ANY },
+};
+
+#define COUNT(array) (sizeof(array) / sizeof *(array))
+
+/* ---- what a filter says --------------------------------------------------------------------- */
+
+struct program {
+	struct sock_filter insn[BPF_MAXINSNS];
+	long count;
+};
+
+/* The classic BPF of seccomp(2), on arguments of which only the number, the architecture and, if
+ * it is not ANY, the first one are known.  Whoever looks at anything else may say anything. */
+#define DEPENDS SECCOMP_RET_KILL_PROCESS
+
+static bool load(uint32_t at, long nr, uint64_t arg, uint32_t *value)
+{
+	if (at == offsetof(struct seccomp_data, nr))
+		*value = (uint32_t)nr;
+	else if (at == offsetof(struct seccomp_data, arch))
+		*value = ARCH_AUDIT;
+	else if (arg != ANY && at == offsetof(struct seccomp_data, args))
+		*value = (uint32_t)arg;
+	else if (arg != ANY && at == offsetof(struct seccomp_data, args) + 4)
+		*value = (uint32_t)(arg >> 32);
+	else
+		return false;
+	return true;
+}
+
+static bool compute(uint16_t op, uint32_t operand, uint32_t *a)
+{
+	switch (op) {
+	case BPF_ADD:
+		*a += operand;
+		return true;
+	case BPF_SUB:
+		*a -= operand;
+		return true;
+	case BPF_AND:
+		*a &= operand;
+		return true;
+	case BPF_OR:
+		*a |= operand;
+		return true;
+	case BPF_XOR:
+		*a ^= operand;
+		return true;
+	case BPF_LSH:
+		*a = operand < 32 ? *a << operand : 0;
+		return true;
+	case BPF_RSH:
+		*a = operand < 32 ? *a >> operand : 0;
+		return true;
+	case BPF_NEG:
+		*a = -*a;
+		return true;
+	default:
+		return false;
+	}
+}
+
+static bool compare(uint16_t op, uint32_t a, uint32_t operand)
+{
+	switch (op) {
+	case BPF_JEQ:
+		return a == operand;
+	case BPF_JGT:
+		return a > operand;
+	case BPF_JGE:
+		return a >= operand;
+	default:
+		return a & operand; /* BPF_JSET */
+	}
+}
+
+static uint32_t run(const struct program *p, long nr, uint64_t arg)
+{
+	uint32_t a = 0, x = 0, mem[BPF_MEMWORDS] = { 0 };
+
+	/* All jumps go forward. */
+	for (long pc = 0; pc < p->count; pc++) {
+		const struct sock_filter *f = &p->insn[pc];
+		const uint32_t operand = BPF_SRC(f->code) == BPF_X ? x : f->k;
+		uint32_t *to = BPF_CLASS(f->code) == BPF_LDX ? &x : &a;
+
+		switch (BPF_CLASS(f->code)) {
+		case BPF_LD:
+		case BPF_LDX:
+			if (BPF_MODE(f->code) == BPF_IMM)
+				*to = f->k;
+			else if (BPF_MODE(f->code) == BPF_MEM && f->k < BPF_MEMWORDS)
+				*to = mem[f->k];
+			else if (BPF_MODE(f->code) != BPF_ABS || !load(f->k, nr, arg, to))
+				return DEPENDS;
+			break;
+		case BPF_ST:
+		case BPF_STX:
+			if (f->k >= BPF_MEMWORDS)
+				return DEPENDS;
+			mem[f->k] = BPF_CLASS(f->code) == BPF_ST ? a : x;
+			break;
+		case BPF_ALU:
+			if (!compute(BPF_OP(f->code), operand, &a))
+				return DEPENDS;
+			break;
+		case BPF_JMP:
+			if (BPF_OP(f->code) == BPF_JA)
+				pc += f->k;
+			else
+				pc += compare(BPF_OP(f->code), a, operand) ? f->jt : f->jf;
+			break;
+		case BPF_RET:
+			return BPF_RVAL(f->code) == BPF_A ? a : f->k;
+		default: /* BPF_MISC */
+			if (BPF_MISCOP(f->code) == BPF_TAX)
+				x = a;
+			else
+				a = x;
+		}
+	}
+	return DEPENDS;
+}
+
+/* Whether it keeps a call from being made, and how.  The worst of several filters counts. */
+enum verdict { PASSES, REFUSES, BARS };
+
+static enum verdict verdict(const struct program *p, long nr, uint64_t arg)
+{
+	switch (run(p, nr, arg) & SECCOMP_RET_ACTION_FULL) {
+	case SECCOMP_RET_ALLOW:
+	case SECCOMP_RET_LOG:
+		return PASSES;
+	case SECCOMP_RET_ERRNO:
+		return REFUSES;
+	default:
+		return BARS;
+	}
+}
+
+/* What the container's own filters refuse, the app cannot have done either, so nobody needs it. */
+static bool bars(const struct program *p, bool containers)
+{
+	for (size_t i = 0; i < COUNT(wanted); i++) {
+		const enum verdict v = verdict(p, wanted[i].nr, wanted[i].arg);
+
+		if (v == BARS || (v == REFUSES && !containers))
+			return true;
+	}
+	return false;
+}
+
+static long filter_get(pid_t tid, uint32_t index, void *insn)
+{
+	return ptrace(PTRACE_SECCOMP_GET_FILTER, tid, (long)index, insn);
+}
+
+int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_way *way)
+{
+	struct program p;
+	uint32_t i;
+
+	/* Filters come, and never go. */
+	if (*way == SECCOMP_SUPERVISED ||
+	    (*known && filter_get(tid, *known, NULL) < 0 && errno == ENOENT))
+		return 0;
+	for (i = 0; (p.count = filter_get(tid, i, p.insn)) > 0; i++)
+		if (i == FILTERS_MAX || bars(&p, i < containers)) {
+			*way = SECCOMP_SUPERVISED;
+			return 0;
+		}
+	if (errno != ENOENT && errno != EINVAL && errno != EMEDIUMTYPE)
+		return -1;
+	*known = i;
+	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it can not be read */
+	       : i                  ? SECCOMP_IN_FORCE
+				    : SECCOMP_NONE;
+	return 0;
+}
+
+/* ---- supervision ---------------------------------------------------------------------------- */
+
+static __thread struct {
+	struct {
+		pid_t tid, inside;
+		long options;
+	} task[SUPERVISED_MAX];
+	uint32_t count;
+} supervised;
+
+static int find(pid_t tid)
+{
+	for (uint32_t i = 0; i < supervised.count; i++)
+		if (supervised.task[i].tid == tid)
+			return (int)i;
+	return -1;
+}
+
+int seccomp_supervise(pid_t tid, pid_t inside, long options)
+{
+	int i = find(tid);
+
+	if (i < 0 && supervised.count == SUPERVISED_MAX) {
+		/* Those that ended without a word make room. */
+		for (uint32_t k = supervised.count; k-- > 0;)
+			if (!tracee_is_ours(supervised.task[k].tid))
+				supervised.task[k] = supervised.task[--supervised.count];
+	}
+	if (i < 0 && supervised.count == SUPERVISED_MAX)
+		return -1;
+	if (i < 0)
+		i = (int)supervised.count++;
+	supervised.task[i].tid = tid;
+	supervised.task[i].inside = inside;
+	supervised.task[i].options = options;
+	return 0;
+}
+
+void seccomp_let_be(pid_t tid)
+{
+	const int i = find(tid);
+
+	if (i >= 0)
+		supervised.task[i] = supervised.task[--supervised.count];
+}
+
+bool seccomp_is_supervised(pid_t tid)
+{
+	return find(tid) >= 0;
+}
+
+static bool is_among(const struct kind *kinds, size_t count, long nr, uint64_t arg)
+{
+	for (size_t i = 0; i < count; i++)
+		if (kinds[i].nr == nr && (kinds[i].arg == ANY || kinds[i].arg == arg))
+			return true;
+	return false;
+}
+
+/* Whether injected code makes such a call; `inside` is the process it is in, as that knows it. */
+static bool is_wanted(const struct arch_regs *regs, pid_t inside)
+{
+	const long nr = arch_syscall_nr(regs);
+	const uint64_t arg = arch_syscall_arg(regs, 0);
+
+	if (!is_among(wanted, COUNT(wanted), nr, arg) &&
+	    !is_among(wanted_to_restore, COUNT(wanted_to_restore), nr, arg))
+		return false;
+	switch (nr) {
+	case SYS_ioctl:
+		return arch_syscall_arg(regs, 1) == TIOCSPGRP ||
+		       arch_syscall_arg(regs, 1) == TIOCSCTTY;
+	case SYS_mmap:
+	case SYS_pkey_mprotect:
+	case SYS_mprotect: /* new code is for the porter to bring (infect.c) */
+		return !inside || !(arch_syscall_arg(regs, 2) & PROT_EXEC);
+	case SYS_rt_sigqueueinfo:
+	case SYS_rt_tgsigqueueinfo:
+	case SYS_tgkill: /* to itself, not to others */
+		return (pid_t)arg == inside;
+	default:
+		return true;
+	}
+}
+
+void seccomp_at_call(pid_t tid, pid_t inside, long options)
+{
+	struct arch_regs regs;
+
+	if (tracee_enters_call(tid) && arch_regs_get(tid, &regs) == 0 && is_wanted(&regs, inside))
+		options |= PTRACE_O_SUSPEND_SECCOMP;
+	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* it was killed: no matter */
+}
+
+long seccomp_go_on(pid_t tid, const struct stop *stop)
+{
+	const long signal = stop && stop->kind == STOP_SIGNAL ? stop->signal : 0;
+	const int i = find(tid);
+
+	if (i < 0)
+		return ptrace(PTRACE_CONT, tid, NULL, signal);
+	if (stop && stop->kind == STOP_SYSCALL)
+		seccomp_at_call(tid, supervised.task[i].inside, supervised.task[i].options);
+	return ptrace(PTRACE_SYSCALL, tid, NULL, signal);
+}

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""With default labels nobody gets an answer that is another request's.
+
+`python -m testkit.answers` asks 20,000 requests of each server (docs/fidelity.md has what came out).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from testkit.answers.servers import SERVERS, missing
+from testkit.answers.trial import run
+
+REQUESTS = 1000
+KILLS = 3
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None) -> None:
+    """avckpt-init."""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("server", SERVERS)
+def test_every_answer_is_its_requests_own(server: str, tmp_path: Path) -> None:
+    """Clients keep their connections; the server is killed at random moments."""
+    if why := missing(server):
+        pytest.skip(why)
+    outcome = run(server, REQUESTS, tmp_path)
+    assert outcome.wrong == []
+    assert outcome.kills >= KILLS
+    assert outcome.silent == 0  # nobody waits for what was forgotten
+
+
+@pytest.mark.timeout(300)
+def test_kept_connections_give_wrong_answers(tmp_path: Path) -> None:
+    """What the test above would see if connections simply went on."""
+    assert run("prefork", 20 * REQUESTS, tmp_path, {"avckpt.tcp": "keep"}).wrong != []

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An image is never of a process that is already dying: one crash costs one restore."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from testkit.guarded import PATIENCE_S, WHERE, GuardProcess, Victim, config
+from testkit.harness import wait_until
+
+CRASHES = 3
+SIGNALS = ("segv", "bus", "fpe", "ill", "abrt", "trap", "sys")
+STYLES = ("plain", "full", "open", "python", "sysv", "breakpad", "exit")
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def crash_often(tmp_path: Path, options: str) -> None:
+    """Under checkpoints as frequent as they can be."""
+    with (
+        Victim(f"reporter {options}", tmp_path) as victim,
+        GuardProcess(config(0.01, keep=3), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint", count=3)
+        since = guard.mark()
+        for crash in range(1, CRASHES + 1):
+            # Right after one, so that the next finds it in the handler: an image of the moment before
+            # the crash, which it has been decided on, is good, and crashes again.
+            guard.wait("checkpoint", since=guard.mark(), count=2)
+            victim.board.set_counter(0, crash)
+            guard.wait("restored", since=since, count=crash)
+            victim.wait_beats(3)
+        seen = victim.see()
+        assert seen.counter[1:3] == (CRASHES, CRASHES), "crashes, and reports of them"
+        assert sum(event.get("kind") == "restored" for event in guard.events) == CRASHES
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_styles(tmp_path: Path, style: str) -> None:
+    """As they are installed by the crash reporters of the field."""
+    crash_often(tmp_path, f"segv {style}")
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_styles_in_another_thread(tmp_path: Path, style: str) -> None:
+    """The main thread stands still, and is not in the handler."""
+    crash_often(tmp_path, f"abrt {style} --in-thread")
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_signals(tmp_path: Path, name: str) -> None:
+    """All that a crash is known by."""
+    crash_often(tmp_path, f"{name} plain")
+
+
+@pytest.mark.parametrize("style", ["plain", "open"])
+def test_a_child(tmp_path: Path, style: str) -> None:
+    """Nor is an image of several processes, one of which is dying; the parent ends as that does."""
+    crash_often(tmp_path, f"segv {style} --in-child")
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_faults_that_are_mended(tmp_path: Path, where: str) -> None:
+    """A program that lives by them is protected as any other."""
+    with (
+        Victim(f"reporter segv mend {where}".strip(), tmp_path) as victim,
+        GuardProcess(config(0.01), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint", count=100)
+        missed = [event for event in guard.events if event.get("kind") == "missed"]
+        assert len(missed) < 10, missed[:3]
+        reports = victim.see().counter[2]
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        wait_until(lambda: victim.see().counter[2] > reports + 50, PATIENCE_S, "more faults")
+        victim.check()

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An application that leaks until the kernel kills it comes back; and nobody is killed for our copies of him."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from testkit.cgroups import MemoryGroup
+from testkit.guarded import GuardProcess, Victim, config
+from testkit.harness import wait_until
+
+LIMIT_BYTES = 256 << 20
+BASE_MB = 40
+TRIALS = int(os.environ.get("AVCKPT_OOM_TRIALS", "1"))
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@pytest.fixture
+def group() -> Iterator[MemoryGroup]:
+    """256 MB for all that is started in it."""
+    with MemoryGroup(LIMIT_BYTES) as made:
+        yield made
+
+
+@pytest.mark.parametrize("trial", range(TRIALS))
+@pytest.mark.parametrize("rate", [10, 50, 200])
+def test_a_leak_is_restored(rate: int, trial: int, group: MemoryGroup, tmp_path: Path) -> None:
+    with (
+        Victim(f"leak {rate} {BASE_MB}", tmp_path, preexec=group.enter) as victim,
+        GuardProcess(config(0.5, memory_limit_bytes=LIMIT_BYTES), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint", count=2)
+        os.kill(victim.app, signal.SIGUSR1)
+        died = guard.wait("died", timeout_s=60)
+        assert died["wait_status"] == signal.SIGKILL
+        assert guard.wait("restored", timeout_s=20)["reason"] == "signal"
+        victim.wait_beats(5)
+
+
+def test_a_leak_is_restored_where_no_limit_is_known(group: MemoryGroup, tmp_path: Path) -> None:
+    """That of a group above the container's own, or all of the host's memory."""
+    with (
+        Victim(f"leak 100 {BASE_MB}", tmp_path, preexec=group.enter) as victim,
+        GuardProcess(config(0.5), [victim.pid]) as guard,
+    ):
+        guard.wait("checkpoint", count=2)
+        os.kill(victim.app, signal.SIGUSR1)
+        guard.wait("restored", timeout_s=60)
+        victim.wait_beats(5)
+
+
+def test_nobody_is_killed_for_what_a_template_holds(group: MemoryGroup, tmp_path: Path) -> None:
+    """140 MB, all written again under a checkpoint: 280 of 256, and without the template there is room."""
+    with (
+        Victim("hoard 140", tmp_path, preexec=group.enter) as victim,
+        GuardProcess(config(memory_limit_bytes=LIMIT_BYTES), [victim.pid]) as guard,
+    ):
+        app = victim.app
+        for n in range(1, 4):
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            os.kill(app, signal.SIGUSR1)
+            assert guard.wait("dropped", count=n)["reason"] == "killed"
+            wait_until(lambda n=n: victim.see().counter[0] == 140 * n, 10, "it has written all of it")  # type: ignore[misc]
+            victim.wait_beats()
+        assert victim.app == app
+
+
+def test_older_generations_go_first(group: MemoryGroup, tmp_path: Path) -> None:
+    """80 MB three times are 240, and a leak from there kills the application: but what is restored is the newest."""
+    with (
+        Victim("hoard 80", tmp_path, preexec=group.enter) as victim,
+        GuardProcess(config(memory_limit_bytes=LIMIT_BYTES, keep=3), [victim.pid]) as guard,
+    ):
+        app = victim.app
+        for n in range(1, 4):
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            os.kill(app, signal.SIGUSR1)
+            wait_until(lambda n=n: victim.see().counter[0] == 80 * n, 10, "it has written all of it")  # type: ignore[misc]
+        dropped = guard.wait("dropped")
+        assert (dropped["generation"], dropped["reason"]) == (1, "killed")
+        victim.wait_beats()
+        assert victim.app == app
+
+
+def test_what_fills_its_container_is_not_gone_back_to(group: MemoryGroup, tmp_path: Path) -> None:
+    with (
+        Victim("hoard 235", tmp_path, preexec=group.enter) as victim,
+        GuardProcess(config(memory_limit_bytes=LIMIT_BYTES), [victim.pid]) as guard,
+    ):
+        missed = guard.command("checkpoint")
+        assert missed["kind"] == "missed"
+        assert "it fills the memory of its container" in missed["error"]["message"]
+        victim.wait_beats()

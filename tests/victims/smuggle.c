@@ -1,0 +1,193 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * smuggle WHERE FOLDER [--little]: an application whose own seccomp filter refuses it mkdir(2), and
+ * with --little all but a few calls, has what avckpt runs in it make that call:
+ *
+ *   lists    it writes it into the list of calls that a thread of its is about to make
+ *   code     it maps code of its own over that of the parasite
+ *   setup    it writes it into what a process restored from it will call
+ *
+ * It begins at SIGUSR1, when there is one parasite only.  counter[0] says that it has found it,
+ * counter[1] how often the call was made and refused, counter[2] how often it was not.
+ */
+#include <linux/filter.h>
+#include <linux/seccomp.h>
+#include <pthread.h>
+#include <stddef.h>
+#include <sys/prctl.h>
+#include <sys/stat.h>
+
+#include "parasite_place.h"
+
+#define SLOTS 3 /* avckpt.keep is 2 in the tests */
+#define UNTOUCHED INT64_C(0x7777)
+
+#define ALLOW(nr)                                        \
+	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
+
+static const char *folder, *where;
+static struct inj_setup fake;
+static volatile int64_t outcome = UNTOUCHED;
+static volatile sig_atomic_t asked;
+
+static void ask(int signal)
+{
+	(void)signal;
+	asked = 1;
+}
+
+static void confine(bool little)
+{
+	struct sock_filter most[] = {
+		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
+		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_mkdir, 0, 1),
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM),
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW),
+	};
+	struct sock_filter few[] = {
+		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
+		ALLOW(SYS_clock_nanosleep),
+		ALLOW(SYS_restart_syscall),
+		ALLOW(SYS_rt_sigreturn),
+		ALLOW(SYS_openat),
+		ALLOW(SYS_newfstatat),
+		ALLOW(SYS_fstat),
+		ALLOW(SYS_read),
+		ALLOW(SYS_close),
+		ALLOW(SYS_mmap),
+		ALLOW(SYS_munmap),
+		ALLOW(SYS_brk),
+		ALLOW(SYS_exit_group),
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM),
+	};
+	struct sock_fprog program = { sizeof(most) / sizeof(*most), most };
+
+	if (little)
+		program = (struct sock_fprog){ sizeof(few) / sizeof(*few), few };
+	must(!prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "PR_SET_NO_NEW_PRIVS");
+	must(!syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC, &program),
+	     "seccomp");
+	CHECK(mkdir(folder, 0700) < 0 && errno == EPERM, "the filter does not hold");
+}
+
+static void note(int64_t result)
+{
+	if (result == -EPERM)
+		count(1, 1);
+	else if (result == 0)
+		count(2, 1);
+}
+
+static void write_lists(struct inj_call *call)
+{
+	/* The first of a list is not yet made while the others are being written. */
+	for (unsigned int i = 0; i < 48; i++) {
+		struct inj_syscall *s = &call->call[i];
+
+		if (s->nr == SYS_mkdir) {
+			if (s->result != UNTOUCHED && s->result != -ENOSYS) {
+				note(s->result);
+				s->result = UNTOUCHED;
+			}
+			continue;
+		}
+		s->arg[0] = (uint64_t)folder;
+		s->arg[1] = 0700;
+		s->result = UNTOUCHED;
+		__atomic_store_n(&s->nr, SYS_mkdir, __ATOMIC_RELEASE);
+	}
+}
+
+/* mkdir(folder, 0700), and what came of it. */
+static void map_code(const struct place *place)
+{
+	uint8_t *code = mmap((void *)place->start, INJ_CODE_BYTES,
+			     PROT_READ | PROT_WRITE | PROT_EXEC,
+			     MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED, -1, 0);
+	const uint64_t to = (uint64_t)&outcome, name = (uint64_t)folder;
+	uint8_t *at = code + INJ_CODE_BYTES - 64;
+
+	must(code != MAP_FAILED, "mmap");
+	memset(code, 0x90, INJ_CODE_BYTES); /* nop */
+	*at++ = 0xb8;                       /* mov $SYS_mkdir, %eax */
+	memcpy(at, &(uint32_t){ SYS_mkdir }, 4);
+	at += 4;
+	memcpy(at, (uint8_t[]){ 0x48, 0xbf }, 2); /* mov $folder, %rdi */
+	memcpy(at + 2, &name, 8);
+	at += 10;
+	*at++ = 0xbe; /* mov $0700, %esi */
+	memcpy(at, &(uint32_t){ 0700 }, 4);
+	at += 4;
+	memcpy(at, (uint8_t[]){ 0x0f, 0x05 }, 2); /* syscall */
+	at += 2;
+	memcpy(at, (uint8_t[]){ 0x48, 0xbf }, 2); /* mov $outcome, %rdi */
+	memcpy(at + 2, &to, 8);
+	at += 10;
+	memcpy(at, (uint8_t[]){ 0x48, 0x89, 0x07, 0xeb, 0xfe }, 5); /* mov %rax, (%rdi); jmp . */
+}
+
+static void write_setup(const struct place *place)
+{
+	const uint64_t slot_bytes = (place->bytes - INJ_SLOTS_OFFSET) / SLOTS;
+
+	for (unsigned int i = 0; i < SLOTS; i++) {
+		struct inj_slot *slot =
+			(struct inj_slot *)(place->start + INJ_SLOTS_OFFSET + i * slot_bytes);
+
+		if (slot->setup[INJ_AFTER] && slot->setup[INJ_AFTER] != (uint64_t)&fake)
+			slot->setup[INJ_AFTER] = (uint64_t)&fake;
+	}
+	if (fake.call.result != UNTOUCHED) {
+		note(fake.call.result);
+		fake.call.result = UNTOUCHED;
+	}
+}
+
+static void *attack(void *unused)
+{
+	struct inj_control *control;
+	struct place place;
+
+	while (!asked)
+		usleep(1000);
+	place = await_parasite();
+	control = (struct inj_control *)(place.start + INJ_CODE_BYTES);
+	fake = (struct inj_setup){
+		.flags = INJ_MAY_FAIL,
+		.call = { .nr = SYS_mkdir, .arg = { (uint64_t)folder, 0700 }, .result = UNTOUCHED }
+	};
+	count(0, 1);
+	if (!strcmp(where, "code"))
+		map_code(&place);
+	for (;;) {
+		if (!strcmp(where, "lists"))
+			write_lists(&control->runner);
+		else if (!strcmp(where, "setup"))
+			write_setup(&place);
+		if (outcome != UNTOUCHED) {
+			note(outcome);
+			outcome = UNTOUCHED;
+		}
+	}
+	return unused;
+}
+
+int main(int argc, char **argv)
+{
+	const bool little = victim_flag(&argc, argv, "--little");
+	pthread_t thread;
+
+	victim_start(&argc, argv, 2, "WHERE FOLDER [--little]");
+	where = argv[1];
+	folder = argv[2];
+	signal(SIGUSR1, ask);
+	must(!pthread_create(&thread, NULL, attack, NULL), "pthread_create");
+	usleep(20000);
+	confine(little);
+	victim_ready();
+	for (;;) {
+		usleep(1000);
+		beat();
+	}
+}

@@ -1,0 +1,79 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * steady: a main thread that is not to notice anything, whoever borrows it and dies.  A signal
+ * comes every millisecond; its handler has to run on the program's own stack (now and
+ * then: on its alternate one), and takes more of that than a borrower could have.  Between
+ * two calls, and over each of them, registers, mask and stacks are the same (inlined.h).
+ */
+#include <sys/epoll.h>
+#include <sys/time.h>
+
+#include "inlined.h"
+
+#define STACK_BYTES (256 * 1024)
+#define USED_BYTES (48 * 1024)
+
+static uintptr_t own_low, own_high;
+static uint8_t other[STACK_BYTES];
+static volatile bool is_on_other;
+
+static void handle(int signal)
+{
+	volatile uint8_t used[USED_BYTES];
+	const uintptr_t at = (uintptr_t)used;
+	const bool on_other = at - (uintptr_t)other < sizeof other;
+
+	(void)signal;
+	CHECK(on_other || (at >= own_low && at < own_high), "a handler runs at %#lx", at);
+	CHECK(on_other == is_on_other, "a handler runs on the %s stack",
+	      on_other ? "alternate" : "ordinary");
+	for (unsigned int i = 0; i < USED_BYTES; i += 512)
+		used[i] = 1;
+	count(1, 1);
+}
+
+static void set_handler(bool on_other)
+{
+	const struct sigaction action = { .sa_handler = handle,
+					  .sa_flags = on_other ? SA_ONSTACK : 0 };
+	sigset_t alarm, before;
+
+	sigemptyset(&alarm);
+	sigaddset(&alarm, SIGALRM);
+	sigprocmask(SIG_BLOCK, &alarm, &before);
+	is_on_other = on_other;
+	must(!sigaction(SIGALRM, &action, NULL), "sigaction");
+	sigprocmask(SIG_SETMASK, &before, NULL);
+}
+
+int main(int argc, char **argv)
+{
+	const struct itimerval often = { { 0, 1000 }, { 0, 1000 } };
+	const stack_t alternate = { .ss_sp = other, .ss_size = sizeof other };
+	const int epoll_fd = epoll_create1(EPOLL_CLOEXEC);
+	struct timespec ts = { 0, 3000000 };
+	struct epoll_event event;
+
+	victim_start(&argc, argv, 0, "");
+	own_high = (uintptr_t)__builtin_frame_address(0);
+	own_low = own_high - (1 << 20);
+	must(!sigaltstack(&alternate, NULL), "sigaltstack");
+	set_handler(false);
+	must(!setitimer(ITIMER_REAL, &often, NULL), "setitimer");
+	victim_ready();
+	for (unsigned int i = 0;; i++) {
+		const long slept = inlined("nanosleep", SYS_nanosleep, (uint64_t)&ts, 0, 3, 4, 5,
+					   6);
+		const int slept_errno = errno;
+		const long waited = inlined("epoll_wait", SYS_epoll_wait, (uint64_t)epoll_fd,
+					    (uint64_t)&event, 1, 3, 5, 6);
+
+		CHECK(slept == 0 || slept_errno == EINTR, "nanosleep: %s", strerror(slept_errno));
+		CHECK(waited == 0 || errno == EINTR, "epoll_wait: %s", strerror(errno));
+		for (volatile int k = 0; k < 100000; k++)
+			;
+		beat();
+		if (i % 64 == 0)
+			set_handler(i % 128 == 0);
+	}
+}
