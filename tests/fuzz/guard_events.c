@@ -3,6 +3,7 @@
  * A daemon that gets rubbish from a guard.  The guard is rubbish.c, which says what the input says:
  * flags and length of each packet (a byte each), then its bytes.
  */
+#include <fcntl.h>
 #include <poll.h>
 #include <stdbool.h>
 #include <sys/mman.h>
@@ -53,7 +54,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	if (input < 0) {
 		char number[16];
 
-		input = memfd_create("input", 0); /* which rubbish reads */
+		/* Which rubbish reads; not where its socket will be. */
+		input = fcntl(memfd_create("input", MFD_CLOEXEC), F_DUPFD, 10);
 		own = (int)syscall(SYS_pidfd_open, getpid(), 0);
 		snprintf(number, sizeof number, "%d", input);
 		setenv("RUBBISH", number, 1);
