@@ -40,6 +40,8 @@ def main() -> int:
 
 def register(state: dict[str, Any]) -> str:
     """Registers the container of an OCI state.  Returns what is wrong with its protection, in a clause, or ""."""
+    if not protocol.is_container_id(state["id"]):  # which names files
+        raise ValueError("its id is not one of Podman's")
     pid = state["pid"]
     pidfd = os.pidfd_open(pid)
     try:

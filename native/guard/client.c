@@ -25,6 +25,7 @@
 #define QUEUE_MAX 4096
 #define STOP_MS 15000     /* a guard may be in the middle of a restore                    */
 #define END_MS 1000       /* from the end of its socket to the end of the process         */
+#define EVENTS_AT_ONCE 64 /* that are taken from one of them before it is the others' turn */
 #define STARVED_FACTOR 10 /* so much more patience with who only waits for a CPU          */
 
 extern char **environ;
@@ -40,6 +41,7 @@ struct avc_guard {
 	bool stopping;            /* somebody has asked for its end                 */
 	bool ended;               /* its socket says so                             */
 	bool hung;                /* and we have killed it                          */
+	bool mad;                 /* likewise, for what it said                     */
 	int status;               /* of the ended process, as from waitpid(2)       */
 };
 
@@ -120,7 +122,10 @@ static void guard_lost(struct avc_guard *guard)
 				   .cookie = guard->cookie,
 				   .at_ns = now_ns() };
 
-	if (guard->hung)
+	if (guard->mad)
+		fail(&event.error, AVC_PROTOCOL, 0, 0, "", "",
+		     "its guard said what makes no sense and was killed");
+	else if (guard->hung)
 		fail(&event.error, AVC_DEADLINE, 0, 0, "", "",
 		     "its guard gave no sign of life and was killed");
 	else if (WIFSIGNALED(guard->status))
@@ -132,24 +137,48 @@ static void guard_lost(struct avc_guard *guard)
 	queue_event(guard->engine, &event);
 }
 
-/* Queues what it has said so far. */
+static bool is_text(const char *chars, size_t size)
+{
+	return memchr(chars, 0, size) != NULL;
+}
+
+/* A guard reads what containers show it, and may have been talked into anything: what it says of
+ * its own container goes for that one, and nothing else does. */
+static bool event_is_sound(const struct avc_guard *guard, const struct avc_event *event)
+{
+	return event->cookie == guard->cookie && event->kind >= AVC_EVENT_ATTACHED &&
+	       event->kind < AVC_EVENT_GUARD_LOST && event->reason >= AVC_REASON_NONE &&
+	       event->reason <= AVC_REASON_EXECUTED && event->error.code >= AVC_OK &&
+	       event->error.code <= AVC_RETRY &&
+	       is_text(event->error.operation, sizeof event->error.operation) &&
+	       is_text(event->error.syscall, sizeof event->error.syscall) &&
+	       is_text(event->error.detail, sizeof event->error.detail);
+}
+
+/* Queues what it has said so far, or a part of that: one that never ends must not keep us. */
 static void guard_listen(struct avc_guard *guard)
 {
 	struct avc_event event;
-	ssize_t n;
+	ssize_t n = 0;
 
-	while ((n = recv(guard->socket, &event, sizeof event, MSG_DONTWAIT)) == sizeof event) {
+	for (int i = 0; i < EVENTS_AT_ONCE; i++) {
+		n = recv(guard->socket, &event, sizeof event, MSG_DONTWAIT | MSG_TRUNC);
+		if (n <= 0)
+			break;
+		guard->mad = n != sizeof event || !event_is_sound(guard, &event);
+		if (guard->mad)
+			break;
 		/* Its last word, after which it ends by itself. */
 		guard->stopping |= event.kind == AVC_EVENT_ENDED;
 		queue_event(guard->engine, &event);
 	}
-	if (n < 0 && (errno == EAGAIN || errno == EINTR))
+	if (!guard->mad && (n > 0 || (n < 0 && (errno == EAGAIN || errno == EINTR))))
 		return;
 	guard->ended = true;
 	epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
-	if (guard->stopping)
+	if (guard->stopping && !guard->mad)
 		return;
-	guard_reap(guard, END_MS);
+	guard_reap(guard, guard->mad ? 0 : END_MS);
 	guard_lost(guard);
 }
 

@@ -12,6 +12,7 @@
  *   heartbeat.c     the guard's sign of life
  *   budget.c        what one checkpoint or restore may cost
  *   proc.c          /proc
+ *   proc_text.c     what its texts say
  *   pagemap.c       which pages of a process are there
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
@@ -22,6 +23,7 @@
 #include <pthread.h>
 #include <stdbool.h>
 #include <stdint.h>
+#include <stdio.h>
 #include <sys/socket.h>
 #include <sys/types.h>
 
@@ -93,6 +95,10 @@ struct proc_stat {
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
+/* All of one, as a string: in `first` if that is large enough, else allocated, for the application
+ * makes it as long as it likes.  NULL with errno; EFBIG: that is too long. */
+#define PROC_TEXT_MAX (8u << 20) /* about 100,000 descriptors, or 60,000 files, that are watched  */
+char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes);
 int proc_stat(pid_t pid, struct proc_stat *stat);
 /* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
 int proc_stat_of(int stat_fd, struct proc_stat *stat);
@@ -185,10 +191,12 @@ int proc_sched(pid_t tid, struct proc_sched *sched);
 /* What is of interest in /proc/PID/status. */
 #define STATUS_GROUPS 64
 struct proc_status {
-	int64_t locked_kb;       /* -1: it has no memory any more                    */
-	pid_t inside;            /* in the innermost PID namespace                   */
-	pid_t tracer;            /* a thread, in our namespace; 0: none              */
-	uint64_t caught;         /* signals it has handlers for, as in sigset_t      */
+	int64_t locked_kb; /* -1: it has no memory any more                    */
+	pid_t inside;      /* in the innermost PID namespace                   */
+	pid_t tracer;      /* a thread, in our namespace; 0: none              */
+	uint64_t caught;   /* signals it has handlers for, as in sigset_t      */
+	uint64_t ignored;  /* likewise                                         */
+	uint32_t umask;
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	int group_count;         /* supplementary; those beyond are not known   */
 	uint32_t groups[STATUS_GROUPS];
@@ -213,6 +221,31 @@ int proc_borrow_fd(int pidfd, int fd);
 /* The OOM killer takes those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
 int proc_oom_score_adj(pid_t pid);
+
+/* ---- proc_text.c -------------------------------------------------------------------- */
+
+/* What the texts say, for the functions above; -1 with EPROTO: not what was expected. */
+int proc_parse_stat(const char *text, struct proc_stat *stat);
+int proc_parse_statm(const char *text, long *pages, long *anonymous);
+int proc_parse_status(const char *text, struct proc_status *status);
+int proc_parse_sched(const char *text, struct proc_sched *sched);
+int proc_parse_limits(const char *text, uint64_t limit[LIMITS][2]);
+int proc_parse_children(const char *text, pid_t *children, int max);
+int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *mapping, void *arg),
+			void *arg);
+
+/* A line of mountinfo, which the strings are in. */
+struct proc_mount {
+	uint32_t major, minor;
+	char *point;
+	const char *options, *type;
+	char *details; /* of the file system's own; escaped                  */
+};
+
+/* False: it is no such line.  Changes it. */
+bool proc_parse_mount(char *line, struct proc_mount *mount);
+/* "\\040" and the like stand for blanks. */
+void proc_unescape(char *text);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */
 

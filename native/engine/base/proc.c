@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * /proc, see proc(5).
+ * /proc, see proc(5): opened and read here, understood in proc_text.c.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -81,6 +81,46 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size)
 	return n;
 }
 
+char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes)
+{
+	int fd = proc_open(pid, name, O_RDONLY), saved;
+	size_t room = first_bytes, used = 0;
+	char *text = first;
+	ssize_t n = -1;
+
+	while (fd >= 0 && (n = read(fd, text + used, room - used - 1)) > 0) {
+		char *more;
+
+		used += (size_t)n;
+		if (used < room - 1)
+			continue;
+		if (used > PROC_TEXT_MAX) {
+			errno = EFBIG;
+			n = -1;
+			break;
+		}
+		more = realloc(text == first ? NULL : text, 4 * room);
+		if (!more) {
+			n = -1;
+			break;
+		}
+		if (text == first)
+			memcpy(more, first, used);
+		text = more;
+		room *= 4;
+	}
+	saved = errno;
+	close_fd(&fd);
+	if (n == 0) {
+		text[used] = 0;
+		return text;
+	}
+	if (text != first)
+		free(text);
+	errno = saved;
+	return NULL;
+}
+
 int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 {
 	char path[64];
@@ -94,60 +134,25 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 	return 0;
 }
 
-static int parse_stat(const char *buf, struct proc_stat *stat)
-{
-	const char *name = strchr(buf, '('), *last = strrchr(buf, ' '), *p;
-	int tty;
-	unsigned long long start;
-
-	/* The name may hold anything, also ") R": the last ')' ends it. */
-	p = strrchr(buf, ')');
-	if (!name || !last || !p ||
-	    sscanf(p + 1,
-		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu"
-		   " %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %d",
-		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
-		   &stat->tty_group, &stat->flags, &stat->threads, &start,
-		   &stat->exit_signal) != 10) {
-		errno = EPROTO;
-		return -1;
-	}
-	stat->tty = (uint32_t)tty;
-	stat->start = start;
-	stat->exit_status = atoi(last + 1);
-	snprintf(stat->name, sizeof stat->name, "%.*s", (int)(p - name - 1), name + 1);
-	return 0;
-}
-
 int proc_stat(pid_t pid, struct proc_stat *stat)
 {
 	char buf[1024];
 
-	return proc_read(pid, "stat", buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
+	return proc_read(pid, "stat", buf, sizeof buf) < 0 ? -1 : proc_parse_stat(buf, stat);
 }
 
 int proc_stat_of(int stat_fd, struct proc_stat *stat)
 {
 	char buf[1024];
 
-	return read_text(stat_fd, buf, sizeof buf) < 0 ? -1 : parse_stat(buf, stat);
+	return read_text(stat_fd, buf, sizeof buf) < 0 ? -1 : proc_parse_stat(buf, stat);
 }
 
 pid_t proc_inside(pid_t tid)
 {
-	char buf[4096], *line, *last, *end;
+	struct proc_status status;
 
-	if (proc_read(tid, "status", buf, sizeof buf) < 0)
-		return -1;
-	line = strstr(buf, "\nNSpid:");
-	if (!line)
-		return -1;
-	line++;
-	end = strchr(line, '\n');
-	if (end)
-		*end = 0;
-	last = strrchr(line, '\t');
-	return last ? atoi(last) : -1;
+	return proc_status(tid, &status) ? -1 : status.inside;
 }
 
 /* Its memory goes first, before it is a zombie. */
@@ -198,8 +203,8 @@ void proc_await_end(pid_t tid)
 
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
 {
-	char name[32], buf[CHILDREN_MAX * sizeof "4194304"], *p = buf;
-	int count = 0, fd;
+	char name[32], buf[CHILDREN_MAX * sizeof "4194304"];
+	int fd;
 	ssize_t n;
 
 	snprintf(name, sizeof name, "%d/children", tid);
@@ -212,16 +217,7 @@ int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
 	if (n < 0)
 		return -1;
 	buf[n] = 0;
-	while (count < max) {
-		char *next;
-		long child = strtol(p, &next, 10);
-
-		if (next == p)
-			break;
-		children[count++] = (pid_t)child;
-		p = next;
-	}
-	return count;
+	return proc_parse_children(buf, children, max);
 }
 
 int proc_children(pid_t pid, pid_t *children, int max)
@@ -236,177 +232,40 @@ int proc_children(pid_t pid, pid_t *children, int max)
 	return count;
 }
 
-static const struct {
-	char name[3];
-	enum mapping_flag flag;
-} mapping_flags[] = {
-	{ "dc", MAPPING_DONTFORK },  { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
-	{ "lo", MAPPING_LOCKED },    { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
-	{ "hg", MAPPING_HUGE },      { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
-	{ "mg", MAPPING_MERGEABLE }, { "gd", MAPPING_GROWING },    { "sl", MAPPING_SEALED },
-	{ "de", MAPPING_FIXED },     { "pf", MAPPING_FIXED },      { "mm", MAPPING_FIXED },
-};
-
-static uint32_t parse_flags(const char *p)
-{
-	uint32_t flags = 0;
-
-	for (; *p == ' '; p += strlen(p) > 3 ? 3 : strlen(p))
-		for (size_t i = 0; i < sizeof mapping_flags / sizeof *mapping_flags; i++)
-			if (!strncmp(p + 1, mapping_flags[i].name, 2))
-				flags |= mapping_flags[i].flag;
-	return flags;
-}
-
-static bool parse_mapping(const char *line, struct mapping *m)
-{
-	unsigned long start, end, offset, inode;
-	unsigned int major, minor;
-	int name = 0;
-
-	*m = (struct mapping){ 0 };
-	if (sscanf(line, "%lx-%lx %4s %lx %x:%x %lu %n", &start, &end, m->mode, &offset, &major,
-		   &minor, &inode, &name) < 7)
-		return false;
-	m->device = (uint64_t)major << 32 | minor;
-	m->start = start;
-	m->end = end;
-	m->offset = offset;
-	m->inode = inode;
-	m->shared = m->mode[3] == 's';
-	snprintf(m->name, sizeof m->name, "%.*s", (int)strcspn(line + name, "\n"), line + name);
-	return true;
-}
-
 int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
 		  void *arg)
 {
-	const bool smaps = !strcmp(file, "smaps");
-	struct mapping m = { 0 };
-	char path[64], *line = NULL;
-	size_t size = 0;
-	int result = 0;
+	char path[64];
+	int result;
 	FILE *maps;
 
 	snprintf(path, sizeof path, "/proc/%d/%s", pid, file);
 	maps = fopen(path, "re");
 	if (!maps)
 		return -1;
-	while (!result && getline(&line, &size, maps) > 0) {
-		heartbeat();
-		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
-			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
-				  MAPPING_KEYS;
-		} else if (smaps && !strncmp(line, "VmFlags:", 8)) {
-			m.flags |= parse_flags(line + 8);
-			result = fn(&m, arg);
-		} else if (!smaps || !(line[0] >= 'A' && line[0] <= 'Z')) {
-			if (parse_mapping(line, &m) && !smaps)
-				result = fn(&m, arg);
-		}
-	}
-	if (ferror(maps))
-		result = -1;
-	free(line);
+	result = proc_parse_mappings(maps, !strcmp(file, "smaps"), fn, arg);
 	fclose(maps);
-	return result < 0 ? -1 : 0;
+	return result;
 }
-
-int mapping_protection(const struct mapping *m)
-{
-	return (m->mode[0] == 'r' ? PROT_READ : 0) | (m->mode[1] == 'w' ? PROT_WRITE : 0) |
-	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
-}
-
-bool mapping_is_special(const struct mapping *m)
-{
-	return !strncmp(m->name, "[vdso", 5) || !strncmp(m->name, "[vvar", 5);
-}
-
-static void parse_ids(const char *p, uint32_t id[4])
-{
-	sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]);
-}
-
-static void parse_groups(const char *p, struct proc_status *status)
-{
-	char *next;
-
-	while (status->group_count < STATUS_GROUPS) {
-		const unsigned long group = strtoul(p, &next, 10);
-
-		if (next == p)
-			return;
-		status->groups[status->group_count++] = (uint32_t)group;
-		p = next;
-	}
-}
-
-#define LIMIT_NAME 26 /* columns: fs/proc/base.c, proc_pid_limits() */
-#define LIMIT_VALUE 21
 
 int proc_status(pid_t tid, struct proc_status *status)
 {
-	static const char *const caps[5] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
-					     "CapAmb:" };
-	char buf[8192], *line, *save = NULL;
+	char first[8192], *text = proc_text(tid, "status", first, sizeof first);
+	int result;
 
-	*status = (struct proc_status){ .locked_kb = -1 };
-	if (proc_read(tid, "status", buf, sizeof buf) <= 0)
+	if (!text)
 		return -1;
-	for (line = strtok_r(buf, "\n", &save); line; line = strtok_r(NULL, "\n", &save)) {
-		const char *value = strchr(line, '\t');
-
-		if (!value)
-			continue;
-		if (!strncmp(line, "NSpid:", 6))
-			status->inside = atoi(strrchr(line, '\t') + 1);
-		else if (!strncmp(line, "TracerPid:", 10))
-			status->tracer = atoi(value);
-		else if (!strncmp(line, "SigCgt:", 7))
-			status->caught = strtoull(value, NULL, 16);
-		else if (!strncmp(line, "VmLck:", 6))
-			status->locked_kb = strtoll(value, NULL, 10);
-		else if (!strncmp(line, "Uid:", 4))
-			parse_ids(value, status->uid);
-		else if (!strncmp(line, "Gid:", 4))
-			parse_ids(value, status->gid);
-		else if (!strncmp(line, "Groups:", 7))
-			parse_groups(value, status);
-		else if (!strncmp(line, "NoNewPrivs:", 11))
-			status->no_new_privs = (uint32_t)atoi(value);
-		else if (!strncmp(line, "x86_Thread_features:", 20))
-			status->shadow_stack = strstr(value, "shstk") != NULL;
-		else if (!strncmp(line, "Seccomp:", 8))
-			status->seccomp = (uint32_t)atoi(value);
-		else if (!strncmp(line, "Seccomp_filters:", 16))
-			status->seccomp_filters = (uint32_t)atoi(value);
-		else
-			for (int i = 0; i < 5; i++)
-				if (!strncmp(line, caps[i], 7))
-					status->caps[i] = strtoull(value, NULL, 16);
-	}
-	return 0;
+	result = proc_parse_status(text, status);
+	if (text != first)
+		free(text);
+	return result;
 }
 
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2])
 {
-	char buf[4096], *line;
+	char buf[4096];
 
-	if (proc_read(pid, "limits", buf, sizeof buf) <= 0)
-		return -1;
-	line = buf;
-	for (int i = 0; i < LIMITS; i++) {
-		line = strchr(line, '\n');
-		if (!line || strlen(++line) < LIMIT_NAME)
-			return -1;
-		for (int k = 0; k < 2; k++) {
-			char *value = line + LIMIT_NAME + k * LIMIT_VALUE;
-
-			limit[i][k] = *value == 'u' ? ~UINT64_C(0) : strtoull(value, NULL, 10);
-		}
-	}
-	return 0;
+	return proc_read(pid, "limits", buf, sizeof buf) <= 0 ? -1 : proc_parse_limits(buf, limit);
 }
 
 struct linux_dirent64 {
@@ -465,13 +324,12 @@ int proc_thread_count(int task_dirfd)
 long proc_vm_pages(int statm_fd, long *anonymous)
 {
 	char buf[128];
-	long pages, resident, of_files;
+	long pages, of_no_file;
 
-	if (read_text(statm_fd, buf, sizeof buf) <= 0 ||
-	    sscanf(buf, "%ld %ld %ld", &pages, &resident, &of_files) != 3)
+	if (read_text(statm_fd, buf, sizeof buf) <= 0 || proc_parse_statm(buf, &pages, &of_no_file))
 		return -1;
 	if (anonymous)
-		*anonymous = resident - of_files;
+		*anonymous = of_no_file;
 	return pages;
 }
 
@@ -494,20 +352,8 @@ int proc_pidfd_open(pid_t pid)
 int proc_sched(pid_t tid, struct proc_sched *sched)
 {
 	char buf[4096];
-	const char *ran, *switches, *migrations;
-	unsigned long long ms, ns;
 
-	if (proc_read(tid, "sched", buf, sizeof buf) <= 0)
-		return -1;
-	ran = strstr(buf, "\nse.exec_start");
-	switches = strstr(buf, "\nnr_switches");
-	migrations = strstr(buf, "\nse.nr_migrations");
-	if (!ran || !switches || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
-	    sscanf(switches, " %*s : %lu", &sched->switches) != 1 ||
-	    sscanf(migrations, " %*s : %lu", &sched->migrations) != 1)
-		return -1;
-	sched->ran_ns = ms * NS_PER_MS + ns;
-	return 0;
+	return proc_read(tid, "sched", buf, sizeof buf) <= 0 ? -1 : proc_parse_sched(buf, sched);
 }
 
 /* A task gets the flag before it closes anything (kernel/exit.c, do_exit()). */

@@ -288,6 +288,8 @@ bool files_is_closed(const struct files_held *held);
 /* fdinfo of a descriptor: O_CLOEXEC, locks, and what is in anonymous inodes.  True if
  * it says that it is of that kind. */
 bool file_read_info(pid_t pid, struct file *file);
+/* The same of the text, which it changes. */
+bool file_parse_info(struct file *file, char *text);
 /* Of an eventfd of ours. */
 uint64_t file_count(int fd);
 

@@ -11,77 +11,41 @@
 
 #include "files.h"
 
-#define TEXT_MAX (8u << 20) /* about 100,000 descriptors, or 60,000 files, that are watched  */
+/* Of the arrays: how many elements there is memory for. */
+struct rooms {
+	uint32_t locks, watches, marks;
+};
 
-/* All of a file of /proc, NUL at the end; NULL if it can not be had.  `first` is used
- * when it is large enough. */
-static char *read_all(int fd, char *first, size_t first_bytes)
+/* As make_room(), of what a checkpoint may have. */
+static bool take_room(void *array, uint32_t count, uint32_t *room, size_t bytes)
 {
-	char *text = first;
-	size_t room = first_bytes, used = 0;
-
-	for (;;) {
-		const ssize_t n = read(fd, text + used, room - used - 1);
-
-		if (n < 0)
-			goto failed;
-		if (n == 0)
-			break;
-		used += (size_t)n;
-		if (used > TEXT_MAX) {
-			budget_exceed(
-				AVC_UNSUPPORTED,
-				"it watches more by one epoll or inotify descriptor than can be kept");
-			goto failed;
-		}
-		if (room - used < 512) {
-			char *more = realloc(text == first ? NULL : text, 4 * room);
-
-			if (!more)
-				goto failed;
-			if (text == first)
-				memcpy(more, first, used);
-			text = more;
-			room *= 4;
-		}
-	}
-	text[used] = 0;
-	return text;
-failed:
-	if (text != first)
-		free(text);
-	return NULL;
+	return count < *room ||
+	       (budget_take((*room ? *room : 16) * bytes) && make_room(array, count, room, bytes));
 }
 
 /* "1: POSIX  ADVISORY  WRITE 14092 fe:00:2147490 5 14" */
-static void add_lock(struct file *file, const char *line)
+static void add_lock(struct file *file, const char *line, uint32_t *room)
 {
 	char kind[16], mode[16], way[16], end[24];
+	struct file_lock lock;
 	long long start;
-	struct file_lock *more;
 
 	if (sscanf(line, "%*d: %15s %15s %15s %*d %*s %lld %23s", kind, mode, way, &start, end) !=
 	    5)
 		return;
-	more = budget_take(sizeof *more)
-		       ? realloc(file->lock, (file->lock_count + 1) * sizeof *more)
-		       : NULL;
-	if (!more)
-		return;
-	file->lock = more;
-	more += file->lock_count;
 	if (!strcmp(kind, "FLOCK"))
-		more->kind = LOCK_FLOCK_;
+		lock.kind = LOCK_FLOCK_;
 	else if (!strcmp(kind, "POSIX"))
-		more->kind = LOCK_POSIX_;
+		lock.kind = LOCK_POSIX_;
 	else if (!strcmp(kind, "OFDLCK"))
-		more->kind = LOCK_OFD_;
+		lock.kind = LOCK_OFD_;
 	else
 		return; /* a lease */
-	more->exclusive = !strcmp(way, "WRITE");
-	more->start = start;
-	more->end = strcmp(end, "EOF") ? atoll(end) : -1;
-	file->lock_count++;
+	lock.exclusive = !strcmp(way, "WRITE");
+	lock.start = start;
+	lock.end = strcmp(end, "EOF") ? atoll(end) : -1;
+	if (take_room(&file->lock, file->lock_count, room, sizeof lock))
+		file->lock[file->lock_count++] = lock;
 }
 
 static void add_watch(struct file *file, const char *line, uint32_t *room)
@@ -92,18 +56,18 @@ static void add_watch(struct file *file, const char *line, uint32_t *room)
 	if (sscanf(line, " %d events: %x data: %llx", &watch.fd, &watch.events, &data) != 3)
 		return;
 	watch.data = data;
-	if (file->watch_count == *room) {
-		const uint32_t wanted = *room ? 2 * *room : 32;
-		struct file_watch *more = budget_take((wanted - *room) * sizeof *more)
-						  ? realloc(file->watch, wanted * sizeof *more)
-						  : NULL;
+	if (take_room(&file->watch, file->watch_count, room, sizeof watch))
+		file->watch[file->watch_count++] = watch;
+}
 
-		if (!more)
-			return;
-		file->watch = more;
-		*room = wanted;
-	}
-	file->watch[file->watch_count++] = watch;
+/* Two hex digits for each byte.  False: there is less. */
+static bool parse_handle(const char *text, uint8_t *handle, uint32_t bytes)
+{
+	if (strspn(text, "0123456789abcdef") < 2 * (size_t)bytes)
+		return false;
+	for (uint32_t i = 0; i < bytes; i++)
+		(void)sscanf(text + 2 * i, "%2hhx", &handle[i]);
+	return true;
 }
 
 /* "5 ino:3f7e8 sdev:fe00000 mask:fff ignored_mask:0 fhandle-bytes:8 fhandle-type:1
@@ -124,23 +88,11 @@ static void add_mark(struct file *file, const char *line, uint32_t *room)
 	mark.ino = ino;
 	mark.dev = dev;
 	mark.handle_type = (int)type;
-	if (!at || mark.handle_bytes > sizeof mark.handle)
+	if (!at || mark.handle_bytes > sizeof mark.handle ||
+	    !parse_handle(line + at, mark.handle, mark.handle_bytes))
 		mark.handle_bytes = 0;
-	for (uint32_t i = 0; i < mark.handle_bytes; i++)
-		if (sscanf(line + at + 2 * i, "%2hhx", &mark.handle[i]) != 1)
-			mark.handle_bytes = 0;
-	if (file->mark_count == *room) {
-		const uint32_t wanted = *room ? 2 * *room : 8;
-		struct file_mark *more = budget_take((wanted - *room) * sizeof *more)
-						 ? realloc(file->mark, wanted * sizeof *more)
-						 : NULL;
-
-		if (!more)
-			return;
-		file->mark = more;
-		*room = wanted;
-	}
-	file->mark[file->mark_count++] = mark;
+	if (take_room(&file->mark, file->mark_count, room, sizeof mark))
+		file->mark[file->mark_count++] = mark;
 }
 
 static uint64_t nanoseconds(const char *value)
@@ -160,7 +112,7 @@ static void timer_deadline(struct file *file, uint64_t left_ns)
 				    left_ns;
 }
 
-static void take_line(struct file *file, const char *key, const char *value, uint32_t *room,
+static void take_line(struct file *file, const char *key, const char *value, struct rooms *room,
 		      uint64_t *left_ns)
 {
 	if (!strcmp(key, "flags")) {
@@ -171,7 +123,7 @@ static void take_line(struct file *file, const char *key, const char *value, uin
 	else if (!strcmp(key, "ino"))
 		file->told_ino = strtoull(value, NULL, 10);
 	else if (!strcmp(key, "lock"))
-		add_lock(file, value);
+		add_lock(file, value, &room->locks);
 	else if (!strcmp(key, "eventfd-count"))
 		file->count = strtoull(value, NULL, 16);
 	else if (!strcmp(key, "eventfd-id"))
@@ -193,9 +145,9 @@ static void take_line(struct file *file, const char *key, const char *value, uin
 	else if (!strcmp(key, "Pid"))
 		file->pid = atoi(value);
 	else if (!strcmp(key, "tfd"))
-		add_watch(file, value, room);
+		add_watch(file, value, &room->watches);
 	else if (!strcmp(key, "inotify wd"))
-		add_mark(file, value, room);
+		add_mark(file, value, &room->marks);
 }
 
 /* The kernel has an order of its own; there may be tens of thousands to be compared. */
@@ -241,22 +193,13 @@ static const struct {
 	{ FILE_PIDFD, "Pid" },
 };
 
-bool file_read_info(pid_t pid, struct file *file)
+bool file_parse_info(struct file *file, char *text)
 {
-	char name[32], first[4096], *text, *line, *next;
+	char *line, *next;
 	uint64_t left_ns = 0;
-	uint32_t room = 0;
+	struct rooms room = { 0 };
 	bool told = false;
-	int fd;
 
-	snprintf(name, sizeof name, "fdinfo/%d", file->fd);
-	fd = proc_open(pid, name, O_RDONLY);
-	if (fd < 0)
-		return false;
-	text = read_all(fd, first, sizeof first);
-	close(fd);
-	if (!text)
-		return false;
 	file->lock_count = 0;
 	file->watch_count = 0;
 	file->mark_count = 0;
@@ -277,6 +220,23 @@ bool file_read_info(pid_t pid, struct file *file)
 	sort_watched(file);
 	if (file->kind == FILE_TIMERFD)
 		timer_deadline(file, left_ns);
+	return told;
+}
+
+bool file_read_info(pid_t pid, struct file *file)
+{
+	char name[32], first[4096], *text;
+	bool told;
+
+	snprintf(name, sizeof name, "fdinfo/%d", file->fd);
+	text = proc_text(pid, name, first, sizeof first);
+	if (!text && errno == EFBIG)
+		budget_exceed(
+			AVC_UNSUPPORTED,
+			"it watches more by one epoll or inotify descriptor than can be kept");
+	if (!text)
+		return false;
+	told = file_parse_info(file, text);
 	if (text != first)
 		free(text);
 	return told;

@@ -83,29 +83,31 @@ int file_open_path(const struct file *want, pid_t init, const struct file_rights
 	return fd;
 }
 
+struct mapped_look {
+	const struct file *want;
+	pid_t template;
+	int fd;
+};
+
+static int try_mapped(const struct mapping *m, void *arg)
+{
+	struct mapped_look *look = arg;
+
+	if (m->inode != look->want->ino)
+		return 0;
+	look->fd = proc_open_mapped(look->template, m->start, m->end, O_PATH);
+	if (look->fd >= 0 && !is_the_one(look->fd, look->want))
+		close_fd(&look->fd);
+	return look->fd >= 0 ? -1 : 0;
+}
+
 /* A file without a name may still be mapped into the template. */
 static int open_mapped(const struct file *want, pid_t template)
 {
-	char path[64], line[512];
-	FILE *maps;
-	int fd = -1;
+	struct mapped_look look = { .want = want, .template = template, .fd = -1 };
 
-	snprintf(path, sizeof path, "/proc/%d/maps", template);
-	maps = fopen(path, "re");
-	if (!maps)
-		return -1;
-	while (fd < 0 && fgets(line, sizeof line, maps)) {
-		unsigned long start, end, ino;
-
-		if (sscanf(line, "%lx-%lx %*s %*x %*s %lu", &start, &end, &ino) != 3 ||
-		    ino != want->ino)
-			continue;
-		fd = proc_open_mapped(template, start, end, O_PATH);
-		if (fd >= 0 && !is_the_one(fd, want))
-			close_fd(&fd);
-	}
-	fclose(maps);
-	return fd;
+	(void)proc_mappings(template, "maps", try_mapped, &look);
+	return look.fd;
 }
 
 static int open_empty(const struct file *want)

@@ -7,6 +7,7 @@
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <limits.h>
 #include <linux/openat2.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -23,23 +24,6 @@
 #define SET_NEXT_WD _IOW('I', 0, int32_t)
 
 /* ---- where it is ---------------------------------------------------------------- */
-
-/* Of mountinfo: "\040" and the like stand for blanks. */
-static void unescape(char *path)
-{
-	char *to = path;
-	unsigned int code;
-
-	for (const char *p = path; *p;) {
-		if (*p == '\\' && sscanf(p + 1, "%3o", &code) == 1) {
-			*to++ = (char)code;
-			p += 4;
-		} else {
-			*to++ = *p++;
-		}
-	}
-	*to = 0;
-}
 
 /* A server is asked nothing while the app is dead (files.c). */
 static bool is_served(const char *type)
@@ -85,31 +69,32 @@ struct file_system {
 	/* The root of most containers.  Its handles can not be opened, but in them are
 	 * those of the file system below, to which the anchor belongs.           */
 	bool overlay;
-	char point[2048]; /* where it is mounted                               */
+	char point[PATH_MAX]; /* where it is mounted                               */
 };
 
 static void try_mount(struct file_system *fs, pid_t init, char *line)
 {
-	char *type = strstr(line, " - "), *upper;
+	struct proc_mount mount;
 	struct proc_stat stat;
-	unsigned int major, minor;
+	char *upper;
 	int at = -1;
 
-	if (sscanf(line, "%*d %*d %u:%u %*s %2047s", &major, &minor, fs->point) != 3 ||
-	    ((uint64_t)major << 20 | minor) != fs->dev || !type || is_served(type + 3))
+	if (!proc_parse_mount(line, &mount) ||
+	    ((uint64_t)mount.major << 20 | mount.minor) != fs->dev || is_served(mount.type) ||
+	    strlen(mount.point) >= sizeof fs->point)
 		return;
-	unescape(fs->point);
-	fs->overlay = !strncmp(type + 3, "overlay ", 8);
-	upper = fs->overlay ? strstr(type, ",upperdir=") : NULL;
+	strcpy(fs->point, mount.point);
+	fs->overlay = !strcmp(mount.type, "overlay");
+	upper = fs->overlay ? strstr(mount.details, ",upperdir=") : NULL;
 	if (upper) {
 		upper += 10;
-		upper[strcspn(upper, ",\n")] = 0;
-		unescape(upper);
+		upper[strcspn(upper, ",")] = 0;
+		proc_unescape(upper);
 		/* A path of the host's; init's parent is the container's monitor there. */
 		if (proc_stat(init, &stat) == 0)
 			at = open_below(stat.parent, upper);
 	} else if (!fs->overlay) {
-		at = open_below(init, fs->point);
+		at = open_below(init, mount.point);
 	}
 	if (at >= 0)
 		fs->anchor = open_anchor(at);

@@ -9,6 +9,7 @@
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <limits.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -66,35 +67,17 @@ static bool is_worth_it(const char *point, const char *options, const char *type
 	       !starts_with_one_of(type, types);
 }
 
-/* "\040" and the like, as proc(5) writes them. */
-static void unescape(char *text)
-{
-	char *to = text;
-	unsigned int value;
-
-	for (const char *from = text; *from; to++) {
-		if (*from == '\\' && sscanf(from + 1, "%3o", &value) == 1) {
-			*to = (char)value;
-			from += 4;
-		} else {
-			*to = *from++;
-		}
-	}
-	*to = 0;
-}
-
 static void mark(struct files_written *written, pid_t pid, char *line)
 {
-	char point[2048], options[64], type[32], path[2100];
-	const char *rest = strstr(line, " - ");
+	struct proc_mount mount;
+	char path[PATH_MAX];
 
-	if (!rest || sscanf(rest, " - %31s", type) != 1 ||
-	    sscanf(line, "%*d %*d %*s %*s %2047s %63s", point, options) != 2)
+	if (!proc_parse_mount(line, &mount) || !is_worth_it(mount.point, mount.options, mount.type))
 		return;
-	if (!is_worth_it(point, options, type))
+	if (snprintf(path, sizeof path, "/proc/%d/root%s", pid, mount.point) >= (int)sizeof path) {
+		written->errnum = ENAMETOOLONG;
 		return;
-	unescape(point);
-	snprintf(path, sizeof path, "/proc/%d/root%s", pid, point);
+	}
 	if (fanotify_mark(written->fd, FAN_MARK_ADD | FAN_MARK_MOUNT, FAN_MODIFY, AT_FDCWD, path) &&
 	    errno != ENOENT && errno != EACCES)
 		written->errnum = errno;

@@ -87,52 +87,54 @@ static void note_old_pad(struct process *process, avc_remote base, avc_remote en
 	process->old_parasite[process->old_parasites++].bytes = end - base;
 }
 
+struct survey {
+	struct process *process;
+	avc_remote pc, cave, pad, pad_end; /* pad: the one that is being gone through     */
+	bool in_stub;
+};
+
 /* Of a parasite that is there, or was being brought in (bring_parasite). */
-static bool is_of_pad(const char *line)
+static bool is_of_pad(const struct mapping *m)
 {
-	return strstr(line, "/memfd:" PARASITE_NAME " (deleted)") ||
-	       strstr(line, "/dev/zero (deleted)");
+	return !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)") ||
+	       !strcmp(m->name, "/dev/zero (deleted)");
+}
+
+static int survey_mapping(const struct mapping *m, void *arg)
+{
+	struct survey *survey = arg;
+	struct process *process = survey->process;
+	const bool code = m->mode[2] == 'x' && !m->shared;
+
+	/* In pieces, one right behind the other. */
+	if (is_of_pad(m)) {
+		if (m->start != survey->pad_end || is_place_of_pads(m->start)) {
+			note_old_pad(process, survey->pad, survey->pad_end);
+			survey->pad = m->start;
+		}
+		survey->pad_end = m->end;
+	}
+	if (code && survey->pc < m->end && survey->pc >= m->end - CAVE_BYTES)
+		survey->in_stub = has_stub(process->mem_fd, m->end);
+	if (code && m->mode[0] == 'r' && (!survey->cave || !strcmp(m->name, "[vdso]")) &&
+	    (has_cave(process->mem_fd, m->end) || has_stub(process->mem_fd, m->end)))
+		survey->cave = m->end - CAVE_BYTES;
+	return 0;
 }
 
 /* Finds a cave, and the parasites of guards that died.  Fails if the stopped main thread
  * is still in one of those, or in a stub. */
 static int survey(struct process *process, avc_remote pc, avc_remote *cave, struct avc_error *err)
 {
-	char path[64], line[512];
-	avc_remote pad = 0, pad_end = 0;
-	bool in_stub = false;
-	FILE *maps;
+	struct survey survey = { .process = process, .pc = pc };
 
 	*cave = 0;
 	process->old_parasites = 0;
-	snprintf(path, sizeof path, "/proc/%d/maps", process->pid);
-	maps = fopen(path, "re");
-	if (!maps)
-		return fail_errno(err, process->pid, "infect", "open(maps)", "it has ended");
-	while (fgets(line, sizeof line, maps)) {
-		unsigned long start, end;
-		char mode[5];
-
-		if (sscanf(line, "%lx-%lx %4s", &start, &end, mode) != 3)
-			continue;
-		/* In pieces, one right behind the other. */
-		if (is_of_pad(line)) {
-			if (start != pad_end || is_place_of_pads(start)) {
-				note_old_pad(process, pad, pad_end);
-				pad = start;
-			}
-			pad_end = end;
-		}
-		if (mode[2] == 'x' && mode[3] == 'p' && pc < end && pc >= end - CAVE_BYTES)
-			in_stub = has_stub(process->mem_fd, end);
-		if (mode[0] == 'r' && mode[2] == 'x' && mode[3] == 'p' &&
-		    (!*cave || strstr(line, "[vdso]")) &&
-		    (has_cave(process->mem_fd, end) || has_stub(process->mem_fd, end)))
-			*cave = end - CAVE_BYTES;
-	}
-	fclose(maps);
-	note_old_pad(process, pad, pad_end);
-	if (in_stub || parasite_is_old(process, pc))
+	if (proc_mappings(process->pid, "maps", survey_mapping, &survey))
+		return fail_errno(err, process->pid, "infect", "read(maps)", "it has ended");
+	note_old_pad(process, survey.pad, survey.pad_end);
+	*cave = survey.cave;
+	if (survey.in_stub || parasite_is_old(process, pc))
 		return fail(err, AVC_DEADLINE, 0, process->pid, "infect", "",
 			    "still on its way home from a guard that died");
 	if (!*cave)

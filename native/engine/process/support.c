@@ -59,32 +59,30 @@ static int check_descriptors(struct process *process, struct avc_error *err)
 	return result;
 }
 
+static int check_mapping(const struct mapping *m, void *arg)
+{
+	const char **reason = arg;
+
+	if (!strncmp(m->name, "/[aio]", 6))
+		*reason = "it uses kernel AIO";
+	/* Those of files are found in the first clone. */
+	if (!m->shared && !m->offset && !strncmp(m->name, "/anon_hugepage", 14))
+		*reason = memory_private_huge_pages;
+	return *reason ? -1 : 0;
+}
+
 /* Only when its size has changed: the file is long. */
 static int check_mappings(struct process *process, struct avc_error *err)
 {
 	const long pages = proc_vm_pages(process->statm_fd, NULL);
-	char path[64], line[512];
-	int result = 0;
-	FILE *maps;
+	const char *reason = NULL;
 
 	if (pages == process->surveyed_pages)
 		return 0;
-	snprintf(path, sizeof path, "/proc/%d/maps", process->pid);
-	maps = fopen(path, "re");
-	if (!maps)
-		return fail_errno(err, process->pid, "check", "open(maps)", "it has ended");
-	while (!result && fgets(line, sizeof line, maps)) {
-		if (strstr(line, " /[aio]"))
-			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
-				      "it uses kernel AIO");
-		/* Those of files are found in the first clone. */
-		if (strstr(line, "p 0") && strstr(line, " /anon_hugepage"))
-			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s",
-				      memory_private_huge_pages);
-	}
-	fclose(maps);
-	process->surveyed_pages = result ? -1 : pages;
-	return result;
+	if (proc_mappings(process->pid, "maps", check_mapping, &reason) && !reason)
+		return fail_errno(err, process->pid, "check", "read(maps)", "it has ended");
+	process->surveyed_pages = reason ? -1 : pages;
+	return reason ? fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s", reason) : 0;
 }
 
 /* Of one that is just ending they are gone, or EACCES is the answer. */

@@ -64,27 +64,6 @@ static int read_queue(struct pending *pending, pid_t tid, int block, struct avc_
 	}
 }
 
-/* Signals that the app handles, and those that it ignores, as in sigset_t. */
-struct dispositions {
-	uint64_t caught, ignored;
-};
-
-static bool read_dispositions(pid_t pid, struct dispositions *dispositions)
-{
-	char buf[4096], *ignored, *caught;
-
-	*dispositions = (struct dispositions){ 0 };
-	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
-		return false;
-	ignored = strstr(buf, "\nSigIgn:");
-	caught = strstr(buf, "\nSigCgt:");
-	if (!ignored || !caught)
-		return false;
-	dispositions->ignored = strtoull(ignored + 8, NULL, 16);
-	dispositions->caught = strtoull(caught + 8, NULL, 16);
-	return true;
-}
-
 static bool takes(const struct thread *t, int signal)
 {
 	return t->block >= 0 && !(t->sigmask >> (signal - 1) & 1);
@@ -93,10 +72,10 @@ static bool takes(const struct thread *t, int signal)
 /* A thread that was just about to run a handler: its call is cut short by the signal,
  * so it has to get that, also one that any thread could take.  (One that is ignored
  * is queued only because we trace.) */
-static void assign(struct process *process, const struct dispositions *dispositions)
+static void assign(struct process *process, const struct proc_status *status)
 {
 	struct pending *pending = process->pending;
-	const uint64_t handled = dispositions->caught;
+	const uint64_t handled = status->caught;
 
 	for (uint32_t k = 0; k < pending->count; k++) {
 		const int signal = pending->signal[k].info.si_signo;
@@ -128,10 +107,10 @@ static bool ends_by_default(int signal)
 
 /* A process that has got a deadly signal and was stopped by us before it could die of
  * it, or run its handler of a crash: every restore of such an image would die at once. */
-static int find_deadly(const struct process *process, const struct dispositions *dispositions)
+static int find_deadly(const struct process *process, const struct proc_status *status)
 {
 	const struct pending *pending = process->pending;
-	const uint64_t spared = (dispositions->caught & ~FATAL_SIGNALS) | dispositions->ignored;
+	const uint64_t spared = (status->caught & ~FATAL_SIGNALS) | status->ignored;
 
 	for (uint32_t k = 0; k < pending->count; k++) {
 		const int signal = pending->signal[k].info.si_signo;
@@ -152,7 +131,7 @@ static int find_deadly(const struct process *process, const struct dispositions 
 int pending_read(struct process *process, struct avc_error *err)
 {
 	struct pending *pending = process->pending;
-	struct dispositions dispositions;
+	struct proc_status status;
 
 	pending->count = 0;
 	pending->deadly = 0;
@@ -168,11 +147,10 @@ int pending_read(struct process *process, struct avc_error *err)
 		    read_queue(pending, t->tid, t->block, err))
 			return -1;
 	}
-	if (pending->count && read_dispositions(process->pid, &dispositions)) {
-		assign(process, &dispositions);
-		pending->deadly = find_deadly(process, &dispositions);
-		pending->caught = pending->deadly &&
-				  dispositions.caught & SIGNAL_BIT(pending->deadly);
+	if (pending->count && !proc_status(process->pid, &status)) {
+		assign(process, &status);
+		pending->deadly = find_deadly(process, &status);
+		pending->caught = pending->deadly && status.caught & SIGNAL_BIT(pending->deadly);
 	}
 	return 0;
 }

@@ -103,12 +103,12 @@ static int read_mm(pid_t pid, struct process_attrs *attrs)
 
 static int read_status(pid_t pid, struct process_attrs *attrs)
 {
-	char buf[8192], *line;
+	struct proc_status status;
+	char buf[64];
 
-	if (proc_read(pid, "status", buf, sizeof buf) <= 0)
+	if (proc_status(pid, &status))
 		return -1;
-	line = strstr(buf, "\nUmask:");
-	attrs->umask = line ? (uint32_t)strtoul(line + 7, NULL, 8) : 022;
+	attrs->umask = status.umask;
 	attrs->dumped = proc_read(pid, "coredump_filter", buf, sizeof buf) > 0
 				? (int64_t)strtoul(buf, NULL, 16)
 				: -1;

@@ -87,6 +87,8 @@ void pending_setup(const struct process *process, struct setup *setup);
 /* ---- timers.c -------------------------------------------------------------------- */
 
 struct timers *timers_new(void);
+/* What /proc/PID/timers says, which it changes. */
+void timers_parse(struct timers *timers, char *text);
 /* While everything is stopped: what to call first in the list; when that was done. */
 void timers_ask(struct process *process, struct inj_call *call);
 void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns);

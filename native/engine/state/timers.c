@@ -50,11 +50,13 @@ struct timers *timers_new(void)
 
 /* Lines "ID: 0", "signal: 34/000000000000abcd", "notify: signal/tid.123", "ClockID: 1"
  * (fs/proc/base.c, show_timer). */
-static void parse(struct timers *timers, char *text)
+void timers_parse(struct timers *timers, char *text)
 {
 	struct posix_timer *t = NULL;
 	char *save = NULL;
 
+	timers->count = 0;
+	timers->too_many = false;
 	for (char *line = strtok_r(text, "\n", &save); line; line = strtok_r(NULL, "\n", &save)) {
 		unsigned long value;
 		char how[8], whom[4];
@@ -94,14 +96,13 @@ void timers_ask(struct process *process, struct inj_call *call)
 	ssize_t n;
 
 	timers->count = 0;
-	timers->too_many = false;
 	for (int which = 0; which < ITIMERS; which++)
 		call_add(call, SYS_getitimer, (uint64_t)which,
 			 out + (uint64_t)which * sizeof(struct inj_timer), 0, 0, 0);
 	n = pread(process->timers_fd, timers->text, sizeof timers->text - 1, 0);
 	if (n > 0) {
 		timers->text[n] = 0;
-		parse(timers, timers->text);
+		timers_parse(timers, timers->text);
 	}
 	for (uint32_t i = 0; i < timers->count; i++)
 		call_add(call, SYS_timer_gettime, (uint64_t)timers->posix[i].id,

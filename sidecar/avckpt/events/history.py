@@ -93,7 +93,7 @@ class History:
             self._lines += 1
             try:
                 record = EventRecord.from_json(json.loads(line))
-            except (ValueError, AttributeError, UnicodeDecodeError):
+            except (ValueError, AttributeError, RecursionError):
                 whole = False
                 continue
             if record.seq > last:

@@ -28,6 +28,9 @@ from avckpt.events.vocabulary import (
 from avckpt.guard import Event
 
 
+NUMBERS_BELOW = 1 << 64
+
+
 def said(description: str, default: Any = None, values: tuple[Reason, ...] = ()) -> Any:
     """A field of EventRecord with its meaning, and the values it may have where these are not all of its type."""
     return field(default=default, metadata={"description": description, "values": values})
@@ -112,6 +115,9 @@ def _value(name: str, kind: type, value: object) -> object:
         return from_json(value)
     if issubclass(kind, enum.Enum):
         return kind(value)
+    # JSON has numbers of any length, and Python's JSON has NaN.
+    if isinstance(value, (int, float)) and not -NUMBERS_BELOW < value < NUMBERS_BELOW:
+        raise ValueError(f"{name} is out of range")
     if type(value) is kind or (kind is float and type(value) is int):
         return value
     raise ValueError(f"{name} is {value!r}")

@@ -122,6 +122,8 @@ def why_not_restored(reason: Reason | None, error: AvckptError | None) -> str:
 
 def describe_wait_status(wait_status: int) -> str:
     """A status of waitpid(2) in words: "killed by SIGSEGV", "exited with status 3"."""
+    if not 0 <= wait_status <= 0xFFFF:
+        return f"ended with wait status {wait_status:#x}"
     if os.WIFSIGNALED(wait_status):
         return f"killed by {signal_name(os.WTERMSIG(wait_status))}"
     if os.WIFEXITED(wait_status):

@@ -84,7 +84,7 @@ def health_check_of(found: object, *, has_startup_check: bool = False) -> Health
 
     def seconds(key: str, default: float = 0.0) -> float:
         value = found.get(key) or 0
-        if not isinstance(value, int) or value < 0:
+        if not isinstance(value, int) or not 0 <= value < 1 << 63:  # Go's time.Duration
             raise ValueError(f"{key} is {value!r}")
         return value / 1e9 or default
 

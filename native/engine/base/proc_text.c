@@ -1,0 +1,347 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the texts of /proc say, see proc(5).
+ *
+ * The kernel writes them, but names, paths and lengths in them are the application's: nothing here
+ * takes a line's end, a field or its length for granted (tests/fuzz).
+ */
+#include <errno.h>
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+
+#include "base.h"
+
+static int not_understood(void)
+{
+	errno = EPROTO;
+	return -1;
+}
+
+int proc_parse_stat(const char *text, struct proc_stat *stat)
+{
+	const char *name = strchr(text, '('), *last = strrchr(text, ' '), *p;
+	int tty;
+	unsigned long long start;
+
+	/* The name may hold anything, also ") R": the last ')' ends it. */
+	p = strrchr(text, ')');
+	if (!name || !last || !p || p < name ||
+	    sscanf(p + 1,
+		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu"
+		   " %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %d",
+		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
+		   &stat->tty_group, &stat->flags, &stat->threads, &start,
+		   &stat->exit_signal) != 10)
+		return not_understood();
+	stat->tty = (uint32_t)tty;
+	stat->start = start;
+	stat->exit_status = atoi(last + 1);
+	snprintf(stat->name, sizeof stat->name, "%.*s", (int)(p - name - 1), name + 1);
+	return 0;
+}
+
+int proc_parse_statm(const char *text, long *pages, long *anonymous)
+{
+	long resident, of_files;
+
+	if (sscanf(text, "%ld %ld %ld", pages, &resident, &of_files) != 3 || *pages < 0 ||
+	    resident < 0 || of_files < 0)
+		return not_understood();
+	*anonymous = resident - of_files;
+	return 0;
+}
+
+int proc_parse_sched(const char *text, struct proc_sched *sched)
+{
+	/* In front is the name, as it is, line feeds included: too short for both this and a key. */
+	const char *rest = strstr(text, "\n------"), *ran, *switches, *migrations;
+	unsigned long long ms, ns;
+
+	if (!rest)
+		return not_understood();
+	ran = strstr(rest, "\nse.exec_start");
+	switches = strstr(rest, "\nnr_switches");
+	migrations = strstr(rest, "\nse.nr_migrations");
+	if (!ran || !switches || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
+	    sscanf(switches, " %*s : %lu", &sched->switches) != 1 ||
+	    sscanf(migrations, " %*s : %lu", &sched->migrations) != 1)
+		return not_understood();
+	sched->ran_ns = ms * NS_PER_MS + ns;
+	return 0;
+}
+
+int proc_parse_children(const char *text, pid_t *children, int max)
+{
+	int count = 0;
+
+	while (count < max) {
+		char *next;
+		const long child = strtol(text, &next, 10);
+
+		if (next == text)
+			break;
+		children[count++] = (pid_t)child;
+		text = next;
+	}
+	return count;
+}
+
+/* ---- maps, smaps ---------------------------------------------------------------- */
+
+static const struct {
+	char name[3];
+	enum mapping_flag flag;
+} mapping_flags[] = {
+	{ "dc", MAPPING_DONTFORK },  { "wf", MAPPING_WIPEONFORK }, { "io", MAPPING_DEVICE },
+	{ "lo", MAPPING_LOCKED },    { "dp", MAPPING_DROPPABLE },  { "ht", MAPPING_HUGETLB },
+	{ "hg", MAPPING_HUGE },      { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
+	{ "mg", MAPPING_MERGEABLE }, { "gd", MAPPING_GROWING },    { "sl", MAPPING_SEALED },
+	{ "de", MAPPING_FIXED },     { "pf", MAPPING_FIXED },      { "mm", MAPPING_FIXED },
+};
+
+/* " rd wr mr mw me ac " */
+static uint32_t parse_flags(const char *p)
+{
+	uint32_t flags = 0;
+
+	for (; p[0] == ' ' && p[1] && p[2]; p += 3)
+		for (size_t i = 0; i < sizeof mapping_flags / sizeof *mapping_flags; i++)
+			if (!strncmp(p + 1, mapping_flags[i].name, 2))
+				flags |= mapping_flags[i].flag;
+	return flags;
+}
+
+static bool parse_mapping(const char *line, struct mapping *m)
+{
+	unsigned long start, end, offset, inode;
+	unsigned int major, minor;
+	int name = 0;
+
+	*m = (struct mapping){ 0 };
+	if (sscanf(line, "%lx-%lx %4s %lx %x:%x %lu %n", &start, &end, m->mode, &offset, &major,
+		   &minor, &inode, &name) < 7 ||
+	    strlen(m->mode) != 4)
+		return false;
+	m->device = (uint64_t)major << 32 | minor;
+	m->start = start;
+	m->end = end;
+	m->offset = offset;
+	m->inode = inode;
+	m->shared = m->mode[3] == 's';
+	snprintf(m->name, sizeof m->name, "%.*s", (int)strcspn(line + name, "\n"), line + name);
+	return true;
+}
+
+int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *mapping, void *arg),
+			void *arg)
+{
+	struct mapping m = { 0 };
+	bool known = false; /* smaps: the lines are about m                    */
+	char *line = NULL;
+	size_t size = 0;
+	int result = 0;
+
+	while (!result && getline(&line, &size, text) > 0) {
+		heartbeat();
+		if (smaps && !strncmp(line, "ProtectionKey:", 14)) {
+			m.flags = (uint32_t)strtoul(line + 14, NULL, 10) * MAPPING_KEY_ONE &
+				  MAPPING_KEYS;
+		} else if (smaps && !strncmp(line, "VmFlags:", 8)) {
+			m.flags |= parse_flags(line + 8);
+			if (known)
+				result = fn(&m, arg);
+			known = false;
+		} else if (!smaps || !(line[0] >= 'A' && line[0] <= 'Z')) {
+			known = parse_mapping(line, &m);
+			if (known && !smaps)
+				result = fn(&m, arg);
+		}
+	}
+	if (ferror(text))
+		result = -1;
+	free(line);
+	return result < 0 ? -1 : 0;
+}
+
+int mapping_protection(const struct mapping *m)
+{
+	return (m->mode[0] == 'r' ? PROT_READ : 0) | (m->mode[1] == 'w' ? PROT_WRITE : 0) |
+	       (m->mode[2] == 'x' ? PROT_EXEC : 0);
+}
+
+bool mapping_is_special(const struct mapping *m)
+{
+	return !strncmp(m->name, "[vdso", 5) || !strncmp(m->name, "[vvar", 5);
+}
+
+/* ---- status ---------------------------------------------------------------------- */
+
+/* Those that every process has, a zombie too. */
+enum {
+	HAS_INSIDE = 1,
+	HAS_TRACER = 2,
+	HAS_CAUGHT = 4,
+	HAS_IGNORED = 8,
+	HAS_UID = 16,
+	HAS_GID = 32,
+	HAS_CAPS = 64, /* and those after it */
+	HAS_ALL = 64 * 32 - 1
+};
+
+static bool parse_ids(const char *p, uint32_t id[4])
+{
+	return sscanf(p, "%u %u %u %u", &id[0], &id[1], &id[2], &id[3]) == 4;
+}
+
+static void parse_groups(const char *p, struct proc_status *status)
+{
+	char *next;
+
+	while (status->group_count < STATUS_GROUPS) {
+		const unsigned long group = strtoul(p, &next, 10);
+
+		if (next == p)
+			return;
+		status->groups[status->group_count++] = (uint32_t)group;
+		p = next;
+	}
+}
+
+/* Which of the above the line is. */
+static uint32_t parse_status_line(const char *line, size_t length, struct proc_status *status)
+{
+	static const char *const caps[5] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
+					     "CapAmb:" };
+	const char *value = memchr(line, '\t', length), *last;
+
+	if (!value)
+		return 0;
+	last = memrchr(line, '\t', length);
+	if (!strncmp(line, "NSpid:", 6)) {
+		status->inside = atoi(last + 1);
+		return HAS_INSIDE;
+	}
+	if (!strncmp(line, "TracerPid:", 10)) {
+		status->tracer = atoi(value);
+		return HAS_TRACER;
+	}
+	if (!strncmp(line, "SigCgt:", 7)) {
+		status->caught = strtoull(value, NULL, 16);
+		return HAS_CAUGHT;
+	}
+	if (!strncmp(line, "SigIgn:", 7)) {
+		status->ignored = strtoull(value, NULL, 16);
+		return HAS_IGNORED;
+	}
+	if (!strncmp(line, "Uid:", 4))
+		return parse_ids(value, status->uid) ? HAS_UID : 0;
+	if (!strncmp(line, "Gid:", 4))
+		return parse_ids(value, status->gid) ? HAS_GID : 0;
+	for (int i = 0; i < 5; i++)
+		if (!strncmp(line, caps[i], 7)) {
+			status->caps[i] = strtoull(value, NULL, 16);
+			return (uint32_t)HAS_CAPS << i;
+		}
+	if (!strncmp(line, "VmLck:", 6))
+		status->locked_kb = strtoll(value, NULL, 10);
+	else if (!strncmp(line, "Groups:", 7) && !status->group_count)
+		parse_groups(value, status);
+	else if (!strncmp(line, "Umask:", 6))
+		status->umask = (uint32_t)strtoul(value, NULL, 8);
+	else if (!strncmp(line, "NoNewPrivs:", 11))
+		status->no_new_privs = (uint32_t)atoi(value);
+	else if (!strncmp(line, "x86_Thread_features:", 20))
+		status->shadow_stack = memmem(value, length - (size_t)(value - line), "shstk", 5);
+	else if (!strncmp(line, "Seccomp:", 8))
+		status->seccomp = (uint32_t)atoi(value);
+	else if (!strncmp(line, "Seccomp_filters:", 16))
+		status->seccomp_filters = (uint32_t)atoi(value);
+	return 0;
+}
+
+int proc_parse_status(const char *text, struct proc_status *status)
+{
+	uint32_t has = 0;
+
+	*status = (struct proc_status){ .locked_kb = -1, .umask = 022 };
+	while (*text) {
+		const size_t length = strcspn(text, "\n");
+
+		has |= parse_status_line(text, length, status);
+		text += length + (text[length] == '\n');
+	}
+	/* Half of it would be an application without capabilities or filters. */
+	return has == HAS_ALL ? 0 : not_understood();
+}
+
+/* ---- limits ------------------------------------------------------------------------ */
+
+#define LIMIT_NAME 26 /* columns: fs/proc/base.c, proc_pid_limits() */
+#define LIMIT_VALUE 21
+
+int proc_parse_limits(const char *text, uint64_t limit[LIMITS][2])
+{
+	for (int i = 0; i < LIMITS; i++) {
+		text = strchr(text, '\n');
+		if (!text || strcspn(++text, "\n") < LIMIT_NAME + LIMIT_VALUE)
+			return not_understood();
+		for (int k = 0; k < 2; k++) {
+			const char *value = text + LIMIT_NAME + k * LIMIT_VALUE;
+
+			limit[i][k] = *value == 'u' ? ~UINT64_C(0) : strtoull(value, NULL, 10);
+		}
+	}
+	return 0;
+}
+
+/* ---- mountinfo ---------------------------------------------------------------------- */
+
+static bool is_octal(const char *p)
+{
+	for (int i = 0; i < 3; i++)
+		if (p[i] < '0' || p[i] > (i ? '7' : '3'))
+			return false;
+	return true;
+}
+
+void proc_unescape(char *text)
+{
+	char *to = text;
+
+	for (const char *p = text; *p;) {
+		if (*p == '\\' && is_octal(p + 1)) {
+			*to++ = (char)((p[1] - '0') * 64 + (p[2] - '0') * 8 + (p[3] - '0'));
+			p += 4;
+		} else {
+			*to++ = *p++;
+		}
+	}
+	*to = 0;
+}
+
+bool proc_parse_mount(char *line, struct proc_mount *mount)
+{
+	char *const end = line + strcspn(line, "\n");
+	char *rest = line, *device, *word;
+
+	*end = 0;
+	(void)strsep(&rest, " "); /* its id    */
+	(void)strsep(&rest, " "); /* and its parent's   */
+	device = strsep(&rest, " ");
+	(void)strsep(&rest, " "); /* which part of the file system it is    */
+	mount->point = strsep(&rest, " ");
+	mount->options = strsep(&rest, " ");
+	do
+		word = strsep(&rest, " ");
+	while (word && strcmp(word, "-"));
+	mount->type = strsep(&rest, " ");
+	(void)strsep(&rest, " "); /* what is mounted          */
+	mount->details = rest ? rest : end;
+	if (!mount->type || sscanf(device, "%u:%u", &mount->major, &mount->minor) != 2)
+		return false;
+	proc_unescape(mount->point);
+	return true;
+}
