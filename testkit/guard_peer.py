@@ -6,7 +6,7 @@
 CONFIG is a GuardConfig as JSON.  One guard per init, cookies from 1.  Every event is a line of
 JSON on standard output.  Commands are lines on standard input:
 
-    checkpoint COOKIE TICKET       restore COOKIE TICKET
+    checkpoint COOKIE TICKET       restore COOKIE TICKET      with a time in s behind it: not later
     burst COOKIE TICKET N          N checkpoints back to back; one line {"burst": TICKET, ...} at the end
     check COOKIE MS                kills a guard that has not been heard of for so long
     stop                           stops the guards and ends
@@ -107,7 +107,7 @@ class Peer:
             self.burst = Burst(cookie, ticket, int(words[3]))
             self.guards[cookie].command(Command.CHECKPOINT, ticket)
         else:
-            self.guards[cookie].command(Command[words[0].upper()], ticket)
+            self.guards[cookie].command(Command[words[0].upper()], ticket, *map(float, words[3:]))
 
     def take_events(self) -> None:
         """Tells what happened."""

@@ -154,10 +154,10 @@ class GuardProcess:
         ticket = self.say_command(name, cookie)
         return self.wait_for(lambda event: event.get("ticket") == ticket, f"answer to {name}", timeout_s=timeout_s)
 
-    def say_command(self, name: str, cookie: int = 1) -> int:
-        """The same without waiting for the answer, which has this ticket."""
+    def say_command(self, name: str, cookie: int = 1, within_s: float = 0.0) -> int:
+        """The same without waiting for the answer, which has this ticket; to be begun within that time (0: any)."""
         self.wait("attached", cookie=cookie)
-        return self._say(f"{name} {cookie} %d")
+        return self._say(f"{name} {cookie} %d {within_s}")
 
     def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
         """`n` checkpoints back to back."""

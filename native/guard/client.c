@@ -421,12 +421,13 @@ static int guard_send(struct avc_guard *guard, const struct avc_request *request
 }
 
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
-		      struct avc_error *err)
+		      uint64_t until_ns, struct avc_error *err)
 {
 	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
 					     .kind = AVC_REQUEST_COMMAND,
 					     .command = command,
-					     .ticket = ticket };
+					     .ticket = ticket,
+					     .until_ns = until_ns };
 
 	*err = (struct avc_error){ 0 };
 	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNVOUCH)

@@ -46,6 +46,7 @@ from avckpt.errors import (
     Denied,
     LabelsWrong,
     NothingToRestore,
+    Paused,
     TargetGone,
     Unprotected,
 )
@@ -171,7 +172,7 @@ class Daemon:
     async def command(self, name: str, command: Command) -> tuple[Protected, EventRecord]:
         """Gives a command to a container and waits for the answer.
 
-        Raises NoSuchContainer, Ambiguous, Unprotected, NothingToRestore,
+        Raises NoSuchContainer, Ambiguous, Unprotected, NothingToRestore, Paused,
         DeadlineMissed, TargetGone, or the engine's own error.
         """
         container = self.registry.find(name)
@@ -180,13 +181,15 @@ class Daemon:
             raise Unprotected(f"{container.label} runs unprotected: {container.reason}")
         if command is Command.RESTORE and container.generations == 0:
             raise NothingToRestore(f"{container.label} has nothing to go back to: {container.reason}")
+        if cgroup.is_paused(container.init_pid):
+            raise Paused(f"{container.label} is paused: `podman unpause {container.label}` first")
         ticket = next(self._tickets)
         answer: asyncio.Future[tuple[Event, EventRecord]] = asyncio.get_running_loop().create_future()
         self._answers[ticket] = (container.cookie, answer)
         try:
             if command is Command.RESTORE:
                 watch.rolling_back = Reason.COMMAND
-            watch.guard.command(command, ticket)
+            watch.guard.command(command, ticket, COMMAND_TIMEOUT_S)
             event, record = await asyncio.wait_for(answer, COMMAND_TIMEOUT_S)
         except asyncio.TimeoutError as error:
             raise DeadlineMissed(f"{container.label}: no answer within {COMMAND_TIMEOUT_S:g} s") from error

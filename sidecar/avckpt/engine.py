@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -55,16 +56,18 @@ class Guard:
         # by avc_guard_stop(), so no command may be inside it then.
         self._lock = threading.Lock()
 
-    def command(self, command: Command, ticket: int) -> None:
+    def command(self, command: Command, ticket: int, within_s: float = 0.0) -> None:
         """Hands a command over; the answer is an event with the same `ticket` (not 0).
 
+        One that the guard has not begun within `within_s` (0: any time) is refused.
         Raises TargetGone when the guard has ended.
         """
         err = ffi.new("struct avc_error *")
+        until_ns = time.monotonic_ns() + _ns("time", within_s) if within_s else 0
         with self._lock:
             if self._guard is None:
                 raise TargetGone("its guard has ended", operation=command.name.lower())
-            if lib.avc_guard_command(self._guard, int(command), ticket, err) != 0:
+            if lib.avc_guard_command(self._guard, int(command), ticket, until_ns, err) != 0:
                 raise _error(err)
 
     def configure(self, config: GuardConfig) -> None:

@@ -144,6 +144,12 @@ class DeadlineMissed(AvckptError):
     code = Code.DEADLINE
 
 
+class Paused(AvckptError):
+    """The container is paused (podman pause): nothing in it runs."""
+
+    kind = "paused"
+
+
 class ProtocolError(AvckptError):
     """The other side is not a matching avckpt-init, hook or sidecar."""
 
@@ -222,6 +228,7 @@ _CLASSES: tuple[type[AvckptError], ...] = (
     Unsupported,
     Busy,
     DeadlineMissed,
+    Paused,
     ProtocolError,
     ConfigError,
     LabelsWrong,

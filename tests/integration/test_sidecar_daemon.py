@@ -243,6 +243,28 @@ def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local
         local.wait_for(web, state="protected", generations=1)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("command", ["checkpoint", "restore"])
+def test_a_paused_container_says_so_at_once(command: str, version: int, local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER, ON_COMMAND)
+    take_checkpoint(local.avckpt, "web")
+    app = web.app_pid
+    with freezer(version) as pause, contextlib.ExitStack() as undo:
+        undo.callback(signal.pidfd_send_signal, web.pidfd, signal.SIGKILL)
+        for pid in (web.init_pid, *children_of(web.init_pid)):
+            pause.take(pid)
+        pause.wait()
+        begun = time.monotonic()
+        said = local.avckpt(command, "web", check=False)
+        assert said.status == 1
+        assert "web is paused: `podman unpause web` first" in said.stderr
+        assert time.monotonic() - begun < 10
+        pause.go()
+        take_checkpoint(local.avckpt, "web")
+        row = local.row(web)
+        assert (row["state"], row["restores"], row["generations"], web.app_pid) == ("protected", 0, 2, app)
+
+
 def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:
     web = idle_sidecar.container("web", SLEEPER)
     said = web.hook("prestart", QUICK)

@@ -244,6 +244,23 @@ def test_an_exit_status_that_is_not_restored_is_inits(tmp_path: Path) -> None:
         assert victim.end() == 3
 
 
+def test_a_command_that_came_too_late_is_not_carried_out(tmp_path: Path) -> None:
+    """Who gave it was told that it failed."""
+    with Victim("idle 1 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.command("checkpoint")
+        app = victim.app
+        os.kill(guard.pid, signal.SIGSTOP)
+        begun = time.monotonic()
+        tickets = [guard.say_command(name, within_s=0.1) for name in ("restore", "checkpoint")]
+        wait_until(lambda: time.monotonic() > begun + 0.3, 5, "they are too late")
+        os.kill(guard.pid, signal.SIGCONT)
+        for ticket in tickets:
+            answer = guard.wait_for(lambda event, ticket=ticket: event.get("ticket") == ticket, "an answer")  # type: ignore[misc]
+            assert (answer["kind"], answer["error"]["kind"]) == ("refused", "deadline")
+        assert guard.command("checkpoint")["generation"] == 2
+        assert victim.app == app
+
+
 def test_restores_are_used_up(tmp_path: Path) -> None:
     """The newest keeps crashing, then the one before it, and then it is over, with the app's own status."""
     few = config(restore_max=2, restore_window_s=60.0)

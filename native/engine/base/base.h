@@ -129,6 +129,8 @@ int proc_pidfd_open(pid_t pid);
 int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 /* It is just ending, and may have closed already what it had open. */
 bool proc_is_exiting(pid_t tid);
+/* By SIGKILL, whether or not it has come to its end already. */
+bool proc_is_killed(pid_t pid);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
 	MAPPING_DONTFORK = 1,     /* dc */

@@ -7,6 +7,7 @@
 #include <fcntl.h>
 #include <linux/kcmp.h>
 #include <poll.h>
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -515,6 +516,22 @@ bool proc_is_exiting(pid_t tid)
 	struct proc_stat stat;
 
 	return proc_stat(tid, &stat) || stat.flags & PF_EXITING;
+}
+
+bool proc_is_killed(pid_t pid)
+{
+	static const char *const sets[] = { "\nSigPnd:", "\nShdPnd:" };
+	char buf[4096];
+
+	if (proc_is_exiting(pid) || proc_read(pid, "status", buf, sizeof buf) <= 0)
+		return true;
+	for (size_t i = 0; i < sizeof sets / sizeof *sets; i++) {
+		const char *line = strstr(buf, sets[i]);
+
+		if (line && strtoull(line + strlen(sets[i]), NULL, 16) & 1U << (SIGKILL - 1))
+			return true;
+	}
+	return false;
 }
 
 bool pidfd_ended(int pidfd)

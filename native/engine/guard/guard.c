@@ -179,6 +179,15 @@ static void obey(struct avc_guard *guard, enum avc_command command, uint64_t tic
 	}
 }
 
+/* Who gave the command has said by now that it failed: it must not happen all the same. */
+static void obey_in_time(struct avc_guard *guard, const struct avc_request *request)
+{
+	if (request->until_ns && now_ns() > request->until_ns)
+		guard_refuse(guard, request->ticket, AVC_DEADLINE, "it came too late");
+	else
+		obey(guard, request->command, request->ticket);
+}
+
 /* ---- the daemon ------------------------------------------------------------------- */
 
 /* 1: there is one; 0: none now; -1: there will be no more. */
@@ -200,7 +209,7 @@ static void carry_out(struct avc_guard *guard)
 	send_outbox(guard);
 	while ((found = next_request(guard, &request)) > 0) {
 		if (request.kind == AVC_REQUEST_COMMAND)
-			obey(guard, request.command, request.ticket);
+			obey_in_time(guard, &request);
 		else if (request.kind == AVC_REQUEST_CONFIGURE &&
 			 !config_check(&request.config, &error))
 			guard_take_config(guard, &request.config);

@@ -10,6 +10,9 @@
 
 #include "guard.h"
 
+#define HOLDER_NS (1 * NS_PER_S) /* busy machines */
+#define HOLDER_STEP_US 200
+
 /* ---- death and restore --------------------------------------------------------- */
 
 static int say_restored(void *arg, struct avc_error *err)
@@ -249,6 +252,21 @@ static void reap_tracees(void *arg)
 	guard_reap_unknown(guard);
 }
 
+/* The OOM killer kills whoever has the memory of the one that it has chosen: the holder, too.
+ * Before that one is gone there is no room for what is restored. */
+static void await_killed_holder(struct avc_guard *guard)
+{
+	const struct process *main = &guard->main;
+	const uint64_t end = now_ns() + HOLDER_NS;
+
+	if (!main->holder || !proc_is_killed(main->holder))
+		return;
+	while (!pidfd_ended(main->holder_pidfd) && now_ns() < end) {
+		init_channel_working(&guard->channel);
+		usleep(HOLDER_STEP_US);
+	}
+}
+
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
@@ -285,6 +303,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->pid)
 			process_kill(guard->tree.process[i]);
+	await_killed_holder(guard);
 	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
 		give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (!guard->count) {

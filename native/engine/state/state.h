@@ -42,10 +42,10 @@ struct image {
 	/* The OOM killer's: the app's own, and what it was told of the template (guard_memory.c) */
 	int oom_own, oom_told;
 	bool oom_known;
-	bool sandboxed;        /* has seccomp filters of its own                   */
-	bool headless;         /* its main thread had ended                       */
-	int stop_signal;       /* stopped by that (job control), 0: it was not     */
-	int64_t dumpable;      /* prctl(2), PR_GET_DUMPABLE                        */
+	bool sandboxed;   /* has seccomp filters of its own                   */
+	bool headless;    /* its main thread had ended                       */
+	int stop_signal;  /* stopped by that (job control), 0: it was not     */
+	int64_t dumpable; /* prctl(2), PR_GET_DUMPABLE                        */
 	struct attributes *attributes;
 	struct process_attrs *attrs;  /* of one that its parent is to fork               */
 	struct mem_image *memory;     /* that is not in the template                     */

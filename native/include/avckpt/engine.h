@@ -99,7 +99,7 @@ enum avc_reason {
 	AVC_REASON_UNHEALTHY = 10, /* rolled back by AVC_COMMAND_UNHEALTHY        */
 	AVC_REASON_MEMORY = 11,    /* dropped: AVC_COMMAND_DROP_OLDEST            */
 	AVC_REASON_KILLED = 12,    /* dropped: somebody killed the template (the
-	                            * OOM killer takes templates first)           */
+	                            * OOM killer: guard_memory.c)                 */
 	AVC_REASON_CRASHED = 13,   /* dropped: what was restored from it, or what
 	                            * it was taken from, keeps crashing           */
 	AVC_REASON_EXECUTED = 14   /* dropped: the app is another program now     */
@@ -198,9 +198,10 @@ int32_t avc_guard_pid(struct avc_guard *guard);
 void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns);
 
 /* Hands a command over.  The answer is an event with the same ticket (not 0).
+ * What the guard has not begun by until_ns (CLOCK_MONOTONIC; 0: any time) is refused.
  * Errors: AVC_GONE when the guard has ended, AVC_BUSY when it does not take them. */
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
-		      struct avc_error *err);
+		      uint64_t until_ns, struct avc_error *err);
 
 /* New settings for a guard that runs (their init_pidfd is not looked at).  They hold
  * from the next checkpoint and the next death on.  Held generations stay, up to the

@@ -40,8 +40,9 @@ struct avc_request {
 	uint32_t kind;    /* enum avc_request_kind                            */
 	uint32_t command; /* enum avc_command                                 */
 	uint32_t reserved;
-	uint64_t ticket; /* of the command                                   */
-	uint64_t cookie; /* of the guard's events                            */
+	uint64_t ticket;   /* of the command                                   */
+	uint64_t until_ns; /* CLOCK_MONOTONIC: later it is refused; 0: never too late */
+	uint64_t cookie;   /* of the guard's events                            */
 	struct avc_config config;
 };
 

@@ -35,6 +35,7 @@ from avckpt.errors import (
     DeadlineMissed,
     NoSuchContainer,
     NothingToRestore,
+    Paused,
     TargetGone,
     Unprotected,
     Unsupported,
@@ -59,6 +60,7 @@ STATUS: dict[type[AvckptError], int] = {
     ConfigError: 422,
     TargetGone: 410,
     DeadlineMissed: 504,
+    Paused: 409,
 }
 """HTTP status of an error; 500 for those that are not here."""
 

@@ -77,7 +77,8 @@ class Groups:
     """One per hierarchy."""
     memory: Path | None
     """Where its memory is counted; None: nowhere that we can see."""
-    freezer: Path | None
+    freezers: tuple[Path, ...]
+    """Of both versions, where there are both."""
     memory_version: int = 2
 
     @property
@@ -118,16 +119,18 @@ class Groups:
 
     def is_frozen(self) -> bool:
         """Whether it is paused (podman pause)."""
-        if self.freezer is None:
-            return False
-        state = _read(self.freezer / "freezer.state")
-        return state in ("FROZEN", "FREEZING") or "frozen 1" in _read(self.freezer / "cgroup.events").splitlines()
+        return any(
+            _read(freezer / "freezer.state") in ("FROZEN", "FREEZING")
+            or "frozen 1" in _read(freezer / "cgroup.events").splitlines()
+            for freezer in self.freezers
+        )
 
 
 def groups_of(pid: int) -> Groups:
     """The groups of `pid` that can be seen.  Raises OSError when the process is gone."""
     directories: list[Path] = []
-    memory = freezer = unified = None
+    memory = unified = None
+    freezers: list[Path] = []
     version = 2
     for line in _lines(Path(f"/proc/{pid}/cgroup")):
         _, names, path = line.split(":", 2)
@@ -138,13 +141,22 @@ def groups_of(pid: int) -> Groups:
         directories.append(directory)
         if not controllers:
             unified = directory
+            freezers.append(directory)
         if "memory" in controllers:
             memory, version = directory, 1
         if "freezer" in controllers:
-            freezer = directory
+            freezers.append(directory)
     if memory is None and unified is not None and (unified / "memory.max").exists():
         memory = unified
-    return Groups(tuple(directories), memory, freezer or unified, version)
+    return Groups(tuple(directories), memory, tuple(freezers), version)
+
+
+def is_paused(pid: int) -> bool:
+    """Whether the container of `pid` is (podman pause); False when the process is gone."""
+    try:
+        return groups_of(pid).is_frozen()
+    except OSError:
+        return False
 
 
 def _directory(controllers: frozenset[str], path: str) -> Path | None:

@@ -69,7 +69,7 @@ class Caretaker(Generic[W]):
         try:
             groups = groups_of(ward.container.init_pid)
         except OSError:  # it has just ended
-            groups = Groups((), None, None)
+            groups = Groups((), None, ())
         care = self._cares[ward.container.cookie] = _Care(ward, groups)
         self._tell_limit(care)
         if policy.restore_on.unhealthy:

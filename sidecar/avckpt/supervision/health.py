@@ -28,7 +28,7 @@ from avckpt_hooks.shared.files import read_bounded
 from avckpt_hooks.shared.protocol import MAX_BYTES
 from avckpt_hooks.shared.tell import printable
 
-from avckpt.containers.cgroup import groups_of
+from avckpt.containers.cgroup import is_paused
 from avckpt.containers.process import age_s
 from avckpt.containers.protected import Protected
 from avckpt.errors import AvckptError, TargetGone, of_any
@@ -193,7 +193,7 @@ class _Watcher:
     async def look(self) -> None:
         """One check, and what comes of it.  Raises TargetGone when the container has ended, and nothing else."""
         container = self.ward.container
-        if not container.app_pid or _is_paused(container.init_pid):
+        if not container.app_pid or is_paused(container.init_pid):
             return
         restores = container.restores
         try:
@@ -205,7 +205,7 @@ class _Watcher:
             # Ours to mend, and nothing that a rollback would: not counted.
             self._complain("its health check can not be run", of_any(error))
             return
-        if container.restores != restores or _is_paused(container.init_pid):
+        if container.restores != restores or is_paused(container.init_pid):
             return  # the check has seen two applications, or one that could not answer
         unhealthy = self.pulse.take(done.status == 0, app_age_s)
         if done.status == 0:
@@ -259,10 +259,3 @@ def describe(done: Done, check: HealthCheck) -> str:
     text = f"no answer within {check.timeout_s:g} s" if done.timed_out else f"status {done.status}"
     said = printable(" ".join(done.output.split()))
     return f"{text}: {said[:OUTPUT_SHOWN]}" if said else text
-
-
-def _is_paused(init_pid: int) -> bool:
-    try:
-        return groups_of(init_pid).is_frozen()
-    except OSError:
-        return False
