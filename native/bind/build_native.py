@@ -24,11 +24,11 @@ if __name__ == "__main__":
     os.chdir(NATIVE.parent / "sidecar")
 
 
-def declarations() -> str:
-    """The public headers as cffi's cdef() wants them: no #include, no comments."""
+def declarations(*headers: Path) -> str:
+    """Headers as cffi's cdef() wants them: no #include, no comments."""
     text = []
-    for header in HEADERS:
-        lines = (NATIVE / "include" / header).read_text().splitlines()
+    for header in headers:
+        lines = header.read_text().splitlines()
         text += [line for line in lines if not line.startswith("#include")]
     preprocessed = subprocess.run(
         [os.environ.get("CC", "cc"), "-E", "-P", "-x", "c", "-"],
@@ -46,7 +46,7 @@ def relative(path: Path) -> str:
 
 
 ffibuilder = FFI()
-ffibuilder.cdef(declarations())
+ffibuilder.cdef(declarations(*(NATIVE / "include" / header for header in HEADERS)))
 ffibuilder.set_source(
     "avckpt._native",
     "".join(f'#include "{header}"\n' for header in HEADERS),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from pathlib import Path
 from typing import Any
 
@@ -58,16 +57,6 @@ def test_checkpoints_in_between_do_not_keep_a_crash_loop_alive(poison: Any) -> N
     assert len(restored) in (4, 5), restored
     assert [event["outcome"] for event in victim.events("gave_up")] == ["limit"]
     victim.sidecar.wait_generation(victim.container)  # and the new run is protected
-
-
-def test_crashes_that_are_far_apart_go_on_being_restored(poison: Any) -> None:
-    victim = poison(100000, {"interval": "50ms", "restore.max": "2/1s"}, generation=2)
-    for _ in range(5):
-        victim.kill(signal.SIGKILL)
-        time.sleep(1.2)
-        entry = victim.sidecar.wait_for(victim.container, lambda e: e["generations"] == 2, "both generations again")
-        assert entry["dropped"] == 0
-    assert victim.see().starts == 1
 
 
 def test_a_roll_back_on_command_does_not_count(poison: Any) -> None:

@@ -27,7 +27,7 @@ RESERVED = frozenset({"avckpt.version", "avckpt.name"})
 KEEP_MAX = 16
 """AVC_KEEP_MAX of the engine."""
 RESTORES_MAX = 64
-"""RESTORES_MAX of the engine: how many it remembers."""
+"""AVC_RESTORES_MAX of the engine: how many it remembers."""
 
 SHM_MAX_BYTES = 1_000_000_000
 

@@ -76,8 +76,6 @@ int budget_check(pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- config.c -------------------------------------------------------------- */
 
-#define RESTORES_MAX 64
-
 int config_check(const struct avc_config *config, struct avc_error *err) warn_unused;
 
 /* ---- proc.c ---------------------------------------------------------------- */

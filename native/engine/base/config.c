@@ -12,8 +12,8 @@ int config_check(const struct avc_config *config, struct avc_error *err)
 	if (config->keep < 1 || config->keep > AVC_KEEP_MAX)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
 			    "keep must be 1 to %d", AVC_KEEP_MAX);
-	if (config->restore_max > RESTORES_MAX)
+	if (config->restore_max > AVC_RESTORES_MAX)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
-			    "restore_max must be at most %d", RESTORES_MAX);
+			    "restore_max must be at most %d", AVC_RESTORES_MAX);
 	return 0;
 }

@@ -35,13 +35,6 @@ struct generation {
 	uint64_t taken_ns;
 	uint64_t clone_ns; /* what the clones of it took                      */
 	bool quiescent;
-	/* Taken from a process that had been restored lately: of the same lineage
-	 * as what that one was restored from, and as suspect. */
-	uint32_t lineage;
-	uint32_t crashes;          /* of its lineage, soon after a restore             */
-	uint32_t lost;             /* restores from it that came to nothing            */
-	bool seen;                 /* held when the app was healthy; again so: vouched */
-	bool vouched;              /* the app was healthy well after it was taken      */
 	char written[FILES_NAME];  /* avckpt.files=strict: what was written since; "": none */
 	struct spare spare;        /* of the main process                              */
 	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                   */

@@ -85,41 +85,18 @@ void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, 
 
 static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
 {
+	policy_shrink(&guard->policy);
 	if (!guard->count) {
-		guard->room = 0;
 		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held");
 		return;
 	}
-	guard->room = guard->count - 1;
-	guard_lose_generation(guard, guard_dispensable(guard, false), AVC_REASON_MEMORY, ticket);
+	guard_lose_generation(guard, policy_dispensable(&guard->policy), AVC_REASON_MEMORY, ticket);
 }
 
 static void refill(struct avc_guard *guard)
 {
-	if (guard->room == guard->config.keep)
-		return;
-	guard->room = guard->config.keep;
-	if (!guard->count && guard->config.interval_ns)
+	if (policy_refill(&guard->policy, &guard->config))
 		guard->next_ns = now_ns();
-}
-
-static void vouch(struct avc_guard *guard)
-{
-	guard->vouching = true;
-	guard->proved = true;
-	/* A check that has just passed may have looked at something that a hung app
-	 * left a moment ago: what was taken since the last one waits for the next. */
-	for (uint32_t i = 0; i < guard->count; i++) {
-		guard->generations[i].vouched |= guard->generations[i].seen;
-		guard->generations[i].seen = true;
-	}
-}
-
-static void unvouch(struct avc_guard *guard)
-{
-	guard->vouching = false;
-	for (uint32_t i = 0; i < guard->count; i++)
-		guard->generations[i].vouched = guard->generations[i].seen = false;
 }
 
 static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason reason)
@@ -171,10 +148,10 @@ static void obey(struct avc_guard *guard, enum avc_command command, uint64_t tic
 		refill(guard);
 		break;
 	case AVC_COMMAND_VOUCH:
-		vouch(guard);
+		policy_vouch(&guard->policy);
 		break;
 	case AVC_COMMAND_UNVOUCH:
-		unvouch(guard);
+		policy_unvouch(&guard->policy);
 		break;
 	}
 }
@@ -233,7 +210,7 @@ static void attach(struct avc_guard *guard)
 		}
 		guard->attached = true;
 		guard->unprotected = false;
-		guard->next_ns = guard_interval_end(guard);
+		guard->next_ns = policy_due(&guard->config, now_ns());
 		{
 			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);
 
@@ -469,7 +446,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 		return NULL;
 	guard->socket = socket;
 	guard->cookie = start->cookie;
-	guard->room = start->config.keep;
+	guard->policy.room = start->config.keep;
 	guard->started_ns = now_ns();
 	init_channel_init(&guard->channel);
 	process_init(&guard->main);

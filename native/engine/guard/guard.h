@@ -7,6 +7,7 @@
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
  *   guard_death.c       what follows a death
+ *   policy.c            what is decided in these
  */
 #ifndef AVCKPT_GUARD_H
 #define AVCKPT_GUARD_H
@@ -14,6 +15,7 @@
 #include <poll.h>
 
 #include "avckpt/guard.h"
+#include "policy.h"
 #include "restore.h"
 
 #define OUTBOX_MAX 64 /* events that the daemon has not taken yet                */
@@ -40,19 +42,11 @@ struct avc_guard {
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t
 		dying_until_ns; /* when it was found dying, some time more: see guard_reap_unknown() */
-	uint32_t misses;        /* in a row, of one that is unsupported     */
 	uint64_t reported_ns; /* since when it has been traced by one of its own; 0: it is not */
 	bool cramped;         /* there is no room for spares              */
 	uint64_t ahead_ns;    /* when to guard_work_ahead(); UINT64_MAX: never  */
-	uint32_t room;        /* generations that may be held now         */
-	uint64_t restored_at[RESTORES_MAX]; /* after a crash, not on command    */
-	uint32_t restores, crash_restores;
-	/* Of the process that runs now. */
-	uint32_t lineage, lineages;    /* its own; how many there have been        */
-	uint64_t restored_from;        /* generation, 0: never restored            */
-	uint64_t restored_ns;          /* after a crash; 0: not, or long ago       */
-	bool proved;                   /* got somewhere since it was restored      */
-	bool vouching;                 /* somebody says when the app is healthy    */
+	struct policy policy; /* held[i] is of generations[i]             */
+	uint32_t restores;
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	struct files_written *written; /* avckpt.files=strict; NULL: not yet        */
@@ -71,8 +65,6 @@ uint32_t guard_tend_stragglers(struct avc_guard *guard);
 
 /* ---- guard_configure.c ----------------------------------------------------- */
 
-/* When the next checkpoint is due, an interval from now; UINT64_MAX: on command only. */
-uint64_t guard_interval_end(const struct avc_guard *guard);
 void guard_set_config(struct avc_guard *guard, const struct avc_config *config);
 /* What is held stays, unless there are more than are wanted now. */
 void guard_take_config(struct avc_guard *guard, const struct avc_config *config);
@@ -106,11 +98,9 @@ void guard_reap_dead(struct avc_guard *guard);
 /* A tracee that is a thread of the app's, or ours (tracee_know()). */
 bool guard_knows_tracee(pid_t tid, const void *guard);
 void guard_reap_unknown(const struct avc_guard *guard);
-uint32_t guard_dispensable(const struct avc_guard *guard, bool probation);
 void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
-void guard_count_crash(struct avc_guard *guard, bool hung);
-void guard_drop_unhealthy(struct avc_guard *guard);
-void guard_choose_generation(struct avc_guard *guard, bool used_up);
+/* After a crash: leaves the generation to restore from as the newest, or none. */
+void guard_fall_back(struct avc_guard *guard, bool hung);
 void guard_note_written(struct avc_guard *guard);
 int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		       int pidfd, struct avc_error *err) warn_unused;

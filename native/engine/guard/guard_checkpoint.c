@@ -16,7 +16,6 @@
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
-#define MISSES_UNTIL_UNPROTECTED 3
 #define REPORT_NS (60 * NS_PER_S) /* that a crash reporter may take                       */
 
 /* ---- checkpoint --------------------------------------------------------------- */
@@ -430,16 +429,15 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
-	bool hopeless;
 
-	guard->next_ns = guard_interval_end(guard);
+	guard->next_ns = policy_due(&guard->config, now_ns());
 	if (init_channel_stop_asked(&guard->channel)) {
 		if (ticket)
 			guard_refuse(guard, ticket, AVC_GONE,
 				     "the application has been asked to stop");
 		return;
 	}
-	if (!guard->room) {
+	if (!guard->policy.room) {
 		if (ticket)
 			guard_refuse(guard, ticket, AVC_BUSY,
 				     "memory is short, so no generation is held");
@@ -452,7 +450,6 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	if (take(guard, &event, &error) == 0) {
-		guard->misses = 0;
 		guard->reported_ns = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
@@ -469,20 +466,8 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
-	/* A child process may be gone at the next look: the generations there are
-	 * stay good for a while. */
-	hopeless = error.code == AVC_UNSUPPORTED || error.code == AVC_DENIED ||
-		   error.code == AVC_BUSY;
-	if (is_being_reported(guard, &error)) {
-		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
-		return;
-	}
-	if (hopeless && error.pid != guard->main.pid && guard->count &&
-	    ++guard->misses < MISSES_UNTIL_UNPROTECTED) {
-		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
-		return;
-	}
-	if (hopeless) {
+	if (!is_being_reported(guard, &error) &&
+	    policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
 		guard_unprotect(guard, ticket, &error);
 		return;
 	}

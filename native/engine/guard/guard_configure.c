@@ -6,13 +6,6 @@
 
 #define FREEZE_DEADLINE_NS (50 * NS_PER_MS)
 
-uint64_t guard_interval_end(const struct avc_guard *guard)
-{
-	const uint64_t interval_ns = guard->config.interval_ns;
-
-	return interval_ns ? now_ns() + interval_ns : UINT64_MAX;
-}
-
 void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	guard->config = *config;
@@ -29,18 +22,12 @@ void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	const uint32_t keep = guard->config.keep;
-	uint64_t next;
 
 	guard_set_config(guard, config);
-	/* Who gave generations up because memory is short goes on without them. */
-	if (guard->room == keep || guard->room > config->keep)
-		guard->room = config->keep;
-	while (guard->count > guard->room)
-		guard_drop_generation(guard, guard_dispensable(guard, false));
+	policy_resize(&guard->policy, keep, config->keep);
+	while (guard->count > guard->policy.room)
+		guard_drop_generation(guard, policy_dispensable(&guard->policy));
 	guard_rank_generations(guard);
-	if (!guard->attached)
-		return;
-	next = guard_interval_end(guard);
-	if (next < guard->next_ns || !config->interval_ns)
-		guard->next_ns = next;
+	if (guard->attached)
+		guard->next_ns = policy_due_again(config, guard->next_ns, now_ns());
 }

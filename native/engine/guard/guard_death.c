@@ -22,47 +22,6 @@ static int say_restored(void *arg, struct avc_error *err)
 	return init_channel_verdict(&guard->channel, AVC_VERDICT_RESTORED, err);
 }
 
-static uint32_t restores_within(const struct avc_guard *guard, uint64_t now)
-{
-	uint32_t n = 0;
-
-	for (uint32_t i = 0; i < RESTORES_MAX; i++)
-		n += guard->restored_at[i] &&
-		     now - guard->restored_at[i] < guard->config.restore_window_ns;
-	return n;
-}
-
-/* Whether this death is to be followed by a restore; else why not. */
-static bool is_abnormal(const struct avc_guard *guard, const struct avc_report *report,
-			enum avc_reason *reason)
-{
-	const struct avc_config *config = &guard->config;
-	const int status = report->status;
-
-	if (report->flags & AVC_REPORT_STOP_ASKED) {
-		*reason = AVC_REASON_STOPPED;
-		return false;
-	}
-	if (guard->restore_asked) {
-		*reason = guard->restore_asked;
-		return true;
-	}
-	if (WIFSIGNALED(status)) {
-		*reason = config->restore_on_signal ? AVC_REASON_SIGNAL : AVC_REASON_POLICY;
-		return config->restore_on_signal;
-	}
-	if (WEXITSTATUS(status) == 0) {
-		*reason = AVC_REASON_CLEAN_EXIT;
-		return false;
-	}
-	if (config->restore_on_exit || config->restore_on_status[WEXITSTATUS(status)]) {
-		*reason = AVC_REASON_EXIT;
-		return true;
-	}
-	*reason = AVC_REASON_POLICY;
-	return false;
-}
-
 static void give_up(struct avc_guard *guard, const struct avc_report *report,
 		    enum avc_reason reason, const struct avc_error *error)
 {
@@ -80,7 +39,7 @@ static void give_up(struct avc_guard *guard, const struct avc_report *report,
 	process_unhold(&guard->main);
 	process_close(&guard->main);
 	/* Init ends now, and why is what was told last. */
-	guard->next_ns = UINT64_MAX;
+	guard->next_ns = POLICY_NEVER;
 }
 
 /* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
@@ -120,18 +79,13 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 	guard->main.childless = generation->images == 1;
 }
 
-static void note_restore(struct avc_guard *guard, const struct generation *generation,
-			 enum avc_reason reason)
+static void note_restore(struct avc_guard *guard, enum avc_reason reason)
 {
-	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
+	const uint64_t now = now_ns();
+
+	guard->ahead_ns = now + AHEAD_AFTER_NS;
 	guard->restores++;
-	guard->lineage = generation->lineage;
-	guard->restored_from = generation->number;
-	guard->proved = false;
-	if (reason == AVC_REASON_COMMAND)
-		return;
-	guard->restored_ns = now_ns();
-	guard->restored_at[guard->crash_restores++ % RESTORES_MAX] = guard->restored_ns;
+	policy_restored(&guard->policy, guard->count - 1, reason != AVC_REASON_COMMAND, now);
 }
 
 /* `error`: of a newer generation that would not. */
@@ -173,7 +127,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 	event.reason = reason;
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
-	event.attempt = restores_within(guard, now_ns()) + 1;
+	event.attempt = policy_restores_within(&guard->policy, &guard->config, now_ns()) + 1;
 	while (guard->count) {
 		struct generation *generation = &guard->generations[guard->count - 1];
 		const struct image *image = &generation->image[0];
@@ -203,7 +157,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		if (restore_app(&restore, &failed) == 0) {
 			adopt_family(guard, generation);
 			generation->spare.tried = false; /* that one is used up */
-			note_restore(guard, generation, reason);
+			note_restore(guard, reason);
 			tell_restored(guard, &event, &restore, error);
 			break;
 		}
@@ -271,8 +225,11 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
 	const uint32_t had = guard->count;
+	const struct policy_verdict verdict = policy_judge(&guard->config, report->status,
+							   report->flags & AVC_REPORT_STOP_ASKED,
+							   guard->restore_asked);
+	const enum avc_reason reason = verdict.reason;
 	struct avc_error error = { 0 };
-	enum avc_reason reason;
 
 	rt_priority_begin();
 	guard->channel.death = report->seq;
@@ -282,17 +239,12 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	guard_emit(guard, &event);
 	process_close(&guard->main);
 	guard_kill_lost(guard);
-	if (!is_abnormal(guard, report, &reason)) {
+	if (!verdict.restore) {
 		give_up(guard, report, reason, &error);
 		goto out;
 	}
 	if (reason != AVC_REASON_COMMAND && guard->count) {
-		const uint32_t restores = restores_within(guard, now_ns());
-
-		guard_count_crash(guard, reason == AVC_REASON_UNHEALTHY);
-		if (reason == AVC_REASON_UNHEALTHY)
-			guard_drop_unhealthy(guard);
-		guard_choose_generation(guard, restores >= guard->config.restore_max);
+		guard_fall_back(guard, reason == AVC_REASON_UNHEALTHY);
 		if (!guard->count) {
 			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
 			     "it was restored %u time(s) already", guard->restores);
@@ -314,7 +266,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	} else {
 		if (guard->main.pid)
 			hold_all(guard);
-		guard->next_ns = guard_interval_end(guard);
+		guard->next_ns = policy_due(&guard->config, now_ns());
 	}
 out:
 	rt_priority_end();

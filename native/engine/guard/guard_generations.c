@@ -26,6 +26,7 @@ void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 	guard->count--;
 	memmove(&guard->generations[i], &guard->generations[i + 1],
 		(guard->count - i) * sizeof *guard->generations);
+	policy_drop(&guard->policy, i);
 	guard_rank_generations(guard);
 }
 
@@ -50,14 +51,15 @@ uint32_t guard_free_slot(const struct avc_guard *guard)
 /* Given up before its time; the event is to be emitted. */
 static struct avc_event lost_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason)
 {
-	const struct generation lost = guard->generations[i];
+	const struct policy_generation lost = guard->policy.held[i];
+	const uint64_t taken_ns = guard->generations[i].taken_ns;
 	struct avc_event event;
 
 	guard_drop_generation(guard, i);
 	event = guard_event(guard, AVC_EVENT_DROPPED);
 	event.reason = reason;
 	event.generation = lost.number;
-	event.age_ns = event.at_ns - lost.taken_ns;
+	event.age_ns = event.at_ns - taken_ns;
 	event.attempt = lost.crashes > lost.lost ? lost.crashes : lost.lost;
 	return event;
 }
@@ -325,118 +327,30 @@ void guard_reap_dead(struct avc_guard *guard)
 		guard_emit(guard, &events[i]);
 }
 
-/* ---- which generations are worth keeping ------------------------------------------
- *
- * A bug that is in the state and not in the moment comes back with every restore, and
- * with every checkpoint taken after one.  So for restore_window_ns after a restore the
- * process is on probation: checkpoints of it are of the same lineage as the generation
- * it came from, carry that one's crashes, and take the place of their own kind, so that
- * what is older is still there to go back to.
- */
+/* ---- which generations are worth keeping ------------------------------------------ */
 
-static bool on_probation(const struct avc_guard *guard)
-{
-	return guard->restored_ns &&
-	       now_ns() - guard->restored_ns < guard->config.restore_window_ns;
-}
-
-static int newest_vouched(const struct avc_guard *guard)
-{
-	for (uint32_t i = guard->count; i-- > 0;)
-		if (guard->generations[i].vouched)
-			return (int)i;
-	return -1;
-}
-
-static int newest_seen(const struct avc_guard *guard)
-{
-	for (uint32_t i = guard->count; i-- > 0;)
-		if (guard->generations[i].seen && !guard->generations[i].vouched)
-			return (int)i;
-	return -1;
-}
-
-/* Which one goes next, if one must. */
-uint32_t guard_dispensable(const struct avc_guard *guard, bool probation)
-{
-	const int vouched = newest_vouched(guard), seen = newest_seen(guard);
-
-	if (probation)
-		for (uint32_t i = guard->count; i-- > 0;)
-			if (guard->generations[i].lineage == guard->lineage && (int)i != vouched &&
-			    (int)i != seen)
-				return i;
-	for (uint32_t i = 0; i < guard->count; i++)
-		if ((int)i != vouched && (int)i != seen)
-			return i;
-	return vouched == 0 && guard->count > 1 ? 1 : 0;
-}
-
-/* Takes in a new generation, its lineage known. */
 void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 {
-	const bool probation = on_probation(guard);
+	const uint64_t now = now_ns();
+	const struct policy_generation record =
+		policy_new_generation(&guard->policy, &guard->config, fresh->number, now);
 
-	if (!probation) {
-		guard->restored_ns = 0;
-		guard->lineage = ++guard->lineages;
-	}
-	fresh->lineage = guard->lineage;
-	for (uint32_t i = 0; i < guard->count; i++)
-		if (guard->generations[i].lineage == guard->lineage &&
-		    guard->generations[i].crashes > fresh->crashes)
-			fresh->crashes = guard->generations[i].crashes;
-	while (guard->count >= guard->room)
-		guard_drop_generation(guard, guard_dispensable(guard, probation));
+	while (guard->count >= guard->policy.room)
+		guard_drop_generation(guard, policy_replaced(&guard->policy, &guard->config, now));
 	guard->generations[guard->count++] = *fresh;
+	policy_hold(&guard->policy, record);
 	guard_rank_generations(guard);
-	/* Only a health check can say that a process does not hang. */
-	if (!guard->vouching)
-		guard->proved = true;
 }
 
-/* The process that ran is gone, and nobody wanted that: what it came from is suspect.
- * A hang takes its time to be noticed, so that a hung one is on probation until it was
- * healthy once. */
-void guard_count_crash(struct avc_guard *guard, bool hung)
+void guard_fall_back(struct avc_guard *guard, bool hung)
 {
-	const bool probation = on_probation(guard) ||
-			       (hung && guard->restored_from && !guard->proved);
+	const struct policy_fallback left = policy_crashed(&guard->policy, &guard->config, hung,
+							   now_ns());
 
-	for (uint32_t i = 0; i < guard->count; i++) {
-		struct generation *generation = &guard->generations[i];
-
-		if (generation->lineage == guard->lineage)
-			generation->crashes = probation ? generation->crashes + 1 : 0;
-		if (generation->number == guard->restored_from)
-			generation->lost = probation && !guard->proved ? generation->lost + 1 : 0;
-	}
-}
-
-/* Of a hung process, checkpoints may have been taken for as long as nobody noticed. */
-void guard_drop_unhealthy(struct avc_guard *guard)
-{
-	const int vouched = newest_vouched(guard);
-	const uint32_t good = vouched < 0 ? 0 : (uint32_t)vouched;
-
-	while (guard->count > good + 1)
+	while (guard->count > left.healthy)
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
-}
-
-/* Leaves the generation to restore from as the newest, or none. */
-void guard_choose_generation(struct avc_guard *guard, bool used_up)
-{
-	const uint32_t max = guard->config.restore_max;
-
-	while (guard->count) {
-		const struct generation *newest = &guard->generations[guard->count - 1];
-		const uint32_t tries = guard->count > 1 ? (max + 1) / 2 : max;
-
-		if (!(used_up && (newest->crashes || newest->lost)) &&
-		    newest->lost < (tries ? tries : 1))
-			break;
+	while (guard->count > left.trusted)
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
-	}
 }
 
 /* ---- avckpt.files=strict ----------------------------------------------------- */

@@ -20,6 +20,7 @@
 #include "avckpt/error.h"
 
 #define AVC_KEEP_MAX 16
+#define AVC_RESTORES_MAX 64 /* of avc_config.restore_max */
 
 /* Regular files at a restore. */
 enum avc_files {

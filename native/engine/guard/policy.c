@@ -1,0 +1,247 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the guard decides (policy.h).
+ *
+ * A bug that is in the state and not in the moment comes back with every restore, and
+ * with every checkpoint taken after one.  So for restore_window_ns after a restore the
+ * process is on probation: checkpoints of it are of the same lineage as the generation
+ * it came from, carry that one's crashes, and take the place of their own kind, so that
+ * what is older is still there to go back to.
+ */
+#include <sys/wait.h>
+
+#include "policy.h"
+
+#define MISSES_UNTIL_UNPROTECTED 3
+
+static bool on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
+{
+	return policy->restored_ns && now - policy->restored_ns < config->restore_window_ns;
+}
+
+static int newest_vouched(const struct policy *policy)
+{
+	for (uint32_t i = policy->count; i-- > 0;)
+		if (policy->held[i].vouched)
+			return (int)i;
+	return -1;
+}
+
+/* Which waits to be vouched for, unless it is that one. */
+static int newest_seen(const struct policy *policy)
+{
+	for (uint32_t i = policy->count; i-- > 0;)
+		if (policy->held[i].seen)
+			return (int)i;
+	return -1;
+}
+
+/* ---- checkpoints ------------------------------------------------------------- */
+
+uint64_t policy_due(const struct avc_config *config, uint64_t now)
+{
+	return config->interval_ns ? now + config->interval_ns : POLICY_NEVER;
+}
+
+/* Never later than it was to be, unless there are to be none. */
+uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now)
+{
+	const uint64_t next = policy_due(config, now);
+
+	return next < due || next == POLICY_NEVER ? next : due;
+}
+
+struct policy_generation policy_new_generation(struct policy *policy,
+					       const struct avc_config *config, uint64_t number,
+					       uint64_t now)
+{
+	struct policy_generation fresh = { .number = number };
+
+	if (!on_probation(policy, config, now)) {
+		policy->restored_ns = 0;
+		policy->lineage = ++policy->lineages;
+	}
+	fresh.lineage = policy->lineage;
+	for (uint32_t i = 0; i < policy->count; i++)
+		if (policy->held[i].lineage == fresh.lineage &&
+		    policy->held[i].crashes > fresh.crashes)
+			fresh.crashes = policy->held[i].crashes;
+	return fresh;
+}
+
+uint32_t policy_replaced(const struct policy *policy, const struct avc_config *config, uint64_t now)
+{
+	const int vouched = newest_vouched(policy), seen = newest_seen(policy);
+
+	if (on_probation(policy, config, now))
+		for (uint32_t i = policy->count; i-- > 0;)
+			if (policy->held[i].lineage == policy->lineage && (int)i != vouched &&
+			    (int)i != seen)
+				return i;
+	return policy_dispensable(policy);
+}
+
+void policy_hold(struct policy *policy, struct policy_generation fresh)
+{
+	policy->held[policy->count++] = fresh;
+	policy->misses = 0;
+	/* Only a health check can say that a process does not hang. */
+	if (!policy->vouching)
+		policy->proved = true;
+}
+
+/* A child process may be gone at the next look: the generations there are stay good for a
+ * while. */
+bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
+{
+	if (code != AVC_UNSUPPORTED && code != AVC_DENIED && code != AVC_BUSY)
+		return false;
+	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
+}
+
+/* ---- what is held ------------------------------------------------------------ */
+
+void policy_drop(struct policy *policy, uint32_t i)
+{
+	policy->count--;
+	for (; i < policy->count; i++)
+		policy->held[i] = policy->held[i + 1];
+}
+
+/* The oldest, but not what a roll back of a hung process would need. */
+uint32_t policy_dispensable(const struct policy *policy)
+{
+	const int vouched = newest_vouched(policy), seen = newest_seen(policy);
+
+	for (uint32_t i = 0; i < policy->count; i++)
+		if ((int)i != vouched && (int)i != seen)
+			return i;
+	return vouched == 0 && policy->count > 1 ? 1 : 0;
+}
+
+void policy_shrink(struct policy *policy)
+{
+	policy->room = policy->count ? policy->count - 1 : 0;
+}
+
+bool policy_refill(struct policy *policy, const struct avc_config *config)
+{
+	const bool short_before = policy->room != config->keep;
+
+	policy->room = config->keep;
+	return short_before && !policy->count && config->interval_ns;
+}
+
+/* Who gave generations up because memory is short goes on without them. */
+void policy_resize(struct policy *policy, uint32_t was, uint32_t keep)
+{
+	if (policy->room == was || policy->room > keep)
+		policy->room = keep;
+}
+
+/* A check that has just passed may have looked at something that a hung app left a moment
+ * ago: what was taken since the last one waits for the next. */
+void policy_vouch(struct policy *policy)
+{
+	policy->vouching = true;
+	policy->proved = true;
+	for (uint32_t i = 0; i < policy->count; i++) {
+		policy->held[i].vouched |= policy->held[i].seen;
+		policy->held[i].seen = true;
+	}
+}
+
+void policy_unvouch(struct policy *policy)
+{
+	policy->vouching = false;
+	for (uint32_t i = 0; i < policy->count; i++)
+		policy->held[i].vouched = policy->held[i].seen = false;
+}
+
+/* ---- deaths ------------------------------------------------------------------- */
+
+struct policy_verdict policy_judge(const struct avc_config *config, int status, bool stop_asked,
+				   enum avc_reason asked)
+{
+	if (stop_asked)
+		return (struct policy_verdict){ false, AVC_REASON_STOPPED };
+	if (asked)
+		return (struct policy_verdict){ true, asked };
+	if (WIFSIGNALED(status) && config->restore_on_signal)
+		return (struct policy_verdict){ true, AVC_REASON_SIGNAL };
+	if (WIFSIGNALED(status))
+		return (struct policy_verdict){ false, AVC_REASON_POLICY };
+	if (WEXITSTATUS(status) == 0)
+		return (struct policy_verdict){ false, AVC_REASON_CLEAN_EXIT };
+	if (config->restore_on_exit || config->restore_on_status[WEXITSTATUS(status)])
+		return (struct policy_verdict){ true, AVC_REASON_EXIT };
+	return (struct policy_verdict){ false, AVC_REASON_POLICY };
+}
+
+/* What it came from is suspect.  A hang takes its time to be noticed, so that a hung process
+ * is on probation until it was healthy once. */
+static void count_crash(struct policy *policy, const struct avc_config *config, bool hung,
+			uint64_t now)
+{
+	const bool probation = on_probation(policy, config, now) || (hung && !policy->proved);
+
+	for (uint32_t i = 0; i < policy->count; i++) {
+		struct policy_generation *held = &policy->held[i];
+
+		if (held->lineage == policy->lineage)
+			held->crashes = probation ? held->crashes + 1 : 0;
+		if (held->number == policy->restored_from)
+			held->lost = probation && !policy->proved ? held->lost + 1 : 0;
+	}
+}
+
+/* Where there is something older to go back to, half of the restores are enough. */
+static bool is_trusted(const struct policy *policy, const struct avc_config *config, uint32_t i,
+		       bool used_up)
+{
+	const struct policy_generation *held = &policy->held[i];
+	const uint32_t tries = i > 0 ? (config->restore_max + 1) / 2 : config->restore_max;
+
+	return !(used_up && (held->crashes || held->lost)) && held->lost < (tries ? tries : 1);
+}
+
+struct policy_fallback policy_crashed(struct policy *policy, const struct avc_config *config,
+				      bool hung, uint64_t now)
+{
+	const bool used_up = policy_restores_within(policy, config, now) >= config->restore_max;
+	struct policy_fallback left = { .healthy = policy->count };
+
+	count_crash(policy, config, hung, now);
+	/* Checkpoints may have been taken for as long as nobody noticed the hang. */
+	if (hung && policy->count) {
+		const int vouched = newest_vouched(policy);
+
+		left.healthy = vouched < 0 ? 1 : (uint32_t)vouched + 1;
+	}
+	left.trusted = left.healthy;
+	while (left.trusted && !is_trusted(policy, config, left.trusted - 1, used_up))
+		left.trusted--;
+	return left;
+}
+
+void policy_restored(struct policy *policy, uint32_t i, bool crashed, uint64_t now)
+{
+	policy->lineage = policy->held[i].lineage;
+	policy->restored_from = policy->held[i].number;
+	policy->proved = false;
+	if (!crashed)
+		return;
+	policy->restored_ns = now;
+	policy->restored_at[policy->restores++ % AVC_RESTORES_MAX] = now;
+}
+
+uint32_t policy_restores_within(const struct policy *policy, const struct avc_config *config,
+				uint64_t now)
+{
+	uint32_t n = 0;
+
+	for (uint32_t i = 0; i < AVC_RESTORES_MAX; i++)
+		n += policy->restored_at[i] &&
+		     now - policy->restored_at[i] < config->restore_window_ns;
+	return n;
+}

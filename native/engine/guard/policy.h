@@ -1,0 +1,118 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the guard decides: which deaths are undone, which generation is gone back to and which
+ * one makes way, when to give up, when the next checkpoint is due (docs/policy.md).
+ *
+ * Nothing here acts.  No function makes a system call, reads a clock or has state of its own:
+ * each reads its arguments and changes the `struct policy` that it is given, if anything.
+ * So all of it is tested without an application (tests/unit/test_guard_policy.py).
+ * Times are nanoseconds of CLOCK_MONOTONIC.
+ */
+#ifndef AVCKPT_POLICY_H
+#define AVCKPT_POLICY_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "avckpt/engine.h"
+
+#define POLICY_NEVER UINT64_MAX
+
+/* What is known of a generation that is held. */
+struct policy_generation {
+	uint64_t number;
+	/* A generation taken on probation is of the lineage of the one that its process was
+	 * restored from, and as suspect.  Any other one begins a lineage. */
+	uint32_t lineage;
+	uint32_t crashes; /* of its lineage, soon after a restore             */
+	uint32_t lost;    /* restores from it that came to nothing            */
+	bool seen;        /* held when the app was healthy; again so: vouched */
+	bool vouched;     /* the app was healthy well after it was taken      */
+};
+
+/* All zero but `room` at the start. */
+struct policy {
+	struct policy_generation held[AVC_KEEP_MAX]; /* oldest first        */
+	uint32_t count;
+	uint32_t room;     /* generations that may be held now                */
+	uint32_t lineages; /* that there have been                            */
+	uint32_t misses;   /* in a row, for want of a child process's support */
+	uint32_t restores; /* after a crash, not on command                   */
+	uint64_t restored_at[AVC_RESTORES_MAX]; /* the last of these        */
+	bool vouching;                          /* a health check says when the app is healthy */
+	/* Of the process that runs now. */
+	uint32_t lineage;
+	uint64_t restored_from; /* generation, 0: never restored              */
+	uint64_t restored_ns;   /* after a crash; 0: not, or long ago         */
+	bool proved;            /* got somewhere since it was restored        */
+};
+
+/* ---- checkpoints ------------------------------------------------------------- */
+
+/* An interval from now; POLICY_NEVER: on command only. */
+uint64_t policy_due(const struct avc_config *config, uint64_t now);
+/* The one that was due at `due`, by a new configuration. */
+uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now);
+
+/* The record of a generation that was just taken.  Then policy_replaced() says what makes way
+ * while there is no room, and policy_hold() takes it in. */
+struct policy_generation policy_new_generation(struct policy *policy,
+					       const struct avc_config *config, uint64_t number,
+					       uint64_t now);
+uint32_t policy_replaced(const struct policy *policy, const struct avc_config *config,
+			 uint64_t now);
+void policy_hold(struct policy *policy, struct policy_generation fresh);
+
+/* A checkpoint has failed because of the main process, or of another one.  True: nothing that
+ * is held is any good, the app is unprotected.  False: it is tried again when it is due. */
+bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
+
+/* ---- what is held ------------------------------------------------------------ */
+
+/* held[i] is gone, whatever the reason. */
+void policy_drop(struct policy *policy, uint32_t i);
+/* Which one goes next, if one must.  There is one at least. */
+uint32_t policy_dispensable(const struct policy *policy);
+/* Memory is short: no more are held than there are now, but for one. */
+void policy_shrink(struct policy *policy);
+/* It is not short any more.  True: there is none, so a checkpoint is due at once. */
+bool policy_refill(struct policy *policy, const struct avc_config *config);
+/* `keep` is another one than it `was`. */
+void policy_resize(struct policy *policy, uint32_t was, uint32_t keep);
+
+/* A health check has passed. */
+void policy_vouch(struct policy *policy);
+/* There will be none. */
+void policy_unvouch(struct policy *policy);
+
+/* ---- deaths ------------------------------------------------------------------- */
+
+struct policy_verdict {
+	bool restore;
+	enum avc_reason reason;
+};
+
+/* Of an end with this status (waitpid(2)).  `asked`: why we have killed it ourselves; NONE: we
+ * have not. */
+struct policy_verdict policy_judge(const struct avc_config *config, int status, bool stop_asked,
+				   enum avc_reason asked);
+
+/* How many of the oldest are left: of those after `healthy`, the app may have hung already;
+ * what is restored from those between the two keeps crashing.  The newest of `trusted` is to
+ * be restored; 0: it is over. */
+struct policy_fallback {
+	uint32_t healthy, trusted;
+};
+
+/* The process that ran is gone, and nobody wanted that. */
+struct policy_fallback policy_crashed(struct policy *policy, const struct avc_config *config,
+				      bool hung, uint64_t now);
+
+/* held[i] runs again.  `crashed`: not on command. */
+void policy_restored(struct policy *policy, uint32_t i, bool crashed, uint64_t now);
+
+/* Restores after a crash, as far as they count now. */
+uint32_t policy_restores_within(const struct policy *policy, const struct avc_config *config,
+				uint64_t now);
+
+#endif
