@@ -14,7 +14,8 @@
 #include "fuzz.h"
 #include "guard.h"
 
-static void send_start(int socket, const struct avc_request *request, const int fds[2], size_t count)
+static void send_start(int socket, const struct avc_request *request, const int fds[2],
+		       size_t count)
 {
 	union {
 		char bytes[CMSG_SPACE(2 * sizeof(int))];

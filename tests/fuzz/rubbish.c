@@ -32,8 +32,7 @@ int main(void)
 		if (how & 8)
 			(void)send(AVC_GUARD_FD, input + at, (size_t)bytes, MSG_NOSIGNAL);
 		else
-			(void)send(AVC_GUARD_FD, &event, sizeof event,
-				   MSG_NOSIGNAL);
+			(void)send(AVC_GUARD_FD, &event, sizeof event, MSG_NOSIGNAL);
 		at += bytes;
 	}
 	return 0;
