@@ -113,7 +113,7 @@ bench-trees: setup-build ## measure freeze and restore of process trees beside f
 	@$(VENV)/python -m bench.trees
 
 clean: ## remove what was built here (images and the base's cache stay)
-	rm -rf build .venv native/build native/build-san .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build .venv native/build native/build-san native/build-fuzz .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
 	find hooks sidecar native tests testkit scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
 

@@ -77,7 +77,7 @@ have() { command -v "$1" >/dev/null 2>&1; }
 # no git to ask.
 list_sources() {
 	git ls-files -z --cached --others --exclude-standard -- "$@" 2>/dev/null ||
-		find "$@" \( -name build -o -name build-san -o -name __pycache__ -o -name '*.egg-info' \) -prune \
+		find "$@" \( -name build -o -name build-san -o -name build-fuzz -o -name __pycache__ -o -name '*.egg-info' \) -prune \
 			-o \( -type f -o -type l \) ! -name '*.so' ! -name '_native.c' -print0 2>/dev/null || true
 }
 
