@@ -64,7 +64,7 @@ from avckpt.supervision.notify import Notifier
 log = logging.getLogger("avckpt")
 
 LOOK_S = 5.0
-"""How often is looked for containers that could not be protected when they came."""
+"""Seconds between retries for containers that could not be protected at start."""
 GUARD_LOOK_S = 1.0
 """Seconds between looks whether guards are alive."""
 GUARD_PATIENCE_S = 5.0
@@ -72,7 +72,7 @@ GUARD_PATIENCE_S = 5.0
 GUARD_AGAIN_S = 30.0
 """A guard that is lost sooner than that after the last one is started anew at the next look, not at once."""
 COMMAND_TIMEOUT_S = 30.0
-"""How long a command waits for the engine's answer."""
+"""Seconds that a command waits for the guard's answer."""
 
 
 @dataclass

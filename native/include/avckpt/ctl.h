@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What avckpt-init and the guard (the engine's thread for one container) say
+ * What avckpt-init and the guard (avckpt-guard, one process for each container) say
  * to each other.
  *
  * init makes, before it starts the app:
