@@ -79,6 +79,10 @@ lint: setup-build ## ruff, mypy --strict, layers of the engine, shellcheck, clan
 test-sqlite: setup ## kill SQLite under write load in containers, strict and rewind (KILLS=200; about an hour)
 	@$(VENV)/python -m bench.sqlite --kills $(KILLS)
 
+fuzz: setup-build ## fuzz what reads what containers, hooks and files say: SECONDS=20 for each target (T="proc api": these)
+	@scripts/setup-fuzz.sh
+	@$(VENV)/python -m tests.fuzz --seconds $(if $(filter file,$(origin SECONDS)),20,$(SECONDS)) $(T)
+
 soak: setup-build ## an hour of checkpoints, deaths and restores: does anything leak? (SECONDS=3600)
 	@$(VENV)/python -c 'import matplotlib' 2>/dev/null || $(VENV)/python -m pip install --disable-pip-version-check -q 'matplotlib>=3.6'
 	@$(VENV)/python -m bench.soak --seconds $(SECONDS)
@@ -113,7 +117,7 @@ bench-trees: setup-build ## measure freeze and restore of process trees beside f
 	@$(VENV)/python -m bench.trees
 
 clean: ## remove what was built here (images and the base's cache stay)
-	rm -rf build .venv native/build native/build-san native/build-fuzz .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build .venv native/build native/build-san native/build-fuzz tests/fuzz/build tests/fuzz/build-seeds .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
 	find hooks sidecar native tests testkit scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
 
@@ -121,5 +125,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
+.PHONY: help setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
 .DEFAULT_GOAL := help

@@ -38,6 +38,14 @@ in_podman_dirs() {
 }
 has_netavark() { in_podman_dirs netavark; }
 has_cyclonedds() { echo "#include <dds/dds.h>" | cc -x c -fsyntax-only - 2>/dev/null; }
+has_libfuzzer() {
+	local out status=0
+	out=$(mktemp)
+	echo 'int LLVMFuzzerTestOneInput(const char *data, unsigned long size) { return !data && size; }' |
+		clang -x c -fsanitize=fuzzer,address -o "$out" - 2>/dev/null || status=1
+	rm -f "$out"
+	return "$status"
+}
 has_catatonit() { have catatonit || in_podman_dirs catatonit; }
 
 # The newest of what is needed of each: PTRACE_GET_RSEQ_CONFIGURATION; `podman generate
@@ -77,6 +85,9 @@ optional|iptables|have iptables|bridge networks for containers (Podman 4)
 optional|nftables|have nft|bridge networks for containers (Podman 5)
 lint|clang-format|have clang-format|checks the C code's style
 lint|shellcheck|have shellcheck|checks the shell scripts
+fuzz|clang|have clang|compiles fuzz targets
+fuzz|libclang-rt-dev|has_libfuzzer|libFuzzer and the sanitizers
+fuzz|llvm|have llvm-symbolizer|names the lines of what a sanitizer finds
 optional|runc|have runc|the tests run on both OCI runtimes
 optional|g++|have c++|compiles the C++ program that the tests kill and restore
 optional|cyclonedds-dev|has_cyclonedds|a test of ROS 2's transport
@@ -88,7 +99,10 @@ check_versions
 missing_required=() missing_optional=()
 while IFS='|' read -r need package check why; do
 	[ -n "$need" ] || continue
-	if [ "$need" = lint ] && [ "${1:-}" != lint ]; then continue; fi
+	case $need in
+	required | optional) ;;
+	*) [ "$need" = "${1:-}" ] || continue ;;
+	esac
 	if ! $check; then
 		if [ "$need" != optional ]; then missing_required+=("$package"); else missing_optional+=("$package"); fi
 		note "missing: $package - $why"

@@ -18,6 +18,7 @@ _PLAIN = ("int", "float", "bool", "null")
 
 
 FILE_BYTES = 1 << 20
+BRACKETS_MOST = 50
 VALUES_MOST = 100_000
 """Keys and values of a file when every alias is replaced by what it stands for."""
 
@@ -42,6 +43,15 @@ class Unreadable(Exception):
         self.why = why
 
 
+class _Loader(yaml.SafeLoader):
+    """Not deeper than anybody writes: each token takes PyYAML's scanner as long as the brackets around it are many."""
+
+    def fetch_flow_collection_start(self, token: type[yaml.Token]) -> None:
+        super().fetch_flow_collection_start(token)
+        if self.flow_level > BRACKETS_MOST:
+            raise RecursionError
+
+
 def read(path: Path) -> yaml.Node | None:
     """The root of the only document in `path`; None: the file is empty.  Raises Unreadable.
 
@@ -57,7 +67,7 @@ def read(path: Path) -> yaml.Node | None:
     except UnicodeDecodeError as error:
         raise Unreadable(Place(str(path), 1), f"not UTF-8: {error.reason}") from error
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = yaml.compose(text, Loader=_Loader)
         _expanded(root, path, {})
         return root
     except yaml.MarkedYAMLError as error:

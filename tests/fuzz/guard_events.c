@@ -3,6 +3,7 @@
  * A daemon that gets rubbish from a guard.  The guard is rubbish.c, which says what the input says:
  * flags and length of each packet (a byte each), then its bytes.
  */
+#include <errno.h>
 #include <fcntl.h>
 #include <poll.h>
 #include <stdbool.h>
@@ -13,7 +14,7 @@
 #include "avckpt/engine.h"
 #include "fuzz.h"
 
-enum { COOKIE = 7 };
+enum { COOKIE = 7, PATIENCE_MS = 15000 };
 
 static const char *rubbish(void)
 {
@@ -68,7 +69,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 	guard = avc_guard_start(engine, &config, COOKIE, &err);
 	must(guard != NULL, "avc_guard_start");
 	news = (struct pollfd){ .fd = avc_engine_event_fd(engine), .events = POLLIN };
-	while (!over && poll(&news, 1, 5000) == 1)
+	/* The fuzzer's own timer interrupts it. */
+	while (!over && (poll(&news, 1, PATIENCE_MS) == 1 || errno == EINTR))
 		while (avc_engine_next_event(engine, &event)) {
 			check(&event);
 			over |= event.kind == AVC_EVENT_GUARD_LOST || event.kind == AVC_EVENT_ENDED;

@@ -26,22 +26,23 @@ from types import SimpleNamespace
 from unittest import mock
 
 from avckpt import config, yamlfile
+from avckpt._native import ffi
 from avckpt.api.server import ApiServer
 from avckpt.cli.compose import manifest
 from avckpt.containers.protected import Protected
 from avckpt.containers.records import Records
 from avckpt.daemon import Daemon
-from avckpt.engine import _event, ffi
+from avckpt.engine import _event
 from avckpt.errors import ConfigError, LabelsWrong
 from avckpt.events.history import History
 from avckpt.events.metrics import Metrics
-from avckpt.events.record import of_guard
+from avckpt.events.record import EventRecord, of_guard
 from avckpt.events.vocabulary import Kind, Reason
 from avckpt.guard import GuardConfig
 from avckpt.policy import guard_config, settings_of
 from avckpt.supervision import health
+from avckpt_hooks import VERSION, podman, poststop, precreate, prestart
 from avckpt_hooks import health as hook_health
-from avckpt_hooks import podman, poststop, precreate, prestart
 from avckpt_hooks.shared import labels, protocol, tell
 
 ID = "ab" * 32
@@ -77,9 +78,9 @@ def alone(data: bytes) -> Iterator[io.BytesIO]:
         yield out
 
 
-def is_line(text: str) -> bool:
+def must_be_line(text: str) -> None:
     """What a message may be: one line that does nothing to a terminal."""
-    return text.isprintable()
+    assert text.isprintable(), text
 
 
 # ---- hooks -------------------------------------------------------------------------
@@ -88,14 +89,15 @@ def is_line(text: str) -> bool:
 def hook_config(data: bytes) -> None:
     """A container's OCI configuration and, behind a NUL, what `podman generate spec` says of it."""
     given, _, spec = data.partition(b"\0")
-    with alone(given) as out, mock.patch.object(podman, "generate_spec", lambda *_: spec or b"{}"):
+    with alone(given) as out, mock.patch.object(podman, "generate_spec", return_value=spec or b"{}"):
         status = precreate.main()
     written = out.getvalue()
     assert status in (0, 1)
     if status == 0 and written != given:
-        args = json.loads(written)["process"]["args"]
-        wanted = json.loads(spec or b"{}").get("labels") or {}
-        assert args[0] == precreate.INIT_PATH or "avckpt.notify" in {*wanted, *json.loads(given)["annotations"]}
+        now = json.loads(written)
+        assert now["annotations"]["avckpt.version"] == VERSION
+        if "avckpt.notify" not in now["annotations"]:
+            assert now["process"]["args"][0] == precreate.INIT_PATH
     if b'"avckpt' not in data.lower():
         assert (status, written) == (0, given)
 
@@ -147,7 +149,7 @@ def label(data: bytes) -> None:
         wanted = labels.merge(given, annotations)
         guard_config(labels.parse_policy(wanted))
     except labels.LabelError as error:
-        assert is_line(str(error)), str(error)
+        must_be_line(str(error))
     else:
         settings_of(wanted)
     for key in given:
@@ -192,8 +194,13 @@ def health_answer(data: bytes) -> None:
     """A container's health check, as `podman inspect` told a hook."""
     path = home() / "health.json"
     path.write_bytes(data)
-    told = []
-    check = asyncio.run(health._known(path, lambda event: told.append(event) or event))
+    told: list[EventRecord] = []
+
+    def tell_it(event: EventRecord) -> EventRecord:
+        told.append(event)
+        return event
+
+    check = asyncio.run(health._known(path, tell_it))
     assert (check is None) == bool(told)
     for event in told:
         json.dumps(event.to_json()).encode()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
@@ -111,3 +112,33 @@ def test_the_container_ends_first(guard_program: Path, tmp_path: Path) -> None:
         guard.wait("checkpoint", 3)
         os.kill(victim.pid, signal.SIGKILL)
         wait_until(lambda: guard.count("ended") == 1, 10, "the end is noticed")
+
+
+SCRIBBLED_S = float(os.environ.get("AVCKPT_FUZZ_S", "8"))
+"""How long memory is scribbled on in all; `make fuzz` takes longer."""
+LIFE_S = 2.0
+"""Of a victim, which may not live that long: what it does to itself is its own affair."""
+
+
+def test_the_parasite_is_written_at_random(guard_program: Path, tmp_path: Path) -> None:
+    """Whatever an application writes into what it shares with its guard, while that uses it: the guard lives."""
+    first = int.from_bytes(os.urandom(4), "little")
+    end = time.monotonic() + SCRIBBLED_S
+    found = 0
+    for number in range(10_000):
+        if time.monotonic() > end:
+            break
+        print(f"scribble {first + number}")
+        with (
+            Victim(f"scribble {first + number}", tmp_path) as victim,
+            guarding(guard_program, victim, 10, 0, tmp_path / f"guard-{number}.out") as guard,
+        ):
+            wait_until(
+                lambda: victim.see().counter[0] or guard.count("unprotected") or victim.popen.poll() is not None,
+                20,
+                "it has found the parasite",
+            )
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                victim.popen.wait(LIFE_S)
+            found += victim.see().counter[0]
+    assert found

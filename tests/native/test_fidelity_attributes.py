@@ -34,6 +34,27 @@ def test_traits(kind: str, where: str, tmp_path: Path) -> None:
         kill_at_random(guard, victim, 10, (0.01, 0.12))
 
 
+def test_thousands_of_groups(tmp_path: Path) -> None:
+    """They make /proc/PID/status as long as they like; what comes after them there is not missed."""
+    groups = range(10**9, 10**9 + 3000)
+    with (
+        Victim("threads 4 1", tmp_path, preexec=lambda: os.setgroups(groups)) as victim,
+        GuardProcess(config(0.03), [victim.pid]) as guard,
+    ):
+        before = credentials(victim)
+        kill_at_random(guard, victim, 3, (0.01, 0.12))
+        assert credentials(victim) == before
+        assert len(before["Groups"].split()) == len(groups)
+
+
+def credentials(victim: Victim) -> dict[str, str]:
+    """Of its main process, as /proc has them."""
+    lines = Path(f"/proc/{victim.app}/status").read_text().splitlines()
+    fields = dict(line.split(":", 1) for line in lines)
+    names = [name for name in fields if name in ("Uid", "Gid", "Groups", "NoNewPrivs") or name.startswith("Cap")]
+    return {name: fields[name] for name in names}
+
+
 @pytest.mark.parametrize("where", WHERE)
 def test_a_personality_that_changes(where: str, tmp_path: Path) -> None:
     """Also of a process whose holder was made before."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,10 @@ SEEDS = [(name, path) for name in TARGETS for path in sorted((CORPUS / name).ite
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The run-time directory of the targets, and everything else as it was afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("AVCKPT_RUN_DIR", str(home() / "run"))
-    yield
 
 
 @pytest.mark.parametrize(("name", "path"), SEEDS, ids=[f"{name}-{path.name}" for name, path in SEEDS])

@@ -27,7 +27,6 @@ from avckpt.events.vocabulary import (
 )
 from avckpt.guard import Event
 
-
 NUMBERS_BELOW = 1 << 64
 
 
