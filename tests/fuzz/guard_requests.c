@@ -68,7 +68,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 			if (how & 1)
 				request.config.keep = 1 + request.config.keep % AVC_KEEP_MAX;
 			if (how & 2)
-				request.config.restore_max %= RESTORES_MAX + 1;
+				request.config.restore_max %= AVC_RESTORES_MAX + 1;
 			if (how & 4)
 				request.magic++;
 			must(how & 8 || ftruncate(fds[1], sizeof(struct avc_heartbeat)) == 0,

@@ -155,8 +155,8 @@ def test_how_a_container_wants_to_be_notified(text: str, means: Notify) -> None:
 
 def test_the_engine_takes_every_number_of_restores_that_a_label_may_ask_for() -> None:
     """More would be a container that runs unprotected."""
-    source = (Path(__file__).parents[2] / "native" / "engine" / "base" / "base.h").read_text()
-    assert f"#define RESTORES_MAX {RESTORES_MAX}\n" in source
+    source = (Path(__file__).parents[2] / "native" / "include" / "avckpt" / "engine.h").read_text()
+    assert f"#define AVC_RESTORES_MAX {RESTORES_MAX}" in source
     assert parse_policy({**ON, "avckpt.restore.max": f"{RESTORES_MAX}/1s"}).restore_max == RESTORES_MAX
 
 
