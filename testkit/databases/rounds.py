@@ -71,7 +71,13 @@ class Bank:
         self.container: Container = factory.protected(
             *("python3", "/databases/bank.py", "127.0.0.1", str(observer.port), "/data/bank.db", *arguments),
             # What the bank ends by itself has told why, and is not to be hidden by a restore.
-            labels={"interval": interval, "files": files, "restore.on": "signal", "restore.max": "60/60s"},
+            labels={
+                "interval": interval,
+                "files": files,
+                "restore.on": "signal",
+                "restore.max": "60/60s",
+                "tcp": "keep",
+            },
             options=[
                 *("--network=host", f"--restart={restart}", "--volume", f"{PROGRAM.parent}:/databases:ro"),
                 *("--volume", f"{folder}:/data"),
