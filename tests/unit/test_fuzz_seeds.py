@@ -17,6 +17,7 @@ SEEDS = [(name, path) for name in TARGETS for path in sorted((CORPUS / name).ite
 def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The run-time directory of the targets, and everything else as it was afterwards."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("AVCKPT_RUN_DIR", "")  # before home() sets it, or that would be what is put back
     monkeypatch.setenv("AVCKPT_RUN_DIR", str(home() / "run"))
 
 
