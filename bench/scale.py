@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What many small protected containers cost: CPU and memory of the sidecar, missed checkpoints.
+"""What many small protected containers cost: CPU and memory of sidecar and guards, missed checkpoints.
 
     .venv/bin/python -m bench.scale [--containers 100] [--seconds 60] [--interval 3s]
 
@@ -20,13 +20,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 from avckpt.supervision.pressure import held_bytes, templates_of
 
 from testkit.harness import ROOT, SIDECAR_NAME, ContainerFactory, Podman, Sidecar, machine_lock, running_sidecar
 
 VICTIMS = ROOT / "tests/victims/build-static"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 @dataclass
@@ -37,11 +37,14 @@ class Result:
     interval: str
     seconds: float
     sidecar_cpu_percent: float
+    guards_cpu_percent: float
+    """Of all guard processes together, kernel's work for them included."""
     machine_cpu_percent: float
     """Of all cores, everything on the machine included."""
     idle_machine_cpu_percent: float
     """The same just before, with the same containers and no sidecar: what the containers themselves cost."""
-    sidecar_rss_mb: float
+    sidecar_pss_mb: float
+    guards_pss_mb: float
     generations_mb: float
     """Held by all templates and not used by the applications."""
     checkpoints: int
@@ -95,10 +98,11 @@ def measure(sidecar: Sidecar, factory: ContainerFactory, options: argparse.Names
     wait_protected(sidecar, options.containers)
     pid = int(factory.podman.inspect(SIDECAR_NAME)["State"]["Pid"])
     rows = sidecar.ps()
-    cpu, busy, started = cpu_s(pid), machine_cpu_s(), time.monotonic()
+    sidecar_processes, guards = processes(pid)
+    cpu, guards_cpu, busy, started = cpu_s(sidecar_processes), cpu_s(guards), machine_cpu_s(), time.monotonic()
     time.sleep(options.seconds)
     took = time.monotonic() - started
-    cpu, busy = cpu_s(pid) - cpu, machine_cpu_s() - busy
+    cpu, guards_cpu, busy = cpu_s(sidecar_processes) - cpu, cpu_s(guards) - guards_cpu, machine_cpu_s() - busy
     after, now = sidecar.ps(), time.time()
     freezes = [row["last_freeze_s"] * 1000 for row in after]
     return Result(
@@ -106,9 +110,11 @@ def measure(sidecar: Sidecar, factory: ContainerFactory, options: argparse.Names
         interval=options.interval,
         seconds=round(took, 1),
         sidecar_cpu_percent=round(100 * cpu / took, 2),
+        guards_cpu_percent=round(100 * guards_cpu / took, 2),
         machine_cpu_percent=round(100 * busy / took / (os.cpu_count() or 1), 1),
         idle_machine_cpu_percent=round(idle_percent, 1),
-        sidecar_rss_mb=round(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE_BYTES / 1e6, 1),
+        sidecar_pss_mb=pss_mb(sidecar_processes),
+        guards_pss_mb=pss_mb(guards),
         generations_mb=round(sum(held_bytes(r["app_pid"], templates_of(r["init_pid"])) for r in after) / 1e6, 1),
         checkpoints=total(after, "checkpoints") - total(rows, "checkpoints"),
         missed=total(after, "missed") - total(rows, "missed"),
@@ -131,10 +137,22 @@ def total(rows: list[dict[str, Any]], key: str) -> int:
     return sum(row[key] for row in rows)
 
 
-def cpu_s(pid: int) -> float:
-    """CPU time of a process, all threads."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+def processes(main_pid: int) -> tuple[list[psutil.Process], list[psutil.Process]]:
+    """The sidecar's own processes, and its guards."""
+    main = psutil.Process(main_pid)
+    below = main.children(recursive=True)
+    guards = [process for process in below if process.name() == "avckpt-guard"]
+    return [main, *(process for process in below if process not in guards)], guards
+
+
+def cpu_s(of: list[psutil.Process]) -> float:
+    """CPU time of all their threads."""
+    return sum(times.user + times.system for times in (process.cpu_times() for process in of))
+
+
+def pss_mb(of: list[psutil.Process]) -> float:
+    """What they share with others is counted in proportion."""
+    return round(sum(process.memory_full_info().pss for process in of) / 1e6, 1)
 
 
 def machine_cpu_s() -> float:
