@@ -31,7 +31,7 @@ from avckpt.api.server import ApiServer
 from avckpt.cli.compose import manifest
 from avckpt.containers.protected import Protected
 from avckpt.containers.records import Records
-from avckpt.daemon import Daemon
+from avckpt.daemon import Daemon, Watch
 from avckpt.engine import _event
 from avckpt.errors import ConfigError, LabelsWrong
 from avckpt.events.history import History
@@ -261,13 +261,13 @@ def api_socket() -> str:
 
     async def serve() -> None:
         daemon = Daemon(home() / "run", home() / "config.yaml")
-        daemon.registry.add(
-            Protected(id=ID, name="web", cookie=1, init_pid=os.getpid(), config=CONFIG, registered_at=0)
-        )
-        daemon.registry.add(
-            Protected(id="cd" * 32, name="", cookie=2, init_pid=os.getpid(), config=CONFIG, registered_at=0)
-        )
-        daemon._watches = {cookie: SimpleNamespace(guard=None) for cookie in (1, 2)}  # type: ignore[misc]
+        for cookie, (container_id, name) in enumerate([(ID, "web"), ("cd" * 32, "")], 1):
+            container = Protected(
+                id=container_id, name=name, cookie=cookie, init_pid=os.getpid(), config=CONFIG, registered_at=0
+            )
+            daemon.registry.add(container)
+            # Without a guard: commands are refused, everything else is real.
+            daemon._watches[cookie] = Watch(container, pidfd=-1, labels={}, settings=settings_of({}))
         await ApiServer(daemon, path).start()
         ready.set()
         await asyncio.Event().wait()
