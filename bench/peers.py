@@ -13,7 +13,7 @@ and what is still there afterwards: PID, memory, TCP connection, the container's
 
 Results go into bench/results/peers.json (rows of subjects and sizes that were not
 measured this time stay), plots and a table beside it.  Ends with 1 when something
-could not be measured at all; what a peer can not do is a result, with its own words.
+could not be measured at all; what a peer cannot do is a result, with its own words.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def stop_and_restore(subject: InWorld, client: Client, row: Row) -> None:
 
 
 def measure(subject: Subject, row: Row, cycles: int) -> None:
-    """Fills the row; what a peer can not do becomes a failure in it."""
+    """Fills the row; what a peer cannot do becomes a failure in it."""
     rng = random.Random(row.mb * 1000 + row.threads)
     row.load = round(os.getloadavg()[0], 1)
     try:

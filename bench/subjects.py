@@ -28,7 +28,7 @@ PATIENCE_S = 60.0
 
 
 class BenchFailed(Exception):
-    """It can not be measured; the message says why."""
+    """It cannot be measured; the message says why."""
 
 
 def build() -> None:

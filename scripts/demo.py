@@ -55,7 +55,7 @@ console = Console(highlight=False, soft_wrap=True)
 
 
 class DemoFailed(Exception):
-    """The story can not be told to its end; the message says why."""
+    """The story cannot be told to its end; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def start_tracker(podman: Podman, stack: ExitStack, sidecar: Sidecar) -> tuple[C
     stack.callback(factory.close)
     podman.remove(NAME)  # left by a demo that was killed
     port = free_port()
-    # Some machines (containers, mostly) can not make a bridge: the story is the same without.
+    # Some machines (containers, mostly) cannot make a bridge: the story is the same without.
     bridge = podman.run("run", "--rm", "--pull=never", BASE_IMAGE, "true", check=False).status == 0
     inside, network = (INSIDE_PORT, f"--publish=127.0.0.1:{port}:{INSIDE_PORT}") if bridge else (port, "--network=host")
     with doing(f"podman run --label avckpt.enable=true --label avckpt.interval={INTERVAL} … tracker.py"):

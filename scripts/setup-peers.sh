@@ -6,7 +6,7 @@
 # host, whose own Podman and CRIU may be of any age; bench/peers_world.sh unpacks
 # it into memory for as long as the measurement runs.
 #
-# CRIU comes from the next Debian: CRIU before 4.2 can not dump a TCP socket on
+# CRIU comes from the next Debian: CRIU before 4.2 cannot dump a TCP socket on
 # Linux 6.16 and newer ("Can't get 1:16 opt: Operation not supported").
 
 # shellcheck source=scripts/lib.sh
@@ -41,7 +41,7 @@ bootstrap() {
 	mv "$new" "$tarball"
 }
 
-have mmdebstrap || die "mmdebstrap is needed to make the peers' Debian (debootstrap can not mix two releases)"
+have mmdebstrap || die "mmdebstrap is needed to make the peers' Debian (debootstrap cannot mix two releases)"
 key=$(content_key -- "$SUITE" "$NEXT" "$MIRROR" "$PACKAGES" "$PREFER" "$(declare -f bootstrap)")
 cached peers "$SUITE-$key"
 if [ -f "$tarball" ]; then

@@ -70,10 +70,10 @@ until said=$(try_run --network=none); do
 	*"hybrid mode not supported"*)
 		[ -z "$emptied" ] || die "crun does not work with this machine's cgroups, and runc is another way: $said"
 		emptied=yes
-		empty_cgroup2 || die "crun refuses this machine's hybrid cgroups and $HUGETLB can not be mounted: install runc and name it in containers.conf ([engine] runtime=\"runc\")"
+		empty_cgroup2 || die "crun refuses this machine's hybrid cgroups and $HUGETLB cannot be mounted: install runc and name it in containers.conf ([engine] runtime=\"runc\")"
 		;;
 	*)
-		die "podman can not start a container here: $said"
+		die "podman cannot start a container here: $said"
 		;;
 	esac
 done

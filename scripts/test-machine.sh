@@ -19,7 +19,7 @@ LIMIT=${LIMIT:-3h}
 
 save_images() {
 	local images
-	# Where they can not be made here, they are made there.
+	# Where they cannot be made here, they are made there.
 	{ have podman && make -s setup-images && scripts/setup-trees.sh; } || return 0
 	mapfile -t images < <(podman images --format '{{.Repository}}:{{.Tag}}' --filter 'reference=localhost/avckpt-*' |
 		grep -v -e '-build:' -e '-ros' -e '-programs')

@@ -61,14 +61,14 @@ def make_group() -> Path:
     try:
         group.mkdir()
     except OSError as error:
-        pytest.skip(f"{group} can not be made: {error.strerror}")
+        pytest.skip(f"{group} cannot be made: {error.strerror}")
     # Version 2 lets who is above `high` wait, which is what is wanted.
     limit = group / ("memory.limit_in_bytes" if version_1 else "memory.high")
     try:
         limit.write_text(str(LIMIT_BYTES))
     except OSError as error:
         group.rmdir()
-        pytest.skip(f"{limit} can not be set: {error.strerror}")
+        pytest.skip(f"{limit} cannot be set: {error.strerror}")
     return group
 
 

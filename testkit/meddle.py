@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes a thread's floating-point registers, has it make system calls, or takes its descriptors, behind its back.
 
-Registers by ptrace(2) itself: gdb 13 can not write them on a CPU whose XSAVE area is larger than it knows (AMX).
+Registers by ptrace(2) itself: gdb 13 cannot write them on a CPU whose XSAVE area is larger than it knows (AMX).
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ class UnixConnection(http.client.HTTPConnection):
 
 
 def events(path: str, last_id: str, connected: Callable[[], None]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The sidecar's events, each with its id ("" for one that can not be resumed after), until it closes.
+    """The sidecar's events, each with its id ("" for one that cannot be resumed after), until it closes.
 
     Calls connected() as soon as it answers.
 

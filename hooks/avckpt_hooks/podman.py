@@ -66,7 +66,7 @@ _OTHER_FLAGS = {
 
 
 class Unknown(Exception):
-    """What was asked for can not be found out; the text says why."""
+    """What was asked for cannot be found out; the text says why."""
 
 
 def container_id(config: bytes) -> str:
@@ -259,7 +259,7 @@ def _run(program: str, argv: list[str], env: dict[str, str], deadline: float) ->
     except OSError as error:
         os.close(out)
         os.close(err)
-        raise Unknown(f"{program} can not be run: {error.strerror}") from error
+        raise Unknown(f"{program} cannot be run: {error.strerror}") from error
     finally:
         os.close(out_end)
         os.close(err_end)

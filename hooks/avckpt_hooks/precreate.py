@@ -130,7 +130,7 @@ def _ask_for_health(container: str, name: str, parent: int) -> None:
     try:
         health.ask_later(container, parent)
     except (OSError, podman.Unknown) as error:
-        tell.journal(f"avckpt: container {name}: its health check can not be found out: {error}")
+        tell.journal(f"avckpt: container {name}: its health check cannot be found out: {error}")
 
 
 def put_init_in_front(data: dict[str, Any]) -> None:
@@ -180,7 +180,7 @@ def add_hooks(data: dict[str, Any], told: bool) -> None:
 
 
 def spoil(config: bytes, line: str) -> bytes:
-    """A configuration that can not start, so that `line` is the reason given.
+    """A configuration that cannot start, so that `line` is the reason given.
 
     A client of Podman's REST service sees what Podman says, and of a failed
     precreate hook that is the exit status only.  Of a hook that is not there,

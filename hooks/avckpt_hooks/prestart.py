@@ -58,7 +58,7 @@ def register(state: dict[str, Any]) -> str:
         try:
             write_record(registration)
         except OSError as error:
-            unwritten = f"{protocol.records_dir()} can not be written ({error.strerror})"
+            unwritten = f"{protocol.records_dir()} cannot be written ({error.strerror})"
         refusal = ask(registration, pidfd)
     finally:
         os.close(pidfd)

@@ -71,7 +71,7 @@ static void make_list(struct inj_syscall *s, uint64_t count)
 					  s[i].arg[3], s[i].arg[4], s[i].arg[5]);
 }
 
-/* Nothing tells but new memory: what is locked can not be dropped, and is there at once
+/* Nothing tells but new memory: what is locked cannot be dropped, and is there at once
  * if it is not to be locked on fault only. */
 static long find_future_lock(void)
 {

@@ -66,7 +66,7 @@ class Defaults:
 
 @dataclass(frozen=True)
 class Problem:
-    """Something in the file that can not be honoured."""
+    """Something in the file that cannot be honoured."""
 
     place: Place
     message: str
@@ -214,7 +214,7 @@ def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> I
 
 def _unknown(key: str) -> str:
     if key == "enable":
-        return "can not be a default: a container is protected when its own label says avckpt.enable=true"
+        return "cannot be a default: a container is protected when its own label says avckpt.enable=true"
     if key.startswith(PREFIX):
         return f"here the keys have no prefix; write {key[len(PREFIX) :]}"
     known = sorted(label[len(PREFIX) :] for label in LABELS if label != ENABLE)

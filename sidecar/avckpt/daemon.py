@@ -127,7 +127,7 @@ class Daemon:
     async def run(self) -> None:
         """Serves until SIGTERM or SIGINT, then lets every container run on unprotected.
 
-        Raises OSError when a socket can not be made.
+        Raises OSError when a socket cannot be made.
         """
         loop = asyncio.get_running_loop()
         stop = asyncio.Event()
@@ -259,7 +259,7 @@ class Daemon:
 
     def _hook(self, request: Register | Deregister, pidfd: int | None) -> None:
         if isinstance(request, Deregister):
-            # Nothing to do: init's pidfd says the same, and can not be taken
+            # Nothing to do: init's pidfd says the same, and cannot be taken
             # for that of a later run.
             log.debug("%s: stopped, says its hook", request.id[:12])
         elif pidfd is not None:
@@ -519,7 +519,7 @@ def raise_descriptor_limit() -> None:
 def serve(run_dir: Path, config_path: Path) -> None:
     """Runs the sidecar in the foreground until it is told to stop.
 
-    Raises Denied or Unsupported when this process or machine can not do it,
+    Raises Denied or Unsupported when this process or machine cannot do it,
     Busy when there is a sidecar already.
     """
     probe()
@@ -533,4 +533,4 @@ def serve(run_dir: Path, config_path: Path) -> None:
             asyncio.run(Daemon(run_dir, config_path).run())
     except OSError as error:
         kind = Denied if isinstance(error, PermissionError) else AvckptError
-        raise kind(f"{error.filename or run_dir} can not be used", errno=error.errno or 0) from error
+        raise kind(f"{error.filename or run_dir} cannot be used", errno=error.errno or 0) from error

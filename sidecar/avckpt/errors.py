@@ -122,7 +122,7 @@ class Denied(AvckptError):
 
 
 class Unsupported(AvckptError):
-    """This process, or this machine, can not be protected."""
+    """This process, or this machine, cannot be protected."""
 
     kind = "unsupported"
     code = Code.UNSUPPORTED
@@ -165,7 +165,7 @@ class ConfigError(AvckptError):
 
 
 class LabelsWrong(AvckptError):
-    """A label of the container that can not be honoured."""
+    """A label of the container that cannot be honoured."""
 
     kind = "labels"
     exit_code = ExitCode.USAGE

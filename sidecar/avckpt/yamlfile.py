@@ -35,7 +35,7 @@ class Place:
 
 
 class Unreadable(Exception):
-    """A file that can not be read, or is not YAML."""
+    """A file that cannot be read, or is not YAML."""
 
     def __init__(self, place: Place, why: str) -> None:
         super().__init__(f"{place}: {why}")

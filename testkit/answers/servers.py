@@ -87,7 +87,7 @@ SERVERS: dict[str, Command] = {"nginx": _nginx, "haproxy": _haproxy, "prefork": 
 
 
 def missing(name: str) -> str:
-    """Why it can not be run here; empty if it can."""
+    """Why it cannot be run here; empty if it can."""
     return "" if name == "prefork" or shutil.which(name) else f"no {name} on this machine"
 
 

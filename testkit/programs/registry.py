@@ -61,7 +61,7 @@ PROGRAMS = (
 
 
 class Missing(Exception):
-    """A program can not be run here, and why."""
+    """A program cannot be run here, and why."""
 
 
 def find(name: str) -> Program:

@@ -157,11 +157,11 @@ def test_what_goes_wrong_with_a_check_is_told_once_and_does_not_end_them(sidecar
     assert sidecar.process is not None
     pid = sidecar.process.pid
     before = resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
-    wait_until(lambda: "its health check can not be run: the kernel said no" in sidecar.log, 10, "it is said")
+    wait_until(lambda: "its health check cannot be run: the kernel said no" in sidecar.log, 10, "it is said")
     time.sleep(1)  # some more of them
     resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
     wait_until(lambda: "its health check passes again" in sidecar.log, 10, "it goes on")
-    assert sidecar.log.count("its health check can not be run") == 1
+    assert sidecar.log.count("its health check cannot be run") == 1
     sick.touch()
     wait_until(lambda: unhealthy(sidecar), 20, "it is rolled back")
 

@@ -221,7 +221,7 @@ open(sys.argv[1], "w").close()
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local: LocalSidecar, tmp_path: Path) -> None:
-    """There are more threads than there was room for, and then they can not be stopped (`podman pause`)."""
+    """There are more threads than there was room for, and then they cannot be stopped (`podman pause`)."""
     there = tmp_path / "there"
     web = local.protected("web", [sys.executable, "-c", MANY, str(there)], ON_COMMAND)
     wait_until(there.exists, 10, "it is ready")
@@ -319,7 +319,7 @@ def test_descriptors_that_run_out_keep_nobody_from_being_adopted_later(local: Lo
     web = missed(local, "web", QUICK)
     with descriptors_left(local, 0):
         time.sleep(6)  # it looks every 5 s
-    assert "can not be read, containers may run unprotected: Too many open files" in local.log
+    assert "cannot be read, containers may run unprotected: Too many open files" in local.log
     assert local.wait_for(web, state="protected", timeout_s=15)["adopted"]
 
 

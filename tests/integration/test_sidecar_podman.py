@@ -138,9 +138,7 @@ def test_a_sidecar_that_can_not_be_started_is_said(sidecar: Sidecar, podman: Pod
     sidecar.stop()
     try:
         podman.run("create", "--name", SIDECAR_NAME, "--network=none", base_image, "/no/such/program")
-        with pytest.raises(
-            SidecarUnreachable, match=f"the container {SIDECAR_NAME} can not be started: podman start: "
-        ):
+        with pytest.raises(SidecarUnreachable, match=f"the container {SIDECAR_NAME} cannot be started: podman start: "):
             sidecar_container.ensure(RUN_DIR, print)
     finally:
         sidecar.restart()

@@ -57,7 +57,7 @@ def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
             # It would go on for ever: no two deaths are within the window.
             guard.wait("restored", since=guard.mark(), count=3)
             victim.kill(signal.SIGKILL)
-        # init can not end before every tracee was reaped.
+        # init cannot end before every tracee was reaped.
         victim.end(5)
         assert guard.wait("ended")
         assert sum(event["kind"] == "restored" for event in guard.events if "kind" in event) > 20

@@ -146,7 +146,7 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
 
 
 def test_made_while_the_container_ends_it_is_no_news(tmp_path: Path) -> None:
-    """Its template has been killed with all others, and can not be seen to have ended yet."""
+    """Its template has been killed with all others, and cannot be seen to have ended yet."""
     rng = random.Random(4)
     for n in range(40):
         (tmp_path / str(n)).mkdir()

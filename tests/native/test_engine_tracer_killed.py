@@ -60,7 +60,7 @@ def test_no_application_notices(tmp_path: Path) -> None:
 
 
 def test_blocked_calls_go_on(tmp_path: Path) -> None:
-    """A guard that dies between stopping a thread and mending its call can not undo the stop.
+    """A guard that dies between stopping a thread and mending its call cannot undo the stop.
 
     Calls that the kernel never makes again by itself (signal(7)) then answer EINTR, once, as after
     SIGSTOP and SIGCONT.  No other call may, and none may be lost.

@@ -37,7 +37,7 @@ def test_what_was_said_in_a_cycle_is_lost_with_its_socket(tmp_path: Path) -> Non
     with Victim(f"devices cycle {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         checkpoint(guard)
         disturb(victim)
-        assert "can not be made again" in restored(victim, guard)["error"]["detail"]
+        assert "cannot be made again" in restored(victim, guard)["error"]["detail"]
 
 
 @pytest.mark.parametrize("where", WHERE)

@@ -103,7 +103,7 @@ def test_only_what_the_application_may_open_is_opened_again(tmp_path: Path) -> N
             disturb(victim)
             error = restored(victim, guard)["error"]["detail"]
             assert "revoked" in error
-            assert "can not be opened again" in error or "is not there any more" in error
+            assert "cannot be opened again" in error or "is not there any more" in error
             assert "more)" not in error
 
 

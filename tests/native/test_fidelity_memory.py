@@ -145,7 +145,7 @@ def test_a_divided_segment_is_only_mapped_and_told(tmp_path: Path) -> None:
     command = f"regions divided {tmp_path} --in-child"
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
-        assert "can not be detached" in restored(victim, guard)["error"]["message"]
+        assert "cannot be detached" in restored(victim, guard)["error"]["message"]
 
 
 @pytest.mark.parametrize("where", WHERE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can not be protected runs on as if avckpt were not there, and it is told why."""
+"""What cannot be protected runs on as if avckpt were not there, and it is told why."""
 
 from __future__ import annotations
 

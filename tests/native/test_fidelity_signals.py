@@ -30,7 +30,7 @@ def test_pending_signals(command: str, where: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("signum", [signal.SIGABRT, signal.SIGTERM, signal.SIGRTMIN])
 def test_a_deadly_signal_is_in_no_image(signum: int, tmp_path: Path) -> None:
-    """Sent while a checkpoint is being taken, it waits until the application runs: what has it pending can not live."""
+    """Sent while a checkpoint is being taken, it waits until the application runs: what has it pending cannot live."""
     with Victim("busy 64", tmp_path) as victim, GuardProcess(config(0.001), [victim.pid]) as guard:
         guard.wait("checkpoint", count=5)
         for n in range(1, 21):

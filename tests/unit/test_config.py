@@ -69,7 +69,7 @@ def test_no_file_is_no_mistake(path: Path) -> None:
         ("defaults:\n  intervall: 3s\n", "2: defaults.intervall: unknown key; did you mean interval?"),
         ("defaults:\n  restore: {on: exit}\n", "2: defaults.restore: unknown key; did you mean restore.on?"),
         ("defaults:\n  avckpt.keep: 2\n", "2: defaults.avckpt.keep: here the keys have no prefix; write keep"),
-        ("\ndefaults:\n\n  enable: true\n", "4: defaults.enable: can not be a default"),
+        ("\ndefaults:\n\n  enable: true\n", "4: defaults.enable: cannot be a default"),
         ("defaults:\n  interval: ''\n", "2: defaults.interval: an empty value: not a duration"),
         ("names:\n  web*:\n    quiesce: 5s\n", "3: names.web*.quiesce: 5s: more than 1s"),
         ("names:\n  web*: 3s\n", "2: names.web*: not a mapping"),
@@ -109,7 +109,7 @@ def test_every_label_but_enable_may_have_a_default(path: Path, label: str) -> No
     key = label.removeprefix("avckpt.")
     found = problems(path, f"defaults:\n  {key}: '?!'\n")
     assert len(found) == 1
-    assert ("can not be a default" in found[0]) == (key == "enable")
+    assert ("cannot be a default" in found[0]) == (key == "enable")
     assert "unknown key" not in found[0]
 
 

@@ -91,7 +91,7 @@ def test_what_can_not_be_written_is_kept_in_memory_and_said_once(path: Path, cap
     records = [history.add(died()) for _ in range(3)]
     assert history.after() == records
     assert [record.message for record in caplog.records] == [
-        f"{path} can not be used (Is a directory): events are kept in memory only"
+        f"{path} cannot be used (Is a directory): events are kept in memory only"
     ]
 
 
@@ -113,7 +113,7 @@ def test_it_is_whole_again_once_it_can_be_written(
     records.append(history.add(died(5.0)))
     assert History(path).after() == records
     assert [record.getMessage() for record in caplog.records] == [
-        f"{path} can not be used (File too large): events are kept in memory only",
+        f"{path} cannot be used (File too large): events are kept in memory only",
         f"{path} is written again",
     ]
 

@@ -189,7 +189,7 @@ def test_prestart_registers_also_without_a_record(
     thread = answer(listener, lambda c, _, __: c.send(protocol.encode_reply()))
     said, _ = call("prestart", state_of(process))
     thread.join()
-    why = f"{records} can not be written (File exists)"
+    why = f"{records} cannot be written (File exists)"
     assert said == f"avckpt: container web is not known to a sidecar that starts later: {why}\n"
     listener.close()
     said, _ = call("prestart", state_of(process))

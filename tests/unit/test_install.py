@@ -201,7 +201,7 @@ def test_another_python_of_the_system(root: Path) -> None:
 
 
 def test_without_a_python_nothing_is_installed(root: Path) -> None:
-    """A hook that can not start would fail every `podman run`."""
+    """A hook that cannot start would fail every `podman run`."""
     (root / "usr/bin/python3").unlink()
     before = tree(root)
     with pytest.raises(ConfigError, match="the hooks need the system's Python"):
@@ -213,7 +213,7 @@ def test_an_installation_that_breaks_off_can_be_removed(root: Path) -> None:
     (root / "usr/local/share/avckpt").mkdir(parents=True)
     (root / "usr/local/share/avckpt/oci-hooks.d").write_text("in the way")
     before = tree(root)
-    with pytest.raises(ConfigError, match="can not be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         install.install(root)
     assert not (root / "etc/containers/containers.conf.d/50-avckpt.conf").exists()
     install.uninstall(root)
@@ -239,7 +239,7 @@ def full_disk(root: Path) -> None:
             file.write(bytes(4096))
             file.flush()
     with pytest.raises(
-        ConfigError, match=r"/avckpt_hooks/\w+\.py can not be written: No space left on device; nothing was changed$"
+        ConfigError, match=r"/avckpt_hooks/\w+\.py cannot be written: No space left on device; nothing was changed$"
     ):
         install.install(root)
     (root / "full").unlink()
@@ -267,7 +267,7 @@ def test_an_upgrade_that_breaks_off_half_way_removes_nothing(root: Path) -> None
     drop_in = root / "etc/containers/containers.conf.d/50-avckpt.conf"
     drop_in.unlink()
     drop_in.mkdir()
-    with pytest.raises(ConfigError, match=f"{drop_in} can not be written: Is a directory; only a part is in place"):
+    with pytest.raises(ConfigError, match=f"{drop_in} cannot be written: Is a directory; only a part is in place"):
         install.install(root)
     assert old.exists()
     assert {*before} <= {*tree(root)}

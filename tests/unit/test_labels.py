@@ -120,7 +120,7 @@ def test_the_rest_of_the_table() -> None:
         ("notify", "signal:0", "not within 1 to 64"),
         ("notify", "signal:33", "33 is no signal"),
         ("notify", "signal:RTMAX+1", "RTMAX+1 is no signal"),
-        ("notify.self", "signal:KILL", "can not be caught"),
+        ("notify.self", "signal:KILL", "cannot be caught"),
         ("notify.self", "exec:echo 'a", "a quotation that does not end"),
     ],
 )

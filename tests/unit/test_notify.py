@@ -71,7 +71,7 @@ def test_one_that_can_not_be_delivered_takes_no_other_with_it(friend: Protected)
 
 
 def test_one_that_finds_no_descriptor_is_told_of(friend: Protected) -> None:
-    watch = Listening(friend, -1, None)  # it can not be duplicated
+    watch = Listening(friend, -1, None)  # it cannot be duplicated
     assert told(watch, Notify(signal=signal.SIGCHLD)) == [
         (Kind.NOTIFY_FAILED, "web restored: the kernel said no (Bad file descriptor)")
     ]

@@ -119,7 +119,7 @@ def test_without_descriptors_it_waits_and_says_so_once(caplog: pytest.LogCapture
     assert answer is None
     assert busy_s < 0.2
     (line,) = [record.getMessage() for record in caplog.records]
-    assert line.startswith("hooks can not be answered (Too many open files): ")
+    assert line.startswith("hooks cannot be answered (Too many open files): ")
 
 
 def test_the_socket_is_roots_alone_and_replaces_a_dead_one(run_dir: Path) -> None:

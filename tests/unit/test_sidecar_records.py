@@ -124,7 +124,7 @@ def test_without_descriptors_nobody_is_found_and_later_everybody(
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     said = [each.getMessage() for each in caplog.records]
     assert len(said) == 2
-    assert said[0] == f"{tmp_path} can not be read, containers may run unprotected: Too many open files"
+    assert said[0] == f"{tmp_path} cannot be read, containers may run unprotected: Too many open files"
     [(_, pidfd)] = records.adoptable(lambda _: False)
     os.close(pidfd)
 

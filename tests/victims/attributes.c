@@ -57,7 +57,7 @@ static void add_file(struct look *look, const char *name, bool status)
 		n = read(fd, buf, sizeof(buf) - 1);
 		close(fd);
 	}
-	CHECK(n > 0, "%s can not be read: %s", name, strerror(errno));
+	CHECK(n > 0, "%s cannot be read: %s", name, strerror(errno));
 	buf[n] = 0;
 	for (line = strtok_r(buf, "\n", &save); line; line = strtok_r(NULL, "\n", &save)) {
 		bool wanted = !status;

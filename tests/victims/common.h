@@ -97,7 +97,7 @@ static void pass_tokens(struct party *me)
 	int tries;
 
 	if (me->token) {
-		CHECK(write(event_fd, &n, 8) == 8, "a token can not be given back: %s",
+		CHECK(write(event_fd, &n, 8) == 8, "a token cannot be given back: %s",
 		      strerror(errno));
 		shared->tokens_out--;
 		me->token = false;

@@ -90,7 +90,7 @@ static void closed_verify(void)
 	CHECK(lseek(fd[4], 0, SEEK_CUR) == 10 && lseek(700, 0, SEEK_CUR) == 10,
 	      "what shared an offset does not any more");
 	lseek(fd[4], 4, SEEK_SET);
-	CHECK(write(fd[0], "4", 1) == 1, "a file opened again can not be written: %s",
+	CHECK(write(fd[0], "4", 1) == 1, "a file opened again cannot be written: %s",
 	      strerror(errno));
 	lseek(fd[4], 4, SEEK_SET);
 	CHECK((fcntl(fd[0], F_GETFL) & O_ACCMODE) == O_RDWR, "not read-write");

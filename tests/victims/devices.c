@@ -166,7 +166,7 @@ static void talk(void)
 	CHECK(read(fd[ANSWERS], scratch, sizeof scratch) == 500, "half a message over ISO-TP");
 }
 
-/* But for what can not be made again. */
+/* But for what cannot be made again. */
 static void buses_disturb(void)
 {
 	for (int i = LISTENER; i <= ANSWERS; i++)

@@ -5,7 +5,7 @@
  * never answer EINTR, and a timeout must take its time: no less, and not much more.  All
  * registers are to be what they were (inlined.h).
  *
- * By default a second thread wakes the call every 50 ms (kinds that can not be
+ * By default a second thread wakes the call every 50 ms (kinds that cannot be
  * woken run into their timeout) and beats.  With --quiet there is no other
  * thread: nothing but the timeout ends the call.  SECONDS 0 means no timeout,
  * for kinds that have one; kinds without one ignore it.  With --late a timeout

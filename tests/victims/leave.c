@@ -38,12 +38,12 @@ static void see_off(pthread_t thread, size_t n)
 		at.tv_nsec %= 1000000000;
 		err = pthread_timedjoin_np(thread, &result, &at);
 	} while (err == ETIMEDOUT && ++tries < 300);
-	CHECK(err == 0, "thread %zu can not be joined: %s", n, strerror(err));
+	CHECK(err == 0, "thread %zu cannot be joined: %s", n, strerror(err));
 	CHECK(result == (void *)(n + 1), "thread %zu returned %p", n, result);
 	err = pthread_mutex_trylock(&mutex[n]);
 	CHECK(err == EOWNERDEAD, "the mutex of dead thread %zu: %s", n, strerror(err));
 	CHECK(!pthread_mutex_consistent(&mutex[n]) && !pthread_mutex_unlock(&mutex[n]),
-	      "mutex %zu can not be made good", n);
+	      "mutex %zu cannot be made good", n);
 	count(0, 1);
 	beat();
 }

@@ -96,7 +96,7 @@ static void expect_server(int i, int type, const struct sockaddr_un *address, so
 	int server;
 
 	CHECK(connect(client, (const struct sockaddr *)address, bytes) == 0,
-	      "socket %d can not be connected to: %s", i, strerror(errno));
+	      "socket %d cannot be connected to: %s", i, strerror(errno));
 	server = accept(fd[i], NULL, NULL);
 	CHECK(server >= 0, "socket %d accepts nobody: %s", i, strerror(errno));
 	must(write(client, "hello", 5) == 5, "write");
@@ -394,7 +394,7 @@ static void handed_over_verify(void)
 	int server;
 
 	CHECK(connect(client, (struct sockaddr *)&name[0], name_bytes[0]) == 0,
-	      "port %d can not be connected to: %s", ntohs(remembered_port(0)), strerror(errno));
+	      "port %d cannot be connected to: %s", ntohs(remembered_port(0)), strerror(errno));
 	server = accept(fd[0], NULL, NULL);
 	CHECK(server >= 0, "nobody comes in: %s", strerror(errno));
 	close(server);
@@ -556,11 +556,11 @@ static void early_disturb(void)
 		CHECK(!(early[i].connects
 				? connect(fd[i], (struct sockaddr *)&name[to], name_bytes[to])
 				: bind(fd[i], (struct sockaddr *)&any, bytes)),
-		      "socket %d can not be used: %s", i, strerror(errno));
+		      "socket %d cannot be used: %s", i, strerror(errno));
 		if (early[i].connects)
 			close(accept(fd[to], NULL, NULL)); /* there is not much room */
 		CHECK(early[i].connects || early[i].type == SOCK_DGRAM || !listen(fd[i], 5),
-		      "socket %d can not listen: %s", i, strerror(errno));
+		      "socket %d cannot listen: %s", i, strerror(errno));
 	}
 }
 

@@ -60,7 +60,7 @@ class Pool
 	}
 
       private:
-	/// What std::function can not hold: a packaged_task, which only moves.
+	/// What std::function cannot hold: a packaged_task, which only moves.
 	struct Task {
 		struct Base {
 			virtual ~Base() = default;
@@ -248,7 +248,7 @@ void churn(uint64_t round)
 
 	CHECK(event >= 0 && null >= 0 && pipe2(ends, O_CLOEXEC) == 0, "no descriptors: %s",
 	      strerror(errno));
-	CHECK(write(ends[1], &round, sizeof round) == sizeof round, "can not write to a pipe");
+	CHECK(write(ends[1], &round, sizeof round) == sizeof round, "cannot write to a pipe");
 	CHECK(read(ends[0], &got, sizeof got) == sizeof got && got == round,
 	      "a pipe brought %lu in round %lu", got, round);
 	CHECK(block.front() == round && block.back() == round, "a block of another round");

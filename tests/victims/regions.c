@@ -8,7 +8,7 @@
  *   unguard    a parent has them, its child has taken them away and uses the pages
  *   sealed     a memfd that nobody may write to any more, mapped shared
  *   late       one that nobody may map for writing any more, which is sealed so after the checkpoint
- *   changed    one that was written and sealed since: it can not go back
+ *   changed    one that was written and sealed since: it cannot go back
  *   droppable  memory that is wiped in forks and dropped when it is short (MAP_DROPPABLE)
  *   growing    memory that grows downwards (MAP_GROWSDOWN)
  *   attached   System V shared memory

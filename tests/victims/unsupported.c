@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * unsupported KIND [AFTER_SECONDS [FOR_SECONDS]]: a process that can not be
+ * unsupported KIND [AFTER_SECONDS [FOR_SECONDS]]: a process that cannot be
  * checkpointed, from AFTER_SECONDS after its start (0), for FOR_SECONDS (0: for
  * ever; not every kind can be undone); AFTER_SECONDS "signal": from SIGUSR1 on.  Beats every 1 ms; counter 0 is 1 while it
  * is as it says.

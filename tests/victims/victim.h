@@ -36,7 +36,7 @@
 #define BOARD_BYTES 4096
 #define BOARD_MAGIC UINT64_C(0x31445242544356) /* "VCTBRD1" in memory */
 #define VIOLATION_STATUS 99
-#define UNAVAILABLE_STATUS 77 /* this machine can not do what was asked for */
+#define UNAVAILABLE_STATUS 77 /* this machine cannot do what was asked for */
 
 /* All little-endian, no padding; testkit/board.py reads it. */
 struct board {

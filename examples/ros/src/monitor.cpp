@@ -27,7 +27,7 @@ public:
 	{
 		std::string path;
 		if (own_.getParam("log", path) && !(log_ = std::fopen(path.c_str(), "ae"))) {
-			ROS_FATAL("%s can not be written", path.c_str());
+			ROS_FATAL("%s cannot be written", path.c_str());
 			std::exit(1);
 		}
 		const ros::TransportHints hints = ros::TransportHints().tcpNoDelay();

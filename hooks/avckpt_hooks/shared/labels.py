@@ -33,7 +33,7 @@ SHM_MAX_BYTES = 1_000_000_000
 
 
 class LabelError(ValueError):
-    """A label that can not be honoured.  The text is one line for a person."""
+    """A label that cannot be honoured.  The text is one line for a person."""
 
     def __init__(self, key: str, value: str | None, why: str, allowed: str) -> None:
         setting = shown(key) if value is None else f"{shown(key)}={shown(value)}"
@@ -106,7 +106,7 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
     """What `mapping` (labels or annotations; other names are ignored) asks for.
 
     Raises LabelError for the first name or value, in alphabetical order, that
-    can not be honoured.
+    cannot be honoured.
     """
     fields: dict[str, Any] = {}
     for key in sorted(mapping):
@@ -305,7 +305,7 @@ def _signal_number(text: str) -> int:
     if number not in signal.valid_signals() or signal.SIGSYS < number < signal.SIGRTMIN:
         raise ValueError(f"{shown(text)} is no signal")
     if number in (signal.SIGKILL, signal.SIGSTOP):
-        raise ValueError("nobody can be told by that signal, it can not be caught")
+        raise ValueError("nobody can be told by that signal, it cannot be caught")
     return number
 
 

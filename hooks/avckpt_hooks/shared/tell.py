@@ -64,7 +64,7 @@ def _stderr_of(pid: int) -> int:
     """A descriptor for `pid`'s standard error.  Raises OSError."""
     # The descriptor itself, by pidfd_getfd(2), and not a second opening of the
     # same file: with `2>file` a second one has an offset of its own and each
-    # writer overwrites the other; a socket can not be opened at all.
+    # writer overwrites the other; a socket cannot be opened at all.
     try:
         return _borrow(pid, 2)
     except OSError:

@@ -47,7 +47,7 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 	       const char *detail, ...) __attribute__((format(printf, 5, 6)));
 uint64_t now_ns(void);
 void close_fd(int *fd);
-/* As much of it as there is; -1: it can not be read. */
+/* As much of it as there is; -1: it cannot be read. */
 ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 /* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
  * and nothing has changed. */

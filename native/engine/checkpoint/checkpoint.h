@@ -71,7 +71,7 @@ void generation_drop(struct generation *generation);
 struct image *generation_image(const struct generation *generation, const struct process *process);
 /* Of all its processes. */
 uint32_t generation_threads(const struct generation *generation);
-/* What could not be read, or can not be put back; the first of it. */
+/* What could not be read, or cannot be put back; the first of it. */
 const struct avc_error *generation_notice(const struct generation *generation);
 int generation_files_error(const struct generation *generation, struct avc_error *err) warn_unused;
 /* Closes what the template of a process that has ended still has open. */

@@ -28,7 +28,7 @@
 /* ---- what is read ----------------------------------------------------------------------- */
 
 /* In a handler, on an alternate stack that it has given up for as long (sigaltstack(2),
- * SS_AUTODISARM), or was when it was asked last.  Any other can not be changed by who is on it. */
+ * SS_AUTODISARM), or was when it was asked last.  Any other cannot be changed by who is on it. */
 static bool may_be_disarmed(const struct thread *t)
 {
 	return t->disarmed || (t->altstack[1] & SS_AUTODISARM_ &&
@@ -68,7 +68,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 		if (arch_frame_read_xstate(t->tid, parasite_frame(&process->parasite, slot,
 								  (uint32_t)t->block)))
 			return fail_errno(err, t->tid, "freeze", "ptrace(GETREGSET)",
-					  "its state can not be read");
+					  "its state cannot be read");
 		if ((!t->known || t->known_tls != arch_tls(&t->regs) || may_be_disarmed(t)) &&
 		    thread_ask(process, t, err))
 			return -1;

@@ -127,7 +127,7 @@ const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mappi
 		result = read_extent(snapshot, pages, m->start, m->end);
 	if (result) {
 		fail_errno(err, snapshot->template, "restore memory", "read(pagemap)",
-			   "its pages can not be compared");
+			   "its pages cannot be compared");
 		return NULL;
 	}
 	pages->known = true;

@@ -147,7 +147,7 @@ int spare_await(struct generation *generation, struct avc_error *err)
 		spare_drop(generation);
 	if (spare->aside && step_back(generation->image[0].template, &spare->scheduling))
 		return fail_errno(err, generation->image[0].template, "make spare", "sched_setattr",
-				  "its scheduling can not be put back");
+				  "its scheduling cannot be put back");
 	return 0;
 }
 

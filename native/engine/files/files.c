@@ -452,7 +452,7 @@ static int by_key(const void *a, const void *b)
 /* kcmp(2)'s order; -1: one of them has been closed since. */
 static long compare_held(const struct files_held *a, const struct files_held *b)
 {
-	/* A socket can not be opened twice, its file (O_PATH) can. */
+	/* A socket cannot be opened twice, its file (O_PATH) can. */
 	if (a->file->kind == FILE_SOCKET && !((a->file->flags | b->file->flags) & O_PATH))
 		return 0;
 	return syscall(SYS_kcmp, a->pid, b->pid, KCMP_FILE, a->file->fd, b->file->fd);

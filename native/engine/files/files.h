@@ -84,7 +84,7 @@ int files_mapped_check(const struct image *image, pid_t holder, struct avc_error
 /* files_written.c: what is written in the container's mount namespace. */
 struct files_written *files_written_new(void);
 void files_written_free(struct files_written *written);
-/* From now on; *notice if it can not be. */
+/* From now on; *notice if it cannot be. */
 void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice);
 /* Whether a file was written since the last time this was asked, and which; inherited
  * ones in `files` (may be NULL) do not count. */
@@ -220,7 +220,7 @@ struct file {
 	/* What can be read from it, when its other end is the app's own as well   */
 	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
-	bool content_lost; /* there was something that can not be put back          */
+	bool content_lost; /* there was something that cannot be put back          */
 	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 	struct file_video video;

@@ -42,7 +42,7 @@ static uint32_t list_held(struct files_held *held, const struct image *image,
 	return count;
 }
 
-/* What has been closed since the freeze (a worker does that when its parent has died) can not
+/* What has been closed since the freeze (a worker does that when its parent has died) cannot
  * be compared any more; as a rule it was shared in the checkpoint before. */
 static void group_closed(struct files_held *held, uint32_t count)
 {

@@ -153,7 +153,7 @@ static int make_named(const struct file *want, pid_t template, pid_t init,
 		fd = open_as(found, want);
 		file_rights_give_back(&own);
 		if (fd < 0)
-			*why = "it was closed since the checkpoint and can not be opened again";
+			*why = "it was closed since the checkpoint and cannot be opened again";
 		else if (is_another_instance(want))
 			*why = "it was closed since the checkpoint: the device was opened anew";
 	}
@@ -161,7 +161,7 @@ static int make_named(const struct file *want, pid_t template, pid_t init,
 	return fd >= 0 ? fd : open_empty(want);
 }
 
-static const char not_again[] = "it was closed since the checkpoint and can not be made again";
+static const char not_again[] = "it was closed since the checkpoint and cannot be made again";
 
 /* In the app's network namespace, or it would get a way into ours. */
 static int socket_of(pid_t template, int domain, int type, int protocol)

@@ -31,7 +31,7 @@ struct files_mapped {
 	struct mapped_area area[MAPPED_MAX];
 };
 
-/* Not on a disk: what others are told through it can not be taken back anyhow. */
+/* Not on a disk: what others are told through it cannot be taken back anyhow. */
 static bool is_data(const struct mapping *m)
 {
 	return m->shared && m->mode[1] == 'w' && m->inode && strncmp(m->name, "/dev/", 5) &&
@@ -84,7 +84,7 @@ struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
 		.bytes_left = limit_bytes,
 	};
 
-	/* What can not be had counts as written at a restore. */
+	/* What cannot be had counts as written at a restore. */
 	if (look.mapped)
 		(void)proc_mappings(pid, "maps", take_area, &look);
 	return look.mapped;
@@ -153,7 +153,7 @@ static int check_process(pid_t pid, struct check *check)
 	if (check->err->code)
 		return -1;
 	return fail(check->err, AVC_UNSUPPORTED, 0, pid, "restore", "open(maps)",
-		    "avckpt.files=strict: what files were mapped can not be told");
+		    "avckpt.files=strict: what files were mapped cannot be told");
 }
 
 int files_mapped_check(const struct image *image, pid_t holder, struct avc_error *err)

@@ -323,7 +323,7 @@ static void make_lost(struct files_work *work)
 					       &work->want->rights, &why);
 		files_note(work, w, why);
 		if (work->local[group] < 0)
-			files_note(work, w, "it can not be made again");
+			files_note(work, w, "it cannot be made again");
 	}
 }
 

@@ -60,7 +60,7 @@ static bool is_idle(int fd, const struct file_socket *s)
 	return s->type == SOCK_DGRAM || state.revents & POLLHUP;
 }
 
-/* net/can/af_can.c does not remember it: 0, if it can not be told from another one. */
+/* net/can/af_can.c does not remember it: 0, if it cannot be told from another one. */
 static int can_protocol(int fd, int type)
 {
 	struct can_isotp_options options;
@@ -347,7 +347,7 @@ static void keep_messages(struct process *process, int fd, struct file *file)
 			file->content = more;
 		n = more ? peek(fd, file, more + used + sizeof bytes, MESSAGE_MAX)
 			 : MESSAGE_MAX + 1;
-		/* An empty datagram can not be looked past; for others it is the end. */
+		/* An empty datagram cannot be looked past; for others it is the end. */
 		file->content_lost |=
 			n > MESSAGE_MAX ||
 			(n > 0 && (used + (size_t)n > CONTENT_MAX || !budget_has((uint64_t)n))) ||

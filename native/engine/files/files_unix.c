@@ -304,7 +304,7 @@ static int put_file(int fd, int root, int folder, const struct file_node *node, 
 
 	snprintf(link, sizeof link, "/proc/thread-self/fd/%d", file);
 	if (file < 0 || (!is_there(folder, name, file) && !move(file, root, folder, name))) {
-		*why = "it was closed since the checkpoint and its file can not be put back";
+		*why = "it was closed since the checkpoint and its file cannot be put back";
 		result = -1;
 	} else if (node->deleted) {
 		unlinkat(folder, name, 0);
@@ -338,7 +338,7 @@ static int bind_path(struct errand *errand, const struct file_node *node, pid_t 
 	else if (call_there(errand, template, init))
 		*why = errno == EADDRINUSE
 			       ? TAKEN
-			       : "it was closed since the checkpoint and can not be bound again";
+			       : "it was closed since the checkpoint and cannot be bound again";
 	else
 		result = put_file(errand->fd, root, folder, node, why);
 	close_fd(&root);
@@ -374,7 +374,7 @@ static const char *connect_unix(const struct files_work *work, int fd, const str
 				 .bytes = s->remote_bytes };
 
 	return call_there(&errand, work->image->template, work->init)
-		       ? "it was closed since the checkpoint and can not be connected again"
+		       ? "it was closed since the checkpoint and cannot be connected again"
 		       : NULL;
 }
 

@@ -66,7 +66,7 @@ static int open_below(pid_t pid, const char *path)
 struct file_system {
 	uint64_t dev;
 	int anchor; /* anything that is on it, or -1                           */
-	/* The root of most containers.  Its handles can not be opened, but in them are
+	/* The root of most containers.  Its handles cannot be opened, but in them are
 	 * those of the file system below, to which the anchor belongs.           */
 	bool overlay;
 	char point[PATH_MAX]; /* where it is mounted                               */

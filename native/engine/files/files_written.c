@@ -20,7 +20,7 @@
 #include "files.h"
 
 struct files_written {
-	int fd;          /* -1: it can not be watched                            */
+	int fd;          /* -1: it cannot be watched                            */
 	int errnum;      /* why                                                  */
 	uint64_t mounts; /* a hash of what was marked                            */
 };
@@ -172,7 +172,7 @@ bool files_written_since(struct files_written *written, const struct files *file
 		if (n < 0 && errno == EINTR)
 			continue;
 		if (n <= 0) {
-			/* A file that can not be opened for us any more was written, too. */
+			/* A file that cannot be opened for us any more was written, too. */
 			if (n < 0 && errno != EAGAIN && !found) {
 				found = true;
 				snprintf(name, FILES_NAME, "a file");

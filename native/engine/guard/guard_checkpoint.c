@@ -20,7 +20,7 @@
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
-/* The app as it can not be protected: says so once, and gives everything up. */
+/* The app as it cannot be protected: says so once, and gives everything up. */
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
 {
 	guard_drop_all(guard);

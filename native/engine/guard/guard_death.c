@@ -143,7 +143,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		budget_begin(say_working, &guard->channel);
 
 		/* What was written since the newest was written since all others, also
-		 * where that can not be seen any more. */
+		 * where that cannot be seen any more. */
 		if (guard_check_strict(guard, generation, image->template, image->pidfd, &failed)) {
 			*error = failed;
 			guard_drop_all(guard);
@@ -196,7 +196,7 @@ static void hold_all(struct avc_guard *guard)
 	}
 }
 
-/* Killed in the middle of a checkpoint: init can not wait for a process before we have waited
+/* Killed in the middle of a checkpoint: init cannot wait for a process before we have waited
  * for those of its threads that are our tracees. */
 static void reap_tracees(void *arg)
 {

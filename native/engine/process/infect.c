@@ -11,7 +11,7 @@
  * it, and ends.  It makes one system call at a time, of which every register is set from outside.
  *
  * The stub ends by loading the thread's own registers, so it gets home without us, and a porter
- * that we can not tell what to do ends by itself.
+ * that we cannot tell what to do ends by itself.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -152,7 +152,7 @@ static int step_failed(const struct stop *stop, pid_t tid, struct avc_error *err
 }
 
 /* To the next entry into a system call, exit from one, or new task.  Other stops may come in
- * between: job control, or SIGSTOP, which can not be blocked. */
+ * between: job control, or SIGSTOP, which cannot be blocked. */
 static int step(pid_t tid, struct stop *stop, struct avc_error *err)
 {
 	do {
@@ -372,7 +372,7 @@ static int open_channel(const struct porter *porter, avc_remote scratch, struct 
 	close_fd(&pidfd);
 	if (channel < 0)
 		return fail_errno(err, porter->tid, "infect", "pidfd_getfd", "it was killed");
-	if (porter_must(porter, "close", "its end of a socket can not be closed", SYS_close, ours,
+	if (porter_must(porter, "close", "its end of a socket cannot be closed", SYS_close, ours,
 			err))
 		close_fd(&channel);
 	return channel;
@@ -392,15 +392,15 @@ static int bring(const struct process *process, const struct porter *porter, int
 		return fail_errno(err, process->pid, "infect", "write(mem)", "it has ended");
 	if (fd_send(channel, fd))
 		return fail_errno(err, process->pid, "infect", "sendmsg",
-				  "the parasite can not be handed over");
-	return porter_must(porter, "recvmsg", "the parasite can not be handed over", SYS_recvmsg,
+				  "the parasite cannot be handed over");
+	return porter_must(porter, "recvmsg", "the parasite cannot be handed over", SYS_recvmsg,
 			   receive, err) ||
 			       porter_must(porter, "mmap",
 					   map[2] & PROT_EXEC
 						   ? "it may not have new executable memory"
 						   : "it may not map the parasite",
 					   SYS_mmap, map, err) ||
-			       porter_must(porter, "close", "a descriptor can not be closed",
+			       porter_must(porter, "close", "a descriptor cannot be closed",
 					   SYS_close, received, err)
 		       ? -1
 		       : 0;
@@ -526,7 +526,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	bytes = arch_stub_build(stub, &home, thread->sigmask);
 	if (pwrite(process->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
 		return fail_errno(err, process->pid, "infect", "write(mem)",
-				  "its code can not be written");
+				  "its code cannot be written");
 	result = make_pad(process, thread, cave, slots, threads_max, &stub_is_free, err);
 	/* Nobody is in the stub any more: leave no trace. */
 	if (stub_is_free && thread->stopped &&

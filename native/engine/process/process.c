@@ -109,7 +109,7 @@ int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_er
 	process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
 	if (process->pidfd < 0 || process->task_dirfd < 0 || process->mem_fd < 0 ||
 	    process->timers_fd < 0 || process->stat_fd < 0 || process->statm_fd < 0) {
-		fail_errno(err, pid, "attach", "open(/proc)", "its /proc can not be read");
+		fail_errno(err, pid, "attach", "open(/proc)", "its /proc cannot be read");
 		process_close(process);
 		return -1;
 	}
@@ -150,7 +150,7 @@ static int read_signal_state(struct thread *thread, struct avc_error *err)
 	/* PTRACE_GET_RSEQ_CONFIGURATION, since Linux 5.13 */
 	if (ptrace(PTRACE_GET_RSEQ, thread->tid, sizeof rseq, &rseq) < 0)
 		return fail_errno(err, thread->tid, "read state", "ptrace(GET_RSEQ_CONFIGURATION)",
-				  "rseq can not be read");
+				  "rseq cannot be read");
 	thread->rseq = rseq.pointer;
 	thread->rseq_bytes = rseq.bytes;
 	thread->rseq_signature = rseq.signature;

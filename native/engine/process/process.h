@@ -5,7 +5,7 @@
  *   process.c        one of them: looked at, asked, stopped
  *   stop.c          ... stopped, let go
  *   infect.c        parasite and holder brought into it
- *   support.c       what can not be protected; quiescence
+ *   support.c       what cannot be protected; quiescence
  *   waits.c         calls that are to be ended
  *   dying.c         in its own handler of a fatal signal
  *   tree.c          all of them
@@ -129,7 +129,7 @@ void process_unhold_soon(struct process *process);
 
 /* ---- support.c --------------------------------------------------------------------- */
 
-/* Looks at a running app for what can not be protected.  0, or -1 with
+/* Looks at a running app for what cannot be protected.  0, or -1 with
  * AVC_UNSUPPORTED and the reason in words. */
 int support_check(struct process *process, struct avc_error *err) warn_unused;
 /* Whether the (running, infected) process has another program: what was brought into it

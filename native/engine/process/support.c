@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What can not be protected, found while the app runs; and whether this is a
+ * What cannot be protected, found while the app runs; and whether this is a
  * good moment.
  */
 #include <dirent.h>
@@ -93,7 +93,7 @@ static int not_seen(pid_t pid, struct avc_error *err)
 	if (proc_is_exiting(pid))
 		return fail(err, AVC_GONE, ESRCH, pid, "check", "stat(ns)", "it has ended");
 	errno = errnum;
-	return fail_errno(err, pid, "check", "stat(ns)", "its namespaces can not be seen");
+	return fail_errno(err, pid, "check", "stat(ns)", "its namespaces cannot be seen");
 }
 
 /* Its children are made by their parents, which have to have what their children have. */
@@ -136,7 +136,7 @@ static int check_shadow_stack(struct process *process, struct avc_error *err)
 		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
 	if (status.shadow_stack)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
-			    "it has shadow stacks (CET), which can not be put back; "
+			    "it has shadow stacks (CET), which cannot be put back; "
 			    "GLIBC_TUNABLES=glibc.cpu.x86_shstk=off runs it without");
 	return 0;
 }

@@ -62,7 +62,7 @@ struct copier *copier_new(struct avc_error *err)
 	return copier;
 }
 
-/* The kernel gives no reason when it comes to a page that it can not get at after others. */
+/* The kernel gives no reason when it comes to a page that it cannot get at after others. */
 static bool is_all(ssize_t done, size_t bytes)
 {
 	if (done >= 0 && (size_t)done < bytes)
@@ -91,10 +91,10 @@ static int copy(const struct source *source, uint8_t *buffer, avc_remote start, 
 
 		if (!is_all(pread(source->from, buffer, bytes, (off_t)at), bytes))
 			return fail_errno(err, source->template, "restore memory", "read(mem)",
-					  "it can not be read at %lx", (unsigned long)at);
+					  "it cannot be read at %lx", (unsigned long)at);
 		if (!put(source, buffer, bytes, at, plain))
 			return fail_errno(err, source->pid, "restore memory", "write(mem)",
-					  "it can not be written at %lx", (unsigned long)at);
+					  "it cannot be written at %lx", (unsigned long)at);
 		at += bytes;
 	}
 	return 0;
@@ -145,7 +145,7 @@ int copier_open(struct copier *copier, pid_t template, pid_t pid, struct avc_err
 
 	if (source.from < 0 || source.to < 0)
 		result = fail_errno(err, pid, "restore memory", "open(mem)",
-				    "it can not be reached");
+				    "it cannot be reached");
 	pthread_mutex_lock(&copier->lock);
 	if (!result && !make_room(&copier->source, copier->sources, &copier->sources_room,
 				  sizeof *copier->source))

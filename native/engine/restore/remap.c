@@ -91,7 +91,7 @@ static int give_file(const struct remap *r, struct syscall_batch *batch, const s
 	fd = open_mapped(r->want->template, m);
 	if (fd < 0)
 		return fail_errno(err, batch->pid, "restore memory", "open(map_files)",
-				  "%s can not be opened", m->name);
+				  "%s cannot be opened", m->name);
 	result = syscall_batch_give(batch, fd, err);
 	close(fd);
 	return result;
@@ -122,7 +122,7 @@ static int attach(const struct remap *r, struct syscall_batch *batch, const stru
 		  struct avc_error *err)
 {
 	static const char only_mapped[] =
-		"System V shared memory is only mapped: it can not be detached";
+		"System V shared memory is only mapped: it cannot be detached";
 	const struct mapping *m = piece->want;
 	int flags = SHM_REMAP | (m->mode[2] == 'x' ? SHM_EXEC : 0);
 

@@ -307,7 +307,7 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 	    (!(from->caps[0] >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "thread %d has other supplementary groups than the main thread, which "
-			    "can not be put back",
+			    "cannot be put back",
 			    inside);
 	if (to->seccomp != from->seccomp || to->filters != from->filters)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
@@ -401,11 +401,11 @@ static int put_back(pid_t tid, void *arg)
 			continue;
 		if (syscall(SYS_sched_setattr, tid, s->attr, 0))
 			fail_errno(search->notice, tid, "restore", "sched_setattr",
-				   "its scheduling can not be put back");
+				   "its scheduling cannot be put back");
 		if (s->io_priority >= 0 &&
 		    syscall(SYS_ioprio_set, IOPRIO_WHO_PROCESS, tid, s->io_priority))
 			fail_errno(search->notice, tid, "restore", "ioprio_set",
-				   "its I/O priority can not be put back");
+				   "its I/O priority cannot be put back");
 	}
 	return 0;
 }

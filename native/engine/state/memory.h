@@ -112,7 +112,7 @@ bool areas_add(struct areas *areas, const struct area *area);
 /* Room for no more than there is; false: out of memory. */
 bool areas_copy(struct areas *to, const struct areas *from);
 void areas_free(struct areas *areas);
-/* Those beyond MARKS_MAX are not known: of advice that is no harm, and what can not be mapped
+/* Those beyond MARKS_MAX are not known: of advice that is no harm, and what cannot be mapped
  * again is seen at the restore. */
 void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags);
 /* Were the areas that were copied those that there are?  Of the long file only as

@@ -53,7 +53,7 @@ struct image {
 	struct avc_error files_error; /* why they could not be read             */
 	struct files_mapped *mapped;  /* avckpt.files=strict; NULL: it was not             */
 	struct fd_table table;        /* at a restore: what it is to have open           */
-	struct avc_error notice;      /* what of it can not be put back              */
+	struct avc_error notice;      /* what of it cannot be put back              */
 };
 #define PARENT_INIT (-1)
 
@@ -198,7 +198,7 @@ int memory_check_unkept(const struct image *image, uint32_t images,
 			struct avc_error *err) warn_unused;
 /* When all of a checkpoint are finished: what is more than may be kept. */
 void memory_note_left(const struct image *image, uint32_t images, struct avc_error *notice);
-/* At a restore, before anything runs; *notes: what can not be written. */
+/* At a restore, before anything runs; *notes: what cannot be written. */
 int memory_put_back(const struct image *image, pid_t pid, struct avc_error *notes,
 		    struct avc_error *err) warn_unused;
 

@@ -62,7 +62,7 @@ static int find_ctl(pid_t init)
 #define TMPFS_MAGIC_ 0x01021994
 
 /* What the container shows us is looked at before it is opened: by a duplicate of its own
- * descriptor, which gives us no more rights than it has, and which it can not exchange for another
+ * descriptor, which gives us no more rights than it has, and which it cannot exchange for another
  * meanwhile.  Then it is opened anew, for O_NONBLOCK and flock(2) are of the open file. */
 static int reopen(int *theirs, int flags)
 {
@@ -98,7 +98,7 @@ static int open_pipe_of(const struct init_channel *channel, int number, int flag
 	return reopen(&theirs, flags);
 }
 
-/* A memfd that can not shrink under our mapping (SIGBUS), and not one of huge pages, of which there
+/* A memfd that cannot shrink under our mapping (SIGBUS), and not one of huge pages, of which there
  * may be none (SIGBUS).  Files of a tmpfs have seals, too, but never these. */
 static int open_ctl_of(const struct init_channel *channel, int number)
 {
@@ -127,7 +127,7 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 			    "its control page is not one of avckpt-init's");
 	if (channel->ctl_fd < 0)
 		return fail_errno(err, channel->init, "attach", "pidfd_getfd",
-				  "its control page can not be opened");
+				  "its control page cannot be opened");
 	if (flock(channel->ctl_fd, LOCK_EX | LOCK_NB))
 		return fail(err, AVC_BUSY, errno, channel->init, "attach", "flock",
 			    "another avckpt guards it already");
@@ -136,7 +136,7 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 	if (channel->ctl == MAP_FAILED) {
 		channel->ctl = NULL;
 		return fail_errno(err, channel->init, "attach", "mmap",
-				  "its control page can not be mapped");
+				  "its control page cannot be mapped");
 	}
 	ctl = channel->ctl;
 	if (ctl->version != AVC_CTL_VERSION)
@@ -148,7 +148,7 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 	channel->verdict_fd = open_pipe_of(channel, ctl->verdict_fd, O_WRONLY);
 	if (channel->report_fd < 0 || channel->verdict_fd < 0)
 		return fail_errno(err, channel->init, "attach", "open(fd)",
-				  "its pipes can not be opened");
+				  "its pipes cannot be opened");
 	channel->init_inside = ctl->init_pid;
 	return 0;
 }

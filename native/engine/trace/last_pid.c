@@ -360,7 +360,7 @@ int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 	if (error)
 		return fail(
 			err, AVC_DENIED, error, 0, "restore", "write(ns_last_pid)",
-			"the next PID can not be chosen (CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN is needed)");
+			"the next PID cannot be chosen (CAP_CHECKPOINT_RESTORE or CAP_SYS_ADMIN is needed)");
 	return 0;
 }
 

@@ -61,7 +61,7 @@ static int make_memory(size_t bytes)
 	return fd;
 }
 
-/* Read-only: who has it like this can not map it for writing; kernels before 6.7 let nobody map
+/* Read-only: who has it like this cannot map it for writing; kernels before 6.7 let nobody map
  * by any other descriptor what is sealed for good. */
 static int open_read_only(int fd)
 {
@@ -104,7 +104,7 @@ int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *e
 		if (map != MAP_FAILED)
 			munmap(map, parasite->bytes);
 		close(fd);
-		return fail_errno(err, 0, "infect", "mmap", "the parasite can not be mapped");
+		return fail_errno(err, 0, "infect", "mmap", "the parasite cannot be mapped");
 	}
 	parasite->code_fd = code_fd;
 	parasite->data_fd = fd;
@@ -228,7 +228,7 @@ void parasite_will_done(struct process *process)
  * restore an older one.
  *
  * A task that is killed never gets done: to be noticed at once, for its process
- * can not be reaped before we have. */
+ * cannot be reaped before we have. */
 static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct avc_error *err)
 {
 	const struct timespec slice = { .tv_nsec = 500000 };
@@ -424,7 +424,7 @@ static int look_at_seccomp(struct process *process, struct thread *thread, struc
 	if (seccomp_look(thread->tid, process->plain_filters, &thread->filters_known,
 			 &thread->seccomp))
 		return fail_errno(err, thread->tid, "run injected code",
-				  "ptrace(SECCOMP_GET_FILTER)", "its filters can not be read");
+				  "ptrace(SECCOMP_GET_FILTER)", "its filters cannot be read");
 	parasite->seccomp = thread->seccomp;
 	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL, options_of(parasite, false)))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",

@@ -319,7 +319,7 @@ int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_w
 	if (errno != ENOENT && errno != EINVAL && errno != EMEDIUMTYPE)
 		return -1;
 	*known = i;
-	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it can not be read */
+	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it cannot be read */
 	       : i                  ? SECCOMP_IN_FORCE
 				    : SECCOMP_NONE;
 	return 0;

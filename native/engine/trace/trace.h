@@ -450,7 +450,7 @@ struct setup {
 	uint64_t *tail[INJ_STAGES]; /* where the next one's address goes        */
 	uint64_t *thread_tail;
 	bool full;
-	struct avc_error notice; /* what can not be put back, the first of it */
+	struct avc_error notice; /* what cannot be put back, the first of it */
 	struct inj_setup spare;  /* written to when there is no room         */
 };
 

@@ -68,7 +68,7 @@ enum avc_event_kind {
 	                            * The guard tries again at the next interval.
 	                            * What was held is, unless it was to make way
 	                            * for this one: see `generations`             */
-	AVC_EVENT_UNPROTECTED = 4, /* the app can not be protected as it is;
+	AVC_EVENT_UNPROTECTED = 4, /* the app cannot be protected as it is;
 	                            * `error` is why.  Held generations are given
 	                            * up.  The guard looks again every interval   */
 	AVC_EVENT_DIED = 5,        /* the app died; wait_status, died_ns          */
@@ -133,7 +133,7 @@ struct avc_event {
 	uint64_t fork_ns;    /* of it, cloning the template                   */
 	uint64_t threads_ns; /* of it, creating threads                       */
 	uint64_t age_ns;     /* of the generation when the app died           */
-	/* CHECKPOINT: what of it can not be put back, RESTORED: what was not (or why
+	/* CHECKPOINT: what of it cannot be put back, RESTORED: what was not (or why
 	 * not from a newer generation); else why                                 */
 	struct avc_error error;
 };

@@ -15,7 +15,7 @@ enum avc_code {
 	AVC_OK = 0,
 	AVC_GONE = 1,        /* the process (or its container) has ended            */
 	AVC_DENIED = 2,      /* a privilege is missing (EPERM, EACCES)              */
-	AVC_UNSUPPORTED = 3, /* this process can not be protected; `detail` is why  */
+	AVC_UNSUPPORTED = 3, /* this process cannot be protected; `detail` is why  */
 	AVC_BUSY = 4,        /* somebody else traces or guards it                   */
 	AVC_DEADLINE = 5,    /* not stopped within the freeze deadline              */
 	AVC_PROTOCOL = 6,    /* the other side is not a (matching) avckpt-init      */

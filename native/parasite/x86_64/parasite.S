@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What injected code can not say in C (x86-64).
+ * What injected code cannot say in C (x86-64).
  */
 #include "home.h"
 

@@ -110,7 +110,7 @@ class ApiServer:
         self._runner = web.AppRunner(app, handle_signals=False, access_log=None, shutdown_timeout=1.0)
 
     async def start(self) -> None:
-        """Starts to serve.  Raises OSError when the socket can not be made."""
+        """Starts to serve.  Raises OSError when the socket cannot be made."""
         await self._runner.setup()
         await web.SockSite(self._runner, bind_socket(self._path, socket.SOCK_STREAM)).start()
 
@@ -203,7 +203,7 @@ def _sse(record: EventRecord) -> bytes:
 
 
 def _after(request: web.Request) -> int | None:
-    """The number of the last event that the other side has: the header, or for those who can not set one, `after`."""
+    """The number of the last event that the other side has: the header, or for those who cannot set one, `after`."""
     text = request.headers.get("Last-Event-ID") or request.query.get("after")
     if text is None:
         return None

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from avckpt.cli.client import Client, Json
 
 EPILOG = """
-Exit status: 0 done, 1 failed, 2 wrong usage, 3 the sidecar can not be reached,
+Exit status: 0 done, 1 failed, 2 wrong usage, 3 the sidecar cannot be reached,
 4 no such container, 5 the container is unprotected or has nothing to restore.
 "avckpt run" ends with its program's status, 128+N if signal N killed it, and
 with 125 if it could not start it.

@@ -198,7 +198,7 @@ def _judge_podman(facts: Facts) -> Iterator[Check]:
         yield Check("podman", Status.FAIL, "this is a rootless Podman", "protected containers must be root's: use sudo")
     elif _numbers(podman.version) < PODMAN_LEAST:
         least = ".".join(map(str, PODMAN_LEAST))
-        detail = f"{podman.version} is too old: its hooks can not learn a container's labels"
+        detail = f"{podman.version} is too old: its hooks cannot learn a container's labels"
         yield Check("podman", Status.FAIL, detail, f"use Podman {least} or newer")
     else:
         yield Check("podman", Status.OK, podman.version)

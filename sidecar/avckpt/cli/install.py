@@ -194,7 +194,7 @@ def install(root: Path = _HOST) -> list[str]:
         _record(root, installed, made)
     except OSError as error:
         where = error.filename2 or error.filename  # of a rename, the new name
-        raise ConfigError(f"{where} can not be written: {error.strerror}; {state}") from error
+        raise ConfigError(f"{where} cannot be written: {error.strerror}; {state}") from error
     environ = os.environ if root == _HOST else {}
     problems = containers_conf.problems(HOOKS_DIR, root, environ) + (service_problems() if root == _HOST else [])
     return done + [f"warning: {line}" for line in problems]
@@ -265,7 +265,7 @@ def uninstall(root: Path = _HOST) -> list[str]:
         try:
             _record(root, kept, list(manifest.directories))
         except OSError as error:
-            raise ConfigError(f"{MANIFEST} can not be written: {error.strerror}; run avckpt uninstall again") from error
+            raise ConfigError(f"{MANIFEST} cannot be written: {error.strerror}; run avckpt uninstall again") from error
         done.append(
             f"left {HOOK_PROGRAM}: {', '.join(callers)} will call it when ended; run avckpt uninstall again then"
         )
@@ -354,7 +354,7 @@ def _remove(path: Path) -> bool:
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise ConfigError(f"{path} can not be removed: {error.strerror}") from error
+        raise ConfigError(f"{path} cannot be removed: {error.strerror}") from error
     return True
 
 
@@ -378,7 +378,7 @@ def _hook_python(root: Path) -> str:
 def _compile(root: Path, python: str) -> list[Path]:
     """Byte code for the hooks: they start for every container, and run with -B."""
     if root != _HOST:
-        return []  # the host's Python can not be run from here
+        return []  # the host's Python cannot be run from here
     # Not fatal: without byte code the hooks are slower, no more.
     subprocess.run([python, "-IS", "-m", "compileall", "-q", str(_PACKAGE)], check=False, stdout=subprocess.DEVNULL)
     return sorted(path for cache in _CACHES for path in cache.glob("*.pyc"))

@@ -34,7 +34,7 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable
     the terminal's foreground group.  Signals in `ignored` are ignored in the
     new process, SIGPIPE and SIGXFSZ, which Python itself ignores, are not.
 
-    Raises Denied, Unsupported or KernelError when it can not be started; then
+    Raises Denied, Unsupported or KernelError when it cannot be started; then
     nothing is left behind.  Precondition: this process has one thread.
     """
     with contextlib.ExitStack() as undo:
@@ -62,7 +62,7 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable
 def _children_in_new_namespace(own: int) -> Iterator[None]:
     """Children forked in the body are in a new PID namespace.
 
-    Undone at once: while it lasts this process can not start a thread, clone(2).
+    Undone at once: while it lasts this process cannot start a thread, clone(2).
     """
     if _libc.unshare(CLONE_NEWPID) != 0:
         raise _problem("unshare", ctypes.get_errno())
@@ -114,7 +114,7 @@ def _problem(syscall: str, errno: int) -> AvckptError:
         kind = Denied
     elif syscall == "unshare":
         kind = Unsupported
-    detail = "a PID namespace for the program can not be made"
+    detail = "a PID namespace for the program cannot be made"
     if kind is Denied:
         detail += ": it takes root (CAP_SYS_ADMIN)"
     return kind(detail, syscall=syscall, errno=errno)

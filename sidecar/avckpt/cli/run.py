@@ -76,7 +76,7 @@ def config_of_run(labels: Mapping[str, str]) -> GuardConfig:
 def run(config: GuardConfig, argv: list[str], *, verbose: bool) -> int:
     """Runs `argv` to its end and returns its exit status, 128+N when signal N killed it.
 
-    Raises AvckptError when it can not be started.
+    Raises AvckptError when it cannot be started.
     """
     probe()
     init = init_binary()

@@ -22,7 +22,7 @@ ANSWERS_WITHIN_S = 20.0
 def ensure(run_dir: Path, say: Callable[[str], None]) -> None:
     """Returns when a sidecar answers; starts its container if none does.
 
-    Raises SidecarUnreachable with what is to be done when that can not be.
+    Raises SidecarUnreachable with what is to be done when that cannot be.
     """
     _ensure(run_dir, say)
     if is_outdated():
@@ -103,7 +103,7 @@ def _podman(*args: str, check: bool = True) -> subprocess.CompletedProcess[str]:
     if check and done.returncode != 0:
         lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
         raise SidecarUnreachable(
-            f"the container {NAME} can not be started: podman {args[0]}: {lines[-1]}; "
+            f"the container {NAME} cannot be started: podman {args[0]}: {lines[-1]}; "
             f"mend that, or remove it (podman rm -f {NAME}) and try again"
         )
     return done

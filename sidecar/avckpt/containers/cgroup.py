@@ -36,7 +36,7 @@ def see_whole_tree() -> None:
         fd = os.open("/proc/1/ns/cgroup", os.O_RDONLY | os.O_CLOEXEC)
         try:
             if libc.setns(fd, CLONE_NEWCGROUP) != 0:
-                log.debug("the host's cgroup namespace can not be entered: %s", os.strerror(ctypes.get_errno()))
+                log.debug("the host's cgroup namespace cannot be entered: %s", os.strerror(ctypes.get_errno()))
         finally:
             os.close(fd)
     whole = {mount.controllers for mount in _mounts("self") if mount.root == "/"}
@@ -51,10 +51,10 @@ def see_whole_tree() -> None:
         try:
             where.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            log.debug("%s can not be made: %s", where, error)
+            log.debug("%s cannot be made: %s", where, error)
             return
         if libc.mount(b"avckpt", bytes(where), kind, 0, options.encode() if controllers else None) != 0:
-            log.debug("cgroup %s can not be mounted: %s", names, os.strerror(ctypes.get_errno()))
+            log.debug("cgroup %s cannot be mounted: %s", names, os.strerror(ctypes.get_errno()))
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Groups:
         return limit + min(swap, _host_swap_bytes())
 
     def memory_used_bytes(self) -> int | None:
-        """What counts against the limit and can not simply be given back: usage less clean file pages."""
+        """What counts against the limit and cannot simply be given back: usage less clean file pages."""
         if self.memory is None:
             return None
         text = _read(self.memory / ("memory.current" if self.memory_version == 2 else "memory.usage_in_bytes"))

@@ -97,7 +97,7 @@ class HookListener:
         """Accepts nobody for a moment: who waits goes on waiting, so that the socket stays readable."""
         if not self._is_short:
             log.error(
-                "hooks can not be answered (%s): containers that start now run unprotected at first; "
+                "hooks cannot be answered (%s): containers that start now run unprotected at first; "
                 "give the sidecar more descriptors (podman run --ulimit nofile=N)",
                 error.strerror,
             )

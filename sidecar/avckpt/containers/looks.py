@@ -46,7 +46,7 @@ async def look(what: str, pid: int, function: Callable[[], T]) -> T:
     if wait_s > 0:
         await asyncio.wait([future], timeout=wait_s)
     if not future.done():
-        raise DeadlineMissed(f"its {what} can not be read within {WAIT_S:g} s", pid=pid)
+        raise DeadlineMissed(f"its {what} cannot be read within {WAIT_S:g} s", pid=pid)
     result: T = future.result()
     return result
 

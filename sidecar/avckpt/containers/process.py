@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Naming a process so that PID reuse can not confuse it: a pidfd, or a PID with its start time."""
+"""Naming a process so that PID reuse cannot confuse it: a pidfd, or a PID with its start time."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Records:
         """Every recorded container whose init still lives, with a pidfd that becomes the caller's.
 
         Those whose id `is_known` are left out, at the cost of a listing.  Records
-        of containers that have ended are removed; those that can not be read, or
+        of containers that have ended are removed; those that cannot be read, or
         whose PID means nothing here, are left where they are and logged.  Raises
         nothing: whatever is wrong now may be right at the next look.
         """
@@ -58,7 +58,7 @@ class Records:
         except FileNotFoundError:
             return  # no hook has left one yet
         except OSError as error:
-            self.complain("", f"{self._directory} can not be read, containers may run unprotected: {error.strerror}")
+            self.complain("", f"{self._directory} cannot be read, containers may run unprotected: {error.strerror}")
             return
         self._complaints = {name: line for name, line in self._complaints.items() if name in names}
         for path in map(self._directory.joinpath, names):

@@ -30,7 +30,7 @@ AGAIN_S = 10.0
 class History:
     """The events of a machine since it started, at most `limit`.  For one thread.
 
-    What can not be written is kept in memory until it can, and the log says so once.
+    What cannot be written is kept in memory until it can, and the log says so once.
     """
 
     def __init__(self, path: Path, limit: int = LIMIT) -> None:
@@ -143,7 +143,7 @@ class History:
 
     def _complain(self, error: OSError) -> None:
         if self._failed_s is None:
-            log.error("%s can not be used (%s): events are kept in memory only", self._path, error.strerror)
+            log.error("%s cannot be used (%s): events are kept in memory only", self._path, error.strerror)
         self._failed_s = time.monotonic()
 
 

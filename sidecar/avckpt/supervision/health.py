@@ -171,9 +171,9 @@ async def _known(answer: Path, tell: Tell) -> HealthCheck | None:
         except FileNotFoundError:
             pass  # not yet
         except OSError as error:  # no descriptors left, for example: it may work in a moment
-            why = f"{answer} can not be read: {error.strerror}"
+            why = f"{answer} cannot be read: {error.strerror}"
         except (ValueError, AttributeError, RecursionError) as error:
-            why = f"{answer} can not be read: {error}"
+            why = f"{answer} cannot be read: {error}"
             break
         await asyncio.sleep(LOOK_S)
     tell(EventRecord(Kind.HEALTH, detail=f"avckpt.restore.on names unhealthy, but no health check is run: {why}"))
@@ -203,7 +203,7 @@ class _Watcher:
             raise
         except Exception as error:  # noqa: BLE001 - whatever stops this check, the next one may work
             # Ours to mend, and nothing that a rollback would: not counted.
-            self._complain("its health check can not be run", of_any(error))
+            self._complain("its health check cannot be run", of_any(error))
             return
         if container.restores != restores or is_paused(container.init_pid):
             return  # the check has seen two applications, or one that could not answer
@@ -240,7 +240,7 @@ class _Watcher:
             try:
                 self._order(Command.UNHEALTHY)
             except AvckptError as error:
-                self._complain(f"{detail}, it can not be rolled back", error)
+                self._complain(f"{detail}, it cannot be rolled back", error)
             else:
                 self.troubled = True
                 self.tell(EventRecord(Kind.HEALTH, detail=f"{detail}: rolled back ({why})"))

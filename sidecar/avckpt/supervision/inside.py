@@ -70,7 +70,7 @@ async def run_inside(
     container as it is now; the pidfd stays the caller's.
 
     Raises TargetGone when the container has ended, AvckptError when the command
-    can not be started in there.  Precondition: the event loop's main thread.
+    cannot be started in there.  Precondition: the event loop's main thread.
     """
     pid = pid_of(init_pidfd)
     if not pid:
@@ -111,7 +111,7 @@ async def run_inside(
                 pass_fds=(init_pidfd, failure_end, env_fd, program),
             )
         except OSError as error:
-            raise KernelError("avckpt-exec can not be started", syscall="execve", errno=error.errno or 0) from error
+            raise KernelError("avckpt-exec cannot be started", syscall="execve", errno=error.errno or 0) from error
         os.close(output_end)
         os.close(failure_end)
         kept = await _wait(process, output, timeout_s + GRACE_S)
@@ -121,7 +121,7 @@ async def run_inside(
     if said and not timed_out:
         if has_ended(init_pidfd):
             raise TargetGone("the container has ended", pid=pid)
-        raise AvckptError(f"a command can not be run in the container: {said}", pid=pid)
+        raise AvckptError(f"a command cannot be run in the container: {said}", pid=pid)
     return Done(process.returncode, timed_out, kept.decode(errors="replace").strip(), took_s)
 
 
@@ -174,7 +174,7 @@ def _credentials(pid: int) -> tuple[str, list[str]]:
     if uid is None or gid is None:
         raise AvckptError("its main process has a user or group that its user namespace does not", pid=pid)
     sets = [fields[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")]
-    # A group without a number in there (one of the host's, kept) can not be asked for.
+    # A group without a number in there (one of the host's, kept) cannot be asked for.
     groups = [_inside(int(group), gid_map) for group in fields["Groups"].split()]
     return (
         ":".join([str(uid), str(gid), *sets, fields["NoNewPrivs"]]),

@@ -125,7 +125,7 @@ void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote
 void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
 
 /* The extended (FPU, vector) state of a stopped thread.  `arch_xstate_bytes` is
- * its size on this machine, 0 if it can not be found out. */
+ * its size on this machine, 0 if it cannot be found out. */
 size_t arch_xstate_bytes(void);
 
 /* Room one thread's signal frame takes, and how it is built: first, while the

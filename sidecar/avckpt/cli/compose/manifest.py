@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a Compose file says to avckpt, and what of it can not be honoured.
+"""What a Compose file says to avckpt, and what of it cannot be honoured.
 
 Only the `avckpt.*` labels and annotations of services are looked at; whether
 the rest of the file is good Compose is podman-compose's to say.  Followed are

@@ -2,7 +2,7 @@
 """Runs podman-compose, a program of its own, and bounds what it leaves unbounded.
 
 podman-compose 1.6 waits for a dependency with `podman wait --condition=running`
-and no end: one service that can not start hangs everything that depends on it.
+and no end: one service that cannot start hangs everything that depends on it.
 While that is all it does, no container will change any more; then it is ended.
 The same goes for `--condition=healthy`, with more patience: where nobody runs
 the health checks, no container ever becomes healthy.
