@@ -50,7 +50,7 @@ test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
-sweep: setup-build ## kill the guard before each of its system calls, one run each: nobody notices (half an hour)
+sweep: setup-build ## kill the guard before each of its system calls, one run each: nobody notices (an hour or more)
 	@AVCKPT_SWEEP=all $(VENV)/python -m pytest tests/native/test_engine_sweep.py $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp
