@@ -2,7 +2,8 @@
 """The guard dies before its 1st, 2nd, 3rd ... system call that changes something, one run each.
 
 No application notices: each checks its own registers, stacks, masks, options and signals all the
-time.  All of it is `make sweep`; otherwise a part of it, another one each hour.
+time.  All of it is `make sweep`; otherwise a part of it, another one each hour, or the one that
+AVCKPT_SWEEP names.
 """
 
 from __future__ import annotations
@@ -28,8 +29,10 @@ CHANGES = ",".join(
 )
 MOST = 4000
 """System calls of one checkpoint or restore; there are never so many."""
-PART = 1 if os.environ.get("AVCKPT_SWEEP") == "all" else 16
-HOUR = int(time.time()) // 3600
+SWEEP = os.environ.get("AVCKPT_SWEEP") or str(int(time.time()) // 3600)
+"""Which part: "all", or a number."""
+PART = 1 if SWEEP == "all" else 16
+FIRST = 1 if SWEEP == "all" else 1 + int(SWEEP) % PART
 
 pytestmark = [
     pytest.mark.skipif(not shutil.which("strace"), reason="strace is what kills the guard; it is not installed"),
@@ -44,7 +47,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 def numbers() -> Iterator[int]:
     """Of the calls before which it dies."""
-    yield from range(1 + HOUR % PART, MOST, PART)
+    yield from range(FIRST, MOST, PART)
 
 
 class Killer:
