@@ -14,6 +14,7 @@
 #include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
+#include <sys/wait.h>
 
 #include "trace.h"
 
@@ -52,6 +53,13 @@ void syscall_batch_soften(struct syscall_batch *batch, const char *problem)
 		batch->soft[batch->softs++] = (struct soft){ batch->listed - 1, problem };
 }
 
+/* Its own SIGSTOP has served: nobody is to be told of it again (tracee_wait). */
+static int taken(pid_t pid)
+{
+	(void)waitpid(pid, NULL, __WALL | __WNOTHREAD | WNOHANG);
+	return 0;
+}
+
 /* At the end of its list; somebody else may have a signal for it, too. */
 static int await_end(const struct syscall_batch *batch, const struct inj_syscall *last,
 		     struct avc_error *err)
@@ -68,7 +76,7 @@ static int await_end(const struct syscall_batch *batch, const struct inj_syscall
 			if (stop.signal != SIGSTOP)
 				signal = stop.signal;
 			else if (last->result != NOT_MADE)
-				return 0;
+				return taken(batch->pid);
 			break;
 		case STOP_EXIT:
 		case STOP_DYING:

@@ -259,7 +259,8 @@ struct stop {
 
 /* From now on a wait also ends (as at the deadline) when *word is not 0; NULL: no more. */
 void tracee_watch(const uint32_t *word);
-/* Waits for the next stop of one tracee of this thread; options: 0 or WNOHANG. */
+/* Waits for the next stop of one tracee of this thread; options: 0 or WNOHANG.  A STOP_SIGNAL is
+ * told of again until it is made to go on: so the application gets its signal also if we die. */
 struct stop tracee_wait(pid_t tid, int options);
 /* For a running tracee that was interrupted (or is new): waits until it is in a
  * plain trap stop (STOP_TRAP); signals that come in between are delivered.  A new

@@ -104,6 +104,27 @@ static bool is_dying(pid_t tid)
 	return proc_stat(tid, &stat) || stat.state == 'Z' || stat.state == 'X';
 }
 
+/* As waitpid(2), but a thread that is about to receive a signal stays as it is.  Who waits for such
+ * a stop takes the signal out of it (kernel/exit.c, wait_task_stopped()); if we then died before
+ * we let the thread go on with it, the application would never have been sent that signal.  From
+ * one that was only looked at, it gets it whatever becomes of us. */
+static pid_t wait_keeping_signal(pid_t tid, int *status, int options)
+{
+	siginfo_t info = { 0 };
+
+	options |= __WALL | __WNOTHREAD;
+	if (waitid(P_PID, (id_t)tid, &info, WEXITED | WSTOPPED | WNOWAIT | options))
+		return -1;
+	if (!info.si_pid)
+		return 0;
+	/* No event, no system call: si_status is the exit code of the stop, ptrace(2). */
+	if (info.si_code == CLD_TRAPPED && info.si_status < 0x80) {
+		*status = W_STOPCODE(info.si_status);
+		return tid;
+	}
+	return waitpid(tid, status, options);
+}
+
 /* tick() is called now and then, as long as there is a deadline. */
 static struct stop wait_ticking(pid_t tid, int options, void (*tick)(void))
 {
@@ -112,7 +133,7 @@ static struct stop wait_ticking(pid_t tid, int options, void (*tick)(void))
 	pid_t r;
 
 	do {
-		r = waitpid(tid, &stop.status, __WALL | __WNOTHREAD | options);
+		r = wait_keeping_signal(tid, &stop.status, options);
 		if (r < 0 && errno == EINTR) {
 			stop.kind = is_dying(tid) ? STOP_DYING : STOP_DEADLINE;
 			if (stop.kind == STOP_DYING || tracee_deadline_passed() ||
