@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import select
 import signal
 import struct
 from collections.abc import Iterable, Iterator
@@ -19,10 +20,11 @@ from avckpt.errors import AvckptError, Denied, KernelError, Unsupported
 
 CLONE_NEWNS = 0x00020000
 CLONE_NEWPID = 0x20000000
+PR_SET_PDEATHSIG = 1
 MS_NOSUID, MS_NODEV, MS_NOEXEC = 2, 4, 8
 MS_REC, MS_PRIVATE = 0x4000, 0x40000
 
-_STEPS = ("setpgid", "unshare", "mount", "mount", "execve")
+_STEPS = ("setpgid", "prctl", "unshare", "mount", "mount", "execve")
 _FAILURE = struct.Struct("ii")
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -33,6 +35,8 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable
     With `tty` (a descriptor of our controlling terminal) the new group becomes
     the terminal's foreground group.  Signals in `ignored` are ignored in the
     new process, SIGPIPE and SIGXFSZ, which Python itself ignores, are not.
+
+    It is killed, with all that it has started, when this process ends, however that comes about.
 
     Raises Denied, Unsupported or KernelError when it cannot be started; then
     nothing is left behind.  Precondition: this process has one thread.
@@ -46,6 +50,7 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable
             with _children_in_new_namespace(own):
                 pid = os.fork()
                 if pid == 0:
+                    os.close(failed)  # only the parent's: that it is closed says that the parent has ended
                     _become(path, argv, tty, ignored, tell)
         finally:
             os.close(tell)
@@ -85,12 +90,16 @@ def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int],
             os.tcsetpgrp(tty, os.getpgrp())
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTTOU})
         step = 1
-        _check(_libc.unshare(CLONE_NEWNS))
+        _check(_libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0))
+        if _has_ended(tell):
+            os._exit(125)  # before we asked to be told
         step = 2
-        _check(_libc.mount(b"none", b"/", None, MS_REC | MS_PRIVATE, None))
+        _check(_libc.unshare(CLONE_NEWNS))
         step = 3
-        _check(_libc.mount(b"proc", b"/proc", b"proc", MS_NOSUID | MS_NODEV | MS_NOEXEC, None))
+        _check(_libc.mount(b"none", b"/", None, MS_REC | MS_PRIVATE, None))
         step = 4
+        _check(_libc.mount(b"proc", b"/proc", b"proc", MS_NOSUID | MS_NODEV | MS_NOEXEC, None))
+        step = 5
         # Python ignores them; what it starts should not.
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
@@ -101,6 +110,13 @@ def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int],
         os.write(tell, _FAILURE.pack(step, error.errno or 0))
     finally:
         os._exit(125)
+
+
+def _has_ended(tell: int) -> bool:
+    """Whether nobody reads what is written to this pipe."""
+    poll = select.poll()
+    poll.register(tell, 0)
+    return bool(poll.poll(0))
 
 
 def _check(result: int) -> None:
