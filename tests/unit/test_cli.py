@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,16 @@ def test_an_answer_that_is_no_sidecars(run_dir: Path) -> None:
 
 @pytest.mark.parametrize(
     "args",
-    [["checkpoint"], ["restore", "a", "b"], ["ps", "--nonsense"], ["nonsense"], ["run"], ["run", "-l", "x", "true"]],
+    [
+        ["checkpoint"],
+        ["restore", "a", "b"],
+        ["ps", "--nonsense"],
+        ["nonsense"],
+        ["run"],
+        ["run", "-l", "x", "true"],
+        ["run", "--lable", "avckpt.interval=1s", "--", "true"],
+        ["events", "--all"],
+    ],
 )
 def test_wrong_usage(args: list[str]) -> None:
     assert avckpt(*args).exit_code == 2
@@ -134,6 +144,23 @@ def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lines[2].split()[:2] == ["abababababab", "starting"]
     assert lines[2].count("[red]no[/red]") == 20
     assert len(lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("age_s", "said"),
+    [
+        (0, "0 s ago"),
+        (100, "100 s ago"),
+        (150, "2 min ago"),
+        (7140, "119 min ago"),
+        (10**5, "27 h ago"),
+        (10**6, "11 d ago"),
+    ],
+)
+def test_ages(monkeypatch: pytest.MonkeyPatch, age_s: float, said: str) -> None:
+    rows = [row(last_checkpoint_at=time.time() - age_s)]
+    monkeypatch.setattr(Client, "containers", lambda self, ended: rows)
+    assert f" {said} " in avckpt("ps").stdout
 
 
 def test_json_is_what_the_api_said(monkeypatch: pytest.MonkeyPatch) -> None:

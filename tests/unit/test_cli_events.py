@@ -40,7 +40,9 @@ def test_without_a_sidecar(args: list[str]) -> None:
     assert result.stderr.startswith("avckpt: the sidecar is not running (no ")
 
 
-@pytest.mark.parametrize(("text", "ago_s"), [("30s", 30), ("10m", 600), ("2h", 7200), ("1.5d", 129600), (None, None)])
+@pytest.mark.parametrize(
+    ("text", "ago_s"), [("30s", 30), ("10m", 600), ("2h", 7200), ("2h30m", 9000), ("1.5d", 129600), (None, None)]
+)
 def test_since_so_long_ago(monkeypatch: pytest.MonkeyPatch, text: str | None, ago_s: float | None) -> None:
     asked: list[float | None] = []
 

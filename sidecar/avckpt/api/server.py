@@ -67,6 +67,9 @@ STATUS: dict[type[AvckptError], int] = {
 HTTP_KINDS = {400: "bad_request", 404: "not_found", 405: "method_not_allowed"}
 """`kind` of an error that is the request's own."""
 
+FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+"""Values of a parameter that is a boolean."""
+
 KEEP_ALIVE_S = 15.0
 """A stream of events says something at least this often, so that either end notices when the other has gone."""
 
@@ -94,7 +97,7 @@ class ApiServer:
     def __init__(self, backend: Backend, path: Path) -> None:
         self._backend = backend
         self._path = path
-        self.app = app = web.Application(middlewares=[_errors_as_json])
+        self.app = app = web.Application(middlewares=[_errors_as_json, _known_parameters])
         app.add_routes(
             [
                 web.get("/v1/info", self._info),
@@ -228,7 +231,26 @@ def _since(request: web.Request) -> float | None:
 
 
 def _flag(request: web.Request, name: str, default: str = "0") -> bool:
-    return request.query.get(name, default).lower() not in ("0", "false", "no")
+    text = request.query.get(name, default)
+    if text.lower() not in FLAGS:
+        raise web.HTTPBadRequest(reason=f"{name} is {printable(text)[:40]}, neither true nor false")
+    return FLAGS[text.lower()]
+
+
+@web.middleware
+async def _known_parameters(
+    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+) -> web.StreamResponse:
+    """Refuses a query with a parameter that the path does not take: nobody is to believe that it did something."""
+    resource = request.match_info.route.resource
+    path = "" if resource is None else resource.canonical.replace("{command}", request.match_info.get("command", ""))
+    operation = document()["paths"].get(path, {}).get(request.method.lower(), {})
+    known = [each["name"] for each in operation.get("parameters", []) if each["in"] == "query"]
+    for name in request.query:
+        if operation and name not in known:
+            takes = f"it takes {', '.join(known)}" if known else "it takes none"
+            raise web.HTTPBadRequest(reason=f"there is no parameter {printable(name)[:40]}; {takes}")
+    return await handler(request)
 
 
 @web.middleware

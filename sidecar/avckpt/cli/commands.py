@@ -217,7 +217,7 @@ def doctor(as_json: bool) -> None:
 
 
 @main.command(
-    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+    context_settings={"allow_interspersed_args": False},
     options_metavar="[--label avckpt.KEY=VALUE ...] [-v] --",
 )
 @click.option("-l", "--label", "labels", multiple=True, metavar="avckpt.KEY=VALUE", help="As of a container.")
@@ -319,12 +319,20 @@ def _row(c: Json) -> tuple[str, ...]:
         c["state"],
         "-" if c["state"] == "listening" else f"{c['generations']}/{c['keep']}",
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
-        "-" if age_s is None else f"{age_s:.0f} s ago",
+        "-" if age_s is None else _ago(age_s),
         _ms(c["last_freeze_s"]),
         str(c["restores"]),
         _ms(c["last_restore_s"]),
         c["reason"],
     )
+
+
+def _ago(seconds: float) -> str:
+    """In the largest unit of which there are two."""
+    for unit, unit_s in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * unit_s:
+            return f"{seconds // unit_s:.0f} {unit} ago"
+    return f"{seconds:.0f} s ago"
 
 
 def _ms(seconds: float | None) -> str:

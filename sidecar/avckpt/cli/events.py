@@ -44,13 +44,13 @@ class Instant(click.ParamType):  # type: ignore[type-arg] # generic only in newe
         """To seconds since 1970."""
         if isinstance(value, float):
             return value
-        found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value, re.ASCII)
-        if found is not None:
-            return time.time() - float(found[1]) * _UNITS_S[found[2]]
+        if re.fullmatch(r"(\d+(\.\d+)?[smhd])+", value, re.ASCII):
+            parts = re.findall(r"([\d.]+)([smhd])", value)
+            return time.time() - sum(float(number) * _UNITS_S[unit] for number, unit in parts)
         try:
             return datetime.fromisoformat(value).timestamp()
         except (ValueError, OverflowError):
-            self.fail(f"{value!r} is neither a time ago (30s, 10m, 2h, 1d) nor a date and time (2026-05-17T08:30)")
+            self.fail(f"{value!r} is neither a time ago (30s, 10m, 2h30m, 1d) nor a date and time (2026-05-17T08:30)")
 
 
 @click.command()
@@ -63,6 +63,8 @@ def events(follow: bool, since: float | None, routine: bool, as_json: bool) -> N
 
     The sidecar keeps the last 1000 events, also over its own restart.
     """
+    if routine and not follow:
+        raise click.UsageError("--all needs --follow: single checkpoints are told of when they are taken, and not kept")
     client = _client()
     try:
         for event in _followed(client, since, routine) if follow else client.history(since):
