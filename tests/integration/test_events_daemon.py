@@ -89,6 +89,21 @@ def crash(local: LocalSidecar, container: Container, restores: int = 1) -> None:
     local.wait_for(container, restores=restores, state="protected")
 
 
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("/v1/containers?al=1", "there is no parameter al; it takes all, memory"),
+        ("/v1/info?all=1", "there is no parameter all; it takes none"),
+        ("/v1/containers?all=2", "all is 2, neither true nor false"),
+        ("/metrics?name=web", "there is no parameter name; it takes none"),
+    ],
+)
+def test_a_parameter_that_does_nothing_is_refused(target: str, said: str, local: LocalSidecar) -> None:
+    status, _, body = get(local, target)
+    assert status == 400
+    assert said in json.loads(body)["error"]["message"]
+
+
 def test_the_stream_tells_a_crash_as_it_happens_and_ends_with_the_sidecar(local: LocalSidecar) -> None:
     events = stream(local, "?all=1")
     web = local.protected("web", SLEEPER, {**QUICK, "avckpt.group": "chain"})
@@ -225,6 +240,9 @@ def test_the_command_events(local: LocalSidecar) -> None:
     time.sleep(1.1)
     assert local.avckpt("events", "--since", "1s").stdout == ""
     assert len(local.avckpt("events", "--since", "10m").stdout.splitlines()) == 4
+    assert local.avckpt("events", "web", "--kind", "restored").stdout.splitlines() == [
+        line for line in lines if "restored in" in line
+    ]
 
 
 def test_following_goes_on_over_a_restart_of_the_sidecar(local: LocalSidecar, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import os
 import re
 import resource
 import signal
-import socket
 import stat
 import struct
 import subprocess
@@ -533,26 +532,6 @@ def test_info(local: LocalSidecar) -> None:
     assert info["pid"] == local.process.pid
     assert info["containers"] == 0
     assert info["version"] == run([*avckpt_command(), "--version"]).stdout.split()[1]
-
-
-@pytest.mark.parametrize(
-    ("target", "said"),
-    [
-        ("/v1/containers?al=1", "there is no parameter al; it takes all, memory"),
-        ("/v1/info?all=1", "there is no parameter all; it takes none"),
-        ("/v1/containers?all=2", "all is 2, neither true nor false"),
-        ("/metrics?name=web", "there is no parameter name; it takes none"),
-    ],
-)
-def test_a_parameter_that_does_nothing_is_refused(target: str, said: str, local: LocalSidecar) -> None:
-    with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(10)
-        connection.connect(str(local.run_dir / "api.sock"))
-        connection.sendall(f"GET {target} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
-        answer = connection.makefile("rb").read().decode()
-    status, _, body = answer.partition("\r\n")
-    assert " 400 " in status
-    assert said in body
 
 
 def test_who_does_not_ask_for_memory_does_not_have_it_looked_at(local: LocalSidecar) -> None:

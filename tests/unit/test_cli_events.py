@@ -58,6 +58,40 @@ def test_since_so_long_ago(monkeypatch: pytest.MonkeyPatch, text: str | None, ag
         assert asked == [pytest.approx(time.time() - ago_s, abs=5)]
 
 
+KEPT = [
+    event(container="web", id="ab" * 32, kind="restored", message="web restored"),
+    event(container="db", id="cd" * 32, kind="gave_up", message="db gave up"),
+    event(container="web", id="ab" * 32, kind="gave_up", message="web gave up"),
+]
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        ([], ["web restored", "db gave up", "web gave up"]),
+        (["web"], ["web restored", "web gave up"]),
+        (["cdcd"], ["db gave up"]),
+        (["--kind", "gave_up"], ["db gave up", "web gave up"]),
+        (["web", "-k", "restored", "-k", "missed"], ["web restored"]),
+        (["idle"], []),
+    ],
+)
+def test_only_some(args: list[str], said: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Client, "history", lambda self, since: KEPT)
+    monkeypatch.setattr(Client, "containers", lambda self, **options: [{"name": "idle", "id": "ef" * 32}])
+    result = avckpt("events", *args)
+    assert result.exit_code == 0
+    assert [line.partition(": ")[2] for line in result.stdout.splitlines()] == said
+
+
+def test_of_one_that_was_never_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Client, "history", lambda self, since: KEPT)
+    monkeypatch.setattr(Client, "containers", lambda self, **options: [])
+    result = avckpt("events", "wbe")
+    assert result.exit_code == 4
+    assert result.stderr == "avckpt: no event is kept of a container 'wbe', and none is called so now\n"
+
+
 def test_since_a_date(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float | None] = []
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avckpt.errors import AvckptError, SidecarUnreachable
+from avckpt.errors import AvckptError, NoSuchContainer, SidecarUnreachable
+from avckpt.events.vocabulary import Kind
 
 if TYPE_CHECKING:
     from avckpt.cli.client import Client, Json
@@ -53,25 +54,56 @@ class Instant(click.ParamType):  # type: ignore[type-arg] # generic only in newe
             self.fail(f"{value!r} is neither a time ago (30s, 10m, 2h30m, 1d) nor a date and time (2026-05-17T08:30)")
 
 
+def complete_container(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Names of protected containers; none when there is no sidecar to ask."""
+    try:
+        names = [str(row["name"] or row["id"][:12]) for row in _client().containers(memory=False)]
+    except AvckptError:
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
 @click.command()
+@click.argument("name", required=False, shell_complete=complete_container)
 @click.option("-f", "--follow", is_flag=True, help="Go on with those to come, also over a restart of the sidecar.")
 @click.option("--since", type=Instant(), help="Only from then on: 10m (ago), or 2026-05-17T08:30.")
 @click.option("-a", "--all", "routine", is_flag=True, help="With --follow: also every single checkpoint.")
+@click.option(
+    "-k", "--kind", "kinds", multiple=True, type=click.Choice([kind.value for kind in Kind]), help="Only these."
+)
 @click.option("--json", "as_json", is_flag=True, help="JSON lines, one for each event.")
-def events(follow: bool, since: float | None, routine: bool, as_json: bool) -> None:
+def events(
+    name: str | None, follow: bool, since: float | None, routine: bool, kinds: tuple[str, ...], as_json: bool
+) -> None:
     """Tell what happened: crashes, restores, what is unprotected and why.
 
+    With NAME (a name, an id or the beginning of one) only of that container.
     The sidecar keeps the last 1000 events, also over its own restart.
     """
     if routine and not follow:
         raise click.UsageError("--all needs --follow: single checkpoints are told of when they are taken, and not kept")
     client = _client()
     try:
-        for event in _followed(client, since, routine) if follow else client.history(since):
-            click.echo(json.dumps(event) if as_json else _line(event))
-            sys.stdout.flush()
+        for event in _followed(client, since, routine) if follow else _kept(client, name, since):
+            if (name is None or _is_of(event, name)) and (not kinds or event["kind"] in kinds):
+                click.echo(json.dumps(event) if as_json else _line(event))
+                sys.stdout.flush()
     except KeyboardInterrupt:
         return  # the usual way to have enough
+
+
+def _is_of(event: Json, name: str) -> bool:
+    return name == event["container"] or (bool(name) and event["id"].startswith(name))
+
+
+def _kept(client: Client, name: str | None, since: float | None) -> list[Json]:
+    """What the sidecar has kept.  Raises NoSuchContainer when it never heard of that one."""
+    kept = client.history(since)
+    if name is not None and not any(_is_of(event, name) for event in kept):
+        known = client.containers(ended=True, memory=False)
+        if not any(_is_of({"container": row["name"], "id": row["id"]}, name) for row in known):
+            raise NoSuchContainer(f"no event is kept of a container {name!r}, and none is called so now")
+    return kept
 
 
 def _followed(client: Client, since: float | None, routine: bool) -> Iterator[Json]:
@@ -122,15 +154,6 @@ def completion(shell: str) -> None:
     root = click.get_current_context().find_root().command
     assert found is not None
     click.echo(found(root, {}, "avckpt", "_AVCKPT_COMPLETE").source())
-
-
-def complete_container(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """Names of protected containers; none when there is no sidecar to ask."""
-    try:
-        names = [str(row["name"] or row["id"][:12]) for row in _client().containers(memory=False)]
-    except AvckptError:
-        return []
-    return [name for name in names if name.startswith(incomplete)]
 
 
 def _client() -> Client:
