@@ -18,6 +18,9 @@ Row = dict[str, float]
 MEMORY = ("rss_kb", "anon_kb", "page_tables_kb")
 """Figures that may be a little more: allocators and page tables go in steps."""
 
+ARENA_KB = 256
+"""Python takes its memory in arenas of this size or more, each a mapping."""
+
 NOT_JUDGED = ("at_s", "pss_kb", "private_kb")
 """What a page of libc counts for changes with every program on the machine that starts or ends."""
 
@@ -117,5 +120,6 @@ def growths(rows: Sequence[Row], memory_allowed_kb: float) -> list[Growth]:
         if name.endswith(MEMORY):
             found.append(Growth(name, min(first), min(last), memory_allowed_kb))
         else:
-            found.append(Growth(name, max(first), min(last), 0))
+            arenas = memory_allowed_kb // ARENA_KB if name == "sidecar.maps" else 0
+            found.append(Growth(name, max(first), min(last), arenas))
     return found
