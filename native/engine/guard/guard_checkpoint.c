@@ -413,13 +413,16 @@ static bool is_being_reported(struct avc_guard *guard, const struct avc_error *e
 	struct proc_stat stat;
 	pid_t pid;
 
-	if (err->code != AVC_BUSY || !guard->count || proc_status(err->pid, &status))
+	if (err->code != AVC_BUSY || !guard->count)
 		return false;
-	for (pid = status.tracer; pid > 1 && pid != guard->channel.init; pid = stat.parent)
-		if (proc_stat(pid, &stat))
-			return true; /* it has just ended */
-	if (pid != guard->channel.init)
-		return false;
+	/* By now the tracer may have let it go, or either of them have ended. */
+	if (proc_status(err->pid, &status) == 0 && status.tracer) {
+		for (pid = status.tracer; pid > 1 && pid != guard->channel.init; pid = stat.parent)
+			if (proc_stat(pid, &stat))
+				return true;
+		if (pid != guard->channel.init)
+			return false;
+	}
 	if (!guard->reported_ns)
 		guard->reported_ns = now_ns();
 	return now_ns() - guard->reported_ns < REPORT_NS;
