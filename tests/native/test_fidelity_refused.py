@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -114,6 +116,47 @@ def test_a_tracer_of_its_own(tmp_path: Path) -> None:
         os.kill(tracer, signal.SIGKILL)
         guard.wait("checkpoint", since=since)
         victim.wait_beats(20)
+
+
+class Tracer:
+    """strace of one thread, which comes in between two checkpoints."""
+
+    def __init__(self, tid: int) -> None:
+        self.process = self._start(tid)
+        wait_until(lambda: self._traces(tid), 5, "strace traces it")
+
+    @staticmethod
+    def _start(tid: int) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(["strace", "-qq", "-o", "/dev/null", "-p", str(tid)], stderr=subprocess.DEVNULL)
+
+    def _traces(self, tid: int) -> bool:
+        if self.process.poll() is not None:  # a checkpoint was being taken
+            self.process = self._start(tid)
+        return f"TracerPid:\t{self.process.pid}\n" in Path(f"/proc/{tid}/status").read_text()
+
+    def leave(self) -> None:
+        """What it traces runs on."""
+        self.process.terminate()
+        self.process.wait()
+
+
+@pytest.mark.skipif(not shutil.which("strace"), reason="strace is what traces the victim; it is not installed")
+def test_a_tracer_from_outside(tmp_path: Path) -> None:
+    """Checkpoints pause; what was held before is good for a crash after it has left."""
+    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(0.02, keep=2), [victim.pid]) as guard:
+        guard.wait("checkpoint", count=3)
+        strace = Tracer(victim.app)
+        since = guard.mark()
+        for _ in range(5):
+            missed = guard.wait("missed", since=since)
+            assert f"traced by process {strace.process.pid}" in missed["error"]["message"]
+            assert missed["generations"] == 2
+            since = guard.mark()
+        strace.leave()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        victim.wait_beats(20)
+        assert not [event for event in guard.events if event["kind"] in ("unprotected", "dropped")]
 
 
 def test_stopped_by_job_control(tmp_path: Path) -> None:

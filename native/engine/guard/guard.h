@@ -41,7 +41,6 @@ struct avc_guard {
 	uint64_t number; /* of the last generation taken             */
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* it was found dying: guard_reap_unknown() until then    */
-	uint64_t reported_ns;    /* since when it has been traced by one of its own; 0: it is not */
 	bool cramped;            /* there is no room for spares              */
 	uint64_t ahead_ns;       /* when to guard_work_ahead(); UINT64_MAX: never  */
 	struct policy policy;    /* held[i] is of generations[i]             */

@@ -16,7 +16,6 @@
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
-#define REPORT_NS (60 * NS_PER_S) /* that a crash reporter may take                       */
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
@@ -404,30 +403,6 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
-/* Being traced by a process of the app's own, as one is that crashes while the reporter that it
- * has started for that (breakpad, gdb) looks into it.  One that lives like that is not
- * protected, though. */
-static bool is_being_reported(struct avc_guard *guard, const struct avc_error *err)
-{
-	struct proc_status status = { 0 };
-	struct proc_stat stat;
-	pid_t pid;
-
-	if (err->code != AVC_BUSY || !guard->count)
-		return false;
-	/* By now the tracer may have let it go, or either of them have ended. */
-	if (proc_status(err->pid, &status) == 0 && status.tracer) {
-		for (pid = status.tracer; pid > 1 && pid != guard->channel.init; pid = stat.parent)
-			if (proc_stat(pid, &stat))
-				return true;
-		if (pid != guard->channel.init)
-			return false;
-	}
-	if (!guard->reported_ns)
-		guard->reported_ns = now_ns();
-	return now_ns() - guard->reported_ns < REPORT_NS;
-}
-
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
@@ -453,7 +428,6 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	if (take(guard, &event, &error) == 0) {
-		guard->reported_ns = 0;
 		guard->unprotected = false;
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
@@ -469,8 +443,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
-	if (!is_being_reported(guard, &error) &&
-	    policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
+	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
 		guard_unprotect(guard, ticket, &error);
 		return;
 	}

@@ -91,10 +91,13 @@ void policy_hold(struct policy *policy, struct policy_generation fresh)
 }
 
 /* A child process may be gone at the next look: the generations there are stay good for a
- * while. */
+ * while.  As long as somebody traces it there is no new one: a debugger, or a crash reporter
+ * (breakpad, gdb) that the app has started, whose report a death may follow. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
 {
-	if (code != AVC_UNSUPPORTED && code != AVC_DENIED && code != AVC_BUSY)
+	if (code == AVC_BUSY)
+		return !policy->count;
+	if (code != AVC_UNSUPPORTED && code != AVC_DENIED)
 		return false;
 	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
 }
