@@ -47,6 +47,7 @@ demo: setup ## kill a protected container's application twice and watch it go on
 	@$(VENV)/python -m scripts.demo
 
 test: setup ## every test (T=expression selects, TESTS=folder narrows)
+	@scripts/setup-system.sh view
 	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 

@@ -61,7 +61,7 @@ def data_files(build_lib: Path) -> list[tuple[Path, Path]]:
 setup(
     package_dir={"avckpt": "sidecar/avckpt", "avckpt_hooks": "hooks/avckpt_hooks"},
     packages=find_packages("sidecar") + find_packages("hooks"),
-    package_data={"avckpt": ["py.typed"], "avckpt_hooks": ["py.typed"]},
+    package_data={"avckpt": ["py.typed", "web/page/*"], "avckpt_hooks": ["py.typed"]},
     cffi_modules=["native/bind/build_native.py:ffibuilder"],
     cmdclass={"build_ext": BuildExt, "build_py": BuildPy},
     # The binding is built against the stable ABI: one wheel for every Python from this one on.

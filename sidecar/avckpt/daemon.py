@@ -38,6 +38,7 @@ from avckpt.containers.protected import Protected
 from avckpt.containers.records import NOT_SEEN, Records, keep_private
 from avckpt.containers.registry import Registry
 from avckpt.engine import Engine, Guard, probe
+from avckpt.engine import version as native_version
 from avckpt.errors import (
     AvckptError,
     Busy,
@@ -113,7 +114,7 @@ class Daemon:
         self.records = Records(run_dir / "containers")
         self.feed = Feed()
         self.history = History(run_dir / "history.jsonl")
-        self.metrics = Metrics()
+        self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
         self.started_at = time.time()
@@ -334,6 +335,7 @@ class Daemon:
             detail = f"{self.configuration.path} does not hold for it"
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail=detail, error=problem))
         if settings.policy.enable:
+            self.metrics.begin(container.label)
             self._start_guard(watch)
         else:
             container.listen()

@@ -176,7 +176,7 @@ def history(data: bytes) -> None:
     path = home() / "history.jsonl"
     path.write_bytes(data)
     kept = History(path, limit=20)
-    metrics = Metrics()
+    metrics = Metrics("1.0", "1.0")
     for event in kept.after():
         json.dumps(event.to_json(), allow_nan=False).encode()
         metrics.take(event)
@@ -245,7 +245,7 @@ def guard_event(data: bytes) -> None:
     assert isinstance(told.kind, Kind)
     assert told.reason is None or isinstance(told.reason, Reason)
     json.dumps([told.to_json(), container.to_json(), event.to_json()], allow_nan=False).encode()
-    metrics = Metrics()
+    metrics = Metrics("1.0", "1.0")
     metrics.take(told)
     metrics.render([container])
 

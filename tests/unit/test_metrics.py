@@ -25,7 +25,7 @@ def value(text: bytes, name: str, **labels: str) -> float | None:
 
 
 def test_events_are_counted_by_container_reason_and_outcome() -> None:
-    metrics = Metrics()
+    metrics = Metrics("1.0", "1.0")
     for _ in range(3):
         metrics.take(EventRecord(Kind.CHECKPOINT, container="web", freeze_s=0.0015))
     metrics.take(EventRecord(Kind.MISSED, container="web", freeze_s=0.05, error=DeadlineMissed("slow")))
@@ -37,6 +37,7 @@ def test_events_are_counted_by_container_reason_and_outcome() -> None:
             outcome=Reason.RESTORED,
             restore_s=0.004,
             freeze_s=0.002,
+            lost_s=1.5,
         )
     )
     metrics.take(EventRecord(Kind.GAVE_UP, container="db", reason=Reason.EXIT, outcome=Reason.LIMIT))
@@ -50,9 +51,26 @@ def test_events_are_counted_by_container_reason_and_outcome() -> None:
     assert value(text, "avckpt_freeze_seconds_bucket", container="web", le="0.002") == 3
     assert value(text, "avckpt_restore_seconds_sum", container="web") == 0.004
     assert value(text, "avckpt_restores_total", container="web", reason="signal", outcome="restored") == 1
+    assert value(text, "avckpt_lost_seconds_sum", container="web") == 1.5
+    assert value(text, "avckpt_last_lost_seconds", container="web") == 1.5
+    assert value(text, "avckpt_last_lost_seconds", container="db") is None
     assert value(text, "avckpt_restores_total", container="db", reason="exit", outcome="limit") == 1
     assert value(text, "avckpt_restore_seconds_count", container="db") is None
     assert value(text, "avckpt_notifications_total", container="db", outcome="failed") == 1
+
+
+def test_what_alerts_ask_for_is_zero_from_the_start() -> None:
+    metrics = Metrics("1.0", "1.1")
+    metrics.begin("web")
+    text = metrics.render([])
+    assert value(text, "avckpt_build_info", version="1.0", native_version="1.1") == 1
+    assert value(text, "avckpt_checkpoints_total", container="web") == 0
+    assert value(text, "avckpt_restores_total", container="web", reason="signal", outcome="restored") == 0
+    assert value(text, "avckpt_restores_total", container="web", reason="exit", outcome="failed") == 0
+    for histogram in ("freeze", "restore", "lost"):
+        assert value(text, f"avckpt_{histogram}_seconds_count", container="web") == 0
+    metrics.forget_all_but([])
+    assert b'"web"' not in metrics.render([])
 
 
 def container(name: str, state: State, generations: int) -> Protected:
@@ -62,7 +80,7 @@ def container(name: str, state: State, generations: int) -> Protected:
 
 
 def test_gauges_are_of_live_containers_only() -> None:
-    metrics = Metrics()
+    metrics = Metrics("1.0", "1.0")
     web, db = container("web", State.PROTECTED, 2), container("db", State.UNPROTECTED, 0)
     text = metrics.render([web, db])
     assert value(text, "avckpt_generations", container="web") == 2
@@ -70,14 +88,22 @@ def test_gauges_are_of_live_containers_only() -> None:
     assert value(text, "avckpt_generations_memory_bytes", container="web") == 1000
     assert value(text, "avckpt_generations_memory_bytes", container="db") == 0
     assert value(text, "avckpt_protected", container="db") == 0
+    assert value(text, "avckpt_last_checkpoint_timestamp_seconds", container="web") is None
+    web.last_checkpoint_at = 1700000000.5
+    assert value(metrics.render([web]), "avckpt_last_checkpoint_timestamp_seconds", container="web") == 1700000000.5
     web.state = State.RESTORING
     text = metrics.render([web])
     assert value(text, "avckpt_protected", container="web") == 0
     assert value(text, "avckpt_protected", container="db") is None
 
 
+def test_who_only_listens_has_no_gauges() -> None:
+    text = Metrics("1.0", "1.0").render([container("ear", State.LISTENING, 0)])
+    assert b'"ear"' not in text
+
+
 def test_a_forgotten_container_leaves_no_series() -> None:
-    metrics = Metrics()
+    metrics = Metrics("1.0", "1.0")
     for name in ("old", "new"):
         metrics.take(EventRecord(Kind.CHECKPOINT, container=name, freeze_s=0.001))
         metrics.take(EventRecord(Kind.NOTIFIED, container=name))

@@ -20,6 +20,7 @@ import click
 from avckpt import __version__
 from avckpt.cli.compose.commands import check, down, up
 from avckpt.cli.events import complete_container, completion, events
+from avckpt.cli.web import web
 from avckpt.errors import AvckptError, ExitCode
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def main() -> None:
 
 main.add_command(events)
 main.add_command(completion)
-for command in (check, up, down):
+for command in (check, up, down, web):
     main.add_command(command)
 
 root_option = click.option(
@@ -136,6 +137,18 @@ def ps(ended: bool, as_json: bool) -> None:
         click.echo(json.dumps(containers, indent=2))
         return
     _print_table(containers)
+
+
+@main.command()
+def top() -> None:
+    """Watch all protected containers live; "?" lists the keys."""
+    from avckpt.cli.top import Top
+
+    client = _client()
+    client.info()
+    if not sys.stdout.isatty():
+        raise click.UsageError("it needs a terminal; avckpt ps and avckpt events write to a pipe")
+    Top(client).run()
 
 
 @main.command()

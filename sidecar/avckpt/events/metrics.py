@@ -11,20 +11,25 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_late
 
 from avckpt.containers.protected import Protected, State
 from avckpt.events.record import EventRecord
-from avckpt.events.vocabulary import Kind
+from avckpt.events.vocabulary import Kind, Reason
 
-Metric = TypeVar("Metric", Counter, Histogram)
+Metric = TypeVar("Metric", Counter, Gauge, Histogram)
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 FREEZE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25)
 RESTORE_BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
+LOST_BUCKETS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+UNWANTED = (Reason.SIGNAL, Reason.EXIT, Reason.UNHEALTHY)
+"""Causes of restores whose series exist from the start: an alert on a rate never sees the first of a new series."""
 
 
 class Metrics:
     """All metrics of a sidecar, by container."""
 
-    def __init__(self) -> None:
+    def __init__(self, version: str, native_version: str) -> None:
         self._registry = CollectorRegistry()
+        build = Gauge("avckpt_build_info", "1; who serves this", ["version", "native_version"], registry=self._registry)
+        build.labels(version, native_version).set(1)
         self._freeze = Histogram(
             "avckpt_freeze_seconds",
             "How long checkpoints held the application",
@@ -37,6 +42,13 @@ class Metrics:
             "Death of the application to its last thread running again",
             ["container"],
             buckets=RESTORE_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._lost = Histogram(
+            "avckpt_lost_seconds",
+            "What the application lost by a restore: age of what it went back to, and the restore itself",
+            ["container"],
+            buckets=LOST_BUCKETS_S,
             registry=self._registry,
         )
         self._taken = self._counter("avckpt_checkpoints_total", "Checkpoints taken")
@@ -56,7 +68,20 @@ class Metrics:
             "Memory that a container's generations hold and its application does not use",
         )
         self._protected = self._gauge("avckpt_protected", "1 while at least one generation is held, else 0")
-        self._labels: dict[str, set[tuple[Counter | Histogram, tuple[str, ...]]]] = {}
+        self._checkpoint_at = self._gauge(
+            "avckpt_last_checkpoint_timestamp_seconds", "When the newest checkpoint was taken, since 1970"
+        )
+        self._last_lost = self._gauge("avckpt_last_lost_seconds", "What the application lost by its last restore")
+        self._labels: dict[str, set[tuple[Counter | Gauge | Histogram, tuple[str, ...]]]] = {}
+
+    def begin(self, container: str) -> None:
+        """Makes the series of a container that is to be protected, at zero."""
+        self._of(self._taken, container)
+        for histogram in (self._freeze, self._restore, self._lost):
+            self._of(histogram, container)
+        for cause in UNWANTED:
+            for outcome in (Reason.RESTORED, Reason.LIMIT, Reason.FAILED, Reason.EMPTY):
+                self._of(self._restores, container, cause.value, outcome.value)
 
     def take(self, record: EventRecord) -> None:
         """Counts an event."""
@@ -71,6 +96,9 @@ class Metrics:
             self._of(self._restores, container, cause, record.outcome.value if record.outcome else "").inc()
             if record.restore_s is not None:
                 self._of(self._restore, container).observe(record.restore_s)
+            if record.lost_s is not None:
+                self._of(self._lost, container).observe(record.lost_s)
+                self._of(self._last_lost, container).set(record.lost_s)
         elif record.kind in (Kind.NOTIFIED, Kind.NOTIFY_FAILED):
             outcome = "delivered" if record.kind is Kind.NOTIFIED else "failed"
             self._of(self._notifications, container, outcome).inc()
@@ -83,12 +111,16 @@ class Metrics:
 
     def render(self, live: Iterable[Protected]) -> bytes:
         """The text that Prometheus reads, with what the generations of each held at the last look."""
-        for gauge in (self._generations, self._memory, self._protected):
+        for gauge in (self._generations, self._memory, self._protected, self._checkpoint_at):
             gauge.clear()
         for container in live:
+            if container.state is State.LISTENING:
+                continue  # it has asked for no protection
             self._generations.labels(container.label).set(container.generations)
             self._memory.labels(container.label).set(container.memory_bytes if container.generations else 0)
             self._protected.labels(container.label).set(container.state is State.PROTECTED)
+            if container.last_checkpoint_at is not None:
+                self._checkpoint_at.labels(container.label).set(container.last_checkpoint_at)
         return generate_latest(self._registry)
 
     def _counter(self, name: str, text: str, *labels: str) -> Counter:

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`avckpt top` with a real sidecar: driven by its keys, and once on a terminal."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import pytest
+from avckpt.cli.client import Client
+from avckpt.cli.top import COLUMNS, Top, sparkline
+from textual.pilot import Pilot
+from textual.widgets import DataTable, RichLog
+
+from testkit.harness import avckpt_command, wait_until
+from testkit.local_sidecar import LocalSidecar, local_sidecar
+
+SLEEPER = ["sleep", "1000"]
+LABELS = {"avckpt.enable": "true", "avckpt.interval": "300ms"}
+PATIENCE_S = 60
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Iterator[LocalSidecar]:
+    with local_sidecar(tmp_path) as sidecar:
+        sidecar.start()
+        yield sidecar
+
+
+def cells(app: Top, column: str) -> list[str]:
+    table = app.query_one("#units", DataTable)
+    return [str(table.get_row_at(row)[COLUMNS.index(column)]) for row in range(table.row_count)]
+
+
+def events(app: Top) -> str:
+    return "\n".join(line.text for line in app.query_one("#events", RichLog).lines)
+
+
+async def until(pilot: Pilot[None], holds: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline, what
+        await pilot.pause(0.05)
+
+
+def driven(local: LocalSidecar, steps: Callable[[Top, Pilot[None]], Awaitable[None]]) -> None:
+    async def drive() -> None:
+        app = Top(Client(local.run_dir))
+        async with app.run_test(size=(160, 40)) as pilot:
+            await steps(app, pilot)
+
+    asyncio.run(drive())
+
+
+@pytest.mark.shared_machine("restores and screens on a busy machine may take longer than the test waits")
+def test_units_crashes_and_keys(local: LocalSidecar) -> None:
+    lidar, planner = (local.protected(name, SLEEPER, LABELS) for name in ("lidar", "planner"))
+    for each in (lidar, planner):
+        local.wait_for(each, state="protected")
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        await until(pilot, lambda: cells(app, "UNIT") == ["lidar", "planner"], "both units")
+        await until(pilot, lambda: len(cells(app, "FREEZES")[0]) > 1, "a sparkline of freezes")
+        os.kill(planner.app_pid, signal.SIGSEGV)
+        await until(pilot, lambda: "killed by SIGSEGV, restored in" in cells(app, "LAST CRASH")[1], "the crash")
+        assert cells(app, "RESTORES") == ["0", "1"]
+        await pilot.press("s")
+        await until(pilot, lambda: cells(app, "UNIT") == ["planner", "lidar"], "who crashed last comes first")
+        await pilot.press("s", "home")
+        await until(pilot, lambda: cells(app, "UNIT") == ["lidar", "planner"], "by name again")
+        app.query_one("#units", DataTable).move_cursor(row=0)
+        await pilot.press("r", "n")
+        await pilot.press("r", "y")
+        await until(pilot, lambda: "lidar: rolled back on command" in events(app), "the roll back")
+        assert "planner: killed by SIGSEGV" in events(app)
+        await pilot.press("e")
+        await until(pilot, lambda: "planner" not in events(app), "only what happened to the chosen one")
+        assert "lidar: rolled back" in events(app)
+        assert events(app).count("lidar: rolled back on command") == 1
+
+    driven(local, steps)
+
+
+@pytest.mark.shared_machine("restores and screens on a busy machine may take longer than the test waits")
+def test_a_sidecar_that_goes_and_comes(local: LocalSidecar) -> None:
+    local.wait_for(local.protected("lidar", SLEEPER, LABELS), state="protected")
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        head = app.query_one("#head")
+        await until(pilot, lambda: "1 of 1" in str(head.render()), "one is protected")
+        await asyncio.to_thread(local.stop)
+        await until(pilot, lambda: "the sidecar is not running" in str(head.render()), "it says so")
+        await asyncio.to_thread(local.start)
+        await until(pilot, lambda: "not running" not in str(head.render()), "it is back")
+
+    driven(local, steps)
+
+
+def test_on_a_terminal(local: LocalSidecar) -> None:
+    local.protected("lidar", SLEEPER, LABELS)
+    leader, terminal = pty.openpty()
+    env = {**os.environ, **local.env, "TERM": "xterm-256color"}
+    shown = subprocess.Popen([*avckpt_command(), "top"], stdin=terminal, stdout=terminal, stderr=terminal, env=env)
+    screen = b""
+
+    def sees(text: bytes) -> bool:
+        nonlocal screen
+        while select.select([leader], [], [], 0)[0]:
+            screen += os.read(leader, 65536)
+        return text in screen
+
+    try:
+        wait_until(lambda: sees(b"lidar"), PATIENCE_S, "the unit")
+        os.write(leader, b"q")
+        wait_until(lambda: sees(b"\x1b[?1049l") and shown.poll() is not None, PATIENCE_S, "the terminal is as before")
+        assert shown.returncode == 0
+    finally:
+        shown.kill()
+        shown.wait()
+        os.close(terminal)
+        os.close(leader)
+
+
+def test_without_a_terminal_or_a_sidecar_it_says_so(local: LocalSidecar) -> None:
+    said = local.avckpt("top", check=False)
+    assert (said.status, "it needs a terminal" in said.stderr) == (2, True)
+    local.stop()
+    said = local.avckpt("top", check=False)
+    assert (said.status, "the sidecar is not running" in said.stderr) == (3, True)
+
+
+def test_a_sparkline_is_against_its_greatest() -> None:
+    assert sparkline([]) == ""
+    assert sparkline([0.0, 0.0]) == "▁▁"
+    assert sparkline([1.0, 4.0, 8.0]) == "▂▅█"
