@@ -206,12 +206,13 @@ def measure(way: Way, seconds: float, folder: Path, before: Sequence[str] = ()) 
     latencies = sorted(ms * 1e3 for sent, ms in zip(logged.sent_ns, logged.latency_ms) if started_ns <= sent < ended_ns)
     if len(latencies) < 1000:
         raise BenchFailed(f"only {len(latencies)} requests were answered")
-    return _cell(way, latencies, begin, end, server.events, (ended_ns - started_ns) / 1e9, load)
+    return _cell(way, latencies, (begin, end), server.events, (ended_ns - started_ns) / 1e9, load)
 
 
 def _cell(
-    way: Way, latencies: Sequence[float], before: Seen, after: Seen, events: Sequence[Event], took_s: float, load: float
+    way: Way, latencies: Sequence[float], seen: tuple[Seen, Seen], events: Sequence[Event], took_s: float, load: float
 ) -> Cell:
+    before, after = seen
     pages, ns, faults = (after.counter[n] - before.counter[n] for n in (1, 2, 3))
     taken = [event for event in events if event.kind is Kind.CHECKPOINT]
     freezes = [event.freeze_s * 1e3 for event in taken]

@@ -102,7 +102,7 @@ class Parts:
 
 
 def measure(
-    mb: int, threads: int, descriptors: int, thp: bool, cycles: int, soon: bool, folder: Path
+    mb: int, threads: int, descriptors: int, folder: Path, *, thp: bool, cycles: int, soon: bool
 ) -> tuple[Row, Parts]:
     """One victim, `cycles` times; `soon`: killed before there is a spare.  Raises BenchFailed, AvckptError."""
     rng = random.Random(mb * 1000 + threads)
@@ -239,7 +239,7 @@ def main() -> int:
                 if not args.json:
                     what = f"{mb} MB, {threads} threads, {descriptors} descriptors, {cycles} cycles"
                     console.print(f"{what} (load {os.getloadavg()[0]:.1f}) ...", style="dim")
-                row, part = measure(mb, threads, descriptors, args.thp, cycles, args.soon, Path(folder))
+                row, part = measure(mb, threads, descriptors, Path(folder), thp=args.thp, cycles=cycles, soon=args.soon)
                 rows.append(row)
                 parts.append(part)
     except (BenchFailed, AvckptError) as error:

@@ -22,6 +22,8 @@ check "ruff check" .venv/bin/ruff check .
 check "ruff format" .venv/bin/ruff format --check --diff .
 mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests testkit bench 2>/dev/null)
 check "mypy --strict" .venv/bin/mypy "${typed[@]}"
+mapfile -t python < <(git ls-files --cached --others --exclude-standard '*.py')
+check "arguments of functions" scripts/arguments.py "${c[@]}" "${python[@]}"
 check "layers of the engine" make -s -C native layers
 # What is not checked is not right: a missing tool is a failure.
 check "shellcheck" shellcheck -x "${shell[@]}"

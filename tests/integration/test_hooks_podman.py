@@ -203,7 +203,7 @@ def test_init_runs_in_front_of_a_protected_container(
     ids=["systemd", "s6-overlay"],
 )
 def test_what_must_be_process_1_is_left_alone(
-    hooked: Podman, receiver: Receiver, base_image: str, name: str, tmp_path: Path, options: list[str], why: str
+    *, hooked: Podman, receiver: Receiver, base_image: str, name: str, tmp_path: Path, options: list[str], why: str
 ) -> None:
     init = tmp_path / "init"
     init.write_text('#!/bin/sh\nexec sh "$@"\n')
@@ -342,7 +342,7 @@ def test_a_bad_label_is_refused_where_the_user_sees_it(
     ],
 )
 def test_what_a_label_is_called_does_nothing_to_the_terminal(
-    hooked: Podman, receiver: Receiver, base_image: str, name: str, label: str, status: int, shown: str
+    *, hooked: Podman, receiver: Receiver, base_image: str, name: str, label: str, status: int, shown: str
 ) -> None:
     done = foreground(hooked, name, "--network=none", "--label", f"{label}=1", image=base_image)
     assert done[0] == status
@@ -436,7 +436,7 @@ def test_a_broken_hook_does_not_keep_a_container_from_running(
 
 @pytest.mark.parametrize(("stage", "seconds"), [("precreate", 11), ("prestart", 6)])
 def test_a_slow_machine_does_not_keep_a_container_from_running(
-    podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, name: str, stage: str, seconds: int
+    *, podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, name: str, stage: str, seconds: int
 ) -> None:
     """A runtime that kills a hook for being late does not start the container."""
     slow = tmp_path / "libexec"

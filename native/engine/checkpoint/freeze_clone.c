@@ -81,7 +81,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 /* ECHILD, if it has none: the one question that needs no look at each thread. */
 static const struct inj_syscall *ask_for_children(struct inj_call *call)
 {
-	return call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL, 0);
+	return call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL);
 }
 
 /* Nobody has looked below one that had none at the last checkpoint. */
@@ -107,7 +107,7 @@ static void drop_old_parasites(struct process *process, struct inj_call *call)
 		const avc_remote base = process->old_parasite[process->old_parasites - 1].base;
 		const size_t bytes = process->old_parasite[process->old_parasites - 1].bytes;
 
-		call_add(call, SYS_munmap, base, bytes, 0, 0, 0);
+		call_add(call, SYS_munmap, base, bytes);
 		process->clone_pages -= (long)(bytes / ARCH_PAGE_BYTES);
 	}
 }
@@ -125,7 +125,7 @@ static int start_own_clone(struct process *process, struct avc_error *err)
 	drop_old_parasites(process, call);
 	process->children = ask_for_children(call);
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD);
 	process->asked_ns = now_ns();
 	return thread_borrow(process, thread, err) || parasite_start(thread->tid, err) ? -1 : 0;
 }
@@ -160,10 +160,10 @@ static int start_holders_clone(struct process *process, struct avc_error *err)
 	struct inj_call *call = &process->parasite.control->holder;
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0);
+	call_add(call, INJ_FUTURE_LOCK);
 	memory_dofork(process->memory, call);
 	drop_old_parasites(process, call);
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD);
 	if (parasite_send(&process->parasite, process->holder, &process->holder_base, call, err) ||
 	    parasite_start(process->holder, err))
 		return -1;

@@ -82,18 +82,16 @@ static int quieten(struct image *image, struct avc_error *err)
 	call_begin(call, INJ_AFTER_PARK);
 	/* Out of the app's session or process group, or the number stays taken. */
 	if (process->descendant || image->stat.session == process->leader)
-		call_add(call, SYS_setsid, 0, 0, 0, 0, 0);
+		call_add(call, SYS_setsid);
 	else
-		call_add(call, SYS_setpgid, 0, 0, 0, 0, 0);
+		call_add(call, SYS_setpgid);
 	call_add(call, SYS_prctl, PR_GET_NAME,
-		 parasite_remote(&process->parasite, call->out + TEMPLATE_NAME), 0, 0, 0);
-	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, call->out), 0, 0,
-		 0);
-	dumpable = call_add(call, SYS_prctl, PR_GET_DUMPABLE, 0, 0, 0, 0);
+		 parasite_remote(&process->parasite, call->out + TEMPLATE_NAME));
+	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, call->out));
+	dumpable = call_add(call, SYS_prctl, PR_GET_DUMPABLE);
 	if (cloned) {
 		call_add(call, SYS_sigaltstack, 0,
-			 parasite_remote(&process->parasite, call->out + TEMPLATE_ALTSTACK), 0, 0,
-			 0);
+			 parasite_remote(&process->parasite, call->out + TEMPLATE_ALTSTACK));
 		attributes = attributes_ask(call, call->out + TEMPLATE_ATTRIBUTES,
 					    parasite_remote(&process->parasite,
 							    call->out + TEMPLATE_ATTRIBUTES));
@@ -102,7 +100,7 @@ static int quieten(struct image *image, struct avc_error *err)
 	 * that.  A holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
 	if (cloned && cloned->rseq)
 		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
-				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature, 0);
+				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature);
 	if (parasite_send(&process->parasite, pid, &image->base, call, err) ||
 	    parasite_run(pid, call, err))
 		return -1;
@@ -222,7 +220,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	/* A change of users takes it from the whole process, whichever thread it is. */
 	if (image->dumpable == 0 || image->dumpable == 1)
 		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
-			  (uint64_t)image->dumpable, 0, 0, 0)
+			  (uint64_t)image->dumpable)
 			->flags = INJ_MAY_FAIL;
 	if (setup.notice.code)
 		image->notice = setup.notice;
@@ -316,7 +314,7 @@ void generation_close_files(const struct image *image)
 	struct avc_error ignored = { 0 };
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	call_add(call, SYS_close_range, 0, ~0u);
 	if (parasite_send(parasite, image->template, &image->base, call, &ignored) ||
 	    parasite_run(image->template, call, &ignored))
 		return; /* it was killed, and has nothing open any more */
@@ -328,7 +326,7 @@ static bool start_closing(struct process *process)
 	struct avc_error gone = { 0 };
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_close_range, 0, ~0u, 0, 0, 0);
+	call_add(call, SYS_close_range, 0, ~0u);
 	return parasite_send(&process->parasite, process->holder, &process->holder_base, call,
 			     &gone) == 0 &&
 	       parasite_start(process->holder, &gone) == 0;

@@ -59,7 +59,7 @@ static int begin_fork(struct generation *generation, struct avc_error *err)
 	struct inj_call *call = call_of(generation);
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD);
 	if (parasite_send(parasite, generation->image[0].template, &generation->image[0].base, call,
 			  err) ||
 	    parasite_start(generation->image[0].template, err))
@@ -98,7 +98,7 @@ static bool name_spare(const struct generation *generation)
 
 	memcpy(call->out, "avckpt-spare", 13);
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(parasite, call->out), 0, 0, 0);
+	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(parasite, call->out));
 	return generation->spare.pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
 	       parasite_send(parasite, spare, &generation->image[0].base, call, &gone) == 0 &&
 	       parasite_run(spare, call, &gone) == 0;

@@ -705,14 +705,15 @@ static int walk(struct look *look, struct avc_error *err)
 	}
 }
 
-int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
-	       struct files *known, pid_t init, struct avc_error *err)
+int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
+	       struct files *known, struct avc_error *err)
 {
+	const pid_t pid = owner->pid, init = owner->init;
 	struct look look = { .files = files,
 			     .known = known,
 			     .pid = pid,
 			     .init = init,
-			     .pidfd = pidfd,
+			     .pidfd = owner->pidfd,
 			     .depth = depth };
 	struct timespec now;
 	int result;
@@ -788,6 +789,7 @@ static void find_owners(const struct process *process, struct files *files)
 
 int files_prepare(struct process *process, struct avc_error *err)
 {
+	const struct files_owner owner = { process->pid, process->pidfd, process->init };
 	struct files *before = files_new(process->files_seen + ROOM_SPARE);
 	struct files *image;
 
@@ -796,8 +798,7 @@ int files_prepare(struct process *process, struct avc_error *err)
 	if (!before)
 		return fail_errno(err, process->pid, "look at descriptors", "calloc",
 				  "out of memory");
-	if (files_look(before, process->pid, process->pidfd, FILES_BEFORE, process->files_before,
-		       process->init, err)) {
+	if (files_look(before, &owner, FILES_BEFORE, process->files_before, err)) {
 		files_free(before);
 		return -1;
 	}
@@ -820,6 +821,7 @@ void files_capture(struct image *image, const struct image *parent, bool several
 		   struct scratch *scratch)
 {
 	struct process *process = image->process;
+	const struct files_owner owner = { process->pid, process->pidfd, process->init };
 	struct files *files = process->files_image;
 	int result;
 
@@ -830,8 +832,8 @@ void files_capture(struct image *image, const struct image *parent, bool several
 	files->parent_pid = parent ? parent->process->pid : 0;
 	files->scratch = scratch;
 	files->process = process;
-	result = files_look(files, process->pid, process->pidfd, FILES_FROZEN,
-			    process->files_before, process->init, &image->files_error);
+	result = files_look(files, &owner, FILES_FROZEN, process->files_before,
+			    &image->files_error);
 	files->parent = NULL; /* may be gone before this one */
 	files->scratch = NULL;
 	files->process = NULL;

@@ -265,8 +265,14 @@ enum files_depth {
 
 /* files.c */
 struct files *files_new(uint32_t room);
-int files_look(struct files *files, pid_t pid, int pidfd, enum files_depth depth,
-	       struct files *known, pid_t init, struct avc_error *err) warn_unused;
+/* Whose they are. */
+struct files_owner {
+	pid_t pid;
+	int pidfd;
+	pid_t init;
+};
+int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
+	       struct files *known, struct avc_error *err) warn_unused;
 /* Puts them in order. */
 void files_missing_sort(struct files_missing *missing);
 struct file *files_find(const struct files *files, int fd);

@@ -57,10 +57,10 @@ static void list_epoll(const struct files_work *work, struct setup *setup, const
 		event.data.u64 = watch->data;
 		stage = of->pid_inside ? INJ_OWNERS : INJ_DESCRIPTORS; /* when it is there */
 		setup_add(setup, stage, "", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_DEL,
-			  (uint64_t)watch->fd, 0, 0)
+			  (uint64_t)watch->fd)
 			->flags = INJ_MAY_FAIL;
 		setup_add(setup, stage, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_ADD,
-			  (uint64_t)watch->fd, setup_data(setup, &event, sizeof event), 0)
+			  (uint64_t)watch->fd, setup_data(setup, &event, sizeof event))
 			->flags = INJ_MAY_FAIL;
 	}
 }
@@ -76,7 +76,7 @@ static void list_lock(struct setup *setup, const struct file *w, const struct fi
 	};
 
 	setup_add(setup, INJ_DESCRIPTORS, type == F_UNLCK ? "" : "fcntl(F_SETLK)", SYS_fcntl,
-		  (uint64_t)w->fd, F_SETLK, setup_data(setup, &l, sizeof l), 0, 0)
+		  (uint64_t)w->fd, F_SETLK, setup_data(setup, &l, sizeof l))
 		->flags = INJ_MAY_FAIL;
 }
 
@@ -106,13 +106,13 @@ static void list_owner(struct setup *setup, const struct file *w)
 	struct f_owner_ex owner = { .type = (int)w->owner_type, .pid = w->owner_inside };
 
 	setup_add(setup, INJ_OWNERS, "fcntl(F_SETOWN)", SYS_fcntl, (uint64_t)w->fd, F_SETOWN_EX,
-		  setup_data(setup, &owner, sizeof owner), 0, 0)
+		  setup_data(setup, &owner, sizeof owner))
 		->flags = INJ_MAY_FAIL;
 	setup_add(setup, INJ_OWNERS, "fcntl(F_SETSIG)", SYS_fcntl, (uint64_t)w->fd, F_SETSIG,
-		  (uint64_t)w->owner_signal, 0, 0)
+		  (uint64_t)w->owner_signal)
 		->flags = INJ_MAY_FAIL;
 	setup_add(setup, INJ_OWNERS, "fcntl(F_SETFL)", SYS_fcntl, (uint64_t)w->fd, F_SETFL,
-		  (uint64_t)w->flags, 0, 0)
+		  (uint64_t)w->flags)
 		->flags = INJ_MAY_FAIL;
 }
 
@@ -121,7 +121,7 @@ static void list_pidfd(struct setup *setup, const struct file *w)
 {
 	setup_add(setup, INJ_OWNERS, "pidfd_open", INJ_PIDFD_OPEN, (uint64_t)w->fd,
 		  (uint64_t)w->pid_inside, (uint64_t)w->flags & (O_NONBLOCK | O_EXCL),
-		  w->cloexec ? O_CLOEXEC : 0, 0)
+		  w->cloexec ? O_CLOEXEC : 0)
 		->flags = INJ_MAY_FAIL;
 }
 
@@ -147,8 +147,7 @@ static void list_limit(const struct files_work *work, struct setup *setup)
 
 	if (proc_limits(work->image->template, limit) == 0)
 		setup_add(setup, INJ_OWNERS, "", INJ_LIMIT, RLIMIT_NOFILE,
-			  setup_data(setup, limit[RLIMIT_NOFILE], sizeof limit[RLIMIT_NOFILE]), 0,
-			  0, 0)
+			  setup_data(setup, limit[RLIMIT_NOFILE], sizeof limit[RLIMIT_NOFILE]))
 			->flags = INJ_MAY_FAIL;
 }
 
@@ -162,7 +161,7 @@ static void list_listen(const struct files_work *work, struct setup *setup, cons
 	if (!n && s && s->domain == AF_UNIX && s->listening && (!w->family || w->family == w) &&
 	    work->lost[files_index(work->want, w)])
 		setup_add(setup, INJ_OWNERS, "listen", SYS_listen, (uint64_t)w->fd,
-			  (uint64_t)s->backlog, 0, 0, 0)
+			  (uint64_t)s->backlog)
 			->flags = INJ_MAY_FAIL;
 }
 

@@ -340,7 +340,7 @@ static bool is_urgent(const struct files_work *work)
 /* ---- in the table ------------------------------------------------------------------ */
 
 /* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
-static struct fd_letter *mail_of(const struct files_work *work)
+static struct fd_letter *letter_of(const struct files_work *work)
 {
 	return (struct fd_letter *)(parasite_files(&work->process->parasite, work->image->slot) +
 				    INJ_FILES_BYTES / 2);
@@ -348,7 +348,7 @@ static struct fd_letter *mail_of(const struct files_work *work)
 
 static struct inj_syscall *list_of(const struct files_work *work)
 {
-	return (struct inj_syscall *)(mail_of(work) + 1);
+	return (struct inj_syscall *)(letter_of(work) + 1);
 }
 
 #define LISTED_MAX ((INJ_FILES_BYTES / 2 - sizeof(struct fd_letter)) / sizeof(struct inj_syscall))
@@ -366,8 +366,7 @@ static void close_list(struct files_work *work)
 {
 	if (work->listed)
 		call_add(call_of(work), INJ_LIST,
-			 parasite_remote(&work->process->parasite, list_of(work)), work->listed, 0,
-			 0, 0);
+			 parasite_remote(&work->process->parasite, list_of(work)), work->listed);
 	work->listed = 0;
 }
 
@@ -448,7 +447,7 @@ static int forget_watches(struct files_work *work, struct avc_error *err)
 /* POSIX locks are the table's (fcntl(2)), and the one that is made anew has to get them. */
 static int unlock_all(struct files_work *work, struct avc_error *err)
 {
-	struct flock *all = (struct flock *)mail_of(work);
+	struct flock *all = (struct flock *)letter_of(work);
 
 	*all = (struct flock){ .l_type = F_UNLCK, .l_whence = SEEK_SET };
 	for (uint32_t i = 0; i < work->now->count; i++)
@@ -524,9 +523,9 @@ static int lowest_free(const struct numbers *numbers, const struct files *avoid)
 	return -1;
 }
 
-static avc_remote lay_out_mail(const struct files_work *work)
+static avc_remote lay_out_letter(const struct files_work *work)
 {
-	struct fd_letter *letter = mail_of(work);
+	struct fd_letter *letter = letter_of(work);
 	const avc_remote remote = parasite_remote(&work->process->parasite, letter);
 
 	fd_letter_write(letter, remote);
@@ -537,7 +536,7 @@ static avc_remote lay_out_mail(const struct files_work *work)
 static int receive(struct files_work *work, struct numbers *numbers, int ours, int theirs,
 		   struct avc_error *err)
 {
-	const avc_remote mail = lay_out_mail(work);
+	const avc_remote letter = lay_out_letter(work);
 
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
@@ -551,7 +550,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 			files_note(work, w, "it could not be handed over");
 			continue;
 		}
-		if (inject(work, err, SYS_recvmsg, (uint64_t)theirs, mail,
+		if (inject(work, err, SYS_recvmsg, (uint64_t)theirs, letter,
 			   MSG_CMSG_CLOEXEC | MSG_DONTWAIT))
 			return -1;
 		if (to != w->fd) {
@@ -597,7 +596,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	    limit.rlim_cur < (rlim_t)numbers.room)
 		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
-		 parasite_remote(parasite, call->out), 0);
+		 parasite_remote(parasite, call->out));
 	if (flush(work, err))
 		goto out;
 	memcpy(ends, call->out, sizeof ends);
@@ -716,12 +715,12 @@ static int find_missing(const struct files_work *work, struct files_missing *mis
 static int look_once(struct files_work *work, const struct files_missing *missing,
 		     struct avc_error *err)
 {
+	const struct files_owner owner = { work->table, work->table_pidfd, work->init };
 	int result = 0;
 
 	work->now->missing = missing;
 	if (work->table)
-		result = files_look(work->now, work->table, work->table_pidfd, FILES_NOW,
-				    work->want, work->init, err);
+		result = files_look(work->now, &owner, FILES_NOW, work->want, err);
 	work->now->missing = NULL;
 	if (result)
 		return -1;

@@ -328,8 +328,9 @@ static void keep_messages(struct process *process, int fd, struct file *file)
 	const int first = 0, before = option(fd, SOL_SOCKET, SO_PEEK_OFF);
 	size_t used = 0;
 
-	if (parasite_will(process, SYS_setsockopt, (uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
-			  (uint64_t)(int64_t)before, sizeof before)) {
+	if (parasite_will(process, SYS_setsockopt,
+			  ARGUMENTS((uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
+				    (uint64_t)(int64_t)before, sizeof before))) {
 		file->content_lost = true;
 		return;
 	}

@@ -34,11 +34,12 @@ static bool was_written(const struct files *want, const struct file *w, const st
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
 		       struct avc_error *err)
 {
+	const struct files_owner owner = { pid, pidfd, init };
 	const struct files *want = image->files;
 	struct files *now = files_new(want->count + 64);
 	int result = -1;
 
-	if (!now || files_look(now, pid, pidfd, FILES_NOW, image->files, init, err))
+	if (!now || files_look(now, &owner, FILES_NOW, image->files, err))
 		goto out;
 	for (uint32_t i = 0; i < want->count; i++) {
 		const struct file *w = &want->file[i];

@@ -72,7 +72,7 @@ static bool is_place_of_pads(avc_remote base)
 }
 
 /* The mapping of a guard that died before it wrote anything is told by its place. */
-static void note_old_pad(struct process *process, avc_remote base, avc_remote end)
+static void note_old_parasite(struct process *process, avc_remote base, avc_remote end)
 {
 	uint64_t magic;
 
@@ -89,12 +89,12 @@ static void note_old_pad(struct process *process, avc_remote base, avc_remote en
 
 struct survey {
 	struct process *process;
-	avc_remote pc, cave, pad, pad_end; /* pad: the one that is being gone through     */
+	avc_remote pc, cave, start, end; /* start, end: of the parasite that is gone through */
 	bool in_stub;
 };
 
 /* Of a parasite that is there, or was being brought in (bring_parasite). */
-static bool is_of_pad(const struct mapping *m)
+static bool is_of_parasite(const struct mapping *m)
 {
 	return !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)") ||
 	       !strcmp(m->name, "/dev/zero (deleted)");
@@ -107,12 +107,12 @@ static int survey_mapping(const struct mapping *m, void *arg)
 	const bool code = m->mode[2] == 'x' && !m->shared;
 
 	/* In pieces, one right behind the other. */
-	if (is_of_pad(m)) {
-		if (m->start != survey->pad_end || is_place_of_pads(m->start)) {
-			note_old_pad(process, survey->pad, survey->pad_end);
-			survey->pad = m->start;
+	if (is_of_parasite(m)) {
+		if (m->start != survey->end || is_place_of_pads(m->start)) {
+			note_old_parasite(process, survey->start, survey->end);
+			survey->start = m->start;
 		}
-		survey->pad_end = m->end;
+		survey->end = m->end;
 	}
 	if (code && survey->pc < m->end && survey->pc >= m->end - CAVE_BYTES)
 		survey->in_stub = has_stub(process->mem_fd, m->end);
@@ -132,7 +132,7 @@ static int survey(struct process *process, avc_remote pc, avc_remote *cave, stru
 	process->old_parasites = 0;
 	if (proc_mappings(process->pid, "maps", survey_mapping, &survey))
 		return fail_errno(err, process->pid, "infect", "read(maps)", "it has ended");
-	note_old_pad(process, survey.pad, survey.pad_end);
+	note_old_parasite(process, survey.start, survey.end);
 	*cave = survey.cave;
 	if (survey.in_stub || parasite_is_old(process, pc))
 		return fail(err, AVC_DEADLINE, 0, process->pid, "infect", "",
@@ -221,11 +221,11 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 		       struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
-	const uint64_t kin = porter->is_thread
-				     ? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM
-			     : process->descendant ? 0
-						   : CLONE_PARENT | SIGCHLD;
-	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | kin };
+	const uint64_t shared = porter->is_thread
+					? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM
+				: process->descendant ? 0
+						      : CLONE_PARENT | SIGCHLD;
+	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared };
 	const long options = (long)(porter->is_thread ? TRACE_OPTIONS_APP : TRACE_OPTIONS_OURS);
 	const struct sched_param first = { .sched_priority = 1 };
 	struct arch_regs regs;
@@ -381,8 +381,9 @@ static int open_channel(const struct porter *porter, avc_remote scratch, struct 
 /* One part of the parasite; it comes as descriptor 1.  If somebody has changed the letter
  * meanwhile, it comes not at all, or is not there to be mapped. */
 static int bring(const struct process *process, const struct porter *porter, int channel, int fd,
-		 avc_remote scratch, const uint64_t map[6], struct avc_error *err)
+		 const uint64_t map[6], struct avc_error *err)
 {
+	const avc_remote scratch = process->parasite.base;
 	const uint64_t receive[6] = { 0, scratch, MSG_CMSG_CLOEXEC | MSG_DONTWAIT };
 	const uint64_t received[6] = { 1 };
 	struct fd_letter letter;
@@ -434,24 +435,24 @@ static int bring_parasite(struct process *process, const struct porter *porter,
 	channel = open_channel(porter, scratch[0], err);
 	if (channel < 0)
 		return -1;
-	result = bring(process, porter, channel, parasite->data_fd, scratch[0], data, err) ||
-				 bring(process, porter, channel, parasite->code_fd, scratch[0],
-				       code, err)
+	result = bring(process, porter, channel, parasite->data_fd, data, err) ||
+				 bring(process, porter, channel, parasite->code_fd, code, err)
 			 ? -1
 			 : 0;
 	close_fd(&channel);
 	return result;
 }
 
-static int make_pad(struct process *process, struct thread *thread, avc_remote cave, uint32_t slots,
-		    uint32_t threads_max, bool *stub_is_free, struct avc_error *err)
+/* Of `bytes`, as parasite_layout() has them. */
+static int make_parasite(struct process *process, struct thread *thread, avc_remote cave,
+			 size_t bytes, bool *stub_is_free, struct avc_error *err)
 {
 	struct porter porter = { .cave = cave,
 				 .base = &thread->regs,
 				 .is_thread = process->descendant && can_be_thread() };
 	int result;
 
-	if (check_room(process, parasite_layout(&process->parasite, slots, threads_max), err) ||
+	if (check_room(process, bytes, err) ||
 	    parasite_make(&process->parasite, process->nonce, err))
 		return -1;
 	result = make_porter(process, thread, &porter, err);
@@ -527,7 +528,9 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	if (pwrite(process->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
 		return fail_errno(err, process->pid, "infect", "write(mem)",
 				  "its code cannot be written");
-	result = make_pad(process, thread, cave, slots, threads_max, &stub_is_free, err);
+	result = make_parasite(process, thread, cave,
+			       parasite_layout(&process->parasite, slots, threads_max),
+			       &stub_is_free, err);
 	/* Nobody is in the stub any more: leave no trace. */
 	if (stub_is_free && thread->stopped &&
 	    (!thread->borrowed || thread_give_back(thread, err) == 0)) {
@@ -625,9 +628,8 @@ static int make_holder(struct process *process, pid_t holder, const struct arch_
 	call_begin(own, INJ_AFTER_PARK);
 	/* Out of the app's process group, or the number stays taken; and of its session,
 	 * which another process of the app may lead. */
-	call_add(own, process->descendant ? SYS_setsid : SYS_setpgid, 0, 0, 0, 0, 0);
-	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, own->out), 0, 0,
-		 0);
+	call_add(own, process->descendant ? SYS_setsid : SYS_setpgid);
+	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, own->out));
 	return parasite_send(&process->parasite, holder, base, own, err) ||
 			       parasite_run(holder, own, err)
 		       ? -1
@@ -642,9 +644,9 @@ int process_adopt_no_more(struct process *process, struct avc_error *err)
 	if (process->paused)
 		return 0;
 	call_begin(call, INJ_AFTER_HOME);
-	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0);
-	call_add(call, INJ_PAUSE, 0, 0, 0, 0, 0);
-	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER);
+	call_add(call, INJ_PAUSE);
+	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1);
 	if (thread_borrow(process, thread, err))
 		return -1;
 	process->paused = true;
@@ -704,7 +706,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		return -1;
 	}
 	call_begin(call, INJ_AFTER_HOME);
-	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD, 0, 0, 0, 0);
+	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD);
 	result = thread_borrow(process, thread, err);
 	if (!result) {
 		result = parasite_run_clone(thread->tid, call, &holder, err);
@@ -734,19 +736,22 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	return keep_holder(process, holder, result, err);
 }
 
-/* A stopped task in the parasite makes one clone; *child is in its first stop. */
-static int clone_by(struct process *process, pid_t tid, const struct arch_regs *base,
-		    struct inj_call *call, uint64_t flags, pid_t *child, struct avc_error *err)
+/* The stopped task in between makes the holder, which is in its first stop then. */
+static int clone_holder(struct process *process, pid_t between, pid_t *holder,
+			struct avc_error *err)
 {
+	struct inj_call *call = &process->parasite.control->holder;
+
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, flags, 0, 0, 0, 0);
-	if (parasite_send(&process->parasite, tid, base, call, err) ||
-	    parasite_run_clone(tid, call, child, err))
+	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD);
+	if (parasite_send(&process->parasite, between, &process->holder_base, call, err) ||
+	    parasite_run_clone(between, call, holder, err))
 		return -1;
-	if (tracee_await(*child, NULL, err) != STOP_TRAP)
+	if (tracee_await(*holder, NULL, err) != STOP_TRAP)
 		return -1;
-	if (parasite_own(&process->parasite, *child))
-		return fail_errno(err, *child, "make holder", "ptrace(SETOPTIONS)", "it has ended");
+	if (parasite_own(&process->parasite, *holder))
+		return fail_errno(err, *holder, "make holder", "ptrace(SETOPTIONS)",
+				  "it has ended");
 	return 0;
 }
 
@@ -771,11 +776,11 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 			    "its main thread has ended");
 	call_begin(call, INJ_AFTER_HOME);
 	if (thread->creds.subreaper)
-		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0);
-	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND, 0, 0, 0, 0);
-	call_add(call, INJ_WAIT, 0, 0, 0, 0, 0);
+		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER);
+	call_add(call, SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND);
+	call_add(call, INJ_WAIT);
 	if (thread->creds.subreaper)
-		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1);
 	if (thread_borrow(process, thread, err))
 		return -1;
 	process->waiting = true;
@@ -791,10 +796,7 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 		result = fail_errno(err, between, "make holder", "ptrace(SETOPTIONS)",
 				    "it has ended");
 	if (!result)
-		result = clone_by(process, between, &process->holder_base,
-				  &process->parasite.control->holder,
-				  CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD,
-				  &holder, err);
+		result = clone_holder(process, between, &holder, err);
 	tracee_kill(between);
 	if (!result)
 		result = make_holder(process, holder, &process->holder_base, err);

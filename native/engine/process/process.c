@@ -183,14 +183,14 @@ void thread_ask_add(const struct process *process, bool with_locks, struct inj_c
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *attributes, *locks;
 
 	memset(call->out, 0, sizeof call->out);
-	tid_address = call_add(call, SYS_prctl, PR_GET_TID_ADDRESS, out, 0, 0, 0);
-	altstack = call_add(call, SYS_sigaltstack, 0, out + 8, 0, 0, 0);
+	tid_address = call_add(call, SYS_prctl, PR_GET_TID_ADDRESS, out);
+	altstack = call_add(call, SYS_sigaltstack, 0, out + 8);
 	/* Not from /proc: whatever is looked at there is remembered, and makes the
 	 * thread's end, for which a restore waits, several microseconds longer
 	 * (fs/proc/base.c, proc_flush_pid()). */
-	inside = call_add(call, SYS_gettid, 0, 0, 0, 0, 0);
-	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32, 0, 0, 0);
-	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK, 0, 0, 0, 0, 0) : NULL;
+	inside = call_add(call, SYS_gettid);
+	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32);
+	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK) : NULL;
 	attributes = attributes_ask(call, call->out + 64, out + 64);
 	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
 }

@@ -26,8 +26,8 @@ static int unmap(const struct remap *r, struct syscall_batch *batch, struct avc_
 		while (i + 1 < r->pieces && r->piece[i + 1].start == r->piece[i].end &&
 		       r->piece[i + 1].is && !r->piece[i + 1].kept)
 			i++;
-		if (syscall_batch_ask(batch, SYS_munmap, r->piece[first].start,
-				      r->piece[i].end - r->piece[first].start, 0, 0, 0, 0, err))
+		if (syscall_batch_ask(batch, err, SYS_munmap, r->piece[first].start,
+				      r->piece[i].end - r->piece[first].start))
 			return -1;
 	}
 	return 0;
@@ -53,10 +53,10 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
 					    "", "its vDSO is of another size");
 			if (away)
 				syscall_batch_add(batch, SYS_mremap, a->start, bytes, bytes,
-						  MREMAP_MAYMOVE | MREMAP_FIXED, between, 0);
+						  MREMAP_MAYMOVE | MREMAP_FIXED, between);
 			else
 				syscall_batch_add(batch, SYS_mremap, between, bytes, bytes,
-						  MREMAP_MAYMOVE | MREMAP_FIXED, b->start, 0);
+						  MREMAP_MAYMOVE | MREMAP_FIXED, b->start);
 			between += bytes;
 			if (i + 1 == sizeof names / sizeof *names)
 				between = r->process->parasite.base + r->process->parasite.bytes +
@@ -83,7 +83,7 @@ static int give_file(const struct remap *r, struct syscall_batch *batch, const s
 	if (m && *given && m->device == (*given)->device && m->inode == (*given)->inode &&
 	    !m->shared && !(*given)->shared)
 		return 0;
-	if (*given && syscall_batch_ask(batch, SYS_close, 1, 0, 0, 0, 0, 0, err))
+	if (*given && syscall_batch_ask(batch, err, SYS_close, 1))
 		return -1;
 	*given = m;
 	if (!m)
@@ -135,11 +135,11 @@ static int attach(const struct remap *r, struct syscall_batch *batch, const stru
 	}
 	if (!proc_mapped_for_writing(r->want->template, m->start, m->end))
 		flags |= SHM_RDONLY;
-	if (syscall_batch_ask(batch, SYS_shmat, m->inode, m->start, (uint64_t)flags, 0, 0, 0, err))
+	if (syscall_batch_ask(batch, err, SYS_shmat, m->inode, m->start, (uint64_t)flags))
 		return -1;
 	syscall_batch_soften(batch, only_mapped);
-	return syscall_batch_ask(batch, SYS_mprotect, m->start, m->end - m->start,
-				 (uint64_t)mapping_protection(m), 0, 0, 0, err) ||
+	return syscall_batch_ask(batch, err, SYS_mprotect, m->start, m->end - m->start,
+				 (uint64_t)mapping_protection(m)) ||
 			       syscall_batch_flush(batch, err)
 		       ? -1
 		       : 0;
@@ -157,13 +157,12 @@ static int map_piece(const struct remap *r, struct syscall_batch *batch, const s
 	const int growing = mapping_kind(m) & MAPPING_GROWING ? MAP_GROWSDOWN : 0;
 
 	if (!mapping_is_file(m))
-		return syscall_batch_ask(batch, SYS_mmap, piece->start, bytes, prot,
-					 (uint64_t)(flags | MAP_ANONYMOUS | growing), (uint64_t)-1,
-					 0, err);
+		return syscall_batch_ask(batch, err, SYS_mmap, piece->start, bytes, prot,
+					 (uint64_t)(flags | MAP_ANONYMOUS | growing), (uint64_t)-1);
 	return give_file(r, batch, m, given, err) ||
-			       syscall_batch_ask(batch, SYS_mmap, piece->start, bytes, prot,
+			       syscall_batch_ask(batch, err, SYS_mmap, piece->start, bytes, prot,
 						 (uint64_t)flags, 1,
-						 m->offset + (piece->start - m->start), err) ||
+						 m->offset + (piece->start - m->start)) ||
 			       attach(r, batch, piece, err)
 		       ? -1
 		       : 0;
@@ -178,15 +177,14 @@ static int protect_piece(struct syscall_batch *batch, const struct piece *piece,
 
 	/* Without keys, pkey_mprotect(2) may not know key 0 either. */
 	if (!key && (!piece->is || !mapping_key(piece->is)))
-		return syscall_batch_ask(batch, SYS_mprotect, piece->start, bytes, mode, 0, 0, 0,
-					 err);
+		return syscall_batch_ask(batch, err, SYS_mprotect, piece->start, bytes, mode);
 	/* What can only be executed has a key that the kernel took (pkeys(7)).  Where this process
 	 * has inherited such a key the first call sets it, and the second is refused; where it has
 	 * not, no key is free to be taken (process_attrs_take_keys), and the second call sets it. */
 	if (mode == PROT_EXEC &&
-	    syscall_batch_ask(batch, SYS_mprotect, piece->start, bytes, mode, 0, 0, 0, err))
+	    syscall_batch_ask(batch, err, SYS_mprotect, piece->start, bytes, mode))
 		return -1;
-	if (syscall_batch_ask(batch, SYS_pkey_mprotect, piece->start, bytes, mode, key, 0, 0, err))
+	if (syscall_batch_ask(batch, err, SYS_pkey_mprotect, piece->start, bytes, mode, key))
 		return -1;
 	if (mode == PROT_EXEC)
 		syscall_batch_soften(batch, NULL);
@@ -244,9 +242,8 @@ static int fill(const struct remap *r, struct syscall_batch *batch, struct copie
 		const int advice = advice_of(run->what);
 
 		opened = opened || run->what == PAGE_OPEN_COPY;
-		if (advice &&
-		    syscall_batch_ask(batch, SYS_madvise, run->start, run->end - run->start,
-				      (uint64_t)advice, 0, 0, 0, err))
+		if (advice && syscall_batch_ask(batch, err, SYS_madvise, run->start,
+						run->end - run->start, (uint64_t)advice))
 			return -1;
 	}
 	/* Nothing can be written where a guard page still is. */

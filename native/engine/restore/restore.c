@@ -118,8 +118,7 @@ static int fork_template(struct restore *restore, bool again, struct avc_error *
 	/* The first time there are calls of files_restore() before it. */
 	if (again)
 		call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, (spare ? CLONE_VM : 0) | CLONE_FILES | CLONE_PARENT | SIGCHLD, 0,
-		 0, 0, 0);
+	call_add(call, SYS_clone, (spare ? CLONE_VM : 0) | CLONE_FILES | CLONE_PARENT | SIGCHLD);
 	if (parasite_send(parasite, from, &image->base, call, err) ||
 	    parasite_run_clone(from, call, &child, err))
 		return -1;

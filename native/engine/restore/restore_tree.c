@@ -94,7 +94,7 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 		      struct chores *chores, pid_t *child, struct avc_error *err)
 {
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, flags, 0, 0, 0, 0);
+	call_add(call, SYS_clone, flags);
 	if (parasite_send(batch->parasite, batch->pid, &batch->base, call, err) ||
 	    parasite_run_clone_while(batch->pid, call, chores ? do_chores : NULL, chores, child,
 				     err))
@@ -114,7 +114,7 @@ static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *
 	tracee_kill(child);
 	if (inside <= 0)
 		return 0; /* nobody had to wait for it */
-	syscall_batch_add(host, SYS_wait4, (uint64_t)inside, 0, __WALL, 0, 0, 0);
+	syscall_batch_add(host, SYS_wait4, (uint64_t)inside, 0, __WALL);
 	syscall_batch_soften(host, NULL);
 	return syscall_batch_flush(host, err);
 }
@@ -222,9 +222,9 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 
 	memset(data, 0, 64);
 	memcpy(data + 32, image->name, sizeof image->name);
-	syscall_batch_add(batch, SYS_prctl, PR_SET_NAME, remote + 32, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_prctl, PR_SET_NAME, remote + 32);
 	if (signal) {
-		syscall_batch_add(batch, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8, 0, 0);
+		syscall_batch_add(batch, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8);
 		syscall_batch_soften(batch, NULL); /* nobody may change that of SIGKILL */
 		if (syscall_batch_flush(batch, err))
 			return -1;
@@ -234,11 +234,10 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 					  "it was killed");
 		tracee_signal(batch->pid, signal);
 	} else {
-		syscall_batch_add(batch, SYS_exit_group, (uint64_t)WEXITSTATUS(image->status), 0, 0,
-				  0, 0, 0);
+		syscall_batch_add(batch, SYS_exit_group, (uint64_t)WEXITSTATUS(image->status));
 		call_begin(batch->call, INJ_AFTER_PARK);
 		call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list),
-			 batch->listed, 0, 0, 0);
+			 batch->listed);
 		batch->listed = 0;
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
@@ -268,14 +267,14 @@ static int place(struct forked *forked, const struct image *image, struct avc_er
 	if (proc_stat(batch->pid, &stat))
 		return fail_errno(err, batch->pid, "restore", "open(stat)", "it was killed");
 	if (image->session == image->inside) {
-		syscall_batch_add(batch, SYS_setsid, 0, 0, 0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_setsid);
 	} else {
 		if (image->session > 0 && proc_inside(stat.session) != image->session)
 			fail(batch->notes, AVC_UNSUPPORTED, 0, image->inside, "restore", "",
 			     "process %d is not in the session it was in, whose leader is gone",
 			     image->inside);
 		if (image->group == image->inside)
-			syscall_batch_add(batch, SYS_setpgid, 0, 0, 0, 0, 0, 0);
+			syscall_batch_add(batch, SYS_setpgid);
 	}
 	return 0;
 }
@@ -287,7 +286,7 @@ static void take_terminal(struct syscall_batch *batch, const struct image *image
 
 	if (!image->stat.tty || image->session != image->inside)
 		return;
-	syscall_batch_add(batch, SYS_ioctl, (uint64_t)fd, TIOCSCTTY, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_ioctl, (uint64_t)fd, TIOCSCTTY);
 	syscall_batch_soften(batch, "the session that it leads has lost its terminal");
 }
 
@@ -302,7 +301,7 @@ static int put_foreground(struct syscall_batch *batch, const struct image *image
 	if (!image->stat.tty || image->tty_group <= 0 || fd < 0)
 		return 0;
 	*group = image->tty_group;
-	syscall_batch_add(batch, SYS_ioctl, (uint64_t)fd, TIOCSPGRP, remote, 0, 0, 0);
+	syscall_batch_add(batch, SYS_ioctl, (uint64_t)fd, TIOCSPGRP, remote);
 	syscall_batch_soften(batch, NULL);
 	return syscall_batch_flush(batch, err);
 }
@@ -318,7 +317,7 @@ static int join_group(struct forked *forked, const struct image *image, struct a
 	if (image->group <= 0 || image->group == image->inside ||
 	    proc_inside(stat.group) == image->group)
 		return 0;
-	syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)image->group, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)image->group);
 	syscall_batch_soften(batch,
 			     "it is not in the process group it was in, whose leader is gone");
 	return syscall_batch_flush(batch, err);
@@ -456,7 +455,7 @@ static int flush_signals(struct restore_tree *restored, struct syscall_batch *ba
 		data = syscall_batch_data(batch, &remote);
 		data[0] = restored->flush;
 		data[1] = data[2] = 0;
-		syscall_batch_add(batch, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8, 0, 0);
+		syscall_batch_add(batch, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8);
 		syscall_batch_soften(batch, NULL);
 		if (syscall_batch_flush(batch, err))
 			return -1;
@@ -483,9 +482,9 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 	if (forked->pidfd < 0 || parasite_own(parasite, pid) || arch_regs_get(pid, &batch->base))
 		return fail_errno(err, pid, "restore", "ptrace(GETREGS)", "it was killed");
 	if (slot->session_leader)
-		syscall_batch_add(batch, SYS_setsid, 0, 0, 0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_setsid);
 	else
-		syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)slot->group, 0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)slot->group);
 	if (syscall_batch_flush(batch, err))
 		return -1;
 	slot->placed = 1;

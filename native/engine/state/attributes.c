@@ -84,24 +84,24 @@ const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_r
 	a->header[0] = CAPABILITY_VERSION_3;
 	a->header[1] = 0;
 #define AT(field) (remote + offsetof(struct answers, field))
-	first = call_add(call, SYS_setfsuid, (uint64_t)-1, 0, 0, 0, 0); /* changes nothing */
-	call_add(call, SYS_setfsgid, (uint64_t)-1, 0, 0, 0, 0);
-	call_add(call, SYS_prctl, PR_GET_SECUREBITS, 0, 0, 0, 0);
-	call_add(call, SYS_prctl, PR_GET_NO_NEW_PRIVS, 0, 0, 0, 0);
-	call_add(call, SYS_prctl, PR_GET_TIMERSLACK, 0, 0, 0, 0);
-	call_add(call, SYS_prctl, PR_GET_SECCOMP, 0, 0, 0, 0);
-	call_add(call, SYS_getgroups, 0, 0, 0, 0, 0);
-	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS, 0, 0);
-	call_add(call, SYS_personality, 0xffffffff, 0, 0, 0, 0);
-	call_add(call, SYS_capget, AT(header), AT(caps), 0, 0, 0);
-	call_add(call, INJ_CAPS, PR_CAPBSET_READ, 0, 0, 0, 0);
-	call_add(call, INJ_CAPS, PR_CAP_AMBIENT, AT(caps), 0, 0, 0);
-	call_add(call, ARCH_STATE_CALL, ARCH_STATE_PERMITTED, AT(state_permitted), 0, 0, 0);
-	call_add(call, SYS_getgroups, GROUPS_KEPT, AT(group), 0, 0, 0);
-	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8, 0, 0);
-	call_add(call, SYS_getresgid, AT(gid), AT(gid) + 4, AT(gid) + 8, 0, 0);
-	call_add(call, SYS_prctl, PR_GET_PDEATHSIG, AT(death_signal), 0, 0, 0);
-	call_add(call, SYS_prctl, PR_GET_CHILD_SUBREAPER, AT(subreaper), 0, 0, 0);
+	first = call_add(call, SYS_setfsuid, (uint64_t)-1); /* changes nothing */
+	call_add(call, SYS_setfsgid, (uint64_t)-1);
+	call_add(call, SYS_prctl, PR_GET_SECUREBITS);
+	call_add(call, SYS_prctl, PR_GET_NO_NEW_PRIVS);
+	call_add(call, SYS_prctl, PR_GET_TIMERSLACK);
+	call_add(call, SYS_prctl, PR_GET_SECCOMP);
+	call_add(call, SYS_getgroups);
+	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS);
+	call_add(call, SYS_personality, 0xffffffff);
+	call_add(call, SYS_capget, AT(header), AT(caps));
+	call_add(call, INJ_CAPS, PR_CAPBSET_READ);
+	call_add(call, INJ_CAPS, PR_CAP_AMBIENT, AT(caps));
+	call_add(call, ARCH_STATE_CALL, ARCH_STATE_PERMITTED, AT(state_permitted));
+	call_add(call, SYS_getgroups, GROUPS_KEPT, AT(group));
+	call_add(call, SYS_getresuid, AT(uid), AT(uid) + 4, AT(uid) + 8);
+	call_add(call, SYS_getresgid, AT(gid), AT(gid) + 4, AT(gid) + 8);
+	call_add(call, SYS_prctl, PR_GET_PDEATHSIG, AT(death_signal));
+	call_add(call, SYS_prctl, PR_GET_CHILD_SUBREAPER, AT(subreaper));
 #undef AT
 	return first;
 }
@@ -177,7 +177,7 @@ static void add_capset(struct setup *setup, uint64_t effective, uint64_t permitt
 	};
 	const avc_remote at = setup_data(setup, &data, sizeof data);
 
-	setup_add_thread(setup, "capset", SYS_capset, at, at + sizeof data.header, 0, 0, 0);
+	setup_add_thread(setup, "capset", SYS_capset, at, at + sizeof data.header);
 }
 
 static bool differ_in_securebits(const struct creds *from, const struct creds *to)
@@ -206,48 +206,47 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 
 	if (differ_in_groups(from, to))
 		setup_add_thread(setup, "setgroups", SYS_setgroups, (uint64_t)to->group_count,
-				 setup_data(setup, to->group, sizeof to->group), 0, 0, 0);
+				 setup_data(setup, to->group, sizeof to->group));
 	if (memcmp(from->gid, to->gid, sizeof to->gid))
 		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
-				 to->gid[2], 0, 0);
+				 to->gid[2]);
 	/* Or the capabilities would go with the user. */
 	if (uids && !(bits & SECBIT_KEEP_CAPS)) {
-		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1, 0, 0, 0);
+		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1);
 		bits |= SECBIT_KEEP_CAPS;
 	}
 	if (uids)
 		setup_add_thread(setup, "setresuid", SYS_setresuid, to->uid[0], to->uid[1],
-				 to->uid[2], 0, 0);
+				 to->uid[2]);
 	if ((bits ^ to->securebits) & SECBIT_KEEP_CAPS)
 		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS,
-				 (to->securebits & SECBIT_KEEP_CAPS) != 0, 0, 0, 0);
+				 (to->securebits & SECBIT_KEEP_CAPS) != 0);
 	/* Those that were effective have gone all the same, and are needed once more. */
 	if (caps)
 		add_capset(setup, caps_of(from, PERMITTED), caps_of(from, PERMITTED),
 			   caps_of(to, INHERITABLE));
 	if (from->fsgid != to->fsgid || to->fsgid != to->gid[1])
-		setup_add_thread(setup, "setfsgid", SYS_setfsgid, to->fsgid, 0, 0, 0, 0);
+		setup_add_thread(setup, "setfsgid", SYS_setfsgid, to->fsgid);
 	if (from->fsuid != to->fsuid || to->fsuid != to->uid[1])
-		setup_add_thread(setup, "setfsuid", SYS_setfsuid, to->fsuid, 0, 0, 0, 0);
+		setup_add_thread(setup, "setfsuid", SYS_setfsuid, to->fsuid);
 	/* After what is inheritable, of which nothing may be out of bounds. */
 	if (from->bounding != to->bounding)
 		setup_add_thread(setup, "prctl(CAPBSET_DROP)", INJ_CAPS_CHANGE, PR_CAPBSET_DROP,
-				 from->bounding & ~to->bounding, 0, 0, 0);
+				 from->bounding & ~to->bounding);
 	if (from->ambient & ~to->ambient)
 		setup_add_thread(setup, "prctl(CAP_AMBIENT)", SYS_prctl, PR_CAP_AMBIENT,
-				 PR_CAP_AMBIENT_CLEAR_ALL, 0, 0, 0);
+				 PR_CAP_AMBIENT_CLEAR_ALL);
 	if (raises_ambient(from, to))
 		setup_add_thread(setup, "prctl(CAP_AMBIENT)", INJ_CAPS_CHANGE, PR_CAP_AMBIENT,
-				 to->ambient, 0, 0, 0);
+				 to->ambient);
 	if (differ_in_securebits(from, to))
 		setup_add_thread(setup, "prctl(SECUREBITS)", SYS_prctl, PR_SET_SECUREBITS,
-				 to->securebits, 0, 0, 0);
+				 to->securebits);
 	if (caps)
 		add_capset(setup, caps_of(to, EFFECTIVE), caps_of(to, PERMITTED),
 			   caps_of(to, INHERITABLE));
 	if (to->no_new_privs && !from->no_new_privs)
-		setup_add_thread(setup, "prctl(NO_NEW_PRIVS)", SYS_prctl, PR_SET_NO_NEW_PRIVS, 1, 0,
-				 0, 0);
+		setup_add_thread(setup, "prctl(NO_NEW_PRIVS)", SYS_prctl, PR_SET_NO_NEW_PRIVS, 1);
 }
 
 /* Each set of capabilities of `to` within what `from` may have? */
@@ -295,13 +294,13 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 {
 	if (to->slack_ns && to->slack_ns != from->slack_ns)
 		setup_add_thread(setup, "prctl(TIMERSLACK)", SYS_prctl, PR_SET_TIMERSLACK,
-				 to->slack_ns, 0, 0, 0)
+				 to->slack_ns)
 			->flags = INJ_MAY_FAIL;
 	if (to->memory_policy >= 0 && (to->memory_policy != from->memory_policy ||
 				       memcmp(to->nodes, from->nodes, sizeof to->nodes)))
 		setup_add_thread(setup, "set_mempolicy", SYS_set_mempolicy,
 				 (uint64_t)to->memory_policy,
-				 setup_data(setup, to->nodes, sizeof to->nodes), NODE_BITS, 0, 0)
+				 setup_data(setup, to->nodes, sizeof to->nodes), NODE_BITS)
 			->flags = INJ_MAY_FAIL;
 	if (differ_in_groups(from, to) &&
 	    (!(from->caps[0] >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
@@ -333,19 +332,17 @@ int attributes_setup_thread(const struct process *process, const struct thread *
 	const struct creds *to = &t->creds;
 
 	if (t == main_thread && to->subreaper)
-		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1, 0,
-				 0, 0);
+		setup_add_thread(setup, "prctl(SUBREAPER)", SYS_prctl, PR_SET_CHILD_SUBREAPER, 1);
 	if ((t != main_thread || process->descendant) &&
 	    set_apart(process, t->inside, from, to, setup, err))
 		return -1;
 	/* A process that is made gets its own with what else it has (process_attrs.c). */
 	if (to->personality != main_thread->creds.personality)
-		setup_add_thread(setup, "personality", SYS_personality, to->personality, 0, 0, 0,
-				 0);
+		setup_add_thread(setup, "personality", SYS_personality, to->personality);
 	/* After a change of users, which takes it away. */
 	if (to->death_signal)
 		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
-				 to->death_signal, 0, 0, 0);
+				 to->death_signal);
 	return 0;
 }
 

@@ -235,11 +235,10 @@ void memory_dofork(const struct memory *memory, struct inj_call *call)
 		return;
 	for (uint32_t i = 0; i < memory->holes; i++) {
 		if (memory->hole[i].start > at)
-			call_add(call, SYS_madvise, at, memory->hole[i].start - at, MADV_DOFORK, 0,
-				 0);
+			call_add(call, SYS_madvise, at, memory->hole[i].start - at, MADV_DOFORK);
 		at = memory->hole[i].end;
 	}
-	call_add(call, SYS_madvise, at, ARCH_USER_END - at, MADV_DOFORK, 0, 0);
+	call_add(call, SYS_madvise, at, ARCH_USER_END - at, MADV_DOFORK);
 }
 
 /* ---- mappings, from /proc ------------------------------------------------------------ */
@@ -351,8 +350,7 @@ static void lock_again(struct process *process, int64_t locked_kb, struct setup 
 	}
 	for (uint32_t i = 0; i < memory->locked.count; i++)
 		setup_add(setup, INJ_BEFORE, "mlock2", SYS_mlock2, memory->locked.area[i].start,
-			  memory->locked.area[i].end - memory->locked.area[i].start, MLOCK_ONFAULT,
-			  0, 0)
+			  memory->locked.area[i].end - memory->locked.area[i].start, MLOCK_ONFAULT)
 			->flags = INJ_MAY_FAIL;
 }
 
@@ -375,7 +373,7 @@ static void advise_again(const struct memory *memory, struct setup *setup)
 					  memory->advised.area[i].start,
 					  memory->advised.area[i].end -
 						  memory->advised.area[i].start,
-					  (uint64_t)advices[k].advice, 0, 0)
+					  (uint64_t)advices[k].advice)
 					->flags = INJ_MAY_FAIL;
 }
 
@@ -387,7 +385,7 @@ static void seal_again(const struct memory *memory, struct setup *setup)
 		if ((memory->kinds.area[i].flags & (MAPPING_SEALED | MAPPING_SPECIAL)) ==
 		    MAPPING_SEALED)
 			setup_add(setup, INJ_BEFORE, "mseal", MSEAL, memory->kinds.area[i].start,
-				  memory->kinds.area[i].end - memory->kinds.area[i].start, 0, 0, 0)
+				  memory->kinds.area[i].end - memory->kinds.area[i].start)
 				->flags = INJ_MAY_FAIL;
 }
 
@@ -406,7 +404,7 @@ int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		seal_again(process->memory, setup);
 	if (main_thread && main_thread->creds.future_lock)
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,
-			  (uint64_t)main_thread->creds.future_lock, 0, 0, 0, 0)
+			  (uint64_t)main_thread->creds.future_lock)
 			->flags = INJ_MAY_FAIL;
 	if (process->memory->others_bytes && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
@@ -475,7 +473,7 @@ static int protect(const struct image *image, const struct area *a, int protecti
 	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_mprotect, a->start, area_bytes(a), (uint64_t)protection, 0, 0);
+	call_add(call, SYS_mprotect, a->start, area_bytes(a), (uint64_t)protection);
 	return parasite_send(parasite, image->template, &image->base, call, err) ||
 			       parasite_run(image->template, call, err)
 		       ? -1

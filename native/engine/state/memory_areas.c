@@ -56,7 +56,7 @@ static uint64_t hash(uint64_t h, uint64_t value)
 	return h ^ h >> 29;
 }
 
-static bool is_pad(const struct process *process, avc_remote at)
+static bool is_of_parasite(const struct process *process, avc_remote at)
 {
 	if (parasite_contains(&process->parasite, at))
 		return true;
@@ -176,13 +176,13 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
-	if (!is_pad(survey->process, m->start)) {
+	if (!is_of_parasite(survey->process, m->start)) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
 		if (survey->process->descendant)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
-	if ((!wiped && !is_shared(m) && !has_name(m)) || is_pad(survey->process, m->start))
+	if ((!wiped && !is_shared(m) && !has_name(m)) || is_of_parasite(survey->process, m->start))
 		return 0;
 	if (survey->areas.count == AREAS_MAX) {
 		survey->too_many = true;

@@ -136,7 +136,7 @@ static int advise(const struct image *image, struct inj_call *call, avc_remote s
 {
 	if (call->count >= INJ_CALLS_MAX && flush(image, call, err))
 		return -1;
-	call_add(call, SYS_madvise, start, end - start, (uint64_t)advice, 0, 0);
+	call_add(call, SYS_madvise, start, end - start, (uint64_t)advice);
 	return 0;
 }
 
@@ -170,7 +170,7 @@ int wiped_fill(const struct image *image, struct setup *setup, struct avc_error 
 			continue;
 		result = advise(image, call, a->start, a->end, MADV_KEEPONFORK, err);
 		setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise, a->start, area_bytes(a),
-			  MADV_WIPEONFORK, 0, 0);
+			  MADV_WIPEONFORK);
 	}
 	close_fd(&mem_fd);
 	wiped_free(&memory->wiped);

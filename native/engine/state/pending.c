@@ -198,7 +198,7 @@ void pending_setup_thread(const struct process *process, const struct thread *th
 			setup_add_thread(setup, "rt_tgsigqueueinfo", SYS_rt_tgsigqueueinfo,
 					 (uint64_t)process->inside, (uint64_t)thread->inside,
 					 (uint64_t)info->si_signo,
-					 setup_data(setup, info, sizeof *info), 0)
+					 setup_data(setup, info, sizeof *info))
 				->flags = INJ_MAY_FAIL;
 	}
 }
@@ -213,7 +213,7 @@ void pending_setup(const struct process *process, struct setup *setup)
 		if (pending->signal[i].block < 0 && can_be_queued(info))
 			setup_add(setup, INJ_AFTER, "rt_sigqueueinfo", SYS_rt_sigqueueinfo,
 				  (uint64_t)process->inside, (uint64_t)info->si_signo,
-				  setup_data(setup, info, sizeof *info), 0, 0)
+				  setup_data(setup, info, sizeof *info))
 				->flags = INJ_MAY_FAIL;
 	}
 	if (pending->too_many && !setup->notice.code)

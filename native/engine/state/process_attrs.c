@@ -187,7 +187,7 @@ int process_attrs_learn(struct image *image, struct avc_error *err)
 	for (int i = 0; i < KEYS - 1; i++)
 		list[n++] = (struct inj_syscall){ .nr = SYS_pkey_alloc };
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, INJ_LIST, parasite_remote(parasite, list), n, 0, 0, 0);
+	call_add(call, INJ_LIST, parasite_remote(parasite, list), n);
 	if (parasite_send(parasite, image->template, &image->base, call, err) ||
 	    parasite_run(image->template, call, err))
 		return -1;
@@ -247,8 +247,7 @@ static void put_mm(struct syscall_batch *batch, const struct process_attrs *attr
 	arguments->map.auxv_bytes = attrs->auxv_bytes;
 	arguments->map.exe_fd = ~0u;
 	syscall_batch_add(batch, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP,
-			  parasite_remote(batch->parasite, &arguments->map), sizeof arguments->map,
-			  0, 0);
+			  parasite_remote(batch->parasite, &arguments->map), sizeof arguments->map);
 	syscall_batch_soften(batch,
 			     "what it knows of its heap and arguments could not be put back");
 }
@@ -281,8 +280,7 @@ void process_attrs_setup_limits(const struct image *image, struct setup *setup)
 {
 	for (uint64_t i = 0; i < LIMITS; i++)
 		setup_add(setup, INJ_AFTER, "prlimit", INJ_LIMIT, i,
-			  setup_data(setup, image->attrs->limit[i], sizeof image->attrs->limit[i]),
-			  0, 0, 0)
+			  setup_data(setup, image->attrs->limit[i], sizeof image->attrs->limit[i]))
 			->flags = INJ_MAY_FAIL;
 }
 
@@ -311,8 +309,8 @@ static int enter(struct syscall_batch *batch, pid_t template, const char *name,
 		return -1;
 	}
 	close(folder);
-	syscall_batch_add(batch, SYS_fchdir, 1, 0, 0, 0, 0, 0);
-	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_fchdir, 1);
+	syscall_batch_add(batch, SYS_close, 1);
 	return 0;
 }
 
@@ -326,7 +324,7 @@ static int put_folders(struct syscall_batch *batch, pid_t template, struct avc_e
 			return -1;
 		strcpy(arguments->here, ".");
 		syscall_batch_add(batch, SYS_chroot,
-				  parasite_remote(batch->parasite, arguments->here), 0, 0, 0, 0, 0);
+				  parasite_remote(batch->parasite, arguments->here));
 	}
 	return enter(batch, template, "cwd", err);
 }
@@ -349,7 +347,7 @@ int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err)
 	if (!has_keys())
 		return 0;
 	for (int i = 0; i < KEYS - 1; i++) {
-		if (syscall_batch_ask(batch, SYS_pkey_alloc, 0, 0, 0, 0, 0, 0, err))
+		if (syscall_batch_ask(batch, err, SYS_pkey_alloc))
 			return -1;
 		syscall_batch_soften(batch, NULL);
 	}
@@ -363,7 +361,7 @@ static int free_keys(struct syscall_batch *batch, uint32_t kept, struct avc_erro
 	for (uint64_t key = 1; key < KEYS; key++) {
 		if (kept & 1u << key)
 			continue;
-		if (syscall_batch_ask(batch, SYS_pkey_free, key, 0, 0, 0, 0, 0, err))
+		if (syscall_batch_ask(batch, err, SYS_pkey_free, key))
 			return -1;
 		syscall_batch_soften(batch, NULL);
 	}
@@ -377,30 +375,28 @@ int process_attrs_put(struct syscall_batch *batch, const struct image *image, st
 
 	if (put_folders(batch, image->template, err) || free_keys(batch, attrs->keys, err))
 		return -1;
-	syscall_batch_add(batch, SYS_umask, attrs->umask, 0, 0, 0, 0, 0);
-	syscall_batch_add(batch, SYS_personality, attrs->personality, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_umask, attrs->umask);
+	syscall_batch_add(batch, SYS_personality, attrs->personality);
 	memcpy(arguments->action, attrs->action, sizeof arguments->action);
 	for (int i = 0; i < SIGNALS; i++)
 		if (i + 1 != SIGKILL && i + 1 != SIGSTOP &&
-		    syscall_batch_ask(batch, SYS_rt_sigaction, (uint64_t)i + 1,
-				      parasite_remote(batch->parasite, &arguments->action[i]), 0, 8,
-				      0, 0, err))
+		    syscall_batch_ask(batch, err, SYS_rt_sigaction, (uint64_t)i + 1,
+				      parasite_remote(batch->parasite, &arguments->action[i]), 0,
+				      8))
 			return -1;
 	for (int64_t left = attrs->barriers; left > 0; left &= left - 1)
-		syscall_batch_add(batch, SYS_membarrier, (uint64_t)(left & -left), 0, 0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_membarrier, (uint64_t)(left & -left));
 	put_mm(batch, attrs);
 	put_dumped(batch, attrs->dumped);
 	if (attrs->state_permitted >> ARCH_STATE_NUMBER & 1)
-		syscall_batch_add(batch, ARCH_STATE_CALL, ARCH_STATE_ASK, ARCH_STATE_NUMBER, 0, 0,
-				  0, 0);
+		syscall_batch_add(batch, ARCH_STATE_CALL, ARCH_STATE_ASK, ARCH_STATE_NUMBER);
 	/* Since Linux 6.18 what is answered has the flags in it, which are asked for apart. */
 	if (attrs->no_huge_pages >= 0)
 		syscall_batch_add(batch, SYS_prctl, PR_SET_THP_DISABLE,
 				  (uint64_t)attrs->no_huge_pages & 1,
-				  (uint64_t)attrs->no_huge_pages & ~UINT64_C(1), 0, 0, 0);
+				  (uint64_t)attrs->no_huge_pages & ~UINT64_C(1));
 	if (attrs->merging >= 0) {
-		syscall_batch_add(batch, SYS_prctl, PR_SET_MEMORY_MERGE, (uint64_t)attrs->merging,
-				  0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_prctl, PR_SET_MEMORY_MERGE, (uint64_t)attrs->merging);
 		syscall_batch_soften(batch,
 				     "what it says of pages to be merged could not be put back");
 	}

@@ -98,7 +98,7 @@ void timers_ask(struct process *process, struct inj_call *call)
 	timers->count = 0;
 	for (int which = 0; which < ITIMERS; which++)
 		call_add(call, SYS_getitimer, (uint64_t)which,
-			 out + (uint64_t)which * sizeof(struct inj_timer), 0, 0, 0);
+			 out + (uint64_t)which * sizeof(struct inj_timer));
 	n = pread(process->timers_fd, timers->text, sizeof timers->text - 1, 0);
 	if (n > 0) {
 		timers->text[n] = 0;
@@ -106,9 +106,8 @@ void timers_ask(struct process *process, struct inj_call *call)
 	}
 	for (uint32_t i = 0; i < timers->count; i++)
 		call_add(call, SYS_timer_gettime, (uint64_t)timers->posix[i].id,
-			 out + (ITIMERS + i) * sizeof(struct inj_timer), 0, 0, 0);
-	call_add(call, SYS_clock_gettime, CLOCK_MONOTONIC, out + CLOCK * sizeof(struct inj_timer),
-		 0, 0, 0);
+			 out + (ITIMERS + i) * sizeof(struct inj_timer));
+	call_add(call, SYS_clock_gettime, CLOCK_MONOTONIC, out + CLOCK * sizeof(struct inj_timer));
 }
 
 void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns)
@@ -152,19 +151,20 @@ static bool ticks(const struct inj_timer *s)
 	return s->interval[0] || s->interval[1];
 }
 
-static void add_setting(struct setup *setup, const struct timers *timers, const char *name, long nr,
-			uint64_t timer, const struct inj_timer *s, bool cpu)
+static void add_setting(struct setup *setup, const struct timers *timers, long nr, uint64_t timer,
+			const struct inj_timer *s, bool cpu)
 {
+	const char *name = nr == SYS_setitimer ? "setitimer" : "timer_settime";
 	const avc_remote at = setup_data(setup, s, sizeof *s);
 	struct inj_setup *set;
 
 	if (!cpu)
 		set = setup_add(setup, INJ_AFTER, name, INJ_TIMER_SET, (uint64_t)nr, timer, at,
-				timers->asked_ns, 0);
+				timers->asked_ns);
 	else if (nr == SYS_setitimer)
-		set = setup_add(setup, INJ_AFTER, name, nr, timer, at, 0, 0, 0);
+		set = setup_add(setup, INJ_AFTER, name, nr, timer, at);
 	else
-		set = setup_add(setup, INJ_AFTER, name, nr, timer, 0, at, 0, 0);
+		set = setup_add(setup, INJ_AFTER, name, nr, timer, 0, at);
 	set->flags = INJ_MAY_FAIL;
 }
 
@@ -187,11 +187,11 @@ static void add_posix(struct process *process, const struct posix_timer *t,
 	}
 	setup_add(setup, INJ_AFTER, "timer_create", INJ_TIMER_CREATE, (uint64_t)(int64_t)t->clock,
 		  setup_data(setup, &event, sizeof event), setup_data(setup, &id, sizeof id),
-		  (uint64_t)id, 0)
+		  (uint64_t)id)
 		->flags = INJ_MAY_FAIL;
 	if (valid && runs(s) && !has_just_expired(process, s, 1, t->signal, t->id))
-		add_setting(setup, process->timers, "timer_settime", SYS_timer_settime,
-			    (uint64_t)id, s, counts_cpu(t->clock));
+		add_setting(setup, process->timers, SYS_timer_settime, (uint64_t)id, s,
+			    counts_cpu(t->clock));
 }
 
 static int by_id(const void *a, const void *b)
@@ -222,8 +222,7 @@ void timers_setup(struct process *process, struct setup *setup)
 
 		if (timers->valid[which] && (runs(s) || (real && ticks(s))) &&
 		    !(real && has_just_expired(process, s, 1000, SIGALRM, -1)))
-			add_setting(setup, timers, "setitimer", SYS_setitimer, (uint64_t)which, s,
-				    !real);
+			add_setting(setup, timers, SYS_setitimer, (uint64_t)which, s, !real);
 	}
 	if (timers->too_many && !setup->notice.code)
 		fail(&setup->notice, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",

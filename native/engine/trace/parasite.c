@@ -180,8 +180,7 @@ void call_begin(struct inj_call *call, enum inj_after after)
 	call->park_ms = INJ_PARK_MS;
 }
 
-struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
-			     uint64_t d, uint64_t e)
+struct inj_syscall *call_append(struct inj_call *call, long nr, const uint64_t arg[6])
 {
 	/* The parasite is the app's to scribble on, and its other threads run while one of them is
 	 * asked: not even a number that was written just now is believed. */
@@ -190,12 +189,12 @@ struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_
 	struct inj_syscall *s = &call->call[i];
 
 	call->count = i + 1;
-	*s = (struct inj_syscall){ .nr = nr, .arg = { a, b, c, d, e, 0 }, .result = -ENOSYS };
+	*s = (struct inj_syscall){ .nr = nr, .result = -ENOSYS };
+	memcpy(s->arg, arg, sizeof s->arg);
 	return s;
 }
 
-int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
-		  uint64_t data, uint64_t e)
+int parasite_will(struct process *process, long nr, const uint64_t arg[6])
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	const struct thread *thread = thread_find(process, process->pid);
@@ -205,11 +204,10 @@ int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint
 	if (!thread || !thread->borrowed || i >= INJ_WILLS_MAX ||
 	    process->parasite.seccomp == SECCOMP_SUPERVISED)
 		return -1;
-	call->will_data[i] = data;
-	call->will[i] = (struct inj_syscall){
-		.nr = nr,
-		.arg = { a, b, c, parasite_remote(&process->parasite, &call->will_data[i]), e }
-	};
+	call->will_data[i] = arg[3];
+	call->will[i] = (struct inj_syscall){ .nr = nr };
+	memcpy(call->will[i].arg, arg, sizeof call->will[i].arg);
+	call->will[i].arg[3] = parasite_remote(&process->parasite, &call->will_data[i]);
 	__atomic_store_n(&call->wills, i + 1, __ATOMIC_RELEASE);
 	return 0;
 }

@@ -33,25 +33,24 @@ static void *room(struct setup *setup, size_t bytes)
 }
 
 static struct inj_setup *add(struct setup *setup, uint64_t **tail, const char *name, long nr,
-			     const uint64_t arg[5])
+			     const uint64_t arg[6])
 {
 	struct inj_setup *s = room(setup, sizeof *s);
 
 	if (!s)
 		return &setup->spare;
-	*s = (struct inj_setup){
-		.call = { .nr = nr, .arg = { arg[0], arg[1], arg[2], arg[3], arg[4], 0 } },
-	};
+	*s = (struct inj_setup){ .call = { .nr = nr } };
+	memcpy(s->call.arg, arg, sizeof s->call.arg);
 	strncpy(s->name, name, sizeof s->name - 1);
 	**tail = parasite_remote(setup->parasite, s);
 	*tail = &s->next;
 	return s;
 }
 
-struct inj_setup *setup_add(struct setup *setup, enum inj_stage stage, const char *name, long nr,
-			    uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e)
+struct inj_setup *setup_append(struct setup *setup, enum inj_stage stage, const char *name, long nr,
+			       const uint64_t arg[6])
 {
-	return add(setup, &setup->tail[stage], name, nr, (const uint64_t[]){ a, b, c, d, e });
+	return add(setup, &setup->tail[stage], name, nr, arg);
 }
 
 void setup_thread(struct setup *setup, struct inj_thread *thread)
@@ -60,10 +59,10 @@ void setup_thread(struct setup *setup, struct inj_thread *thread)
 	setup->thread_tail = &thread->setup;
 }
 
-struct inj_setup *setup_add_thread(struct setup *setup, const char *name, long nr, uint64_t a,
-				   uint64_t b, uint64_t c, uint64_t d, uint64_t e)
+struct inj_setup *setup_append_thread(struct setup *setup, const char *name, long nr,
+				      const uint64_t arg[6])
 {
-	return add(setup, &setup->thread_tail, name, nr, (const uint64_t[]){ a, b, c, d, e });
+	return add(setup, &setup->thread_tail, name, nr, arg);
 }
 
 avc_remote setup_data(struct setup *setup, const void *data, size_t bytes)

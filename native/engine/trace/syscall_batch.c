@@ -11,6 +11,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
+#include <string.h>
 #include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
@@ -37,14 +38,15 @@ void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *par
 	batch->listed = batch->softs = 0;
 }
 
-void syscall_batch_add(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
-		       uint64_t d, uint64_t e, uint64_t f)
+void syscall_batch_append(struct syscall_batch *batch, long nr, const uint64_t arg[6])
 {
-	if (batch->listed < batch->list_max)
-		batch->list[batch->listed] = (struct inj_syscall){ .nr = nr,
-								   .arg = { a, b, c, d, e, f },
-								   .result = NOT_MADE };
-	batch->listed++;
+	struct inj_syscall *call;
+
+	if (batch->listed++ >= batch->list_max)
+		return;
+	call = &batch->list[batch->listed - 1];
+	*call = (struct inj_syscall){ .nr = nr, .result = NOT_MADE };
+	memcpy(call->arg, arg, sizeof call->arg);
 }
 
 void syscall_batch_soften(struct syscall_batch *batch, const char *problem)
@@ -106,14 +108,13 @@ static int run(struct syscall_batch *batch, struct avc_error *err)
 
 	if (!listed)
 		return 0;
-	syscall_batch_add(batch, SYS_tgkill, self, self, SIGSTOP, 0, 0, 0);
+	syscall_batch_add(batch, SYS_tgkill, self, self, SIGSTOP);
 	batch->listed = 0;
 	if (listed >= batch->list_max)
 		return fail(err, AVC_UNSUPPORTED, 0, batch->pid, "restore", "",
 			    "there is no room for so many system calls");
 	call_begin(batch->call, INJ_AFTER_PARK);
-	call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list), listed + 1,
-		 0, 0, 0);
+	call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list), listed + 1);
 	return parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err) ||
 			       parasite_start(batch->pid, err) ||
 			       await_end(batch, &batch->list[listed - 1], err)
@@ -187,12 +188,12 @@ int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err)
 }
 
 /* One of any number; those before it are made when there is no more room. */
-int syscall_batch_ask(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
-		      uint64_t d, uint64_t e, uint64_t f, struct avc_error *err)
+int syscall_batch_append_any(struct syscall_batch *batch, struct avc_error *err, long nr,
+			     const uint64_t arg[6])
 {
 	if (batch->listed + SPARE > batch->list_max && syscall_batch_flush(batch, err))
 		return -1;
-	syscall_batch_add(batch, nr, a, b, c, d, e, f);
+	syscall_batch_append(batch, nr, arg);
 	return 0;
 }
 
@@ -236,20 +237,20 @@ int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_c
 	if (fd_channel && fd_channel->ours >= 0) {
 		if (fd_channel->theirs)
 			syscall_batch_add(batch, SYS_dup3, (uint64_t)fd_channel->theirs, 0,
-					  O_CLOEXEC, 0, 0, 0);
-		syscall_batch_add(batch, SYS_close_range, 1, ~0u, 0, 0, 0, 0);
+					  O_CLOEXEC);
+		syscall_batch_add(batch, SYS_close_range, 1, ~0u);
 		batch->socket = fcntl(fd_channel->ours, F_DUPFD_CLOEXEC, 3);
 		return batch->socket < 0 ? fail_errno(err, batch->pid, "restore", "fcntl",
 						      "no descriptor is left for its socket")
 					 : 0;
 	}
 	(void)syscall_batch_data(batch, &out);
-	syscall_batch_add(batch, SYS_close_range, 0, ~0u, 0, 0, 0, 0);
-	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	syscall_batch_add(batch, SYS_close_range, 0, ~0u);
+	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out);
 	if (syscall_batch_flush(batch, err))
 		return -1;
 	batch->socket = fetch(batch, 1, err);
-	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_close, 1);
 	return batch->socket < 0 ? -1 : 0;
 }
 
@@ -259,7 +260,7 @@ int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channe
 	avc_remote out;
 	const int *ends = syscall_batch_data(batch, &out);
 
-	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out, 0, 0);
+	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out);
 	syscall_batch_soften(batch, NULL);
 	if (syscall_batch_flush(batch, err))
 		return -1;
@@ -267,7 +268,7 @@ int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channe
 		return 0;
 	fd_channel->theirs = ends[0];
 	fd_channel->ours = fetch(batch, ends[1], err);
-	syscall_batch_add(batch, SYS_close, (uint64_t)ends[1], 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_close, (uint64_t)ends[1]);
 	return fd_channel->ours < 0 || syscall_batch_flush(batch, err) ? -1 : 0;
 }
 
@@ -277,7 +278,7 @@ int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_chan
 	if (fd_channel->ours < 0)
 		return 0;
 	close_fd(&fd_channel->ours);
-	syscall_batch_add(batch, SYS_close, (uint64_t)fd_channel->theirs, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_close, (uint64_t)fd_channel->theirs);
 	return syscall_batch_flush(batch, err);
 }
 
@@ -289,8 +290,8 @@ static int hand_over(struct syscall_batch *batch, int socket, int fd, struct avc
 	    (errno != EAGAIN || syscall_batch_flush(batch, err) || fd_send(batch->socket, fd)))
 		return fail_errno(err, batch->pid, "restore", "sendmsg",
 				  "a descriptor could not be handed over");
-	return syscall_batch_ask(batch, SYS_recvmsg, (uint64_t)socket, write_letter(batch),
-				 MSG_CMSG_CLOEXEC | MSG_DONTWAIT, 0, 0, 0, err);
+	return syscall_batch_ask(batch, err, SYS_recvmsg, (uint64_t)socket, write_letter(batch),
+				 MSG_CMSG_CLOEXEC | MSG_DONTWAIT);
 }
 
 int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err)
@@ -307,14 +308,13 @@ int syscall_batch_change_parasite(struct syscall_batch *batch, const struct proc
 	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
-			  PARASITE_FLAGS, 1, 0);
-	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+			  PARASITE_FLAGS, 1);
+	syscall_batch_add(batch, SYS_close, 1);
 	if (syscall_batch_give(batch, parasite->data_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
-			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1,
-			  0);
-	syscall_batch_add(batch, SYS_close, 1, 0, 0, 0, 0, 0);
+			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1);
+	syscall_batch_add(batch, SYS_close, 1);
 	if (syscall_batch_flush(batch, err))
 		return -1;
 	syscall_batch_enter(batch, parasite, slot);
@@ -332,8 +332,8 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 	for (uint32_t i = 0; i < table->count; i++)
 		socket += table->entry[i].fd == socket;
 	if (socket) {
-		syscall_batch_add(batch, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket, 0, 0, 0);
-		syscall_batch_add(batch, SYS_close, 0, 0, 0, 0, 0, 0);
+		syscall_batch_add(batch, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket);
+		syscall_batch_add(batch, SYS_close);
 	}
 	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
 		const int fd = table->entry[i].fd;
@@ -350,12 +350,12 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 			return -1;
 		if (lowest != fd) {
 			syscall_batch_add(batch, SYS_dup3, (uint64_t)lowest, (uint64_t)fd,
-					  table->entry[i].cloexec ? O_CLOEXEC : 0, 0, 0, 0);
-			syscall_batch_add(batch, SYS_close, (uint64_t)lowest, 0, 0, 0, 0, 0);
+					  table->entry[i].cloexec ? O_CLOEXEC : 0);
+			syscall_batch_add(batch, SYS_close, (uint64_t)lowest);
 		} else if (!table->entry[i].cloexec) {
-			syscall_batch_add(batch, SYS_fcntl, (uint64_t)fd, F_SETFD, 0, 0, 0, 0);
+			syscall_batch_add(batch, SYS_fcntl, (uint64_t)fd, F_SETFD);
 		}
 	}
-	syscall_batch_add(batch, SYS_close, (uint64_t)socket, 0, 0, 0, 0, 0);
+	syscall_batch_add(batch, SYS_close, (uint64_t)socket);
 	return 0;
 }

@@ -389,10 +389,12 @@ void *parasite_stack(const struct parasite *parasite, uint32_t slot, uint32_t i)
 uint8_t *parasite_setup(const struct parasite *parasite, uint32_t slot); /* INJ_SETUP_BYTES */
 uint8_t *parasite_files(const struct parasite *parasite, uint32_t slot); /* INJ_FILES_BYTES */
 
+/* Of a system call; those that are not given are 0. */
+#define ARGUMENTS(...) ((const uint64_t[6]){ __VA_ARGS__ })
 /* Prepares a list of calls; returns the next call to fill in. */
 void call_begin(struct inj_call *call, enum inj_after after);
-struct inj_syscall *call_add(struct inj_call *call, long nr, uint64_t a, uint64_t b, uint64_t c,
-			     uint64_t d, uint64_t e);
+struct inj_syscall *call_append(struct inj_call *call, long nr, const uint64_t arg[6]);
+#define call_add(call, nr, ...) call_append(call, nr, ARGUMENTS(__VA_ARGS__))
 /* Sends a stopped task into the parasite to make the calls.  `base` is a user context
  * of the task.  For a thread of the app use thread_borrow(). */
 int parasite_send(const struct parasite *parasite, pid_t tid, const struct arch_regs *base,
@@ -417,11 +419,10 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
 /* While the main thread is in its parasite: a call that it makes before it goes home if we are not
- * there any more, with the address of `data` as its fourth argument.  For what we are about to
+ * there any more, with the address of arg[3] as its fourth argument.  For what we are about to
  * change in what is the app's; that must not be changed if this fails.  The last one has been
  * undone: parasite_will_done(). */
-int parasite_will(struct process *process, long nr, uint64_t a, uint64_t b, uint64_t c,
-		  uint64_t data, uint64_t e) warn_unused;
+int parasite_will(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
 void parasite_will_done(struct process *process);
 /* exec puts another program in its place, at any moment, and the parasite is gone: whether it
  * is there, in a stopped thread.  If not, the process is not infected any more. */
@@ -458,11 +459,15 @@ struct setup {
 void setup_begin(struct setup *setup, const struct parasite *parasite, uint32_t slot);
 /* One more call for a stage or (after setup_thread()) for a thread; `name` is for
  * messages.  To be filled in further: call.arg[5], store, flags. */
-struct inj_setup *setup_add(struct setup *setup, enum inj_stage stage, const char *name, long nr,
-			    uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e);
+struct inj_setup *setup_append(struct setup *setup, enum inj_stage stage, const char *name, long nr,
+			       const uint64_t arg[6]);
+#define setup_add(setup, stage, name, nr, ...) \
+	setup_append(setup, stage, name, nr, ARGUMENTS(__VA_ARGS__))
 void setup_thread(struct setup *setup, struct inj_thread *thread);
-struct inj_setup *setup_add_thread(struct setup *setup, const char *name, long nr, uint64_t a,
-				   uint64_t b, uint64_t c, uint64_t d, uint64_t e);
+struct inj_setup *setup_append_thread(struct setup *setup, const char *name, long nr,
+				      const uint64_t arg[6]);
+#define setup_add_thread(setup, name, nr, ...) \
+	setup_append_thread(setup, name, nr, ARGUMENTS(__VA_ARGS__))
 /* A copy of `bytes` bytes where the process can read it; the process's address. */
 avc_remote setup_data(struct setup *setup, const void *data, size_t bytes);
 /* -1 if there was not enough room for it all. */
@@ -525,11 +530,13 @@ void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *par
 			 uint32_t slot);
 /* One more call.  All of them are made by syscall_batch_flush(), which leaves the results in
  * batch->list and tells the first that failed. */
-void syscall_batch_add(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
-		       uint64_t d, uint64_t e, uint64_t f);
+void syscall_batch_append(struct syscall_batch *batch, long nr, const uint64_t arg[6]);
+#define syscall_batch_add(batch, nr, ...) syscall_batch_append(batch, nr, ARGUMENTS(__VA_ARGS__))
 /* The same, for any number: those before it are made when there is no more room. */
-int syscall_batch_ask(struct syscall_batch *batch, long nr, uint64_t a, uint64_t b, uint64_t c,
-		      uint64_t d, uint64_t e, uint64_t f, struct avc_error *err) warn_unused;
+int syscall_batch_append_any(struct syscall_batch *batch, struct avc_error *err, long nr,
+			     const uint64_t arg[6]) warn_unused;
+#define syscall_batch_ask(batch, err, nr, ...) \
+	syscall_batch_append_any(batch, err, nr, ARGUMENTS(__VA_ARGS__))
 /* The last one may fail: then `problem`, if any, is noted. */
 void syscall_batch_soften(struct syscall_batch *batch, const char *problem);
 int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err) warn_unused;

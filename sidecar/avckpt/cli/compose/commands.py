@@ -60,6 +60,7 @@ def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
 @click.option("--json", "as_json", is_flag=True, help="The containers as JSON.")
 @click.argument("services", nargs=-1)
 def up(
+    *,
     files: tuple[Path, ...],
     project: str,
     profiles: tuple[str, ...],
@@ -115,6 +116,7 @@ def up(
 @click.option("--json", "as_json", is_flag=True, help="The containers that are gone, as JSON.")
 @click.argument("services", nargs=-1)
 def down(
+    *,
     files: tuple[Path, ...],
     project: str,
     profiles: tuple[str, ...],
