@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.cli import containers_conf
+from avckpt.cli import containers_conf, doctor
 from avckpt.cli.install import DROP_IN, HOOKS_DIR
 
 from testkit.harness import Podman, avckpt_command, hooks_installed, run, wait_until
@@ -86,6 +86,7 @@ def test_a_service_that_runs_already_calls_no_hooks(
         done = run([*avckpt_command(), "install"])  # again: nothing new
         assert problem not in done.stderr
         assert first_word() == INIT
+        assert doctor.service_facts(path) == doctor.podman_facts()
 
 
 def test_containers_conf_in_the_environment_hides_it_and_the_remedy_helps(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import socket
 import subprocess
 from pathlib import Path
 
@@ -23,6 +24,7 @@ GOOD = Facts(
     pidfd=True,
     podman=PodmanFacts("4.3.1", "crun", False, "/usr/share/containers/seccomp.json"),
     hooks_dir_problems=(),
+    service=None,
     service_problems=(),
     installed_version=avckpt.__version__,
     missing_files=(),
@@ -35,6 +37,7 @@ GOOD = Facts(
     engine_problem="",
     config=ConfigFacts("/etc/avckpt/config.yaml", True, ""),
 )
+OTHER = PodmanFacts("4.2.0", "crun", False, "")
 REMOTE = PodmanFacts("4.3.1", "crun", False, "", remote=True)
 
 
@@ -81,6 +84,9 @@ def test_a_good_machine() -> None:
         ({"init_problem": "/i is not static"}, "init", "fail", "/i is not static", "avckpt install"),
         ({"hooks_dir_problems": ("it is hidden: write this",)}, "hooks_dir", "fail", "it is hidden", "write this"),
         ({"service_problems": ("it is old: restart it",)}, "podman service", "warn", "it is old", "restart it"),
+        ({"service": OTHER}, "podman service", "warn", "runs is of version 4.2.0, podman of 4.3.1", "restart podman"),
+        ({"service": "refused"}, "podman service", "warn", "does not answer: refused", "restart podman.socket"),
+        ({"service": GOOD.podman}, "podman service", "ok", "answers, version 4.3.1", ""),
         ({"config": ConfigFacts("/c", True, "/c:3: x")}, "config", "warn", "refused: /c:3: x", "avckpt reload"),
         ({"config": ConfigFacts("/c", True, "", True)}, "config", "warn", "/c has changed", "avckpt reload"),
         ({"config": ConfigFacts("/c", False, "")}, "config", "ok", "no /c: the built-in defaults hold", ""),
@@ -104,6 +110,16 @@ def test_looking_at_this_machine_ends_in_verdicts() -> None:
     found = {check.name: check for check in doctor.checks()}
     assert found["kernel"].detail.startswith("Linux ")
     assert {"processor", "ptrace", "engine", "podman", "hooks", "sidecar"} <= set(found)
+
+
+def test_a_service_that_is_not_there_or_answers_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "podman.sock"
+    assert doctor.service_facts(path) is None
+    with socket.socket(socket.AF_UNIX) as left_behind:
+        left_behind.bind(str(path))
+        answer = doctor.service_facts(path)  # nobody listens
+    assert isinstance(answer, str)
+    assert "Connection refused" in answer
 
 
 def test_an_init_must_be_static(tmp_path: Path) -> None:

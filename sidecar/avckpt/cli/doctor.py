@@ -86,6 +86,8 @@ class Facts:
     podman: PodmanFacts | str
     """A string: why Podman does not answer."""
     hooks_dir_problems: tuple[str, ...]
+    service: PodmanFacts | str | None
+    """Podman's REST service.  None: nobody has set it up."""
     service_problems: tuple[str, ...]
     installed_version: str | None
     """None: nothing is installed."""
@@ -109,6 +111,7 @@ class Facts:
 KERNEL_LEAST = (5, 13)  # PTRACE_GET_RSEQ_CONFIGURATION, the newest call that the engine needs
 PODMAN_LEAST = (4, 3)  # `podman generate spec`, by which the precreate hook learns labels
 MACHINES = ("x86_64",)
+SERVICE = Path("/run/podman/podman.sock")  # root's, where podman.socket has it
 _CAPABILITIES = {"CAP_SYS_PTRACE": 19, "CAP_SYS_ADMIN": 21}
 
 
@@ -234,9 +237,24 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
             yield Check("hooks_dir", Status.FAIL, what, remedy)
     else:
         yield Check("hooks_dir", Status.OK, f"Podman looks into {HOOKS_DIR}")
+    yield from _judge_service(facts)
+
+
+def _judge_service(facts: Facts) -> Iterator[Check]:
+    """Containers that podman-py, Ansible or a client of Docker's starts are the service's."""
+    name = "podman service"
     for problem in facts.service_problems:
         what, _, remedy = problem.rpartition(": ")
-        yield Check("podman service", Status.WARN, what, remedy)
+        yield Check(name, Status.WARN, what, remedy)
+    service = facts.service
+    again = "run: sudo systemctl restart podman.socket podman.service"
+    if isinstance(service, str):
+        yield Check(name, Status.WARN, f"it does not answer: {service}", again)
+    elif service is not None and isinstance(facts.podman, PodmanFacts) and service.version != facts.podman.version:
+        what = f"the one that runs is of version {service.version}, podman of {facts.podman.version}"
+        yield Check(name, Status.WARN, what, again)
+    elif service is not None and not facts.service_problems:
+        yield Check(name, Status.OK, f"answers, version {service.version}")
 
 
 def _few(names: Sequence[str]) -> str:
@@ -284,8 +302,9 @@ def gather() -> Facts:
         ns_last_pid=os.path.exists("/proc/sys/kernel/ns_last_pid"),
         map_files=os.path.exists("/proc/self/map_files"),
         pidfd=_has_pidfd(),
-        podman=_podman(),
+        podman=podman_facts(),
         hooks_dir_problems=tuple(containers_conf.problems(HOOKS_DIR, environ=os.environ)),
+        service=service_facts(SERVICE),
         service_problems=tuple(install.service_problems()),
         installed_version=installed,
         missing_files=missing,
@@ -345,7 +364,8 @@ def _hook_problem() -> str:
     return lines[-1] if lines else f"exit status {done.returncode}"
 
 
-def _podman() -> PodmanFacts | str:
+def podman_facts() -> PodmanFacts | str:
+    """What `podman info` says, or why it says nothing."""
     if shutil.which("podman") is None:
         return "podman is not here"
     try:
@@ -358,17 +378,39 @@ def _podman() -> PodmanFacts | str:
         lines = done.stderr.strip().splitlines()
         return f"podman info: {lines[-1] if lines else 'failed'}"
     try:
-        info: dict[str, Any] = json.loads(done.stdout)
-        host = info["host"]
-        return PodmanFacts(
-            version=str(info["version"]["Version"]),
-            runtime=str(host["ociRuntime"]["name"]),
-            rootless=bool(host["security"]["rootless"]),
-            seccomp_profile=str(host["security"].get("seccompProfilePath", "")),
-            remote=bool(host.get("serviceIsRemote", False)),
-        )
+        return _facts_of(json.loads(done.stdout))
     except (ValueError, KeyError, TypeError) as error:
         return f"podman info: unexpected answer ({error})"
+
+
+def service_facts(socket: Path) -> PodmanFacts | str | None:
+    """What the service at that socket says of itself, or why it does not; None: there is no socket."""
+    if not socket.is_socket():
+        return None
+    # Who has no service does not wait for the import.
+    from podman import PodmanClient
+
+    try:
+        with PodmanClient(base_url=f"unix://{socket}", timeout=10) as client:
+            return _facts_of(client.info())  # type: ignore[no-untyped-call]
+    except OSError as error:  # podman-py's own errors are, too, and their first cause says most
+        cause: BaseException = error
+        while cause.__context__ is not None:
+            cause = cause.__context__
+        return str(cause)
+    except (ValueError, KeyError, TypeError) as error:
+        return f"unexpected answer ({error})"
+
+
+def _facts_of(info: dict[str, Any]) -> PodmanFacts:
+    host = info["host"]
+    return PodmanFacts(
+        version=str(info["version"]["Version"]),
+        runtime=str(host["ociRuntime"]["name"]),
+        rootless=bool(host["security"]["rootless"]),
+        seccomp_profile=str(host["security"].get("seccompProfilePath", "")),
+        remote=bool(host.get("serviceIsRemote", False)),
+    )
 
 
 def _sidecar() -> tuple[dict[str, Any], str]:
