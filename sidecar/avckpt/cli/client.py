@@ -57,6 +57,12 @@ class Client:
         """Has the configuration file read again; returns {"config": ..., "containers": [...]}."""
         return self._request("POST", "/v1/reload")
 
+    def metrics(self) -> str:
+        """The metrics, as Prometheus reads them."""
+        with self._connected() as connection:
+            connection.request("GET", "/metrics")
+            return connection.getresponse().read().decode("utf-8", "replace")
+
     def history(self, since: float | None = None) -> list[Json]:
         """The events that are kept, oldest first, with `since` (seconds since 1970) those from then on."""
         query = "" if since is None else f"?since={since!r}"

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avckpt import __version__
+from avckpt.cli.bundle import bundle
 from avckpt.cli.compose.commands import check, down, up
 from avckpt.cli.events import complete_container, completion, events
 from avckpt.cli.web import web
@@ -64,7 +65,7 @@ def main() -> None:
 
 main.add_command(events)
 main.add_command(completion)
-for command in (check, up, down, web):
+for command in (check, up, down, web, bundle):
     main.add_command(command)
 
 root_option = click.option(

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`avckpt bundle`: one archive with what is known of a container, for whoever has to find out why it crashed."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import subprocess
+import tarfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from avckpt import __version__
+from avckpt.cli.events import complete_container
+from avckpt.errors import AvckptError, NoSuchContainer
+
+if TYPE_CHECKING:
+    from avckpt.cli.client import Client, Json
+
+COMMAND_TIMEOUT_S = 30.0
+LOG_LINES = 2000
+MOST_BYTES = 8 << 20
+"""Of what one program says; the end is what matters."""
+README = """What avckpt knows of {name}, {at}.
+
+events.jsonl      what happened to it, one JSON object a line, oldest first
+container.json    how it is now (avckpt ps --json)
+labels.json       its avckpt.* labels
+inspect.json      image, state, restarts and mounts, as Podman has them; no environment, no command
+container.log     the last {lines} lines that it wrote
+sidecar.json      the sidecar: version, configuration in force
+sidecar.log       the last {lines} lines of its log
+metrics.txt       the sidecar's metrics
+doctor.json       what avckpt doctor says of the machine
+config.yaml       defaults for all containers, where there are any
+versions.txt      kernel, Podman, runtime
+missing.txt       what could not be had, and why, if anything
+"""
+INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCount", "Mounts")
+"""What of `podman inspect` is taken: nothing that could hold a secret, as environment and command can."""
+
+
+@click.command()
+@click.argument("name", shell_complete=complete_container)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Where to put it; default avckpt-NAME-TIME.tar.gz here.",
+)
+def bundle(name: str, output: Path | None) -> None:
+    """Collect all that is known of container NAME in one archive.
+
+    Events, state, labels, logs, metrics, versions and what "avckpt doctor" says; no
+    environment and no command lines.  Look through it before you send it on: logs
+    hold what the container wrote.
+    """
+    from avckpt_hooks.shared import protocol
+
+    from avckpt.cli.client import Client
+
+    run_dir = Path(protocol.run_dir())
+    container, events = find(Client(run_dir), name)
+    stem = f"avckpt-{_plain(container)}-{time.strftime('%Y%m%d-%H%M%S')}"
+    path = output or Path(f"{stem}.tar.gz")
+    try:
+        # Only its owner may read it: a log may say more than others should know.
+        with open(path, "xb", opener=_open_private) as file:
+            missing = write(file, stem, list(contents(Client(run_dir), container, events)))
+    except OSError as error:
+        raise AvckptError(f"{path} cannot be written", errno=error.errno or 0) from error
+    for each in missing:
+        click.echo(f"warning: without {each}", err=True)
+    click.echo(str(path))
+
+
+def find(client: Client, name: str) -> tuple[Json, list[Json]]:
+    """The container of that name, id or beginning of an id, its last run first, and its events.
+
+    Raises NoSuchContainer.
+    """
+    rows = [row for row in client.containers(ended=True) if name == row["name"] or row["id"].startswith(name)]
+    names = {row["id"] for row in rows}
+    events = [event for event in client.history() if event["id"] in names or name == event["container"]]
+    if not rows and not events:
+        raise NoSuchContainer(f"nothing is known of a container {name!r}")
+    if rows:
+        return max(rows, key=lambda row: row["registered_at"]), events
+    return {"name": events[-1]["container"], "id": events[-1]["id"], "state": "ended"}, events
+
+
+def contents(client: Client, container: Json, events: list[Json]) -> Iterator[tuple[str, Callable[[], str]]]:
+    """Names of the files, and how to get what is in them; this may raise AvckptError or OSError."""
+    from avckpt.cli import doctor, sidecar_container
+
+    called = container["name"] or container["id"][:12]
+    at = time.strftime("%Y-%m-%d %H:%M:%S %Z")
+    yield "README.txt", lambda: README.format(name=called, at=at, lines=LOG_LINES)
+    yield "events.jsonl", lambda: "".join(json.dumps(event) + "\n" for event in events)
+    yield "container.json", lambda: _pretty(container)
+    inspected: list[Json] = []
+
+    def inspect() -> str:
+        inspected.extend(json.loads(_program("podman", "container", "inspect", container["id"])))
+        return _pretty({key: inspected[0].get(key) for key in INSPECTED})
+
+    def labels() -> str:
+        if not inspected:
+            raise AvckptError("Podman does not know it (any more)")
+        labels = inspected[0]["Config"]["Labels"] or {}
+        return _pretty({key: value for key, value in labels.items() if key.startswith("avckpt.")})
+
+    yield "inspect.json", inspect
+    yield "labels.json", labels
+    yield "container.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), container["id"])
+    yield "sidecar.json", lambda: _pretty(client.info())
+    yield "sidecar.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), sidecar_container.NAME)
+    yield "metrics.txt", client.metrics
+    yield "doctor.json", lambda: _pretty([asdict(check) for check in doctor.checks()])
+    yield "config.yaml", lambda: _tail(Path(client.info()["config"]["path"]).read_bytes())
+    yield "versions.txt", versions
+
+
+def write(file: io.BufferedIOBase, folder: str, files: list[tuple[str, Callable[[], str]]]) -> list[str]:
+    """Writes the archive; returns what could not be had, with the reasons, which missing.txt has, too."""
+    missing = []
+    with tarfile.open(fileobj=file, mode="w:gz") as archive:
+
+        def add(name: str, text: str) -> None:
+            data = text.encode("utf-8", "backslashreplace")
+            entry = tarfile.TarInfo(f"{folder}/{name}")
+            entry.size, entry.mtime, entry.mode = len(data), int(time.time()), 0o600
+            archive.addfile(entry, io.BytesIO(data))
+
+        for name, get in files:
+            try:
+                add(name, get())
+            except (AvckptError, OSError, ValueError) as error:
+                missing.append(f"{name}: {error}")
+        if missing:
+            add("missing.txt", "".join(f"{each}\n" for each in missing))
+    return missing
+
+
+def versions() -> str:
+    """Of all that takes part."""
+    lines = [f"avckpt {__version__}", f"{platform.system()} {platform.release()} {platform.machine()}"]
+    for program in ("podman", "crun", "runc", "conmon"):
+        try:
+            lines.append(_program(program, "--version").partition("\n")[0])
+        except AvckptError as error:
+            lines.append(f"{program}: {error}")
+    return "\n".join(lines) + "\n"
+
+
+def _program(*argv: str) -> str:
+    """What a program says on both of its outputs.  Raises AvckptError when it fails."""
+    try:
+        done = subprocess.run(
+            argv,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=COMMAND_TIMEOUT_S,
+            check=False,
+        )
+    except FileNotFoundError:
+        raise AvckptError(f"there is no {argv[0]}") from None
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise AvckptError(f"{argv[0]}: {error}") from error
+    said = _tail(done.stdout)
+    if done.returncode != 0:
+        raise AvckptError(said.strip().rpartition("\n")[2] or f"{argv[0]} ended with status {done.returncode}")
+    return said
+
+
+def _tail(data: bytes) -> str:
+    return data[-MOST_BYTES:].decode("utf-8", "replace")
+
+
+def _pretty(data: object) -> str:
+    return json.dumps(data, indent=2, default=str) + "\n"
+
+
+def _plain(container: Json) -> str:
+    """Its name as a part of a file's."""
+    called = container["name"] or container["id"][:12]
+    return "".join(each if each.isalnum() or each in "-_." else "_" for each in called)
+
+
+def _open_private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)

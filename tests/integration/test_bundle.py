@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`avckpt bundle` of a real container."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from testkit.harness import ContainerFactory, Sidecar, wait_until
+
+SECRET = "a-secret-of-the-application"
+
+
+def read(path: Path) -> dict[str, str]:
+    with tarfile.open(path) as archive:
+        members = archive.getmembers()
+        assert len({member.name.partition("/")[0] for member in members}) == 1
+        found = {}
+        for member in members:
+            file = archive.extractfile(member)
+            assert file is not None
+            found[member.name.partition("/")[2]] = file.read().decode()
+        return found
+
+
+@pytest.mark.shared_machine("a restore on a busy machine may take longer than the test waits")
+def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
+    crashing = container.protected(
+        *("sh", "-c", "echo it has started; while :; do sleep 1; done"),
+        labels={"interval": "100ms"},
+        options=("--env", f"TOKEN={SECRET}", "--label", "owner=somebody"),
+    )
+    sidecar.wait_generation(crashing)
+    os.kill(sidecar.app_pid(crashing), signal.SIGSEGV)
+    sidecar.wait_restores(crashing)
+    wait_until(lambda: "restored in" in sidecar.logs(), 20, "the restore is told")
+    path = tmp_path / "bundle.tar.gz"
+    said = sidecar.avckpt("bundle", crashing.name, "-o", str(path))
+    assert said.stdout == f"{path}\n"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    found = read(path)
+    kinds = [json.loads(line)["kind"] for line in found["events.jsonl"].splitlines()]
+    assert "died" in kinds
+    assert "restored" in kinds
+    assert json.loads(found["container.json"])["restores"] == 1
+    assert json.loads(found["labels.json"])["avckpt.interval"] == "100ms"
+    assert "owner" not in found["labels.json"]
+    assert json.loads(found["inspect.json"])["State"]["Status"] == "running"
+    assert "it has started" in found["container.log"]
+    assert "restored in" in found["sidecar.log"]
+    assert json.loads(found["sidecar.json"])["version"]
+    assert "avckpt_restores_total" in found["metrics.txt"]
+    assert any(check["name"] == "kernel" for check in json.loads(found["doctor.json"]))
+    assert "Linux" in found["versions.txt"]
+    assert SECRET not in "".join(found.values())
+    # What could not be had is told, and nothing that is there is written over.
+    assert ("config.yaml" in found) != ("config.yaml" in found.get("missing.txt", ""))
+    again = sidecar.avckpt("bundle", crashing.name, "-o", str(path), check=False)
+    assert again.status == 1
+    assert "cannot be written" in again.stderr
+    nobody = sidecar.avckpt("bundle", "no-such-container", check=False)
+    assert (nobody.status, "nothing is known of a container 'no-such-container'" in nobody.stderr) == (4, True)
