@@ -34,6 +34,16 @@ struct inj_timespec {
 	int64_t s, ns;
 };
 
+/* asm-generic/fcntl.h, which does not go with the compiler's. */
+#define F_RDLCK_ 0
+#define F_WRLCK_ 1
+#define F_UNLCK_ 2
+struct inj_flock {
+	int16_t type, whence;
+	int64_t start, bytes;
+	int32_t pid;
+};
+
 static void futex_wake(uint32_t *word)
 {
 	SYS3(__NR_futex, word, FUTEX_WAKE, 0x7fffffff);
@@ -278,6 +288,21 @@ static long put_limit(uint64_t which, const uint64_t *limit)
 	return r;
 }
 
+/* Made of the other kind for a moment: then nobody gets in who waits to write.  Where others read, too,
+ * it cannot be made so, and they keep out who would write while it is given back. */
+static long own_lock(uint64_t fd, uint64_t command, struct inj_flock *lock)
+{
+	const int16_t type = lock->type;
+
+	lock->type = type == F_RDLCK_ ? F_WRLCK_ : F_RDLCK_;
+	if (SYS3(__NR_fcntl, fd, command, lock)) {
+		lock->type = F_UNLCK_;
+		SYS3(__NR_fcntl, fd, command, lock);
+	}
+	lock->type = type;
+	return SYS3(__NR_fcntl, fd, command, lock);
+}
+
 static long make_call(const struct inj_syscall *s)
 {
 	const uint64_t *arg = s->arg;
@@ -286,6 +311,8 @@ static long make_call(const struct inj_syscall *s)
 		return make_timer(arg[0], arg[1], (int32_t *)arg[2], (int32_t)arg[3]);
 	if (s->nr == INJ_TIMER_SET)
 		return set_timer(arg[0], arg[1], (const struct inj_timer *)arg[2], arg[3]);
+	if (s->nr == INJ_LOCK)
+		return own_lock(arg[0], arg[1], (struct inj_flock *)arg[2]);
 	if (s->nr == INJ_PIDFD_OPEN)
 		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
 	if (s->nr == INJ_CAPS_CHANGE)

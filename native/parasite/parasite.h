@@ -124,6 +124,9 @@ struct inj_setup {
  * is left now of the struct inj_timer at arg[2], which it was at arg[3] ns of CLOCK_MONOTONIC,
  * that of the process: there are time namespaces. */
 #define INJ_TIMER_SET (-5)
+/* Likewise: fcntl(arg[0], arg[1], arg[2]), a lock that is the caller's own in any case.  To set one that
+ * is there already changes nothing, not even whose it is said to be. */
+#define INJ_LOCK (-6)
 
 enum inj_setup_flag {
 	INJ_MUST = 0,

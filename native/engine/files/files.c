@@ -317,7 +317,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	const struct file_socket *socket;
 	uint32_t locks;
 	bool silent;
-	int fd;
+	int fd, unread;
 
 	if (!budget_step() || !budget_take(sizeof *f))
 		return budget_check(look->pid, err);
@@ -394,6 +394,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		file_read_info(look->pid, f);
 	if ((f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) && !(f->flags & O_PATH))
 		f->offset = lseek(fd, 0, SEEK_CUR);
+	f->unread = f->kind == FILE_INOTIFY && !ioctl(fd, FIONREAD, &unread) && unread;
 	socket = known && look->depth == FILES_NOW ? known->socket : f->socket;
 	if (f->kind == FILE_SOCKET && (look->depth == FILES_NOW || look->files->with_tcp))
 		file_look_at_tcp(fd, f, socket);
@@ -849,6 +850,7 @@ void files_capture(struct image *image, const struct image *parent, bool several
  * there before it may be of either side, and is left alone at a restore. */
 void files_settle(struct image *image)
 {
+	files_find_closed(image->files, image->template);
 	file_rights_read(&image->files->rights, image->process->pid);
 	for (uint32_t i = 0; i < image->files->count; i++) {
 		struct file *f = &image->files->file[i];

@@ -12,6 +12,7 @@
  *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
  *   files_watches.c inotify
+ *   files_epoll.c   epoll
  *   files_video.c   buffers of cameras
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *   files_mapped.c  the same of files that are mapped
@@ -119,6 +120,11 @@ struct file_watch { /* of an epoll set                                         *
 	int fd;
 	uint32_t events;
 	uint64_t data;
+	uint64_t dev, ino; /* of what is watched, as the kernel has them          */
+	uint32_t at;       /* of those with this number, in the kernel's order     */
+	/* The number of what is watched, which may be closed, or another file's, if another
+	 * descriptor is of the same description; -1: of none that is known          */
+	int of;
 };
 
 struct file_mark { /* of inotify                                               */
@@ -202,6 +208,7 @@ struct file {
 	struct file_watch *watch; /* epoll, allocated                              */
 	uint32_t mark_count;
 	struct file_mark *mark; /* inotify, allocated                              */
+	bool unread;            /* there are events in it                          */
 	/* As fdinfo says it                                                      */
 	int told_flags;
 	uint64_t told_ino;
@@ -430,6 +437,8 @@ int files_work_table(const struct files_work *work, struct fd_table *table,
 void files_work_end(struct files_work *work);
 /* A duplicate of what is at this place of the table now. */
 int files_borrow_placed(const struct files_work *work, const struct file *w);
+/* Makes the calls that were listed. */
+int files_work_flush(struct files_work *work, struct avc_error *err) warn_unused;
 void files_note(struct files_work *work, const struct file *f, const char *problem);
 
 uint32_t files_index(const struct files *files, const struct file *file);
@@ -438,7 +447,17 @@ uint32_t files_leader(const struct files *files, const struct file *file);
 /* What is `want`'s i-th already, or NULL if it is made anew. */
 const struct file *files_now_of(const struct files_work *work, uint32_t i);
 void files_list_calls(struct files_work *work);
-/* What the set watches under this number, or NULL; `epoll` may be NULL. */
-const struct file_watch *files_find_watch(const struct file *epoll, int fd);
+
+/* files_epoll.c */
+/* After a freeze: finds out what is watched under a number that is not its own any more. */
+void files_find_closed(struct files *files, pid_t pid);
+/* What the set `now` (may be NULL) watches just as `watch` says, or NULL. */
+const struct file_watch *files_find_watch(const struct file *now, const struct file_watch *watch);
+/* Whether there are calls of files_list_epoll() that take a number beyond the last. */
+bool files_watch_closed(const struct files *files);
+/* Sets that cannot be made what they were are made again. */
+int files_give_up_sets(struct files_work *work, struct avc_error *err) warn_unused;
+void files_list_epoll(const struct files_work *work, struct setup *setup, const struct file *w,
+		      const struct file *n);
 
 #endif

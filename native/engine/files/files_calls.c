@@ -6,64 +6,11 @@
  */
 #include <fcntl.h>
 #include <string.h>
-#include <sys/epoll.h>
 #include <sys/mman.h>
 #include <sys/resource.h>
 #include <sys/syscall.h>
 
 #include "files.h"
-
-const struct file_watch *files_find_watch(const struct file *epoll, int fd)
-{
-	uint32_t low = 0, high = epoll ? epoll->watch_count : 0;
-
-	while (low < high) {
-		const uint32_t middle = (low + high) / 2;
-
-		if (epoll->watch[middle].fd < fd)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return epoll && low < epoll->watch_count && epoll->watch[low].fd == fd ? &epoll->watch[low]
-									       : NULL;
-}
-
-/* Has to be registered again?  An edge that came since the checkpoint is gone, and a
- * signalfd is bound to the process that registered it. */
-static bool renew(const struct files_work *work, const struct file *n,
-		  const struct file_watch *watch)
-{
-	const struct file *of = files_find(work->want, watch->fd);
-	const struct file_watch *is = files_find_watch(n, watch->fd);
-
-	return !is || is->events != watch->events || is->data != watch->data ||
-	       work->lost[files_index(work->want, of)] || of->kind == FILE_SIGNALFD ||
-	       of->kind == FILE_EPOLL || watch->events & (EPOLLET | EPOLLONESHOT);
-}
-
-/* What it watches since has been forgotten (files_restore.c). */
-static void list_epoll(const struct files_work *work, struct setup *setup, const struct file *w,
-		       const struct file *n)
-{
-	for (uint32_t i = 0; i < w->watch_count; i++) {
-		const struct file_watch *watch = &w->watch[i];
-		const struct file *of = files_find(work->want, watch->fd);
-		struct epoll_event event = { .events = watch->events };
-		enum inj_stage stage;
-
-		if (!of || !renew(work, n, watch))
-			continue;
-		event.data.u64 = watch->data;
-		stage = of->pid_inside ? INJ_OWNERS : INJ_DESCRIPTORS; /* when it is there */
-		setup_add(setup, stage, "", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_DEL,
-			  (uint64_t)watch->fd)
-			->flags = INJ_MAY_FAIL;
-		setup_add(setup, stage, "epoll_ctl", SYS_epoll_ctl, (uint64_t)w->fd, EPOLL_CTL_ADD,
-			  (uint64_t)watch->fd, setup_data(setup, &event, sizeof event))
-			->flags = INJ_MAY_FAIL;
-	}
-}
 
 static void list_lock(struct setup *setup, const struct file *w, const struct file_lock *lock,
 		      short type)
@@ -75,8 +22,9 @@ static void list_lock(struct setup *setup, const struct file *w, const struct fi
 		.l_len = lock->end < 0 ? 0 : lock->end - lock->start + 1,
 	};
 
-	setup_add(setup, INJ_DESCRIPTORS, type == F_UNLCK ? "" : "fcntl(F_SETLK)", SYS_fcntl,
-		  (uint64_t)w->fd, F_SETLK, setup_data(setup, &l, sizeof l))
+	setup_add(setup, INJ_DESCRIPTORS, type == F_UNLCK ? "" : "fcntl(F_SETLK)",
+		  type == F_UNLCK ? SYS_fcntl : INJ_LOCK, (uint64_t)w->fd, F_SETLK,
+		  setup_data(setup, &l, sizeof l))
 		->flags = INJ_MAY_FAIL;
 }
 
@@ -88,8 +36,8 @@ static bool has_lock(const struct file *f, const struct file_lock *lock)
 	return false;
 }
 
-/* POSIX locks belong to the table, so they outlive the app; but whoever closes any
- * descriptor of the file loses them, and we may have. */
+/* POSIX locks belong to the table, so they outlive the app; but whoever closes any descriptor of the
+ * file loses them, and we may have.  And they are said to be of the process that took them. */
 static void list_locks(struct setup *setup, const struct file *w, const struct file *n)
 {
 	for (uint32_t i = 0; n && i < n->lock_count; i++)
@@ -133,9 +81,14 @@ static bool has_pidfds(const struct files *files)
 	return false;
 }
 
+static bool needs_numbers(const struct files *want)
+{
+	return has_pidfds(want) || files_watch_closed(want);
+}
+
 void files_lift_limit(const struct files *want, pid_t pid)
 {
-	if (has_pidfds(want))
+	if (needs_numbers(want))
 		process_attrs_lift_limit(pid, RLIMIT_NOFILE,
 					 (uint64_t)want->file[want->count - 1].fd + 2);
 }
@@ -201,16 +154,19 @@ void files_list_calls(struct files_work *work)
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->want->file[i].pid_inside)
 			list_pidfd(setup, &work->want->file[i]);
-	if (!work->process->descendant && has_pidfds(work->want))
+	if (!work->process->descendant && needs_numbers(work->want))
 		list_limit(work, setup);
+	/* Numbers are taken for moments, and who closes a file loses its locks. */
+	for (uint32_t i = 0; i < work->want->count; i++)
+		if (work->want->file[i].kind == FILE_EPOLL &&
+		    files_leader(work->want, &work->want->file[i]) == i)
+			files_list_epoll(work, setup, &work->want->file[i], files_now_of(work, i));
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
 
 		if (files_leader(work->want, w) != i)
 			continue;
 		list_listen(work, setup, w, n);
-		if (w->kind == FILE_EPOLL)
-			list_epoll(work, setup, w, n);
 		if (w->kind == FILE_REGULAR && (w->lock_count || (n && n->lock_count)))
 			list_locks(setup, w, n);
 		if (w->owner_inside)

@@ -50,12 +50,18 @@ static void add_lock(struct file *file, const char *line, uint32_t *room)
 
 static void add_watch(struct file *file, const char *line, uint32_t *room)
 {
-	struct file_watch watch;
-	unsigned long long data;
+	struct file_watch watch = { 0 };
+	unsigned long long data, ino = 0;
+	unsigned int dev = 0;
 
-	if (sscanf(line, " %d events: %x data: %llx", &watch.fd, &watch.events, &data) != 3)
+	if (sscanf(line, " %d events: %x data: %llx pos:%*d ino:%llx sdev:%x", &watch.fd,
+		   &watch.events, &data, &ino, &dev) < 3)
 		return;
 	watch.data = data;
+	watch.ino = ino;
+	watch.dev = dev;
+	watch.at = file->watch_count;
+	watch.of = watch.fd;
 	if (take_room(&file->watch, file->watch_count, room, sizeof watch))
 		file->watch[file->watch_count++] = watch;
 }
@@ -157,7 +163,7 @@ static int by_number(const void *a, const void *b)
 
 	if (x->fd != y->fd)
 		return x->fd < y->fd ? -1 : 1;
-	return (x->data > y->data) - (x->data < y->data);
+	return (x->at > y->at) - (x->at < y->at);
 }
 
 static int by_wd(const void *a, const void *b)
@@ -171,6 +177,10 @@ static void sort_watched(struct file *file)
 {
 	if (file->watch_count)
 		qsort(file->watch, file->watch_count, sizeof *file->watch, by_number);
+	for (uint32_t i = 0; i < file->watch_count; i++)
+		file->watch[i].at = i && file->watch[i].fd == file->watch[i - 1].fd
+					    ? file->watch[i - 1].at + 1
+					    : 0;
 	if (file->mark_count)
 		qsort(file->mark, file->mark_count, sizeof *file->mark, by_wd);
 }

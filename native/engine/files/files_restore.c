@@ -384,7 +384,7 @@ static void note_refused(struct files_work *work, uint32_t count)
 	}
 }
 
-static int flush(struct files_work *work, struct avc_error *err)
+int files_work_flush(struct files_work *work, struct avc_error *err)
 {
 	const struct process *process = work->process;
 	struct inj_call *call = call_of(work);
@@ -407,7 +407,7 @@ static int flush(struct files_work *work, struct avc_error *err)
 static int inject(struct files_work *work, struct avc_error *err, long nr, uint64_t a, uint64_t b,
 		  uint64_t c)
 {
-	if (work->listed == LISTED_MAX && flush(work, err))
+	if (work->listed == LISTED_MAX && files_work_flush(work, err))
 		return -1;
 	list_of(work)[work->listed++] = (struct inj_syscall){ .nr = nr, .arg = { a, b, c } };
 	return 0;
@@ -419,7 +419,7 @@ static bool is_watched_since(const struct files_work *work, const struct file *w
 {
 	const struct file *w = files_find(work->want, watch->fd);
 
-	return !files_find_watch(want, watch->fd) || !w || work->lost[files_index(work->want, w)];
+	return !files_find_watch(want, watch) || !w || work->lost[files_index(work->want, w)];
 }
 
 /* A set watches a number and an open file description, and lets go of them when nobody has
@@ -588,7 +588,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	for (uint32_t i = 0; i < work->now->count; i++)
 		if (!work->closed[i])
 			numbers.taken[work->now->file[i].fd] = 1;
-	if (flush(work, err))
+	if (files_work_flush(work, err))
 		goto out;
 	/* To hand descriptors over takes some more, and there may be one with a number that was
 	 * allowed once. */
@@ -597,7 +597,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
 	call_add(call, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0,
 		 parasite_remote(parasite, call->out));
-	if (flush(work, err))
+	if (files_work_flush(work, err))
 		goto out;
 	memcpy(ends, call->out, sizeof ends);
 	if (call->call[0].result || ends[0] < 0 || ends[0] >= numbers.room || ends[1] < 0 ||
@@ -620,7 +620,7 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 	    inject(work, err, SYS_close, (uint64_t)ends[0], 0, 0) ||
 	    inject(work, err, SYS_close, (uint64_t)ends[1], 0, 0) ||
 	    receive(work, &numbers, ours, theirs, err) ||
-	    inject(work, err, SYS_close, (uint64_t)theirs, 0, 0) || flush(work, err))
+	    inject(work, err, SYS_close, (uint64_t)theirs, 0, 0) || files_work_flush(work, err))
 		result = -1;
 	else
 		result = 0;
@@ -813,7 +813,7 @@ void files_work_end(struct files_work *work)
 /* All other processes have a table that is made anew. */
 static int gather_anew(struct files_work *work, struct avc_error *err)
 {
-	if (unlock_all(work, err) || flush(work, err))
+	if (unlock_all(work, err) || files_work_flush(work, err))
 		return -1;
 	for (uint32_t i = 0; i < work->want->count; i++)
 		work->lost[i] = true;
@@ -830,11 +830,13 @@ int files_work_gather(struct files_work *work, struct avc_error *err)
 	if (work->process->descendant)
 		return gather_anew(work, err);
 	/* What is left on the list is made just before the fork (restore.c). */
-	return set_cloexec(work, err) || (is_urgent(work) && flush(work, err)) ? -1 : 0;
+	return set_cloexec(work, err) || (is_urgent(work) && files_work_flush(work, err)) ? -1 : 0;
 }
 
 int files_work_place(struct files_work *work, struct avc_error *err)
 {
+	if (files_give_up_sets(work, err))
+		return -1;
 	make_lost(work);
 	if (!work->process->descendant && put_lost(work, err))
 		return -1;

@@ -34,7 +34,8 @@
 #define CONTENT_MAX (1 << 20)
 #define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
-#define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
+#define SET_TICKS _IOW('T', 0, uint64_t) /* linux/timerfd.h, which does not go with the libc's */
+#define MESSAGE_MAX (256 << 10)          /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
 #define STATUS_FLAGS (O_APPEND | O_NONBLOCK | O_DIRECT | O_NOATIME)
 
@@ -509,23 +510,44 @@ static struct timespec timespec_of(uint64_t ns)
 				  .tv_nsec = (long)(ns % NS_PER_S) };
 }
 
-/* At the instant it would have gone off; an expiry that was not read yet at once. */
+/* Beyond the instants at which it would have gone off: how often that was; 0: never again. */
+static uint64_t next_of(const struct file *want, uint64_t now_of_clock, uint64_t *ticks)
+{
+	const uint64_t late = now_of_clock - want->deadline_ns;
+
+	if (!want->deadline_ns || now_of_clock < want->deadline_ns)
+		return want->deadline_ns;
+	*ticks += 1 + (want->interval_ns ? late / want->interval_ns : 0);
+	return want->interval_ns ? now_of_clock + want->interval_ns - late % want->interval_ns : 0;
+}
+
+/* One that goes off and is not read stands still until then, and does not say since when. */
+static bool stands_still(const struct file *want)
+{
+	return want->ticks && want->interval_ns && !want->deadline_ns;
+}
+
+/* At the instants it would have gone off; what was not read yet can be read.  An older kernel does
+ * not let itself be told how often it has, and takes the instant before the next. */
 static const char *put_timer(int fd, const struct file *want)
 {
-	struct itimerspec t = { .it_interval = timespec_of(want->interval_ns),
-				.it_value = timespec_of(want->deadline_ns) };
-	int flags = TFD_TIMER_ABSTIME | (want->settime_flags & TFD_TIMER_CANCEL_ON_SET);
+	const uint64_t set_ticks_of = want->ticks && !stands_still(want) ? want->ticks : 0;
+	int flags = want->settime_flags & (TFD_TIMER_ABSTIME | TFD_TIMER_CANCEL_ON_SET);
+	uint64_t now, next, ticks = set_ticks_of;
+	struct itimerspec t = { .it_interval = timespec_of(want->interval_ns) };
+	struct timespec clock;
 
-	if (want->ticks)
-		t.it_value = (struct timespec){ .tv_nsec = 1 };
-	if (want->ticks && want->deadline_ns && want->interval_ns) {
-		/* The one before the next, so that the phase stays. */
-		const uint64_t last = want->deadline_ns > want->interval_ns
-					      ? want->deadline_ns - want->interval_ns
-					      : 1;
-
-		t.it_value = timespec_of(last);
-	}
+	if (clock_gettime(want->clock, &clock))
+		return "its timer could not be set";
+	now = (uint64_t)clock.tv_sec * NS_PER_S + (uint64_t)clock.tv_nsec;
+	next = stands_still(want) ? now + 1 : next_of(want, now, &ticks);
+	t.it_value = timespec_of(next && !(flags & TFD_TIMER_ABSTIME) ? next - now : next);
+	if (timerfd_settime(fd, flags, &t, NULL))
+		return "its timer could not be set";
+	if (!ticks || !ioctl(fd, SET_TICKS, &ticks))
+		return NULL;
+	t.it_value = timespec_of(next > want->interval_ns ? next - want->interval_ns : 1);
+	flags |= TFD_TIMER_ABSTIME;
 	return timerfd_settime(fd, flags, &t, NULL) ? "its timer could not be set" : NULL;
 }
 

@@ -14,6 +14,7 @@
 #include <string.h>
 #include <sys/inotify.h>
 #include <sys/ioctl.h>
+#include <sys/mman.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
@@ -231,9 +232,9 @@ static void remove_new(int fd, const struct file *want, const struct file *now)
 			removed++;
 	if (!before)
 		take_events(fd, removed * (int)sizeof(struct inotify_event));
-	/* Nothing in it is of a watch that is known. */
-	while (before && !kept && ++reads < READS_MAX && ioctl(fd, FIONREAD, &before) == 0 &&
-	       before && read(fd, buf, sizeof buf) > 0)
+	/* Nothing in it is of a watch that is known, or was in it then. */
+	while (before && !kept && !want->unread && ++reads < READS_MAX &&
+	       ioctl(fd, FIONREAD, &before) == 0 && before && read(fd, buf, sizeof buf) > 0)
 		;
 }
 
@@ -269,6 +270,62 @@ static uint32_t add_missing(int fd, const struct file *want, const struct file *
 	return failed;
 }
 
+#define EVENTS_MAX (1 << 16) /* four times fs.inotify.max_queued_events               */
+#define EVENTS_EACH 256
+
+/* Two of the same, one after the other, would be one.  Of what nobody has opened by a name, the kernel
+ * tells nothing.  What is in the queue then, in bytes; true: it is full. */
+static bool fill(int fd, const char *path, int *bytes)
+{
+	const int file = open(path, O_RDWR | O_CLOEXEC);
+	int before = -1;
+	char byte;
+
+	while (file >= 0 && *bytes != before &&
+	       *bytes < EVENTS_MAX * (int)sizeof(struct inotify_event)) {
+		before = *bytes;
+		for (int i = 0; i < EVENTS_EACH / 2; i++)
+			if (pwrite(file, "", 1, 0) != 1 || pread(file, &byte, 1, 0) != 1)
+				break;
+		if (!budget_step() || ioctl(fd, FIONREAD, bytes))
+			break;
+	}
+	if (file >= 0)
+		close(file);
+	return *bytes && *bytes == before;
+}
+
+/* Nobody can put an event back.  But there is one that says that some were lost (inotify(7),
+ * IN_Q_OVERFLOW), the last that the kernel puts into a full queue: those before it are read away. */
+static const char *put_overflow(int fd)
+{
+	const int file = memfd_create("avckpt", MFD_CLOEXEC), event = sizeof(struct inotify_event);
+	int wd, bytes = 0;
+	bool full;
+	char path[40], buf[EVENTS_EACH * sizeof(struct inotify_event)];
+
+	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", file);
+	wd = file < 0 ? -1 : inotify_add_watch(fd, path, IN_MODIFY | IN_ACCESS);
+	full = wd >= 0 && fill(fd, path, &bytes);
+	/* There must be no room for the event that tells of this. */
+	if (wd >= 0)
+		inotify_rm_watch(fd, wd);
+	if (!full)
+		bytes += 2 * event;
+	while (bytes > event) {
+		const size_t most = (size_t)(bytes - event);
+		const ssize_t n = read(fd, buf, most < sizeof buf ? most : sizeof buf);
+
+		if (n <= 0)
+			break;
+		bytes -= (int)n;
+	}
+	if (file >= 0)
+		close(file);
+	return full ? "events in it were lost, and it says so (IN_Q_OVERFLOW)"
+		    : "events in it were lost";
+}
+
 static int highest(const struct file *f, int so_far)
 {
 	for (uint32_t i = 0; f && i < f->mark_count; i++)
@@ -278,12 +335,16 @@ static int highest(const struct file *f, int so_far)
 
 const char *file_put_marks(int fd, const struct file *want, const struct file *now, pid_t init)
 {
+	const char *problem = NULL;
 	uint32_t failed;
+	int bytes = 0;
 
 	if (now)
 		remove_new(fd, want, now);
 	failed = add_missing(fd, want, now, init);
+	if (want->unread && !ioctl(fd, FIONREAD, &bytes) && !bytes)
+		problem = put_overflow(fd);
 	/* As ever, a number is not given again soon. */
 	ioctl(fd, SET_NEXT_WD, highest(now, highest(want, 0)) + 1);
-	return failed ? "not all of what it watched is there any more" : NULL;
+	return problem ? problem : failed ? "not all of what it watched is there any more" : NULL;
 }
