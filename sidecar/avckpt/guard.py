@@ -32,6 +32,7 @@ class Files(enum.IntEnum):
     REWIND = 0
     KEEP = 1
     STRICT = 2
+    AUTO = 3
 
 
 class Tcp(enum.IntEnum):

@@ -52,10 +52,11 @@ def checkpoint(sidecar: Sidecar, bank: Bank) -> None:
 
 
 @pytest.mark.parametrize("journal", ["delete", "wal"])
-def test_strict_restores_only_what_agrees_with_the_database(
-    journal: str, sidecar: Sidecar, container: ContainerFactory, observer: Observer, tmp_path: Path
+@pytest.mark.parametrize("files", ["auto", "strict"])
+def test_restores_only_what_agrees_with_the_database(
+    files: str, journal: str, sidecar: Sidecar, container: ContainerFactory, observer: Observer, tmp_path: Path
 ) -> None:
-    bank = Bank(container, observer, tmp_path, "strict", ["--journal", journal], restart="always", interval="1h")
+    bank = Bank(container, observer, tmp_path, files, ["--journal", journal], restart="always", interval="1h")
     transact(bank, "first")
     checkpoint(sidecar, bank)
     # Nobody has written since: it goes on where it was.
@@ -65,7 +66,7 @@ def test_strict_restores_only_what_agrees_with_the_database(
     # Written since: started anew, by Podman, and protected again.
     done = bank.kill()
     assert (done.outcome, done.damage) == ("cold", [])
-    assert "avckpt.files=strict" in done.detail
+    assert f"avckpt.files={files}" in done.detail
     assert len(observer.lines("start")) == 2
     # In the middle of a transaction, whose end the checkpoint does not know.
     begin(bank, "third")
@@ -112,10 +113,11 @@ def test_rewind_loses_transactions(
 
 
 @pytest.mark.parametrize("journal", ["delete", "wal"])
-def test_strict_under_write_load(
-    journal: str, sidecar: Sidecar, container: ContainerFactory, observer: Observer, tmp_path: Path
+@pytest.mark.parametrize("files", ["auto", "strict"])
+def test_under_write_load(
+    files: str, journal: str, sidecar: Sidecar, container: ContainerFactory, observer: Observer, tmp_path: Path
 ) -> None:
-    bank = Bank(container, observer, tmp_path, "strict", [*LOAD, "--journal", journal], restart="always")
+    bank = Bank(container, observer, tmp_path, files, [*LOAD, "--journal", journal], restart="always")
     rng = random.Random(1)
     for _ in range(KILLS):
         done = kill_at_random(bank, rng)

@@ -85,8 +85,8 @@ class Policy:
     """How long to look for a quiescent moment; 0: not at all."""
     shm_bytes: int = 4_000_000
     """Shared memory of the application's own that is rolled back with it, at most."""
-    files: str = "rewind"
-    """Regular files at a restore: rewind, keep or strict."""
+    files: str = "auto"
+    """Regular files at a restore: auto, rewind, keep or strict."""
     tcp: str = "reset-moved"
     """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     group: str = ""
@@ -331,7 +331,9 @@ LABELS: dict[str, Label] = {
         "reset-moved, reset, keep or messages",
         _one_of("tcp", "reset-moved", "reset", "keep", "messages"),
     ),
-    "avckpt.files": Label("rewind", "rewind, keep or strict", _one_of("files", "rewind", "keep", "strict")),
+    "avckpt.files": Label(
+        "auto", "auto, rewind, keep or strict", _one_of("files", "auto", "rewind", "keep", "strict")
+    ),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),

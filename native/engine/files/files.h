@@ -14,6 +14,7 @@
  *   files_watches.c inotify
  *   files_epoll.c   epoll
  *   files_video.c   buffers of cameras
+ *   files_auto.c    whether a file was written in place (avckpt.files=auto)
  *   files_strict.c  whether a file was written (avckpt.files=strict)
  *   files_mapped.c  the same of files that are mapped
  *   files_written.c the same of files that are not open any more
@@ -73,6 +74,11 @@ void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t ins
  * that has the table as it is now, `holder` one that has the memory. */
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
 		       struct avc_error *err) warn_unused;
+
+/* -1 if it belongs to its files, and those have gone on since, with AVC_UNSUPPORTED and which.
+ * `pidfd` is that of a process that has the table as it is now; -1: nobody has it any more. */
+int files_check_auto(const struct image *image, int pidfd, pid_t init,
+		     struct avc_error *err) warn_unused;
 
 /* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
  * out of memory. */
@@ -397,6 +403,9 @@ bool file_is_pts(const struct file *file);
 /* The file that it was, by its path: an O_PATH descriptor, or -1.  With our own rights if `rights` is
  * NULL. */
 int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights);
+/* The file that it was, by its path or because it is still mapped: an O_PATH descriptor; or -1, with
+ * errno: ESTALE if another one has its name. */
+int file_find(const struct file *want, pid_t template, pid_t init);
 /* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
  * may be set on success as well: what is not as it was. */
 int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,

@@ -110,6 +110,15 @@ static int open_mapped(const struct file *want, pid_t template)
 	return look.fd;
 }
 
+int file_find(const struct file *want, pid_t template, pid_t init)
+{
+	const int found = file_open_path(want, init, NULL), missing = errno;
+	const int mapped = found < 0 ? open_mapped(want, template) : -1;
+
+	errno = missing;
+	return found < 0 ? mapped : found;
+}
+
 static int open_empty(const struct file *want)
 {
 	return open("/dev/null", (want->flags & (O_ACCMODE | O_PATH)) | O_CLOEXEC);

@@ -114,8 +114,8 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	budget_begin(NULL, NULL);
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
-	    guard_check_strict(guard, &guard->generations[guard->count - 1], guard->main.pid,
-			       guard->main.pidfd, &error)) {
+	    guard_check_files(guard, &guard->generations[guard->count - 1], guard->main.pid,
+			      guard->main.pidfd, &error)) {
 		guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}

@@ -100,8 +100,8 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
 /* After a crash: leaves the generation to restore from as the newest, or none. */
 void guard_fall_back(struct avc_guard *guard, bool hung);
 void guard_note_written(struct avc_guard *guard);
-int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
-		       int pidfd, struct avc_error *err) warn_unused;
+int guard_check_files(struct avc_guard *guard, const struct generation *generation, pid_t pid,
+		      int pidfd, struct avc_error *err) warn_unused;
 
 /* ---- guard_memory.c ------------------------------------------------------- */
 

@@ -144,7 +144,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 
 		/* What was written since the newest was written since all others, also
 		 * where that cannot be seen any more. */
-		if (guard_check_strict(guard, generation, image->template, image->pidfd, &failed)) {
+		if (guard_check_files(guard, generation, image->template, image->pidfd, &failed)) {
 			*error = failed;
 			guard_drop_all(guard);
 			break;

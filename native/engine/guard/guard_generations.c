@@ -353,7 +353,7 @@ void guard_fall_back(struct avc_guard *guard, bool hung)
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
 }
 
-/* ---- avckpt.files=strict ----------------------------------------------------- */
+/* ---- avckpt.files=auto and strict ---------------------------------------------- */
 
 /* Before the next generation is taken, and before one is restored: no generation is
  * good any more after a file was written. */
@@ -370,11 +370,31 @@ void guard_note_written(struct avc_guard *guard)
 		memcpy(guard->generations[i].written, name, sizeof name);
 }
 
-/* Whether it may be restored, in a container that is strict.  A process that has the
- * table of descriptors as it is now. */
-int guard_check_strict(struct avc_guard *guard, const struct generation *generation, pid_t pid,
-		       int pidfd, struct avc_error *err)
+/* All of them, also those that have ended before: what they had written belongs to the others. */
+static int check_auto(const struct avc_guard *guard, const struct generation *generation, int pidfd,
+		      struct avc_error *err)
 {
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+		const struct process *process = image->process;
+
+		if (!process)
+			continue;
+		if (process->descendant)
+			pidfd = process->holder ? process->holder_pidfd : -1;
+		if (files_check_auto(image, pidfd, guard->channel.init, err))
+			return -1;
+	}
+	return 0;
+}
+
+/* Whether memory may go back although files do not.  A process that has the table of
+ * descriptors as it is now. */
+int guard_check_files(struct avc_guard *guard, const struct generation *generation, pid_t pid,
+		      int pidfd, struct avc_error *err)
+{
+	if (guard->config.files == AVC_FILES_AUTO)
+		return check_auto(guard, generation, pidfd, err);
 	if (guard->config.files != AVC_FILES_STRICT)
 		return 0;
 	guard_note_written(guard);

@@ -26,8 +26,9 @@
 enum avc_files {
 	AVC_FILES_REWIND = 0, /* their offsets are the checkpoint's               */
 	AVC_FILES_KEEP = 1,   /* their offsets stay                               */
-	AVC_FILES_STRICT = 2  /* as REWIND; and no restore if one that is open for
+	AVC_FILES_STRICT = 2, /* as REWIND; and no restore if one that is open for
 	                       * writing was written since the checkpoint         */
+	AVC_FILES_AUTO = 3    /* the same if one was written otherwise than at its end */
 };
 
 /* Established TCP connections at a restore. */

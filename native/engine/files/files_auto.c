@@ -1,0 +1,139 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.files=auto: what the program's files say of its memory.
+ *
+ * A log, or any other output, is only ever written on; that it has lines of which a restored program
+ * does not know harms nobody.  A database knows what is in its files and where, and memory that goes
+ * back behind them writes old pages over new ones.  Such a file is opened to be read as well, or is
+ * locked, and it is written elsewhere than at its end.  And a file that has been deleted since
+ * belonged to work that is done.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "files.h"
+
+/* As in files_strict.c. */
+#define TICK_NS (10 * NS_PER_MS)
+
+/* A page that is mapped and dirty can be written again without a sign, until the kernel has written
+ * it out (vm.dirty_expire_centisecs, and the flusher's own interval). */
+#define DIRTY_NS (35 * NS_PER_S)
+
+/* What a program shows of itself to others, and does not read back (/tmp/hsperfdata_USER of Java,
+ * queries.active of Prometheus), is mapped and small. */
+#define STATUS_BYTES 65536
+
+/* Of no disk; and what is shared memory is looked after elsewhere. */
+static bool is_data(const struct file *f)
+{
+	static const char *const elsewhere[] = { "/memfd:", "/dev/", "/proc/", "/sys/" };
+
+	if (f->kind != FILE_REGULAR || f->flags & O_PATH || f->outside || f->remote || !f->name)
+		return false;
+	for (size_t i = 0; i < sizeof elsewhere / sizeof *elsewhere; i++)
+		if (!strncmp(f->name, elsewhere[i], strlen(elsewhere[i])))
+			return false;
+	return true;
+}
+
+static uint64_t real_ns(const struct timespec *t)
+{
+	return (uint64_t)t->tv_sec * NS_PER_S + (uint64_t)t->tv_nsec;
+}
+
+static int is_mapping_of(const struct mapping *m, void *arg)
+{
+	const struct file *w = arg;
+
+	return m->shared && m->mode[1] == 'w' && m->inode == w->ino ? -1 : 0;
+}
+
+/* For writing, at the checkpoint. */
+static bool is_mapped(const struct image *image, const struct file *w)
+{
+	struct file key = { .ino = w->ino };
+
+	return proc_mappings(image->template, "maps", is_mapping_of, &key) != 0;
+}
+
+/* `offset`: where it stands now; -1: it was closed since. */
+static bool is_in_the_way(const struct image *image, const struct file *w, const struct stat *st,
+			  int64_t offset)
+{
+	const bool output = (w->flags & O_ACCMODE) == O_WRONLY;
+	const uint64_t modified = real_ns(&w->modified);
+	const bool changed = st->st_size != w->bytes || real_ns(&st->st_mtim) != modified ||
+			     modified + TICK_NS > image->files->taken_ns;
+
+	if (w->flags & O_APPEND || (output && !w->lock_count))
+		return false;
+	if (!changed)
+		return w->bytes > STATUS_BYTES && modified + DIRTY_NS > image->files->taken_ns &&
+		       is_mapped(image, w);
+	/* Written on, from its end to its end; one that has not grown was written over. */
+	if (w->offset == w->bytes && offset == st->st_size && offset > w->offset)
+		return false;
+	return w->bytes > STATUS_BYTES || st->st_size > STATUS_BYTES || !is_mapped(image, w);
+}
+
+/* It, or what stands for it by now, as it is in the table; -1: it is not there. */
+static int borrow(const struct file *w, int pidfd, struct stat *st)
+{
+	int fd = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, w->fd);
+
+	if (fd >= 0 && (fstat(fd, st) || st->st_ino != w->ino || st->st_dev != w->dev))
+		close_fd(&fd);
+	return fd;
+}
+
+static int check(const struct image *image, const struct file *w, int pidfd, pid_t init,
+		 struct avc_error *err)
+{
+	const bool readable = (w->flags & O_ACCMODE) != O_WRONLY;
+	int64_t offset = -1;
+	struct stat st = { 0 };
+	int fd = borrow(w, pidfd, &st), missing;
+
+	if (fd >= 0) {
+		offset = lseek(fd, 0, SEEK_CUR);
+	} else {
+		fd = file_find(w, image->template, init);
+		missing = errno;
+		if (fd < 0 || fstat(fd, &st)) {
+			close_fd(&fd);
+			/* A log that was rotated goes on under another name. */
+			if (w->flags & O_APPEND || (missing == ESTALE && !readable))
+				return 0;
+			/* A file that was read is replaced whole (rename(2)). */
+			if (missing == ESTALE && (w->flags & O_ACCMODE) == O_RDONLY)
+				return 0;
+			return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+				    "avckpt.files=auto: %.60s, which it had open, was deleted "
+				    "since the checkpoint",
+				    w->name);
+		}
+	}
+	close(fd);
+	if ((w->flags & O_ACCMODE) == O_RDONLY || !is_in_the_way(image, w, &st, offset))
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+		    "avckpt.files=auto: %.60s was written in place since the checkpoint, so memory "
+		    "cannot go back",
+		    w->name);
+}
+
+int files_check_auto(const struct image *image, int pidfd, pid_t init, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < image->files->count; i++) {
+		const struct file *w = &image->files->file[i];
+
+		(void)budget_step();
+		if (is_data(w) && check(image, w, pidfd, init, err))
+			return -1;
+	}
+	return 0;
+}
