@@ -127,7 +127,7 @@ def test_a_receiver_by_default_takes_a_group(path: Path) -> None:
 def test_what_changes_is_what_means_something_else() -> None:
     before = settings_of({**ENABLED, "avckpt.interval": "3s", "avckpt.keep": "2", "avckpt.group": "a"})
     after = settings_of({**ENABLED, "avckpt.interval": "3000ms", "avckpt.files": " keep "})
-    assert [str(change) for change in changes(before, after)] == ["files rewind -> keep", "group a -> none"]
+    assert [str(change) for change in changes(before, after)] == ["files auto -> keep", "group a -> none"]
     assert changes(before, before) == []
 
 

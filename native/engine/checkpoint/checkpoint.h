@@ -35,7 +35,7 @@ struct generation {
 	uint64_t taken_ns;
 	uint64_t clone_ns; /* what the clones of it took                      */
 	bool quiescent;
-	char written[FILES_NAME];  /* avckpt.files=strict: what was written since; "": none */
+	char written[FILES_NAME];  /* avckpt.files: what was written since; "": none */
 	struct spare spare;        /* of the main process                              */
 	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                   */
 };

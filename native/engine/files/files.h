@@ -27,6 +27,7 @@
 
 #include <signal.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <time.h>
 
 #include "avckpt/engine.h"
@@ -75,6 +76,11 @@ void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t ins
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
 		       struct avc_error *err) warn_unused;
 
+/* Whether it looks like a database, as of files_prepare(): what others write matters, too. */
+bool files_is_database(const struct process *process);
+/* Of such a one, whether memory may not go back to the image behind a file that was written and
+ * is `st`.  True also if the image knows nothing of it. */
+bool files_is_older(const struct image *image, int fd, const struct stat *st);
 /* -1 if it belongs to its files, and those have gone on since, with AVC_UNSUPPORTED and which.
  * `pidfd` is that of a process that has the table as it is now; -1: nobody has it any more. */
 int files_check_auto(const struct image *image, int pidfd, pid_t init,
@@ -93,10 +99,11 @@ struct files_written *files_written_new(void);
 void files_written_free(struct files_written *written);
 /* From now on; *notice if it cannot be. */
 void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice);
-/* Whether a file was written since the last time this was asked, and which; inherited
- * ones in `files` (may be NULL) do not count. */
+/* Whether a file was written since the last time this was asked, and which; inherited ones in
+ * `files` (may be NULL) do not count, nor what `counts` (may be NULL: all do) says no to. */
+typedef bool files_counts(int fd, const struct stat *st, const void *arg);
 bool files_written_since(struct files_written *written, const struct files *files,
-			 char name[FILES_NAME]);
+			 files_counts *counts, const void *arg, char name[FILES_NAME]);
 
 /* ---- what its own files give each other --------------------------------------------- */
 

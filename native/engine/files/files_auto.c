@@ -7,6 +7,9 @@
  * back behind them writes old pages over new ones.  Such a file is opened to be read as well, or is
  * locked, and it is written elsewhere than at its end.  And a file that has been deleted since
  * belonged to work that is done.
+ *
+ * Beside such a file, what is not open counts as well (files_written.c): each session of PostgreSQL's
+ * is a process of its own that writes to its log and ends.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -16,7 +19,7 @@
 
 #include "files.h"
 
-/* As in files_strict.c. */
+/* Timestamps of most kernels advance by a tick (files_strict.c). */
 #define TICK_NS (10 * NS_PER_MS)
 
 /* A page that is mapped and dirty can be written again without a sign, until the kernel has written
@@ -52,12 +55,12 @@ static int is_mapping_of(const struct mapping *m, void *arg)
 	return m->shared && m->mode[1] == 'w' && m->inode == w->ino ? -1 : 0;
 }
 
-/* For writing, at the checkpoint. */
-static bool is_mapped(const struct image *image, const struct file *w)
+/* For writing. */
+static bool is_mapped(pid_t pid, const struct file *w)
 {
 	struct file key = { .ino = w->ino };
 
-	return proc_mappings(image->template, "maps", is_mapping_of, &key) != 0;
+	return proc_mappings(pid, "maps", is_mapping_of, &key) != 0;
 }
 
 /* `offset`: where it stands now; -1: it was closed since. */
@@ -73,11 +76,12 @@ static bool is_in_the_way(const struct image *image, const struct file *w, const
 		return false;
 	if (!changed)
 		return w->bytes > STATUS_BYTES && modified + DIRTY_NS > image->files->taken_ns &&
-		       is_mapped(image, w);
+		       is_mapped(image->template, w);
 	/* Written on, from its end to its end; one that has not grown was written over. */
 	if (w->offset == w->bytes && offset == st->st_size && offset > w->offset)
 		return false;
-	return w->bytes > STATUS_BYTES || st->st_size > STATUS_BYTES || !is_mapped(image, w);
+	return w->bytes > STATUS_BYTES || st->st_size > STATUS_BYTES ||
+	       !is_mapped(image->template, w);
 }
 
 /* It, or what stands for it by now, as it is in the table; -1: it is not there. */
@@ -124,6 +128,41 @@ static int check(const struct image *image, const struct file *w, int pidfd, pid
 		    "avckpt.files=auto: %.60s was written in place since the checkpoint, so memory "
 		    "cannot go back",
 		    w->name);
+}
+
+bool files_is_database(const struct process *process)
+{
+	const struct files *files = process->files_before;
+
+	for (uint32_t i = 0; files && i < files->count; i++) {
+		const struct file *f = &files->file[i];
+
+		if (is_data(f) && (f->flags & O_ACCMODE) == O_RDWR && !(f->flags & O_APPEND) &&
+		    (f->bytes > STATUS_BYTES || !is_mapped(process->pid, f)))
+			return true;
+	}
+	return false;
+}
+
+bool files_is_older(const struct image *image, int fd, const struct stat *st)
+{
+	struct statx born;
+
+	/* One that was made since is of no concern. */
+	if (!statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC, STATX_BTIME, &born) &&
+	    born.stx_mask & STATX_BTIME &&
+	    (uint64_t)born.stx_btime.tv_sec * NS_PER_S + born.stx_btime.tv_nsec >
+		    image->files->taken_ns)
+		return false;
+	/* Of what was open for writing, files_check_auto() knows more. */
+	for (uint32_t i = 0; i < image->files->count; i++) {
+		const struct file *w = &image->files->file[i];
+
+		if (w->ino == st->st_ino && w->dev == st->st_dev && w->kind == FILE_REGULAR &&
+		    (w->flags & O_ACCMODE) != O_RDONLY)
+			return false;
+	}
+	return true;
 }
 
 int files_check_auto(const struct image *image, int pidfd, pid_t init, struct avc_error *err)

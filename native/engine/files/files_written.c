@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.files=strict, for files that are opened, written and closed between two looks
- * at the table, also by a child or by a program that was executed since: fanotify(7)
- * tells of everything written in the container's mount namespace.
+ * avckpt.files=strict, and auto beside a database, for files that are opened, written and
+ * closed between two looks at the table, also by a child or by a program that was executed
+ * since: fanotify(7) tells of everything written in the container's mount namespace.
  *
  * The kernel queues an event within the write(2) that it is about, so after a death the
  * queue has all of them.  Nobody waits for us, and the queue ends with our process.
@@ -142,13 +142,15 @@ static bool is_inherited(const struct files *files, const struct stat *st)
 	return false;
 }
 
-static bool is_written_data(int fd, const struct files *files, char name[FILES_NAME])
+static bool is_written_data(int fd, const struct files *files, files_counts *counts,
+			    const void *arg, char name[FILES_NAME])
 {
 	struct stat st;
 	char path[64];
 	ssize_t n;
 
-	if (fstat(fd, &st) || !S_ISREG(st.st_mode) || is_inherited(files, &st))
+	if (fstat(fd, &st) || !S_ISREG(st.st_mode) || is_inherited(files, &st) ||
+	    (counts && !counts(fd, &st, arg)))
 		return false;
 	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
 	n = readlink(path, name, FILES_NAME - 1);
@@ -157,7 +159,7 @@ static bool is_written_data(int fd, const struct files *files, char name[FILES_N
 }
 
 bool files_written_since(struct files_written *written, const struct files *files,
-			 char name[FILES_NAME])
+			 files_counts *counts, const void *arg, char name[FILES_NAME])
 {
 	_Alignas(struct fanotify_event_metadata) char buf[4096];
 	bool found = false;
@@ -189,7 +191,7 @@ bool files_written_since(struct files_written *written, const struct files *file
 				snprintf(name, FILES_NAME, "a file");
 			}
 			if (fd >= 0 && !found)
-				found = is_written_data(fd, files, name);
+				found = is_written_data(fd, files, counts, arg, name);
 			close_fd(&fd);
 		}
 	}

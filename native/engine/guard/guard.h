@@ -47,7 +47,7 @@ struct avc_guard {
 	uint32_t restores;
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
-	struct files_written *written; /* avckpt.files=strict; NULL: not yet        */
+	struct files_written *written; /* avckpt.files; NULL: not watched           */
 };
 
 /* ---- guard.c: what is told ------------------------------------------------- */

@@ -188,16 +188,32 @@ static void abandon(struct avc_guard *guard, struct generation *fresh)
 	guard_let_ended_go(guard);
 }
 
-/* avckpt.files=strict: from here on, nothing is written that is not seen. */
+static bool is_database(const struct avc_guard *guard)
+{
+	for (uint32_t i = 0; i < guard->tree.count; i++)
+		if (guard->tree.entry[i].process && files_is_database(guard->tree.entry[i].process))
+			return true;
+	return false;
+}
+
+/* avckpt.files=strict, or auto and a database: from here on, nothing is written that is not seen. */
 static void watch_files(struct avc_guard *guard, struct image *main)
 {
+	const bool strict = guard->config.files == AVC_FILES_STRICT;
 	struct process *process = main->process;
+	struct avc_error untold = { 0 };
 
+	if (!strict && (guard->config.files != AVC_FILES_AUTO || !is_database(guard))) {
+		files_written_free(guard->written);
+		guard->written = NULL;
+		return;
+	}
 	if (!guard->written)
 		guard->written = files_written_new();
 	if (guard->written)
-		files_written_watch(guard->written, process->pid, &main->notice);
-	main->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
+		files_written_watch(guard->written, process->pid, strict ? &main->notice : &untold);
+	if (strict)
+		main->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
 }
 
 /* What a restore can be spared of it is found out when nothing else is to be done. */
@@ -275,8 +291,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	if (prepare_files(guard, err) ||
 	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
-	if (guard->config.files == AVC_FILES_STRICT)
-		watch_files(guard, main);
+	watch_files(guard, main);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;
 

@@ -355,16 +355,29 @@ void guard_fall_back(struct avc_guard *guard, bool hung)
 
 /* ---- avckpt.files=auto and strict ---------------------------------------------- */
 
+/* Older than the generation, and open in none of its processes. */
+static bool is_old(int fd, const struct stat *st, const void *arg)
+{
+	const struct generation *generation = arg;
+
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].process && !files_is_older(&generation->image[i], fd, st))
+			return false;
+	return true;
+}
+
 /* Before the next generation is taken, and before one is restored: no generation is
  * good any more after a file was written. */
 void guard_note_written(struct avc_guard *guard)
 {
-	const struct files *known = guard->count
-					    ? guard->generations[guard->count - 1].image[0].files
-					    : NULL;
+	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
+						       : NULL;
 	char name[FILES_NAME];
 
-	if (!guard->written || !files_written_since(guard->written, known, name))
+	if (!guard->written ||
+	    !files_written_since(guard->written, newest ? newest->image[0].files : NULL,
+				 guard->config.files == AVC_FILES_AUTO && newest ? is_old : NULL,
+				 newest, name))
 		return;
 	for (uint32_t i = 0; i < guard->count; i++)
 		memcpy(guard->generations[i].written, name, sizeof name);
@@ -393,15 +406,17 @@ static int check_auto(const struct avc_guard *guard, const struct generation *ge
 int guard_check_files(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		      int pidfd, struct avc_error *err)
 {
-	if (guard->config.files == AVC_FILES_AUTO)
-		return check_auto(guard, generation, pidfd, err);
-	if (guard->config.files != AVC_FILES_STRICT)
+	const bool strict = guard->config.files == AVC_FILES_STRICT;
+
+	if (!strict && guard->config.files != AVC_FILES_AUTO)
 		return 0;
 	guard_note_written(guard);
 	if (generation->written[0])
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
-			    "avckpt.files=strict: %.80s was written since the checkpoint",
-			    generation->written);
+			    "avckpt.files=%s: %.80s was written since the checkpoint",
+			    strict ? "strict" : "auto", generation->written);
+	if (!strict)
+		return check_auto(guard, generation, pidfd, err);
 	for (uint32_t i = 0; i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
 		const struct process *process = image->process;
