@@ -13,6 +13,7 @@ started for every container to find out that they have nothing to do.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 
@@ -28,6 +29,8 @@ INIT_PATH = "/run/avckpt-init"
 
 WAIT_MS = 2000
 """How long init waits for a sidecar that lives but does not answer."""
+
+IO_URING = ("io_uring_setup", "io_uring_enter", "io_uring_register")
 
 HOOK_TIMEOUT_S = 120
 """After this the OCI runtime kills our hooks, and then the container does not start: for what nobody has
@@ -117,6 +120,8 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
         return config
     told = _tell_if_alone(name, parent)
     put_init_in_front(data)
+    if not policy.io_uring:
+        take_io_uring_away(data)
     data["annotations"] = annotations
     add_hooks(data, told)
     # Always: the sidecar's configuration may say avckpt.restore.on=unhealthy, now or later.
@@ -162,6 +167,21 @@ def put_init_in_front(data: dict[str, Any]) -> None:
             "options": ["bind", "ro", "nosuid", "nodev", "rprivate"],
         }
     )
+
+
+def take_io_uring_away(data: dict[str, Any]) -> None:
+    """Has io_uring answer as on a kernel that has none, by the container's seccomp profile.  Changes `data`."""
+    linux = data.setdefault("linux", {})
+    # A container without a profile (--privileged, seccomp=unconfined) gets one that allows all else.
+    profile = linux.get("seccomp") or {"defaultAction": "SCMP_ACT_ALLOW"}
+    rules = []
+    for rule in profile.get("syscalls") or []:
+        # One call with two answers is an error to libseccomp.
+        names = [name for name in rule.get("names") or [] if name not in IO_URING]
+        if names:
+            rules.append({**rule, "names": names})
+    rules.append({"names": list(IO_URING), "action": "SCMP_ACT_ERRNO", "errnoRet": errno.ENOSYS})
+    linux["seccomp"] = {**profile, "syscalls": rules}
 
 
 def add_hooks(data: dict[str, Any], told: bool) -> None:

@@ -32,6 +32,8 @@ from avckpt.yamlfile import Place, Unreadable
 PATH = Path("/etc/avckpt/config.yaml")
 ENABLE = f"{PREFIX}enable"
 GROUP = f"{PREFIX}group"
+AT_START = (ENABLE, f"{PREFIX}io_uring")
+"""What is decided when a container starts, by its own labels."""
 NOTIFY = f"{PREFIX}notify"
 
 
@@ -171,7 +173,7 @@ class _Reader:
         settings = {}
         for key, (here, value) in self._mapping(called, place, node).items():
             label = PREFIX + key
-            if label not in LABELS or label == ENABLE:
+            if label not in LABELS or label in AT_START:
                 self._complain(here, f"{called}.{key}: {_unknown(key)}")
             elif _is_null(value):
                 continue
@@ -215,8 +217,10 @@ def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> I
 def _unknown(key: str) -> str:
     if key == "enable":
         return "cannot be a default: a container is protected when its own label says avckpt.enable=true"
+    if key == "io_uring":
+        return "cannot be a default: it is taken away when a container starts, by its own label"
     if key.startswith(PREFIX):
         return f"here the keys have no prefix; write {key[len(PREFIX) :]}"
-    known = sorted(label[len(PREFIX) :] for label in LABELS if label != ENABLE)
+    known = sorted(label[len(PREFIX) :] for label in LABELS if label not in AT_START)
     near = difflib.get_close_matches(key, known, n=1)
     return f"unknown key; did you mean {near[0]}?" if near else "unknown key; known are " + ", ".join(known)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import pty
 import select
@@ -143,6 +144,15 @@ def test_nohup_is_passed_on() -> None:
     )
     ignored = int(done.stdout.split()[1], 16)
     assert ignored & 0b11 == 0b11  # SIGHUP is 1, SIGINT 2
+
+
+IO_URING = "import ctypes; c = ctypes.CDLL(None, use_errno=True); print(c.syscall(425, 0, 0), ctypes.get_errno())"
+
+
+def test_io_uring_can_be_taken_away() -> None:
+    python = ("--", sys.executable, "-c", IO_URING)
+    assert avckpt_run(*python).stdout.split()[1] != str(errno.ENOSYS)
+    assert avckpt_run("--label", "avckpt.io_uring=off", *python).stdout == f"-1 {errno.ENOSYS}\n"
 
 
 @pytest.mark.parametrize(

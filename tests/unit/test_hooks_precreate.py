@@ -334,3 +334,37 @@ def test_one_that_only_listens_is_made_known_and_not_touched(hook: Hook) -> None
     assert after == before
     # Without a group there is nobody to hear of, and nothing to do.
     assert hook(config, with_labels(spec, notify="signal:USR1")).out == config
+
+
+IO_URING = {"io_uring_setup", "io_uring_enter", "io_uring_register"}
+
+
+@pytest.mark.parametrize(
+    "seccomp",
+    [
+        None,
+        {
+            "defaultAction": "SCMP_ACT_ERRNO",
+            "syscalls": [
+                {"names": ["read", "io_uring_enter", "io_uring_setup"], "action": "SCMP_ACT_ALLOW"},
+                {"names": ["io_uring_register"], "action": "SCMP_ACT_ALLOW"},
+            ],
+        },
+    ],
+)
+def test_io_uring_is_taken_away_by_the_seccomp_profile(hook: Hook, seccomp: dict[str, Any] | None) -> None:
+    config, spec = (json.loads((SAMPLES / f"labelled.{kind}.json").read_text()) for kind in ("config", "spec"))
+    if seccomp is not None:
+        config["linux"]["seccomp"] = seccomp
+    spec["labels"]["avckpt.io_uring"] = "off"
+    profile = hook(json.dumps(config).encode(), json.dumps(spec)).config["linux"]["seccomp"]
+    rules = [(set(rule["names"]), rule["action"]) for rule in profile["syscalls"]]
+    assert rules[-1] == (IO_URING, "SCMP_ACT_ERRNO")
+    assert profile["syscalls"][-1]["errnoRet"] == 38
+    assert all(not names & IO_URING for names, _ in rules[:-1])
+    if seccomp is None:
+        assert profile["defaultAction"] == "SCMP_ACT_ALLOW"
+        assert len(rules) == 1
+    else:
+        assert rules[0] == ({"read"}, "SCMP_ACT_ALLOW")
+        assert profile["defaultAction"] == "SCMP_ACT_ERRNO"

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import pytest
-from avckpt.cli.run import config_of_run
+from avckpt.cli.run import settings_of_run
 from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Tcp
 from avckpt.policy import settings_of
@@ -20,6 +20,7 @@ def test_defaults_are_those_of_the_label_table() -> None:
         restore_max=5,
         restore_window_s=60.0,
         quiesce_s=0.02,
+        files=Files.AUTO,
     )
 
 
@@ -60,7 +61,7 @@ def test_a_wrong_label_is_one_line() -> None:
 
 
 def test_run_implies_enable() -> None:
-    assert config_of_run({"avckpt.interval": "1s"}).interval_s == 1.0
+    assert settings_of_run({"avckpt.interval": "1s"}).config.interval_s == 1.0
 
 
 @pytest.mark.parametrize(
@@ -68,4 +69,4 @@ def test_run_implies_enable() -> None:
 )
 def test_run_refuses_what_it_can_not_honour(labels: dict[str, str]) -> None:
     with pytest.raises(LabelsWrong):
-        config_of_run(labels)
+        settings_of_run(labels)

@@ -87,6 +87,8 @@ class Policy:
     """Shared memory of the application's own that is rolled back with it, at most."""
     files: str = "auto"
     """Regular files at a restore: auto, rewind, keep or strict."""
+    io_uring: bool = True
+    """Whether the kernel has it for the container; an application that uses it cannot be protected."""
     tcp: str = "reset-moved"
     """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     group: str = ""
@@ -204,6 +206,12 @@ def _parse_enable(text: str) -> dict[str, Any]:
     if text.lower() not in _TRUE | _FALSE:
         raise ValueError("neither true nor false")
     return {"enable": text.lower() in _TRUE}
+
+
+def _parse_io_uring(text: str) -> dict[str, Any]:
+    if text not in ("on", "off"):
+        raise ValueError("neither on nor off")
+    return {"io_uring": text == "on"}
 
 
 def _parse_interval(text: str) -> dict[str, Any]:
@@ -331,9 +339,8 @@ LABELS: dict[str, Label] = {
         "reset-moved, reset, keep or messages",
         _one_of("tcp", "reset-moved", "reset", "keep", "messages"),
     ),
-    "avckpt.files": Label(
-        "auto", "auto, rewind, keep or strict", _one_of("files", "auto", "rewind", "keep", "strict")
-    ),
+    "avckpt.files": Label("auto", "auto, rewind, keep or strict", _one_of("files", "auto", "rewind", "keep", "strict")),
+    "avckpt.io_uring": Label("on", "on or off", _parse_io_uring),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),

@@ -20,7 +20,8 @@
 static const struct {
 	const char *prefix, *reason;
 } unsupported_fds[] = {
-	{ "anon_inode:[io_uring]", "it uses io_uring" },
+	{ "anon_inode:[io_uring]", "it uses io_uring (most programs do without: "
+				   "avckpt.io_uring=off)" },
 	{ "anon_inode:[userfaultfd]", "it uses userfaultfd" },
 	{ "anon_inode:[perf_event]", "it has performance counters open" },
 	{ "/dev/nvidia", "it has a GPU device open" },

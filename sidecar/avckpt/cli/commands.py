@@ -248,8 +248,8 @@ def run(labels: tuple[str, ...], verbose: bool, argv: tuple[str, ...]) -> None:
     try:
         from avckpt.cli import run as runner
 
-        config = runner.config_of_run(dict(_split_label(label) for label in labels))
-        status = runner.run(config, list(argv), verbose=verbose)
+        settings = runner.settings_of_run(dict(_split_label(label) for label in labels))
+        status = runner.run(settings, list(argv), verbose=verbose)
     except LabelsWrong as error:
         click.echo(f"avckpt: {error}", err=True)
         status = int(ExitCode.USAGE)

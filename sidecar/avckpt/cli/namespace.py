@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 import select
 import signal
@@ -24,17 +25,23 @@ PR_SET_PDEATHSIG = 1
 MS_NOSUID, MS_NODEV, MS_NOEXEC = 2, 4, 8
 MS_REC, MS_PRIVATE = 0x4000, 0x40000
 
-_STEPS = ("setpgid", "prctl", "unshare", "mount", "mount", "execve")
+PR_SET_SECCOMP, SECCOMP_MODE_FILTER = 22, 2
+AUDIT_ARCH_X86_64 = 0xC000003E
+SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO = 0x7FFF0000, 0x00050000
+
+_STEPS = ("setpgid", "prctl", "unshare", "mount", "mount", "seccomp", "execve")
 _FAILURE = struct.Struct("ii")
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable[int]) -> int:
+def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable[int], io_uring: bool = True) -> int:
     """Starts `path` with a /proc of its own and its own process group; returns its PID in our namespace.
 
     With `tty` (a descriptor of our controlling terminal) the new group becomes
     the terminal's foreground group.  Signals in `ignored` are ignored in the
     new process, SIGPIPE and SIGXFSZ, which Python itself ignores, are not.
+
+    Without `io_uring` the kernel has none for it.
 
     It is killed, with all that it has started, when this process ends, however that comes about.
 
@@ -51,15 +58,15 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable
                 pid = os.fork()
                 if pid == 0:
                     os.close(failed)  # only the parent's: that it is closed says that the parent has ended
-                    _become(path, argv, tty, ignored, tell)
+                    _become(path, argv, tty, ignored, io_uring, tell)
         finally:
             os.close(tell)
         # The child's end closes when its exec succeeds.
         message = os.read(failed, _FAILURE.size)
     if message:
         os.waitpid(pid, 0)
-        step, errno = _FAILURE.unpack(message)
-        raise _problem(_STEPS[step], errno)
+        step, number = _FAILURE.unpack(message)
+        raise _problem(_STEPS[step], number)
     return pid
 
 
@@ -78,7 +85,7 @@ def _children_in_new_namespace(own: int) -> Iterator[None]:
             raise _problem("setns", ctypes.get_errno())
 
 
-def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int], tell: int) -> NoReturn:
+def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int], io_uring: bool, tell: int) -> NoReturn:
     """The child's way to the program; never returns, and runs nothing of the parent's."""
     step = 0
     try:
@@ -100,6 +107,9 @@ def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int],
         step = 4
         _check(_libc.mount(b"proc", b"/proc", b"proc", MS_NOSUID | MS_NODEV | MS_NOEXEC, None))
         step = 5
+        if not io_uring:
+            _take_io_uring_away()
+        step = 6
         # Python ignores them; what it starts should not.
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
@@ -110,6 +120,26 @@ def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int],
         os.write(tell, _FAILURE.pack(step, error.errno or 0))
     finally:
         os._exit(125)
+
+
+def _take_io_uring_away() -> None:
+    """For this process and what it starts: io_uring_setup(2) and its like answer ENOSYS."""
+    load, equal, above, at_least, answer = 0x20, 0x15, 0x25, 0x35, 0x06  # linux/bpf_common.h
+    program = b"".join(
+        struct.pack("HBBI", *instruction)
+        for instruction in (
+            (load, 0, 0, 4),  # seccomp_data.arch
+            (equal, 0, 4, AUDIT_ARCH_X86_64),
+            (load, 0, 0, 0),  # seccomp_data.nr
+            (at_least, 0, 2, 425),  # io_uring_setup
+            (above, 1, 0, 427),  # io_uring_register
+            (answer, 0, 0, SECCOMP_RET_ERRNO | errno.ENOSYS),
+            (answer, 0, 0, SECCOMP_RET_ALLOW),
+        )
+    )
+    code = ctypes.create_string_buffer(program, len(program))
+    header = struct.pack("HxxxxxxP", len(program) // 8, ctypes.addressof(code))
+    _check(_libc.prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, header, 0, 0))
 
 
 def _has_ended(tell: int) -> bool:
@@ -124,13 +154,13 @@ def _check(result: int) -> None:
         raise OSError(ctypes.get_errno(), "")
 
 
-def _problem(syscall: str, errno: int) -> AvckptError:
+def _problem(syscall: str, number: int) -> AvckptError:
     kind: type[AvckptError] = KernelError
-    if isinstance(OSError(errno, ""), PermissionError):
+    if isinstance(OSError(number, ""), PermissionError):
         kind = Denied
     elif syscall == "unshare":
         kind = Unsupported
     detail = "a PID namespace for the program cannot be made"
     if kind is Denied:
         detail += ": it takes root (CAP_SYS_ADMIN)"
-    return kind(detail, syscall=syscall, errno=errno)
+    return kind(detail, syscall=syscall, errno=number)

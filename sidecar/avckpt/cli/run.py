@@ -33,7 +33,7 @@ from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
 from avckpt.events.vocabulary import Kind, signal_name
 from avckpt.guard import GuardConfig
-from avckpt.policy import settings_of
+from avckpt.policy import Settings, settings_of
 
 NOT_FORWARDED = frozenset(
     {
@@ -58,7 +58,7 @@ NOT_FORWARDED = frozenset(
 )
 
 
-def config_of_run(labels: Mapping[str, str]) -> GuardConfig:
+def settings_of_run(labels: Mapping[str, str]) -> Settings:
     """What `--label` says; `avckpt.enable` is implied.  Raises LabelsWrong."""
     for key in labels:
         if not key.startswith("avckpt."):
@@ -70,10 +70,10 @@ def config_of_run(labels: Mapping[str, str]) -> GuardConfig:
         raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
     if labels.get("avckpt.enable", "true").strip().lower() in ("false", "0", "no", "off"):
         raise LabelsWrong("label avckpt.enable=false: then run the program without avckpt run")
-    return settings.config
+    return settings
 
 
-def run(config: GuardConfig, argv: list[str], *, verbose: bool) -> int:
+def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
     """Runs `argv` to its end and returns its exit status, 128+N when signal N killed it.
 
     Raises AvckptError when it cannot be started.
@@ -83,14 +83,14 @@ def run(config: GuardConfig, argv: list[str], *, verbose: bool) -> int:
     with _signals() as signals_fd, _terminal() as terminal:
         ignored = [signal.SIGTSTP] if terminal is not None else []
         command = [init.name, "--wait-ms", "2000", "--stop-signal", "15", "--", *argv]
-        pid = spawn_pid1(str(init), command, tty=terminal, ignored=ignored)
+        pid = spawn_pid1(str(init), command, tty=terminal, ignored=ignored, io_uring=settings.policy.io_uring)
         if terminal is not None:
             # We are in the background now, and say things all the same.
             signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         pidfd = os.pidfd_open(pid)
         try:
             _Supervisor(argv[0], pidfd, signals_fd, verbose).watch(
-                replace(config, memory_limit_bytes=_memory_limit_bytes(pid))
+                replace(settings.config, memory_limit_bytes=_memory_limit_bytes(pid))
             )
             _, status = os.waitpid(pid, 0)
         finally:
