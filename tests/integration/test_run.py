@@ -347,6 +347,25 @@ def test_control_z_does_not_lock_the_terminal(terminal) -> None:  # type: ignore
     session.wait_for("status=0")
 
 
+@pytest.mark.parametrize("how", ["fg", "bg; sleep 0.2; fg"])
+def test_control_z_stops_it_as_a_job(how: str, terminal) -> None:  # type: ignore[no-untyped-def]
+    program = "bash -c 'echo ready; while read x; do echo got=$x; done'"
+    session = terminal(
+        f"set -m; {RUN} --label avckpt.interval=50ms -- {program}; echo stopped=$?; read y; echo y=$y; {how}; "
+        "echo status=$?"
+    )
+    session.wait_for("protected: first checkpoint")
+    session.type("\x1a")
+    session.wait_for(f"stopped={128 + signal.SIGTSTP}")
+    # Now the terminal is the shell's.
+    session.type("mine\n")
+    session.wait_for("y=mine")
+    session.type("yours\n")
+    session.wait_for("got=yours")
+    session.type("\x04")
+    session.wait_for("status=0")
+
+
 def test_the_terminal_comes_back_after_a_restore(terminal) -> None:  # type: ignore[no-untyped-def]
     session = terminal(
         f"{RUN} --label avckpt.interval=50ms -- bash -c 'while read -p ? x; do echo got=$x; done'; echo status=$?"

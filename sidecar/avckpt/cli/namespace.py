@@ -14,7 +14,7 @@ import os
 import select
 import signal
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NoReturn
 
 from avckpt.errors import AvckptError, Denied, KernelError, Unsupported
@@ -34,12 +34,12 @@ _FAILURE = struct.Struct("ii")
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable[int], io_uring: bool = True) -> int:
+def spawn_pid1(path: str, argv: list[str], *, tty: int | None, io_uring: bool = True) -> int:
     """Starts `path` with a /proc of its own and its own process group; returns its PID in our namespace.
 
     With `tty` (a descriptor of our controlling terminal) the new group becomes
-    the terminal's foreground group.  Signals in `ignored` are ignored in the
-    new process, SIGPIPE and SIGXFSZ, which Python itself ignores, are not.
+    the terminal's foreground group.  SIGPIPE and SIGXFSZ, which Python itself
+    ignores, are not ignored in the new process.
 
     Without `io_uring` the kernel has none for it.
 
@@ -58,7 +58,7 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, ignored: Iterable
                 pid = os.fork()
                 if pid == 0:
                     os.close(failed)  # only the parent's: that it is closed says that the parent has ended
-                    _become(path, argv, tty, ignored, io_uring, tell)
+                    _become(path, argv, tty, io_uring, tell)
         finally:
             os.close(tell)
         # The child's end closes when its exec succeeds.
@@ -85,7 +85,7 @@ def _children_in_new_namespace(own: int) -> Iterator[None]:
             raise _problem("setns", ctypes.get_errno())
 
 
-def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int], io_uring: bool, tell: int) -> NoReturn:
+def _become(path: str, argv: list[str], tty: int | None, io_uring: bool, tell: int) -> NoReturn:
     """The child's way to the program; never returns, and runs nothing of the parent's."""
     step = 0
     try:
@@ -113,8 +113,6 @@ def _become(path: str, argv: list[str], tty: int | None, ignored: Iterable[int],
         # Python ignores them; what it starts should not.
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
-        for signum in ignored:
-            signal.signal(signum, signal.SIG_IGN)
         os.execv(path, argv)
     except OSError as error:
         os.write(tell, _FAILURE.pack(step, error.errno or 0))
@@ -162,5 +160,5 @@ def _problem(syscall: str, number: int) -> AvckptError:
         kind = Unsupported
     detail = "a PID namespace for the program cannot be made"
     if kind is Denied:
-        detail += ": it takes root (CAP_SYS_ADMIN)"
+        detail += ": it takes root (CAP_SYS_ADMIN)" + ("" if os.geteuid() == 0 else ", use sudo")
     return kind(detail, syscall=syscall, errno=number)

@@ -6,8 +6,8 @@
         PROGRAM
 
 The program has our standard descriptors and, if we had it, the foreground of
-our terminal.  SIGTSTP (^Z) is then ignored in the program, as under any parent
-that does no job control: nobody could bring it back.
+our terminal.  ^Z stops the program, and us with our group, as a job; the shell
+that continues us has the program continued.
 
 When `avckpt run` itself is killed with SIGKILL, init and program go on as
 orphans, unprotected.
@@ -15,13 +15,16 @@ orphans, unprotected.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import selectors
 import signal
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import FrameType
 
 from avckpt.artifacts import init_binary
@@ -81,15 +84,15 @@ def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
     probe()
     init = init_binary()
     with _signals() as signals_fd, _terminal() as terminal:
-        ignored = [signal.SIGTSTP] if terminal is not None else []
         command = [init.name, "--wait-ms", "2000", "--stop-signal", "15", "--", *argv]
-        pid = spawn_pid1(str(init), command, tty=terminal, ignored=ignored, io_uring=settings.policy.io_uring)
+        pid = spawn_pid1(str(init), command, tty=terminal, io_uring=settings.policy.io_uring)
         if terminal is not None:
             # We are in the background now, and say things all the same.
             signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         pidfd = os.pidfd_open(pid)
         try:
-            _Supervisor(argv[0], pidfd, signals_fd, verbose).watch(
+            job = _Job(terminal, pid) if terminal is not None else None
+            _Supervisor(argv[0], pidfd, signals_fd, verbose, job).watch(
                 replace(settings.config, memory_limit_bytes=_memory_limit_bytes(pid))
             )
             _, status = os.waitpid(pid, 0)
@@ -110,8 +113,9 @@ def _memory_limit_bytes(pid: int) -> int:
 class _Supervisor:
     """Forwards signals and tells events until init has ended."""
 
-    def __init__(self, name: str, init_pidfd: int, signals_fd: int, verbose: bool) -> None:
+    def __init__(self, name: str, init_pidfd: int, signals_fd: int, verbose: bool, job: _Job | None) -> None:
         self._name = name
+        self._job = job
         self._pidfd = init_pidfd
         self._signals_fd = signals_fd
         self._verbose = verbose
@@ -135,12 +139,14 @@ class _Supervisor:
             selector.register(self._signals_fd, selectors.EVENT_READ)
             ended = False
             while not ended:
-                for key, _ in selector.select():
+                for key, _ in selector.select(None if self._job is None else _Job.LOOK_EVERY_S):
                     if key.fd == self._pidfd:
                         ended = True
                     elif key.fd == self._signals_fd:
                         self._take_signals()
                 self._take_events(engine)
+                if self._job is not None:
+                    self._job.look()
             if guard is not None:
                 guard.stop()
             self._take_events(engine)
@@ -165,6 +171,8 @@ class _Supervisor:
         except BlockingIOError:
             return
         for signum in numbers:
+            if signum == signal.SIGCONT and self._job is not None:
+                self._job.go_on()
             if self._ready:
                 self._forward(signum)
             else:
@@ -177,6 +185,49 @@ class _Supervisor:
             return  # it has ended meanwhile
         if self._verbose:
             say(f"{self._name}: {signal_name(signum)} passed on")
+
+
+class _Job:
+    """The program in the foreground of our terminal, as part of the job that the shell knows us as.
+
+    Only its parent, init, hears when it stops, and cannot be stopped itself; so it is looked at.
+    """
+
+    LOOK_EVERY_S = 0.1
+
+    def __init__(self, terminal: int, init_pid: int) -> None:
+        self._terminal = terminal
+        self._init_pid = init_pid
+        self._group = 0
+        """The program's own, when it was seen last."""
+
+    def look(self) -> None:
+        """Stops with it if it was stopped (^Z), until somebody continues us."""
+        try:
+            group = os.tcgetpgrp(self._terminal)
+            if group == os.getpgrp():
+                self.go_on()  # a shell has brought us back to the foreground
+                return
+            state, parent = Path(f"/proc/{group}/stat").read_text().rpartition(")")[2].split()[:2]
+        except OSError:
+            return
+        if int(parent) != self._init_pid:
+            return  # ours, a shell's, or that of a program which sees to its own jobs
+        self._group = group
+        if state == "T":
+            # With nobody to continue us (a script without job control) this is ignored, and it goes on at once.
+            os.killpg(os.getpgrp(), signal.SIGTSTP)
+            time.sleep(0.01)  # another thread may be the one that stops us
+            self.go_on()
+
+    def go_on(self) -> None:
+        """Continues it, and where the shell has given us the terminal, gives it on."""
+        if not self._group:
+            return
+        with contextlib.suppress(OSError):
+            if os.tcgetpgrp(self._terminal) == os.getpgrp():
+                os.tcsetpgrp(self._terminal, self._group)
+            os.killpg(self._group, signal.SIGCONT)
 
 
 def say(text: str) -> None:
