@@ -15,6 +15,12 @@ check() {
 	"$@" || status=1
 }
 
+# Tables and code are as wide as they must be.
+# shellcheck disable=SC2317  # called by check
+narrow() {
+	! LC_ALL=C.UTF-8 grep -nHP '^(?!\||    ).{101,}' "$@"
+}
+
 mapfile -t shell < <(git ls-files --cached --others --exclude-standard 'scripts/*.sh' .ci/run)
 mapfile -t c < <(git ls-files --cached --others --exclude-standard '*.c' '*.h')
 
@@ -24,6 +30,8 @@ mapfile -t typed < <(ls -d setup.py scripts examples sidecar hooks native tests 
 check "mypy --strict" .venv/bin/mypy "${typed[@]}"
 mapfile -t python < <(git ls-files --cached --others --exclude-standard '*.py')
 check "arguments of functions" scripts/arguments.py "${c[@]}" "${python[@]}"
+mapfile -t documents < <(git ls-files --cached --others --exclude-standard '*.md' ':!bench/results')
+check "lines of documents" narrow "${documents[@]}"
 check "layers of the engine" make -s -C native layers
 # What is not checked is not right: a missing tool is a failure.
 check "shellcheck" shellcheck -x "${shell[@]}"
