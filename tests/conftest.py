@@ -17,11 +17,6 @@ from testkit import devices, harness
 from testkit.harness import CommandFailed, ContainerFactory, Podman, Sidecar
 
 CONTAINERS = pytest.StashKey[ContainerFactory]()
-REAL = {
-    folder: pytest.mark.shared_machine("real processes: nobody may get a CPU for as long as init waits for its guard")
-    for folder in ("native", "platform", "integration")
-}
-"""Folders of tests whose every test is excused; to be narrowed to the tests that need it."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -51,9 +46,6 @@ def reset_if_ignored(number: int) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Whatever takes the fixture `podman` is marked so; who excuses a failure says why.  Raises UsageError."""
     for item in items:
-        real = REAL.get(item.path.parent.name)
-        if real is not None and item.get_closest_marker("shared_machine") is None:
-            item.add_marker(real)
         excuse = item.get_closest_marker("shared_machine")
         if excuse is not None and not (len(excuse.args) == 1 and str(excuse.args[0]).strip()):
             raise pytest.UsageError(f'{item.nodeid}: write @pytest.mark.shared_machine("why it may fail there")')

@@ -14,6 +14,8 @@ import pytest
 
 from testkit.harness import ContainerFactory, Sidecar, wait_until
 
+pytestmark = pytest.mark.shared_machine("the sidecar is given a time to protect")
+
 SECRET = "a-secret-of-the-application"
 
 

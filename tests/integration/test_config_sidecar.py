@@ -15,7 +15,10 @@ import pytest
 from testkit.harness import take_checkpoint, wait_until
 from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root"),
+    pytest.mark.shared_machine("a daemon is given a time to start, to protect and to read its configuration again"),
+]
 
 NAP = [sys.executable, "-c", "import time\nwhile True: time.sleep(0.1)"]
 ENABLE = {"avckpt.enable": "true"}

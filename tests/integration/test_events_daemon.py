@@ -29,7 +29,12 @@ from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, en
 
 SLEEPER = ["sleep", "1000"]
 Stream = Generator[dict[str, Any], None, None]
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
+    pytest.mark.shared_machine(
+        "init waits two seconds for its guard, which may get no CPU for as long; events are given a time to come"
+    ),
+]
 
 
 @pytest.fixture

@@ -15,6 +15,8 @@ import pytest
 from testkit.harness import wait_until
 from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
+pytestmark = pytest.mark.shared_machine("a guard that gets no CPU for long is taken for one that hangs")
+
 SLEEPER = ["sleep", "infinity"]
 
 CAP_SYS_MODULE, CAP_SYS_PTRACE, CAP_SYS_RAWIO, CAP_SYS_BOOT, CAP_SYS_TIME, CAP_MKNOD = 16, 19, 17, 22, 25, 27

@@ -21,7 +21,10 @@ from avckpt.supervision.pressure import templates_of
 from testkit.harness import wait_until
 from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="PID namespaces and ptrace need root"),
+    pytest.mark.shared_machine("health checks have time limits"),
+]
 
 NAP = [sys.executable, "-c", "import time\nwhile True: time.sleep(0.1)"]
 QUICK = {"avckpt.enable": "true", "avckpt.interval": "100ms", "avckpt.restore.max": "60/1s"}

@@ -15,6 +15,8 @@ from avckpt.cli.install import DROP_IN, HOOKS_DIR
 
 from testkit.harness import Podman, avckpt_command, hooks_installed, run, wait_until
 
+pytestmark = pytest.mark.shared_machine("Podman and its service are given a time to start")
+
 INIT = "/run/avckpt-init"
 
 

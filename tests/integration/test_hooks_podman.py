@@ -33,6 +33,8 @@ from testkit.harness import (
     wait_until,
 )
 
+pytestmark = pytest.mark.shared_machine("a hook that gets no CPU for ten seconds is late")
+
 INIT = "/run/avckpt-init --wait-ms 2000 --stop-signal"
 # With the newline that journald waits for.
 SHOW_PID_1 = "tr '\\0' ' ' </proc/1/cmdline; echo"

@@ -14,6 +14,11 @@ import pytest
 from testkit.harness import SIDECAR_NAME, SLOWNESS, ContainerFactory, Sidecar, wait_until
 from testkit.protected import QUICK, ours, start_victim
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "the next sidecar is given a time to protect"
+)
+
 
 @pytest.mark.slow
 def test_killed_and_started_again(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:

@@ -32,7 +32,12 @@ from testkit.harness import (
 COUNT = "import itertools, time\nfor i in itertools.count():\n  print('n', i, flush=True); time.sleep(0.02)\n"
 PATIENCE_S = 300.0
 """For a command that brings several containers up on a busy machine."""
-pytestmark = pytest.mark.timeout(900)
+pytestmark = [
+    pytest.mark.timeout(900),
+    pytest.mark.shared_machine(
+        "podman-compose is ended when it seems to hang, and containers are given a time to be protected"
+    ),
+]
 SERVICES = f"""\
 x-node: &node
   image: {BASE_IMAGE}

@@ -18,7 +18,10 @@ from testkit.local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
 from testkit.procfs import children_of
 
 HOARD = ROOT / "tests/victims/build/hoard"
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
+    pytest.mark.shared_machine("the guard is given a time to see a new limit"),
+]
 
 
 def comm_of(pid: int) -> str:

@@ -11,6 +11,10 @@ import pytest
 
 from testkit.harness import SIDECAR_NAME, Container, ContainerFactory, Podman, Sidecar, wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; notifications have time limits"
+)
+
 LISTENER = (
     "import signal, time\n"
     "signal.signal(signal.SIGUSR1, lambda *_: print('USR1', flush=True))\n"

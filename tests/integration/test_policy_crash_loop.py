@@ -13,6 +13,10 @@ import pytest
 from testkit.harness import SLOWNESS, ContainerFactory, Sidecar, wait_until
 from testkit.protected import ProtectedVictim, ended, start_victim
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; restores within a time are counted"
+)
+
 
 @pytest.fixture
 def poison(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Any:

@@ -15,6 +15,10 @@ import pytest
 from testkit.harness import RUN_DIR, Container, ContainerFactory, Sidecar, wait_until
 from testkit.protected import ProtectedVictim, ended, start_victim, told
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; health checks have time limits"
+)
+
 FRESH = "test -n \"$(find /tmp/alive -newermt '-1 seconds')\""
 """The victim `poison` touches that file as long as it does not hang."""
 

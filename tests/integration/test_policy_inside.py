@@ -17,7 +17,10 @@ from avckpt.supervision.inside import OUTPUT_BYTES, Done, _sealed_program, run_i
 
 from testkit.harness import ROOT, Container, ContainerFactory, Podman, wait_until
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root"),
+    pytest.mark.shared_machine("commands that are run in containers have time limits"),
+]
 
 WHO = (
     "id; pwd; hostname; echo $GREETING; ulimit -n; cat /proc/self/cgroup; "

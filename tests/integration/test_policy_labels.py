@@ -13,6 +13,8 @@ import pytest
 from testkit.harness import ContainerFactory, Sidecar, wait_until
 from testkit.protected import ProtectedVictim, ended, ours, start_victim
 
+pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
+
 ON_COMMAND = {"interval": "1h", "restore.max": "60/60s"}
 
 

@@ -13,6 +13,10 @@ import pytest
 from testkit.harness import SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
 from testkit.protected import ours, start_hoard, told, write_hoard
 
+pytestmark = pytest.mark.shared_machine(
+    "whether a generation is given up in time before memory is short is a race with the application"
+)
+
 MB = 1 << 20
 
 

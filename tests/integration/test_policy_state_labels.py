@@ -14,6 +14,8 @@ import pytest
 
 from testkit.harness import Container, ContainerFactory, Sidecar, free_port, take_checkpoint, wait_until
 
+pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
+
 # Appends to a file when told "write", counts in anonymous shared memory when told "count"; answers any
 # line with the file's offset, the count, and when it was started.
 KEEPER = """

@@ -9,6 +9,11 @@ from testkit.harness import Podman, Sidecar
 from testkit.programs.registry import PROGRAMS, Missing, find
 from testkit.programs.rounds import MODES, run
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "programs under load have time limits of their own"
+)
+
 ROUNDS = 4
 
 

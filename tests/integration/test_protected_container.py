@@ -13,6 +13,10 @@ import pytest
 from testkit.harness import ContainerFactory, Sidecar, take_checkpoint, wait_until
 from testkit.protected import QUICK, ours, start_victim
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
+)
+
 OPTIONS = {
     "root": [],
     "user": ["--user", "1000:1000"],

@@ -15,6 +15,10 @@ from testkit.harness import ContainerFactory, Sidecar, take_checkpoint
 from testkit.protected import QUICK, ProtectedVictim, start_victim
 from testkit.scenario import disturb_app
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; a bus and a camera go on meanwhile"
+)
+
 KILLS = 6
 
 

@@ -14,6 +14,10 @@ import pytest
 
 from testkit.harness import Container, ContainerFactory, Sidecar, wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; clients have time limits of their own"
+)
+
 ASYNCIO_SERVER = """
 import asyncio, os, threading
 

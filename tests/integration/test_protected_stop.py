@@ -6,7 +6,13 @@ from __future__ import annotations
 import os
 import signal
 
+import pytest
+
 from testkit.harness import SIDECAR_NAME, SLOWNESS, Container, ContainerFactory, Sidecar
+
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; podman stop kills after ten seconds"
+)
 
 QUICK = {"interval": "100ms"}
 # Much less than the 20 s after which Podman kills it.

@@ -17,6 +17,11 @@ import pytest
 from bench.ros_pipeline import Crash, Pipeline
 from testkit.harness import Podman, Sidecar, wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "a pipeline of ROS nodes is given a time to deliver again"
+)
+
 IMAGE = "localhost/avckpt-ros:latest"
 DRIVE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "avckpt" / "ros-drive" / "drive.bag"
 PATIENCE_S = 30.0

@@ -26,7 +26,12 @@ from testkit.harness import ROOT, avckpt_command, run, wait_until
 from testkit.local_sidecar import app_of
 from testkit.procfs import children_of
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root"),
+    pytest.mark.shared_machine(
+        "init waits two seconds for its guard, which may get no CPU for as long; a reader is given a time to hear again"
+    ),
+]
 needs_dds = pytest.mark.skipif(
     shutil.which("idlc") is None or ctypes.util.find_library("ddsc") is None,
     reason="no CycloneDDS here (Debian: cyclonedds-dev, cyclonedds-tools)",

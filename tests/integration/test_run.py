@@ -23,7 +23,13 @@ from testkit.harness import Completed, avckpt_command, run, wait_until
 from testkit.local_sidecar import app_of
 from testkit.procfs import children_of
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root"),
+    pytest.mark.shared_machine(
+        "init waits two seconds for its guard, which may get no CPU for as long; "
+        "a command is given a time to protect its program"
+    ),
+]
 
 COUNTER = """
 import sys, time

@@ -29,7 +29,10 @@ from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, en
 from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
+    pytest.mark.shared_machine("the daemon's patience with hooks, guards and clients has limits"),
+]
 
 
 @pytest.fixture

@@ -15,6 +15,10 @@ from avckpt.errors import SidecarUnreachable
 
 from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
+)
+
 if TYPE_CHECKING:
     from testkit.harness import Completed, Container, ContainerFactory, Podman, Sidecar
 

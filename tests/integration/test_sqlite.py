@@ -17,6 +17,10 @@ from testkit.databases.observer import Observer
 from testkit.databases.rounds import LOAD, Bank, kill_at_random
 from testkit.harness import ContainerFactory, Sidecar, take_checkpoint
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
+)
+
 KILLS = 8
 
 

@@ -25,7 +25,10 @@ from testkit.local_sidecar import LocalSidecar, local_sidecar
 SLEEPER = ["sleep", "1000"]
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "300ms"}
 PATIENCE_S = 60
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
+    pytest.mark.shared_machine("a screen is given a time to show what it should"),
+]
 
 
 @pytest.fixture

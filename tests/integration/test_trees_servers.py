@@ -15,6 +15,10 @@ from testkit.harness import ContainerFactory, Sidecar, wait_until
 from testkit.procfs import figures
 from testkit.trees import LONG, Load, Tree, start_tree, write_files
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; clients have time limits of their own"
+)
+
 KILLS = 50 if LONG else 4
 
 NGINX = """

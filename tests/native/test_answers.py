@@ -13,6 +13,10 @@ import pytest
 from testkit.answers.servers import SERVERS, missing
 from testkit.answers.trial import run
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; clients have time limits of their own"
+)
+
 REQUESTS = 1000
 KILLS = 3
 

@@ -11,6 +11,10 @@ import pytest
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import SLOWNESS
 
+pytestmark = pytest.mark.shared_machine(
+    "a checkpoint is missed when the application does not stop in time, and how far a guard got is looked at"
+)
+
 CHILDREN = 40
 PATIENCE_S = 30.0 * SLOWNESS
 

@@ -10,6 +10,10 @@ import pytest
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "children are made and checkpoints taken at random moments, and late ones are missed"
+)
+
 CHILDREN = 6000
 
 

@@ -10,6 +10,11 @@ import pytest
 from testkit.guarded import PATIENCE_S, WHERE, GuardProcess, Victim, config
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "which of two comes first, a death or a checkpoint, is the scheduler's choice"
+)
+
 CRASHES = 3
 SIGNALS = ("segv", "bus", "fpe", "ill", "abrt", "trap", "sys")
 STYLES = ("plain", "full", "open", "python", "sysv", "breakpad", "exit")

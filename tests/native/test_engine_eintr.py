@@ -12,6 +12,8 @@ import pytest
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import SLOWNESS
 
+pytestmark = pytest.mark.shared_machine("timeouts of blocked calls are compared with the clock")
+
 CHECKPOINTS = 10_000 if os.environ.get("AVCKPT_LONG") == "1" else 1_500
 LONGEST, PUNCTUAL = 3, 7
 KINDS_AT = 8

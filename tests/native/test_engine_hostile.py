@@ -18,6 +18,10 @@ from testkit.fake_init import FAKE_INIT, FOLLY
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; attacks and checkpoints race"
+)
+
 SCRIBBLED_S = 3.0
 
 

@@ -10,6 +10,11 @@ import pytest
 
 from testkit.guarded import BUILD, GuardProcess, Victim, config
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "it must meet tasks that live for milliseconds"
+)
+
 SECONDS = 60
 
 

@@ -15,6 +15,10 @@ from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
 from testkit.procfs import children_of
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
+)
+
 KILLS = 12
 
 

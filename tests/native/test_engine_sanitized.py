@@ -19,6 +19,11 @@ from testkit.family import kill_main
 from testkit.guarded import Victim
 from testkit.harness import ROOT, wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "sanitizers make the guard several times slower"
+)
+
 SOURCE = Path(__file__).with_name("sanitized_guard.c")
 GUARD = ROOT / "native/build-san/avckpt-guard"
 FLAGS = [

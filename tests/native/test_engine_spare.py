@@ -27,6 +27,11 @@ from testkit.guarded import BUILD, GuardProcess, Victim, config, forks_beside
 from testkit.harness import wait_until
 from testkit.procfs import children_of
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "a spare is there only if the guard had the time to make it"
+)
+
 MEGABYTES = 300
 
 

@@ -37,6 +37,9 @@ FIRST = 1 if SWEEP == "all" else 1 + int(SWEEP) % PART
 pytestmark = [
     pytest.mark.skipif(not shutil.which("strace"), reason="strace is what kills the guard; it is not installed"),
     pytest.mark.timeout(3600 if PART == 1 else 300),
+    pytest.mark.shared_machine(
+        "a guard is killed before each of its calls, hundreds of times, and each next one has to protect in time"
+    ),
 ]
 
 

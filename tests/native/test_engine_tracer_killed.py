@@ -15,6 +15,8 @@ from testkit.guarded import GuardProcess, Victim, config, parasites, storm
 from testkit.harness import wait_until
 from testkit.procfs import threads
 
+pytestmark = pytest.mark.shared_machine("guards are killed at random moments, and each next one has to protect in time")
+
 KILLS = 500
 PTRACE_CALLS = 40
 """Of a checkpoint of one thread, and some."""

@@ -25,6 +25,11 @@ from testkit.guarded import GuardProcess, Victim, config, forks_beside, meanwhil
 from testkit.harness import wait_until
 from testkit.procfs import children_of, figures
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "a tree that does not stop in time is not checkpointed"
+)
+
 LONG = os.environ.get("AVCKPT_LONG") == "1"
 KILLS = 100 if LONG else 5
 CHECKPOINTS = 1000 if LONG else 20

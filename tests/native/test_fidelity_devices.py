@@ -14,6 +14,10 @@ from testkit.devices import load_driver
 from testkit.guarded import WHERE, GuardProcess, Victim, config
 from testkit.scenario import checkpoint, disturb, disturb_and_restore, restored
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; a bus and a camera go on meanwhile"
+)
+
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

@@ -22,6 +22,10 @@ from testkit.meddle import get_fd
 from testkit.procfs import below
 from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
+)
+
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

@@ -13,7 +13,10 @@ import pytest
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random, since_linux
 from testkit.procfs import state_of, threads
 
-pytestmark = since_linux(6, 9, "pidfds of threads")
+pytestmark = [
+    since_linux(6, 9, "pidfds of threads"),
+    pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long"),
+]
 
 
 @pytest.fixture(autouse=True)

@@ -15,6 +15,10 @@ import pytest
 from testkit.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; copies of much memory take long"
+)
+
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

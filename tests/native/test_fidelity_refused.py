@@ -15,6 +15,8 @@ import pytest
 from testkit.guarded import GuardProcess, Victim, config, since_linux
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine("an application that does not stop in time is told another reason")
+
 NETWORKS = since_linux(6, 11, "a namespace of a thread can be asked for")
 DISPATCH = since_linux(6, 4, "what a thread dispatches can be asked for")
 

@@ -19,6 +19,10 @@ from testkit.guarded import GuardProcess, Victim, config, parasites
 from testkit.harness import wait_until
 from testkit.procfs import children_of, inside, state_of, threads
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; peers have time limits of their own"
+)
+
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

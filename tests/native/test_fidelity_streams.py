@@ -16,6 +16,11 @@ from avckpt.guard import Tcp
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import SLOWNESS, wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "messages are in the middle at random moments"
+)
+
 # An emulated sender is silent for longer within a message.
 AT_SPEED = pytest.mark.skipif(SLOWNESS > 1, reason="8 ms without a byte are a pause between messages")
 SHORT, LONG = b"m" * 1000, b"m" * 300_000

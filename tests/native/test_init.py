@@ -25,6 +25,7 @@ from testkit.init_peer import INIT, PATIENCE_S, Guard, Init, Phoenix
 from testkit.procfs import children_of, state_of
 
 pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
+SHARED = pytest.mark.shared_machine("init, the application and a stand-in for the guard are given a time")
 
 both = pytest.mark.parametrize("pid1", [False, True], ids=["child", "pid1"])
 PYTHON = os.path.realpath(sys.executable)
@@ -147,6 +148,7 @@ def test_app_has_exactly_the_inherited_descriptors(closed: tuple[int, ...], tmp_
     assert listed["init"] == listed["plain"]
 
 
+@SHARED
 def test_init_lets_go_of_what_the_app_inherited() -> None:
     """What the app closes is closed: a reader sees the end although init lives."""
     read_end, write_end = os.pipe()
@@ -159,6 +161,7 @@ def test_init_lets_go_of_what_the_app_inherited() -> None:
         os.close(read_end)
 
 
+@SHARED
 @pytest.mark.parametrize("closed", [(0,), (0, 1), (0, 1, 2)], ids=str)
 def test_protected_also_with_closed_stdio(closed: tuple[int, ...]) -> None:
     def setup() -> None:
@@ -232,6 +235,7 @@ def test_unprotected_app_dies_as_under_any_init() -> None:
         assert init.end() == 128 + signal.SIGSEGV
 
 
+@SHARED
 def test_app_of_the_same_user_can_not_reach_the_guards_page(public_init: Path) -> None:
     script = "for f in 3 4 5 6 7 8; do cat /proc/$PPID/fd/$f; done 2>&1; ls /proc/$PPID/fd 2>&1; id -u; sleep 60"
     argv = [str(public_init), "--", "sh", "-c", script]
@@ -256,6 +260,7 @@ def test_app_of_the_same_user_can_not_reach_the_guards_page(public_init: Path) -
 # --- signals ---------------------------------------------------------------
 
 
+@SHARED
 @both
 def test_every_signal_reaches_the_app(pid1: bool) -> None:
     with Phoenix(pid1=pid1) as init:
@@ -268,6 +273,7 @@ def test_every_signal_reaches_the_app(pid1: bool) -> None:
             assert init.app.hear() == f"signal {int(sig)} -1"
 
 
+@SHARED
 @both
 @pytest.mark.parametrize("sig", [32, 33])
 def test_signals_that_libc_keeps_for_itself_are_forwarded_too(pid1: bool, sig: int) -> None:
@@ -277,6 +283,7 @@ def test_signals_that_libc_keeps_for_itself_are_forwarded_too(pid1: bool, sig: i
         assert init.end() == 128 + sig
 
 
+@SHARED
 def test_queued_realtime_signals_keep_order_and_value() -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     with Phoenix() as init:
@@ -286,6 +293,7 @@ def test_queued_realtime_signals_keep_order_and_value() -> None:
         assert [init.app.hear() for _ in range(5)] == [f"signal 40 {value}" for value in range(1, 6)]
 
 
+@SHARED
 def test_signals_go_to_the_main_process_only() -> None:
     script = (
         "import os, signal, time\n"
@@ -305,6 +313,7 @@ def test_signals_go_to_the_main_process_only() -> None:
         assert not out.read()
 
 
+@SHARED
 def test_sigchld_is_not_forwarded() -> None:
     script = (
         "import signal\n"
@@ -323,6 +332,7 @@ def test_sigchld_is_not_forwarded() -> None:
         assert out.readline() == b"SIGUSR1\n"
 
 
+@SHARED
 def test_the_app_signalling_its_own_group_hears_it_once() -> None:
     script = (
         "import os, signal\n"
@@ -338,6 +348,7 @@ def test_the_app_signalling_its_own_group_hears_it_once() -> None:
         assert init.output() == "heard\n" * 20
 
 
+@SHARED
 @both
 def test_stopped_and_continued_app_goes_on(pid1: bool) -> None:
     with Phoenix(pid1=pid1) as init:
@@ -350,6 +361,7 @@ def test_stopped_and_continued_app_goes_on(pid1: bool) -> None:
         assert init.app_pid() == app_pid
 
 
+@SHARED
 @pytest.mark.parametrize("guarded", [True, False])
 def test_init_sleeps_when_there_is_nothing_to_do(guarded: bool) -> None:
     with Phoenix() as init:
@@ -370,6 +382,7 @@ def test_init_sleeps_when_there_is_nothing_to_do(guarded: bool) -> None:
 # --- children --------------------------------------------------------------
 
 
+@SHARED
 @both
 def test_orphans_are_reaped(pid1: bool) -> None:
     with Phoenix(pid1=pid1) as init:
@@ -382,6 +395,7 @@ def test_orphans_are_reaped(pid1: bool) -> None:
         assert init.app_pid() > 0
 
 
+@SHARED
 @both
 def test_what_the_app_leaves_behind_ends_with_it(pid1: bool, tmp_path: Path) -> None:
     fifo = tmp_path / "fifo"

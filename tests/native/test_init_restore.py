@@ -19,7 +19,12 @@ from testkit.harness import wait_until
 from testkit.init_peer import CTL, PATIENCE_S, Guard, Init, Page, Phoenix, Verdict
 from testkit.procfs import children_of, comm_of, state_of
 
-pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
+pytestmark = [
+    pytest.mark.usefixtures("init_built", "victims_built"),
+    pytest.mark.shared_machine(
+        "a stand-in for the guard, in Python, must answer within the two seconds that init waits"
+    ),
+]
 
 both = pytest.mark.parametrize("pid1", [False, True], ids=["child", "pid1"])
 STOP_ASKED = 1

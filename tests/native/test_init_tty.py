@@ -20,7 +20,10 @@ from testkit.harness import wait_until
 from testkit.init_peer import INIT, PATIENCE_S, Guard, Init, Phoenix, Verdict
 from testkit.procfs import children_of, state_of
 
-pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
+pytestmark = [
+    pytest.mark.usefixtures("init_built", "victims_built"),
+    pytest.mark.shared_machine("what a terminal shows is given a time"),
+]
 
 PYTHON = os.path.realpath(sys.executable)
 LONG_WAIT = ("--wait-ms", "60000")

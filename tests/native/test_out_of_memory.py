@@ -14,6 +14,11 @@ from testkit.cgroups import MemoryGroup
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "the kernel's OOM killer takes whom it finds at that moment"
+)
+
 LIMIT_BYTES = 256 << 20
 BASE_MB = 40
 TRIALS = int(os.environ.get("AVCKPT_OOM_TRIALS", "1"))

@@ -22,6 +22,8 @@ from testkit.guarded import Victim
 from testkit.harness import SLOWNESS, wait_until
 from testkit.meddle import get_fd, remote_syscall
 
+pytestmark = pytest.mark.shared_machine("a victim is given a time to find what is wrong")
+
 CONTENT = [
     "tree 0",
     "tree 8",

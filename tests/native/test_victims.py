@@ -24,6 +24,8 @@ from testkit.harness import SLOWNESS, wait_until
 from testkit.init_peer import PATIENCE_S
 from testkit.meddle import set_fpu_register
 
+pytestmark = pytest.mark.shared_machine("a victim is given a time to find what is wrong, and some look at clocks")
+
 Start = Callable[..., "subprocess.Popen[str]"]
 
 TIMED = [

@@ -9,7 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from testkit.harness import ROOT, ContainerFactory, Sidecar
+
+pytestmark = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
+)
 
 
 def test_a_killed_app_is_there_again(sidecar: Sidecar, container: ContainerFactory) -> None:
