@@ -112,18 +112,24 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
         data["annotations"] = annotations
         add_hooks(data, told=True)
         return json.dumps(data, separators=(",", ":")).encode()
-    reason = _unprotectable(data, container)
+    reason = _unprotectable(data, container, policy.scope)
     if reason:
         warn(f"container {name} runs unprotected: {reason}", parent)
         return config
-    if data["process"]["args"][0] == INIT_PATH:  # the hook stands in two directories
+    # The hook stands in two directories.
+    if data["process"]["args"][0] == INIT_PATH or INIT_PATH in map(_destination, data.get("mounts") or []):
         return config
     told = _tell_if_alone(name, parent)
-    put_init_in_front(data)
+    if policy.scope == "nodes":
+        lend_init(data)
+    else:
+        put_init_in_front(data)
     if not policy.io_uring:
         take_io_uring_away(data)
     data["annotations"] = annotations
     add_hooks(data, told)
+    if policy.scope == "nodes":
+        return json.dumps(data, separators=(",", ":")).encode()
     # Always: the sidecar's configuration may say avckpt.restore.on=unhealthy, now or later.
     _ask_for_health(container, name, parent)
     return json.dumps(data, separators=(",", ":")).encode()
@@ -158,12 +164,30 @@ def put_init_in_front(data: dict[str, Any]) -> None:
         "--",
         *args,
     ]
+    _mount(data, init_binary(), INIT_PATH)
+
+
+def lend_init(data: dict[str, Any]) -> None:
+    """Leaves the main process, a launcher, as it is, and gives it what it takes to start units.  Changes `data`."""
+    from avckpt_hooks.shared import protocol
+
+    # Not the socket itself: each sidecar makes a new one.
+    os.makedirs(protocol.units_dir(), mode=0o755, exist_ok=True)
+    _mount(data, init_binary(), INIT_PATH)
+    _mount(data, protocol.units_dir(), protocol.UNITS_IN_CONTAINER)
+    process = data["process"]
+    ours = ("AVCKPT_INIT=", "AVCKPT_UNIT=", "AVCKPT_UNITS=")
+    kept = [entry for entry in process.get("env") or [] if not entry.startswith(ours)]
+    process["env"] = [*kept, f"AVCKPT_INIT={INIT_PATH}"]
+
+
+def _mount(data: dict[str, Any], source: str, destination: str) -> None:
     # Last, so that no mount on /run (a tmpfs of --read-only, say) hides it.
     data.setdefault("mounts", []).append(
         {
-            "destination": INIT_PATH,
+            "destination": destination,
             "type": "bind",
-            "source": init_binary(),
+            "source": source,
             "options": ["bind", "ro", "nosuid", "nodev", "rprivate"],
         }
     )
@@ -231,12 +255,20 @@ def warn(line: str, parent: int) -> bool:
     return tell.parent(line, parent) and not podman.is_service(parent)
 
 
-def _unprotectable(data: dict[str, Any], container: str) -> str:
+def _destination(mount: dict[str, Any]) -> object:
+    return mount.get("destination")
+
+
+def _unprotectable(data: dict[str, Any], container: str, scope: str) -> str:
     """Why a container is better left as it is; "" if nothing speaks against it."""
     from avckpt_hooks.shared.programs import must_be_pid_1
 
     if not _is_ours():
         return "only containers of root can be protected, and this Podman is rootless"
+    if not init_binary():
+        return "avckpt-init is missing; run `avckpt install` again"
+    if scope == "nodes":
+        return ""  # no init stands in front of its main process
     process = data.get("process") or {}
     command = (process.get("args") or [""])[0]
     if must_be_pid_1(command):
@@ -247,8 +279,6 @@ def _unprotectable(data: dict[str, Any], container: str) -> str:
     # What Podman tells a systemd, and nothing else (--systemd, by default for some commands).
     if container and f"container_uuid={container[:32]}" in (process.get("env") or []):
         return "Podman starts it as systemd, which must itself be PID 1; if it is none, give --systemd=false"
-    if not init_binary():
-        return "avckpt-init is missing; run `avckpt install` again"
     return ""
 
 

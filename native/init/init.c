@@ -4,6 +4,10 @@
  *
  *   avckpt-init [--wait-ms N] [--stop-signal N] [--] PROGRAM [ARG...]
  *
+ * Below a launcher it is the parent of one program, a unit (unit.c):
+ *
+ *   avckpt-init [--name NAME] [--label avckpt.KEY=VALUE ...] [--] PROGRAM [ARG...]
+ *
  * It does what every container init does (forwards signals, reaps zombies,
  * ends with the app's status), and one thing more: when the app dies in a way
  * nobody asked for, it does not end but reports the death to the guard, and
@@ -37,11 +41,11 @@
 #include <unistd.h>
 
 #include "avckpt/ctl.h"
+#include "init.h"
 
 #define NAME "avckpt-init"
 #define EXIT_USAGE 125 /* init's own failure, as Podman's own are */
 #define END_CHILDREN_MS 500
-#define NS_PER_MS UINT64_C(1000000)
 #define VERDICTS_PER_ROUND 1024
 
 #ifndef MFD_NOEXEC_SEAL
@@ -72,6 +76,7 @@ static struct {
 	const char *app_name;
 	int stop_signal;
 	uint32_t wait_ms;
+	bool is_unit; /* below a launcher: unit.c */
 
 	bool waiting; /* reported death `seq`, waits for the verdict */
 	uint32_t seq;
@@ -87,7 +92,7 @@ static struct {
 	struct sigaction chld; /* the SIGCHLD disposition we were started with */
 } self = { .fd = { [0 ... FDS - 1] = -1 } };
 
-static uint64_t now_ns(void)
+uint64_t now_ns(void)
 {
 	struct timespec ts;
 
@@ -96,7 +101,7 @@ static uint64_t now_ns(void)
 }
 
 /* One line on stderr, in one write so that it is not torn apart. */
-__attribute__((format(printf, 1, 2))) static void say(const char *format, ...)
+void say(const char *format, ...)
 {
 	char line[PIPE_BUF] = NAME ": ";
 	size_t len = strlen(line);
@@ -124,7 +129,7 @@ static int mask_set(uint64_t mask, uint64_t *old)
 
 /* Moves a new descriptor above stderr: when we are started with closed 0..2,
  * new ones land there, and a message of ours would be written into them. */
-static int above_stdio(int fd)
+int above_stdio(int fd)
 {
 	int high;
 
@@ -234,9 +239,20 @@ static _Noreturn void become_app(char **argv)
 	const char *listen_pid = getenv("LISTEN_PID");
 	int err;
 
-	/* A group of its own, so that a kill(0) of the app's does not come back
-	 * to it through us, and the terminal's signals are the app's alone. */
-	setpgid(0, 0);
+	if (self.is_unit) {
+		/* What stands in the launcher's group stays there, and who kills the one
+		 * that the launcher knows, us, means the program. */
+		unit_mark_environment();
+		if (getpid() != self.pid) {
+			prctl(PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0);
+			if (getppid() != self.pid)
+				raise(SIGKILL);
+		}
+	} else {
+		/* A group of its own, so that a kill(0) of the app's does not come back
+		 * to it through us, and the terminal's signals are the app's alone. */
+		setpgid(0, 0);
+	}
 	if (self.fd[TTY] >= 0)
 		tcsetpgrp(self.fd[TTY], getpid()); /* SIGTTOU is blocked here */
 	/* Socket activation names the process the sockets are for: it was us. */
@@ -350,6 +366,11 @@ static void end_children(void)
  * way of saying it is used, as every container init does. */
 static _Noreturn void finish(int status)
 {
+	if (self.is_unit) {
+		/* Other children are what the program has left behind on purpose. */
+		unit_end_templates();
+		unit_finish(status);
+	}
 	if (self.pid != 1)
 		end_children();
 	/* A shell that started us takes its terminal back itself, a plain program
@@ -546,6 +567,17 @@ static void reap(void)
 		finish(self.status);
 }
 
+/* A shell that has started a unit as a job waits for us to stop with the program. */
+static void stop_along(void)
+{
+	siginfo_t info = { 0 };
+
+	if (!self.waiting && waitid(P_PID, (id_t)self.app_pid, &info, WSTOPPED | WNOHANG) == 0 &&
+	    info.si_pid == self.app_pid &&
+	    (info.si_status == SIGTSTP || info.si_status == SIGTTIN || info.si_status == SIGTTOU))
+		kill(self.pid, SIGSTOP);
+}
+
 /* The stop key stops the app, and where init leads the session there is no shell
  * that could continue it: the terminal would be dead for good.  As the main process
  * of its container the app would not have been stopped in the first place. */
@@ -553,11 +585,26 @@ static void continue_stopped(void)
 {
 	siginfo_t info = { 0 };
 
+	if (self.is_unit) {
+		stop_along();
+		return;
+	}
 	if (self.fd[TTY] < 0 || getsid(0) != self.pid || self.waiting)
 		return;
 	if (waitid(P_PID, (id_t)self.app_pid, &info, WSTOPPED | WNOHANG) == 0 &&
 	    info.si_pid == self.app_pid && info.si_status == SIGTSTP)
 		kill(-self.app_pid, SIGCONT);
+}
+
+/* The terminal's signals come to the whole group, a unit's program is in it, and has its own. */
+static bool app_has_it(int sig, const struct signalfd_siginfo *info)
+{
+	if (!self.is_unit || info->ssi_code != SI_KERNEL || self.waiting)
+		return false;
+	if (is_stop(sig))
+		note_stop(now_ns());
+	self.sent_ns[sig] = now_ns();
+	return true;
 }
 
 static void take_signals(void)
@@ -570,6 +617,8 @@ static void take_signals(void)
 		/* Our own SIGPIPE is ours.  A SIGSEGV in here was sent by somebody:
 		 * a fault of our own would not be blocked but kill. */
 		if (sig == SIGCHLD || (pid_t)info.ssi_pid == self.pid)
+			continue;
+		if (app_has_it(sig, &info))
 			continue;
 		/* The terminal hung up on the session's leader: the app goes too. */
 		if (sig == SIGHUP && info.ssi_code == SI_KERNEL)
@@ -598,25 +647,33 @@ static void wait_event(void)
 		{ .fd = self.fd[SIGNALS], .events = POLLIN },
 		{ .fd = self.waiting ? self.fd[VERDICT] : -1, .events = POLLIN },
 		{ .fd = self.fd[EXEC], .events = POLLIN },
+		{ .fd = self.is_unit ? unit_fd() : -1, .events = POLLIN },
 	};
-	struct timespec left = { 0 };
+	uint64_t due_ns = UINT64_MAX, at_ns = now_ns();
+	struct timespec left;
 
 	if (self.waiting) {
-		uint64_t at_ns = now_ns();
-
 		if (at_ns >= self.deadline_ns)
 			finish_unrestored("the guard did not answer in time");
-		left.tv_sec = (time_t)((self.deadline_ns - at_ns) / (1000 * NS_PER_MS));
-		left.tv_nsec = (long)((self.deadline_ns - at_ns) % (1000 * NS_PER_MS));
+		due_ns = self.deadline_ns;
 	}
-	ppoll(fds, sizeof(fds) / sizeof(fds[0]), self.waiting ? &left : NULL, NULL);
+	/* Whoever fails to execute the program is not worth being protected. */
+	if (self.is_unit && self.fd[EXEC] < 0 && unit_due_ns() < due_ns)
+		due_ns = unit_due_ns();
+	due_ns = due_ns > at_ns ? due_ns - at_ns : 0;
+	left.tv_sec = (time_t)(due_ns / (1000 * NS_PER_MS));
+	left.tv_nsec = (long)(due_ns % (1000 * NS_PER_MS));
+	ppoll(fds, sizeof(fds) / sizeof(fds[0]), due_ns > UINT64_MAX / 2 ? NULL : &left, NULL);
 	if (fds[2].revents)
 		app_started();
+	if (self.is_unit && self.ctl && self.fd[EXEC] < 0)
+		unit_tend(self.app_name);
 }
 
 static _Noreturn void usage(void)
 {
-	say("usage: " NAME " [--wait-ms N] [--stop-signal N] [--] PROGRAM [ARG...]");
+	say("usage: " NAME " [--name NAME] [--label avckpt.KEY=VALUE ...] [--wait-ms N] "
+	    "[--stop-signal N] [--] PROGRAM [ARG...]");
 	_exit(EXIT_USAGE);
 }
 
@@ -636,6 +693,8 @@ static uint32_t number_of(const char *text, uint32_t max)
 
 static char **take_options(char **argv)
 {
+	bool of_container = false;
+
 	self.wait_ms = AVC_CTL_WAIT_MS_DEFAULT;
 	self.stop_signal = SIGTERM;
 	for (argv++; *argv && **argv == '-'; argv += 2) {
@@ -643,15 +702,23 @@ static char **take_options(char **argv)
 			argv++;
 			break;
 		}
+		of_container |= !strcmp(*argv, "--wait-ms");
 		if (!strcmp(*argv, "--wait-ms"))
 			self.wait_ms = number_of(argv[1], 3600 * 1000);
 		else if (!strcmp(*argv, "--stop-signal"))
 			self.stop_signal = (int)number_of(argv[1], _NSIG - 1);
+		else if ((!strcmp(*argv, "--label") || !strcmp(*argv, "-l")) &&
+			 unit_take_label(argv[1]))
+			continue;
+		else if (!strcmp(*argv, "--name") && unit_take_name(argv[1]))
+			continue;
 		else
 			usage();
 	}
 	if (!*argv)
 		usage();
+	/* The hook, too, starts us where an image may have set any environment. */
+	self.is_unit = !of_container && unit_is_wanted();
 	return argv;
 }
 
@@ -665,6 +732,14 @@ int main(int argc, char **argv)
 	argv = take_options(argv);
 	self.app_name = argv[0];
 	self.status = W_EXITCODE(EXIT_USAGE, 0);
+	if (self.is_unit && !unit_begin(argv[0])) {
+		int err;
+
+		execvp(argv[0], argv);
+		err = errno;
+		say("%s: %s", argv[0], strerror(err));
+		_exit(err == ENOENT ? 127 : 126);
+	}
 
 	mask_set(all, &self.mask);
 	/* Inherited as ignored it would reap our children for us. */
@@ -677,7 +752,8 @@ int main(int argc, char **argv)
 	}
 	/* Orphans come to us also where we are not PID 1. */
 	prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
-	find_terminal();
+	if (!self.is_unit)
+		find_terminal();
 	protect();
 	start_app(argv);
 	for (;;) {

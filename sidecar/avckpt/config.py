@@ -32,7 +32,7 @@ from avckpt.yamlfile import Place, Unreadable
 PATH = Path("/etc/avckpt/config.yaml")
 ENABLE = f"{PREFIX}enable"
 GROUP = f"{PREFIX}group"
-AT_START = (ENABLE, f"{PREFIX}io_uring")
+AT_START = (ENABLE, f"{PREFIX}io_uring", f"{PREFIX}scope")
 """What is decided when a container starts, by its own labels."""
 NOTIFY = f"{PREFIX}notify"
 
@@ -219,6 +219,8 @@ def _unknown(key: str) -> str:
         return "cannot be a default: a container is protected when its own label says avckpt.enable=true"
     if key == "io_uring":
         return "cannot be a default: it is taken away when a container starts, by its own label"
+    if key == "scope":
+        return "cannot be a default: it decides how a container is started, so its own label says it"
     if key.startswith(PREFIX):
         return f"here the keys have no prefix; write {key[len(PREFIX) :]}"
     known = sorted(label[len(PREFIX) :] for label in LABELS if label not in AT_START)

@@ -10,6 +10,7 @@ processes of their own, not here.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import fcntl
 import itertools
@@ -18,6 +19,7 @@ import math
 import os
 import resource
 import signal
+import socket
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -30,11 +32,11 @@ from avckpt_hooks.shared.protocol import Deregister, Register
 from avckpt import __version__
 from avckpt.api.server import ApiServer
 from avckpt.config import Configuration
-from avckpt.containers import cgroup
+from avckpt.containers import cgroup, units
 from avckpt.containers.listener import HookListener
 from avckpt.containers.looks import in_own_thread
 from avckpt.containers.process import has_ended, is_foreign, pid_of
-from avckpt.containers.protected import Protected
+from avckpt.containers.protected import Protected, State
 from avckpt.containers.records import NOT_SEEN, Records, keep_private
 from avckpt.containers.registry import Registry
 from avckpt.engine import Engine, Guard, probe
@@ -92,6 +94,10 @@ class Watch:
     guard: Guard | None = None
     guard_lost_s: float = -math.inf
     """When a guard was lost last, time.monotonic()."""
+    connection: socket.socket | None = None
+    """Of a unit: when it closes, avckpt-init looks for another sidecar."""
+    units: units.Allowance = field(default_factory=units.Allowance)
+    """Of a launcher's container."""
 
     @property
     def notify(self) -> Notify | None:
@@ -124,6 +130,7 @@ class Daemon:
         self._tickets = itertools.count(1)
         self._answers: dict[int, tuple[int, asyncio.Future[tuple[Event, EventRecord]]]] = {}
         self._endings: set[asyncio.Task[None]] = set()
+        self._host_units = units.Allowance()
 
     async def run(self) -> None:
         """Serves until SIGTERM or SIGINT, then lets every container run on unprotected.
@@ -145,11 +152,13 @@ class Daemon:
         # Listen first, adopt second: a container that starts in between then
         # comes twice, not never.
         hooks = HookListener(self.run_dir / "hooks.sock", self._hook)
-        looking = None
+        nodes = looking = None
         try:
             self.caretaker.start()
             await api.start()
             self._adopt()
+            # After the containers that they are in.
+            nodes = units.UnitListener(self.run_dir / "units" / "units.sock", self._register_unit)
             looking = loop.create_task(self._keep_catching_up())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
             await stop.wait()
@@ -158,6 +167,8 @@ class Daemon:
             if looking is not None:
                 looking.cancel()
             hooks.close()
+            if nodes is not None:
+                nodes.close()
             self.feed.close()
             await api.close()
             await self.notifier.close()
@@ -219,7 +230,7 @@ class Daemon:
         try:
             after = self._settings_of(watch.labels, container.name)
             changed = tuple(changes(watch.settings, after))
-            if not after.policy.enable:  # it only listens
+            if not after.policy.guarded:  # it only listens
                 changed = tuple(change for change in changed if change.setting in ("group", "notify"))
             if not changed:
                 return None
@@ -277,7 +288,7 @@ class Daemon:
         """Protects whoever could not be when it came: for want of descriptors, threads, memory or an answer."""
         self._adopt()
         for watch in list(self._watches.values()):
-            if watch.guard is None and watch.settings.policy.enable and not has_ended(watch.pidfd):
+            if watch.guard is None and watch.settings.policy.guarded and not has_ended(watch.pidfd):
                 self._start_guard(watch)
 
     async def _keep_catching_up(self) -> None:
@@ -300,7 +311,51 @@ class Daemon:
         known = self.registry.by_id(container_id)
         return None if known is None or has_ended(self._watches[known.cookie].pidfd) else known
 
-    def _watch(self, request: Register, pidfd: int, *, adopted: bool) -> None:
+    def _register_unit(self, claim: units.Claim, peer: units.Peer) -> None:
+        """A node below a launcher, or a unit of the host.  Raises AvckptError or OSError to refuse it."""
+        launcher = self._launcher_of(peer.pid)
+        if launcher is None:
+            if peer.uid != 0 or not units.is_of_host(peer.pid):
+                raise Denied("its container was not started with avckpt.scope=nodes, and of the host only root may")
+            owner = prefix = units.HOST
+            labels, allowance = units.labels_of_host_unit(claim.labels), self._host_units
+        else:
+            owner, prefix = launcher.container.id, launcher.container.label
+            labels, allowance = units.labels_of_node(claim.labels, launcher.labels), launcher.units
+        inits = {each.container.init_pid: each for each in self._watches.values() if each.guard is not None}
+        for pid in units.ancestors(peer.pid):
+            if pid in inits:
+                raise Denied(f"it is part of {inits[pid].container.label}, which is protected as a whole")
+        unit = units.unit_id(owner, peer.pid)
+        if has_ended(peer.pidfd):
+            raise TargetGone("it has ended already")  # then what was read may be of another process
+        allowance.take()
+        if self._live_run(unit) is None:
+            siblings = [each.name for each in self.registry.live() if each.node_of == owner]
+            if len(siblings) >= units.UNITS_MOST:
+                raise Busy(f"{prefix} has {units.UNITS_MOST} units already")
+            name = units.unique_name(f"{prefix}/{claim.name}", siblings)
+            request = Register(id=unit, name=name, pid=peer.pid, starttime=0, bundle="", annotations=labels)
+            self._watch(request, os.dup(peer.pidfd), adopted=False, node_of=owner)
+        known = self._live_run(unit)
+        if known is None:
+            raise TargetGone("it has just ended")
+        watch = self._watches[known.cookie]
+        if watch.connection is not None:
+            watch.connection.close()
+        watch.connection = peer.connection
+        os.close(peer.pidfd)
+
+    def _launcher_of(self, pid: int) -> Watch | None:
+        """The container of which a process may be a node.  Raises OSError when it is gone."""
+        for watch in self._watches.values():
+            if watch.container.state is State.NODES and not has_ended(watch.pidfd):
+                with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+                    if units.is_in(pid, watch.container.id, watch.container.init_pid):
+                        return watch
+        return None
+
+    def _watch(self, request: Register, pidfd: int, *, adopted: bool, node_of: str = "") -> None:
         """Starts protecting a container.  `pidfd` is ours from here on, whatever happens."""
         with closed_on_error(pidfd):
             if has_ended(pidfd):
@@ -323,6 +378,7 @@ class Daemon:
                 config=settings.config,
                 registered_at=time.time(),
                 adopted=adopted,
+                node_of=node_of,
             )
             container.group = settings.policy.group
         watch = Watch(container, pidfd, request.annotations, settings)
@@ -334,9 +390,11 @@ class Daemon:
         if problem is not None:
             detail = f"{self.configuration.path} does not hold for it"
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail=detail, error=problem))
-        if settings.policy.enable:
+        if settings.policy.guarded:
             self.metrics.begin(container.label)
             self._start_guard(watch)
+        elif settings.policy.enable:
+            container.launch()
         else:
             container.listen()
 
@@ -452,6 +510,8 @@ class Daemon:
             self._take_events()  # it may just have said how the container ended
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)
+        if watch.connection is not None:
+            watch.connection.close()
         del self._watches[container.cookie]
         self.registry.remove(container)
         if ended:

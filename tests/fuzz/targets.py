@@ -15,6 +15,7 @@ import io
 import json
 import logging
 import os
+import re
 import socket
 import sys
 import tempfile
@@ -29,6 +30,7 @@ from avckpt import config, yamlfile
 from avckpt._native import ffi
 from avckpt.api.server import ApiServer
 from avckpt.cli.compose import manifest
+from avckpt.containers import units
 from avckpt.containers.protected import Protected
 from avckpt.containers.records import Records
 from avckpt.daemon import Daemon, Watch
@@ -111,6 +113,22 @@ def hook_state(data: bytes) -> None:
         assert path.is_dir() or protocol.is_container_id(path.stem), path
         if path.is_file():
             path.unlink()
+
+
+def unit_claim(data: bytes) -> None:
+    """What an avckpt-init in front of a node says of itself, and what comes of its labels."""
+    try:
+        claim = units.decode_claim(data)
+    except protocol.ProtocolError:
+        return
+    assert re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,62}", claim.name), claim.name
+    assert all(key.startswith("avckpt.") for key in claim.labels)
+    with contextlib.suppress(LabelsWrong):
+        merged = units.labels_of_node(claim.labels, {"avckpt.enable": "true", "avckpt.scope": "nodes"})
+        policy = settings_of(merged).policy
+        assert policy.guarded
+        assert not policy.group
+        assert policy.interval_s >= units.LEAST_INTERVAL_S
 
 
 def hook_packet(data: bytes) -> None:
@@ -303,6 +321,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         hook_config,
         hook_state,
         hook_packet,
+        unit_claim,
         label,
         record,
         history,

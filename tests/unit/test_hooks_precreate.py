@@ -131,6 +131,25 @@ def test_init_is_put_in_front_and_nothing_else_touched(hook: Hook, name: str) ->
     assert json.loads(spec)["name"] == "web"
 
 
+def test_a_launcher_is_left_as_it_is_and_lent_an_init(hook: Hook) -> None:
+    config, spec = sample("labelled")
+    before = json.loads(config)
+    before["process"]["env"].append("AVCKPT_INIT=/evil")
+    result = hook(json.dumps(before).encode(), with_labels(spec, enable="true", scope="nodes"))
+    assert (result.status, result.config["hooks"].keys()) == (0, {"prestart", "poststop"})
+    after = result.config
+    init, units = after["mounts"][-2:]
+    assert after["mounts"][:-2] == before["mounts"]
+    assert (init["destination"], units["destination"]) == ("/run/avckpt-init", "/run/avckpt-units")
+    assert os.access(init["source"], os.X_OK)
+    assert Path(units["source"]).is_dir()
+    assert all({"bind", "ro", "nosuid", "nodev"} <= set(mount["options"]) for mount in (init, units))
+    assert after["process"].pop("env") == [*before["process"].pop("env")[:-1], "AVCKPT_INIT=/run/avckpt-init"]
+    assert after["process"] == before["process"]
+    # The hook stands in two directories.
+    assert hook(result.out, with_labels(spec, enable="true", scope="nodes")).out == result.out
+
+
 def test_the_other_two_hooks_are_added_behind_those_that_are_there(hook: Hook) -> None:
     config, spec = sample("labelled")
     data = json.loads(config)

@@ -91,12 +91,19 @@ class Policy:
     """Whether the kernel has it for the container; an application that uses it cannot be protected."""
     tcp: str = "reset-moved"
     """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
+    scope: str = "container"
+    """What is protected: the container as a whole, or the nodes that its launcher starts by avckpt-init."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
     notify: Notify | None = None
     """Of the recoveries of others in the group."""
     notify_self: Notify | None = None
     """Of its own."""
+
+    @property
+    def guarded(self) -> bool:
+        """It has a guard: it is to be protected, and by itself."""
+        return self.enable and self.scope == "container"
 
     @property
     def listens(self) -> bool:
@@ -127,6 +134,13 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
         # A hang is noticed late: by then the newest generation hangs, too.
         raise LabelError(
             "avckpt.keep", mapping["avckpt.keep"], "too few for avckpt.restore.on=unhealthy", "allowed there: 2 to 16"
+        )
+    if policy.scope == "nodes" and policy.restore_on.unhealthy:
+        raise LabelError(
+            "avckpt.restore.on",
+            mapping.get("avckpt.restore.on"),
+            "a health check is of a whole container",
+            "leave unhealthy out, or avckpt.scope=nodes",
         )
     if policy.enable and policy.notify is not None and not policy.group:
         raise LabelError(
@@ -343,6 +357,7 @@ LABELS: dict[str, Label] = {
     "avckpt.io_uring": Label("on", "on or off", _parse_io_uring),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
+    "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),
     "avckpt.notify": Label("", _NOTIFY, _parse_notify),
     "avckpt.notify.self": Label("", _NOTIFY, _parse_notify_self),

@@ -58,6 +58,20 @@ def hooks_socket() -> str:
     return os.path.join(run_dir(), "hooks.sock")
 
 
+UNITS_IN_CONTAINER = "/run/avckpt-units"
+"""Where a container with avckpt.scope=nodes has `units_dir()`."""
+
+
+def units_dir() -> str:
+    """The directory of the socket for units: containers see it, and nothing else of ours."""
+    return os.path.join(run_dir(), "units")
+
+
+def units_socket() -> str:
+    """Where the sidecar listens for avckpt-init in front of a node (native/init/unit.c)."""
+    return os.path.join(units_dir(), "units.sock")
+
+
 def records_dir() -> str:
     """The directory with one record per live protected container."""
     return os.path.join(run_dir(), "containers")

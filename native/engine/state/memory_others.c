@@ -4,7 +4,8 @@
  * back with the application.
  *
  * Others are the processes outside of its PID namespace: those inside are the application, and
- * whoever was sent in to look after it.  Who has mapped it or has it open for writing is looked
+ * whoever was sent in to look after it.  Of a unit below a launcher, whose init is not the first
+ * in there, they are all that are not below its init.  Who has mapped it or has it open for writing is looked
  * for now and then.  Who opens it by its name, writes and closes it within that time is told by
  * inotify(7), which tells of write(2) and not of what is written through a mapping; but not who
  * it was, so that what the application itself writes in this way is not taken back either.
@@ -28,6 +29,7 @@
 #define DEVICES_MAX 16    /* file systems that the application has such memory of */
 #define OBJECTS_MAX 65536 /* of others, on these                                  */
 #define WATCHES_MAX 1024
+#define ANCESTORS_MAX 256
 #define READS_MAX 64 /* then so much was written that it is enough to know that */
 
 struct object {
@@ -159,8 +161,22 @@ int area_find_descriptor(pid_t pid, const struct area *a)
 	return found;
 }
 
+/* Whether a process in the application's PID namespace is the application's. */
+static bool is_below(pid_t pid, pid_t init)
+{
+	struct proc_stat stat;
+
+	for (int i = 0; pid != init && i < ANCESTORS_MAX; i++) {
+		if (pid <= 1 || proc_stat(pid, &stat))
+			return false;
+		pid = stat.parent;
+	}
+	return pid == init;
+}
+
 static void look(struct mem_others *others, const struct process *process)
 {
+	const bool whole = proc_inside(process->init) == 1;
 	char inside[64] = "", its[64];
 	DIR *proc = opendir("/proc");
 	struct dirent *entry;
@@ -172,7 +188,7 @@ static void look(struct mem_others *others, const struct process *process)
 		const pid_t pid = (pid_t)atoi(entry->d_name);
 
 		if (pid <= 0 || pid == getpid() || proc_link(pid, "ns/pid", its, sizeof its) < 0 ||
-		    !strcmp(its, inside))
+		    (!strcmp(its, inside) && (whole || is_below(pid, process->init))))
 			continue;
 		heartbeat();
 		(void)proc_mappings(pid, "maps", add_mapped, others);

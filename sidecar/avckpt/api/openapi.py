@@ -93,6 +93,7 @@ def _container() -> Json:
             "id": _text("64 hex digits"),
             "name": _text("as Podman has it"),
             "group": _text("avckpt.group, empty: none"),
+            "node_of": _text("id of the container in which it is a node; host; empty: it is a container"),
             "state": {"type": "string", "enum": [state.value for state in State]},
             "reason": _text("why it is not (quite) protected, or how it ended; empty when all is well"),
             "init_pid": _integer("avckpt-init, in the sidecar's PID namespace"),

@@ -242,6 +242,9 @@ def run(labels: tuple[str, ...], verbose: bool, argv: tuple[str, ...]) -> None:
 
     PROGRAM runs in a PID namespace of its own; its input, output and exit
     status are untouched, avckpt's own messages go to stderr.
+
+    With --label avckpt.scope=nodes PROGRAM is a launcher, which is left alone:
+    what it starts as $AVCKPT_INIT -- NODE [ARGS...] is protected.
     """
     from avckpt.errors import LabelsWrong
 
@@ -331,7 +334,7 @@ def _row(c: Json) -> tuple[str, ...]:
     return (
         _called(c),
         c["state"],
-        "-" if c["state"] == "listening" else f"{c['generations']}/{c['keep']}",
+        "-" if c["state"] in ("listening", "nodes") else f"{c['generations']}/{c['keep']}",
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
         "-" if age_s is None else _ago(age_s),
         _ms(c["last_freeze_s"]),

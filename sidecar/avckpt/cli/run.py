@@ -21,11 +21,12 @@ import os
 import selectors
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
 from avckpt.artifacts import init_binary
 from avckpt.cli.namespace import spawn_pid1
@@ -61,6 +62,9 @@ NOT_FORWARDED = frozenset(
 )
 
 
+S = TypeVar("S", bound="Supervisor")
+
+
 def settings_of_run(labels: Mapping[str, str]) -> Settings:
     """What `--label` says; `avckpt.enable` is implied.  Raises LabelsWrong."""
     for key in labels:
@@ -81,20 +85,35 @@ def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
 
     Raises AvckptError when it cannot be started.
     """
+    io_uring = settings.policy.io_uring
+    if settings.policy.scope == "nodes":
+        from avckpt.cli.run_nodes import NodesSupervisor, socket_for_nodes
+
+        with socket_for_nodes(init_binary()) as listening:
+            return _run(
+                argv, NodesSupervisor, lambda _, nodes: nodes.watch_nodes(listening, settings.said), verbose, io_uring
+            )
+
+    def watch(pid: int, supervisor: Supervisor) -> None:
+        supervisor.watch(replace(settings.config, memory_limit_bytes=memory_limit_bytes(pid)))
+
+    return _run(argv, Supervisor, watch, verbose, io_uring)
+
+
+def _run(argv: list[str], kind: type[S], watch: Callable[[int, S], None], verbose: bool, io_uring: bool) -> int:
+    """Raises AvckptError when it cannot be started."""
     probe()
     init = init_binary()
     with _signals() as signals_fd, _terminal() as terminal:
         command = [init.name, "--wait-ms", "2000", "--stop-signal", "15", "--", *argv]
-        pid = spawn_pid1(str(init), command, tty=terminal, io_uring=settings.policy.io_uring)
+        pid = spawn_pid1(str(init), command, tty=terminal, io_uring=io_uring)
         if terminal is not None:
             # We are in the background now, and say things all the same.
             signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         pidfd = os.pidfd_open(pid)
         try:
-            job = _Job(terminal, pid) if terminal is not None else None
-            _Supervisor(argv[0], pidfd, signals_fd, verbose, job).watch(
-                replace(settings.config, memory_limit_bytes=_memory_limit_bytes(pid))
-            )
+            job = Job(terminal, pid) if terminal is not None else None
+            watch(pid, kind(argv[0], pidfd, signals_fd, verbose, job))
             _, status = os.waitpid(pid, 0)
         finally:
             os.close(pidfd)
@@ -103,17 +122,18 @@ def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
     return os.WEXITSTATUS(status) if os.WIFEXITED(status) else 128 + os.WTERMSIG(status)
 
 
-def _memory_limit_bytes(pid: int) -> int:
+def memory_limit_bytes(pid: int) -> int:
+    """Of its control groups, with swap; 0: none."""
     try:
         return groups_of(pid).memory_and_swap_bytes() or 0
     except OSError:  # it has just ended
         return 0
 
 
-class _Supervisor:
+class Supervisor:
     """Forwards signals and tells events until init has ended."""
 
-    def __init__(self, name: str, init_pidfd: int, signals_fd: int, verbose: bool, job: _Job | None) -> None:
+    def __init__(self, name: str, init_pidfd: int, signals_fd: int, verbose: bool, job: Job | None) -> None:
         self._name = name
         self._job = job
         self._pidfd = init_pidfd
@@ -139,7 +159,7 @@ class _Supervisor:
             selector.register(self._signals_fd, selectors.EVENT_READ)
             ended = False
             while not ended:
-                for key, _ in selector.select(None if self._job is None else _Job.LOOK_EVERY_S):
+                for key, _ in selector.select(None if self._job is None else Job.LOOK_EVERY_S):
                     if key.fd == self._pidfd:
                         ended = True
                     elif key.fd == self._signals_fd:
@@ -153,10 +173,7 @@ class _Supervisor:
 
     def _take_events(self, engine: Engine) -> None:
         while (event := engine.next_event()) is not None:
-            if not self._ready:
-                self._ready = True
-                for signum in self._waiting:
-                    self._forward(signum)
+            self._become_ready()
             line = self._journal.line(of_guard(event))
             if line is None:
                 continue
@@ -164,6 +181,11 @@ class _Supervisor:
             quiet = level < logging.WARNING or event.kind is Kind.MISSED
             if self._verbose or not quiet:
                 say(f"{self._name}: {text}")
+
+    def _become_ready(self) -> None:
+        waiting, self._waiting, self._ready = self._waiting, [], True
+        for signum in waiting:
+            self._forward(signum)
 
     def _take_signals(self) -> None:
         try:
@@ -187,7 +209,7 @@ class _Supervisor:
             say(f"{self._name}: {signal_name(signum)} passed on")
 
 
-class _Job:
+class Job:
     """The program in the foreground of our terminal, as part of the job that the shell knows us as.
 
     Only its parent, init, hears when it stops, and cannot be stopped itself; so it is looked at.

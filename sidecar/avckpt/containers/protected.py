@@ -19,6 +19,8 @@ class State(enum.Enum):
     """At least one generation is held."""
     UNPROTECTED = "unprotected"
     """It runs as if avckpt were not there; `reason` says why."""
+    NODES = "nodes"
+    """A launcher, which is left alone: what it starts by avckpt-init is protected."""
     LISTENING = "listening"
     """Not to be protected: it only wants to hear of others in its group."""
     RESTORING = "restoring"
@@ -43,6 +45,8 @@ class Protected:
     registered_at: float
     group: str = ""
     """`avckpt.group`; empty: none."""
+    node_of: str = ""
+    """Id of the container in which it is a node, "host", or empty: it is a container."""
     adopted: bool = False
     """It ran already when the sidecar started."""
     state: State = State.STARTING
@@ -134,7 +138,7 @@ class Protected:
     def end(self, at: float) -> None:
         """Its init is gone."""
         if self.state is not State.ENDED:
-            self._to(State.ENDED, "the container was stopped or killed")
+            self._to(State.ENDED, f"{'it' if self.node_of else 'the container'} was stopped or killed")
         self.generations = 0
         self.memory_bytes = 0
         self.ended_at = at
@@ -143,6 +147,11 @@ class Protected:
         """It is told of others, and has no guard: its main process is its application."""
         self.app_pid = self.init_pid
         self._to(State.LISTENING, "only hears of others in its group: avckpt.enable is not true")
+
+    def launch(self) -> None:
+        """It has no guard: its main process is a launcher, and its nodes have theirs."""
+        self.app_pid = self.init_pid
+        self._to(State.NODES, "what it starts by $AVCKPT_INIT is protected, each by itself")
 
     def fail(self, reason: str) -> None:
         """There is no guard for it, and why."""
@@ -154,6 +163,7 @@ class Protected:
             "id": self.id,
             "name": self.name,
             "group": self.group,
+            "node_of": self.node_of,
             "state": self.state.value,
             "reason": self.reason,
             "init_pid": self.init_pid,

@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units of protection that no hook registers: an avckpt-init below a launcher, or of the host.
+
+Each connects to the sidecar's socket for units and says who it is (native/init/unit.c).  All
+of it may be a container's, which may lie: what is believed is what the kernel says of the
+process at the other end.  It can register itself and nobody else, in the container that it is
+in, if that was started with avckpt.scope=nodes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+import os
+import re
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, parse_policy
+from avckpt_hooks.shared.protocol import ProtocolError
+
+from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
+from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
+
+log = logging.getLogger("avckpt")
+
+UNIT_BYTES = 16384
+"""Longest packet; PACKET_MAX of native/init/unit.c."""
+GREETING = b"avckpt-unit 1"
+FIELDS_MOST = 64
+MAX_WAITING = 64
+"""Connections that have not said who they are yet, ..."""
+MAX_WAITING_EACH = 16
+"""... and of these, of one PID namespace."""
+WAIT_S = 1.0
+UNITS_MOST = 128
+"""Of one container, or of the host."""
+REGISTRATIONS_PER_S = 4.0
+"""What a container may go on with when it has registered UNITS_MOST at once: each starts a guard."""
+ANCESTORS_MOST = 64
+HOST = "host"
+"""What stands in front of a unit's name when it is in no container."""
+LEAST_INTERVAL_S = 0.1
+"""A node may ask for that, or for what its container has been given."""
+NOT_INHERITED = frozenset(
+    {"avckpt.enable", "avckpt.scope", "avckpt.name", "avckpt.version", "avckpt.notify", "avckpt.io_uring"}
+)
+NOT_A_NODES = ("avckpt.scope", "avckpt.group", "avckpt.io_uring", "avckpt.version")
+"""Labels that say something of others than the node itself."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What a unit says of itself."""
+
+    name: str
+    labels: Mapping[str, str]
+
+
+def decode_claim(packet: bytes) -> Claim:
+    """Raises ProtocolError with a clause for a person."""
+    fields = packet.split(b"\0")
+    if fields.pop() or not fields or fields[0] != GREETING:
+        raise ProtocolError("it does not speak our protocol: avckpt-init and sidecar must be of the same release")
+    if len(fields) > FIELDS_MOST:
+        raise ProtocolError(f"it says more than {FIELDS_MOST} things")
+    names: dict[str, str] = {}
+    labels: dict[str, str] = {}
+    for each in fields[1:]:
+        try:
+            key, _, value = each.decode().partition("=")
+        except UnicodeDecodeError as error:
+            raise ProtocolError("what it says is not UTF-8") from error
+        if key == "label":
+            label, _, value = value.partition("=")
+            if not label.startswith("avckpt."):
+                raise ProtocolError(f"label {label[:60]!r}: ours begin with avckpt.")
+            labels[label] = value
+        elif key in ("name", "program"):
+            names[key] = value
+        else:
+            raise ProtocolError(f"unknown field {key[:60]!r}")
+    name = names.get("name") or labels.pop("avckpt.name", "") or names.get("program", "")
+    labels.pop("avckpt.name", None)
+    # It becomes a file name nowhere, but part of lines and of arguments everywhere.
+    return Claim(re.sub(r"[^A-Za-z0-9_.-]", "_", name).strip(".-")[:63] or "node", labels)
+
+
+def labels_of_node(claimed: Mapping[str, str], container: Mapping[str, str]) -> dict[str, str]:
+    """What holds for a node: its own labels over its container's.
+
+    Raises LabelsWrong when they are wrong, or more than whoever started the container has allowed.
+    """
+    for key in NOT_A_NODES:
+        if key in claimed:
+            raise LabelsWrong(f"label {key}: it is for whoever starts the container to give, not for a node")
+    inherited = {key: value for key, value in container.items() if key in LABELS and key not in NOT_INHERITED}
+    merged = {"avckpt.enable": "true", **inherited, **claimed}
+    try:
+        policy, allowed = parse_policy(merged), parse_policy(inherited)
+        plain = parse_policy({})
+    except LabelError as error:
+        raise LabelsWrong(str(error)) from error
+    if policy.restore_on.unhealthy:
+        raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
+    if policy.interval_s < min(allowed.interval_s, LEAST_INTERVAL_S):
+        raise LabelsWrong("label avckpt.interval: less than 100ms takes a container that was given it, too")
+    if policy.shm_bytes > max(allowed.shm_bytes, plain.shm_bytes) or policy.shm_bytes > SHM_MAX_BYTES:
+        raise LabelsWrong("label avckpt.shm: more than the container was given")
+    if not policy.enable:
+        raise LabelsWrong("label avckpt.enable is not true")
+    return merged
+
+
+def labels_of_host_unit(claimed: Mapping[str, str]) -> dict[str, str]:
+    """The same for a unit of the host, whose labels are root's.  Raises LabelsWrong."""
+    merged = {"avckpt.enable": "true", **claimed}
+    try:
+        policy = parse_policy(merged)
+    except LabelError as error:
+        raise LabelsWrong(str(error)) from error
+    if policy.restore_on.unhealthy:
+        raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
+    if policy.scope != "container":
+        raise LabelsWrong("label avckpt.scope=nodes: here each program is a unit already, leave it out")
+    if not policy.enable:
+        raise LabelsWrong("label avckpt.enable is not true")
+    return merged
+
+
+def unique_name(name: str, taken: Iterable[str]) -> str:
+    """The name, or with -2, -3, ... behind it."""
+    names = set(taken)
+    if name not in names:
+        return name
+    return next(f"{name}-{i}" for i in range(2, len(names) + 3) if f"{name}-{i}" not in names)
+
+
+# Who it is, as the kernel says
+
+
+def check_sender(pidfd: int, pid: int) -> None:
+    """Whether a pidfd is of the process that has connected.  Raises AvckptError."""
+    if has_ended(pidfd):
+        raise TargetGone("it has ended already")
+    if is_foreign(pidfd):
+        raise Denied("the sidecar does not see the host's processes: start it with --pid=host")
+    if pid_of(pidfd) != pid:
+        raise Denied("it can register itself only")
+
+
+def pid_namespace(pid: int) -> int:
+    """Which it is in.  Raises OSError when it is gone."""
+    return os.stat(f"/proc/{pid}/ns/pid").st_ino
+
+
+def is_in(pid: int, container_id: str, container_pid: int) -> bool:
+    """Whether a process is in a container: its PID namespace, and its control groups or some below.
+
+    Raises OSError when one of them is gone.
+    """
+    if pid_namespace(pid) != pid_namespace(container_pid):
+        return False
+    its, theirs = _groups(pid), _groups(container_pid)
+    # The main process may have moved itself away (an init.scope).
+    if any(container_id in path for path in its.values()):
+        return True
+    return all(_is_below(path, theirs[names]) for names, path in its.items() if names in theirs)
+
+
+def is_of_host(pid: int) -> bool:
+    """Whether it is in our own PID and user namespace.  Raises OSError when it is gone."""
+    return all(
+        os.stat(f"/proc/{pid}/ns/{kind}").st_ino == os.stat(f"/proc/self/ns/{kind}").st_ino for kind in ("pid", "user")
+    )
+
+
+def runs_same_program(pid: int, other: int) -> bool:
+    """Whether two processes execute one and the same file.  Raises OSError."""
+    one, two = os.stat(f"/proc/{pid}/exe"), os.stat(f"/proc/{other}/exe")
+    return (one.st_dev, one.st_ino) == (two.st_dev, two.st_ino)
+
+
+def ancestors(pid: int) -> Iterator[int]:
+    """Its parent, that one's parent, ...  Ends when one is gone."""
+    for _ in range(ANCESTORS_MOST):
+        try:
+            pid = int(status(pid)["PPid"])
+        except (OSError, KeyError, ValueError):
+            return
+        if pid <= 1:
+            return
+        yield pid
+
+
+def unit_id(owner: str, pid: int) -> str:
+    """64 hex digits, the same for the same process.  Raises TargetGone."""
+    return hashlib.sha256(f"{owner} {pid} {start_time(pid)}".encode()).hexdigest()
+
+
+def _groups(pid: int) -> dict[str, str]:
+    lines = os.fsdecode(Path(f"/proc/{pid}/cgroup").read_bytes()).split("\n")[:-1]
+    return {names: path for _, names, path in (line.split(":", 2) for line in lines)}
+
+
+def _is_below(path: str, top: str) -> bool:
+    return path == top or path.startswith(top.rstrip("/") + "/")
+
+
+@dataclass
+class Allowance:
+    """How many registrations one container has left.  Times are CLOCK_MONOTONIC seconds."""
+
+    left: float = UNITS_MOST
+    at_s: float = field(default_factory=time.monotonic)
+
+    def take(self) -> None:
+        """Raises Busy when there are none."""
+        now = time.monotonic()
+        self.left = min(self.left + (now - self.at_s) * REGISTRATIONS_PER_S, UNITS_MOST)
+        self.at_s = now
+        if self.left < 1:
+            raise Busy("too many units were started in too short a time")
+        self.left -= 1
+
+
+# The socket
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Who is at the other end of a connection; the connection is its registration."""
+
+    connection: socket.socket
+    pidfd: int
+    pid: int
+    """In our own PID namespace."""
+    uid: int
+
+
+Handler = Callable[[Claim, Peer], None]
+"""Registers a unit; connection and pidfd are its own from then on.  Raises AvckptError or OSError to refuse."""
+
+
+class UnitListener:
+    """Accepts units.  Runs in the event loop that is running."""
+
+    def __init__(self, path: Path, handler: Handler) -> None:
+        self._path = path
+        self._handler = handler
+        self._loop = asyncio.get_running_loop()
+        self._waiting: dict[socket.socket, tuple[asyncio.TimerHandle, int]] = {}
+        """And of which PID namespace."""
+        self._socket = listen(path)
+        self._loop.add_reader(self._socket, self._accept)
+
+    def close(self) -> None:
+        """Ends every connection that is not a unit's yet, and removes the socket."""
+        self._loop.remove_reader(self._socket)
+        self._socket.close()
+        for connection in list(self._waiting):
+            self._forget(connection)
+            connection.close()
+        self._path.unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._socket.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            return
+        except OSError as error:
+            log.error("a unit cannot be accepted: %s", error.strerror)
+            self._loop.remove_reader(self._socket)
+            self._loop.call_later(WAIT_S, self._accept_again)
+            return
+        connection.setblocking(False)
+        try:
+            space = pid_namespace(credentials(connection)[0])
+        except OSError:
+            connection.close()
+            return
+        each = sum(1 for _, other in self._waiting.values() if other == space)
+        if len(self._waiting) >= MAX_WAITING or each >= MAX_WAITING_EACH:
+            connection.close()  # it tries again
+            return
+        timer = self._loop.call_later(WAIT_S, self._drop, connection)
+        self._waiting[connection] = timer, space
+        self._loop.add_reader(connection, self._serve, connection)
+
+    def _accept_again(self) -> None:
+        if self._socket.fileno() >= 0:
+            self._loop.add_reader(self._socket, self._accept)
+
+    def _serve(self, connection: socket.socket) -> None:
+        try:
+            answer = serve(connection, self._handler)
+        except BlockingIOError:
+            return  # not readable after all
+        self._forget(connection)
+        if answer is not None:
+            log.warning("refused a unit: %s", answer.partition(" ")[2])
+
+    def _drop(self, connection: socket.socket) -> None:
+        self._forget(connection)
+        connection.close()
+
+    def _forget(self, connection: socket.socket) -> None:
+        waiting = self._waiting.pop(connection, None)
+        if waiting is not None:
+            waiting[0].cancel()
+            self._loop.remove_reader(connection)
+
+
+def listen(path: Path) -> socket.socket:
+    """A listening socket that everybody may connect to who can see it; replaces what a killed sidecar left behind."""
+    path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+    try:
+        listening.bind(str(path))
+        path.chmod(0o666)
+        listening.listen(MAX_WAITING)
+    except OSError:
+        listening.close()
+        raise
+    return listening
+
+
+def credentials(connection: socket.socket) -> tuple[int, int]:
+    """PID and UID of the process that has connected.  Raises OSError."""
+    pid, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    return pid, uid
+
+
+def serve(connection: socket.socket, handler: Handler) -> str | None:
+    """Takes what a unit says, and answers.  The refusal, or None: then the connection is the handler's.
+
+    Raises BlockingIOError when it has said nothing yet.
+    """
+    name = "a unit"
+    fds: list[int] = []
+    try:
+        claim, fds = _receive(connection)
+        name = claim.name
+        pid, uid = credentials(connection)
+        name = f"{claim.name} (pid {pid})"
+        if len(fds) != 1:
+            raise ProtocolError(f"one descriptor wanted, {len(fds)} came")
+        check_sender(fds[0], pid)
+        handler(claim, Peer(connection, fds[0], pid, uid))
+    except BlockingIOError:
+        raise
+    except (ProtocolError, AvckptError, OSError) as error:
+        for fd in fds:
+            os.close(fd)
+        word = "later" if isinstance(error, (Busy, OSError)) else "no"
+        why = str(error) if isinstance(error, (ProtocolError, AvckptError)) else str(of_any(error))
+        _say(connection, f"{word} {why}")
+        connection.close()
+        return f"{word} {name}: {why}"
+    _say(connection, "ok")
+    return None
+
+
+def _receive(connection: socket.socket) -> tuple[Claim, list[int]]:
+    room = socket.CMSG_SPACE(4 * struct.calcsize("i"))
+    packet, ancillary, flags, _ = connection.recvmsg(UNIT_BYTES, room, socket.MSG_CMSG_CLOEXEC)
+    fds: list[int] = []
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            count = len(data) // struct.calcsize("i")
+            fds.extend(struct.unpack(f"{count}i", data[: count * struct.calcsize("i")]))
+    try:
+        if flags & socket.MSG_TRUNC:
+            raise ProtocolError("it says too much")
+        return decode_claim(packet), fds
+    except ProtocolError:
+        for fd in fds:
+            os.close(fd)
+        raise
+
+
+def _say(connection: socket.socket, text: str) -> None:
+    try:
+        connection.send(text.encode(errors="replace")[:1000])
+    except OSError as error:
+        log.debug("a unit went away: %s", error)

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes below a launcher, and units of the host: real avckpt-init processes, no Podman."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from avckpt.artifacts import init_binary
+
+from testkit.harness import avckpt_command, run, wait_until
+from testkit.local_sidecar import LocalSidecar, local_sidecar
+from testkit.procfs import children_of, inside
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+
+INIT = str(init_binary())
+COUNTER = """
+import os, sys, time
+for i in range(10**9):
+    print("n", i, os.getpid(), os.getpgrp(), os.getsid(0), flush=True)
+    time.sleep(0.02)
+"""
+COUNT = [sys.executable, "-c", COUNTER]
+QUICK = ("--label", "avckpt.interval=100ms")
+Json = dict[str, Any]
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Iterator[LocalSidecar]:
+    with local_sidecar(tmp_path) as sidecar:
+        sidecar.start()
+        yield sidecar
+
+
+@pytest.fixture
+def start(local: LocalSidecar, tmp_path: Path) -> Iterator[Any]:
+    """Starts `avckpt-init ARGS`, its output in a file; everything is killed afterwards."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(*args: str, preexec: Any = os.setsid, **env: str) -> subprocess.Popen[bytes]:
+        with (tmp_path / f"{len(started)}.out").open("wb") as out, (tmp_path / f"{len(started)}.err").open("wb") as err:
+            started.append(
+                subprocess.Popen(
+                    [INIT, *args],
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    env={**os.environ, **local.env, **env},
+                    preexec_fn=preexec,
+                )
+            )
+        return started[-1]
+
+    yield start
+    for process in started:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
+
+
+def row(local: LocalSidecar, name: str, **wanted: Any) -> Json:
+    """What `avckpt ps` says of a unit, when it says this."""
+    last: list[Json] = []
+
+    def found() -> Json:
+        last[:] = local.ps("-a")
+        rows = [each for each in last if each["name"] == name and not each["ended_at"]]
+        return next((each for each in rows if all(each[key] == value for key, value in wanted.items())), {})
+
+    try:
+        return wait_until(found, 20, f"{name} {wanted}", every_s=0.05)
+    except TimeoutError as error:
+        raise AssertionError(f"{error}: {last}; log:\n{local.log}") from None
+
+
+def lines(path: Path) -> list[list[str]]:
+    return [line.split()[1:] for line in path.read_text().splitlines() if line.startswith("n ")]
+
+
+def test_a_unit_of_the_host_goes_on_in_place(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
+    process = start("--name", "counter", *QUICK, "--", *COUNT)
+    before = row(local, "host/counter", state="protected")
+    assert (before["node_of"], before["init_pid"], before["interval_s"]) == ("host", process.pid, 0.1)
+    for restores in (1, 2):
+        wait_until(lambda: row(local, "host/counter", state="protected")["generations"] == 2, 10, "two generations")
+        os.kill(before["app_pid"], signal.SIGSEGV)
+        assert row(local, "host/counter", restores=restores, state="protected")["app_pid"] == before["app_pid"]
+    assert process.poll() is None
+    seen = lines(tmp_path / "0.out")
+    wait_until(lambda: len(lines(tmp_path / "0.out")) > len(seen) + 10, 10, "it goes on")
+    # One process, in the group and session that it was started in: init's.
+    assert {tuple(line[1:]) for line in lines(tmp_path / "0.out")} == {
+        (str(before["app_pid"]), str(process.pid), str(process.pid))
+    }
+    assert [line[0] for line in seen].count("0") == 1
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(10) == -signal.SIGTERM
+    assert (tmp_path / "0.err").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("script", "status"), [("exit 0", 0), ("exit 7", 7), ("kill -KILL $$", -9), ("kill -SEGV $$", -11)]
+)
+def test_a_unit_that_is_not_restored_ends_as_its_program(start: Any, script: str, status: int) -> None:
+    # No checkpoint within the hour.
+    process = start("--label", "avckpt.interval=1h", "--", "sh", "-c", f"sleep 0.3; {script}")
+    assert process.wait(10) == status
+
+
+def test_options_and_environment_are_labels(local: LocalSidecar, start: Any) -> None:
+    start("--", "sleep", "1000", AVCKPT_INIT=INIT, AVCKPT_LABELS="avckpt.keep=4  avckpt.interval=200ms")
+    assert (lambda r: (r["keep"], r["interval_s"]))(row(local, "host/sleep", state="protected")) == (4, 0.2)
+    start("--label", "avckpt.keep=5", "--", "sleep", "1000", AVCKPT_LABELS="avckpt.keep=4")
+    assert row(local, "host/sleep-2")["keep"] == 5
+
+
+def test_what_is_refused_is_said_and_runs(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
+    process = start("--label", "avckpt.kepe=4", "--", "sh", "-c", "sleep 1; exit 5")
+    assert process.wait(10) == 5
+    assert (tmp_path / "0.err").read_text() == (
+        "avckpt-init: sh runs unprotected: label avckpt.kepe: unknown label; did you mean avckpt.keep?\n"
+    )
+    assert local.ps() == []
+
+
+def test_of_the_host_only_root_registers(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
+    def nobody() -> None:
+        os.setsid()
+        os.setgid(65534)
+        os.setuid(65534)
+
+    for path in (tmp_path, *tmp_path.parents):
+        if path.stat().st_uid == 0 and path != Path("/tmp"):
+            path.chmod(path.stat().st_mode | 0o011)
+    process = start("--label", "avckpt.keep=4", "--", "sh", "-c", "sleep 1; exit 5", preexec=nobody)
+    assert process.wait(10) == 5
+    assert "of the host only root may" in (tmp_path / "0.err").read_text()
+    assert local.ps() == []
+
+
+def test_a_unit_within_a_unit_is_part_of_it(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
+    start("--name", "outer", *QUICK, "--", "sh", "-c", f"{INIT} --name inner -- sleep 1000; exit 3")
+    row(local, "host/outer", state="protected")
+    assert [each["name"] for each in local.ps()] == ["host/outer"]
+    assert (tmp_path / "0.err").read_text() == "avckpt-init: sleep is part of outer, and is protected with it\n"
+    # Nor does it help to hide that.
+    start("--name", "other", *QUICK, "--", "sh", "-c", f"sleep 1; env -u AVCKPT_UNIT {INIT} --name inner -- sleep 1000")
+    row(local, "host/other", state="protected")
+    wait_until(lambda: "is part of host/other" in (tmp_path / "1.err").read_text(), 10, "it is refused")
+    assert sorted(each["name"] for each in local.ps()) == ["host/other", "host/outer"]
+
+
+def test_units_find_the_next_sidecar(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
+    process = start("--name", "a", *QUICK, "--", *COUNT)
+    first = row(local, "host/a", state="protected")
+    for signum in (signal.SIGTERM, signal.SIGKILL):
+        local.stop(signum)
+        local.start()
+        assert row(local, "host/a", state="protected")["app_pid"] == first["app_pid"]
+    os.kill(first["app_pid"], signal.SIGKILL)
+    row(local, "host/a", restores=1, state="protected")
+    local.stop()
+    # Without a sidecar a death is final.
+    os.kill(first["app_pid"], signal.SIGKILL)
+    assert process.wait(10) == -signal.SIGKILL
+    local.start()
+    start("--name", "b", *QUICK, "--", *COUNT)
+    local.stop()
+    start("--name", "c", *QUICK, "--", *COUNT)
+    alone = "runs unprotected until the sidecar is started"
+    wait_until(lambda: alone in (tmp_path / "2.err").read_text(), 10, "it says that it is alone")
+    local.start()
+    for name in ("host/b", "host/c"):
+        row(local, name, state="protected")
+
+
+def test_whoever_kills_init_means_the_program(local: LocalSidecar, start: Any) -> None:
+    process = start("--name", "a", *QUICK, "--", *COUNT)
+    app = row(local, "host/a", state="protected")["app_pid"]
+    os.kill(app, signal.SIGKILL)
+    row(local, "host/a", restores=1, state="protected")
+    pidfd = os.pidfd_open(app)
+    process.kill()
+    assert process.wait(10) == -signal.SIGKILL
+    assert select.select([pidfd], [], [], 10)[0], "the program runs on"
+    os.close(pidfd)
+    wait_until(lambda: local.ps() == [], 10, "it is gone")
+
+
+def test_what_a_unit_leaves_behind_stays_and_templates_do_not(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
+    script = (
+        "import os, time\n"
+        "if os.fork() == 0:\n"
+        "    os.setsid()\n"
+        f"    open({str(tmp_path / 'daemon')!r}, 'w').write(str(os.getpid()))\n"
+        "    time.sleep(1000)\n"
+        "time.sleep(1.5)\n"
+    )
+    launcher = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import ctypes, os, subprocess, sys\n"
+            "ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)\n"  # whoever is orphaned becomes its child
+            "node = subprocess.Popen(sys.argv[1:])\n"
+            "reaped = [os.wait()[0] == node.pid]\n"
+            "try:\n    reaped.append(os.waitpid(-1, os.WNOHANG))\nexcept ChildProcessError:\n    pass\n"
+            "print(reaped, flush=True)\n",
+            *(INIT, "--name", "a", *QUICK, "--", sys.executable, "-c", script),
+        ],
+        stdout=subprocess.PIPE,
+        env={**os.environ, **local.env},
+        text=True,
+    )
+    row(local, "host/a", state="protected")
+    daemon = int(wait_until((tmp_path / "daemon").read_text, 10, "it has forked"))
+    try:
+        # It hears of one end, and the daemon runs on.
+        assert launcher.wait(20) == 0
+        assert launcher.stdout is not None
+        assert launcher.stdout.readline() == "[True, (0, 0)]\n"
+    finally:
+        os.kill(daemon, signal.SIGKILL)
+        launcher.kill()
+        launcher.communicate()
+
+
+LAUNCHER = f"""
+trap 'echo stopping; kill -HUP $a; wait $a; echo a $?; kill $b; wait $b; echo b $?; exit 9' INT
+$AVCKPT_INIT --name a -- {sys.executable} -c '{COUNTER}' >>a.out & a=$!
+$AVCKPT_INIT -- {sys.executable} -c '{COUNTER}' >>b.out & b=$!
+wait $a; echo a ended $?
+wait
+"""
+
+
+def test_a_shell_launcher_without_podman(tmp_path: Path) -> None:
+    """`avckpt run`: a node's death is undone, the launcher hears nothing of it, and can stop its nodes."""
+    with (tmp_path / "out").open("wb") as out, (tmp_path / "err").open("wb") as err:
+        options = ("-v", "--label", "avckpt.scope=nodes", *QUICK)
+        launched = subprocess.Popen(
+            [*avckpt_command(), "run", *options, "--", "bash", "-c", LAUNCHER],
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            cwd=tmp_path,
+        )
+
+    inits: dict[str, int] = {}
+
+    def said() -> str:
+        return (tmp_path / "err").read_text()
+
+    def node(name: str) -> int:
+        number = int(lines(tmp_path / f"{name}.out")[0][1])
+        return next(pid for pid in children_of(inits[name]) if inside(pid) == number)
+
+    try:
+        wait_until(lambda: said().count("protected: first checkpoint") >= 2, 20, "both are protected")
+        [init] = [pid for pid in children_of(launched.pid) if Path(f"/proc/{pid}/comm").read_text() == "avckpt-init\n"]
+        [shell] = children_of(init)
+        for pid in children_of(shell):
+            arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            inits["a" if b"--name" in arguments else "b"] = pid
+        time.sleep(1)
+        for name, other in (("a", "b"), ("b", "a"), ("a", "b")):
+            pid, count = node(name), said().count("restored in")
+            sibling = len(lines(tmp_path / f"{other}.out"))
+            os.kill(pid, signal.SIGKILL)
+            wait_until(lambda: said().count("restored in") > count, 10, "it is restored")  # noqa: B023
+            wait_until(lambda: len(lines(tmp_path / f"{other}.out")) > sibling, 10, "its sibling goes on")  # noqa: B023
+            time.sleep(0.5)
+        for name in "ab":
+            numbers = [int(line[0]) for line in lines(tmp_path / f"{name}.out")]
+            # One process, to itself; back by moments, at most as often as it died.
+            assert len({line[1] for line in lines(tmp_path / f"{name}.out")}) == 1
+            assert numbers.count(0) == 1
+            assert sum(b <= a for a, b in zip(numbers, numbers[1:])) <= (2 if name == "a" else 1), said()
+            assert max(b - a for a, b in zip(numbers, numbers[1:])) == 1
+        assert (tmp_path / "out").read_text() == ""
+        launched.send_signal(signal.SIGINT)
+        assert launched.wait(15) == 9
+    finally:
+        launched.kill()
+        launched.wait()
+    # Asked to stop they end as any program does, in the launcher's order.
+    assert (tmp_path / "out").read_text() == f"stopping\na {128 + signal.SIGHUP}\nb {128 + signal.SIGTERM}\n"
+
+
+def test_a_job_of_a_shell_stops_and_continues(local: LocalSidecar, tmp_path: Path) -> None:
+    """The keys of a terminal reach a unit's program as without: once."""
+    (tmp_path / "job.py").write_text(
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGINT, lambda *_: print('int', flush=True))\n"
+        "signal.signal(signal.SIGQUIT, lambda *_: sys.exit(7))\n"
+        "print('ready', flush=True)\n"
+        "while True: time.sleep(0.05)\n"
+    )
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ.update({**local.env, "PS1": "$ ", "TERM": "dumb"})
+        os.execvp("bash", ["bash", "--norc", "--noprofile", "-i"])
+    heard = bytearray()
+
+    def until(text: bytes, count: int = 1) -> None:
+        deadline = time.monotonic() + 15
+        while heard.count(text) < count:
+            assert select.select([terminal], [], [], max(deadline - time.monotonic(), 0))[0], bytes(heard)
+            heard.extend(os.read(terminal, 4096))
+
+    try:
+        os.write(terminal, f"{INIT} --name job {' '.join(QUICK)} -- {sys.executable} {tmp_path}/job.py\n".encode())
+        until(b"ready\r\n")
+        app = row(local, "host/job", state="protected")["app_pid"]
+        os.kill(app, signal.SIGKILL)
+        row(local, "host/job", restores=1, state="protected")
+        os.write(terminal, b"\x03")
+        until(b"int\r\n")
+        os.write(terminal, b"\x1a")
+        until(b"Stopped")
+        os.write(terminal, b"fg\n")
+        time.sleep(0.3)
+        os.write(terminal, b"\x03")
+        until(b"int\r\n", 2)
+        os.write(terminal, b"\x1c")
+        until(b"$ ", heard.count(b"$ ") + 1)
+        os.write(terminal, b"echo status-$?\n")
+        until(b"status-7")
+        assert heard.count(b"int\r\n") == 2, bytes(heard)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        os.close(terminal)
+        os.waitpid(pid, 0)
+
+
+def test_scope_nodes_takes_no_health_check() -> None:
+    done = run(
+        [*avckpt_command(), "run", "--label", "avckpt.scope=nodes", "--label", "avckpt.restore.on=unhealthy", "true"],
+        check=False,
+    )
+    assert done.status == 2
+    assert "a health check is of a whole container" in done.stderr
+
+
+def test_a_launcher_without_avckpt_starts_its_nodes_all_the_same(tmp_path: Path) -> None:
+    done = run(
+        [INIT, "--label", "avckpt.keep=3", "sh", "-c", "echo $PPID; exit 4"],
+        env={"AVCKPT_RUN_DIR": str(tmp_path / "nothing")},
+        check=False,
+    )
+    assert (done.status, done.stdout) == (4, f"{os.getpid()}\n")  # no init stands in between
+    assert "there is no avckpt here" in done.stderr
+
+
+def test_the_row_of_a_unit_is_in_the_api(local: LocalSidecar, start: Any) -> None:
+    start("--name", "a", "--", "sleep", "1000")
+    assert row(local, "host/a")["node_of"] == "host"
+    answer = json.loads(local.avckpt("checkpoint", "host/a", "--json").stdout)
+    assert answer["event"]["kind"] == "checkpoint"
+    assert answer["container"]["name"] == "host/a"
+    assert "host/a: back at generation" in local.avckpt("restore", "host/a").stdout
