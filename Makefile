@@ -90,6 +90,7 @@ soak: setup-build ## an hour of checkpoints, deaths and restores: does anything 
 
 bench: setup ## measure freeze, reap and restore beside a plain fork()
 	@$(VENV)/python -m bench.run
+	@$(VENV)/python -m bench.dirty
 
 bench-peers: setup ## measure avckpt beside CRIU (bare, and through Podman), cold start and a plain fork()
 	@scripts/setup-plots.sh

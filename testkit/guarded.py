@@ -21,7 +21,7 @@ from types import TracebackType
 from typing import Any
 
 import pytest
-from avckpt.guard import GuardConfig
+from avckpt.guard import GuardConfig, Images
 
 from testkit.board import UNAVAILABLE_STATUS, Board, Seen
 from testkit.harness import ROOT, SLOWNESS, app_pid, wait_until
@@ -30,6 +30,9 @@ from testkit.procfs import children_of, inside
 
 BUILD = ROOT / "tests/victims/build"
 PATIENCE_S = 15.0 * SLOWNESS
+
+IMAGES = Images[os.environ.get("AVCKPT_TEST_IMAGES", "fork").upper()]
+"""How checkpoints are made where a test does not care: AVCKPT_TEST_IMAGES=dirty runs them all the other way."""
 
 Json = dict[str, Any]
 
@@ -47,6 +50,7 @@ def config(interval_s: float = 0.0, **changes: Any) -> GuardConfig:
         quiesce_s=0.0,
         # 0: the engine's own.
         freeze_deadline_s=0.05 * SLOWNESS if SLOWNESS > 1 else 0.0,
+        images=IMAGES,
     )
     return dataclasses.replace(plain, **changes)
 

@@ -20,7 +20,7 @@ from avckpt_hooks.shared.tell import printable
 from avckpt.artifacts import guard_binary
 from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
 from avckpt.events.vocabulary import Kind, Reason
-from avckpt.guard import Command, Event, GuardConfig
+from avckpt.guard import FORK_REASONS, Command, Event, GuardConfig, Images
 
 try:
     from avckpt._native import ffi, lib
@@ -196,6 +196,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.restore_on_exit = config.restore_on_exit
     c.files = int(config.files)
     c.tcp = int(config.tcp)
+    c.images = int(config.images)
     for status in config.restore_on_statuses:
         c.restore_on_status[status] = 1
     return c
@@ -220,6 +221,9 @@ def _event(e: Any) -> Event:
         freeze_s=e.freeze_ns / _NS_PER_S,
         stop_s=e.stop_ns / _NS_PER_S,
         clone_s=e.clone_ns / _NS_PER_S,
+        images=Images(e.images).name.lower() if Kind.of(e.kind) is Kind.CHECKPOINT else "",
+        fork_reason=FORK_REASONS[e.fork_reason] if e.fork_reason > 1 else "",
+        copied=e.copied,
         died_ns=e.died_ns,
         restore_s=e.restore_ns / _NS_PER_S,
         fork_s=e.fork_ns / _NS_PER_S,

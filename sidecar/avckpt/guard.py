@@ -44,6 +44,32 @@ class Tcp(enum.IntEnum):
     MESSAGES = 3
 
 
+class Images(enum.IntEnum):
+    """`enum avc_images`: how a checkpoint gets the memory of a process."""
+
+    FORK = 0
+    DIRTY = 1
+    AUTO = 2
+
+
+FORK_REASONS = (
+    "",
+    "avckpt.images=fork",
+    "there is no older image yet",
+    "it has several processes",
+    "the kernel cannot watch its memory",
+    "it has a seccomp filter of its own",
+    "it has memory of a kind that cannot be watched",
+    "a device may write to its memory",
+    "what a fork inherits has changed",
+    "its mappings have changed",
+    "it writes too much",
+    "the older images are a minute old",
+    "the older images have too many pages of their own",
+)
+"""`enum avc_fork_reason`: why a checkpoint was taken by a fork."""
+
+
 @dataclass(frozen=True)
 class GuardConfig:
     """`struct avc_config` without the pidfd.  Durations in seconds."""
@@ -68,6 +94,7 @@ class GuardConfig:
     """The longest the app is held to get it stopped; 0: the engine's default."""
     files: Files = Files.REWIND
     tcp: Tcp = Tcp.RESET_MOVED
+    images: Images = Images.FORK
 
 
 @dataclass(frozen=True)
@@ -91,6 +118,12 @@ class Event:
     freeze_s: float = 0.0
     stop_s: float = 0.0
     clone_s: float = 0.0
+    images: str = ""
+    """Of a checkpoint: "fork" or "dirty"."""
+    fork_reason: str = ""
+    """Why it was a fork, in words; not for avckpt.images=fork."""
+    copied: int = 0
+    """Pages."""
     died_ns: int = 0
     restore_s: float = 0.0
     fork_s: float = 0.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from avckpt_hooks.shared.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy, shown
 
 from avckpt.errors import LabelsWrong
-from avckpt.guard import Files, GuardConfig, Tcp
+from avckpt.guard import Files, GuardConfig, Images, Tcp
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ def guard_config(policy: Policy) -> GuardConfig:
         shm_bytes=policy.shm_bytes,
         files=Files[policy.files.upper()],
         tcp=Tcp[policy.tcp.upper().replace("-", "_")],
+        images=Images[policy.images.upper()],
     )
 
 

@@ -93,6 +93,8 @@ class Policy:
     """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     scope: str = "container"
     """What is protected: the container as a whole, or the nodes that its launcher starts by avckpt-init."""
+    images: str = "fork"
+    """How a checkpoint gets the application's memory: fork, dirty or auto."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
     notify: Notify | None = None
@@ -355,6 +357,7 @@ LABELS: dict[str, Label] = {
     ),
     "avckpt.files": Label("auto", "auto, rewind, keep or strict", _one_of("files", "auto", "rewind", "keep", "strict")),
     "avckpt.io_uring": Label("on", "on or off", _parse_io_uring),
+    "avckpt.images": Label("fork", "fork, dirty or auto", _one_of("images", "fork", "dirty", "auto")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
     "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),

@@ -14,6 +14,7 @@
  *   proc.c          /proc
  *   proc_text.c     what its texts say
  *   pagemap.c       which pages of a process are there
+ *   pageset.c       sets of them
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
  */
@@ -259,13 +260,46 @@ void proc_unescape(char *text);
 #define GUARD_INSTALL 102
 #define GUARD_REMOVE 103
 
-/* A guard page without a mapping of its own (madvise(2)); one of the process's own. */
+/* A guard page without a mapping of its own (madvise(2)); one of the process's own, and not just a
+ * mark that nobody has written to an empty place (pagemap_written()). */
 bool page_is_guard(uint64_t entry);
 bool page_is_own(uint64_t entry);
 /* Calls fn for every stretch in which there are pages of no file, or guard pages; for all of it
  * if the kernel cannot tell (before Linux 6.7).  Stops when fn does not return 0.  0 or -1. */
 int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
 		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
+
+/* Which of them were written since they were asked for the last time, and asks anew: fn is told of
+ * each stretch.  Of a stretch of mappings that are all watched so (userfaultfd(2), WP_ASYNC): EPERM,
+ * it is not.  0, or -1 with errno. */
+int pagemap_written(int pagemap, avc_remote start, avc_remote end,
+		    int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
+
+/* ---- pageset.c ------------------------------------------------------------------------ */
+
+#define PAGESET_PAGES 512
+#define PAGESET_CHUNK ((avc_remote)PAGESET_PAGES * ARCH_PAGE_BYTES)
+struct page_chunk {
+	avc_remote start;
+	uint64_t bits[PAGESET_PAGES / 64];
+};
+
+struct pageset {
+	uint32_t count, room;
+	struct page_chunk *chunk; /* in order                                        */
+};
+
+/* False: out of memory. */
+bool pageset_add(struct pageset *set, avc_remote start, avc_remote end);
+bool pageset_add_all(struct pageset *set, const struct pageset *more);
+/* Stretch by stretch; a cursor begins as { 0 }. */
+struct page_cursor {
+	uint32_t chunk, bit;
+};
+bool pageset_next(const struct pageset *set, struct page_cursor *at, avc_remote *start,
+		  avc_remote *end);
+uint64_t pageset_count(const struct pageset *set);
+void pageset_free(struct pageset *set);
 
 /* ---- rt_priority.c -------------------------------------------------------------------- */
 

@@ -15,5 +15,8 @@ int config_check(const struct avc_config *config, struct avc_error *err)
 	if (config->restore_max > AVC_RESTORES_MAX)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
 			    "restore_max must be at most %d", AVC_RESTORES_MAX);
+	if (config->images > AVC_IMAGES_AUTO)
+		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
+			    "images must be 0 to %d", AVC_IMAGES_AUTO);
 	return 0;
 }

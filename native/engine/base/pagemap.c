@@ -4,11 +4,12 @@
  * (Documentation/admin-guide/mm/pagemap.rst).
  */
 #include <errno.h>
+#include <string.h>
 #include <sys/ioctl.h>
 
 #include "base.h"
 
-#define REGIONS 64
+#define REGIONS 256
 
 /* Linux 6.7; the headers may be older. */
 struct scan_region {
@@ -21,6 +22,9 @@ struct scan {
 };
 
 #define SCAN _IOWR('f', 16, struct scan)
+#define SCAN_WRITE_PROTECT (1u << 0) /* flags: PM_SCAN_WP_MATCHING               */
+#define SCAN_CHECK_ASYNC (1u << 1)   /* PM_SCAN_CHECK_WPASYNC                    */
+#define SCAN_WRITTEN (1u << 1)
 #define SCAN_FILE (1u << 2)
 #define SCAN_PRESENT (1u << 3)
 #define SCAN_SWAPPED (1u << 4)
@@ -28,6 +32,7 @@ struct scan {
 /* Where it stands in the page table: a swap entry of the last type, which is none, with
  * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
 #define GUARD_MARKER (UINT64_C(4) << 5 | 31)
+#define WATCH_MARKER (UINT64_C(1) << 5 | 31) /* PTE_MARKER_UFFD_WP                   */
 
 bool page_is_guard(uint64_t entry)
 {
@@ -38,7 +43,9 @@ bool page_is_guard(uint64_t entry)
 
 bool page_is_own(uint64_t entry)
 {
-	return entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(entry & PAGEMAP_FILE);
+	return entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED) && !(entry & PAGEMAP_FILE) &&
+	       (entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED | PAGEMAP_FRAME)) !=
+		       (PAGEMAP_SWAPPED | WATCH_MARKER);
 }
 
 int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
@@ -66,6 +73,41 @@ int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
 		for (int i = 0; i < found; i++)
 			if (fn(region[i].start, region[i].end, arg))
 				return -1;
+		start = scan.walk_end;
+	}
+	return 0;
+}
+
+int pagemap_written(int pagemap, avc_remote start, avc_remote end,
+		    int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg)
+{
+	struct scan_region region[REGIONS];
+
+	while (start < end) {
+		struct scan scan = {
+			.size = sizeof scan,
+			.flags = SCAN_WRITE_PROTECT | SCAN_CHECK_ASYNC,
+			.start = start,
+			.end = end,
+			.vec = (uint64_t)(uintptr_t)region,
+			.vec_len = REGIONS,
+			.category_mask = SCAN_WRITTEN,
+			.return_mask = SCAN_WRITTEN,
+		};
+		int found, errnum;
+
+		memset(region, 0, sizeof region);
+		found = ioctl(pagemap, SCAN, &scan);
+		errnum = errno;
+		/* What it has found before something failed it tells, but not how many: these pages
+		 * are protected again, and nobody else would know of them. */
+		for (int i = 0; i < (found < 0 ? REGIONS : found) && region[i].end; i++)
+			if (fn(region[i].start, region[i].end, arg))
+				return -1;
+		if (found < 0) {
+			errno = errnum;
+			return -1;
+		}
 		start = scan.walk_end;
 	}
 	return 0;

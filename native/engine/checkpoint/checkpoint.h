@@ -4,6 +4,8 @@
  *
  *   freeze.c        stop everything, read it, clone it, let go; see freeze.h
  *   generation.c    templates kept
+ *   dirty.c         ... and brought up to date, instead of being forked anew
+ *   layout.c        ... whose mappings have to be the process's for that
  *   spare.c         ... and forked ahead of the next restore
  *   snapshot.c      mappings and pages of a template
  *   remap_plan.c    how the memory of one differs from another's
@@ -26,6 +28,37 @@ struct spare {
 	bool aside;                   /* it has another policy for as long         */
 };
 
+/* A template that no generation has any more, of which it is known where it is out of date. */
+struct idle_template {
+	pid_t pid; /* 0: none                                           */
+	int pidfd;
+	struct arch_regs base;
+	struct inherited *inherited;
+	struct pageset *stale;
+	uint64_t tracker, forked_ns, copied;
+};
+
+/* Checkpoints by copies of what was written, of the main process (dirty.c). */
+struct dirty {
+	struct process *process;
+	struct idle_template idle;
+	bool fork_next;              /* the last attempt has found that it takes a fork     */
+	enum avc_fork_reason reason; /* why this one is forked                          */
+	uint64_t refused_nonce;      /* the parasite with which it could not be watched  */
+	uint64_t fork_ns;            /* what the last fork took                          */
+	long own_pages;              /* of the process, then                             */
+	uint64_t copied;             /* pages, of this checkpoint                       */
+	/* Read in the freeze, written to the template when the app runs again. */
+	struct run *run;
+	uint32_t runs, run_room;
+	uint8_t *data;
+	size_t data_bytes, used;
+	char *layout; /* /proc/PID/maps                                       */
+	size_t layout_bytes;
+	struct inherited now;
+	int64_t dumpable;
+};
+
 /* What is saved of an app at one instant. */
 struct generation {
 	uint64_t number; /* 0: not whole yet                                  */
@@ -46,6 +79,7 @@ struct generation {
 struct freeze {
 	struct tree *tree;
 	struct generation *generation; /* which has an image of the main process          */
+	struct dirty *dirty;           /* process.recycling                                  */
 	timer_t timer;
 	uint64_t deadline_ns;
 	struct mem_seen seen; /* the shared memory that is prepared for already   */
@@ -79,6 +113,30 @@ void generation_close_files(const struct image *image);
 /* The same of all processes but the main one, once they are restored and have tables of
  * their own: before they go on, for what they close is to be closed. */
 void generation_close_tables(const struct generation *generation);
+
+/* ---- layout.c ------------------------------------------------------------------ */
+
+/* All of /proc/PID/maps, into *text, which grows; false with errno. */
+bool layout_read(pid_t pid, char **text, size_t *bytes);
+/* Whether two of them are of the same mappings, wherever the kernel has them in pieces. */
+bool layout_equal(char *a, char *b);
+
+/* ---- dirty.c ------------------------------------------------------------------- */
+
+/* Before a freeze: process.recycling, or why not; what can be copied while the app runs, is. */
+void dirty_prepare(struct dirty *dirty, const struct tree *tree, const struct avc_config *config,
+		   timer_t timer);
+/* During it, while the main thread answers: what is left is read. */
+int dirty_capture(struct dirty *dirty, const struct generation *generation,
+		  struct avc_error *err) warn_unused;
+/* When the app runs again: the idle template becomes the image's.  AVC_RETRY: it takes a fork. */
+int dirty_apply(struct dirty *dirty, struct image *image, struct avc_error *err) warn_unused;
+/* Of an image of which all is known: from now on it is noted where it gets out of date. */
+void dirty_follow(struct dirty *dirty, struct image *image);
+/* Its template is not needed any more: it becomes the idle one, if it can. */
+void dirty_recycle(struct dirty *dirty, struct generation *generation);
+void dirty_drop_idle(struct dirty *dirty);
+void dirty_free(struct dirty *dirty);
 
 /* ---- spare.c ------------------------------------------------------------------------ */
 

@@ -292,6 +292,8 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 		return -1;
 	/* While main threads are in their parasites: see parasite_will(). */
 	capture_files(generation);
+	if (tree_main(freeze->tree)->recycling && dirty_capture(freeze->dirty, generation, err))
+		return -1;
 	if (see_alive(freeze->tree, err))
 		return -1;
 	return has_all_holders(freeze->tree) ? 0 : clone_missing(freeze, err);

@@ -205,7 +205,8 @@ int freeze_await_clone(struct process *process, pid_t *template, struct avc_erro
 
 /* Timers only the process itself can tell of.  And young processes change what they are
  * all the time: a name, a user.  All are asked at the same time. */
-static int ask_begin(struct process *process, uint64_t takes_ns, struct avc_error *err)
+static int ask_begin(struct process *process, uint32_t slot, uint64_t takes_ns,
+		     struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	struct thread *thread = thread_find(process, process->pid);
@@ -219,6 +220,8 @@ static int ask_begin(struct process *process, uint64_t takes_ns, struct avc_erro
 	timers_ask(process, call);
 	process->children = ask_for_children(call);
 	thread_ask_add(process, false, call, &process->questions);
+	if (process->recycling)
+		inherited_ask(&process->parasite, slot, call);
 	process->asked_ns = now_ns();
 	if (thread_borrow(process, thread, err) || parasite_start(thread->tid, err))
 		return -1;
@@ -289,11 +292,12 @@ static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, stru
 	process->stage = FREEZE_BEGUN;
 	if (read_all(process, slot, err))
 		return -1;
-	if (!process->descendant)
+	if (!process->descendant && !process->recycling)
 		return freeze_start_clone(process, err);
 	return thread_vet(process, thread, err) ||
-			       (process->holder && freeze_start_clone(process, err)) ||
-			       ask_begin(process, takes_ns, err)
+			       (!process->recycling && process->holder &&
+				freeze_start_clone(process, err)) ||
+			       ask_begin(process, slot, takes_ns, err)
 		       ? -1
 		       : 0;
 }

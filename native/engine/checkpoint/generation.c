@@ -64,6 +64,19 @@ static int hear_template(struct process *process, struct thread *cloned,
 	return thread_ask_others(process, cloned, &was, err);
 }
 
+/* For the day when it is brought up to date instead of another one being forked. */
+static int keep_inherited(struct image *image, const struct thread *cloned, struct avc_error *err)
+{
+	int64_t ignored;
+
+	image->inherited = calloc(1, sizeof *image->inherited);
+	if (!image->inherited)
+		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
+	inherited_answer(&image->process->parasite, image->slot, image->inherited, &ignored);
+	inherited_creds(image->inherited, cloned);
+	return inherited_read(image->inherited, image->template, err);
+}
+
 static int quieten(struct image *image, struct avc_error *err)
 {
 	struct process *process = image->process;
@@ -101,6 +114,8 @@ static int quieten(struct image *image, struct avc_error *err)
 	if (cloned && cloned->rseq)
 		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
 				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature);
+	if (process->tracker)
+		inherited_ask(&process->parasite, image->slot, call);
 	if (parasite_send(&process->parasite, pid, &image->base, call, err) ||
 	    parasite_run(pid, call, err))
 		return -1;
@@ -108,7 +123,9 @@ static int quieten(struct image *image, struct avc_error *err)
 		return fail(err, AVC_KERNEL, (int)-rseq->result, pid, "keep template", "rseq",
 			    "refused");
 	image->dumpable = dumpable->result;
-	return attributes ? hear_template(process, cloned, call, attributes, err) : 0;
+	if (attributes && hear_template(process, cloned, call, attributes, err))
+		return -1;
+	return process->tracker && cloned ? keep_inherited(image, cloned, err) : 0;
 }
 
 /* A main thread that has ended while others go on: it is there again until they are,
@@ -191,7 +208,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
 		/* Of the one that was cloned, as it was then. */
 		memcpy(block->name,
-		       !process->descendant && t.tid == process->pid
+		       !process->descendant && !image->recycled && t.tid == process->pid
 			       ? (char *)slot->template_call.out + TEMPLATE_NAME
 			       : t.name,
 		       sizeof block->name);
@@ -240,6 +257,8 @@ static int fill_slot(struct image *image, struct avc_error *err)
 
 static int begin_template(struct image *image, struct avc_error *err)
 {
+	if (image->recycled)
+		return 0;
 	/* The holder rests again. */
 	if (image->process->descendant && tracee_settle(image->process->holder, err))
 		return -1;
@@ -262,7 +281,7 @@ static int finish(struct image *image, struct avc_error *err)
 	pages = proc_vm_pages(statm_fd, &image->anon_pages);
 	process->anon_pages = image->anon_pages;
 	close_fd(&statm_fd);
-	if (pages >= 0 && pages != image->vm_pages)
+	if (pages >= 0 && pages != image->vm_pages && !image->recycled)
 		return memory_learn(process, image->vm_pages - pages, err);
 	if (process->descendant && process_attrs_learn(image, err))
 		return -1;
@@ -362,6 +381,13 @@ static void image_drop(struct image *image)
 	process_attrs_forget(image);
 	files_free(image->files);
 	files_mapped_free(image->mapped);
+	free(image->inherited);
+	if (image->stale) {
+		if (image->process->tracker)
+			tracker_remove(image->process->tracker, image->stale);
+		pageset_free(image->stale);
+		free(image->stale);
+	}
 	if (image->process && image->process->descendant)
 		image->process->images--;
 }

@@ -68,6 +68,9 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 void files_lift_limit(const struct files *want, pid_t pid);
 /* A descriptor of that device, as stat(2) numbers it; -1: there is none. */
 int files_find_device(const struct files *files, uint32_t rdev);
+/* Whether a device or the kernel may write to the process's memory by one of them, unseen by its
+ * page table: pages that were pinned before (files_pinned.c). */
+bool files_may_pin(const struct files *files);
 /* Whether the restored process could do it all. */
 void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t inside,
 		       struct avc_error *notes);

@@ -450,6 +450,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	guard->started_ns = now_ns();
 	init_channel_init(&guard->channel);
 	process_init(&guard->main);
+	guard->dirty = (struct dirty){ .process = &guard->main, .idle.pidfd = -1 };
 	guard->tree = (struct tree){
 		.slots = start->config.keep + 1,
 		.is_ours = guard_owns,
@@ -463,6 +464,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 static void guard_free(struct avc_guard *guard)
 {
 	files_written_free(guard->written);
+	dirty_free(&guard->dirty);
 	process_free_room(&guard->main);
 	tree_free(&guard->tree);
 	mem_others_free(guard->main.others);

@@ -292,6 +292,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
 	watch_files(guard, main);
+	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, guard->timer);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;
 
@@ -315,7 +316,9 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 	if (generation_files_error(fresh, err))
 		return -1;
 	tracee_deadline_set(guard->timer, NS_PER_S);
-	result = generation_finish(fresh, err);
+	result = guard->main.recycling ? dirty_apply(&guard->dirty, &fresh->image[0], err) : 0;
+	if (!result)
+		result = generation_finish(fresh, err);
 	tracee_deadline_clear(guard->timer);
 	return result;
 }
@@ -358,10 +361,16 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	event->error = *generation_notice(fresh);
 	settle_files(guard, fresh);
 	fresh->number = ++guard->number;
-	fresh->clone_ns = freeze->clone_ns;
+	if (!guard->main.recycling)
+		guard->dirty.fork_ns = freeze->clone_ns;
+	dirty_follow(&guard->dirty, &fresh->image[0]);
+	fresh->clone_ns = guard->dirty.fork_ns;
 	begin_ahead(guard, fresh);
 	guard_keep_generation(guard, fresh);
 	init_channel_arm(&guard->channel, true);
+	event->images = guard->main.recycling ? AVC_IMAGES_DIRTY : AVC_IMAGES_FORK;
+	event->fork_reason = guard->dirty.reason;
+	event->copied = guard->dirty.copied;
 	event->generation = fresh->number;
 	event->generations = guard->count;
 	event->quiescent = fresh->quiescent;
@@ -374,6 +383,7 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	struct generation fresh;
 	struct freeze freeze = { .tree = &guard->tree,
 				 .generation = &fresh,
+				 .dirty = &guard->dirty,
 				 .timer = guard->timer,
 				 .deadline_ns = guard->config.freeze_deadline_ns };
 	int result;
@@ -391,6 +401,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
 	if (err->code != AVC_LIMIT)
 		return false;
+	dirty_drop_idle(&guard->dirty);
 	guard_await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
 		guard->cramped |= guard->generations[i].spare.pid != 0;

@@ -34,6 +34,7 @@ void guard_drop_all(struct avc_guard *guard)
 {
 	while (guard->count)
 		guard_drop_generation(guard, 0);
+	dirty_drop_idle(&guard->dirty);
 }
 
 uint32_t guard_free_slot(const struct avc_guard *guard)
@@ -77,7 +78,7 @@ bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (tracee_is_ending(pid))
+	if (tracee_is_ending(pid) || guard->dirty.idle.pid == pid)
 		return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->holder == pid)
@@ -212,6 +213,8 @@ static void lose_program(struct avc_guard *guard)
 {
 	while (guard->count)
 		guard_lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
+	dirty_drop_idle(&guard->dirty);
+	tracker_end(&guard->main);
 	tracee_end_now(); /* they have the table that exec(2) has left */
 	process_unhold(&guard->main);
 	guard->main.infected = false; /* what was mapped there went with its memory */
@@ -316,6 +319,8 @@ void guard_reap_dead(struct avc_guard *guard)
 			if (guard->tree.process[i]->holder &&
 			    pidfd_ended(guard->tree.process[i]->holder_pidfd))
 				process_unhold(guard->tree.process[i]);
+		if (guard->dirty.idle.pid && pidfd_ended(guard->dirty.idle.pidfd))
+			dirty_drop_idle(&guard->dirty);
 		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
 			return;
 		if (news[1].revents & POLLIN)
@@ -335,8 +340,12 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 	const struct policy_generation record =
 		policy_new_generation(&guard->policy, &guard->config, fresh->number, now);
 
-	while (guard->count >= guard->policy.room)
-		guard_drop_generation(guard, policy_replaced(&guard->policy, &guard->config, now));
+	while (guard->count >= guard->policy.room) {
+		const uint32_t i = policy_replaced(&guard->policy, &guard->config, now);
+
+		dirty_recycle(&guard->dirty, &guard->generations[i]);
+		guard_drop_generation(guard, i);
+	}
 	guard->generations[guard->count++] = *fresh;
 	policy_hold(&guard->policy, record);
 	guard_rank_generations(guard);

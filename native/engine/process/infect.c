@@ -508,6 +508,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 
 	while (threads_max < threads)
 		threads_max *= 2;
+	tracker_end(process);
 	parasite_close(&process->parasite);
 	process->parasite.inside = process->inside;
 	memory_forget(process->memory);

@@ -128,6 +128,7 @@ void process_close(struct process *process)
 	process->pid = 0;
 	process->leader = 0;
 	process->infected = false;
+	tracker_end(process);
 	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		process->threads[i].seen = false;

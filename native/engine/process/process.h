@@ -5,6 +5,7 @@
  *   process.c        one of them: looked at, asked, stopped
  *   stop.c          ... stopped, let go
  *   infect.c        parasite and holder brought into it
+ *   tracker.c       which of its pages are written
  *   support.c       what cannot be protected; quiescence
  *   waits.c         calls that are to be ended
  *   dying.c         in its own handler of a fatal signal
@@ -126,6 +127,43 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		 struct avc_error *err) warn_unused;
 void process_unhold(struct process *process);
 void process_unhold_soon(struct process *process);
+
+/* ---- tracker.c -------------------------------------------------------------------- */
+
+/* Sets that are added to. */
+#define TRACKER_SETS (AVC_KEEP_MAX + 2)
+
+/* Whose private memory is watched: the kernel notes which pages are written, in the process's page
+ * table and by no fault that anybody waits for.  With the last descriptor, which is ours, all of it
+ * goes from the process. */
+struct tracker {
+	uint64_t number; /* none has the same: what was known by another one is not known */
+	int uffd, pagemap;
+	uint32_t areas, area_room; /* the mappings that are watched, in order             */
+	struct stretch {
+		avc_remote start, end;
+	} * area;
+	uint32_t parts, part_room; /* where they have pages of their own, in chunks       */
+	struct stretch *part;
+	struct pageset found;
+	struct pageset *set[TRACKER_SETS];
+	uint32_t sets;
+	bool broken; /* there was no memory to note something in                */
+};
+
+/* By a task with the memory of the holder.  AVC_UNSUPPORTED: the kernel cannot do it. */
+int tracker_begin(struct process *process, timer_t timer, struct avc_error *err) warn_unused;
+void tracker_end(struct process *process);
+/* All of its mappings that are private, by /proc/PID/maps of just now.  AVC_UNSUPPORTED: there are
+ * some that cannot be watched. */
+int tracker_watch(struct process *process, char *layout, struct avc_error *err) warn_unused;
+/* What was written since the last time is added to all sets; `template`: a process of which pages
+ * count as written where it has any and the other has not been known to, 0: none.  *pages: how many.
+ * -1: not all of it is watched any more. */
+int tracker_scan(struct tracker *tracker, pid_t template, uint64_t *pages) warn_unused;
+/* From now on, or no more. */
+bool tracker_add(struct tracker *tracker, struct pageset *set);
+void tracker_remove(struct tracker *tracker, const struct pageset *set);
 
 /* ---- support.c --------------------------------------------------------------------- */
 

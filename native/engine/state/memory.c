@@ -226,6 +226,19 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 	}
 }
 
+bool memory_needs_fork(const struct process *process)
+{
+	const struct memory *memory = process->memory;
+
+	for (uint32_t i = 0; i < memory->areas.count; i++)
+		if (memory->areas.area[i].wiped)
+			return true;
+	for (uint32_t i = 0; i < memory->kinds.count; i++)
+		if (memory->kinds.area[i].flags & MAPPING_KEYS)
+			return true;
+	return memory->dontfork;
+}
+
 /* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
 void memory_dofork(const struct memory *memory, struct inj_call *call)
 {

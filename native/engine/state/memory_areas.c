@@ -48,6 +48,7 @@ struct survey {
 	uint64_t layout, shared_bytes, since;
 	uint64_t left_bytes, others_bytes;
 	bool private_huge, too_many, lost_some;
+	bool recycled; /* image.recycled                                             */
 };
 
 static uint64_t hash(uint64_t h, uint64_t value)
@@ -316,7 +317,8 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	int result = 0;
 
 	memory->advised.count = memory->kinds.count = 0;
-	if (proc_mappings(survey->template, "smaps", find_area, survey))
+	/* What the process has been told since its template was forked, that does not know. */
+	if (proc_mappings(survey->recycled ? pid : survey->template, "smaps", find_area, survey))
 		return fail_errno(err, survey->template, "keep memory", "read(smaps)",
 				  "it was killed");
 	sort_out(survey);
@@ -363,6 +365,7 @@ static int check_layout(const struct image *image, struct avc_error *err)
 		.template = image->template,
 		.memory = memory,
 		.since = image->taken_ns,
+		.recycled = image->recycled,
 	};
 	result = read_areas(&survey, &image->memory->areas, err);
 	memory->layout = result ? 0 : survey.layout;

@@ -6,6 +6,7 @@
  *   image.c         which image is whose
  *   attributes.c    scheduling, credentials, prctl settings
  *   process_attrs.c what only a template can tell: signal handlers, limits, directories
+ *   inherited.c     what a fork has of all that by itself
  *   pending.c       signals that have not been delivered
  *   timers.c        interval timers, POSIX timers
  *   memory*.c       memory that a clone does not carry as it is
@@ -54,6 +55,11 @@ struct image {
 	struct files_mapped *mapped;  /* avckpt.files=strict; NULL: it was not             */
 	struct fd_table table;        /* at a restore: what it is to have open           */
 	struct avc_error notice;      /* what of it cannot be put back              */
+	struct inherited *inherited;  /* dirty.c: what its template was forked with; or NULL */
+	struct pageset *stale;        /* ... and where its memory is not the process's       */
+	uint64_t tracker;             /* ... as this one has noted it (struct tracker)        */
+	uint64_t forked_ns, copied;   /* when the template was; pages written to it since     */
+	bool recycled;                /* it is an older one that was brought up to date       */
 };
 #define PARENT_INIT (-1)
 
@@ -134,6 +140,33 @@ void process_attrs_lift_limit(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
 void process_attrs_setup_limits(const struct image *image, struct setup *setup);
 
+/* ---- inherited.c ------------------------------------------------------------------ */
+
+#define INHERITED_SIGNALS 64
+#define INHERITED_VALUES 10
+
+/* What a process has from the one that forked it, besides memory and descriptors: as it was then, or
+ * as the other has it now.  Compared with memcmp(). */
+struct inherited {
+	uint64_t action[INHERITED_SIGNALS][4]; /* rt_sigaction(2)                    */
+	int64_t value[INHERITED_VALUES];       /* prctl(2), membarrier(2), brk(2)    */
+	struct creds creds;
+	uint64_t limit[LIMITS][2];
+	uint64_t stat;   /* a hash of what /proc/PID/stat tells of its layout    */
+	uint64_t places; /* ... of its directories, namespaces and program       */
+	uint32_t umask;
+	uint32_t dumped; /* core(5), coredump_filter                            */
+};
+
+/* One more call for a list (INJ_LIST), which leaves its answers in that slot; these, once made;
+ * what /proc says; and the thread's own attributes, as asked for with the rest. */
+void inherited_ask(const struct parasite *parasite, uint32_t slot, struct inj_call *call);
+void inherited_answer(const struct parasite *parasite, uint32_t slot, struct inherited *inherited,
+		      int64_t *dumpable);
+int inherited_read(struct inherited *inherited, pid_t pid, struct avc_error *err) warn_unused;
+void inherited_creds(struct inherited *inherited, const struct thread *thread);
+bool inherited_equal(const struct inherited *a, const struct inherited *b);
+
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
 /* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
@@ -192,6 +225,8 @@ int memory_learn(struct process *process, long missing_pages, struct avc_error *
 extern const char memory_private_huge_pages[];
 int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		  struct avc_error *err) warn_unused;
+/* Whether only a fork carries what it has: advice, protection keys. */
+bool memory_needs_fork(const struct process *process);
 /* When all of them are there: -1 if several processes have shared memory that is not rolled back
  * with them.  One that went back would wait for what another one had done. */
 int memory_check_unkept(const struct image *image, uint32_t images,

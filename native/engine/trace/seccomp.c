@@ -138,6 +138,7 @@ static const struct kind wanted_to_restore[] = {
 	{ SYS_timer_delete, ANY },
 	{ SYS_mlock2, ANY },
 	{ SYS_listen, ANY },
+	{ SYS_userfaultfd, ANY },
 	{ SYS_ioctl, ANY }, /* TIOCSPGRP, TIOCSCTTY                            */
 	{ SYS_umask, ANY },
 	{ SYS_fchdir, ANY },
@@ -401,6 +402,8 @@ static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 	case SYS_pkey_mprotect:
 	case SYS_mprotect: /* new code is for the porter to bring (infect.c) */
 		return !inside || !(arch_syscall_arg(regs, 2) & PROT_EXEC);
+	case SYS_userfaultfd: /* in a table of its own, for the guard to take (tracker.c) */
+		return inside == SECCOMP_WATCHER;
 	case SYS_rt_sigqueueinfo:
 	case SYS_rt_tgsigqueueinfo:
 	case SYS_tgkill: /* to itself, not to others */

@@ -226,6 +226,8 @@ struct process {
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
 	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
+	struct tracker *tracker; /* process/tracker.c; NULL: nobody watches its memory         */
+	bool recycling;          /* in this freeze a template is brought up to date          */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
 					  * executed another program                       */
 };
@@ -364,6 +366,7 @@ int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known,
 /* From now on, until seccomp_let_be(): `options` are those it has else, `inside` the number of its
  * process as that knows it. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
+#define SECCOMP_WATCHER (-1) /* for `inside`: the one that opens a userfaultfd       */
 void seccomp_let_be(pid_t tid);
 bool seccomp_is_supervised(pid_t tid);
 /* The same for this stop alone, which is of a system call (STOP_SYSCALL). */

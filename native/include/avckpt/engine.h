@@ -39,6 +39,31 @@ enum avc_tcp {
 	AVC_TCP_MESSAGES = 3     /* those that it leaves in the middle of a message */
 };
 
+/* How a checkpoint gets the memory of a process. */
+enum avc_images {
+	AVC_IMAGES_FORK = 0,  /* by a fork of it                                    */
+	AVC_IMAGES_DIRTY = 1, /* by a copy of what was written since an older one, where
+	                       * that is possible                                   */
+	AVC_IMAGES_AUTO = 2   /* and where it holds the application up for less     */
+};
+
+/* Why one was forked that could have been copied. */
+enum avc_fork_reason {
+	AVC_FORK_NONE = 0,      /* it was not                                      */
+	AVC_FORK_CONFIG = 1,    /* AVC_IMAGES_FORK                                 */
+	AVC_FORK_FIRST = 2,     /* there is no older one yet that could be used    */
+	AVC_FORK_PROCESSES = 3, /* it has several processes                        */
+	AVC_FORK_KERNEL = 4,    /* the kernel cannot watch memory (before 6.7)     */
+	AVC_FORK_SANDBOX = 5,   /* it has a seccomp filter of its own              */
+	AVC_FORK_MEMORY = 6,    /* of a kind that cannot be watched or copied      */
+	AVC_FORK_PINNED = 7,    /* a device or the kernel may write to it unseen   */
+	AVC_FORK_CHANGED = 8,   /* what a fork inherits has changed                */
+	AVC_FORK_LAYOUT = 9,    /* its mappings have changed                       */
+	AVC_FORK_WRITES = 10,   /* so much was written that a fork takes less      */
+	AVC_FORK_AGE = 11,      /* the older ones were not forked for a minute     */
+	AVC_FORK_COPIES = 12    /* ... or have too many pages of their own         */
+};
+
 /* What a guard is to do.  Durations in nanoseconds. */
 struct avc_config {
 	int32_t init_pidfd;          /* pidfd of avckpt-init; duplicated, stays the
@@ -59,6 +84,7 @@ struct avc_config {
 	uint8_t restore_on_exit;        /* any non-zero exit status                  */
 	uint8_t files;                  /* enum avc_files                            */
 	uint8_t tcp;                    /* enum avc_tcp                              */
+	uint8_t images;                 /* enum avc_images                           */
 	uint8_t restore_on_status[256]; /* [n] != 0: exit status n is abnormal    */
 };
 
@@ -128,6 +154,10 @@ struct avc_event {
 	uint64_t freeze_ns;
 	uint64_t stop_ns;  /* of it, until every known thread had stopped   */
 	uint64_t clone_ns; /* of it, until everything was read and cloned   */
+	/* CHECKPOINT: how it was made                                            */
+	int32_t images;      /* AVC_IMAGES_FORK or AVC_IMAGES_DIRTY           */
+	int32_t fork_reason; /* enum avc_fork_reason                          */
+	uint64_t copied;     /* pages, before and during the freeze           */
 	/* RESTORED                                                               */
 	uint64_t died_ns;    /* CLOCK_MONOTONIC when init had reaped the app  */
 	uint64_t restore_ns; /* died_ns until the last thread runs again      */

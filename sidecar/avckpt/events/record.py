@@ -69,6 +69,8 @@ class EventRecord:
     )
     restores: int | None = said("restores since the sidecar protects this run of the container")
     quiescent: bool | None = said("whether the checkpoint was taken at a quiet moment")
+    images: str | None = said("how the checkpoint got the memory: fork or dirty")
+    fork_reason: str | None = said("why it was forked, where avckpt.images is not fork")
     app_pid: int | None = said("the application's main process, in the sidecar's PID namespace")
     app_pid_inside: int | None = said("the same in the container's")
     detail: str = said("one clause for a person, where the rest does not say it", "")
@@ -175,6 +177,8 @@ def of_guard(
         attempt=event.attempt if restored or kind is Kind.DROPPED else None,
         restores=event.restores if restored else None,
         quiescent=event.quiescent if kind is Kind.CHECKPOINT else None,
+        images=event.images or None,
+        fork_reason=event.fork_reason or None,
         app_pid=event.app_pid or None,
         app_pid_inside=event.app_pid_inside or None,
         detail=why_dropped(event.reason) if kind is Kind.DROPPED else "",

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints by copies of what was written: what is restored is the application, to the byte."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from avckpt.guard import Images
+
+from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux
+from testkit.harness import wait_until
+
+PAGE = 4096
+DIRTY = config(images=Images.DIRTY)
+BY_ITSELF = config(0.03, images=Images.DIRTY)
+pytestmark = [
+    since_linux(6, 7, "asynchronous write protection"),
+    pytest.mark.shared_machine(
+        "a checkpoint is missed when threads get no CPU to stop in time; kills come at random moments"
+    ),
+]
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def until_copied(guard: GuardProcess, tries: int = 60) -> Json:
+    """Takes checkpoints until one is made by a copy; that one."""
+    for _ in range(tries):
+        taken = guard.command("checkpoint")
+        if taken["kind"] == "checkpoint" and taken["images"] == "dirty":
+            return taken
+    raise AssertionError(f"all were forks: {[event.get('fork_reason') for event in guard.events]}")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "dirt 30 4 --rate 20000",
+        "dirt 16 3 --rate 4000 --maps",
+        "dirt 8 2",
+        "threads 20 16",
+        "rseq 4",
+        "signals 6 --pending",
+        "mappings 0 --inherited",
+    ],
+)
+def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(BY_ITSELF, [victim.pid]) as guard:
+        for seed in range(6):
+            # Not before there is one again that a copy was made for.
+            since = guard.mark()
+            guard.wait("checkpoint", since=since, count=4)
+            kill_at_random(guard, victim, 2, (0.0, 0.4), seed=seed)
+        victim.wait_beats(20)
+
+
+def mappings_of(pid: int) -> list[tuple[int, int]]:
+    """The private ones, in one piece where they are next to each other."""
+    found: list[tuple[int, int]] = []
+    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+        ends, mode = line.split()[:2]
+        if mode[3] != "p" or "[v" in line:
+            continue
+        start, end = (int(text, 16) for text in ends.split("-"))
+        if found and found[-1][1] == start:
+            start = found.pop()[0]
+        found.append((start, end))
+    return found
+
+
+def pages_that_differ(one: int, other: int) -> list[int]:
+    """Addresses of pages of private memory.  Raises OSError when one of them has ended."""
+    assert mappings_of(one) == mappings_of(other), (mappings_of(one), mappings_of(other))
+    differ = []
+    with Path(f"/proc/{one}/mem").open("rb", 0) as first, Path(f"/proc/{other}/mem").open("rb", 0) as second:
+        for start, end in mappings_of(one):
+            for at in range(start, end, 256 * PAGE):
+                size = min(end - at, 256 * PAGE)
+                a, b = (read_at(mem.fileno(), size, at) for mem in (first, second))
+                if a != b:
+                    differ += [at + i for i in range(0, size, PAGE) if a[i : i + PAGE] != b[i : i + PAGE]]
+    return differ
+
+
+def read_at(mem: int, size: int, at: int) -> bytes:
+    """Guard pages read as nothing, page by page."""
+    try:
+        return os.pread(mem, size, at)
+    except OSError:
+        if size == PAGE:
+            return b""
+        return b"".join(read_at(mem, PAGE, at + i).ljust(PAGE, b"?") for i in range(0, size, PAGE))
+
+
+def newest_template(guard: GuardProcess, victim: Victim) -> int:
+    """By the OOM killer's points, of which it has fewer than the others."""
+    points = {}
+    for pid in victim.others():
+        with contextlib.suppress(OSError):
+            if Path(f"/proc/{pid}/comm").read_text() == "avckpt-tmpl\n":
+                points[pid] = int(Path(f"/proc/{pid}/oom_score_adj").read_text())
+    return min(points, key=lambda pid: points[pid])
+
+
+@pytest.mark.parametrize("command", ["dirt 24 3 --rate 8000", "dirt 8 1 --rate 2000 --maps"])
+def test_the_template_is_the_application(command: str, tmp_path: Path) -> None:
+    """While it stands still: its newest template is the same in every byte that the kernel does not write."""
+    with Victim(command, tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        copies = 0
+        for _ in range(40):
+            victim.wait_beats(3)
+            os.kill(victim.app, signal.SIGSTOP)
+            taken = guard.command("checkpoint")
+            differ = pages_that_differ(victim.app, newest_template(guard, victim))
+            # rseq(2): one area in a page of each thread's.
+            assert len(differ) <= 4, (taken, [hex(at) for at in differ])
+            copies += taken["images"] == "dirty"
+            os.kill(victim.app, signal.SIGCONT)
+        assert copies > 5, [event.get("fork_reason") for event in guard.events]
+
+
+def marked(pid: int) -> int:
+    """Mappings whose writes are watched."""
+    return len(re.findall(r"^VmFlags:.* uw\b", Path(f"/proc/{pid}/smaps").read_text(), re.MULTILINE))
+
+
+def test_no_mark_is_left_when_the_guard_dies(tmp_path: Path) -> None:
+    with Victim("dirt 16 2 --rate 10000", tmp_path) as victim:
+        for _ in range(5):
+            with GuardProcess(BY_ITSELF, [victim.pid]) as guard:
+                guard.wait_for(lambda event: event.get("images") == "dirty", "a copy")
+                assert marked(victim.app) > 3
+                assert not [fd for fd in Path(f"/proc/{victim.app}/fd").iterdir() if "userfault" in os.readlink(fd)]
+            wait_until(lambda: not marked(victim.app), 10.0, "no mark is left")
+            victim.wait_beats(5)
+
+
+def test_the_same_one_is_restored_many_times(tmp_path: Path) -> None:
+    with Victim("dirt 70 2 --rate 10000", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        until_copied(guard)
+        for _ in range(5):
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            victim.wait_beats(5)
+        until_copied(guard)
+        victim.wait_beats(5)
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        ("idle 1 1", "there is no older image yet"),
+        ("idle 1 1 --in-child", "it has several processes"),
+        ("sandbox", "it has a seccomp filter of its own"),
+    ],
+)
+def test_says_why_it_forks(command: str, reason: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(BY_ITSELF, [victim.pid]) as guard:
+        guard.wait_for(lambda event: event.get("fork_reason") == reason, reason)
+
+
+def test_a_copy_needs_no_more_memory_than_was_written(tmp_path: Path) -> None:
+    """An idle application: templates have next to nothing of their own."""
+    with Victim("idle 64 2", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        until_copied(guard)
+        for _ in range(10):
+            assert until_copied(guard)["copied"] < 64

@@ -1,0 +1,295 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * dirt MB THREADS [--rate KB_PER_S] [--maps]: memory that is written at random, all the
+ * time, and read again.
+ *
+ * Each thread has a part of MB, and a table that says what stands in each page of it; a page that
+ * holds anything else is a violation.  It writes pages, gives some back (MADV_DONTNEED) and protects
+ * some for a while.  With --maps it also unmaps and maps again, moves mappings, grows and shrinks
+ * the heap, has mappings that come and go, guard pages, and deep stacks.  KB_PER_S (0: as fast as it
+ * can) of all threads together.
+ */
+#include <pthread.h>
+#include <sys/mman.h>
+
+#include "victim.h"
+
+#define PAGE 4096
+#define WORDS (PAGE / 8)
+#ifndef MADV_GUARD_INSTALL
+#define MADV_GUARD_INSTALL 102
+#define MADV_GUARD_REMOVE 103
+#endif
+enum { THREADS_MAX = 64, RUN_MAX = 16, DEPTH_MAX = 24, NAP_US = 1000 };
+
+static size_t part_pages;
+static int threads;
+static uint64_t rate;
+static bool with_maps;
+
+struct part {
+	int index;
+	uint64_t random, stamps;
+	char *memory;
+	uint64_t *expected; /* by page; 0: nothing was written                 */
+};
+
+static char *page_of(const struct part *part, size_t i)
+{
+	return part->memory + i * PAGE;
+}
+
+static void write_page(struct part *part, size_t i)
+{
+	volatile uint64_t *page = (uint64_t *)page_of(part, i);
+	const uint64_t stamp = mix(++part->stamps, (uint64_t)part->index);
+
+	part->expected[i] = stamp;
+	page[0] = stamp;
+	page[stamp % (WORDS - 2) + 1] = stamp;
+	page[WORDS - 1] = stamp;
+}
+
+static void check_page(const struct part *part, size_t i)
+{
+	const uint64_t *page = (const uint64_t *)page_of(part, i), stamp = part->expected[i];
+	const size_t middle = stamp % (WORDS - 2) + 1;
+
+	CHECK(page[0] == stamp && page[WORDS - 1] == stamp && (!stamp || page[middle] == stamp),
+	      "page %zu of part %d holds %lx %lx %lx instead of %lx", i, part->index, page[0],
+	      page[middle], page[WORDS - 1], stamp);
+}
+
+static void forget(struct part *part, size_t first, size_t count)
+{
+	memset(part->expected + first, 0, count * sizeof *part->expected);
+}
+
+/* Some pages one behind the other. */
+static size_t choose(struct part *part, size_t *first)
+{
+	const size_t most = part_pages < RUN_MAX ? part_pages : RUN_MAX;
+	const size_t pages = 1 + next_random(&part->random) % most;
+
+	*first = next_random(&part->random) % (part_pages - pages + 1);
+	return pages;
+}
+
+static void give_back(struct part *part)
+{
+	size_t first, pages = choose(part, &first);
+
+	must(!madvise(page_of(part, first), pages * PAGE, MADV_DONTNEED), "madvise");
+	forget(part, first, pages);
+}
+
+static void protect(struct part *part)
+{
+	size_t first, pages = choose(part, &first);
+
+	must(!mprotect(page_of(part, first), pages * PAGE, PROT_NONE), "mprotect");
+	nap_us(50);
+	must(!mprotect(page_of(part, first), pages * PAGE, PROT_READ), "mprotect");
+	for (size_t i = 0; i < pages; i++)
+		check_page(part, first + i);
+	must(!mprotect(page_of(part, first), pages * PAGE, PROT_READ | PROT_WRITE), "mprotect");
+}
+
+/* ---- --maps ---------------------------------------------------------------------------------- */
+
+static void map_again(struct part *part)
+{
+	size_t first, pages = choose(part, &first);
+	char *at = page_of(part, first);
+
+	/* Else another thread may get the place. */
+	if (threads == 1 && next_random(&part->random) & 1)
+		must(!munmap(at, pages * PAGE), "munmap");
+	must(mmap(at, pages * PAGE, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED,
+		  -1, 0) == at,
+	     "mmap");
+	forget(part, first, pages);
+}
+
+/* Somewhere else, for a moment. */
+static void move(struct part *part)
+{
+	size_t first, pages = choose(part, &first);
+	char *at = page_of(part, first), *away;
+
+	away = mmap(NULL, pages * PAGE, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+	must(away != MAP_FAILED, "mmap");
+	/* What was split must not be moved in one piece (mremap(2)). */
+	for (size_t i = 0; i < pages; i++)
+		must(mremap(at + i * PAGE, PAGE, PAGE,
+			    MREMAP_MAYMOVE | MREMAP_FIXED | MREMAP_DONTUNMAP,
+			    away + i * PAGE) == away + i * PAGE,
+		     "mremap");
+	nap_us(50);
+	for (size_t i = 0; i < pages; i++)
+		must(mremap(away + i * PAGE, PAGE, PAGE, MREMAP_MAYMOVE | MREMAP_FIXED,
+			    at + i * PAGE) == at + i * PAGE,
+		     "mremap");
+}
+
+static void come_and_go(struct part *part)
+{
+	const size_t pages = 1 + next_random(&part->random) % 64;
+	const uint64_t stamp = next_random(&part->random);
+	uint64_t *at = mmap(NULL, pages * PAGE, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS,
+			    -1, 0);
+
+	must(at != MAP_FAILED, "mmap");
+	for (size_t i = 0; i < pages; i++)
+		at[i * WORDS] = mix(stamp, i);
+	nap_us(100);
+	for (size_t i = 0; i < pages; i++)
+		CHECK(at[i * WORDS] == mix(stamp, i), "page %zu of a new mapping holds %lx", i,
+		      at[i * WORDS]);
+	must(!munmap(at, pages * PAGE), "munmap");
+}
+
+static void guard(struct part *part)
+{
+	size_t first, pages = choose(part, &first);
+	char *at = page_of(part, first);
+
+	if (madvise(at, pages * PAGE, MADV_GUARD_INSTALL))
+		return; /* since Linux 6.13 */
+	forget(part, first, pages);
+	nap_us(50);
+	must(!madvise(at, pages * PAGE, MADV_GUARD_REMOVE), "madvise");
+	for (size_t i = 0; i < pages; i++)
+		check_page(part, first + i);
+}
+
+/* Only one thread may: the heap is everybody's. */
+static void grow_heap(struct part *part)
+{
+	const size_t bytes = PAGE * (1 + next_random(&part->random) % 32);
+	const uint64_t stamp = next_random(&part->random);
+	uint64_t *at = sbrk((intptr_t)bytes);
+
+	must(at != (void *)-1, "sbrk");
+	for (size_t i = 0; i < bytes / 8; i += WORDS)
+		at[i] = mix(stamp, i);
+	nap_us(50);
+	for (size_t i = 0; i < bytes / 8; i += WORDS)
+		CHECK(at[i] == mix(stamp, i), "the heap holds %lx", at[i]);
+	/* Somebody else's allocation may be behind it by now. */
+	if (sbrk(0) == (char *)at + bytes)
+		must(sbrk(-(intptr_t)bytes) != (void *)-1, "sbrk");
+}
+
+__attribute__((noinline)) static uint64_t dive(int depth, uint64_t stamp)
+{
+	volatile uint64_t here[WORDS];
+	uint64_t below;
+
+	for (size_t i = 0; i < WORDS; i += 64)
+		here[i] = mix(stamp, i + (size_t)depth);
+	below = depth ? dive(depth - 1, stamp) : (nap_us(50), stamp);
+	for (size_t i = 0; i < WORDS; i += 64)
+		CHECK(here[i] == mix(stamp, i + (size_t)depth), "the stack holds %lx", here[i]);
+	return below;
+}
+
+/* ---- all of it --------------------------------------------------------------------------------- */
+
+static void change_maps(struct part *part)
+{
+	const uint64_t stamp = next_random(&part->random);
+
+	switch (stamp % 6) {
+	case 0:
+		map_again(part);
+		return;
+	case 1:
+		move(part);
+		return;
+	case 2:
+		come_and_go(part);
+		return;
+	case 3:
+		guard(part);
+		return;
+	case 4:
+		if (!part->index)
+			grow_heap(part);
+		return;
+	default:
+		CHECK(dive((int)((stamp >> 8) % DEPTH_MAX), stamp) == stamp, "the stack is torn");
+	}
+}
+
+static void step(struct part *part)
+{
+	const uint64_t what = next_random(&part->random) % 1024;
+
+	if (what == 0)
+		give_back(part);
+	else if (what == 1)
+		protect(part);
+	else if (what < 12 && with_maps)
+		change_maps(part);
+	else
+		write_page(part, next_random(&part->random) % part_pages);
+	check_page(part, next_random(&part->random) % part_pages);
+}
+
+static void *work(void *arg)
+{
+	struct part *part = arg;
+	const uint64_t start = now_ns();
+	uint64_t steps = 0;
+
+	for (;;) {
+		const uint64_t elapsed_us = (now_ns() - start) / 1000;
+		const uint64_t due = rate ? elapsed_us * rate / (uint64_t)threads / 4 / 1000000
+					  : steps + 256;
+
+		/* After a restore much is due. */
+		if (due > steps + 4096)
+			steps = due - 4096;
+		for (; steps < due; steps++)
+			step(part);
+		if (!part->index)
+			beat();
+		if (rate)
+			nap_us(NAP_US);
+	}
+	return NULL;
+}
+
+int main(int argc, char **argv)
+{
+	static struct part parts[THREADS_MAX];
+	pthread_attr_t attr;
+
+	with_maps = victim_flag(&argc, argv, "--maps");
+	victim_start(&argc, argv, 2, "MB THREADS [--rate KB_PER_S] [--maps]");
+	if (argc > 4 && !strcmp(argv[3], "--rate"))
+		rate = strtoull(argv[4], NULL, 10);
+	threads = atoi(argv[2]) < THREADS_MAX ? atoi(argv[2]) : THREADS_MAX;
+	part_pages = ((size_t)atol(argv[1]) << 20) / PAGE / (size_t)threads;
+	pthread_attr_init(&attr);
+	pthread_attr_setstacksize(&attr, 256 << 10);
+	for (int i = 0; i < threads; i++) {
+		struct part *part = &parts[i];
+
+		part->index = i;
+		part->random = mix((uint64_t)i + 1, 7);
+		part->memory = victim_memory(part_pages * PAGE, false);
+		part->expected = calloc(part_pages, sizeof *part->expected);
+		must(part->expected != NULL, "calloc");
+		for (size_t k = 0; k < part_pages; k++)
+			write_page(part, k);
+	}
+	for (int i = 1; i < threads; i++) {
+		pthread_t thread;
+
+		must(!pthread_create(&thread, &attr, work, &parts[i]), "pthread_create");
+	}
+	victim_ready();
+	work(&parts[0]);
+}
