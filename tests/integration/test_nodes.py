@@ -23,7 +23,12 @@ from testkit.harness import avckpt_command, run, wait_until
 from testkit.local_sidecar import LocalSidecar, local_sidecar
 from testkit.procfs import children_of, inside
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
+    pytest.mark.shared_machine(
+        "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
+    ),
+]
 
 INIT = str(init_binary())
 COUNTER = """
