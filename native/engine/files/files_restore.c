@@ -137,8 +137,8 @@ static bool was_idle(const struct file *w)
 	return w->socket && w->socket->idle;
 }
 
-/* Who was about to give it a name, or to connect it, will do so again, and the kernel lets
- * nobody do that twice (bind(2): EINVAL, connect(2): EISCONN). */
+/* A restored caller of bind(2) or connect(2) makes the call again, and the kernel refuses the
+ * second one (EINVAL, EISCONN). */
 static bool was_used(int fd, const struct file *w)
 {
 	return file_socket_was_used(fd, w->socket);

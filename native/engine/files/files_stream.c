@@ -63,8 +63,8 @@ bool file_is_going(int fd)
 	return poll(&writable, 1, 0) == 0;
 }
 
-/* Who has written part of a message asks to be told when there is room for more.
- * Edge-triggered, everybody asks always. */
+/* A writer that has written part of a message asks to be told when there is room for more.
+ * Edge-triggered sets ask for that all the time. */
 void files_find_going(struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++) {

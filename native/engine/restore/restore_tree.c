@@ -150,7 +150,7 @@ static int fork_once(struct forked *host, const struct image *image, pid_t copy,
 	return result ? -1 : 0;
 }
 
-/* Who was killed between making it and telling us has left it in the way. */
+/* A parent that was killed after it had made the child, and before it told us, left it behind. */
 static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc_error *err)
 {
 	pid_t children[CHILDREN_MAX];

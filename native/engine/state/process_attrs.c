@@ -145,7 +145,7 @@ static uint32_t keys_of(const struct inj_syscall given[KEYS - 1])
 
 static int64_t barriers_of(const struct inj_syscall *told, const struct inj_syscall *made)
 {
-	/* Who was to be reached by all: nothing tells.  It costs next to nothing. */
+	/* The kernel does not tell whether it registered for global barriers; to do so is cheap. */
 	int64_t registered = BARRIER_GLOBAL << 1;
 
 	if (told->result >= 0)

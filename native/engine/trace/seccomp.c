@@ -8,8 +8,8 @@
  * what the application does to the parasite, to its stack or its lists meanwhile, or puts in its
  * place, leads to calls that its own filter judges, or to some of those below.
  *
- * Who has no filter at all has nothing that could be suspended but strict mode.  That is suspended
- * for the first checkpoint, and supervised from then on.
+ * A task without any filter can only be in strict mode.  That is suspended for the first
+ * checkpoint, and supervised from then on.
  */
 #include <errno.h>
 #include <linux/filter.h>

@@ -72,7 +72,7 @@ class ConfigFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """Everything that is looked at; None: could not be found out."""
+    """What `gather()` found; None: it could not find out."""
 
     kernel: str
     machine: str
@@ -387,7 +387,7 @@ def service_facts(socket: Path) -> PodmanFacts | str | None:
     """What the service at that socket says of itself, or why it does not; None: there is no socket."""
     if not socket.is_socket():
         return None
-    # Who has no service does not wait for the import.
+    # Here, so that machines without a service do not wait for the import.
     from podman import PodmanClient
 
     try:

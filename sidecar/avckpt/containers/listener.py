@@ -94,7 +94,7 @@ class HookListener:
         self._loop.add_reader(connection, self._serve, connection)
 
     def _wait(self, error: OSError) -> None:
-        """Accepts nobody for a moment: who waits goes on waiting, so that the socket stays readable."""
+        """Accepts nobody for a moment.  Clients go on waiting, so that the socket stays readable."""
         if not self._is_short:
             log.error(
                 "hooks cannot be answered (%s): containers that start now run unprotected at first; "

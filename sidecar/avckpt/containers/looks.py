@@ -23,11 +23,11 @@ T = TypeVar("T")
 WAIT_S = 1.0
 
 _under_way: dict[tuple[str, int], tuple[float, asyncio.Future[Any]]] = {}
-"""What is looked at, and for whom; since when (the loop's time)."""
+"""Looks under way, by subject and process: when each began (the loop's time), and its result."""
 
 
 async def look(what: str, pid: int, function: Callable[[], T]) -> T:
-    """What `function` returns, or raises; `what` of `pid` it looks at is looked at once at a time.
+    """Returns what `function` returns, or raises.  Callers that want the same `what` of `pid` share one call.
 
     Raises DeadlineMissed when that takes longer than WAIT_S.
     """

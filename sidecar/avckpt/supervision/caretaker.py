@@ -34,7 +34,7 @@ from avckpt.supervision.pressure import (
 log = logging.getLogger("avckpt")
 
 LOOK_S = 1.0
-"""How often limits are looked at."""
+"""Seconds between two looks at limits."""
 W = TypeVar("W", bound=Ward)
 
 

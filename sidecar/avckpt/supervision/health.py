@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from avckpt.engine import Guard
 
 LOOK_S = 0.2
-"""How often the answer of the hook's process is looked for, until it is there."""
+"""Seconds between two looks for the answer of the hook's process."""
 KNOWN_WITHIN_S = 90.0
 """How long it is waited for: longer than that process tries."""
 LEAST_INTERVAL_S = 0.1
@@ -246,7 +246,7 @@ class _Watcher:
                 self.tell(EventRecord(Kind.HEALTH, detail=f"{detail}: rolled back ({why})"))
 
     def _complain(self, detail: str, error: AvckptError) -> None:
-        # Who was not told of it (that is not done at every interval) need not hear that it is over.
+        # Only if the trouble was told (not every interval tells) is its end worth telling.
         self.troubled |= self.tell(EventRecord(Kind.HEALTH, detail=detail, error=error)).seq > 0
 
     def _order(self, command: Command) -> None:

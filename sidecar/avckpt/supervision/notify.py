@@ -207,7 +207,7 @@ def _open_app(container: Protected, init_pidfd: int) -> int:
 
 
 async def _send(app: int, number: int) -> None:
-    """Sends a signal unless it would kill the application: who asks for one must be prepared for it."""
+    """Sends a signal unless it would kill the application, which must have a handler for it."""
     pid = pid_of(app)
     if not await look("threads", pid, lambda: _is_ready(pid, number)):
         raise AvckptError(f"its application does not handle {signal_name(number)}, which would end it: it was not sent")
