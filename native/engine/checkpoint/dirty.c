@@ -268,6 +268,8 @@ static enum avc_fork_reason watch(struct dirty *dirty, struct process *process, 
 {
 	struct avc_error refused = { 0 };
 
+	if (process->tracker && (process->tracker->over || process->tracker->broken))
+		tracker_end(process);
 	if (!process->tracker) {
 		if (dirty->refused_nonce == process->nonce || !process->holder)
 			return AVC_FORK_KERNEL;
@@ -566,7 +568,8 @@ void dirty_recycle(struct dirty *dirty, struct generation *generation)
 	char score[16];
 
 	if (generation->images > 1 || generation->spare.work || !image->stale ||
-	    !image->inherited || !image->template || !tracker || tracker->number != image->tracker)
+	    !image->inherited || !image->template || !tracker || tracker->over ||
+	    tracker->number != image->tracker)
 		return;
 	dirty_drop_idle(dirty); /* one that could not be used is older */
 	*idle = (struct idle_template){

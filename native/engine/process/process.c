@@ -128,7 +128,10 @@ void process_close(struct process *process)
 	process->pid = 0;
 	process->leader = 0;
 	process->infected = false;
-	tracker_end(process);
+	/* To close it takes the kernel some 10 ms for each GB as long as that memory is there, and a
+	 * restore does not wait for that. */
+	if (process->tracker)
+		process->tracker->over = true;
 	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		process->threads[i].seen = false;

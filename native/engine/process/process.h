@@ -148,6 +148,7 @@ struct tracker {
 	struct pageset found;
 	struct pageset *set[TRACKER_SETS];
 	uint32_t sets;
+	bool over;   /* the process is another one                              */
 	bool broken; /* there was no memory to note something in                */
 };
 
