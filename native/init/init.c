@@ -76,7 +76,8 @@ static struct {
 	const char *app_name;
 	int stop_signal;
 	uint32_t wait_ms;
-	bool is_unit; /* below a launcher: unit.c */
+	bool is_unit;      /* below a launcher: unit.c */
+	bool shares_group; /* the program is in ours */
 
 	bool waiting; /* reported death `seq`, waits for the verdict */
 	uint32_t seq;
@@ -206,6 +207,7 @@ static void protect(void)
 	ctl->report_fd = self.fd[REPORT_READ];
 	ctl->verdict_fd = self.fd[VERDICT];
 	ctl->wait_ms = self.wait_ms;
+	ctl->is_unit = self.is_unit;
 	__atomic_store_n(&ctl->magic, AVC_CTL_MAGIC, __ATOMIC_RELEASE);
 	self.ctl = ctl;
 	return;
@@ -248,7 +250,8 @@ static _Noreturn void become_app(char **argv)
 			if (getppid() != self.pid)
 				raise(SIGKILL);
 		}
-	} else {
+	}
+	if (!self.shares_group) {
 		/* A group of its own, so that a kill(0) of the app's does not come back
 		 * to it through us, and the terminal's signals are the app's alone. */
 		setpgid(0, 0);
@@ -599,7 +602,7 @@ static void continue_stopped(void)
 /* The terminal's signals come to the whole group, a unit's program is in it, and has its own. */
 static bool app_has_it(int sig, const struct signalfd_siginfo *info)
 {
-	if (!self.is_unit || info->ssi_code != SI_KERNEL || self.waiting)
+	if (!self.shares_group || info->ssi_code != SI_KERNEL || self.waiting)
 		return false;
 	if (is_stop(sig))
 		note_stop(now_ns());
@@ -752,6 +755,8 @@ int main(int argc, char **argv)
 	}
 	/* Orphans come to us also where we are not PID 1. */
 	prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
+	/* A group that is outside our PID namespace cannot be entered again: number 0. */
+	self.shares_group = self.is_unit && getpgrp() > 0;
 	if (!self.is_unit)
 		find_terminal();
 	protect();

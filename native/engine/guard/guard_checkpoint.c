@@ -79,6 +79,38 @@ static void drop_images(struct avc_guard *guard, const struct process *process)
 			guard_drop_generation(guard, i);
 }
 
+/* Nobody of ours forks while another guard in the same PID namespace chooses numbers. */
+static int lock_numbers(const struct avc_guard *guard, struct avc_error *err)
+{
+	if (last_pid_lock(guard->channel.numbers_fd, false))
+		return 0;
+	return fail(err, AVC_DEADLINE, 0, guard->main.pid, "checkpoint", "flock",
+		    "others in its PID namespace choose numbers all the time");
+}
+
+static int infect(struct avc_guard *guard, struct process *process, struct avc_error *err)
+{
+	int result;
+
+	if (lock_numbers(guard, err))
+		return -1;
+	result = process_infect(process, guard->config.keep + 1, guard->timer,
+				guard->config.freeze_deadline_ns, err);
+	last_pid_unlock(guard->channel.numbers_fd);
+	return result;
+}
+
+static int hold(struct avc_guard *guard, struct process *process, struct avc_error *err)
+{
+	int result;
+
+	if (lock_numbers(guard, err))
+		return -1;
+	result = process_hold(process, guard->timer, guard->config.freeze_deadline_ns, err);
+	last_pid_unlock(guard->channel.numbers_fd);
+	return result;
+}
+
 static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_error *err)
 {
 	struct process *process = guard->tree.entry[entry].process;
@@ -98,15 +130,14 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_e
 		process_unhold(process);
 		for (uint32_t i = 0; i < process->thread_count; i++)
 			process->threads[i].known = false;
-		if (process_infect(process, guard->config.keep + 1, guard->timer, deadline, err))
+		if (infect(guard, process, err))
 			return -1;
 	}
 	if (process_acquaint(process, guard->timer, deadline, err))
 		return -1;
 	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
 	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
-	if (!process->holder && !process->adopts &&
-	    process_hold(process, guard->timer, deadline, err))
+	if (!process->holder && !process->adopts && hold(guard, process, err))
 		return -1;
 	return 0;
 }
@@ -254,12 +285,15 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 {
 	struct avc_error error = { 0 };
 
+	if (!last_pid_lock(guard->channel.numbers_fd, false))
+		return;
 	tracee_deadline_set(guard->timer, SPARE_NS);
 	/* A template that was killed is seen to by guard_reap_dead(), as soon as that shows. */
 	if (spare_make(newest, &error) && error.code != AVC_GONE &&
 	    !pidfd_ended(newest->image[0].pidfd))
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
 	tracee_deadline_clear(guard->timer);
+	last_pid_unlock(guard->channel.numbers_fd);
 }
 
 void guard_work_ahead(struct avc_guard *guard)
@@ -346,7 +380,12 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 		generation_drop(fresh);
 		return -1;
 	}
+	if (lock_numbers(guard, err)) {
+		generation_drop(fresh);
+		return -1;
+	}
 	result = freeze_tree(freeze, err);
+	last_pid_unlock(guard->channel.numbers_fd);
 	budget_deadline(0);
 	if (!result)
 		result = budget_check(guard->main.pid, err);

@@ -139,6 +139,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					   .ready = say_restored,
 					   .arg = guard };
 		struct avc_error failed = { 0 };
+		bool restored;
 
 		budget_begin(say_working, &guard->channel);
 
@@ -154,7 +155,11 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		 * tables.  And they count where processes are limited, as a spare does. */
 		if (ending)
 			guard_wait_ended();
-		if (restore_app(&restore, &failed) == 0) {
+		init_channel_working(&guard->channel);
+		(void)last_pid_lock(guard->channel.numbers_fd, true);
+		restored = restore_app(&restore, &failed) == 0;
+		last_pid_unlock(guard->channel.numbers_fd);
+		if (restored) {
 			adopt_family(guard, generation);
 			generation->spare.tried = false; /* that one is used up */
 			note_restore(guard, reason);
@@ -185,6 +190,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
  * are not the main one only the holder keeps what they have open. */
 static void hold_all(struct avc_guard *guard)
 {
+	if (!last_pid_lock(guard->channel.numbers_fd, false))
+		return;
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
 		struct avc_error ignored = { 0 };
@@ -194,6 +201,7 @@ static void hold_all(struct avc_guard *guard)
 		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;
 	}
+	last_pid_unlock(guard->channel.numbers_fd);
 }
 
 /* Killed in the middle of a checkpoint: init cannot wait for a process before we have waited

@@ -29,7 +29,7 @@
 void init_channel_init(struct init_channel *channel)
 {
 	*channel = (struct init_channel){
-		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1
+		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .numbers_fd = -1
 	};
 }
 
@@ -150,6 +150,8 @@ static int connect_all(struct init_channel *channel, int number, struct avc_erro
 		return fail_errno(err, channel->init, "attach", "open(fd)",
 				  "its pipes cannot be opened");
 	channel->init_inside = ctl->init_pid;
+	if (ctl->is_unit)
+		channel->numbers_fd = last_pid_lock_open(channel->init);
 	return 0;
 }
 
@@ -191,6 +193,7 @@ void init_channel_close(struct init_channel *channel)
 	close_fd(&channel->ctl_fd); /* lets the lock go */
 	close_fd(&channel->report_fd);
 	close_fd(&channel->verdict_fd);
+	close_fd(&channel->numbers_fd);
 }
 
 pid_t init_channel_app(const struct init_channel *channel)

@@ -15,6 +15,7 @@
 #include <signal.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
@@ -40,6 +41,10 @@ extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end");
 #define ENGINE_SPINS 100
 #define SLICE_NS (20 * (long)NS_PER_MS)
 #define END_MS 1000
+#define LOCK_NS (300 * NS_PER_MS)
+#define LOCK_URGENT_NS NS_PER_S
+#define LOCK_STEP_US 50
+#define LOCK_STEPS 20 /* of a checkpoint, which has time */
 
 struct last_pid {
 	pid_t task;
@@ -48,6 +53,32 @@ struct last_pid {
 	struct inj_slot **slot;
 	uint32_t count;
 };
+
+/* ---- one at a time ------------------------------------------------------------------ */
+
+int last_pid_lock_open(pid_t init)
+{
+	return proc_open(init, "ns/pid", O_RDONLY);
+}
+
+bool last_pid_lock(int fd, bool urgent)
+{
+	const uint64_t end = now_ns() + (urgent ? LOCK_URGENT_NS : LOCK_NS);
+
+	while (fd >= 0 && flock(fd, LOCK_EX | LOCK_NB)) {
+		if (now_ns() > end)
+			return false;
+		heartbeat();
+		usleep(urgent ? LOCK_STEP_US : LOCK_STEPS * LOCK_STEP_US);
+	}
+	return true;
+}
+
+void last_pid_unlock(int fd)
+{
+	if (fd >= 0)
+		(void)flock(fd, LOCK_UN);
+}
 
 /* ---- its process ------------------------------------------------------------------- */
 

@@ -574,6 +574,13 @@ struct last_pid_slot {
 	const struct parasite *parasite;
 	uint32_t number;
 };
+/* In a PID namespace with several guards one at a time forks, or chooses numbers: what another one
+ * makes meanwhile, a template or a spare, would take them.  A restore is urgent: it looks more
+ * often.  The lock is of the namespace, and so anybody's in there: false if it was not to be had in
+ * time.  fd < 0: there is no need. */
+int last_pid_lock_open(pid_t init);
+bool last_pid_lock(int fd, bool urgent);
+void last_pid_unlock(int fd);
 /* Starts the helper of the next restore, which waits for it; best effort. */
 void last_pid_prepare(int init_pidfd);
 void last_pid_forget(void);
@@ -591,6 +598,7 @@ void last_pid_stop(struct last_pid *helper);
 
 struct init_channel {
 	int init_pidfd, ctl_fd, report_fd, verdict_fd;
+	int numbers_fd; /* last_pid_lock(), where others restore in its PID namespace, too */
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
 	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */

@@ -50,7 +50,8 @@ struct avc_ctl {
 	/* Written by init: set once it has been told to start the app and exec
 	 * failed (errno), else 0.                                               */
 	int32_t exec_errno;
-	int32_t reserved;
+	/* Written by init: 1 where there may be others of our kind in its PID namespace. */
+	int32_t is_unit;
 };
 
 enum avc_report_kind { AVC_REPORT_DEATH = 1 };
