@@ -76,8 +76,18 @@ def test_one_that_does_something_is_waited_for(podman: Path, other: str) -> None
 
 def test_what_it_says_is_passed_on_but_for_ids() -> None:
     said: list[str] = []
-    Fake(f"echo {'ab' * 32}; echo one >&2; sleep 0.3; echo two").up([], said.append)
-    assert said == ["one", "two"]
+    Fake(f"echo {'ab' * 32}; echo it says >&2; sleep 0.3; echo and more; echo project_service_1").up([], said.append)
+    assert said == ["it says", "and more"]
+    with pytest.raises(AvckptError, match="^podman-compose up failed: and more$"):
+        Fake("echo and more; echo project_service_1; exit 1").up([], said.append)
+
+
+def test_a_traceback_is_its_last_line() -> None:
+    said: list[str] = []
+    program = "def f(): {}['a']\ntry:\n  f()\nexcept KeyError:\n  raise ValueError('no such thing')"
+    with pytest.raises(AvckptError, match="^podman-compose up failed: ValueError: no such thing$"):
+        Fake(f'{sys.executable} -c "{program}"').up([], said.append)
+    assert said == ["KeyError: 'a'", "ValueError: no such thing"]
 
 
 def test_a_failure_is_told_by_its_last_words() -> None:

@@ -38,7 +38,9 @@ Say = Callable[[str], None]
 
 _HEALTHY = "--condition=healthy"
 _WAITS = {"--condition=running": "running", _HEALTHY: "healthy"}
-_ID = re.compile(r"[0-9a-f]{64}")
+_ONE_WORD = re.compile(r"[\w.-]+")
+_NOT_THERE = "Error: no container with name or ID"
+_TRACEBACKS = ("Traceback (most recent call last):", "During handling of the above", "The above exception was")
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Compose:
         return [_started(entry) for entry in found]
 
     def _run(self, args: list[str], say: Say) -> None:
-        said: list[str] = []
+        words = _Words(say)
         # A file, not a pipe: what a container's monitor inherits of a pipe would
         # have to be read until the container ends.
         with tempfile.NamedTemporaryFile() as written, open(written.name, errors="replace") as output:
@@ -111,17 +113,16 @@ class Compose:
                 [*self._command, *args], stdin=subprocess.DEVNULL, stdout=written, stderr=subprocess.STDOUT
             )
             try:
-                stuck = _watch(process, lambda: said.extend(_tell(output, say)))
+                stuck = _watch(process, lambda: words.take(output))
             finally:
                 if process.poll() is None:
                     _end(process)
-            said.extend(_tell(output, say))
+            words.take(output)
         command = f"podman-compose {args[0]}"
         if stuck:
             raise AvckptError(f"{command} was ended: it waited in vain for {', '.join(stuck)}")
         if process.returncode != 0:
-            last = said[-1] if said else f"exit status {process.returncode}"
-            raise AvckptError(f"{command} failed: {last}")
+            raise AvckptError(f"{command} failed: {words.last or f'exit status {process.returncode}'}")
 
     def _ask(self, command: list[str], *, lenient: bool = False) -> str:
         try:
@@ -193,20 +194,38 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _tell(output: IO[str], say: Say) -> list[str]:
-    """Passes on the whole lines that have come; ids of what was made tell nobody anything."""
-    lines = []
-    while True:
-        at = output.tell()
-        line = output.readline()
-        if not line.endswith("\n"):
-            output.seek(at)
-            break
-        text = line.rstrip()
-        if text and not _ID.fullmatch(text):
-            lines.append(text)
-            say(text)
-    return lines
+class _Words:
+    """What podman-compose prints, without what tells nobody anything.
+
+    That is names and ids of what was made or removed, that something was not there to be removed, and of a
+    traceback all but its last line.
+    """
+
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._in_traceback = False
+        self.last = ""
+
+    def take(self, output: IO[str]) -> None:
+        """Passes on the whole lines that have come."""
+        while True:
+            at = output.tell()
+            line = output.readline()
+            if not line.endswith("\n"):
+                output.seek(at)
+                return
+            text = line.rstrip()
+            if text and not self._is_noise(text):
+                self.last = text
+                self._say(text)
+
+    def _is_noise(self, text: str) -> bool:
+        if text.startswith(_TRACEBACKS):
+            self._in_traceback = True
+        elif self._in_traceback:
+            self._in_traceback = text[0].isspace()
+            return self._in_traceback
+        return self._in_traceback or _ONE_WORD.fullmatch(text) is not None or text.startswith(_NOT_THERE)
 
 
 def _started(entry: dict[str, Any]) -> Started:

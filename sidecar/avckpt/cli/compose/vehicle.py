@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +17,9 @@ from avckpt.cli.client import Client, Json
 from avckpt.cli.compose.podman_compose import Compose, Started
 from avckpt.cli.doctor import Check, Status
 from avckpt.errors import AvckptError, ConfigError, Denied
+from avckpt.guard import Command
+
+log = logging.getLogger("avckpt")
 
 Say = Callable[[str], None]
 
@@ -103,17 +107,32 @@ def up(compose: Compose, services: Sequence[str], run_dir: Path, wait_s: float, 
 
 
 def wait_protected(compose: Compose, client: Client, started: Sequence[Started], wait_s: float) -> list[Protection]:
-    """Looks until nothing is left to wait for, or for `wait_s`."""
+    """Looks until nothing is left to wait for, or for `wait_s`.
+
+    A first checkpoint is asked for as soon as there can be one: it does not wait for the interval.
+    """
     deadline = time.monotonic() + wait_s
+    asked: set[str] = set()
     while True:
         known = client.containers(memory=False) if any(c.wanted for c in started) else []
         entries = {str(entry["id"]): entry for entry in known}
+        for one in entries.values():
+            if one["state"] == "starting" and one["app_pid"] and one["id"] not in asked:
+                asked.add(one["id"])
+                _ask_for_checkpoint(client, one["id"])
         found = [judge(one, entries.get(one.id)) for one in started]
         if not any(one.may_change for one in found) or time.monotonic() > deadline:
             return found
         time.sleep(LOOK_EVERY_S)
         now = {one.id: one for one in compose.containers()}
         started = [now.get(one.id, one) for one in started]
+
+
+def _ask_for_checkpoint(client: Client, container_id: str) -> None:
+    try:
+        client.command(container_id, Command.CHECKPOINT)
+    except AvckptError as error:
+        log.debug("%s: %s", container_id, error)  # the next look tells its state, with the reason
 
 
 def judge(container: Started, entry: Json | None) -> Protection:
