@@ -50,7 +50,9 @@ struct avc_ctl {
 	/* Written by init: set once it has been told to start the app and exec
 	 * failed (errno), else 0.                                               */
 	int32_t exec_errno;
-	int32_t reserved;
+	/* Written by init: its child that listens to the keys of a terminal, 0: none.  It is
+	 * no process of the app's, and ended while a death is reported.         */
+	int32_t keys_pid;
 };
 
 enum avc_report_kind { AVC_REPORT_DEATH = 1 };
