@@ -51,7 +51,7 @@ test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
-sweep: setup-build ## kill the guard before each of its system calls, one run each: nobody notices (an hour or more)
+sweep: setup-build ## kill the guard before each of its system calls and stores, one run each: nobody notices (an hour)
 	@AVCKPT_SWEEP=all $(VENV)/python -m pytest tests/native/test_engine_sweep.py $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 test-programs: setup ## checkpoint, kill and restore real programs, ROUNDS times each, in both modes of avckpt.tcp
@@ -119,7 +119,7 @@ bench-trees: setup-build ## measure freeze and restore of process trees beside f
 	@$(VENV)/python -m bench.trees
 
 clean: ## remove what was built here (images and the base's cache stay)
-	rm -rf build .venv native/build native/build-san native/build-fuzz tests/fuzz/build tests/fuzz/build-seeds .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build .venv native/build native/build-san native/build-fuzz native/build-stores tests/fuzz/build tests/fuzz/build-seeds .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
 	find hooks sidecar native tests testkit scripts examples bench -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null; true
 

@@ -11,7 +11,7 @@ JSON on standard output.  Commands are lines on standard input:
     check COOKIE MS                kills a guard that has not been heard of for so long
     stop                           stops the guards and ends
 
-The end of the input ends it as `stop` does.
+The end of the input ends it as `stop` does.  AVCKPT_TEST_GUARD names another avckpt-guard to start.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ import select
 import sys
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
+import avckpt.engine
 from avckpt.engine import Engine
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command, Event, GuardConfig
@@ -131,6 +133,8 @@ def tell(message: dict[str, object]) -> None:
 
 def main() -> None:
     """See above."""
+    if program := os.environ.get("AVCKPT_TEST_GUARD"):
+        setattr(avckpt.engine, "guard_binary", lambda: Path(program))  # noqa: B010
     with Engine() as engine:
         peer = Peer(engine, config_of_json(sys.argv[1]), [int(pid) for pid in sys.argv[2:]])
         tell({"kind": "started", "guards": [guard.pid for guard in peer.guards.values()]})

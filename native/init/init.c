@@ -42,10 +42,12 @@
 
 #include "avckpt/ctl.h"
 #include "init.h"
+#include "keys.h"
 
 #define NAME "avckpt-init"
 #define EXIT_USAGE 125 /* init's own failure, as Podman's own are */
 #define END_CHILDREN_MS 500
+#define KEYS_MS 10000 /* an end so long after Ctrl-C is one that was asked for */
 #define VERDICTS_PER_ROUND 1024
 
 #ifndef MFD_NOEXEC_SEAL
@@ -306,6 +308,16 @@ static void drop_inherited(void)
 		close(null_fd);
 }
 
+/* Who presses a key of the terminal; the guard is to know that this task is ours. */
+static void listen_to_keys(void)
+{
+	const pid_t pid = self.ctl && !self.is_unit && self.fd[TTY] >= 0 ? keys_listen(self.app_pid)
+									 : 0;
+
+	if (self.ctl)
+		__atomic_store_n(&self.ctl->keys_pid, pid, __ATOMIC_RELEASE);
+}
+
 /* Forks the app.  On failure *becomes* the app, with no init at all. */
 static void start_app(char **argv)
 {
@@ -316,6 +328,7 @@ static void start_app(char **argv)
 		become_app(argv);
 	close_fd(EXEC_WRITE); /* the child's closes by itself when its exec succeeds */
 	drop_inherited();
+	listen_to_keys();
 }
 
 /* Only now may the guard look at the app: before, it was a copy of us. */
@@ -400,15 +413,17 @@ static bool within_stop_time(uint64_t then_ns, uint64_t at_ns)
 }
 
 /* Was this end wanted?  By a stop, by somebody who sent the very signal that it
- * died of, or by the keys of a terminal: those signals come from the kernel to
- * the app's group, and all we see of them is what the app died of, or the
- * status by which shells and their kin say so. */
-static bool was_wanted(int status, uint64_t at_ns)
+ * died of, or by the keys of a terminal: `keys_ns` is when one was pressed last.
+ * Of its hang-up we see what the app died of, or the status by which shells and
+ * their kin say so. */
+static bool was_wanted(int status, uint64_t at_ns, uint64_t keys_ns)
 {
 	static const int fatal[] = { SIGABRT, SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGTRAP, SIGSYS };
 	int sig = WIFSIGNALED(status) ? WTERMSIG(status) : WEXITSTATUS(status) - 128;
 
 	if (within_stop_time(self.stop_ns, at_ns))
+		return true;
+	if (keys_ns && (keys_ns > at_ns || at_ns - keys_ns < KEYS_MS * NS_PER_MS))
 		return true;
 	if (WIFSIGNALED(status) && within_stop_time(self.sent_ns[sig], at_ns))
 		return true;
@@ -425,7 +440,7 @@ static bool was_wanted(int status, uint64_t at_ns)
  * ended); waits for an answer only where there can be one. */
 static void app_died(int status, uint64_t at_ns)
 {
-	bool wanted = was_wanted(status, at_ns);
+	bool wanted = was_wanted(status, at_ns, keys_pressed());
 	struct avc_report report = {
 		.kind = AVC_REPORT_DEATH,
 		.seq = ++self.seq,
@@ -499,6 +514,7 @@ static void app_restored(void)
 	 * not the same group to the kernel. */
 	if (self.fd[TTY] >= 0 && tcgetpgrp(self.fd[TTY]) == self.app_pid)
 		tcsetpgrp(self.fd[TTY], self.app_pid);
+	listen_to_keys();
 	for (sig = 1; self.deferred; sig++) {
 		if (!(self.deferred & SIGBIT(sig)))
 			continue;
@@ -555,6 +571,7 @@ static void reap(void)
 	while ((pid = waitpid(-1, &status, WNOHANG | __WALL)) > 0) {
 		uint64_t at_ns = now_ns();
 
+		keys_ended(pid);
 		if (pid != self.app_pid)
 			continue;
 		if (self.waiting) {

@@ -13,6 +13,7 @@ import termios
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
@@ -83,6 +84,12 @@ def place(init: Phoenix) -> tuple[int, int, int]:
     return int(pid), int(group), int(foreground)
 
 
+def listeners(init: Phoenix) -> list[int]:
+    """Who listens to the keys."""
+    comms = {pid: Path(f"/proc/{pid}/comm") for pid in children_of(init.pid)}
+    return [pid for pid, comm in comms.items() if comm.read_text() == "avckpt-keys\n"]
+
+
 def test_app_leads_the_foreground_group(init: Phoenix) -> None:
     pid, group, foreground = place(init)
     assert pid == group == foreground != init.pid
@@ -104,6 +111,52 @@ def test_key_reaches_the_app_once(init: Phoenix, terminal: Terminal) -> None:
     terminal.type(b"\x03")
     assert init.app.hear() == "signal 2 -1"
     assert init.app.is_silent(0.2)
+
+
+@pytest.mark.parametrize("key", [b"\x03", b"\x1c"])
+def test_who_ends_in_its_own_way_after_a_key_ends_for_good(init: Phoenix, terminal: Terminal, key: bytes) -> None:
+    """Many programs exit with 1 on Ctrl-C."""
+    with Guard(init) as guard:
+        assert init.app.ask("catch") == "caught"
+        terminal.type(key)
+        assert init.app.hear().startswith("signal")
+        init.app.say("exit 1")
+        assert init.end() == 1
+        assert guard.report().flags == 1
+
+
+def test_the_same_signal_from_a_process_is_no_key(init: Phoenix, terminal: Terminal) -> None:
+    """Of its own group even, as `kill 0` sends it."""
+    with Guard(init) as guard:
+        assert init.app.ask("catch") == "caught"
+        os.killpg(place(init)[0], signal.SIGINT)
+        assert init.app.hear().startswith("signal")
+        init.app.say("exit 1")
+        assert guard.report().flags == 0
+        time.sleep(0.2)
+        assert init.popen.poll() is None
+
+
+def test_a_dead_apps_number_is_free_when_the_guard_hears(init: Phoenix, terminal: Terminal) -> None:
+    """Nobody is left in its group; and who listens to the keys does so again for the restored one."""
+    with Guard(init) as guard:
+        pid = place(init)[0]
+        (listener,) = listeners(init)
+        os.kill(listener, signal.SIGSTOP)  # it may be stopped with its group, and still has to go
+        init.app.say("die 11")
+        guard.report()
+        assert listeners(init) == []
+        with pytest.raises(ProcessLookupError):
+            os.killpg(pid, 0)
+        init.spawn(pid)
+        guard.answer(1, Verdict.RESTORED)
+        init.go()
+        assert init.app.ask("catch") == "caught"
+        wait_until(lambda: len(listeners(init)) == 1, PATIENCE_S, "a listener of the restored one")
+        terminal.type(b"\x03")
+        assert init.app.hear().startswith("signal")
+        init.app.say("exit 1")
+        assert init.end() == 1
 
 
 @pytest.mark.parametrize("status", [130, 131])

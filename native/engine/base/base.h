@@ -11,6 +11,7 @@
  *   config.c        whether settings make sense
  *   heartbeat.c     the guard's sign of life
  *   budget.c        what one checkpoint or restore may cost
+ *   aside.c         calls that may not come back
  *   proc.c          /proc
  *   proc_text.c     what its texts say
  *   pagemap.c       which pages of a process are there
@@ -76,6 +77,23 @@ bool budget_take(uint64_t bytes);
 bool budget_step(void);
 /* -1 with that code and the reason in words when it is. */
 int budget_check(pid_t pid, struct avc_error *err) warn_unused;
+
+/* ---- aside.c ---------------------------------------------------------------- */
+
+/* The beginning of a job, in memory of its own. */
+struct aside {
+	void (*work)(struct aside *job);
+	void (*drop)(struct aside *job); /* frees it: nobody waits for it any more       */
+	int *left_behind;                /* of this kind there is one that was given up   */
+};
+
+/* Has a thread of its own do it.  False: one step of it was not done in so long, and job->drop() is
+ * called as soon as it is; or at once, while another of its kind is not yet done.  Main thread only. */
+bool aside_run(struct aside *job, uint64_t ns);
+/* The calling thread gets on with its job, if it has one. */
+void aside_step(void);
+/* Nobody waits any more for what this thread does. */
+bool aside_is_left_behind(void);
 
 /* ---- config.c -------------------------------------------------------------- */
 
@@ -307,5 +325,9 @@ void pageset_free(struct pageset *set);
  * May be nested. */
 void rt_priority_begin(void);
 void rt_priority_end(void);
+/* Whether it is between the two. */
+bool rt_priority_is(void);
+/* Another thread is to have what the calling one has; best effort. */
+void rt_priority_share(pid_t tid);
 
 #endif

@@ -56,6 +56,7 @@ bool budget_take(uint64_t bytes)
 bool budget_step(void)
 {
 	heartbeat();
+	aside_step();
 	if (budget.working)
 		budget.working(budget.arg);
 	if (budget.end_ns && now_ns() > budget.end_ns)

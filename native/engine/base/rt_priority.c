@@ -36,3 +36,17 @@ void rt_priority_end(void)
 	if (--before.depth == 0 && before.changed)
 		sched_setscheduler(0, before.policy, &before.param);
 }
+
+bool rt_priority_is(void)
+{
+	return before.depth > 0;
+}
+
+void rt_priority_share(pid_t tid)
+{
+	struct sched_param param;
+	const int policy = sched_getscheduler(0);
+
+	if (policy >= 0 && sched_getparam(0, &param) == 0)
+		sched_setscheduler(tid, policy, &param);
+}

@@ -209,7 +209,6 @@ static struct file *take_known(const struct look *look, struct file *f)
 		f->cloexec = k->cloexec;
 	f->outside = k->outside;
 	f->id = k->id;
-	f->pipe_bytes = k->pipe_bytes;
 	f->shared = k->shared;
 	f->owner_type = k->owner_type;
 	f->owner = k->owner;
@@ -319,6 +318,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	bool silent;
 	int fd, unread;
 
+	if (aside_is_left_behind())
+		return -1;
 	if (!budget_step() || !budget_take(sizeof *f))
 		return budget_check(look->pid, err);
 	if (files->count == files->room) {
@@ -372,8 +373,6 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		f->kind = kind_of(f);
 		f->outside = is_inits(look, f);
 		look_at_owner(fd, f);
-		if (f->kind == FILE_PIPE)
-			f->pipe_bytes = fcntl(fd, F_GETPIPE_SZ);
 		if (f->kind == FILE_SOCKET)
 			file_look_at_socket(fd, f);
 		/* What was opened since is not made again. */
@@ -513,6 +512,7 @@ void files_group(struct files_held *held, uint32_t count)
 		uint32_t at = 0;
 		int found;
 
+		aside_step();
 		if (i && compare_keys(held[i].file, held[i - 1].file))
 			kind_count = 0;
 		found = find_kind(kinds, &kind_count, &held[i], &at);
@@ -607,6 +607,10 @@ static void keep_content(const struct look *look, struct file *f)
 	}
 	if (f->ours <= 0)
 		f->ours = proc_borrow_fd(look->pidfd, f->fd);
+	if (f->pipe_bytes < 0) {
+		f->content_lost = true;
+		return;
+	}
 	end.fd = f->ours;
 	if (f->ours < 0 || poll(&end, 1, 0) != 1)
 		return;
@@ -624,6 +628,7 @@ static void drop_ours(struct file *f)
 
 static void keep_contents(const struct look *look)
 {
+	files_measure_pipes(look->files, look->pidfd);
 	for (uint32_t i = 0; i < look->files->count; i++) {
 		struct file *f = &look->files->file[i];
 
@@ -788,21 +793,76 @@ static void find_owners(const struct process *process, struct files *files)
 	}
 }
 
+/* The look before the freeze, while whatever the app has open may be in use. */
+struct survey {
+	struct aside aside;
+	struct files *files;
+	struct files_owner owner;
+	int result;
+	struct avc_error error;
+};
+#define SURVEY_NS (5 * NS_PER_S)
+#define SURVEY_STOPPED_NS (200 * NS_PER_MS) /* of a process found in the freeze                 */
+
+static void survey(struct aside *aside)
+{
+	struct survey *job = (struct survey *)aside;
+
+	job->result = files_look(job->files, &job->owner, FILES_BEFORE, NULL, &job->error);
+}
+
+static void drop_survey(struct aside *aside)
+{
+	struct survey *job = (struct survey *)aside;
+
+	files_free(job->files);
+	close_fd(&job->owner.pidfd);
+	free(job);
+}
+
+static struct files *look_before(const struct process *process, struct avc_error *err)
+{
+	static int left_behind;
+	struct survey *job = calloc(1, sizeof *job);
+	struct files *files = NULL;
+
+	if (job)
+		*job = (struct survey){ .aside = { survey, drop_survey, &left_behind },
+					.files = files_new(process->files_seen + ROOM_SPARE),
+					.owner = {
+						.pid = process->pid,
+						.pidfd = fcntl(process->pidfd, F_DUPFD_CLOEXEC, 3),
+						.init = process->init } };
+	if (!job || !job->files || job->owner.pidfd < 0) {
+		fail_errno(err, process->pid, "look at descriptors", "calloc", "out of memory");
+		if (job)
+			drop_survey(&job->aside);
+		return NULL;
+	}
+	if (!aside_run(&job->aside, rt_priority_is() ? SURVEY_STOPPED_NS : SURVEY_NS)) {
+		fail(err, AVC_DEADLINE, 0, process->pid, "look at descriptors", "",
+		     "one of its files does not answer");
+		return NULL;
+	}
+	if (job->result) {
+		*err = err->code ? *err : job->error;
+	} else {
+		files = job->files;
+		job->files = NULL;
+	}
+	drop_survey(&job->aside);
+	return files;
+}
+
 int files_prepare(struct process *process, struct avc_error *err)
 {
-	const struct files_owner owner = { process->pid, process->pidfd, process->init };
-	struct files *before = files_new(process->files_seen + ROOM_SPARE);
-	struct files *image;
+	struct files *before, *image;
 
 	files_free(process->files_image);
 	process->files_image = NULL;
+	before = look_before(process, err);
 	if (!before)
-		return fail_errno(err, process->pid, "look at descriptors", "calloc",
-				  "out of memory");
-	if (files_look(before, &owner, FILES_BEFORE, process->files_before, err)) {
-		files_free(before);
 		return -1;
-	}
 	files_free(process->files_before);
 	process->files_before = before;
 	process->files_seen = before->count;

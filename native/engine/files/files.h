@@ -13,6 +13,7 @@
  *   files_calls.c   what the restored process has to do for that itself
  *   files_watches.c inotify
  *   files_epoll.c   epoll
+ *   files_pipes.c   sizes of pipes
  *   files_video.c   buffers of cameras
  *   files_auto.c    whether a file was written in place (avckpt.files=auto)
  *   files_strict.c  whether a file was written (avckpt.files=strict)
@@ -231,7 +232,7 @@ struct file {
 	int64_t told_offset;
 	struct file_lock *lock; /* allocated                                     */
 	uint32_t lock_count;
-	int pipe_bytes;             /* F_GETPIPE_SZ                                       */
+	int pipe_bytes;             /* F_GETPIPE_SZ; -1: it does not answer              */
 	bool remote;                /* a network file system: no questions while frozen       */
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
@@ -378,6 +379,10 @@ void files_find_going(struct files *files);
 /* avckpt.tcp=messages: a connection that a restore leaves between two messages goes on,
  * one that can be brought there is, any other is reset.  Returns NULL or what failed. */
 const char *file_put_stream(int fd, const struct file *want, const struct file *now);
+
+/* files_pipes.c */
+/* Of those that are not inherited from a parent, and not init's, too. */
+void files_measure_pipes(struct files *files, int pidfd);
 
 /* files_watches.c */
 /* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is

@@ -361,7 +361,7 @@ int file_make_pair(const struct file *want, const struct file *other, int ends[2
 	if (want->kind == FILE_PIPE) {
 		if (pipe2(ends, O_CLOEXEC))
 			return -1;
-		if (want->pipe_bytes != fcntl(ends[0], F_GETPIPE_SZ))
+		if (want->pipe_bytes > 0 && want->pipe_bytes != fcntl(ends[0], F_GETPIPE_SZ))
 			(void)fcntl(ends[0], F_SETPIPE_SZ, want->pipe_bytes);
 		return 0;
 	}

@@ -294,7 +294,7 @@ static void keep_pipe(int fd, struct file *file, uint32_t bytes, struct scratch 
 	uint32_t got = 0;
 	ssize_t n;
 
-	if (!scratch_open(scratch, fcntl(fd, F_GETPIPE_SZ))) {
+	if (!scratch_open(scratch, file->pipe_bytes)) {
 		file->content_lost = true;
 		return;
 	}

@@ -92,7 +92,7 @@ bool guard_owns(pid_t pid, const void *arg)
 			if (generation->image[k].template == pid)
 				return true;
 	}
-	return false;
+	return init_channel_listens(&guard->channel, pid);
 }
 
 bool guard_knows_process(pid_t pid, const void *arg)

@@ -227,6 +227,14 @@ void init_channel_arm(struct init_channel *channel, bool armed)
 	__atomic_store_n(&channel->ctl->armed, armed, __ATOMIC_RELEASE);
 }
 
+bool init_channel_listens(const struct init_channel *channel, pid_t pid)
+{
+	const pid_t keys = channel->ctl ? __atomic_load_n(&channel->ctl->keys_pid, __ATOMIC_ACQUIRE)
+					: 0;
+
+	return keys > 0 && proc_inside(pid) == keys;
+}
+
 bool init_channel_stop_asked(const struct init_channel *channel)
 {
 	const uint64_t asked = __atomic_load_n(&channel->ctl->stop_asked_ns, __ATOMIC_ACQUIRE);

@@ -614,6 +614,8 @@ void init_channel_close(struct init_channel *channel);
 /* The app's main process in our namespace, 0 if it is not there (yet). */
 pid_t init_channel_app(const struct init_channel *channel);
 void init_channel_arm(struct init_channel *channel, bool armed);
+/* Whether a child of init's is the one that listens to the keys of a terminal. */
+bool init_channel_listens(const struct init_channel *channel, pid_t pid);
 bool init_channel_stop_asked(const struct init_channel *channel);
 int init_channel_report(struct init_channel *channel, struct avc_report *report);
 /* Of the last death.  init waits for only so long, and anew from each init_channel_working() on,

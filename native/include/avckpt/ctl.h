@@ -52,6 +52,9 @@ struct avc_ctl {
 	int32_t exec_errno;
 	/* Written by init: 1 where there may be others of our kind in its PID namespace. */
 	int32_t is_unit;
+	/* Written by init: its child that listens to the keys of a terminal, 0: none.  It is
+	 * no process of the app's, and ended while a death is reported.         */
+	int32_t keys_pid;
 };
 
 enum avc_report_kind { AVC_REPORT_DEATH = 1 };
