@@ -7,6 +7,7 @@
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
  *   guard_death.c       what follows a death
+ *   guard_pace.c        when the next checkpoint is worth its price
  *   policy.c            what is decided in these
  */
 #ifndef AVCKPT_GUARD_H
@@ -49,6 +50,12 @@ struct avc_guard {
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	struct files_written *written; /* avckpt.files; NULL: not watched           */
+	struct policy_pace pace;       /* avckpt.interval=auto                      */
+	/* Of us, since the last checkpoint and at the begin of what we do now; of the app, at
+	 * the last checkpoint. */
+	uint64_t pace_cpu_ns, pace_began_ns, pace_app_cpu_ns, pace_faults;
+	struct avc_event untold; /* checkpoints that were not told of yet          */
+	uint64_t told_ns;        /* of the last that were                           */
 };
 
 /* ---- guard.c: what is told ------------------------------------------------- */
@@ -120,6 +127,22 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket);
 /* Of what a restore from the newest generation can be spared, some; when nobody is just ending,
  * which takes a CPU as well. */
 void guard_work_ahead(struct avc_guard *guard);
+
+/* ---- guard_pace.c ----------------------------------------------------------- */
+
+/* Around whatever is done for checkpoints: its CPU time is counted. */
+void guard_pace_begin(struct avc_guard *guard);
+void guard_pace_end(struct avc_guard *guard);
+/* After guard_pace_begin(): that was one, or none.  They say when to look again. */
+void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event);
+void guard_pace_missed(struct avc_guard *guard);
+void guard_pace_restored(struct avc_guard *guard);
+/* It is time to look: whether a checkpoint is due now. */
+bool guard_pace_wants(struct avc_guard *guard);
+/* Tells of a checkpoint, or soon; of those that were not told yet; when that is due. */
+void guard_tell_taken(struct avc_guard *guard, struct avc_event *event);
+void guard_tell_untold(struct avc_guard *guard);
+uint64_t guard_tell_due(const struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 

@@ -219,7 +219,7 @@ static void watch_files(struct avc_guard *guard, struct image *main)
 /* What a restore can be spared of it is found out when nothing else is to be done. */
 static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 {
-	const uint64_t interval_ns = guard->config.interval_ns;
+	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
 	struct avc_error later = { 0 };
 
 	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
@@ -244,7 +244,7 @@ static bool drop_old_spare(struct avc_guard *guard)
 
 static bool wants_spare(const struct avc_guard *guard, struct generation *newest)
 {
-	const uint64_t interval_ns = guard->config.interval_ns;
+	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
 
 	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
 	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
@@ -262,7 +262,7 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	tracee_deadline_clear(guard->timer);
 }
 
-void guard_work_ahead(struct avc_guard *guard)
+static void work_ahead(struct avc_guard *guard)
 {
 	struct generation *newest;
 	bool more = true;
@@ -281,6 +281,13 @@ void guard_work_ahead(struct avc_guard *guard)
 		       restore_plan_next(newest); /* which reads its memory */
 	if (more)
 		guard->ahead_ns = now_ns();
+}
+
+void guard_work_ahead(struct avc_guard *guard)
+{
+	guard_pace_begin(guard);
+	work_ahead(guard);
+	guard_pace_end(guard);
 }
 
 /* What can be done before the app is stopped. */
@@ -365,6 +372,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 		guard->dirty.fork_ns = freeze->clone_ns;
 	dirty_follow(&guard->dirty, &fresh->image[0]);
 	fresh->clone_ns = guard->dirty.fork_ns;
+	fresh->freeze_ns = freeze->freeze_ns;
 	begin_ahead(guard, fresh);
 	guard_keep_generation(guard, fresh);
 	init_channel_arm(&guard->channel, true);
@@ -453,14 +461,17 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
+	guard_pace_begin(guard);
 	if (take(guard, &event, &error) == 0) {
-		guard->unprotected = false;
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
 		event.app_pid_inside = guard->main.inside;
-		guard_emit(guard, &event);
+		guard_pace_taken(guard, &event);
+		guard_tell_taken(guard, &event);
+		guard->unprotected = false;
 		return;
 	}
+	guard_pace_missed(guard);
 	if (error.code == AVC_GONE)
 		guard->dying_until_ns = now_ns() + DYING_NS;
 	/* Of a dying app init's report tells; this is for one that is only away. */
