@@ -290,6 +290,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
+	watch(guard, &n, output_fd(&guard->output));
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
@@ -341,6 +342,7 @@ static void let_go(struct avc_guard *guard)
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
 	last_pid_forget();
+	output_end(&guard->output);
 	guard_drop_all(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
@@ -391,6 +393,7 @@ static void guard_main(struct avc_guard *guard)
 			break;
 		}
 		carry_out(guard);
+		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
 			guard_tell_untold(guard);
 		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)

@@ -11,7 +11,7 @@
 #define SPARE_NS (NS_PER_S / 2)
 #define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
 #define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
-#define QUIESCE_STEP_NS (1 * NS_PER_MS)
+#define QUIESCE_STEP_MS 1
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
@@ -50,12 +50,15 @@ int guard_find_app(struct avc_guard *guard, struct avc_error *err)
 static void wait_quiescent(struct avc_guard *guard, bool *found)
 {
 	const uint64_t end = now_ns() + guard->config.quiesce_ns;
+	/* Then there is something else to do. */
+	struct pollfd death = { .fd = guard->channel.report_fd, .events = POLLIN };
 
 	*found = false;
 	if (!guard->config.quiesce_ns)
 		return;
-	while (!(*found = process_is_quiescent(&guard->main)) && now_ns() < end)
-		usleep(QUIESCE_STEP_NS / 1000);
+	while (!(*found = process_is_quiescent(&guard->main)) && now_ns() < end &&
+	       poll(&death, 1, QUIESCE_STEP_MS) == 0)
+		;
 }
 
 /* The first touch of a page costs a fault: not while the app is stopped. */

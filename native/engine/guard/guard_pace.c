@@ -9,6 +9,7 @@
 
 #define FAULT_NS 1000 /* the first write to a page after a clone of it             */
 #define TOLD_NS NS_PER_S
+#define SENDS_NS (10 * NS_PER_S) /* so long one that has sent is one that sends             */
 
 static uint64_t own_cpu_ns(void)
 {
@@ -46,6 +47,7 @@ static uint64_t app_faults(const struct avc_guard *guard)
 /* What it does from here on is not in the newest generation. */
 static void begin_rest(struct avc_guard *guard)
 {
+	guard->sent = false;
 	guard->pace_app_cpu_ns = app_cpu_ns(guard);
 	guard->next_ns = policy_ready(&guard->pace, &guard->config);
 }
@@ -109,25 +111,43 @@ void guard_pace_restored(struct avc_guard *guard)
 	begin_rest(guard);
 }
 
+void guard_pace_listen(struct avc_guard *guard)
+{
+	if (!output_heard(&guard->output))
+		return;
+	guard->sent = true;
+	guard->sent_ns = now_ns();
+	guard->next_ns = guard->sent_ns;
+}
+
+static bool wants(const struct avc_guard *guard, uint64_t now)
+{
+	const uint64_t used = app_cpu_ns(guard);
+	const struct policy_activity activity = {
+		.cpu_ns = used - guard->pace_app_cpu_ns,
+		.sent = guard->sent,
+		.sends = guard->sent_ns && now - guard->sent_ns < SENDS_NS,
+	};
+
+	return used < guard->pace_app_cpu_ns || /* one of them has ended */
+	       policy_wants(&guard->pace, &guard->config, activity, now);
+}
+
 bool guard_pace_wants(struct avc_guard *guard)
 {
 	const uint64_t now = now_ns();
-	uint64_t used;
 
-	if (!policy_is_automatic(&guard->config) || !guard->count)
+	/* What others write counts where files are strict, too. */
+	if (!policy_is_automatic(&guard->config) || !guard->count ||
+	    guard->config.files == AVC_FILES_STRICT || wants(guard, now)) {
+		output_disarm(&guard->output);
 		return true;
-	used = app_cpu_ns(guard);
-	if (used >= guard->pace_app_cpu_ns) {
-		const struct policy_activity activity = { .cpu_ns = used - guard->pace_app_cpu_ns };
-
-		/* What others write counts there, too. */
-		if (guard->config.files != AVC_FILES_STRICT &&
-		    !policy_wants(&guard->pace, &guard->config, activity, now)) {
-			guard->next_ns = policy_look_again(&guard->pace, now);
-			return false;
-		}
-	} /* else one of them has ended */
-	return true;
+	}
+	guard_pace_begin(guard);
+	output_arm(&guard->output, &guard->tree);
+	guard_pace_end(guard);
+	guard->next_ns = policy_look_again(&guard->pace, now);
+	return false;
 }
 
 /* ---- telling ------------------------------------------------------------------- */

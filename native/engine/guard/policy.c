@@ -176,7 +176,7 @@ void policy_pay(struct policy_pace *pace, const struct avc_config *config, struc
 {
 	learn(pace, cost);
 	pace->interval_ns = affordable(&pace->cost, config);
-	pace->failures = 0;
+	pace->failures /= 2;
 	pace->taken_ns = now;
 	if (pace->spent_ns < now)
 		pace->spent_ns = now;
