@@ -35,6 +35,8 @@ LOCK = Path("/run/lock/avckpt-tests.lock")
 SLOWNESS = float(os.environ.get("AVCKPT_SLOWNESS", "1"))
 """How many times slower than a machine this one is: an emulated one is (test-machine.sh). Victims look at it, too."""
 
+NAMING_LOOKS = 100
+
 T = TypeVar("T")
 
 
@@ -406,8 +408,20 @@ class Sidecar:
 def app_pid(init_pid: int) -> int:
     """The app below avckpt-init: its only child that is neither template nor holder, and no zombie.
 
-    Raises LookupError when there is none at this moment (it is being restored).
+    Raises LookupError when there is none at this moment (it is being restored), or one too many
+    for longer than a template takes to be named.
     """
+    for _ in range(NAMING_LOOKS):
+        found = _children_of_init(init_pid)
+        if len(found) <= 1:
+            break
+        time.sleep(0.005)
+    if len(found) != 1:
+        raise LookupError(f"children of avckpt-init {init_pid} that could be the app: {found}")
+    return found[0]
+
+
+def _children_of_init(init_pid: int) -> list[int]:
     children = Path(f"/proc/{init_pid}/task/{init_pid}/children").read_text().split()
     found = []
     for child in children:
@@ -418,9 +432,7 @@ def app_pid(init_pid: int) -> int:
             # The main thread may have ended while others go on.
             if not name.startswith("avckpt-") and (state not in "ZX" or threads > 1):
                 found.append(int(child))
-    if len(found) != 1:
-        raise LookupError(f"children of avckpt-init {init_pid} that could be the app: {found}")
-    return found[0]
+    return found
 
 
 @contextlib.contextmanager

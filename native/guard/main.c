@@ -26,7 +26,7 @@
 /* What a guard does with each.  All others are given up for good. */
 static const uint8_t needed[] = {
 	CAP_SYS_PTRACE,         /* ptrace(2), process_vm_*(2), /proc/PID of others         */
-	CAP_SYS_ADMIN,          /* PTRACE_O_SUSPEND_SECCOMP, setns(2), /proc/PID/pagemap   */
+	CAP_SYS_ADMIN,          /* PTRACE_O_SUSPEND_SECCOMP, setns(2), pagemap, perf events */
 	CAP_CHECKPOINT_RESTORE, /* ns_last_pid, /proc/PID/map_files                        */
 	CAP_KILL,               /* templates have the application's user                   */
 	CAP_SYS_RESOURCE,       /* prlimit(2) beyond a hard limit, oom_score_adj           */

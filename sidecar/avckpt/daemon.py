@@ -88,8 +88,6 @@ class Watch:
     settings: Settings
     rolling_back: Reason | None = None
     """Why a roll back was commanded whose answer has not come yet."""
-    freezes_s: dict[int, float] = field(default_factory=dict)
-    """Freeze times of the generations that may still be held, by number."""
     journal: Journal = field(default_factory=Journal)
     guard: Guard | None = None
     guard_lost_s: float = -math.inf
@@ -484,12 +482,7 @@ class Daemon:
                 answer.set_exception(TargetGone(f"{container.label}: {why}"))
 
     def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
-        if event.kind is Kind.CHECKPOINT:
-            watch.freezes_s[event.generation] = event.freeze_s
-            while len(watch.freezes_s) > watch.container.config.keep:
-                del watch.freezes_s[min(watch.freezes_s)]
-        freeze_s = watch.freezes_s.get(event.generation) if event.kind is Kind.RESTORED else None
-        return of_guard(event, at=at, freeze_s=freeze_s, commanded=watch.rolling_back)
+        return of_guard(event, at=at, commanded=watch.rolling_back)
 
     # The end of a container, or of the sidecar
 

@@ -186,6 +186,9 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.init_pidfd = init_pidfd
     c.keep = config.keep
     c.interval_ns = _ns("interval", config.interval_s)
+    c.interval_min_ns = _ns("least interval", config.interval_min_s)
+    c.budget_freeze_ppm = round(config.budget_freeze * 1e6)
+    c.budget_cpu_ppm = round(config.budget_cpu * 1e6)
     c.freeze_deadline_ns = _ns("freeze deadline", config.freeze_deadline_s)
     c.quiesce_ns = _ns("quiesce", config.quiesce_s)
     c.restore_window_ns = _ns("restore window", config.restore_window_s)
@@ -218,6 +221,9 @@ def _event(e: Any) -> Event:
         attempt=e.attempt,
         quiescent=bool(e.quiescent),
         restores=e.restores,
+        checkpoints=e.checkpoints,
+        interval_s=e.interval_ns / _NS_PER_S,
+        freeze_max_s=e.freeze_max_ns / _NS_PER_S,
         freeze_s=e.freeze_ns / _NS_PER_S,
         stop_s=e.stop_ns / _NS_PER_S,
         clone_s=e.clone_ns / _NS_PER_S,

@@ -95,6 +95,12 @@ class GuardConfig:
     files: Files = Files.REWIND
     tcp: Tcp = Tcp.RESET_MOVED
     images: Images = Images.FORK
+    interval_min_s: float = 0.0
+    """Not 0: as often as the budgets allow, between this and `interval_s` apart."""
+    budget_freeze: float = 0.03
+    """Of the application's time, a fraction."""
+    budget_cpu: float = 0.05
+    """Of one CPU's, a fraction."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +121,9 @@ class Event:
     attempt: int = 0
     quiescent: bool = False
     restores: int = 0
+    checkpoints: int = 0
+    interval_s: float = 0.0
+    freeze_max_s: float = 0.0
     freeze_s: float = 0.0
     stop_s: float = 0.0
     clone_s: float = 0.0

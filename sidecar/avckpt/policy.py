@@ -65,8 +65,11 @@ def guard_config(policy: Policy) -> GuardConfig:
     """The part of a policy that is the engine's."""
     return GuardConfig(
         interval_s=policy.interval_s,
-        # One more to go back to from a hang: see docs/policy.md.
-        keep=min(policy.keep + policy.restore_on.unhealthy, KEEP_MAX),
+        interval_min_s=policy.interval_min_s if policy.automatic else 0.0,
+        budget_freeze=policy.budget_freeze,
+        budget_cpu=policy.budget_cpu,
+        # One more to go back to from a hang, and one where the newest is only a moment old: see docs/policy.md.
+        keep=min(policy.keep + policy.restore_on.unhealthy + policy.automatic, KEEP_MAX),
         restore_on_signal=policy.restore_on.signal,
         restore_on_exit=policy.restore_on.exit,
         restore_on_statuses=policy.restore_on.statuses,

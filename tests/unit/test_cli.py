@@ -41,6 +41,8 @@ def row(**fields: object) -> dict[str, object]:
         "generations": 2,
         "keep": 2,
         "memory_bytes": 1_500_000,
+        "interval_s": 0.062,
+        "automatic": True,
         "last_checkpoint_at": 0.0,
         "last_freeze_s": 0.00251,
         "restores": 1,
@@ -138,6 +140,7 @@ def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = avckpt("ps").stdout.splitlines()
     assert lines[0].split()[:3] == ["NAME", "STATE", "GENS"]
     assert lines[1].split()[:3] == ["web", "protected", "2/2"]
+    assert "auto, 62 ms" in lines[1]
     assert "2.51 ms" in lines[1]
     assert "6.30 ms" in lines[1]
     # The short id where there is no name; markup is text; one line, however long.

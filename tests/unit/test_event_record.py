@@ -26,13 +26,14 @@ RESTORED = Event(
     generations=2,
     attempt=1,
     restores=3,
+    freeze_s=0.0025,
     restore_s=0.006,
     age_s=1.5,
 )
 
 
 def test_a_restore_has_everything_that_is_asked_of_it() -> None:
-    record = of_guard(RESTORED, container="web", id="ab" * 32, group="chain", at=1000.0, freeze_s=0.0025)
+    record = of_guard(RESTORED, container="web", id="ab" * 32, group="chain", at=1000.0)
     assert record == EventRecord(
         Kind.RESTORED,
         container="web",

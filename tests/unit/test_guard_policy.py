@@ -5,37 +5,20 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from cffi import FFI
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from native.bind.build_native import NATIVE, declarations
+from testkit.policy_library import Library
 
 SECOND = 1_000_000_000
 NEVER = 2**64 - 1
 WINDOW_S = 60
 START_S = 1000
 """Of the clock.  A machine that has just been started has small numbers, but never 0."""
-HEADERS = ("include/avckpt/error.h", "include/avckpt/engine.h", "engine/guard/policy.h")
-
-
-class Library:
-    """policy.c, compiled alone: only with the public headers and its own."""
-
-    def __init__(self, folder: Path) -> None:
-        self.object, shared = folder / "policy.o", folder / "policy.so"
-        cc = ["cc", "-std=gnu11", "-O1", "-fPIC", f"-I{NATIVE}/include", f"-I{NATIVE}/engine/guard"]
-        subprocess.run([*cc, "-c", str(NATIVE / "engine/guard/policy.c"), "-o", str(self.object)], check=True)
-        subprocess.run(["cc", "-shared", str(self.object), "-o", str(shared)], check=True)
-        self.ffi = FFI()
-        self.ffi.cdef(declarations(*(NATIVE / header for header in HEADERS)))
-        self.calls: Any = self.ffi.dlopen(str(shared))
-
 
 _library: list[Library] = []
 

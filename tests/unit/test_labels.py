@@ -186,7 +186,7 @@ def test_sizes_of_shm(text: str, size: int) -> None:
         ("avckpt.enabled", "did you mean avckpt.enable?"),
         ("avckpt.intervall", "did you mean avckpt.interval?"),
         ("avckpt.restore_on", "did you mean avckpt.restore.on?"),
-        ("avckpt.zzzzzzzzzzzz", "known are avckpt.enable,"),
+        ("avckpt.zzzzzzzzzzzz", "known are avckpt.budget.cpu,"),
     ],
 )
 def test_an_unknown_label_is_an_error_with_a_hint(key: str, hint: str) -> None:

@@ -30,6 +30,8 @@ RESTORES_MAX = 64
 """AVC_RESTORES_MAX of the engine: how many it remembers."""
 
 SHM_MAX_BYTES = 1_000_000_000
+AUTOMATIC_MAX = "3s"
+"""The longest time between two checkpoints at avckpt.interval=auto."""
 
 
 class LabelError(ValueError):
@@ -74,7 +76,15 @@ class Policy:
 
     enable: bool = False
     interval_s: float = 3.0
-    """Time between checkpoints."""
+    """Time between checkpoints; with `automatic` the longest."""
+    automatic: bool = False
+    """As often as the budgets allow, and not while the application does nothing."""
+    interval_min_s: float = 0.02
+    """With `automatic`: the shortest time between two."""
+    budget_freeze: float = 0.03
+    """With `automatic`: how much of its time checkpoints may hold the application, a fraction."""
+    budget_cpu: float = 0.05
+    """With `automatic`: how much of one CPU they may use, a fraction."""
     keep: int = 2
     """Generations kept, 1..KEEP_MAX."""
     restore_on: RestoreOn = field(default_factory=RestoreOn)
@@ -231,7 +241,25 @@ def _parse_io_uring(text: str) -> dict[str, Any]:
 
 
 def _parse_interval(text: str) -> dict[str, Any]:
-    return {"interval_s": _duration_s(text, "10ms", "24h")}
+    if text == "auto":
+        return {"automatic": True, "interval_s": _duration_s(AUTOMATIC_MAX, "", "")}
+    return {"automatic": False, "interval_s": _duration_s(text, "10ms", "24h")}
+
+
+def _parse_interval_min(text: str) -> dict[str, Any]:
+    return {"interval_min_s": _duration_s(text, "5ms", AUTOMATIC_MAX)}
+
+
+def _share(field_name: str) -> Callable[[str], dict[str, Any]]:
+    def parse(text: str) -> dict[str, Any]:
+        found = re.fullmatch(r"(\d{1,3}(?:\.\d{1,3})?)\s*%", text, re.ASCII)
+        if found is None:
+            raise ValueError("not a percentage")
+        if not 0.1 <= float(found[1]) <= 50:
+            raise ValueError("not within 0.1% to 50%")
+        return {field_name: float(found[1]) / 100}
+
+    return parse
 
 
 def _parse_keep(text: str) -> dict[str, Any]:
@@ -338,7 +366,10 @@ _DURATION = "a number with ms, s, m or h"
 
 LABELS: dict[str, Label] = {
     "avckpt.enable": Label("false", "true or false", _parse_enable),
-    "avckpt.interval": Label("3s", f"{_DURATION}, from 10ms to 24h, as 500ms, 3s or 1m", _parse_interval),
+    "avckpt.interval": Label("3s", f"auto, or {_DURATION}, from 10ms to 24h, as 500ms, 3s or 1m", _parse_interval),
+    "avckpt.interval.min": Label("20ms", f"{_DURATION}, from 5ms to {AUTOMATIC_MAX}, as 20ms", _parse_interval_min),
+    "avckpt.budget.freeze": Label("3%", "a percentage from 0.1% to 50%, as 3%", _share("budget_freeze")),
+    "avckpt.budget.cpu": Label("5%", "a percentage from 0.1% to 50%, as 5%", _share("budget_cpu")),
     "avckpt.keep": Label("2", f"a whole number from 1 to {KEEP_MAX}", _parse_keep),
     "avckpt.restore.on": Label(
         "signal,exit",

@@ -106,6 +106,7 @@ struct proc_stat {
 	pid_t parent, group, session, tty_group;
 	uint32_t tty, flags; /* PF_*                                            */
 	int threads;
+	uint64_t faults; /* that took no reading, of all its threads          */
 	uint64_t start;  /* clock ticks after boot                            */
 	int exit_signal; /* that its parent gets when it ends, 0: none        */
 	int exit_status; /* of a zombie, as wait(2) says it                   */
@@ -119,6 +120,8 @@ ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
 #define PROC_TEXT_MAX (8u << 20) /* about 100,000 descriptors, or 60,000 files, that are watched  */
 char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes);
 int proc_stat(pid_t pid, struct proc_stat *stat);
+/* What all threads of a process have used of the CPUs until now; 0: it is gone. */
+uint64_t proc_cpu_ns(pid_t pid);
 /* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
 int proc_stat_of(int stat_fd, struct proc_stat *stat);
 /* The number of a task in its own (innermost) PID namespace, or -1. */

@@ -18,5 +18,9 @@ int config_check(const struct avc_config *config, struct avc_error *err)
 	if (config->images > AVC_IMAGES_AUTO)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
 			    "images must be 0 to %d", AVC_IMAGES_AUTO);
+	if (config->interval_min_ns > config->interval_ns ||
+	    (config->interval_min_ns && (!config->budget_freeze_ppm || !config->budget_cpu_ppm)))
+		return fail(err, AVC_CONFIG, EINVAL, 0, "configure guard", "",
+			    "an automatic interval takes budgets, and its least is the smaller");
 	return 0;
 }

@@ -141,6 +141,17 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 	return proc_read(pid, "stat", buf, sizeof buf) < 0 ? -1 : proc_parse_stat(buf, stat);
 }
 
+/* pthread_getcpuclockid(3): to be read of any process. */
+uint64_t proc_cpu_ns(pid_t pid)
+{
+	struct timespec used;
+	clockid_t clock;
+
+	if (clock_getcpuclockid(pid, &clock) || clock_gettime(clock, &used))
+		return 0;
+	return (uint64_t)used.tv_sec * NS_PER_S + (uint64_t)used.tv_nsec;
+}
+
 int proc_stat_of(int stat_fd, struct proc_stat *stat)
 {
 	char buf[1024];

@@ -24,19 +24,20 @@ int proc_parse_stat(const char *text, struct proc_stat *stat)
 {
 	const char *name = strchr(text, '('), *last = strrchr(text, ' '), *p;
 	int tty;
-	unsigned long long start;
+	unsigned long long faults, start;
 
 	/* The name may hold anything, also ") R": the last ')' ends it. */
 	p = strrchr(text, ')');
 	if (!name || !last || !p || p < name ||
 	    sscanf(p + 1,
-		   " %c %d %d %d %d %d %u %*u %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu"
+		   " %c %d %d %d %d %d %u %llu %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu"
 		   " %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %d",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
-		   &stat->tty_group, &stat->flags, &stat->threads, &start,
-		   &stat->exit_signal) != 10)
+		   &stat->tty_group, &stat->flags, &faults, &stat->threads, &start,
+		   &stat->exit_signal) != 11)
 		return not_understood();
 	stat->tty = (uint32_t)tty;
+	stat->faults = faults;
 	stat->start = start;
 	stat->exit_status = atoi(last + 1);
 	snprintf(stat->name, sizeof stat->name, "%.*s", (int)(p - name - 1), name + 1);

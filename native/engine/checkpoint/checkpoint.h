@@ -67,6 +67,7 @@ struct generation {
 	uint32_t images;
 	uint64_t taken_ns;
 	uint64_t clone_ns; /* what the clones of it took                      */
+	uint64_t freeze_ns;
 	bool quiescent;
 	char written[FILES_NAME];  /* avckpt.files: what was written since; "": none */
 	struct spare spare;        /* of the main process                              */

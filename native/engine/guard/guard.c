@@ -56,6 +56,7 @@ static void send_outbox(struct avc_guard *guard)
 
 void guard_emit(struct avc_guard *guard, const struct avc_event *event)
 {
+	guard_tell_untold(guard); /* in order */
 	if (guard->outbox_count == OUTBOX_MAX)
 		memmove(guard->outbox, guard->outbox + 1,
 			--guard->outbox_count * sizeof *guard->outbox);
@@ -210,7 +211,7 @@ static void attach(struct avc_guard *guard)
 		}
 		guard->attached = true;
 		guard->unprotected = false;
-		guard->next_ns = policy_due(&guard->config, now_ns());
+		guard->next_ns = policy_first_due(&guard->config, now_ns());
 		{
 			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);
 
@@ -276,7 +277,9 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
 							     : tracee_ending_due();
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
-	const uint64_t soon_ns = waits_ns < sooner_ns ? waits_ns : sooner_ns;
+	const uint64_t tell_ns = guard_tell_due(guard);
+	const uint64_t earlier_ns = tell_ns < sooner_ns ? tell_ns : sooner_ns;
+	const uint64_t soon_ns = waits_ns < earlier_ns ? waits_ns : earlier_ns;
 	const uint64_t due = guard->next_ns < soon_ns ? guard->next_ns : soon_ns;
 	uint64_t ns = due > now ? due - now : 0;
 	struct timespec timeout;
@@ -287,6 +290,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
+	watch(guard, &n, output_fd(&guard->output));
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
@@ -338,6 +342,7 @@ static void let_go(struct avc_guard *guard)
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
 	last_pid_forget();
+	output_end(&guard->output);
 	guard_drop_all(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
@@ -388,6 +393,9 @@ static void guard_main(struct avc_guard *guard)
 			break;
 		}
 		carry_out(guard);
+		guard_pace_listen(guard);
+		if (now_ns() >= guard_tell_due(guard))
+			guard_tell_untold(guard);
 		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
 			guard_work_ahead(guard);
 		if (now_ns() < guard->next_ns)
@@ -396,9 +404,10 @@ static void guard_main(struct avc_guard *guard)
 			attach(guard);
 		else if (guard_tend_stragglers(guard))
 			tell_straggling(guard);
-		else
+		else if (guard_pace_wants(guard))
 			guard_checkpoint(guard, 0);
 	}
+	guard_tell_untold(guard);
 	let_go(guard);
 	timer_delete(guard->timer);
 	if (ended) {

@@ -7,6 +7,8 @@
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
  *   guard_death.c       what follows a death
+ *   guard_pace.c        when the next checkpoint is worth its price
+ *   output.c            hears that the app sends
  *   policy.c            what is decided in these
  */
 #ifndef AVCKPT_GUARD_H
@@ -21,6 +23,22 @@
 #define OUTBOX_MAX 64 /* events that the daemon has not taken yet                */
 #define DYING_NS NS_PER_S
 #define AHEAD_AFTER_NS (20 * NS_PER_MS) /* the app has been held up, and goes first          */
+
+/* A descriptor each, of a thread and what it makes. */
+struct output_event {
+	int fd;
+	pid_t tid, leader;
+	uint64_t start;
+};
+
+/* All zero at the start. */
+struct output {
+	int tracepoint; /* its number; 0: not looked for yet, -1: there is none   */
+	int signal_fd;
+	bool armed;
+	uint32_t count;
+	struct output_event *event;
+};
 
 struct avc_guard {
 	struct avc_config config;
@@ -49,6 +67,15 @@ struct avc_guard {
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	struct files_written *written; /* avckpt.files; NULL: not watched           */
+	struct policy_pace pace;       /* avckpt.interval=auto                      */
+	/* Of us, since the last checkpoint and at the begin of what we do now; of the app, at
+	 * the last checkpoint. */
+	uint64_t pace_cpu_ns, pace_began_ns, pace_app_cpu_ns, pace_faults;
+	struct output output;
+	uint64_t sent_ns;        /* when it was heard last; 0: never                  */
+	bool sent;               /* since the last checkpoint                         */
+	struct avc_event untold; /* checkpoints that were not told of yet          */
+	uint64_t told_ns;        /* of the last that were                           */
 };
 
 /* ---- guard.c: what is told ------------------------------------------------- */
@@ -120,6 +147,36 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket);
 /* Of what a restore from the newest generation can be spared, some; when nobody is just ending,
  * which takes a CPU as well. */
 void guard_work_ahead(struct avc_guard *guard);
+
+/* ---- guard_pace.c ----------------------------------------------------------- */
+
+/* Around whatever is done for checkpoints: its CPU time is counted. */
+void guard_pace_begin(struct avc_guard *guard);
+void guard_pace_end(struct avc_guard *guard);
+/* After guard_pace_begin(): that was one, or none.  They say when to look again. */
+void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event);
+void guard_pace_missed(struct avc_guard *guard);
+void guard_pace_restored(struct avc_guard *guard);
+/* Looks whether the app has sent. */
+void guard_pace_listen(struct avc_guard *guard);
+/* It is time to look: whether a checkpoint is due now. */
+bool guard_pace_wants(struct avc_guard *guard);
+/* Tells of a checkpoint, or soon; of those that were not told yet; when that is due. */
+void guard_tell_taken(struct avc_guard *guard, struct avc_event *event);
+void guard_tell_untold(struct avc_guard *guard);
+uint64_t guard_tell_due(const struct avc_guard *guard);
+
+/* ---- output.c --------------------------------------------------------------- */
+
+/* From now on the next output is heard, of all processes that there are; a second time changes
+ * nothing.  Where that is not to be had, nothing is heard. */
+void output_arm(struct output *output, const struct tree *tree);
+void output_disarm(struct output *output);
+/* Readable when there is some; -1: it is not armed. */
+int output_fd(const struct output *output);
+/* Whether there was some.  Then it is not armed any more. */
+bool output_heard(struct output *output);
+void output_end(struct output *output);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 

@@ -11,7 +11,7 @@
 #define SPARE_NS (NS_PER_S / 2)
 #define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
 #define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
-#define QUIESCE_STEP_NS (1 * NS_PER_MS)
+#define QUIESCE_STEP_MS 1
 #define TAKE_TRIES 4
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
@@ -50,12 +50,15 @@ int guard_find_app(struct avc_guard *guard, struct avc_error *err)
 static void wait_quiescent(struct avc_guard *guard, bool *found)
 {
 	const uint64_t end = now_ns() + guard->config.quiesce_ns;
+	/* Then there is something else to do. */
+	struct pollfd death = { .fd = guard->channel.report_fd, .events = POLLIN };
 
 	*found = false;
 	if (!guard->config.quiesce_ns)
 		return;
-	while (!(*found = process_is_quiescent(&guard->main)) && now_ns() < end)
-		usleep(QUIESCE_STEP_NS / 1000);
+	while (!(*found = process_is_quiescent(&guard->main)) && now_ns() < end &&
+	       poll(&death, 1, QUIESCE_STEP_MS) == 0)
+		;
 }
 
 /* The first touch of a page costs a fault: not while the app is stopped. */
@@ -250,7 +253,7 @@ static void watch_files(struct avc_guard *guard, struct image *main)
 /* What a restore can be spared of it is found out when nothing else is to be done. */
 static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 {
-	const uint64_t interval_ns = guard->config.interval_ns;
+	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
 	struct avc_error later = { 0 };
 
 	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
@@ -275,7 +278,7 @@ static bool drop_old_spare(struct avc_guard *guard)
 
 static bool wants_spare(const struct avc_guard *guard, struct generation *newest)
 {
-	const uint64_t interval_ns = guard->config.interval_ns;
+	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
 
 	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
 	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
@@ -296,7 +299,7 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 	last_pid_unlock(guard->channel.numbers_fd);
 }
 
-void guard_work_ahead(struct avc_guard *guard)
+static void work_ahead(struct avc_guard *guard)
 {
 	struct generation *newest;
 	bool more = true;
@@ -315,6 +318,13 @@ void guard_work_ahead(struct avc_guard *guard)
 		       restore_plan_next(newest); /* which reads its memory */
 	if (more)
 		guard->ahead_ns = now_ns();
+}
+
+void guard_work_ahead(struct avc_guard *guard)
+{
+	guard_pace_begin(guard);
+	work_ahead(guard);
+	guard_pace_end(guard);
 }
 
 /* What can be done before the app is stopped. */
@@ -404,6 +414,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 		guard->dirty.fork_ns = freeze->clone_ns;
 	dirty_follow(&guard->dirty, &fresh->image[0]);
 	fresh->clone_ns = guard->dirty.fork_ns;
+	fresh->freeze_ns = freeze->freeze_ns;
 	begin_ahead(guard, fresh);
 	guard_keep_generation(guard, fresh);
 	init_channel_arm(&guard->channel, true);
@@ -492,14 +503,17 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
+	guard_pace_begin(guard);
 	if (take(guard, &event, &error) == 0) {
-		guard->unprotected = false;
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
 		event.app_pid_inside = guard->main.inside;
-		guard_emit(guard, &event);
+		guard_pace_taken(guard, &event);
+		guard_tell_taken(guard, &event);
+		guard->unprotected = false;
 		return;
 	}
+	guard_pace_missed(guard);
 	if (error.code == AVC_GONE)
 		guard->dying_until_ns = now_ns() + DYING_NS;
 	/* Of a dying app init's report tells; this is for one that is only away. */

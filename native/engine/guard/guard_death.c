@@ -96,6 +96,7 @@ static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 
 	event->app_pid = restore->pid;
 	event->app_pid_inside = guard->main.inside;
+	event->freeze_ns = generation->freeze_ns;
 	event->restore_ns = restore->restore_ns;
 	event->fork_ns = restore->fork_ns;
 	event->threads_ns = restore->threads_ns;
@@ -274,7 +275,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	} else {
 		if (guard->main.pid)
 			hold_all(guard);
-		guard->next_ns = policy_due(&guard->config, now_ns());
+		guard_pace_restored(guard);
 	}
 out:
 	rt_priority_end();

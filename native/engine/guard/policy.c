@@ -13,6 +13,15 @@
 #include "policy.h"
 
 #define MISSES_UNTIL_UNPROTECTED 3
+#define MS UINT64_C(1000000)
+#define FIRST_NS (500 * MS)
+#define PROOF_NS (1000 * MS) /* so long an app lives that got somewhere                      */
+#define AGAIN_NS (50 * MS)
+#define AVERAGE_OF 8
+#define LOOK_NS (20 * MS)
+#define LOOK_LONG_NS (200 * MS)
+/* What a checkpoint makes an app that does nothing use: calls that are made again. */
+#define NOISE_NS (MS / 5)
 
 static bool on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
 {
@@ -38,6 +47,13 @@ static int newest_seen(const struct policy *policy)
 
 /* ---- checkpoints ------------------------------------------------------------- */
 
+uint64_t policy_first_due(const struct avc_config *config, uint64_t now)
+{
+	const uint64_t due = policy_due(config, now);
+
+	return policy_is_automatic(config) && due > now + FIRST_NS ? now + FIRST_NS : due;
+}
+
 uint64_t policy_due(const struct avc_config *config, uint64_t now)
 {
 	return config->interval_ns ? now + config->interval_ns : POLICY_NEVER;
@@ -55,13 +71,15 @@ struct policy_generation policy_new_generation(struct policy *policy,
 					       const struct avc_config *config, uint64_t number,
 					       uint64_t now)
 {
-	struct policy_generation fresh = { .number = number };
+	struct policy_generation fresh = { .number = number, .taken_ns = now };
 
 	if (!on_probation(policy, config, now)) {
 		policy->restored_ns = 0;
 		policy->lineage = ++policy->lineages;
 	}
 	fresh.lineage = policy->lineage;
+	fresh.proves = !policy_is_automatic(config) || !policy->restored_ns ||
+		       now - policy->restored_ns >= PROOF_NS;
 	for (uint32_t i = 0; i < policy->count; i++)
 		if (policy->held[i].lineage == fresh.lineage &&
 		    policy->held[i].crashes > fresh.crashes)
@@ -78,6 +96,15 @@ uint32_t policy_replaced(const struct policy *policy, const struct avc_config *c
 			if (policy->held[i].lineage == policy->lineage && (int)i != vouched &&
 			    (int)i != seen)
 				return i;
+	/* Often taken, they would all be of the last moments: the newest makes way until it is
+	 * as far from the one before it as if they were taken seldom. */
+	if (policy_is_automatic(config) && policy->count > 1) {
+		const uint32_t i = policy->count - 1;
+
+		if ((int)i != vouched && (int)i != seen &&
+		    policy->held[i].taken_ns - policy->held[i - 1].taken_ns < config->interval_ns)
+			return i;
+	}
 	return policy_dispensable(policy);
 }
 
@@ -85,8 +112,9 @@ void policy_hold(struct policy *policy, struct policy_generation fresh)
 {
 	policy->held[policy->count++] = fresh;
 	policy->misses = 0;
-	/* Only a health check can say that a process does not hang. */
-	if (!policy->vouching)
+	/* Only a health check can say that a process does not hang; and one that has just been
+	 * restored has not got far because a checkpoint came at once. */
+	if (!policy->vouching && fresh.proves)
 		policy->proved = true;
 }
 
@@ -100,6 +128,107 @@ bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
 	if (code != AVC_UNSUPPORTED && code != AVC_DENIED)
 		return false;
 	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
+}
+
+/* ---- avckpt.interval=auto ------------------------------------------------------ */
+
+bool policy_is_automatic(const struct avc_config *config)
+{
+	return config->interval_min_ns > 0;
+}
+
+uint64_t policy_interval(const struct policy_pace *pace, const struct avc_config *config)
+{
+	return policy_is_automatic(config) && pace->samples ? pace->interval_ns
+							    : config->interval_ns;
+}
+
+static uint64_t average(uint64_t before, uint64_t now)
+{
+	return before - before / AVERAGE_OF + now / AVERAGE_OF;
+}
+
+/* The first one brings the parasite in: the second says more. */
+static void learn(struct policy_pace *pace, struct policy_cost cost)
+{
+	if (++pace->samples <= 2) {
+		pace->cost = cost;
+		return;
+	}
+	pace->samples = 3;
+	pace->cost.held_ns = average(pace->cost.held_ns, cost.held_ns);
+	pace->cost.cpu_ns = average(pace->cost.cpu_ns, cost.cpu_ns);
+}
+
+static uint64_t affordable(const struct policy_cost *cost, const struct avc_config *config)
+{
+	const uint64_t held = cost->held_ns * 1000000 / config->budget_freeze_ppm,
+		       cpu = cost->cpu_ns * 1000000 / config->budget_cpu_ppm,
+		       more = held > cpu ? held : cpu;
+
+	if (more < config->interval_min_ns)
+		return config->interval_min_ns;
+	return more < config->interval_ns ? more : config->interval_ns;
+}
+
+void policy_pay(struct policy_pace *pace, const struct avc_config *config, struct policy_cost cost,
+		uint64_t now)
+{
+	learn(pace, cost);
+	pace->interval_ns = affordable(&pace->cost, config);
+	pace->failures /= 2;
+	pace->taken_ns = now;
+	if (pace->spent_ns < now)
+		pace->spent_ns = now;
+	pace->spent_ns += pace->interval_ns;
+	/* On command they come as often as somebody wants. */
+	if (pace->spent_ns > now + 2 * pace->interval_ns)
+		pace->spent_ns = now + 2 * pace->interval_ns;
+}
+
+uint64_t policy_try_again(struct policy_pace *pace, const struct avc_config *config, uint64_t now)
+{
+	uint64_t pause = policy_interval(pace, config);
+
+	if (pace->samples == 0 || pause < AGAIN_NS)
+		pause = AGAIN_NS;
+	for (uint32_t i = 0; i < pace->failures && pause < config->interval_ns; i++)
+		pause *= 2;
+	pace->failures++;
+	return now + (pause < config->interval_ns ? pause : config->interval_ns);
+}
+
+uint64_t policy_ready(const struct policy_pace *pace, const struct avc_config *config)
+{
+	const uint64_t least = pace->taken_ns + config->interval_min_ns;
+	const uint64_t afford = pace->spent_ns > pace->interval_ns
+					? pace->spent_ns - pace->interval_ns
+					: 0;
+
+	return afford > least ? afford : least;
+}
+
+bool policy_wants(const struct policy_pace *pace, const struct avc_config *config,
+		  struct policy_activity activity, uint64_t now)
+{
+	if (activity.sent)
+		return now >= policy_ready(pace, config);
+	if (now < pace->spent_ns || activity.cpu_ns <= NOISE_NS)
+		return false;
+	/* What is at stake should be more than what it costs to save it. */
+	return activity.sends || activity.cpu_ns >= pace->cost.cpu_ns ||
+	       now - pace->taken_ns >= config->interval_ns;
+}
+
+uint64_t policy_look_again(const struct policy_pace *pace, uint64_t now)
+{
+	uint64_t pause = (now - pace->taken_ns) / 4;
+
+	if (now < pace->spent_ns)
+		return pace->spent_ns;
+	if (pause < LOOK_NS)
+		pause = LOOK_NS;
+	return now + (pause < LOOK_LONG_NS ? pause : LOOK_LONG_NS);
 }
 
 /* ---- what is held ------------------------------------------------------------ */

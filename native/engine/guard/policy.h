@@ -21,6 +21,7 @@
 /* What is known of a generation that is held. */
 struct policy_generation {
 	uint64_t number;
+	uint64_t taken_ns;
 	/* A generation taken on probation is of the lineage of the one that its process was
 	 * restored from, and as suspect.  Any other one begins a lineage. */
 	uint32_t lineage;
@@ -28,6 +29,7 @@ struct policy_generation {
 	uint32_t lost;    /* restores from it that came to nothing            */
 	bool seen;        /* held when the app was healthy; again so: vouched */
 	bool vouched;     /* the app was healthy well after it was taken      */
+	bool proves;      /* that its process got somewhere since a restore   */
 };
 
 /* All zero but `room` at the start. */
@@ -49,6 +51,8 @@ struct policy {
 
 /* ---- checkpoints ------------------------------------------------------------- */
 
+/* The first one: the app is to get somewhere before. */
+uint64_t policy_first_due(const struct avc_config *config, uint64_t now);
 /* An interval from now; POLICY_NEVER: on command only. */
 uint64_t policy_due(const struct avc_config *config, uint64_t now);
 /* The one that was due at `due`, by a new configuration. */
@@ -66,6 +70,47 @@ void policy_hold(struct policy *policy, struct policy_generation fresh);
 /* A checkpoint has failed because of the main process, or of another one.  True: nothing that
  * is held is any good, the app is unprotected.  False: it is tried again when it is due. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
+
+/* ---- avckpt.interval=auto ------------------------------------------------------ */
+
+/* What one checkpoint costs. */
+struct policy_cost {
+	uint64_t held_ns; /* the app, by its freeze and by the faults that follow it */
+	uint64_t cpu_ns;  /* us and our templates                            */
+};
+
+/* How often there may be one.  All zero at the start. */
+struct policy_pace {
+	struct policy_cost cost; /* on average                                      */
+	uint32_t samples;
+	uint32_t failures;    /* in a row                                        */
+	uint64_t interval_ns; /* between two, by the budgets                     */
+	uint64_t taken_ns;    /* when the app went on after the last one         */
+	uint64_t spent_ns;    /* until then the budgets are used up              */
+};
+
+/* What the app has done since the last one. */
+struct policy_activity {
+	uint64_t cpu_ns;
+	bool sent;  /* just now                                        */
+	bool sends; /* it is one that does                             */
+};
+
+bool policy_is_automatic(const struct avc_config *config);
+/* What it is at present, automatic or not. */
+uint64_t policy_interval(const struct policy_pace *pace, const struct avc_config *config);
+/* One was taken, and cost that. */
+void policy_pay(struct policy_pace *pace, const struct avc_config *config, struct policy_cost cost,
+		uint64_t now);
+/* Nothing was taken; when to try again. */
+uint64_t policy_try_again(struct policy_pace *pace, const struct avc_config *config, uint64_t now);
+/* One more than the budgets allow on average may come right after output: from when on. */
+uint64_t policy_ready(const struct policy_pace *pace, const struct avc_config *config);
+/* Whether one is due. */
+bool policy_wants(const struct policy_pace *pace, const struct avc_config *config,
+		  struct policy_activity activity, uint64_t now);
+/* It is not: when to look again. */
+uint64_t policy_look_again(const struct policy_pace *pace, uint64_t now);
 
 /* ---- what is held ------------------------------------------------------------ */
 

@@ -66,10 +66,16 @@ enum avc_fork_reason {
 
 /* What a guard is to do.  Durations in nanoseconds. */
 struct avc_config {
-	int32_t init_pidfd;          /* pidfd of avckpt-init; duplicated, stays the
+	int32_t init_pidfd;   /* pidfd of avckpt-init; duplicated, stays the
 	                              * caller's                                  */
-	uint32_t keep;               /* generations kept, 1..AVC_KEEP_MAX         */
-	uint64_t interval_ns;        /* between checkpoints; 0: only on command   */
+	uint32_t keep;        /* generations kept, 1..AVC_KEEP_MAX         */
+	uint64_t interval_ns; /* between checkpoints; 0: only on command   */
+	/* Not 0: as often as the budgets allow, between this and interval_ns apart; not
+	 * while the app does nothing.  Budgets in millionths of the time: how long
+	 * checkpoints may hold the app, and what they may use of one CPU.         */
+	uint64_t interval_min_ns;
+	uint32_t budget_freeze_ppm;
+	uint32_t budget_cpu_ppm;
 	uint64_t freeze_deadline_ns; /* the app is never held longer than this to
 	                              * get it stopped; 0: 50 ms                  */
 	uint64_t quiesce_ns;         /* how long to look for a quiescent moment   */
@@ -90,7 +96,8 @@ struct avc_config {
 
 enum avc_event_kind {
 	AVC_EVENT_ATTACHED = 1,    /* init found and agreed with; app_pid is set  */
-	AVC_EVENT_CHECKPOINT = 2,  /* a generation was taken                      */
+	AVC_EVENT_CHECKPOINT = 2,  /* a generation was taken.  With interval_min_ns
+	                            * once a second at most; `checkpoints`        */
 	AVC_EVENT_MISSED = 3,      /* a checkpoint could not be taken; `error`.
 	                            * The guard tries again at the next interval.
 	                            * What was held is, unless it was to make way
@@ -149,8 +156,11 @@ struct avc_event {
 	uint32_t attempt;       /* RESTORED: restores within the window          */
 	uint32_t quiescent;     /* CHECKPOINT: 1 if taken at a quiescent moment  */
 	uint32_t restores;      /* RESTORED: since the guard was started         */
+	uint32_t checkpoints;   /* CHECKPOINT: taken since the last that was told */
+	uint64_t interval_ns;   /* CHECKPOINT: between two of them, at present    */
+	uint64_t freeze_max_ns; /* CHECKPOINT: the longest freeze of them         */
 	/* CHECKPOINT, MISSED: first PTRACE_INTERRUPT until the last thread runs
-	 * again, and parts of it                                                 */
+	 * again (RESTORED: of the generation's checkpoint), and parts of it                                                 */
 	uint64_t freeze_ns;
 	uint64_t stop_ns;  /* of it, until every known thread had stopped   */
 	uint64_t clone_ns; /* of it, until everything was read and cloned   */

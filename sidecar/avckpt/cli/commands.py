@@ -324,8 +324,8 @@ def _print_table(containers: list[Json]) -> None:
     Console(width=width, highlight=False, markup=False).print(table)
 
 
-COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")
-"""Generations, what they hold, age and freeze time of the newest; restores, and how long the last one took."""
+COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "INTERVAL", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")
+"""Generations, what they hold, time between two; age and freeze time of the newest; restores, the last one's time."""
 NOTE_LEAST = 16
 
 
@@ -336,12 +336,19 @@ def _row(c: Json) -> tuple[str, ...]:
         c["state"],
         "-" if c["state"] in ("listening", "nodes") else f"{c['generations']}/{c['keep']}",
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
+        "-" if c["state"] == "listening" else _interval(c),
         "-" if age_s is None else _ago(age_s),
         _ms(c["last_freeze_s"]),
         str(c["restores"]),
         _ms(c["last_restore_s"]),
         c["reason"],
     )
+
+
+def _interval(c: Json) -> str:
+    s = c["interval_s"]
+    text = f"{s:g} s" if s >= 1 and not c["automatic"] else f"{s:.1f} s" if s >= 1 else f"{s * 1000:.0f} ms"
+    return f"auto, {text}" if c["automatic"] else text
 
 
 def _ago(seconds: float) -> str:

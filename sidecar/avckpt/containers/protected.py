@@ -71,6 +71,8 @@ class Protected:
     memory_bytes: int = 0
     last_checkpoint_at: float | None = None
     last_freeze_s: float | None = None
+    last_interval_s: float = 0.0
+    """What the guard goes by, as of the last checkpoint; 0: there was none."""
     last_quiescent: bool | None = None
     last_death: str = ""
     last_death_at: float | None = None
@@ -86,6 +88,11 @@ class Protected:
         """How to call it in a message: its name, or the short id."""
         return self.name or self.id[:12]
 
+    @property
+    def interval_s(self) -> float:
+        """Time between checkpoints, at present."""
+        return (self.config.interval_min_s and self.last_interval_s) or self.config.interval_s
+
     def apply(self, event: Event, at: float) -> None:
         """Takes in an event of this container's guard that happened at `at`."""
         if event.app_pid:
@@ -99,7 +106,8 @@ class Protected:
             self._to(State.STARTING, "no checkpoint yet")
         elif kind is Kind.CHECKPOINT:
             self._to(State.PROTECTED, self._crashing(event.at_ns))
-            self.checkpoints += 1
+            self.checkpoints += event.checkpoints or 1
+            self.last_interval_s = event.interval_s
             self.generation = event.generation
             self.threads = event.threads
             self.last_checkpoint_at = at
@@ -171,7 +179,8 @@ class Protected:
             "app_pid_inside": self.app_pid_inside,
             "guard_pid": self.guard_pid,
             "threads": self.threads,
-            "interval_s": self.config.interval_s,
+            "interval_s": self.interval_s,
+            "automatic": self.config.interval_min_s > 0,
             "keep": self.config.keep,
             "generation": self.generation,
             "generations": self.generations,

@@ -32,7 +32,7 @@ class Metrics:
         build.labels(version, native_version).set(1)
         self._freeze = Histogram(
             "avckpt_freeze_seconds",
-            "How long checkpoints held the application",
+            "How long checkpoints held the application; of several within a second, the longest",
             ["container"],
             buckets=FREEZE_BUCKETS_S,
             registry=self._registry,
@@ -87,8 +87,8 @@ class Metrics:
         """Counts an event."""
         container = record.container
         if record.kind is Kind.CHECKPOINT:
-            self._of(self._taken, container).inc()
-            self._of(self._freeze, container).observe(record.freeze_s or 0.0)
+            self._of(self._taken, container).inc(record.checkpoints or 1)
+            self._of(self._freeze, container).observe(record.freeze_max_s or record.freeze_s or 0.0)
         elif record.kind is Kind.MISSED:
             self._of(self._missed, container, record.error.kind if record.error else "failed").inc()
         elif record.kind in (Kind.RESTORED, Kind.GAVE_UP):

@@ -62,6 +62,9 @@ class EventRecord:
     age_s: float | None = said("age of the restored generation when the application died, or of the dropped one")
     lost_s: float | None = said("what the application lost: age_s and restore_s together")
     freeze_s: float | None = said("how long the application stood still for this generation's checkpoint")
+    checkpoints: int | None = said("checkpoints taken since the last that was told, this one included")
+    freeze_max_s: float | None = said("the longest freeze of these")
+    interval_s: float | None = said("time between checkpoints, at present")
     restore_s: float | None = said("death to the last thread running again")
     threads: int | None = said("threads of the checkpoint or restore")
     attempt: int | None = said(
@@ -144,18 +147,15 @@ def of_guard(
     id: str = "",
     group: str = "",
     at: float = 0.0,
-    freeze_s: float | None = None,
     commanded: Reason | None = None,
 ) -> EventRecord:
     """What a guard said, as a record.
 
-    `freeze_s` is the freeze time of the generation that was restored, where it
-    is known, and `commanded` why a roll back was asked for, if one was.
+    `commanded` is why a roll back was asked for, if one was.
     """
     kind = event.kind
     restored = kind is Kind.RESTORED
-    if kind is Kind.CHECKPOINT or kind is Kind.MISSED:
-        freeze_s = event.freeze_s
+    taken = kind is Kind.CHECKPOINT
     counted = kind in _COUNTED
     return EventRecord(
         kind=kind,
@@ -171,12 +171,15 @@ def of_guard(
         generations=event.generations if counted or kind is Kind.MISSED else None,
         age_s=event.age_s if restored or kind is Kind.DROPPED else None,
         lost_s=event.age_s + event.restore_s if restored else None,
-        freeze_s=freeze_s,
+        freeze_s=event.freeze_s if taken or restored or kind is Kind.MISSED else None,
+        checkpoints=event.checkpoints if taken else None,
+        freeze_max_s=event.freeze_max_s if taken else None,
+        interval_s=event.interval_s if taken else None,
         restore_s=event.restore_s if restored else None,
         threads=event.threads if counted and kind is not Kind.DROPPED else None,
         attempt=event.attempt if restored or kind is Kind.DROPPED else None,
         restores=event.restores if restored else None,
-        quiescent=event.quiescent if kind is Kind.CHECKPOINT else None,
+        quiescent=event.quiescent if taken else None,
         images=event.images or None,
         fork_reason=event.fork_reason or None,
         app_pid=event.app_pid or None,

@@ -1,0 +1,184 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.interval=auto: what checkpoints cost, what the app does between them, and when that
+ * calls for another one (policy_wants()).
+ */
+#include <time.h>
+
+#include "guard.h"
+
+#define FAULT_NS 1000 /* the first write to a page after a clone of it             */
+#define TOLD_NS NS_PER_S
+#define SENDS_NS (10 * NS_PER_S) /* so long one that has sent is one that sends             */
+
+static uint64_t own_cpu_ns(void)
+{
+	struct timespec used;
+
+	if (clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &used))
+		return 0;
+	return (uint64_t)used.tv_sec * NS_PER_S + (uint64_t)used.tv_nsec;
+}
+
+static uint64_t app_cpu_ns(const struct avc_guard *guard)
+{
+	uint64_t sum = 0;
+
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->pid)
+			sum += proc_cpu_ns(guard->tree.process[i]->leader);
+	return sum;
+}
+
+static uint64_t app_faults(const struct avc_guard *guard)
+{
+	uint64_t sum = 0;
+
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct proc_stat stat;
+
+		if (guard->tree.process[i]->pid &&
+		    proc_stat(guard->tree.process[i]->leader, &stat) == 0)
+			sum += stat.faults;
+	}
+	return sum;
+}
+
+/* What it does from here on is not in the newest generation. */
+static void begin_rest(struct avc_guard *guard)
+{
+	guard->sent = false;
+	guard->pace_app_cpu_ns = app_cpu_ns(guard);
+	guard->next_ns = policy_ready(&guard->pace, &guard->config);
+}
+
+void guard_pace_begin(struct avc_guard *guard)
+{
+	if (policy_is_automatic(&guard->config))
+		guard->pace_began_ns = own_cpu_ns();
+}
+
+void guard_pace_end(struct avc_guard *guard)
+{
+	if (policy_is_automatic(&guard->config))
+		guard->pace_cpu_ns += own_cpu_ns() - guard->pace_began_ns;
+}
+
+/* Writes to pages that have not been written since the clone; faults of other kinds look the
+ * same, so no more than what the checkpoint itself has cost the app once more. */
+static uint64_t faults_ns(struct avc_guard *guard, uint64_t freeze_ns)
+{
+	const uint64_t faults = app_faults(guard), before = guard->pace_faults;
+	uint64_t ns;
+
+	guard->pace_faults = faults;
+	if (!before || faults < before)
+		return 0;
+	ns = (faults - before) * FAULT_NS;
+	return ns < freeze_ns ? ns : freeze_ns;
+}
+
+void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
+{
+	struct policy_cost cost;
+
+	if (!policy_is_automatic(&guard->config))
+		return;
+	guard_pace_end(guard);
+	/* The template is made and, when it makes way, unmade. */
+	cost.cpu_ns = guard->pace_cpu_ns + 2 * event->clone_ns;
+	cost.held_ns = event->freeze_ns + faults_ns(guard, event->freeze_ns);
+	guard->pace_cpu_ns = 0;
+	policy_pay(&guard->pace, &guard->config, cost, now_ns());
+	begin_rest(guard);
+}
+
+void guard_pace_missed(struct avc_guard *guard)
+{
+	if (!policy_is_automatic(&guard->config))
+		return;
+	guard_pace_end(guard);
+	guard->next_ns = policy_try_again(&guard->pace, &guard->config, now_ns());
+}
+
+void guard_pace_restored(struct avc_guard *guard)
+{
+	guard->next_ns = policy_due(&guard->config, now_ns());
+	if (!policy_is_automatic(&guard->config))
+		return;
+	guard->pace.taken_ns = now_ns();
+	guard->pace_faults = 0;
+	begin_rest(guard);
+}
+
+void guard_pace_listen(struct avc_guard *guard)
+{
+	if (!output_heard(&guard->output))
+		return;
+	guard->sent = true;
+	guard->sent_ns = now_ns();
+	guard->next_ns = guard->sent_ns;
+}
+
+static bool wants(const struct avc_guard *guard, uint64_t now)
+{
+	const uint64_t used = app_cpu_ns(guard);
+	const struct policy_activity activity = {
+		.cpu_ns = used - guard->pace_app_cpu_ns,
+		.sent = guard->sent,
+		.sends = guard->sent_ns && now - guard->sent_ns < SENDS_NS,
+	};
+
+	return used < guard->pace_app_cpu_ns || /* one of them has ended */
+	       policy_wants(&guard->pace, &guard->config, activity, now);
+}
+
+bool guard_pace_wants(struct avc_guard *guard)
+{
+	const uint64_t now = now_ns();
+
+	/* What others write counts where files are strict, too. */
+	if (!policy_is_automatic(&guard->config) || !guard->count ||
+	    guard->config.files == AVC_FILES_STRICT || wants(guard, now)) {
+		output_disarm(&guard->output);
+		return true;
+	}
+	guard_pace_begin(guard);
+	output_arm(&guard->output, &guard->tree);
+	guard_pace_end(guard);
+	guard->next_ns = policy_look_again(&guard->pace, now);
+	return false;
+}
+
+/* ---- telling ------------------------------------------------------------------- */
+
+/* Fifty a second are no news; how often and at what price is, once a second. */
+void guard_tell_taken(struct avc_guard *guard, struct avc_event *event)
+{
+	struct avc_event *told = &guard->untold;
+
+	event->interval_ns = policy_interval(&guard->pace, &guard->config);
+	event->checkpoints = told->checkpoints + 1;
+	event->freeze_max_ns = event->freeze_ns > told->freeze_max_ns ? event->freeze_ns
+								      : told->freeze_max_ns;
+	*told = *event;
+	if (event->ticket || !policy_is_automatic(&guard->config) || guard->unprotected ||
+	    event->error.code || now_ns() - guard->told_ns >= TOLD_NS)
+		guard_tell_untold(guard);
+}
+
+void guard_tell_untold(struct avc_guard *guard)
+{
+	const struct avc_event event = guard->untold;
+
+	if (!event.checkpoints)
+		return;
+	guard->untold = (struct avc_event){ 0 };
+	guard->told_ns = now_ns();
+	guard_emit(guard, &event);
+}
+
+uint64_t guard_tell_due(const struct avc_guard *guard)
+{
+	return guard->untold.checkpoints ? guard->told_ns + TOLD_NS : UINT64_MAX;
+}

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""avckpt.interval=auto: a guard that finds out itself how often, and when."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from testkit.guarded import GuardProcess, Victim, config, since_linux
+from testkit.harness import app_pid
+from testkit.init_peer import Init
+
+AUTO = config(3.0, interval_min_s=0.02, keep=3)
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def test_an_application_at_work_is_checkpointed_often_and_told_of_seldom(tmp_path: Path) -> None:
+    with Victim("busy 4", tmp_path) as victim, GuardProcess(AUTO, [victim.pid]) as guard:
+        first = guard.wait("checkpoint")
+        assert (first["generation"], first["checkpoints"]) == (1, 1)
+        guard.wait("checkpoint", count=4)
+        told = [event for event in guard.events if event["kind"] == "checkpoint"]
+        assert sum(event["checkpoints"] for event in told) == told[-1]["generation"] > 6
+        assert all(event["freeze_max_s"] >= event["freeze_s"] > 0 for event in told)
+        assert all(0.02 <= event["interval_s"] <= 3 for event in told)
+        gaps = [(b["at_ns"] - a["at_ns"]) / 1e9 for a, b in zip(told, told[1:])]
+        assert min(gaps) > 0.9, gaps
+        victim.check()
+
+
+def test_a_death_is_told_after_the_checkpoints_before_it(tmp_path: Path) -> None:
+    with Victim("busy 4", tmp_path) as victim, GuardProcess(AUTO, [victim.pid]) as guard:
+        guard.wait("checkpoint", count=2)
+        for _ in range(5):
+            since = guard.mark()
+            victim.wait_beats(200)
+            victim.kill_app()
+            restored = guard.wait("restored", since=since)
+            newest = max(event["generation"] for event in guard.events if event["kind"] == "checkpoint")
+            assert restored["generation"] == newest
+            assert restored["freeze_s"] > 0
+            victim.wait_beats(20)
+
+
+def test_an_application_that_does_nothing_is_left_alone(tmp_path: Path) -> None:
+    with Victim("idle 4 6 --beat-us 600000000", tmp_path) as victim, GuardProcess(AUTO, [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        time.sleep(8)
+        assert guard.command("checkpoint")["generation"] <= 3
+        # It goes back to that one all the same.
+        victim.kill_app()
+        assert guard.wait("restored")["restores"] == 1
+
+
+SENDER = """
+import socket, sys, time
+to = ("127.0.0.1", int(sys.argv[1]))
+out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+n, due = 0, time.monotonic()
+while True:
+    out.sendto(str(n).encode(), to)
+    n, due = n + 1, due + float(sys.argv[2])
+    time.sleep(max(due - time.monotonic(), 0))
+"""
+
+
+@contextmanager
+def sender(period_s: float) -> Iterator[tuple[Init, socket.socket]]:
+    """One that sends a number every so often, and does next to nothing else; and who hears them."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(30)
+        command = [sys.executable, "-S", "-c", SENDER, str(peer.getsockname()[1]), str(period_s)]
+        with Init(command, pid1=True) as init:
+            peer.recv(64)
+            yield init, peer
+
+
+@since_linux(6, 6, "sock:sock_send_length")
+def test_what_was_sent_is_remembered(tmp_path: Path) -> None:
+    """Without hearing the output there would be a checkpoint every 3 s: it uses too little CPU time."""
+    with sender(1.2) as (init, peer), GuardProcess(AUTO, [init.pid]) as guard:
+        guard.wait("checkpoint", count=2)
+        first, since = int(peer.recv(64)), guard.mark()
+        guard.wait("checkpoint", since=since, count=7)
+        peer.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                sent = int(peer.recv(64)) - first
+        taken = [event["checkpoints"] for event in guard.events[since:] if event["kind"] == "checkpoint"]
+        assert sum(taken) > 0.7 * sent, (taken, sent)
+
+
+def test_what_listens_is_given_up_with_the_application_that_it_listens_to(tmp_path: Path) -> None:
+    with sender(0.1) as (init, peer), GuardProcess(AUTO, [init.pid]) as guard:
+        guard.wait("checkpoint", count=3)
+        fds = guard.fds()
+        for _ in range(20):
+            since = guard.mark()
+            os.kill(app_pid(init.pid), signal.SIGKILL)
+            guard.wait("restored", since=since)
+            for _ in range(4):
+                peer.recv(64)
+        assert guard.fds() < fds + 10
