@@ -140,7 +140,7 @@ static void make_pause(struct inj_call *call)
 	__atomic_store_n(&call->pause, INJ_PAUSED, __ATOMIC_RELEASE);
 	futex_wake(&call->pause);
 	while (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) == INJ_PAUSED)
-		if (futex_wait(&call->pause, INJ_PAUSED, INJ_PARK_MS) == -110 /* ETIMEDOUT */)
+		if (futex_wait(&call->pause, INJ_PAUSED, call->park_ms) == -110 /* ETIMEDOUT */)
 			return;
 }
 

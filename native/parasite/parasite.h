@@ -55,7 +55,7 @@ struct inj_timer {
 #define INJ_LIST (-1)
 /* wait4(2) for what the call before it has brought forth. */
 #define INJ_WAIT (-3)
-/* Waits until the tracer says so (inj_call.pause), INJ_PARK_MS at most. */
+/* Waits until the tracer says so (inj_call.pause), park_ms at most. */
 #define INJ_PAUSE (-4)
 /* Likewise, with what mlockall(2) was told of memory to come for a result. */
 #define INJ_FUTURE_LOCK (-2)
