@@ -98,8 +98,9 @@ void guard_reap_dead(struct avc_guard *guard);
 bool guard_knows_tracee(pid_t tid, const void *guard);
 void guard_reap_unknown(const struct avc_guard *guard);
 void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
-/* After a crash: leaves the generation to restore from as the newest, or none. */
-void guard_fall_back(struct avc_guard *guard, bool hung);
+/* After a crash with that status: leaves the generation to restore from as the newest, or none, and
+ * then says why. */
+enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung);
 void guard_note_written(struct avc_guard *guard);
 int guard_check_files(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		      int pidfd, struct avc_error *err) warn_unused;
