@@ -118,6 +118,8 @@ bool guard_app_is_full(const struct avc_guard *guard);
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
 int guard_find_app(struct avc_guard *guard, struct avc_error *err);
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket);
+/* Threads of it do not stop; or is there a better reason than that? */
+void guard_tell_unstoppable(struct avc_guard *guard, const struct avc_error *error);
 /* Of what a restore from the newest generation can be spared, some; when nobody is just ending,
  * which takes a CPU as well. */
 void guard_work_ahead(struct avc_guard *guard);
