@@ -140,7 +140,7 @@ static void make_pause(struct inj_call *call)
 	__atomic_store_n(&call->pause, INJ_PAUSED, __ATOMIC_RELEASE);
 	futex_wake(&call->pause);
 	while (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) == INJ_PAUSED)
-		if (futex_wait(&call->pause, INJ_PAUSED, INJ_PARK_MS) == -110 /* ETIMEDOUT */)
+		if (futex_wait(&call->pause, INJ_PAUSED, call->park_ms) == -110 /* ETIMEDOUT */)
 			return;
 }
 
@@ -471,9 +471,12 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 			fail(slot, INJ_STEP_GROUP, me->tid, r);
 	}
 	/* The terminal's foreground group is a reference to the dead leader, not
-	 * a number.  SIGTTOU is blocked here, so this is allowed. */
-	if (slot->tty_fd >= 0) {
-		r = SYS3(__NR_ioctl, slot->tty_fd, 0x5410 /* TIOCSPGRP */, &slot->group);
+	 * a number.  SIGTTOU is blocked here, so this is allowed.  One that becomes a session's is in
+	 * the foreground of it; of several processes the engine has seen to that. */
+	if (slot->tty_fd >= 0 && !(slot->session_leader && slot->placed)) {
+		r = slot->session_leader
+			    ? SYS3(__NR_ioctl, slot->tty_fd, 0x540e /* TIOCSCTTY */, 0)
+			    : SYS3(__NR_ioctl, slot->tty_fd, 0x5410 /* TIOCSPGRP */, &slot->group);
 		if (r)
 			fail(slot, INJ_STEP_TTY, me->tid, r);
 	}

@@ -55,7 +55,7 @@ struct inj_timer {
 #define INJ_LIST (-1)
 /* wait4(2) for what the call before it has brought forth. */
 #define INJ_WAIT (-3)
-/* Waits until the tracer says so (inj_call.pause), INJ_PARK_MS at most. */
+/* Waits until the tracer says so (inj_call.pause), park_ms at most. */
 #define INJ_PAUSE (-4)
 /* Likewise, with what mlockall(2) was told of memory to come for a result. */
 #define INJ_FUTURE_LOCK (-2)
@@ -205,8 +205,9 @@ struct inj_slot {
 	int32_t group; /* process group, inside                          */
 	uint32_t session_leader;
 	uint32_t placed; /* session and group are right already                */
-	int32_t tty_fd;  /* -1, or a descriptor of the tty it was in the
-	                       * foreground of                                  */
+	/* -1, or a descriptor of the terminal that is its session's, or that it was in the
+	 * foreground of */
+	int32_t tty_fd;
 	uint32_t threads;
 	uint32_t block_bytes;       /* of one thread's block                          */
 	uint64_t blocks;            /* address of the first                           */

@@ -53,7 +53,7 @@ def test_killed_at_random_moments(command: str, interval_s: float, tmp_path: Pat
 @pytest.mark.parametrize("how", ["segv", "kill"])
 def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
     """Hundreds of times, in the middle of whatever is being done to it; then it ends, and nothing hangs."""
-    again = config(0.02, restore_window_s=0.001)
+    again = config(0.02, restore_window_s=0.000001)
     with Victim(f"crash {how} 1 --threads 6", tmp_path) as victim, GuardProcess(again, [victim.pid]) as guard:
         guard.wait("restored")
         time.sleep(4)

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import itertools
 import os
+import random
 import shutil
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,6 +76,49 @@ def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:
         guard.wait("checkpoint", count=3)
         for _ in range(200):
             assert flagged(victim.player, "wf") == wiped
+
+
+def uninherited(victim: Victim) -> set[int]:
+    """Pages that are in no fork of it (MADV_DONTFORK)."""
+    return pages(flagged(victim.player, "dc"))
+
+
+def take(guard: GuardProcess) -> None:
+    """A checkpoint; a busy machine misses some."""
+    wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "a checkpoint is taken", 0.02)
+
+
+@pytest.mark.parametrize("command", ["mappings", "mappings --unbound --in-child"])
+def test_what_no_fork_inherits_is_inherited_by_none_after_a_checkpoint(command: str, tmp_path: Path) -> None:
+    """Without a death, and after one; though the template has it."""
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        before = uninherited(victim)
+        assert before
+        for _ in range(5):
+            take(guard)
+            assert uninherited(victim) == before
+        for _ in range(3):
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            victim.wait_beats()
+            assert uninherited(victim) == before
+            take(guard)
+            assert uninherited(victim) == before
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_it_stays_so_if_the_guard_dies(where: str, tmp_path: Path) -> None:
+    """Also between the call that lets it be inherited for a moment and the one that takes that back."""
+    rng = random.Random(7)
+    with Victim(f"mappings 0 {where}", tmp_path) as victim:
+        before = uninherited(victim)
+        for _ in range(25):
+            with GuardProcess(config(0.002), [victim.pid]) as guard:
+                guard.wait("checkpoint", count=2)
+                time.sleep(rng.uniform(0.0, 0.01))
+            wait_until(lambda: uninherited(victim) == before, 5, "it is inherited no more")
+        victim.wait_beats()
 
 
 def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) -> None:

@@ -42,6 +42,8 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported locked", "which has locked its own"),
         ("unsupported locked-child", "which has locked its own"),
         ("unsupported user", "which has locked its own"),
+        ("unsupported dropped", "which has given up the right to be that"),
+        ("unsupported vfork", "executes no program (vfork)"),
         ("unsupported shared-files", "shares its descriptor table"),
         ("unsupported shared-folder", "shares its working directory"),
         pytest.param("unsupported dispatch", "Syscall User Dispatch", marks=DISPATCH),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 from collections.abc import Sequence
 from typing import Any, cast
@@ -71,11 +72,12 @@ class Guarded:
         self.c.policy_hold(self.policy, fresh)
         return self.number
 
-    def crash(self, hung: bool = False) -> int:
+    def crash(self, hung: bool = False, status: int = signal.SIGKILL) -> int:
         """The generation that is restored, 0: it is over.  What is given up is in `unhealthy` and `crashed`."""
         before = self.held
-        left = self.c.policy_crashed(self.policy, self.config, hung, self.now)
+        left = self.c.policy_crashed(self.policy, self.config, status, hung, self.now)
         assert left.trusted <= left.healthy <= self.policy.count
+        self.looping = bool(left.looping)
         self.unhealthy, self.crashed = before[left.healthy :], before[left.trusted : left.healthy]
         while self.policy.count > left.trusted:
             self.c.policy_drop(self.policy, self.policy.count - 1)
@@ -321,6 +323,65 @@ def test_the_only_generation_gets_all_restores() -> None:
     guard.take()
     assert [guard.crash() for _ in range(6)] == [1] * 5 + [0]
     assert guard.crashed == [1]
+
+
+EXIT_3 = 3 << 8
+CORE = 0x80
+
+
+@pytest.mark.parametrize("status", [EXIT_3, signal.SIGSEGV, signal.SIGABRT | CORE, signal.SIGSYS])
+def test_the_same_death_at_once_twice_is_the_images(status: int) -> None:
+    """The first one led to the first restore, and says nothing of it."""
+    guard = Guarded(keep=2, restore_max=64)
+    guard.take()
+    guard.take()
+    chosen = []
+    for _ in range(5):
+        chosen.append(guard.crash(status=status))
+        guard.wait(0.9)
+    assert chosen == [2, 2, 1, 1, 0]
+    assert guard.looping
+
+
+@pytest.mark.parametrize(
+    ("statuses", "pause_s"),
+    [
+        ((signal.SIGSEGV, signal.SIGABRT), 0.5),  # two kinds
+        ((signal.SIGSEGV, signal.SIGKILL), 0.5),  # never twice in a row
+        ((signal.SIGSEGV,), 1.0),  # not at once
+        ((signal.SIGKILL,), 0.1),  # somebody else's
+        ((signal.SIGTERM,), 0.1),
+    ],
+)
+def test_other_deaths_in_quick_succession_are_not(statuses: tuple[int, ...], pause_s: float) -> None:
+    guard = Guarded(keep=2, restore_max=64)
+    guard.take()
+    guard.take()
+    for n in range(20):
+        assert guard.crash(status=statuses[n % len(statuses)]) == 2
+        guard.wait(pause_s)
+
+
+def test_who_sends_a_signal_after_each_checkpoint_ends_nothing() -> None:
+    guard = Guarded(keep=2, restore_max=64)
+    guard.take()
+    for number in range(1, 20):
+        assert guard.crash(status=signal.SIGSEGV) == number
+        guard.wait(0.1)
+        guard.take()
+
+
+def test_an_exit_at_once_is_its_own_whatever_was_taken_in_between() -> None:
+    guard = Guarded(keep=3, restore_max=64)
+    guard.take()
+    guard.take()
+    restored = []
+    while not guard.over:
+        restored.append(guard.crash(status=EXIT_3))
+        guard.wait(0.1)
+        guard.take()
+    assert restored[-1] == 0
+    assert len(restored) == 5
 
 
 def test_when_they_are_used_up_each_older_one_is_tried_once() -> None:

@@ -25,6 +25,8 @@
  *             thread has locked
  *   user      one thread of another user, and the main thread has locked that capabilities are
  *             not kept over that
+ *   dropped   one thread of another user, and the main thread has become a third one's
+ *   vfork     a thread waits for a child that never executes a program (vfork(2))
  *   shared-files, shared-folder   a child process with the descriptors, or the working
  *             directory, of its parent
  *   dispatch  its system calls are dispatched by itself, and while it makes none are blocked
@@ -370,6 +372,26 @@ static bool start_user(void)
 	return lock_securebits(SECBIT_KEEP_CAPS_LOCKED) && start_thread(other_user, true);
 }
 
+static bool start_dropped(void)
+{
+	return start_thread(other_user, true) && !syscall(SYS_setresuid, 1000, 1000, 1000);
+}
+
+static void *wait_for_ever(void *arg)
+{
+	count(1, 1);
+	/* The child has our stack: it must not return. */
+	if (!vfork())
+		for (;;)
+			pause();
+	return arg;
+}
+
+static bool start_vfork(void)
+{
+	return start_thread(wait_for_ever, 0);
+}
+
 static bool start_child(unsigned long flags)
 {
 	const long child = syscall(SYS_clone, flags | SIGCHLD, 0, 0, 0, 0);
@@ -539,6 +561,8 @@ static const struct kind {
 	{ "locked", start_locked, NULL },
 	{ "locked-child", start_locked_child, NULL },
 	{ "user", start_user, NULL },
+	{ "dropped", start_dropped, NULL },
+	{ "vfork", start_vfork, NULL },
 	{ "shared-files", start_shared_files, NULL },
 	{ "shared-folder", start_shared_folder, NULL },
 	{ "dispatch", start_dispatch, stop_dispatch },

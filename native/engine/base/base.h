@@ -215,9 +215,11 @@ int proc_sched(pid_t tid, struct proc_sched *sched);
 struct proc_status {
 	int64_t locked_kb; /* -1: it has no memory any more                    */
 	pid_t inside;      /* in the innermost PID namespace                   */
-	pid_t tracer;      /* a thread, in our namespace; 0: none              */
-	uint64_t caught;   /* signals it has handlers for, as in sigset_t      */
-	uint64_t ignored;  /* likewise                                         */
+	/* The numbers of its group and session there, whoever leads them; 0: led from outside. */
+	pid_t group, session;
+	pid_t tracer;     /* a thread, in our namespace; 0: none              */
+	uint64_t caught;  /* signals it has handlers for, as in sigset_t      */
+	uint64_t ignored; /* likewise                                         */
 	uint32_t umask;
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	int group_count;         /* supplementary; those beyond are not known   */

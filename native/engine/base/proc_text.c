@@ -225,6 +225,10 @@ static uint32_t parse_status_line(const char *line, size_t length, struct proc_s
 		status->inside = atoi(last + 1);
 		return HAS_INSIDE;
 	}
+	if (!strncmp(line, "NSpgid:", 7))
+		status->group = atoi(last + 1);
+	if (!strncmp(line, "NSsid:", 6))
+		status->session = atoi(last + 1);
 	if (!strncmp(line, "TracerPid:", 10)) {
 		status->tracer = atoi(value);
 		return HAS_TRACER;

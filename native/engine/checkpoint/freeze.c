@@ -242,12 +242,14 @@ static int clone_missing(struct freeze *freeze, struct avc_error *err)
 	 * yet. */
 	if (freeze_hear_all(tree, err) ||
 	    freeze_await_clone(main, &freeze->generation->image[0].template, err) ||
-	    freeze_rest_main(thread_find(main, main->pid), err) || make_holders_missing(tree, err))
+	    freeze_rest_main(main, thread_find(main, main->pid), err) ||
+	    make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
 
-		if (process && !process->cloning && freeze_start_clone(process, err))
+		if (process && !process->cloning &&
+		    freeze_start_clone(process, freeze->generation->image[0].slot, err))
 			return -1;
 	}
 	return 0;
@@ -328,7 +330,7 @@ static void let_go(struct freeze *freeze)
 		/* A frozen cgroup, at this very moment. */
 		tracee_deadline_set(freeze->timer, NS_PER_S);
 		if (freeze->generation->image[0].template && main_thread->borrowed)
-			(void)freeze_rest_main(main_thread,
+			(void)freeze_rest_main(main, main_thread,
 					       &ignored); /* or it is killed just now */
 		thread_let_go(main, main_thread);
 	}

@@ -31,10 +31,10 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err) warn_unused
 int freeze_begin_others(struct freeze *freeze, struct avc_error *err) warn_unused;
 /* The main process is cloned by its own main thread, any other by its holder, which shares its
  * memory and descriptors: nobody finds children that he has not made. */
-int freeze_start_clone(struct process *process, struct avc_error *err) warn_unused;
+int freeze_start_clone(struct process *process, uint32_t slot, struct avc_error *err) warn_unused;
 int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err) warn_unused;
 /* The main thread that has cloned has a few steps to go before it can be let go. */
-int freeze_rest_main(struct thread *main_thread, struct avc_error *err);
+int freeze_rest_main(const struct process *main, struct thread *main_thread, struct avc_error *err);
 /* The answers of all others, also of those that were asked before one failed. */
 int freeze_hear_all(struct tree *tree, struct avc_error *err) warn_unused;
 /* Clones that nobody waits for any more: of a process that was killed meanwhile, and all of

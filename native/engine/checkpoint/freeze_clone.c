@@ -9,6 +9,7 @@
 #include <errno.h>
 #include <sched.h>
 #include <signal.h>
+#include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
@@ -114,18 +115,19 @@ static void drop_old_parasites(struct process *process, struct inj_call *call)
 
 /* ---- clones ----------------------------------------------------------------------------- */
 
-static int start_own_clone(struct process *process, struct avc_error *err)
+static int start_own_clone(struct process *process, uint32_t slot, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	struct thread *thread = thread_find(process, process->pid);
 
 	call_begin(call, INJ_AFTER_HOME);
 	timers_ask(process, call);
-	memory_dofork(process->memory, call);
 	drop_old_parasites(process, call);
 	process->children = ask_for_children(call);
+	memory_advise(process, slot, MADV_DOFORK, call);
 	/* The descriptor table is shared, not copied: what the app closes is closed. */
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD);
+	memory_advise(process, slot, MADV_DONTFORK, call);
 	process->asked_ns = now_ns();
 	return thread_borrow(process, thread, err) || parasite_start(thread->tid, err) ? -1 : 0;
 }
@@ -147,9 +149,14 @@ static int await_own_clone(struct process *process, pid_t *template, struct avc_
 	return hear_of_children(process, err);
 }
 
-int freeze_rest_main(struct thread *main_thread, struct avc_error *err)
+int freeze_rest_main(const struct process *main, struct thread *main_thread, struct avc_error *err)
 {
-	if (tracee_settle(main_thread->tid, err) == 0 && thread_give_back(main_thread, err) == 0)
+	const int result = memory_is_unforked(main->memory)
+				   ? parasite_run(main_thread->tid, &main->parasite.control->runner,
+						  err)
+				   : tracee_settle(main_thread->tid, err);
+
+	if (result == 0 && thread_give_back(main_thread, err) == 0)
 		return 0;
 	main_thread->stopped = false;
 	return -1;
@@ -161,7 +168,6 @@ static int start_holders_clone(struct process *process, struct avc_error *err)
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, INJ_FUTURE_LOCK);
-	memory_dofork(process->memory, call);
 	drop_old_parasites(process, call);
 	call_add(call, SYS_clone, CLONE_FILES | CLONE_PARENT | SIGCHLD);
 	if (parasite_send(&process->parasite, process->holder, &process->holder_base, call, err) ||
@@ -171,34 +177,89 @@ static int start_holders_clone(struct process *process, struct avc_error *err)
 	return 0;
 }
 
-static int await_holders_clone(struct process *process, pid_t *template, struct avc_error *err)
+/* After its main thread was asked, which tells of everything else. */
+static void note_future_lock(struct process *process)
 {
 	const struct inj_call *call = &process->parasite.control->holder;
 	struct thread *thread = thread_find(process, process->pid);
 
+	if (thread && call->call[0].result > 0)
+		thread->creds.future_lock = (int32_t)call->call[0].result;
+}
+
+static int await_holders_clone(struct process *process, pid_t *template, struct avc_error *err)
+{
+	const struct inj_call *call = &process->parasite.control->holder;
+
 	if (parasite_await_clone(process->holder, call, template, err))
 		return -1;
 	process->lost = false;
-	if (thread && call->call[0].result > 0)
-		thread->creds.future_lock = (int32_t)call->call[0].result;
 	return 0;
 }
 
-int freeze_start_clone(struct process *process, struct avc_error *err)
+/* Nobody but the process itself may change its memory for a moment: a holder would be killed with
+ * us in the middle of it, and leave it so.  Its main thread waits in the parasite until that is
+ * over, and then puts it back, with us or without. */
+static int clone_unforked(struct process *process, uint32_t slot, struct avc_error *err)
 {
+	struct inj_call *call = &process->parasite.control->runner;
+	struct thread *thread = thread_find(process, process->pid);
+	struct avc_error failed = { 0 };
+	int result;
+
+	call_begin(call, INJ_AFTER_HOME);
+	call->park_ms += (uint32_t)(CLONES_MAX_NS / NS_PER_MS);
+	memory_advise(process, slot, MADV_DOFORK, call);
+	call_add(call, INJ_PAUSE);
+	memory_advise(process, slot, MADV_DONTFORK, call);
+	if (thread_borrow(process, thread, err))
+		return -1;
+	if (parasite_run_to_pause(thread->tid, call, err)) {
+		thread->stopped = false; /* on its way through the parasite, and home */
+		return -1;
+	}
+	result = start_holders_clone(process, err) ||
+				 await_holders_clone(process, &process->cloned, err)
+			 ? -1
+			 : 0;
+	if (parasite_run_on(thread->tid, call, result ? &failed : err)) {
+		thread->stopped = false;
+		return -1;
+	}
+	return thread_give_back(thread, result ? &failed : err) || result ? -1 : 0;
+}
+
+static int start_clone(struct process *process, uint32_t slot, struct avc_error *err)
+{
+	if (!process->descendant)
+		return start_own_clone(process, slot, err);
+	return memory_is_unforked(process->memory) ? clone_unforked(process, slot, err)
+						   : start_holders_clone(process, err);
+}
+
+int freeze_start_clone(struct process *process, uint32_t slot, struct avc_error *err)
+{
+	int result;
+
 	/* Before a holder runs, which maps something for a moment. */
 	process->clone_pages = proc_vm_pages(process->statm_fd, NULL);
-	if (process->descendant ? start_holders_clone(process, err) : start_own_clone(process, err))
-		return -1;
-	process->cloning = true;
-	return 0;
+	process->cloned = 0;
+	result = start_clone(process, slot, err);
+	process->cloning = !result || process->cloned;
+	return result;
 }
 
 int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err)
 {
 	process->cloning = false;
-	return process->descendant ? await_holders_clone(process, template, err)
-				   : await_own_clone(process, template, err);
+	if (!process->descendant)
+		return await_own_clone(process, template, err);
+	if (!process->cloned && await_holders_clone(process, &process->cloned, err))
+		return -1;
+	*template = process->cloned;
+	process->cloned = 0;
+	note_future_lock(process);
+	return 0;
 }
 
 /* ---- questions --------------------------------------------------------------------------- */
@@ -290,13 +351,13 @@ static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, stru
 		return fail(err, process->descendant ? AVC_UNSUPPORTED : AVC_DEADLINE, 0,
 			    process->pid, "freeze", "", "its main thread has ended");
 	process->stage = FREEZE_BEGUN;
-	if (read_all(process, slot, err))
+	if (read_all(process, slot, err) || memory_look(process, err))
 		return -1;
 	if (!process->descendant && !process->recycling)
-		return freeze_start_clone(process, err);
+		return freeze_start_clone(process, slot, err);
 	return thread_vet(process, thread, err) ||
 			       (!process->recycling && process->holder &&
-				freeze_start_clone(process, err)) ||
+				freeze_start_clone(process, slot, err)) ||
 			       ask_begin(process, slot, takes_ns, err)
 		       ? -1
 		       : 0;

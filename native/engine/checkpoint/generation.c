@@ -249,7 +249,8 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	slot->session_leader = stat->session == process->leader;
 	slot->placed = process->descendant;
 	/* Of several processes: restore_tree.c. */
-	slot->tty_fd = !process->descendant && stat->tty && stat->tty_group == stat->group
+	slot->tty_fd = !process->descendant && stat->tty &&
+				       (slot->session_leader || stat->tty_group == stat->group)
 			       ? files_find_device(image->files, stat->tty)
 			       : -1;
 	return setup_end(&setup, process->pid, err);

@@ -332,7 +332,7 @@ static void tell_straggling(struct avc_guard *guard)
 	guard->told_stragglers_ns = now;
 	fail(&error, AVC_DEADLINE, 0, guard->main.pid, "stop", "",
 	     "a thread that was to stop has not done so for a second");
-	guard_emit_error(guard, AVC_EVENT_MISSED, 0, &error);
+	guard_tell_unstoppable(guard, &error);
 }
 
 static void let_go(struct avc_guard *guard)

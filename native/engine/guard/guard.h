@@ -125,8 +125,9 @@ void guard_reap_dead(struct avc_guard *guard);
 bool guard_knows_tracee(pid_t tid, const void *guard);
 void guard_reap_unknown(const struct avc_guard *guard);
 void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
-/* After a crash: leaves the generation to restore from as the newest, or none. */
-void guard_fall_back(struct avc_guard *guard, bool hung);
+/* After a crash with that status: leaves the generation to restore from as the newest, or none, and
+ * then says why. */
+enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung);
 void guard_note_written(struct avc_guard *guard);
 int guard_check_files(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		      int pidfd, struct avc_error *err) warn_unused;
@@ -144,6 +145,8 @@ bool guard_app_is_full(const struct avc_guard *guard);
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error);
 int guard_find_app(struct avc_guard *guard, struct avc_error *err);
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket);
+/* Threads of it do not stop; or is there a better reason than that? */
+void guard_tell_unstoppable(struct avc_guard *guard, const struct avc_error *error);
 /* Of what a restore from the newest generation can be spared, some; when nobody is just ending,
  * which takes a CPU as well. */
 void guard_work_ahead(struct avc_guard *guard);

@@ -4,6 +4,7 @@
  */
 #include <errno.h>
 #include <string.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "guard.h"
@@ -13,6 +14,7 @@
 #define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
 #define QUIESCE_STEP_MS 1
 #define TAKE_TRIES 4
+#define VFORK_NS (2 * NS_PER_S)
 /* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
@@ -160,6 +162,29 @@ static int renew_holders(struct avc_guard *guard, struct avc_error *err)
 	return 0;
 }
 
+/* A parent that waits for its child to execute a program or end (vfork(2)) cannot be stopped, and
+ * every checkpoint would be missed.  Few take that long. */
+static int check_vfork(const struct tree *tree, struct avc_error *err)
+{
+	const uint64_t tick_ns = NS_PER_S / (uint64_t)sysconf(_SC_CLK_TCK);
+	struct timespec now;
+
+	clock_gettime(CLOCK_BOOTTIME, &now);
+	for (uint32_t i = 1; i < tree->count; i++) {
+		const struct tree_entry *entry = &tree->entry[i];
+		const uint64_t age_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec -
+					entry->stat.start * tick_ns;
+
+		if (entry->process && !entry->process->infected && age_ns > VFORK_NS &&
+		    age_ns < INT64_MAX && tree_shares_memory(tree, i))
+			return fail(err, AVC_UNSUPPORTED, 0, entry->pid, "check", "",
+				    "process %d has its parent's memory, and executes no program "
+				    "(vfork)",
+				    entry->process->inside);
+	}
+	return 0;
+}
+
 static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
@@ -169,7 +194,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
 	guard_let_executed_go(guard, true);
-	if (tree_look(tree, err))
+	if (tree_look(tree, err) || check_vfork(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
@@ -188,6 +213,19 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		}
 	}
 	return 0;
+}
+
+void guard_tell_unstoppable(struct avc_guard *guard, const struct avc_error *error)
+{
+	struct avc_error why = { 0 };
+
+	if (guard->main.pid && !tree_look(&guard->tree, &why))
+		(void)check_vfork(&guard->tree, &why);
+	if (policy_missed(&guard->policy, why.code, false))
+		guard_unprotect(guard, 0, &why);
+	else
+		guard_emit_error(guard, AVC_EVENT_MISSED, 0,
+				 why.code == AVC_UNSUPPORTED ? &why : error);
 }
 
 /* What is known of the descriptors while the app runs makes the freeze shorter. */

@@ -253,11 +253,13 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 		goto out;
 	}
 	if (reason != AVC_REASON_COMMAND && guard->count) {
-		guard_fall_back(guard, reason == AVC_REASON_UNHEALTHY);
+		const enum avc_reason over = guard_fall_back(guard, report->status,
+							     reason == AVC_REASON_UNHEALTHY);
+
 		if (!guard->count) {
 			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
 			     "it was restored %u time(s) already", guard->restores);
-			give_up(guard, report, AVC_REASON_LIMIT, &error);
+			give_up(guard, report, over, &error);
 			goto out;
 		}
 	}

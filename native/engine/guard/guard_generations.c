@@ -351,15 +351,16 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 	guard_rank_generations(guard);
 }
 
-void guard_fall_back(struct avc_guard *guard, bool hung)
+enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung)
 {
-	const struct policy_fallback left = policy_crashed(&guard->policy, &guard->config, hung,
-							   now_ns());
+	const struct policy_fallback left = policy_crashed(&guard->policy, &guard->config, status,
+							   hung, now_ns());
 
 	while (guard->count > left.healthy)
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
 	while (guard->count > left.trusted)
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_CRASHED, 0);
+	return left.looping ? AVC_REASON_LOOP : AVC_REASON_LIMIT;
 }
 
 /* ---- avckpt.files=auto and strict ---------------------------------------------- */

@@ -8,6 +8,7 @@
  * it came from, carry that one's crashes, and take the place of their own kind, so that
  * what is older is still there to go back to.
  */
+#include <signal.h>
 #include <sys/wait.h>
 
 #include "policy.h"
@@ -22,6 +23,8 @@
 #define LOOK_LONG_NS (200 * MS)
 /* What a checkpoint makes an app that does nothing use: calls that are made again. */
 #define NOISE_NS (MS / 5)
+/* After a restore: whoever dies before that has come across what is wrong in the image. */
+#define AT_ONCE_NS UINT64_C(1000000000)
 
 static bool on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
 {
@@ -81,9 +84,11 @@ struct policy_generation policy_new_generation(struct policy *policy,
 	fresh.proves = !policy_is_automatic(config) || !policy->restored_ns ||
 		       now - policy->restored_ns >= PROOF_NS;
 	for (uint32_t i = 0; i < policy->count; i++)
-		if (policy->held[i].lineage == fresh.lineage &&
-		    policy->held[i].crashes > fresh.crashes)
-			fresh.crashes = policy->held[i].crashes;
+		if (policy->held[i].lineage == fresh.lineage) {
+			if (policy->held[i].crashes > fresh.crashes)
+				fresh.crashes = policy->held[i].crashes;
+			fresh.looping |= policy->held[i].looping;
+		}
 	return fresh;
 }
 
@@ -327,6 +332,46 @@ static void count_crash(struct policy *policy, const struct avc_config *config, 
 	}
 }
 
+/* Of what somebody else may have done to it, nothing follows for the image.  Nobody can tell who has
+ * sent a signal that a program dies of by its own faults as a rule; but who got as far as the next
+ * checkpoint did not die of the image. */
+static bool is_its_own(const struct policy *policy, int status)
+{
+	if (WIFEXITED(status))
+		return true;
+	switch (WTERMSIG(status)) {
+	case SIGSEGV:
+	case SIGBUS:
+	case SIGFPE:
+	case SIGILL:
+	case SIGTRAP:
+	case SIGABRT:
+	case SIGSYS:
+		return !policy->proved;
+	default:
+		return false;
+	}
+}
+
+/* The same death as after the restore before this one, and again at once. */
+static void count_at_once(struct policy *policy, const struct avc_config *config, int status,
+			  uint64_t now)
+{
+	const int what = WIFEXITED(status) ? status : WTERMSIG(status); /* without WCOREDUMP */
+	const bool again = policy->at_once_status == what &&
+			   policy->at_once_lineage == policy->lineage;
+
+	if (!on_probation(policy, config, now) || now - policy->restored_ns >= AT_ONCE_NS ||
+	    !is_its_own(policy, status)) {
+		policy->at_once_status = 0;
+		return;
+	}
+	policy->at_once_status = what;
+	policy->at_once_lineage = policy->lineage;
+	for (uint32_t i = 0; again && i < policy->count; i++)
+		policy->held[i].looping |= policy->held[i].lineage == policy->lineage;
+}
+
 /* Where there is something older to go back to, half of the restores are enough. */
 static bool is_trusted(const struct policy *policy, const struct avc_config *config, uint32_t i,
 		       bool used_up)
@@ -334,16 +379,19 @@ static bool is_trusted(const struct policy *policy, const struct avc_config *con
 	const struct policy_generation *held = &policy->held[i];
 	const uint32_t tries = i > 0 ? (config->restore_max + 1) / 2 : config->restore_max;
 
-	return !(used_up && (held->crashes || held->lost)) && held->lost < (tries ? tries : 1);
+	return !held->looping && !(used_up && (held->crashes || held->lost)) &&
+	       held->lost < (tries ? tries : 1);
 }
 
 struct policy_fallback policy_crashed(struct policy *policy, const struct avc_config *config,
-				      bool hung, uint64_t now)
+				      int status, bool hung, uint64_t now)
 {
 	const bool used_up = policy_restores_within(policy, config, now) >= config->restore_max;
 	struct policy_fallback left = { .healthy = policy->count };
 
 	count_crash(policy, config, hung, now);
+	if (!hung)
+		count_at_once(policy, config, status, now);
 	/* Checkpoints may have been taken for as long as nobody noticed the hang. */
 	if (hung && policy->count) {
 		const int vouched = newest_vouched(policy);
@@ -351,6 +399,7 @@ struct policy_fallback policy_crashed(struct policy *policy, const struct avc_co
 		left.healthy = vouched < 0 ? 1 : (uint32_t)vouched + 1;
 	}
 	left.trusted = left.healthy;
+	left.looping = left.healthy && policy->held[left.healthy - 1].looping;
 	while (left.trusted && !is_trusted(policy, config, left.trusted - 1, used_up))
 		left.trusted--;
 	return left;

@@ -27,6 +27,7 @@ struct policy_generation {
 	uint32_t lineage;
 	uint32_t crashes; /* of its lineage, soon after a restore             */
 	uint32_t lost;    /* restores from it that came to nothing            */
+	bool looping;     /* restores from its lineage led to the same death at once, twice */
 	bool seen;        /* held when the app was healthy; again so: vouched */
 	bool vouched;     /* the app was healthy well after it was taken      */
 	bool proves;      /* that its process got somewhere since a restore   */
@@ -47,6 +48,9 @@ struct policy {
 	uint64_t restored_from; /* generation, 0: never restored              */
 	uint64_t restored_ns;   /* after a crash; 0: not, or long ago         */
 	bool proved;            /* got somewhere since it was restored        */
+	/* The last death that came at once, and was the program's own. */
+	int at_once_status;
+	uint32_t at_once_lineage;
 };
 
 /* ---- checkpoints ------------------------------------------------------------- */
@@ -147,11 +151,12 @@ struct policy_verdict policy_judge(const struct avc_config *config, int status, 
  * be restored; 0: it is over. */
 struct policy_fallback {
 	uint32_t healthy, trusted;
+	bool looping; /* the newest is not trusted for that: the same death at once, twice  */
 };
 
-/* The process that ran is gone, and nobody wanted that. */
+/* The process that ran is gone, with that status (waitpid(2)), and nobody wanted that. */
 struct policy_fallback policy_crashed(struct policy *policy, const struct avc_config *config,
-				      bool hung, uint64_t now);
+				      int status, bool hung, uint64_t now);
 
 /* held[i] runs again.  `crashed`: not on command. */
 void policy_restored(struct policy *policy, uint32_t i, bool crashed, uint64_t now);

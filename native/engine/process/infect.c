@@ -627,9 +627,9 @@ static int make_holder(struct process *process, pid_t holder, const struct arch_
 		(void)sched_setscheduler(holder, SCHED_FIFO | SCHED_RESET_ON_FORK, &first);
 	memcpy(own->out, "avckpt-hold", 12);
 	call_begin(own, INJ_AFTER_PARK);
-	/* Out of the app's process group, or the number stays taken; and of its session,
-	 * which another process of the app may lead. */
-	call_add(own, process->descendant ? SYS_setsid : SYS_setpgid);
+	/* Out of the app's session and process group, which a process of the app may lead: their
+	 * numbers would stay taken. */
+	call_add(own, SYS_setsid);
 	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, own->out));
 	return parasite_send(&process->parasite, holder, base, own, err) ||
 			       parasite_run(holder, own, err)

@@ -25,14 +25,10 @@
 #define FORK_NS (5 * NS_PER_S)
 
 static const char *const step_names[] = {
-	[INJ_STEP_SESSION] = "setsid",
-	[INJ_STEP_GROUP] = "setpgid",
-	[INJ_STEP_TTY] = "ioctl(TIOCSPGRP)",
-	[INJ_STEP_ROBUST] = "set_robust_list",
-	[INJ_STEP_RSEQ] = "rseq",
-	[INJ_STEP_THREAD] = "clone",
-	[INJ_STEP_TID] = "clone",
-	[INJ_STEP_BASE] = "arch_prctl",
+	[INJ_STEP_SESSION] = "setsid",      [INJ_STEP_GROUP] = "setpgid",
+	[INJ_STEP_TTY] = "ioctl(terminal)", [INJ_STEP_ROBUST] = "set_robust_list",
+	[INJ_STEP_RSEQ] = "rseq",           [INJ_STEP_THREAD] = "clone",
+	[INJ_STEP_TID] = "clone",           [INJ_STEP_BASE] = "arch_prctl",
 };
 
 /* Waits while *word == value; false after `end`. */

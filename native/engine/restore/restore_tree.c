@@ -242,7 +242,8 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
 	}
-	if (seccomp_go_on(batch->pid, NULL))
+	/* Of SIGKILL it dies where it is. */
+	if (signal != SIGKILL && seccomp_go_on(batch->pid, NULL))
 		return fail_errno(err, batch->pid, "restore", "ptrace(CONT)", "it was killed");
 	for (;;) {
 		const struct stop stop = tracee_wait(batch->pid, 0);
@@ -485,6 +486,7 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 		syscall_batch_add(batch, SYS_setsid);
 	else
 		syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)slot->group);
+	take_terminal(batch, image);
 	if (syscall_batch_flush(batch, err))
 		return -1;
 	slot->placed = 1;

@@ -279,6 +279,29 @@ static bool fits_locks(const struct creds *from, const struct creds *to)
 	return !(locks & ~to->securebits) && !(locks >> 1 & changed);
 }
 
+static bool is_among(uint32_t id, const uint32_t ids[3], uint32_t of_files)
+{
+	return id == ids[0] || id == ids[1] || id == ids[2] || id == of_files;
+}
+
+/* setresuid(2), setfsuid(2): an id that it has, in one role or the other. */
+static bool may_take_ids(const uint32_t from[3], const uint32_t to[3])
+{
+	return is_among(to[0], from, from[0]) && is_among(to[1], from, from[0]) &&
+	       is_among(to[2], from, from[0]);
+}
+
+/* What lower() does of this must not be refused at a restore, when it is too late. */
+static bool may_become(const struct creds *from, const struct creds *to)
+{
+	const uint64_t may = caps_of(from, EFFECTIVE), later = caps_of(from, PERMITTED);
+
+	return (may >> CAP_SETGID & 1 || may_take_ids(from->gid, to->gid)) &&
+	       (may >> CAP_SETUID & 1 || may_take_ids(from->uid, to->uid)) &&
+	       (later >> CAP_SETGID & 1 || is_among(to->fsgid, to->gid, to->gid[1])) &&
+	       (later >> CAP_SETUID & 1 || is_among(to->fsuid, to->uid, to->uid[1]));
+}
+
 static int refuse(const struct process *process, pid_t inside, const char *has, const char *main,
 		  struct avc_error *err)
 {
@@ -313,6 +336,9 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 			    "its threads differ in their seccomp filters (thread %d)", inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return refuse(process, inside, "privileges that", " has given up", err);
+	if (!may_become(from, to))
+		return refuse(process, inside, "another user or group than",
+			      ", which has given up the right to be that", err);
 	if (!may_be_lowered(from, to))
 		return refuse(process, inside,
 			      "other capability sets (bounding, ambient, securebits) than",

@@ -2,11 +2,11 @@
  *
  * Memory that a clone does not carry as it is.
  *
- * - MADV_DONTFORK: missing in the clone.  A process that was found to have such
- *   areas is told MADV_DOFORK for its whole address space in the same breath as it
- *   is cloned, so there is no moment at which a new one could be missed.  Its own
- *   forks then copy those areas, too.  (Only those are left that the kernel keeps so: a
- *   device's, and on new kernels, seen on 7.3, huge pages.)
+ * - MADV_DONTFORK: missing in the clone.  Of a process that was found to have such areas they
+ *   are looked up while it is stopped, are told MADV_DOFORK right before it is cloned, and
+ *   MADV_DONTFORK right after that, by the process's own main thread, which does so also if the
+ *   guard dies in between.  (Only those are left that the kernel keeps so: a device's, and on new
+ *   kernels, seen on 7.3, huge pages.)
  * - MADV_WIPEONFORK: zeroes in the clone (memory_wiped.c).
  * - Shared memory that is nobody else's: is not copied by a clone.  Read while the app
  *   is stopped, up to a limit, and written back at a restore; once for all processes of
@@ -47,6 +47,7 @@ void memory_forget(struct memory *memory)
 	areas_free(&memory->areas);
 	areas_free(&memory->foreign);
 	areas_free(&memory->unkept);
+	free(memory->unforked_at);
 	*memory = (struct memory){ 0 };
 }
 
@@ -239,21 +240,6 @@ bool memory_needs_fork(const struct process *process)
 	return memory->dontfork;
 }
 
-/* Told of holes (-ENOMEM), madvise(2) goes on; at a device it stops (-EINVAL). */
-void memory_dofork(const struct memory *memory, struct inj_call *call)
-{
-	avc_remote at = ARCH_PAGE_BYTES;
-
-	if (!memory->dontfork)
-		return;
-	for (uint32_t i = 0; i < memory->holes; i++) {
-		if (memory->hole[i].start > at)
-			call_add(call, SYS_madvise, at, memory->hole[i].start - at, MADV_DOFORK);
-		at = memory->hole[i].end;
-	}
-	call_add(call, SYS_madvise, at, ARCH_USER_END - at, MADV_DOFORK);
-}
-
 /* ---- mappings, from /proc ------------------------------------------------------------ */
 
 /* What drivers map, and huge pages.  Whether the kernel minds shows on our own vDSO, which is so. */
@@ -278,42 +264,98 @@ static bool keeps_dontfork(const struct mapping *m)
 
 struct dontfork {
 	struct memory *memory;
-	bool found, kept;
+	bool found, kept, too_many;
 };
 
 static int find_dontfork(const struct mapping *m, void *arg)
 {
 	struct dontfork *look = arg;
 	struct memory *memory = look->memory;
+	struct stretch *last = memory->unforked ? &memory->unforked_at[memory->unforked - 1] : NULL;
 
-	if (m->flags & MAPPING_DONTFORK) {
-		if (keeps_dontfork(m))
-			look->kept = true;
-		else
-			look->found = true;
-	}
-	if (!keeps_dontfork(m) || m->start >= ARCH_USER_END)
+	if (!(m->flags & MAPPING_DONTFORK) || m->start >= ARCH_USER_END)
 		return 0;
-	if (memory->holes && memory->hole[memory->holes - 1].end == m->start) {
-		memory->hole[memory->holes - 1].end = m->end;
+	if (keeps_dontfork(m)) {
+		look->kept = true;
 		return 0;
 	}
-	if (memory->holes == HOLES_MAX)
+	look->found = true;
+	if (last && last->end == m->start) {
+		last->end = m->end;
+		return 0;
+	}
+	if (memory->unforked == DONTFORK_MAX) {
+		look->too_many = true;
 		return -1;
-	memory->hole[memory->holes].start = m->start;
-	memory->hole[memory->holes++].end = m->end;
+	}
+	memory->unforked_at[memory->unforked++] = (struct stretch){ m->start, m->end };
 	return 0;
+}
+
+static int look_for_dontfork(struct process *process, struct dontfork *look, struct avc_error *err)
+{
+	struct memory *memory = process->memory;
+
+	look->memory = memory;
+	memory->unforked = 0;
+	if (!memory->unforked_at)
+		memory->unforked_at = calloc(DONTFORK_MAX, sizeof *memory->unforked_at);
+	if (!memory->unforked_at)
+		return fail_errno(err, process->pid, "look at memory", "calloc", "out of memory");
+	if (proc_mappings(process->pid, "smaps", find_dontfork, look))
+		return fail_errno(err, process->pid, "look at memory", "read(smaps)",
+				  "it has ended");
+	if (look->too_many)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "look at memory", "",
+			    "more than %d stretches of its memory are not inherited by a clone "
+			    "(MADV_DONTFORK)",
+			    DONTFORK_MAX);
+	return 0;
+}
+
+int memory_look(struct process *process, struct avc_error *err)
+{
+	struct dontfork look = { 0 };
+
+	return process->memory->dontfork ? look_for_dontfork(process, &look, err) : 0;
+}
+
+/* The list is where restores have theirs. */
+void memory_advise(const struct process *process, uint32_t slot, int advice, struct inj_call *call)
+{
+	const struct memory *memory = process->memory;
+	const uint32_t first = advice == MADV_DOFORK ? 0 : DONTFORK_MAX;
+	struct inj_syscall *list = (struct inj_syscall *)(parasite_files(&process->parasite, slot) +
+							  INJ_FILES_BYTES / 2) +
+				   first;
+
+	_Static_assert(2 * DONTFORK_MAX * sizeof *list <= INJ_FILES_BYTES / 2, "room for lists");
+	for (uint32_t i = 0; i < memory->unforked; i++)
+		list[i] = (struct inj_syscall){
+			.nr = SYS_madvise,
+			.arg = { memory->unforked_at[i].start,
+				 memory->unforked_at[i].end - memory->unforked_at[i].start,
+				 (uint64_t)advice },
+		};
+	if (memory->unforked)
+		call_add(call, INJ_LIST, parasite_remote(&process->parasite, list),
+			 memory->unforked);
+}
+
+bool memory_is_unforked(const struct memory *memory)
+{
+	return memory->unforked > 0;
 }
 
 int memory_learn(struct process *process, long missing_pages, struct avc_error *err)
 {
 	struct memory *memory = process->memory;
-	struct dontfork look = { .memory = memory };
-	int result;
+	struct dontfork look = { 0 };
+	const bool known = memory->unforked > 0;
 
-	memory->holes = 0;
-	result = proc_mappings(process->pid, "smaps", find_dontfork, &look);
-	memory->dontfork = !result && (memory->dontfork || look.found);
+	if (look_for_dontfork(process, &look, err))
+		return -1;
+	memory->dontfork = known || look.found;
 	if (look.kept)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "it uses memory of a device, or huge pages, which a clone does not "
@@ -322,8 +364,6 @@ int memory_learn(struct process *process, long missing_pages, struct avc_error *
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "%ld kB of its memory are not inherited by a clone",
 			    missing_pages * ARCH_PAGE_BYTES / 1024);
-	/* Known before, it should not be missing again; but a device may have been
-	 * mapped since, at which the call stopped. */
 	return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 		    "%ld kB of its memory are not inherited by a clone yet (MADV_DONTFORK)",
 		    missing_pages * ARCH_PAGE_BYTES / 1024);
@@ -411,6 +451,13 @@ int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 	image->memory->seen = NULL; /* it was the freeze's                  */
 	if (areas_check(image, err) || wiped_fill(image, setup, err))
 		return -1;
+	for (uint32_t i = 0; i < process->memory->unforked; i++)
+		setup_add(setup, INJ_BEFORE, "madvise", SYS_madvise,
+			  process->memory->unforked_at[i].start,
+			  process->memory->unforked_at[i].end -
+				  process->memory->unforked_at[i].start,
+			  MADV_DONTFORK)
+			->flags = INJ_MAY_FAIL;
 	lock_again(process, locked_kb, setup);
 	advise_again(process->memory, setup);
 	if (process->descendant)

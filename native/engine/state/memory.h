@@ -51,17 +51,19 @@ struct marks {
 	} area[MARKS_MAX];
 };
 
-#define HOLES_MAX 24
+#define DONTFORK_MAX 2000
+
+struct stretch {
+	avc_remote start, end;
+};
 
 /* What is known of a process's memory from one checkpoint to the next. */
 struct memory {
+	/* Some of it was not inherited by a clone (MADV_DONTFORK): which, is looked for in each
+	 * freeze.  As of the last: */
 	bool dontfork;
-	/* Where a device (or the kernel's vvar) is mapped, or what else keeps_dontfork():
-	 * madvise(2) stops there. */
-	uint32_t holes;
-	struct {
-		avc_remote start, end;
-	} hole[HOLES_MAX];
+	uint32_t unforked;
+	struct stretch *unforked_at; /* of DONTFORK_MAX; NULL: there never was any       */
 	struct areas areas;
 	struct areas foreign; /* of others, too; by what they are, not where        */
 	struct areas unkept;  /* beyond the limit, or not writable here; likewise    */

@@ -212,10 +212,15 @@ void mem_image_free(struct mem_image *image);
 uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
 bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
 /* While everything is stopped: copies, what is its own when it stands still, what is shared
- * when everybody does; and what to call before the clone. */
+ * when everybody does. */
 void memory_copy_own(const struct process *process, struct mem_image *image);
 void memory_copy_shared(const struct process *process, struct mem_image *image);
-void memory_dofork(const struct memory *memory, struct inj_call *call);
+/* When it stands still: looks what a clone would not inherit (MADV_DONTFORK); whether there is any;
+ * and what its main thread has to call right before the clone (MADV_DOFORK), and right after it
+ * (MADV_DONTFORK).  Both before it begins. */
+int memory_look(struct process *process, struct avc_error *err) warn_unused;
+bool memory_is_unforked(const struct memory *memory);
+void memory_advise(const struct process *process, uint32_t slot, int advice, struct inj_call *call);
 /* The template is smaller than the app: always fails, with AVC_RETRY if the next
  * attempt will be better. */
 int memory_learn(struct process *process, long missing_pages, struct avc_error *err);

@@ -215,6 +215,7 @@ struct process {
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
 	enum freeze_stage stage;      /* in this freeze                                    */
 	bool cloning;                 /* by its holder, the main one by itself: freeze_tree()  */
+	pid_t cloned;                 /* it is done already, and this is the clone; 0: no      */
 	long clone_pages;             /* its size when that began                         */
 	long anon_pages;              /* of its last template; 0: none yet                */
 	uint64_t caught;              /* fatal signals that it has had handlers for        */

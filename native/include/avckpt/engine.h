@@ -137,7 +137,8 @@ enum avc_reason {
 	                            * OOM killer: guard_memory.c)                 */
 	AVC_REASON_CRASHED = 13,   /* dropped: what was restored from it, or what
 	                            * it was taken from, keeps crashing           */
-	AVC_REASON_EXECUTED = 14   /* dropped: the app is another program now     */
+	AVC_REASON_EXECUTED = 14,  /* dropped: the app is another program now     */
+	AVC_REASON_LOOP = 15       /* gave up: the same death again, at once      */
 };
 
 /* One thing that happened.  Fields that mean nothing for a kind are 0. */

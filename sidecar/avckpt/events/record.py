@@ -53,7 +53,7 @@ class EventRecord:
     )
     outcome: Reason | None = said(  # noqa: RUF009
         "what followed: `restored`, or why not: `clean_exit`, `stopped` (meant), `policy` (avckpt.restore.on), "
-        "`limit` (avckpt.restore.max), `failed`, `empty` (no generation held)",
+        "`limit` (avckpt.restore.max), `loop` (the same death at once, twice), `failed`, `empty` (no generation held)",
         values=OUTCOMES,
     )
     wait_status: int | None = said("of the death, as from waitpid(2)")

@@ -75,6 +75,7 @@ class Reason(_Named):
     KILLED = "killed", 12
     CRASHED = "crashed", 13
     EXECUTED = "executed", 14
+    LOOP = "loop", 15
     RESTORED = "restored"
 
 
@@ -86,6 +87,7 @@ GAVE_UP_WORDS = {
     Reason.STOPPED: "it was asked to stop",
     Reason.POLICY: "avckpt.restore.on does not name this end",
     Reason.LIMIT: "the restores of avckpt.restore.max are used up",
+    Reason.LOOP: "it died the same way within a second of each of two restores",
     Reason.FAILED: "no generation could be restored",
     Reason.EMPTY: "no checkpoint was held",
 }

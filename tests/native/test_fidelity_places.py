@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process stands where it stood: in its session and group, below its parent, with its terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def run(command: str, folder: Path) -> None:
+    with Victim(command, folder) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 12, (0.01, 0.12))
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_those_that_have_ended(where: str, tmp_path: Path) -> None:
+    """By each signal, SIGKILL too, and in sessions and groups of their own: with their status."""
+    run(f"places ended {where}", tmp_path)
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("kind", ["leader", "terminal", "front"])
+def test_a_main_process_that_leads_a_session(kind: str, where: str, tmp_path: Path) -> None:
+    """Before its first checkpoint: its number is not taken by anything of ours; its terminal is its own."""
+    run(f"places {kind} {where}", tmp_path)
