@@ -18,6 +18,7 @@ from testkit.harness import RUN_DIR, wait_until
 if TYPE_CHECKING:
     from testkit.harness import Container, ContainerFactory, Podman, Sidecar
 
+pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
 NODE = """
 import os, sys, time
 i = 0

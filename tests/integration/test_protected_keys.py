@@ -11,6 +11,7 @@ import pytest
 
 from testkit.harness import SLOWNESS, Container, ContainerFactory, Sidecar, wait_until
 
+pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
 QUICK = {"interval": "100ms"}
 PATIENCE_S = 20.0 * SLOWNESS
 ENDS = (

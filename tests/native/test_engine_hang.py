@@ -14,6 +14,7 @@ import pytest
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
 
+pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
 HOLD = """
 import os, socket, sys
 ours, theirs = socket.socketpair()

@@ -18,6 +18,7 @@ from testkit.guarded import GuardProcess, Victim, config, since_linux
 from testkit.harness import app_pid
 from testkit.init_peer import Init
 
+pytestmark = pytest.mark.shared_machine("a guard that gets no CPU for a second takes fewer checkpoints")
 AUTO = config(3.0, interval_min_s=0.02, keep=3)
 
 

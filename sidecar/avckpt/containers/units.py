@@ -180,12 +180,6 @@ def is_of_host(pid: int) -> bool:
     )
 
 
-def runs_same_program(pid: int, other: int) -> bool:
-    """Whether two processes execute one and the same file.  Raises OSError."""
-    one, two = os.stat(f"/proc/{pid}/exe"), os.stat(f"/proc/{other}/exe")
-    return (one.st_dev, one.st_ino) == (two.st_dev, two.st_ino)
-
-
 def ancestors(pid: int) -> Iterator[int]:
     """Its parent, that one's parent, ...  Ends when one is gone."""
     for _ in range(ANCESTORS_MOST):
