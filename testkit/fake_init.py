@@ -19,7 +19,7 @@ from pathlib import Path
 
 MAGIC = int.from_bytes(b"CKPTCTL1", "little")
 SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-PAGE = struct.Struct("<QIiiiiIIxxxxQii")
+PAGE = struct.Struct("<QIiiiiIIxxxxQiiixxxx")
 
 FAKE_INIT = Path(__file__)
 
@@ -34,7 +34,7 @@ FOLLY = {
 
 def page(app: int, report: int, verdict: int) -> bytes:
     """struct avc_ctl."""
-    return PAGE.pack(MAGIC, 1, os.getpid(), app, report, verdict, 2000, 0, 0, 0, 0)
+    return PAGE.pack(MAGIC, 1, os.getpid(), app, report, verdict, 2000, 0, 0, 0, 0, 0)
 
 
 def main(kind: str) -> None:

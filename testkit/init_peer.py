@@ -31,7 +31,7 @@ INIT = Path(os.environ.get("AVCKPT_TEST_INIT") or ROOT / "native/build/avckpt-in
 PHOENIX = ROOT / "tests/victims/build/phoenix"
 
 MAGIC = 0x314C544354504B43
-CTL = struct.Struct("=QIiiiiIIxxxxQii")
+CTL = struct.Struct("=QIiiiiIIxxxxQiiixxxx")
 REPORT = struct.Struct("=IIiiIIQ")
 VERDICT = struct.Struct("=II")
 ARMED_OFFSET = 32
@@ -62,7 +62,8 @@ class Ctl:
     armed: int
     stop_asked_ns: int
     exec_errno: int
-    reserved: int
+    is_unit: int
+    keys_pid: int
 
 
 @dataclass(frozen=True)

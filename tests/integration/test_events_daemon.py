@@ -413,7 +413,7 @@ def test_an_application_can_not_write_lines_of_its_own(local: LocalSidecar, tmp_
         f"signal.signal(signal.SIGUSR1, lambda *_: (os.close(fd), os.unlink({str(path)!r})))\n"
         "while True: signal.pause()\n"
     )
-    web = local.protected("web", [sys.executable, "-c", program], ON_COMMAND)
+    web = local.protected("web", [sys.executable, "-c", program], {**ON_COMMAND, "avckpt.files": "rewind"})
     wait_until(path.exists, 5, "the file is open")
     take_checkpoint(local.avckpt, "web")
     os.kill(web.app_pid, signal.SIGUSR1)

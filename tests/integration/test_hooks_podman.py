@@ -331,7 +331,7 @@ def test_a_bad_label_is_refused_where_the_user_sees_it(
     assert (status, out) == (126, "")
     assert err.startswith(
         f"avckpt: container {name}: label avckpt.interval=banana: not a duration; "
-        "allowed: a number with ms, s, m or h, from 10ms to 24h, as 500ms, 3s or 1m\n"
+        "allowed: auto, or a number with ms, s, m or h, from 10ms to 24h, as 500ms, 3s or 1m\n"
     )
     assert records(run_dir) == []
 
