@@ -42,6 +42,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
 @pytest.fixture
 def node(tmp_path: Path) -> Path:
     (tmp_path / "node.py").write_text(NODE)
+    tmp_path.chmod(0o777)  # for other users in the container
     return tmp_path
 
 
@@ -123,7 +124,6 @@ def test_a_shell_launcher(container: ContainerFactory, sidecar: Sidecar, node: P
 
 def test_a_restarted_sidecar_knows_them_again(container: ContainerFactory, sidecar: Sidecar, node: Path) -> None:
     car = container.protected("bash", "-c", LAUNCHER, labels=NODES, options=("-v", f"{node}:/node", "--user", "1000"))
-    node.chmod(0o777)
     before = wait_nodes(sidecar, car, 2)
     sidecar.restart()
     after = wait_nodes(sidecar, car, 2)

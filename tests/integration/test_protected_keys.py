@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import termios
 from collections.abc import Callable
 
 import pytest
@@ -32,6 +33,8 @@ def press(made: Container) -> None:
     )
     os.close(slave)
     try:
+        # Until then the terminal would take the key for one of its own.
+        wait_until(lambda: not termios.tcgetattr(master)[3] & termios.ISIG, PATIENCE_S, "podman attach is there")
         before = made.logs()
         os.write(master, b"\x03")
         wait_until(lambda: made.logs() != before or made.status == "exited", PATIENCE_S, "the key")

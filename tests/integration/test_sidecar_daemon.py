@@ -415,7 +415,9 @@ def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSid
     local.wait_for(web, state="protected")
     app = web.app_pid
     assert local.stop() == 0
-    assert sorted(path.name for path in local.run_dir.iterdir()) == ["containers", "health", "history.jsonl", "lock"]
+    assert sorted(path.name for path in local.run_dir.iterdir()) == [
+        *("containers", "health", "history.jsonl", "lock", "units")
+    ]
     assert not ended(web)
     # Templates are gone, the application is not traced any more and runs.
     wait_until(lambda: children_of(web.init_pid) == [app], 5, "only the application is left")
