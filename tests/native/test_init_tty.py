@@ -141,7 +141,7 @@ def test_a_dead_apps_number_is_free_when_the_guard_hears(init: Phoenix, terminal
     """Nobody is left in its group; and who listens to the keys does so again for the restored one."""
     with Guard(init) as guard:
         pid = place(init)[0]
-        (listener,) = listeners(init)
+        (listener,) = wait_until(lambda: listeners(init), PATIENCE_S, "a listener")
         os.kill(listener, signal.SIGSTOP)  # it may be stopped with its group, and still has to go
         init.app.say("die 11")
         guard.report()
