@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from testkit.harness import RUN_DIR, wait_until
+from testkit.procfs import children_of, inside
 
 if TYPE_CHECKING:
     from testkit.harness import Container, ContainerFactory, Podman, Sidecar
@@ -77,11 +78,7 @@ def numbers(path: Path) -> list[list[str]]:
 
 def app_pid(row: dict[str, Any]) -> int:
     """Its application now: in our namespace it has another number after each restore."""
-    for pid in Path(f"/proc/{row['init_pid']}/task/{row['init_pid']}/children").read_text().split():
-        last = Path(f"/proc/{pid}/status").read_text().partition("NSpid:")[2].split("\n")[0].split()[-1]
-        if int(last) == row["app_pid_inside"]:
-            return int(pid)
-    return 0
+    return next((pid for pid in children_of(row["init_pid"]) if inside(pid) == row["app_pid_inside"]), 0)
 
 
 def test_a_shell_launcher(container: ContainerFactory, sidecar: Sidecar, node: Path) -> None:

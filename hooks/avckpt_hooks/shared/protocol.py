@@ -200,6 +200,16 @@ def decode_reply(packet: bytes) -> str | None:
     return error
 
 
+def received_fds(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+    """The descriptors in what recvmsg(2) got beside the data; they become the caller's to close."""
+    fds: list[int] = []
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            count = len(data) // struct.calcsize("i")
+            fds.extend(struct.unpack(f"{count}i", data[: count * struct.calcsize("i")]))
+    return fds
+
+
 def receive_request(connection: socket.socket) -> tuple[Register | Deregister, int | None]:
     """Reads one request from an accepted connection (the sidecar's side).
 
@@ -213,11 +223,7 @@ def receive_request(connection: socket.socket) -> tuple[Register | Deregister, i
     packet, ancillary, flags, _ = connection.recvmsg(MAX_BYTES, room, socket.MSG_CMSG_CLOEXEC)
     if not packet and not ancillary:
         raise ConnectionResetError("the hook hung up without a request")
-    fds: list[int] = []
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            count = len(data) // struct.calcsize("i")
-            fds.extend(struct.unpack(f"{count}i", data[: count * struct.calcsize("i")]))
+    fds = received_fds(ancillary)
     try:
         if flags & socket.MSG_TRUNC:
             raise ProtocolError("the request is too long")

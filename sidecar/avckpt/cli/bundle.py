@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import click
 
 from avckpt import __version__
-from avckpt.cli.events import complete_container
+from avckpt.cli.events import called, complete_container
 from avckpt.errors import AvckptError, NoSuchContainer
 
 if TYPE_CHECKING:
@@ -100,9 +100,8 @@ def contents(client: Client, container: Json, events: list[Json]) -> Iterator[tu
     """Names of the files, and how to get what is in them; this may raise AvckptError or OSError."""
     from avckpt.cli import doctor, sidecar_container
 
-    called = container["name"] or container["id"][:12]
     at = time.strftime("%Y-%m-%d %H:%M:%S %Z")
-    yield "README.txt", lambda: README.format(name=called, at=at, lines=LOG_LINES)
+    yield "README.txt", lambda: README.format(name=called(container), at=at, lines=LOG_LINES)
     yield "events.jsonl", lambda: "".join(json.dumps(event) + "\n" for event in events)
     yield "container.json", lambda: _pretty(container)
     inspected: list[Json] = []
@@ -191,8 +190,7 @@ def _pretty(data: object) -> str:
 
 def _plain(container: Json) -> str:
     """Its name as a part of a file's."""
-    called = container["name"] or container["id"][:12]
-    return "".join(each if each.isalnum() or each in "-_." else "_" for each in called)
+    return "".join(each if each.isalnum() or each in "-_." else "_" for each in called(container))
 
 
 def _open_private(path: str, flags: int) -> int:

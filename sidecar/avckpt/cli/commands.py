@@ -20,7 +20,7 @@ import click
 from avckpt import __version__
 from avckpt.cli.bundle import bundle
 from avckpt.cli.compose.commands import check, down, up
-from avckpt.cli.events import complete_container, completion, events
+from avckpt.cli.events import called, complete_container, completion, events
 from avckpt.cli.web import web
 from avckpt.errors import AvckptError, ExitCode
 
@@ -165,7 +165,7 @@ def checkpoint(name: str, as_json: bool) -> None:
         click.echo(json.dumps(answer, indent=2))
         return
     click.echo(
-        f"{_called(answer['container'])}: generation {event.get('generation', 0)}, "
+        f"{called(answer['container'])}: generation {event.get('generation', 0)}, "
         f"{event.get('threads', 0)} thread(s), frozen {event.get('freeze_s', 0.0) * 1000:.2f} ms"
     )
 
@@ -183,7 +183,7 @@ def restore(name: str, as_json: bool) -> None:
         click.echo(json.dumps(answer, indent=2))
         return
     click.echo(
-        f"{_called(answer['container'])}: back at generation {event.get('generation', 0)}, "
+        f"{called(answer['container'])}: back at generation {event.get('generation', 0)}, "
         f"{event.get('age_s', 0.0):.1f} s old, in {event.get('restore_s', 0.0) * 1000:.1f} ms"
     )
 
@@ -301,10 +301,6 @@ def _client() -> Client:
     return Client(_run_dir())
 
 
-def _called(container: Json) -> str:
-    return str(container["name"] or container["id"][:12])
-
-
 def _print_table(containers: list[Json]) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -332,7 +328,7 @@ NOTE_LEAST = 16
 def _row(c: Json) -> tuple[str, ...]:
     age_s = None if c["last_checkpoint_at"] is None else max(time.time() - c["last_checkpoint_at"], 0)
     return (
-        _called(c),
+        called(c),
         c["state"],
         "-" if c["state"] in ("listening", "nodes") else f"{c['generations']}/{c['keep']}",
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",

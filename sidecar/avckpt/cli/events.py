@@ -54,10 +54,15 @@ class Instant(click.ParamType):  # type: ignore[type-arg] # generic only in newe
             self.fail(f"{value!r} is neither a time ago (30s, 10m, 2h30m, 1d) nor a date and time (2026-05-17T08:30)")
 
 
+def called(container: Json) -> str:
+    """How to call a container in what a person reads: its name, or the short id."""
+    return str(container["name"] or container["id"][:12])
+
+
 def complete_container(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     """Names of protected containers; none when there is no sidecar to ask."""
     try:
-        names = [str(row["name"] or row["id"][:12]) for row in _client().containers(memory=False)]
+        names = [called(row) for row in _client().containers(memory=False)]
     except AvckptError:
         return []
     return [name for name in names if name.startswith(incomplete)]

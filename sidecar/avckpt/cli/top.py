@@ -22,7 +22,7 @@ from textual.screen import ModalScreen
 from textual.widgets import DataTable, Footer, Label, RichLog, Static
 
 from avckpt.cli.commands import STATE_STYLES
-from avckpt.cli.events import COLOURS, RETRY_S
+from avckpt.cli.events import COLOURS, RETRY_S, called
 from avckpt.errors import AvckptError
 from avckpt.guard import Command
 
@@ -76,11 +76,6 @@ def sparkline(values: Iterable[float]) -> str:
     values = list(values)
     most = max(values, default=0.0) or 1.0
     return "".join(SPARKS[min(int(value / most * len(SPARKS)), len(SPARKS) - 1)] for value in values)
-
-
-def called(row: Json) -> str:
-    """A unit's name, or the short id."""
-    return str(row["name"] or row["id"][:12])
 
 
 class Ask(ModalScreen[bool]):

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avckpt_hooks.shared.labels import LABELS, SHM_MAX_BYTES, LabelError, parse_policy
-from avckpt_hooks.shared.protocol import ProtocolError
+from avckpt_hooks.shared.protocol import ProtocolError, received_fds
 
 from avckpt.containers.process import has_ended, is_foreign, pid_of, start_time, status
 from avckpt.errors import AvckptError, Busy, Denied, LabelsWrong, TargetGone, of_any
@@ -364,11 +364,7 @@ def serve(connection: socket.socket, handler: Handler) -> str | None:
 def _receive(connection: socket.socket) -> tuple[Claim, list[int]]:
     room = socket.CMSG_SPACE(4 * struct.calcsize("i"))
     packet, ancillary, flags, _ = connection.recvmsg(UNIT_BYTES, room, socket.MSG_CMSG_CLOEXEC)
-    fds: list[int] = []
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            count = len(data) // struct.calcsize("i")
-            fds.extend(struct.unpack(f"{count}i", data[: count * struct.calcsize("i")]))
+    fds = received_fds(ancillary)
     try:
         if flags & socket.MSG_TRUNC:
             raise ProtocolError("it says too much")
