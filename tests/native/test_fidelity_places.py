@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from testkit.family import kill_main
 from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
 
 pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
@@ -33,3 +34,21 @@ def test_those_that_have_ended(where: str, tmp_path: Path) -> None:
 def test_a_main_process_that_leads_a_session(kind: str, where: str, tmp_path: Path) -> None:
     """Before its first checkpoint: its number is not taken by anything of ours; its terminal is its own."""
     run(f"places {kind} {where}", tmp_path)
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("kind", ["stayed", "adopted", "groups"])
+def test_sessions_and_groups_whose_leader_is_gone(kind: str, where: str, tmp_path: Path) -> None:
+    """Or has left them since: everybody is in the one it was in, under the number that that had."""
+    run(f"places {kind} {where}", tmp_path)
+
+
+def test_orphans_of_sessions_whose_leaders_are_gone(tmp_path: Path) -> None:
+    """They are init's, and there are two of these sessions."""
+    with Victim("places orphans", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        for _ in range(12):
+            since = guard.mark()
+            guard.wait("checkpoint", since=since)
+            kill_main(victim)
+            guard.wait("restored", since=since)
+            victim.wait_beats(3)

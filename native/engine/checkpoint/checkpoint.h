@@ -10,6 +10,7 @@
  *   snapshot.c      mappings and pages of a template
  *   remap_plan.c    how the memory of one differs from another's
  *   restore_plan.c  ... of all the processes from that of their parents
+ *   places.c        where each is to be forked, to be in its session
  */
 #ifndef AVCKPT_CHECKPOINT_H
 #define AVCKPT_CHECKPOINT_H
@@ -208,14 +209,31 @@ int remap_check(const struct process *process, struct snapshot *want, struct sna
 		struct avc_error *err) warn_unused;
 void remap_free(struct remap *plan);
 
+/* ---- places.c ---------------------------------------------------------------------------- */
+
+#define PLACE_ANY (-1)
+
+/* Of one image. */
+struct place {
+	uint32_t host; /* the image of the process that forks it, or whose keeper does  */
+	/* The session that it is forked in; 0: the one that the main process was started in. */
+	pid_t born;
+	pid_t before; /* of one that begins a session: where it has a keeper before that     */
+	bool renewed; /* forked by a keeper with the number of the session's leader, who is gone */
+};
+
+/* For each image.  -1: one could not come to be where it is. */
+int places_find(const struct generation *generation, struct place *place,
+		struct avc_error *err) warn_unused;
+
 /* ---- restore_plan.c --------------------------------------------------------------------- */
 
 /* Of a generation that is whole; once is enough.  `ahead_ns`: CPU time that restore_plan_next() may
  * spend on it, about. */
 int restore_plan_begin(struct generation *generation, uint64_t ahead_ns,
 		       struct avc_error *err) warn_unused;
-/* Whose process is to fork that of an image, not the main one's: the place of its image. */
-uint32_t restore_plan_host(const struct generation *generation, uint32_t index);
+/* Whose process is to fork that of an image, not the main one's, and in which session. */
+const struct place *restore_plan_place(const struct generation *generation, uint32_t index);
 /* How it is made of that fork; NULL on error. */
 const struct remap *restore_plan_of(struct generation *generation, uint32_t index,
 				    struct avc_error *err);

@@ -46,19 +46,50 @@ static pid_t group_inside(const struct tree *tree, pid_t group)
 	return inside || group <= 0 ? inside : proc_inside(group);
 }
 
-/* Now, while all stand still: right after, it may be in another group, or who leads its
- * group may be gone, and nobody know what number that one had inside. */
-static void keep_place(const struct tree *tree, const struct tree_entry *entry, struct image *image)
+static bool is_there(pid_t pid)
 {
-	const struct proc_stat *stat = &entry->stat;
+	struct proc_stat stat;
+
+	return proc_stat(pid, &stat) == 0;
+}
+
+/* A leader that is not of the app: it is gone, and the number is nobody else's as long as there is
+ * somebody in its session; or it is somebody of outside (`podman exec`), whom nobody can join. */
+static pid_t session_of_other(const struct tree_entry *entry, const struct proc_status *status,
+			      struct image *image)
+{
+	if (!is_there(entry->stat.session))
+		return status->session;
+	if (entry->process)
+		fail(&image->notice, AVC_UNSUPPORTED, 0, entry->pid, "freeze", "",
+		     "process %d is in a session that is led from outside of the application, and "
+		     "will be in another one after a restore",
+		     image->inside);
+	return 0;
+}
+
+/* Now, while all stand still: right after, it may be in another group, or who leads its
+ * group may be gone. */
+static void keep_place(const struct tree *tree, const struct tree_entry *entry,
+		       const struct image *main, struct image *image)
+{
+	const struct proc_stat *stat = &entry->stat, *of_main = &tree->entry[0].stat;
+	struct proc_status status = { 0 };
+	pid_t session = number_inside(tree, stat->session), group;
 
 	image->pid = entry->pid;
 	image->inside = entry->ended ? proc_inside(entry->pid) : entry->process->inside;
 	image->stat = *stat;
-	image->session = number_inside(tree, stat->session);
-	/* The main process's may have been made by who starts the container. */
-	image->group = entry == tree->entry ? group_inside(tree, stat->group)
-					    : number_inside(tree, stat->group);
+	group = number_inside(tree, stat->group);
+	if (!group && image != main && stat->group == of_main->group)
+		group = main->group;
+	/* The kernel knows its numbers inside, whoever had them. */
+	if (!group || (!session && stat->session != of_main->session))
+		(void)proc_status(entry->pid, &status);
+	if (!session && stat->session != of_main->session)
+		session = session_of_other(entry, &status, image);
+	image->session = session;
+	image->group = group ? group : status.group;
 	image->tty_group = stat->tty ? group_inside(tree, stat->tty_group) : 0;
 	image->exit_signal = stat->exit_signal;
 }
@@ -75,7 +106,7 @@ static int make_images(const struct tree *tree, struct generation *generation,
 				  "it has ended");
 	if (generation_make_room(generation, tree->count, err))
 		return -1;
-	keep_place(tree, &tree->entry[0], &generation->image[0]);
+	keep_place(tree, &tree->entry[0], &generation->image[0], &generation->image[0]);
 	index[0] = 0;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		const struct tree_entry *entry = &tree->entry[i];
@@ -90,7 +121,7 @@ static int make_images(const struct tree *tree, struct generation *generation,
 			.pidfd = -1,
 			.slot = slot,
 		};
-		keep_place(tree, entry, image);
+		keep_place(tree, entry, &generation->image[0], image);
 		if (entry->ended) {
 			if (image->parent == PARENT_INIT || image->inside <= 0)
 				continue; /* init is just about to wait for it */

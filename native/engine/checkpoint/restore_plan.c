@@ -19,7 +19,6 @@
 
 /* Of one image. */
 struct plan_entry {
-	uint32_t host;             /* of whose process it is forked; of the main one unused */
 	struct snapshot *snapshot; /* NULL: nobody has asked yet                      */
 	struct remap *plan;        /* the same                                        */
 };
@@ -28,21 +27,9 @@ struct restore_plan {
 	uint64_t left_ns; /* to be spent ahead                                        */
 	uint32_t next;    /* to be looked at ahead                                    */
 	uint32_t entries;
+	struct place *place;       /* by image                                        */
 	struct plan_entry entry[]; /* by image                                       */
 };
-
-/* Who forks it: its parent; an orphan's is gone, and somebody of its session does. */
-static uint32_t host_of(const struct generation *generation, uint32_t index)
-{
-	const struct image *image = &generation->image[index];
-
-	if (image->parent != PARENT_INIT)
-		return (uint32_t)image->parent;
-	for (uint32_t i = 1; i < index; i++)
-		if (generation->image[i].process && generation->image[i].session == image->session)
-			return i;
-	return 0;
-}
 
 int restore_plan_begin(struct generation *generation, uint64_t ahead_ns, struct avc_error *err)
 {
@@ -56,15 +43,21 @@ int restore_plan_begin(struct generation *generation, uint64_t ahead_ns, struct 
 	all->left_ns = ahead_ns;
 	all->next = 1;
 	all->entries = generation->images;
-	for (uint32_t i = 1; i < all->entries; i++)
-		all->entry[i].host = host_of(generation, i);
+	all->place = calloc(generation->images, sizeof *all->place);
+	if (!all->place || places_find(generation, all->place, err)) {
+		if (!all->place)
+			fail_errno(err, 0, "restore memory", "calloc", "out of memory");
+		free(all->place);
+		free(all);
+		return -1;
+	}
 	generation->plan = all;
 	return 0;
 }
 
-uint32_t restore_plan_host(const struct generation *generation, uint32_t index)
+const struct place *restore_plan_place(const struct generation *generation, uint32_t index)
 {
-	return generation->plan->entry[index].host;
+	return &generation->plan->place[index];
 }
 
 static struct snapshot *look_at(const struct image *image, struct avc_error *err)
@@ -89,7 +82,7 @@ static void rest(const struct generation *generation, uint32_t index)
 
 	for (uint32_t i = 1; i < all->entries; i++)
 		if (generation->image[i].process && !all->entry[i].plan &&
-		    (all->entry[i].host == index || i == index))
+		    (all->place[i].host == index || i == index))
 			return;
 	snapshot_rest(all->entry[index].snapshot);
 }
@@ -98,27 +91,29 @@ const struct remap *restore_plan_of(struct generation *generation, uint32_t inde
 				    struct avc_error *err)
 {
 	struct plan_entry *entry = &generation->plan->entry[index];
+	const uint32_t host = generation->plan->place[index].host;
 	struct snapshot *want, *is;
 
 	if (entry->plan)
 		return entry->plan;
 	want = snapshot_of(generation, index, err);
-	is = want ? snapshot_of(generation, entry->host, err) : NULL;
+	is = want ? snapshot_of(generation, host, err) : NULL;
 	if (!is)
 		return NULL;
 	entry->plan = remap_plan(generation->image[index].process, want, is, err);
 	rest(generation, index);
-	rest(generation, entry->host);
+	rest(generation, host);
 	return entry->plan;
 }
 
 int restore_plan_check(const struct generation *generation, struct avc_error *err)
 {
-	int result = 0;
+	struct place place[PROCESSES_MAX];
+	int result = places_find(generation, place, err);
 
 	for (uint32_t i = 1; !result && i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
-		const struct image *host = &generation->image[host_of(generation, i)];
+		const struct image *host = &generation->image[place[i].host];
 		struct snapshot *want, *is;
 
 		/* Few have anything of the kind. */
@@ -162,5 +157,7 @@ void restore_plan_free(struct restore_plan *all)
 		remap_free(all->entry[i].plan);
 		snapshot_free(all->entry[i].snapshot);
 	}
+	if (all)
+		free(all->place);
 	free(all);
 }

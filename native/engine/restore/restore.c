@@ -303,6 +303,17 @@ static int make_spare_first(struct restore *restore, struct avc_error *err)
 	return result;
 }
 
+/* Of a group that is not its own and not init's: one of its processes leads it, or somebody who is
+ * gone. */
+static bool is_in_another_group(const struct restore *restore)
+{
+	const struct image *main = &restore->generation->image[0];
+	struct proc_stat init;
+
+	return main->group > 0 && main->group != main->inside &&
+	       proc_stat(restore->channel->init, &init) == 0 && init.group != main->stat.group;
+}
+
 /* Until everything is there; nothing of the app's has run then. */
 static int make(struct restore *restore, struct avc_error *err)
 {
@@ -314,7 +325,7 @@ static int make(struct restore *restore, struct avc_error *err)
 	    files_restore(generation->image, generation->images, restore->config,
 			  restore->channel->init, &restore->notes, err))
 		return -1;
-	if (generation->images > 1) {
+	if (generation->images > 1 || is_in_another_group(restore)) {
 		restore->tree = restore_tree_new(restore, err);
 		if (!restore->tree)
 			return -1;

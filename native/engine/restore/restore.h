@@ -4,6 +4,7 @@
  *
  *   restore.c       the main process
  *   restore_tree.c  a restored process makes its children
+ *   restore_fork.c  ... each under its number, in its session
  *   remap.c         ... and their memory
  *   copier.c        ... which a second thread helps to copy
  */

@@ -17,32 +17,12 @@
 #include <sys/syscall.h>
 #include <sys/wait.h>
 
-#include "restore.h"
+#include "restore_tree.h"
 
-#define TRIES 64
-#define TRY_AGAIN_US 200
 #define STEP_NS (5 * NS_PER_S)
 #define FILES_SPARE 64
 /* So many children have fd_channel of their own. */
 #define FEW 2
-
-struct forked {
-	pid_t pid; /* 0: not made yet                                         */
-	int pidfd;
-	bool traced;
-	struct syscall_batch batch;
-	struct sandbox *sandbox; /* NULL: it is on its own, and waits to go            */
-};
-
-struct restore_tree {
-	struct restore *restore;
-	struct generation *generation;
-	struct copier *copier;
-	struct fd_channel fd_channel; /* of the main process's children                  */
-	uint64_t flush;               /* signals of children that ended (sigset_t)       */
-	pid_t last_number;            /* the number given out last; 0: not known          */
-	struct forked forked[];       /* by image                                    */
-};
 
 struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err)
 {
@@ -78,137 +58,6 @@ struct chores {
 	int result;
 	bool done;
 };
-
-/* Has ended, or will, and its parent is told. */
-static void note_end(struct restore_tree *restored, const struct image *image)
-{
-	/* clone(2) takes any number of eight bits for a signal. */
-	if (image->exit_signal > 0 && image->exit_signal < NSIG)
-		restored->flush |= UINT64_C(1) << (image->exit_signal - 1);
-}
-
-static void do_chores(void *arg);
-
-/* One clone of a stopped task that rests in the parasite; *child is in its first stop. */
-static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64_t flags,
-		      struct chores *chores, pid_t *child, struct avc_error *err)
-{
-	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_clone, flags);
-	if (parasite_send(batch->parasite, batch->pid, &batch->base, call, err) ||
-	    parasite_run_clone_while(batch->pid, call, chores ? do_chores : NULL, chores, child,
-				     err))
-		return -1;
-	if (tracee_settle(batch->pid, err) || tracee_await(*child, NULL, err) != STOP_TRAP)
-		return -1;
-	if (parasite_own(batch->parasite, *child))
-		return fail_errno(err, *child, "restore", "ptrace(SETOPTIONS)", "it was killed");
-	return 0;
-}
-
-/* A child of the host's that came to nothing, or was only in between. */
-static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *err)
-{
-	const pid_t inside = proc_inside(child);
-
-	tracee_kill(child);
-	if (inside <= 0)
-		return 0; /* nobody had to wait for it */
-	syscall_batch_add(host, SYS_wait4, (uint64_t)inside, 0, __WALL);
-	syscall_batch_soften(host, NULL);
-	return syscall_batch_flush(host, err);
-}
-
-/* A child of the host's, with the number if nobody else has taken it.  `copy`: a child of the
- * host's that is as it came out of fork(2), and gives its memory to this one; 0: there is none. */
-static int fork_once(struct forked *host, const struct image *image, pid_t copy,
-		     struct chores *chores, pid_t *child, struct avc_error *err)
-{
-	struct restore_tree *restored = chores->restored;
-	struct inj_call *runner = &host->batch.parasite->control->runner;
-	const bool orphan = image->parent == PARENT_INIT;
-	/* Siblings' numbers often follow each other; to ask takes two wake-ups. */
-	const bool follows = !orphan && restored->last_number &&
-			     restored->last_number + 1 == image->inside;
-	struct syscall_batch from = host->batch;
-	int result;
-
-	restored->last_number = 0;
-	/* An orphan's parent has ended: so does one that is there for that. */
-	if (orphan &&
-	    clone_task(&host->batch, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
-		return -1;
-	if (copy)
-		from.pid = copy;
-	result = (!follows && last_pid_set(restored->restore->helper, image->inside - 1, err)) ||
-		 clone_task(&from, runner,
-			    ((uint64_t)image->exit_signal & CSIGNAL) |
-				    (copy ? CLONE_VM | CLONE_PARENT : 0),
-			    chores, child, err);
-	if (orphan && take_back(&host->batch, from.pid, err))
-		return -1;
-	return result ? -1 : 0;
-}
-
-/* A parent that was killed after it had made the child, and before it told us, left it behind. */
-static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc_error *err)
-{
-	pid_t children[CHILDREN_MAX];
-	const int count = proc_children(host->pid, children, CHILDREN_MAX);
-
-	for (int i = 0; i < count; i++)
-		if (proc_inside(children[i]) == inside && tracee_is_ours(children[i]))
-			return take_back(host, children[i], err);
-	return 0;
-}
-
-/* Until it has the number.  The kernel gives it one at the end of the fork (kernel/fork.c,
- * copy_process()), when everything is copied: what is big may never get it where others fork all
- * the time.  So the first that has another one is kept as a copy.  To give its memory away takes
- * no time. */
-static int fork_host(struct restore_tree *restored, struct forked *host, const struct image *image,
-		     struct chores *chores, pid_t *child, struct avc_error *err)
-{
-	const bool orphan = image->parent == PARENT_INIT;
-	pid_t copy = 0;
-
-	for (int i = 0; i < TRIES; i++) {
-		struct avc_error failed = { 0 };
-		bool made;
-
-		if (i)
-			usleep(TRY_AGAIN_US);
-		if (i)
-			note_end(restored, image);
-		*child = 0;
-		made = fork_once(host, image, copy, chores, child, &failed) == 0;
-		if (made && proc_inside(*child) == image->inside) {
-			restored->last_number = image->inside;
-			return copy ? take_back(&host->batch, copy, err) : 0;
-		}
-		if (made && !copy && !orphan) {
-			copy = *child;
-			continue;
-		}
-		if (!made && !*child && !copy) {
-			*err = failed;
-			return -1;
-		}
-		if (*child && orphan)
-			tracee_kill(*child); /* init's */
-		else if (*child && take_back(&host->batch, *child, err))
-			return -1;
-		if (made)
-			continue;
-		/* One of them was killed, or is one too many where processes are limited. */
-		if ((copy && take_back(&host->batch, copy, err)) ||
-		    take_back_untold(&host->batch, image->inside, err))
-			return -1;
-		copy = 0;
-	}
-	return fail(err, AVC_KERNEL, EEXIST, image->inside, "restore", "clone",
-		    "PID %d is taken by somebody else", image->inside);
-}
 
 /* Ended, and not waited for: it ends again, and nobody waits for it. */
 static int make_zombie(struct forked *forked, const struct image *image, struct avc_error *err)
@@ -260,14 +109,18 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 
 /* Session and group before it has children of its own.  What it has from its parent is
  * right as a rule. */
-static int place(struct forked *forked, const struct image *image, struct avc_error *err)
+static int place(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
-	struct syscall_batch *batch = &forked->batch;
+	const struct image *image = &restored->generation->image[index];
+	const pid_t before = restore_plan_place(restored->generation, index)->before;
+	struct syscall_batch *batch = &restored->forked[index].batch;
 	struct proc_stat stat;
 
 	if (proc_stat(batch->pid, &stat))
 		return fail_errno(err, batch->pid, "restore", "open(stat)", "it was killed");
 	if (image->session == image->inside) {
+		if (before != PLACE_ANY && restore_fork_keeper(restored, index, before, err))
+			return -1;
 		syscall_batch_add(batch, SYS_setsid);
 	} else {
 		if (image->session > 0 && proc_inside(stat.session) != image->session)
@@ -307,21 +160,37 @@ static int put_foreground(struct syscall_batch *batch, const struct image *image
 	return syscall_batch_flush(batch, err);
 }
 
-/* When all are there: into groups that others lead. */
-static int join_group(struct forked *forked, const struct image *image, struct avc_error *err)
+static int try_group(struct syscall_batch *batch, pid_t group, bool hard, struct avc_error *err)
 {
-	struct syscall_batch *batch = &forked->batch;
-	struct proc_stat stat;
+	syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)group);
+	if (!hard)
+		syscall_batch_soften(batch, NULL);
+	if (syscall_batch_flush(batch, err))
+		return -1;
+	return batch->list[0].result ? 1 : 0;
+}
 
-	if (proc_stat(batch->pid, &stat))
-		return fail_errno(err, batch->pid, "restore", "open(stat)", "it was killed");
-	if (image->group <= 0 || image->group == image->inside ||
-	    proc_inside(stat.group) == image->group)
+/* When all are there: into groups that others lead, or have led. */
+static int join_group(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+{
+	const struct image *image = &restored->generation->image[index];
+	struct syscall_batch *batch = &restored->forked[index].batch;
+	struct proc_status status;
+	int result;
+
+	if (image->group <= 0 || image->group == image->inside)
 		return 0;
-	syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)image->group);
-	syscall_batch_soften(batch,
-			     "it is not in the process group it was in, whose leader is gone");
-	return syscall_batch_flush(batch, err);
+	if (proc_status(batch->pid, &status))
+		return fail_errno(err, batch->pid, "restore", "open(status)", "it was killed");
+	if (status.group == image->group)
+		return 0;
+	result = try_group(batch, image->group, false, err);
+	if (result <= 0)
+		return result;
+	return restore_fork_group(restored, index, image->group, err) ||
+			       try_group(batch, image->group, true, err)
+		       ? -1
+		       : 0;
 }
 
 static int become(struct restore_tree *restored, uint32_t index, struct avc_error *err)
@@ -330,7 +199,7 @@ static int become(struct restore_tree *restored, uint32_t index, struct avc_erro
 	struct forked *forked = &restored->forked[index];
 	struct syscall_batch *batch = &forked->batch;
 	const struct remap *plan = restore_plan_of(restored->generation, index, err);
-	const bool is_mains = restore_plan_host(restored->generation, index) == 0;
+	const bool is_mains = restore_plan_place(restored->generation, index)->host == 0;
 
 	if (!plan ||
 	    syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL, err))
@@ -338,7 +207,7 @@ static int become(struct restore_tree *restored, uint32_t index, struct avc_erro
 	if (syscall_batch_change_parasite(batch, image->process, image->slot, err) ||
 	    process_attrs_take_keys(batch, err) ||
 	    remap_apply(plan, batch, restored->copier, err) ||
-	    process_attrs_put(batch, image, err) || place(forked, image, err) ||
+	    process_attrs_put(batch, image, err) || place(restored, index, err) ||
 	    syscall_batch_put_files(batch, &image->table, err))
 		return -1;
 	take_terminal(batch, image);
@@ -389,7 +258,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *las
 		    struct avc_error *err)
 {
 	const struct image *image = &restored->generation->image[index];
-	const uint32_t host = restore_plan_host(restored->generation, index);
+	const uint32_t host = restore_plan_place(restored->generation, index)->host;
 	struct forked *forked = &restored->forked[index], *by = &restored->forked[host];
 	struct chores chores = { .restored = restored };
 
@@ -406,7 +275,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *las
 	chores.child = image->process ? index : 0;
 	chores.last = *last;
 	*last = 0;
-	if (fork_host(restored, by, image, &chores, &forked->pid, err))
+	if (restore_fork(restored, index, do_chores, &chores, err))
 		return -1;
 	forked->traced = true;
 	forked->batch = by->batch;
@@ -425,7 +294,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *las
 		*last = index;
 		return 0;
 	}
-	return place(forked, image, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
+	return place(restored, index, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
 }
 
 /* When nobody is to join a group that they lead any more. */
@@ -437,7 +306,7 @@ static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 
 		if (image->process)
 			continue;
-		note_end(restored, image);
+		restore_fork_note(restored, image->exit_signal);
 		if (make_zombie(forked, image, err))
 			return -1;
 		forked->traced = false;
@@ -486,6 +355,9 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 		syscall_batch_add(batch, SYS_setsid);
 	else
 		syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)slot->group);
+	/* One of its own processes may have led the group, or somebody who is gone. */
+	if (!slot->session_leader)
+		syscall_batch_soften(batch, NULL);
 	take_terminal(batch, image);
 	if (syscall_batch_flush(batch, err))
 		return -1;
@@ -499,10 +371,10 @@ static int join_up(struct restore_tree *restored, struct avc_error *err)
 {
 	const struct generation *generation = restored->generation;
 
-	for (uint32_t i = 1; i < generation->images; i++)
-		if (join_group(&restored->forked[i], &generation->image[i], err))
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (join_group(restored, i, err))
 			return -1;
-	if (end_zombies(restored, err))
+	if (restore_fork_end(restored, err) || end_zombies(restored, err))
 		return -1;
 	for (uint32_t i = 0; i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
@@ -518,6 +390,29 @@ static int join_up(struct restore_tree *restored, struct avc_error *err)
 	return 0;
 }
 
+/* An orphan may come after the one that forks it, though parents come before their children. */
+static int make_all(struct restore_tree *restored, uint32_t *last, struct avc_error *err)
+{
+	const struct generation *generation = restored->generation;
+	uint32_t left = generation->images - 1, before = 0;
+
+	while (left && left != before) {
+		before = left;
+		for (uint32_t i = 1; i < generation->images; i++) {
+			const uint32_t host = restore_plan_place(generation, i)->host;
+
+			if (restored->forked[i].pid || !restored->forked[host].pid)
+				continue;
+			if (make_one(restored, i, last, err))
+				return -1;
+			left--;
+		}
+	}
+	return left ? fail(err, AVC_KERNEL, ELOOP, 0, "restore", "",
+			   "%u processes wait for each other to be made", left)
+		    : 0;
+}
+
 int restore_tree_make(struct restore_tree *restored, struct avc_error *err)
 {
 	struct syscall_batch *mains = &restored->forked[0].batch;
@@ -528,9 +423,8 @@ int restore_tree_make(struct restore_tree *restored, struct avc_error *err)
 	if (restored->generation->images > FEW + 1 &&
 	    syscall_batch_share_fd_channel(mains, &restored->fd_channel, err))
 		return -1;
-	for (uint32_t i = 1; i < restored->generation->images; i++)
-		if (make_one(restored, i, &last, err))
-			return -1;
+	if (make_all(restored, &last, err))
+		return -1;
 	if (last && become(restored, last, err))
 		return -1;
 	if (syscall_batch_unshare_fd_channel(mains, &restored->fd_channel, err) ||
@@ -618,6 +512,7 @@ static void kill_one(struct forked *forked)
 
 void restore_tree_kill(struct restore_tree *restored)
 {
+	restore_fork_kill(restored);
 	for (uint32_t i = restored->generation->images; i-- > 0;)
 		kill_one(&restored->forked[i]);
 	for (uint32_t i = 1; i < restored->generation->images; i++) {
@@ -638,5 +533,6 @@ void restore_tree_free(struct restore_tree *restored)
 	}
 	copier_free(restored->copier);
 	close_fd(&restored->fd_channel.ours);
+	free(restored->keeper);
 	free(restored);
 }
