@@ -24,7 +24,7 @@ static int prepare_stopped(struct tree *tree, struct process *process, struct av
 			    "the main thread of process %d has ended", process->inside);
 	if (!process->infected && process_infect_stopped(process, tree->slots, err))
 		return -1;
-	return process->files_image ? 0 : files_prepare(process, err);
+	return process->files_image ? 0 : files_prepare(process, NULL, err);
 }
 
 /* Of the leader of a session or group, as the app knows it; 0: it is none of the app's,

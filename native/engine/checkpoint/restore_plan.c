@@ -111,6 +111,8 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 	struct place place[PROCESSES_MAX];
 	int result = places_find(generation, place, err);
 
+	for (uint32_t i = 1; !result && i < generation->images; i++)
+		generation->image[i].host = place[i].host;
 	for (uint32_t i = 1; !result && i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
 		const struct image *host = &generation->image[place[i].host];

@@ -51,9 +51,16 @@ struct files *files_new(uint32_t room)
 	return files;
 }
 
+/* One more has it, and frees it: a thread that was left behind may be the last (aside.c). */
+static struct files *files_share(struct files *files)
+{
+	__atomic_fetch_add(&files->others, 1, __ATOMIC_RELAXED);
+	return files;
+}
+
 void files_free(struct files *files)
 {
-	if (!files)
+	if (!files || __atomic_fetch_sub(&files->others, 1, __ATOMIC_ACQ_REL))
 		return;
 	for (uint32_t i = 0; i < files->count; i++) {
 		struct file *f = &files->file[i];
@@ -65,14 +72,16 @@ void files_free(struct files *files)
 		file_socket_free(f->socket);
 		free(f->content);
 	}
+	free(files->ends);
 	free(files->file);
 	free(files->area);
 	free(files);
 }
 
-struct file *files_find(const struct files *files, int fd)
+/* Of the first so many, which are in order. */
+static struct file *find_among(const struct files *files, uint32_t count, int fd)
 {
-	uint32_t low = 0, high = files ? files->count : 0;
+	uint32_t low = 0, high = count;
 
 	while (low < high) {
 		const uint32_t middle = (low + high) / 2;
@@ -85,6 +94,11 @@ struct file *files_find(const struct files *files, int fd)
 			high = middle;
 	}
 	return NULL;
+}
+
+struct file *files_find(const struct files *files, int fd)
+{
+	return find_among(files, files ? files->count : 0, fd);
 }
 
 /* The same file, socket, pipe...; of anonymous inodes only eventfds say who they are. */
@@ -177,7 +191,7 @@ static struct file *take_known(const struct look *look, struct file *f)
 	    k->mode != f->mode || (k->flags ^ f->flags) & (O_ACCMODE | O_PATH))
 		return NULL;
 	f->kind = k->kind;
-	if (is_anonymous(f) && !file_read_info(look->pid, f)) {
+	if (is_anonymous(f) && !f->inherited && !file_read_info(look->pid, f)) {
 		char *name = read_name(look, f->fd);
 		const bool same = name && !strcmp(name, k->name);
 
@@ -198,6 +212,8 @@ static struct file *take_known(const struct look *look, struct file *f)
 			return NULL;
 		}
 	}
+	if (f->inherited)
+		f->cloexec = k->cloexec;
 	f->known = true;
 	f->remote = k->remote;
 	if (look->depth == FILES_NOW) {
@@ -259,34 +275,74 @@ static bool look_at_remote(const struct look *look, int number, struct file *f)
 }
 
 /* A child has most of what it has open from its parent: then there is nothing to look at that
- * the look at the parent has not seen. */
+ * the look at the parent has not seen, but for what is the table's own. */
+static bool is_parents(const struct look *look, const struct file *is)
+{
+	return syscall(SYS_kcmp, look->pid, look->files->parent_pid, KCMP_FILE, is->fd, is->fd) ==
+	       0;
+}
+
+/* Everything but what has an owner. */
+static void copy_of(struct file *f, const struct file *is)
+{
+	*f = *is;
+	f->name = NULL;
+	f->socket = NULL;
+	f->watch = NULL;
+	f->mark = NULL;
+	f->lock = NULL;
+	f->content = NULL;
+	f->watch_count = f->mark_count = f->lock_count = f->content_bytes = 0;
+	f->ours = 0;
+	f->shared = is->fd;
+	f->family = NULL;
+	f->inherited = is;
+}
+
+static bool copy_before(const struct look *look, const struct file *is, struct file *f)
+{
+	struct file own = { .fd = is->fd, .kind = is->kind, .told_flags = -1 };
+	size_t bytes;
+	char *name;
+
+	if (is_anonymous(is) || is->lock_count || !is->name || !is_parents(look, is))
+		return false;
+	(void)file_read_info(look->pid, &own);
+	free(own.lock);
+	bytes = strlen(is->name) + 1;
+	name = own.told_flags < 0 || own.lock_count || !budget_take(bytes) ? NULL : malloc(bytes);
+	if (!name)
+		return false;
+	copy_of(f, is);
+	f->cloexec = own.cloexec;
+	f->name = memcpy(name, is->name, bytes);
+	f->socket = is->socket;
+	if (f->socket)
+		file_socket_share(f->socket);
+	return true;
+}
+
+static bool copy_frozen(const struct look *look, const struct file *is, struct file *f)
+{
+	const struct file *k = files_find(look->known, is->fd);
+
+	/* Of locks and of what is watched there is more to know. */
+	if (!k || !is->known || k->remote || k->lock_count || is->lock_count || is->watch_count ||
+	    is->mark_count || k->kind != is->kind || k->id != is->id ||
+	    (is->kind == FILE_REGULAR && is->told_ino) || !is_parents(look, is))
+		return false;
+	copy_of(f, is);
+	return take_known(look, f) != NULL;
+}
+
 static bool look_at_inherited(const struct look *look, int number, struct file *f)
 {
-	const struct files *parent = look->files->parent;
-	const struct file *is = parent ? files_find(parent, number) : NULL;
-	const struct file *k = is ? files_find(look->known, number) : NULL;
+	const struct file *is = look->files->parent ? files_find(look->files->parent, number)
+						    : NULL;
 
-	/* Of connections, locks and anonymous inodes there is more to know. */
-	if (!k || k->remote || k->lock_count || !is->known || is_anonymous(is) || is->told_ino ||
-	    (is->kind == FILE_SOCKET && look->files->with_tcp) ||
-	    syscall(SYS_kcmp, look->pid, look->files->parent_pid, KCMP_FILE, number, number))
+	if (!is || is->remote || look->depth == FILES_NOW)
 		return false;
-	*f = (struct file){
-		.fd = number,
-		.shared = number,
-		.dev = is->dev,
-		.ino = is->ino,
-		.rdev = is->rdev,
-		.mode = is->mode,
-		.flags = is->flags,
-		.offset = is->offset,
-		.bytes = is->bytes,
-		.modified = is->modified,
-		.changed = is->changed,
-		.video = is->video,
-		.inherited = is,
-	};
-	return take_known(look, f);
+	return look->depth == FILES_BEFORE ? copy_before(look, is, f) : copy_frozen(look, is, f);
 }
 
 static bool is_channel(const struct file *f)
@@ -339,7 +395,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	}
 	f = &files->file[files->count];
 	if ((look->depth != FILES_BEFORE && look_at_remote(look, number, f)) ||
-	    (look->depth == FILES_FROZEN && look_at_inherited(look, number, f))) {
+	    look_at_inherited(look, number, f)) {
 		files->count++;
 		return 0;
 	}
@@ -542,13 +598,20 @@ static void find_shared(struct files *files, pid_t pid)
 	free(held);
 }
 
+static bool is_shared_by_parent(const struct files *files, const struct file *f)
+{
+	const struct file *first = files_find(files, f->shared);
+
+	return f->inherited && f->inherited->shared == f->shared && first && first->inherited;
+}
+
 /* The same during a freeze: what was found before it is only checked. */
 static void check_shared(struct files *files, pid_t pid)
 {
 	for (uint32_t i = 0; i < files->count; i++) {
 		struct file *f = &files->file[i];
 
-		if (f->known && (f->shared == f->fd ||
+		if (f->known && (f->shared == f->fd || is_shared_by_parent(files, f) ||
 				 syscall(SYS_kcmp, pid, pid, KCMP_FILE, f->fd, f->shared) == 0))
 			continue;
 		f->shared = f->fd;
@@ -566,7 +629,7 @@ static void check_shared(struct files *files, pid_t pid)
 
 /* Has anybody in the app the other end?  Of several processes that is found out when it
  * matters, at a restore. */
-static bool may_be_ours(const struct files *files, const struct file *f)
+static bool may_be_ours(struct files *files, const struct file *f)
 {
 	if (!files->several)
 		return files_other_end(files, f);
@@ -581,7 +644,8 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->ended = from->ended;
 	f->content_lost = from->content_lost;
 	f->rights_lost = from->rights_lost;
-	if (!from->content_bytes)
+	/* What is put back once, one has (files_family.c). */
+	if (!from->content_bytes || !from->ended)
 		return;
 	f->content = budget_has(from->content_bytes) && budget_take(from->content_bytes)
 			     ? malloc(from->content_bytes)
@@ -688,7 +752,7 @@ static int walk_known(struct look *look, struct avc_error *err)
 	return 0;
 }
 
-static int walk(struct look *look, struct avc_error *err)
+static int walk(struct look *look, uint32_t seen, struct avc_error *err)
 {
 	char buf[16384] __attribute__((aligned(8)));
 
@@ -705,10 +769,26 @@ static int walk(struct look *look, struct avc_error *err)
 
 			at += entry->d_reclen;
 			if (entry->d_name[0] != '.' && is_of_interest(look, entry->d_name) &&
+			    !find_among(look->files, seen, atoi(entry->d_name)) &&
 			    look_at(look, atoi(entry->d_name), err))
 				return -1;
 		}
 	}
+}
+
+/* Since Linux 6.2 a table says how many it has: when all that were there before are, and are as many,
+ * there is no other one. */
+static int walk_all(struct look *look, struct avc_error *err)
+{
+	struct stat st;
+
+	if (look->depth != FILES_FROZEN || !look->known)
+		return walk(look, 0, err);
+	if (walk_known(look, err))
+		return -1;
+	return fstat(look->fd_dir, &st) == 0 && st.st_size == look->files->count
+		       ? 0
+		       : walk(look, look->files->count, err);
 }
 
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
@@ -737,7 +817,7 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	clock_gettime(CLOCK_REALTIME, &now);
 	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
 	result = files->missing && !files->missing->count ? walk_known(&look, err)
-							  : walk(&look, err);
+							  : walk_all(&look, err);
 	close(look.fd_dir);
 	if (result) {
 		for (uint32_t i = 0; i < files->count; i++)
@@ -811,16 +891,28 @@ static void survey(struct aside *aside)
 	job->result = files_look(job->files, &job->owner, FILES_BEFORE, NULL, &job->error);
 }
 
+/* Nothing of it is needed after the look. */
+static void forget_parent(struct files *files)
+{
+	files_free((struct files *)files->parent);
+	files->parent = NULL;
+	for (uint32_t i = 0; i < files->count; i++)
+		files->file[i].inherited = NULL;
+}
+
 static void drop_survey(struct aside *aside)
 {
 	struct survey *job = (struct survey *)aside;
 
+	if (job->files)
+		forget_parent(job->files);
 	files_free(job->files);
 	close_fd(&job->owner.pidfd);
 	free(job);
 }
 
-static struct files *look_before(const struct process *process, struct avc_error *err)
+static struct files *look_before(const struct process *process, const struct process *parent,
+				 struct avc_error *err)
 {
 	static int left_behind;
 	struct survey *job = calloc(1, sizeof *job);
@@ -839,6 +931,10 @@ static struct files *look_before(const struct process *process, struct avc_error
 			drop_survey(&job->aside);
 		return NULL;
 	}
+	if (parent && parent->files_before) {
+		job->files->parent = files_share(parent->files_before);
+		job->files->parent_pid = parent->pid;
+	}
 	if (!aside_run(&job->aside, rt_priority_is() ? SURVEY_STOPPED_NS : SURVEY_NS)) {
 		fail(err, AVC_DEADLINE, 0, process->pid, "look at descriptors", "",
 		     "one of its files does not answer");
@@ -849,18 +945,19 @@ static struct files *look_before(const struct process *process, struct avc_error
 	} else {
 		files = job->files;
 		job->files = NULL;
+		forget_parent(files);
 	}
 	drop_survey(&job->aside);
 	return files;
 }
 
-int files_prepare(struct process *process, struct avc_error *err)
+int files_prepare(struct process *process, const struct process *parent, struct avc_error *err)
 {
 	struct files *before, *image;
 
 	files_free(process->files_image);
 	process->files_image = NULL;
-	before = look_before(process, err);
+	before = look_before(process, parent, err);
 	if (!before)
 		return -1;
 	files_free(process->files_before);
@@ -898,8 +995,6 @@ void files_capture(struct image *image, const struct image *parent, bool several
 	files->parent = NULL; /* may be gone before this one */
 	files->scratch = NULL;
 	files->process = NULL;
-	for (uint32_t i = 0; i < files->count; i++)
-		files->file[i].inherited = NULL;
 	if (result)
 		return;
 	find_owners(process, files);
@@ -916,7 +1011,9 @@ void files_settle(struct image *image)
 		struct file *f = &image->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };
 
-		if (f->kind != FILE_REGULAR || f->flags & O_PATH)
+		if (f->inherited)
+			f->lock_unsure = f->inherited->lock_unsure;
+		if (f->inherited || f->kind != FILE_REGULAR || f->flags & O_PATH)
 			continue;
 		file_read_info(image->process->pid, &now);
 		for (uint32_t k = 0; k < now.lock_count; k++)

@@ -36,8 +36,10 @@
 
 /* ---- for the layers above ------------------------------------------------------- */
 
-/* Before a freeze: what can be known of the app's descriptors while it runs. */
-int files_prepare(struct process *process, struct avc_error *err) warn_unused;
+/* Before a freeze: what can be known of the app's descriptors while it runs.  `parent`: a process
+ * that was prepared just before, of which it may have a lot in common, or NULL. */
+int files_prepare(struct process *process, const struct process *parent,
+		  struct avc_error *err) warn_unused;
 /* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
 struct scratch {
 	int in, out, bytes;
@@ -167,6 +169,7 @@ struct file_area {
 };
 
 struct file_socket {
+	uint32_t others; /* tables that have it, too                                  */
 	int domain, type, protocol;
 	bool listening, connected;
 	bool idle;   /* has never been connected, and does not listen                    */
@@ -177,6 +180,7 @@ struct file_socket {
 	size_t option_bytes;
 	struct file_node *node; /* files_unix.c, allocated, NULL: none or not known */
 	uint64_t peer;          /* inode of the other end of a Unix socket, 0: not known    */
+	bool asked;             /* for that                                               */
 	socklen_t local_bytes, remote_bytes;
 	struct sockaddr_storage local, remote;
 };
@@ -248,7 +252,8 @@ struct file {
 	bool ended;        /* nobody has its other end: what is in it is the last        */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
 	struct file_video video;
-	/* The same open file description in `parent` of files_look(); NULL: not known to be */
+	/* The same open file description in `parent` of files_look(); NULL: not known to be.
+	 * Afterwards only in the images of a freeze, where all are at the same time. */
 	const struct file *inherited;
 };
 
@@ -260,18 +265,21 @@ struct files_missing {
 };
 
 struct files {
+	uint32_t others; /* who have it, too                                          */
 	uint32_t count, room;
+	const struct file **ends; /* pipes and sockets by inode, when it is asked for: allocated */
+	uint32_t end_count;
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */
 	struct file *file;      /* by fd, ascending                                     */
 	struct file_area *area; /* allocated                                       */
 	uint32_t areas;
-	/* During a freeze: a table that has just been looked at.  What this one has in common
+	/* A table that has just been looked at in the same way.  What this one has in common
 	 * with it, as children have with their parents, is not looked at again. */
 	const struct files *parent;
 	pid_t parent_pid;
-	struct scratch *scratch; /* also only then                                 */
+	struct scratch *scratch; /* during a freeze                                 */
 	struct process *process; /* likewise                                       */
 	struct file_rights rights;
 	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
@@ -295,6 +303,7 @@ struct files_owner {
 	int pidfd;
 	pid_t init;
 };
+/* `files->parent` may be set. */
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err) warn_unused;
 /* Puts them in order. */
@@ -330,7 +339,7 @@ void file_look_at_socket(int fd, struct file *file);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
 void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
-const struct file *files_other_end(const struct files *files, const struct file *file);
+const struct file *files_other_end(struct files *files, const struct file *file);
 void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);
 /* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
 bool file_is_locked(int fd);
@@ -343,6 +352,8 @@ bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
 
 /* files_options.c */
+/* One more has it; NULL: there is none. */
+struct file_socket *file_socket_share(struct file_socket *socket);
 void file_socket_free(struct file_socket *socket);
 /* Whether it can be made again: it needs nobody at the other end. */
 bool file_socket_is_alone(const struct file_socket *socket);
@@ -442,12 +453,14 @@ struct files_work {
 	pid_t table;
 	int table_pidfd;
 	struct files *want, *now;
-	int *local;      /* of want, by group leader: a descriptor of ours, or -1  */
-	int *claimed_by; /* of now: leader (index in want) of the group that has it */
-	int *source;     /* of want, by group leader: index in now, or -1          */
-	bool *closed;    /* of now: by us                                          */
-	bool *lost;      /* of want: has to be put in place                        */
-	uint32_t listed; /* calls for the template that were not made yet          */
+	int *local;              /* of want, by group leader: a descriptor of ours, or -1  */
+	int *claimed_by;         /* of now: leader (index in want) of the group that has it */
+	int *source;             /* of want, by group leader: index in now, or -1          */
+	bool *closed;            /* of now: by us                                          */
+	bool *lost;              /* of want: has to be put in place                        */
+	bool *kept;              /* of want: the process that forks it has just this       */
+	struct files_work *host; /* of which process that is; NULL: none            */
+	uint32_t listed;         /* calls for the template that were not made yet          */
 	uint32_t problems;
 	struct avc_error *notes;
 };

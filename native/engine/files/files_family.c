@@ -31,7 +31,7 @@ static uint32_t list_held(struct files_held *held, const struct image *image,
 	for (uint32_t i = 0; image->files && i < image->files->count; i++) {
 		struct file *f = &image->files->file[i];
 
-		if (f->shared != f->fd || f->outside)
+		if (f->shared != f->fd || f->outside || f->inherited)
 			continue;
 		if (held)
 			held[count] = (struct files_held){ .file = f,
@@ -79,6 +79,25 @@ static void name_others(const struct image *image, uint32_t images, struct files
 	}
 }
 
+/* What the freeze has found to be of the parent's descriptions.  Parents come first. */
+static void join_parents(const struct image *image, uint32_t index)
+{
+	const int parent = image[index].parent < 0 ? 0 : image[index].parent;
+	const struct files *files = image[index].files, *parents = image[parent].files;
+
+	for (uint32_t i = 0; index && files && i < files->count; i++) {
+		struct file *f = &files->file[i], *is;
+
+		if (f->inherited && f->shared == f->fd && !f->outside) {
+			is = files_find(parents, f->inherited->shared);
+			if (!is->family)
+				is->family = is;
+			f->family = is->family;
+		}
+		f->inherited = NULL;
+	}
+}
+
 /* By the templates, which have the tables as the processes have them.  What a process has
  * put in a place since is found to be shared with nobody. */
 void files_settle_family(struct image *image, uint32_t images, struct image *before,
@@ -106,14 +125,97 @@ void files_settle_family(struct image *image, uint32_t images, struct image *bef
 		if (held[i].first != held[i].file)
 			held[i].file->family = held[i].first->family = held[i].first;
 	free(held);
+	for (uint32_t i = 0; i < images; i++)
+		join_parents(image, i);
 }
 
 /* ---- a restore -------------------------------------------------------------------- */
 
+/* Where something is wanted: its number in a table. */
+struct spot {
+	uint64_t key; /* its inode; or the first one of its description            */
+	uint32_t table, k;
+};
+
+/* In order, for there are as many as processes times what each has open. */
+struct spots {
+	struct spot *spot;
+	uint32_t count;
+};
+
 struct tables {
 	struct files_work *work;
 	uint32_t count;
+	struct spots ends; /* of pipes and sockets                                */
+	struct spots family;
 };
+
+static int by_spot(const void *a, const void *b)
+{
+	const struct spot *x = a, *y = b;
+
+	if (x->key != y->key)
+		return x->key < y->key ? -1 : 1;
+	if (x->table != y->table)
+		return x->table < y->table ? -1 : 1;
+	return (x->k > y->k) - (x->k < y->k);
+}
+
+static const struct file *file_at(const struct tables *tables, const struct spot *spot)
+{
+	return &tables->work[spot->table].want->file[spot->k];
+}
+
+static uint64_t key_of(const struct file *f, bool family)
+{
+	if (family)
+		return (uint64_t)(uintptr_t)f->family;
+	return f->kind == FILE_PIPE || f->kind == FILE_SOCKET ? f->ino : 0;
+}
+
+static int list_spots(const struct tables *tables, struct spots *spots, bool family)
+{
+	uint32_t room = 1;
+
+	for (uint32_t i = 0; i < tables->count; i++)
+		room += tables->work[i].want->count;
+	spots->spot = malloc(room * sizeof *spots->spot);
+	if (!spots->spot)
+		return -1;
+	for (uint32_t i = 0; i < tables->count; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
+			const uint64_t key = key_of(&tables->work[i].want->file[k], family);
+
+			if (key)
+				spots->spot[spots->count++] = (struct spot){ key, i, k };
+		}
+	qsort(spots->spot, spots->count, sizeof *spots->spot, by_spot);
+	return 0;
+}
+
+/* The first that has this key, as all that follow until it is another one. */
+static const struct spot *first_spot(const struct spots *spots, uint64_t key)
+{
+	uint32_t low = 0, high = spots->count;
+
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+
+		if (spots->spot[middle].key < key)
+			low = middle + 1;
+		else
+			high = middle;
+	}
+	return spots->spot + low;
+}
+
+static bool has_key(const struct spots *spots, const struct spot *spot, uint64_t key)
+{
+	return spot < spots->spot + spots->count && spot->key == key;
+}
+
+#define EACH_SPOT(at, spots, wanted) \
+	for (const struct spot *at = first_spot(spots, wanted); has_key(spots, at, wanted); at++)
 
 static bool is_pair(const struct file *f)
 {
@@ -135,24 +237,44 @@ static bool other_end(const struct file *a, const struct file *b)
 	return a->ino == b->ino && (a->flags ^ b->flags) & O_ACCMODE;
 }
 
-/* Something like `like` that is there, of any process: its descriptor in *fd, ours. */
-static bool find_end(const struct tables *tables, const struct file *like,
-		     bool (*fits)(const struct file *a, const struct file *b), int *fd)
+static uint64_t other_key(const struct file *f)
 {
-	for (uint32_t i = 0; i < tables->count; i++) {
-		const struct files_work *work = &tables->work[i];
+	return f->kind == FILE_SOCKET ? f->socket->peer : f->ino;
+}
 
-		for (uint32_t k = 0; k < work->want->count; k++) {
-			const struct file *w = &work->want->file[k];
+/* One of them that is there, of any process: its descriptor in *fd, ours. */
+static bool borrow(const struct tables *tables, const struct spot *spot, int *fd)
+{
+	const struct files_work *work = &tables->work[spot->table];
+	const struct file *w = file_at(tables, spot);
 
-			if (w->kind != like->kind || !fits(like, w) ||
-			    (work->lost[k] && work->local[files_leader(work->want, w)] < 0))
-				continue;
-			*fd = files_borrow_placed(work, w);
-			if (*fd >= 0)
-				return true;
-		}
-	}
+	if (work->lost[spot->k] && work->local[files_leader(work->want, w)] < 0)
+		return false;
+	*fd = files_borrow_placed(work, w);
+	return *fd >= 0;
+}
+
+static bool find_same(const struct tables *tables, const struct file *like, int *fd)
+{
+	EACH_SPOT(at, &tables->ends, like->ino)
+	if (same_end(like, file_at(tables, at)) && borrow(tables, at, fd))
+		return true;
+	return false;
+}
+
+static bool find_opposite(const struct tables *tables, const struct file *like, int *fd)
+{
+	EACH_SPOT(at, &tables->ends, other_key(like))
+	if (other_end(like, file_at(tables, at)) && borrow(tables, at, fd))
+		return true;
+	return false;
+}
+
+static bool find_family(const struct tables *tables, const struct file *like, int *fd)
+{
+	EACH_SPOT(at, &tables->family, (uint64_t)(uintptr_t)like->family)
+	if (borrow(tables, at, fd))
+		return true;
 	return false;
 }
 
@@ -172,17 +294,17 @@ static int reopen(int fd, int flags)
 static const struct file *find_other(const struct tables *tables, const struct file *w,
 				     bool *made_already)
 {
-	for (uint32_t i = 0; i < tables->count; i++)
-		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
-			const struct files_work *work = &tables->work[i];
-			const struct file *other = &work->want->file[k];
-			const uint32_t leader = files_leader(work->want, other);
+	EACH_SPOT(at, &tables->ends, other_key(w))
+	{
+		const struct files_work *work = &tables->work[at->table];
+		const struct file *other = file_at(tables, at);
+		const uint32_t leader = files_leader(work->want, other);
 
-			if (!other_end(w, other))
-				continue;
-			*made_already = work->local[leader] >= 0 && work->source[leader] < 0;
-			return other;
-		}
+		if (!other_end(w, other))
+			continue;
+		*made_already = work->local[leader] >= 0 && work->source[leader] < 0;
+		return other;
+	}
 	return NULL;
 }
 
@@ -190,28 +312,21 @@ static const struct file *find_other(const struct tables *tables, const struct f
  * any more. */
 static void give_end(const struct tables *tables, const struct file *w, int end)
 {
-	for (uint32_t i = 0; i < tables->count; i++) {
-		struct files_work *work = &tables->work[i];
+	EACH_SPOT(at, &tables->ends, w->ino)
+	{
+		struct files_work *work = &tables->work[at->table];
+		const uint32_t k = at->k;
 
-		for (uint32_t k = 0; k < work->want->count; k++) {
-			const uint32_t leader = files_leader(work->want, &work->want->file[k]);
-
-			if (!same_end(w, &work->want->file[k]))
-				continue;
-			work->lost[k] = true;
-			if (leader != k)
-				continue;
-			work->source[k] = -1;
-			close_fd(&work->local[k]);
-			work->local[k] = fcntl(end, F_DUPFD_CLOEXEC, 0);
-		}
+		if (!same_end(w, file_at(tables, at)))
+			continue;
+		work->lost[k] = true;
+		if (files_leader(work->want, file_at(tables, at)) != k)
+			continue;
+		work->source[k] = -1;
+		close_fd(&work->local[k]);
+		work->local[k] = fcntl(end, F_DUPFD_CLOEXEC, 0);
 	}
 	close(end);
-}
-
-static bool same_family(const struct file *a, const struct file *b)
-{
-	return a->family && a->family == b->family;
 }
 
 /* What another process has still, or again, this one has as well. */
@@ -221,8 +336,8 @@ static void join_family(const struct tables *tables, struct files_work *work)
 		const struct file *w = &work->want->file[k];
 		int fd;
 
-		if (work->lost[k] && w->family && work->local[k] < 0 &&
-		    find_end(tables, w, same_family, &fd))
+		if (work->lost[k] && !work->kept[k] && w->family && work->local[k] < 0 &&
+		    find_family(tables, w, &fd))
 			work->local[k] = fd;
 	}
 }
@@ -234,11 +349,11 @@ static void join_lost(const struct tables *tables, struct files_work *work, cons
 	bool made_already;
 	int fd, ends[2], writer;
 
-	if (find_end(tables, w, same_end, &fd)) {
+	if (find_same(tables, w, &fd)) {
 		work->local[group] = fd;
 		return;
 	}
-	if (w->kind == FILE_PIPE && find_end(tables, w, other_end, &fd)) {
+	if (w->kind == FILE_PIPE && find_opposite(tables, w, &fd)) {
 		work->local[group] = reopen(fd, w->flags);
 		return;
 	}
@@ -261,7 +376,7 @@ static void join(const struct tables *tables)
 			const struct file *w = &work->want->file[k];
 
 			(void)budget_step();
-			if (is_pair(w) && work->lost[k] &&
+			if (is_pair(w) && work->lost[k] && !work->kept[k] &&
 			    work->local[files_leader(work->want, w)] < 0)
 				join_lost(tables, work, w);
 		}
@@ -269,34 +384,32 @@ static void join(const struct tables *tables)
 }
 
 /* Once, however many have an end that can be read. */
-static bool is_first(const struct tables *tables, uint32_t table, const struct file *w)
+static bool is_first(const struct tables *tables, const struct file *w)
 {
-	for (uint32_t i = 0; i <= table; i++)
-		for (uint32_t k = 0; k < tables->work[i].want->count; k++)
-			if (same_end(w, &tables->work[i].want->file[k]))
-				return &tables->work[i].want->file[k] == w;
+	EACH_SPOT(at, &tables->ends, w->ino)
+	if (same_end(w, file_at(tables, at)))
+		return file_at(tables, at) == w;
 	return false;
 }
 
 static const struct file *content_of(const struct tables *tables, const struct file *w)
 {
-	for (uint32_t i = 0; i < tables->count; i++)
-		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
-			const struct file *f = &tables->work[i].want->file[k];
+	EACH_SPOT(at, &tables->ends, w->ino)
+	{
+		const struct file *f = file_at(tables, at);
 
-			if (same_end(w, f) && (f->content_bytes || f->content_lost))
-				return f;
-		}
+		if (same_end(w, f) && (f->content_bytes || f->content_lost))
+			return f;
+	}
 	return w;
 }
 
 /* Whoever had the other end of this pipe had ended already, and left it what is in it. */
 static bool has_ended(const struct tables *tables, const struct file *w)
 {
-	for (uint32_t i = 0; i < tables->count; i++)
-		for (uint32_t k = 0; k < tables->work[i].want->count; k++)
-			if (other_end(w, &tables->work[i].want->file[k]))
-				return false;
+	EACH_SPOT(at, &tables->ends, other_key(w))
+	if (other_end(w, file_at(tables, at)))
+		return false;
 	return w->ended || (tables->work[0].want->several && !w->outside);
 }
 
@@ -313,10 +426,10 @@ static void put_contents(const struct tables *tables)
 			(void)budget_step();
 			if (!(is_pair(w) || (w->kind == FILE_PIPE && w->ended)) ||
 			    (w->kind == FILE_PIPE && (w->flags & O_ACCMODE) == O_WRONLY) ||
-			    !is_first(tables, i, w) || !find_end(tables, w, same_end, &fd))
+			    !is_first(tables, w) || !find_same(tables, w, &fd))
 				continue;
 			content = content_of(tables, w);
-			found = find_end(tables, w, other_end, &other_fd);
+			found = find_opposite(tables, w, &other_fd);
 			if (!found && w->kind == FILE_PIPE && has_ended(tables, w)) {
 				other_fd = fcntl(fd, F_DUPFD_CLOEXEC, 0);
 				found = true;
@@ -328,6 +441,14 @@ static void put_contents(const struct tables *tables)
 			close_fd(&other_fd);
 		}
 	}
+}
+
+static struct files_work *work_of(const struct tables *tables, const struct process *process)
+{
+	for (uint32_t i = 0; i < tables->count; i++)
+		if (tables->work[i].process == process)
+			return &tables->work[i];
+	return NULL;
 }
 
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
@@ -346,6 +467,7 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 		if (!process)
 			continue;
 		tables.work[tables.count++] = (struct files_work){
+			.host = held ? work_of(&tables, image[image[i].host].process) : NULL,
 			.process = image[i].process,
 			.image = &image[i],
 			.config = config,
@@ -361,6 +483,10 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 	for (uint32_t i = 0; i < tables.count; i++)
 		if (files_work_gather(&tables.work[i], err))
 			goto out;
+	if (list_spots(&tables, &tables.ends, false) || list_spots(&tables, &tables.family, true)) {
+		result = fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
+		goto out;
+	}
 	if (tables.count > 1)
 		join(&tables);
 	for (uint32_t i = 0; i < tables.count; i++) {
@@ -381,6 +507,8 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 out:
 	for (uint32_t i = 0; i < tables.count; i++)
 		files_work_end(&tables.work[i]);
+	free(tables.ends.spot);
+	free(tables.family.spot);
 	free(tables.work);
 	return result;
 }

@@ -229,9 +229,16 @@ const char *file_put_options(int fd, const struct file_socket *s)
 	return problem;
 }
 
+struct file_socket *file_socket_share(struct file_socket *s)
+{
+	if (s)
+		__atomic_fetch_add(&s->others, 1, __ATOMIC_RELAXED);
+	return s;
+}
+
 void file_socket_free(struct file_socket *s)
 {
-	if (!s)
+	if (!s || __atomic_fetch_sub(&s->others, 1, __ATOMIC_ACQ_REL))
 		return;
 	free(s->option);
 	free(s->node);

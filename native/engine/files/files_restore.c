@@ -293,7 +293,7 @@ static void gather(struct files_work *work)
 		const struct file *w = &work->want->file[i];
 		const uint32_t group = files_leader(work->want, w);
 
-		if (!work->lost[i] || work->local[group] >= 0)
+		if (!work->lost[i] || work->kept[i] || work->local[group] >= 0)
 			continue;
 		if (work->source[group] >= 0)
 			work->local[group] = proc_borrow_fd(
@@ -316,7 +316,7 @@ static void make_lost(struct files_work *work)
 		const uint32_t group = files_leader(work->want, w);
 		const char *why = NULL;
 
-		if (!work->lost[i] || work->local[group] >= 0)
+		if (!work->lost[i] || work->kept[i] || work->local[group] >= 0)
 			continue;
 		(void)budget_step();
 		work->local[group] = file_make(w, work->image->template, work->init,
@@ -546,7 +546,9 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		to = lowest_free(numbers, NULL);
-		if (fd_send(ours, from)) {
+		/* What is not received yet waits in the socket, which has room for some hundred. */
+		if (fd_send(ours, from) &&
+		    (errno != EAGAIN || files_work_flush(work, err) || fd_send(ours, from))) {
 			files_note(work, w, "it could not be handed over");
 			continue;
 		}
@@ -657,7 +659,7 @@ static void put_states(struct files_work *work)
 		int fd;
 
 		(void)budget_step();
-		if (files_leader(work->want, w) != i)
+		if (files_leader(work->want, w) != i || work->kept[i])
 			continue;
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
 		    !n->lock_count && !w->lock_count)
@@ -769,7 +771,8 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 	work->local = filled(work->want->count, -1);
 	work->source = filled(work->want->count, -1);
 	work->lost = calloc(work->want->count + 1, sizeof *work->lost);
-	if (!work->now || !work->local || !work->source || !work->lost)
+	work->kept = calloc(work->want->count + 1, sizeof *work->kept);
+	if (!work->now || !work->local || !work->source || !work->lost || !work->kept)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	/* The app died while it was cloning (guard_checkpoint.c, abandon()). */
 	if (work->table && work->process->descendant && work->process->doubtful &&
@@ -805,9 +808,41 @@ void files_work_end(struct files_work *work)
 	free(work->local);
 	free(work->source);
 	free(work->lost);
+	free(work->kept);
 	free(work->claimed_by);
 	free(work->closed);
 	files_free(work->now);
+}
+
+/* What a fork of that process passes on; the index of its description there, or -1. */
+static int find_in_host(const struct files_work *work, const struct file *w)
+{
+	const struct files *host = work->host ? work->host->want : NULL;
+	const struct file *h = w->fd >= FD_KEPT_MIN ? files_find(host, w->fd) : NULL;
+	const struct file *first = &work->want->file[files_leader(work->want, w)];
+
+	if (!h || w->pid_inside || !first->family ||
+	    first->family != host->file[files_leader(host, h)].family)
+		return -1;
+	return (int)files_index(host, h);
+}
+
+static bool host_has(const struct files_work *host, int h)
+{
+	return !host->lost[h] || host->kept[h] ||
+	       host->local[files_leader(host->want, &host->want->file[h])] >= 0;
+}
+
+/* One that the host has lost it gets from the first of its children that has it still. */
+static void give_to_host(struct files_work *work, uint32_t i)
+{
+	const struct file *w = &work->want->file[i];
+	const int h = find_in_host(work, w), local = work->local[files_leader(work->want, w)];
+
+	if (h < 0 || local < 0 || host_has(work->host, h))
+		return;
+	work->host->local[files_leader(work->host->want, &work->host->want->file[h])] =
+		fcntl(local, F_DUPFD_CLOEXEC, 0);
 }
 
 /* All other processes have a table that is made anew. */
@@ -815,9 +850,15 @@ static int gather_anew(struct files_work *work, struct avc_error *err)
 {
 	if (unlock_all(work, err) || files_work_flush(work, err))
 		return -1;
-	for (uint32_t i = 0; i < work->want->count; i++)
+	for (uint32_t i = 0; i < work->want->count; i++) {
+		const int h = find_in_host(work, &work->want->file[i]);
+
 		work->lost[i] = true;
+		work->kept[i] = h >= 0 && host_has(work->host, h);
+	}
 	gather(work);
+	for (uint32_t i = 0; i < work->want->count; i++)
+		give_to_host(work, i);
 	return 0;
 }
 
@@ -853,6 +894,9 @@ static void remember_made(struct files_work *work)
 		const int fd = work->local[files_leader(work->want, w)];
 		struct stat st;
 
+		if (work->kept[i] && w->kind == FILE_SOCKET)
+			w->ino = files_find(work->host->want, w->fd)->ino;
+
 		/* And not what stands for it, because its name was taken. */
 		if (fd >= 0 && !files_now_of(work, i) && w->socket &&
 		    file_socket_is_alone(w->socket) && file_socket_has_name(fd, w->socket) &&
@@ -879,11 +923,18 @@ int files_work_table(const struct files_work *work, struct fd_table *table, stru
 		const struct file *w = &work->want->file[i];
 		const int local = work->local[files_leader(work->want, w)];
 
-		if (local < 0)
+		if (local < 0 && !work->kept[i])
 			continue; /* told already */
 		table->entry[table->count].fd = w->fd;
 		table->entry[table->count].cloexec = w->cloexec;
-		table->entry[table->count++].ours = fcntl(local, F_DUPFD_CLOEXEC, 0);
+		table->entry[table->count].changed =
+			work->kept[i] && files_find(work->host->want, w->fd)->cloexec != w->cloexec;
+		table->entry[table->count].ours = work->kept[i] ? -1
+								: fcntl(local, F_DUPFD_CLOEXEC, 0);
+		if (!work->kept[i] && table->entry[table->count].ours < 0)
+			return fail_errno(err, 0, "restore descriptors", "fcntl",
+					  "there is no room for descriptor %d", w->fd);
+		table->count++;
 	}
 	return 0;
 }

@@ -156,37 +156,37 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	file->tcp_going = file_is_going(fd);
 }
 
+struct diag_request {
+	struct nlmsghdr head;
+	struct unix_diag_req ask;
+};
+
 /* Asks sock_diag(7) for the other end of a Unix socket, and how many may wait for one that
- * listens (unix_diag_rqlen). */
-static void ask_diag(int diag, uint64_t ino, struct file_socket *s)
+ * listens (unix_diag_rqlen).  `ino` 0: of all. */
+static bool ask_diag(int diag, uint64_t ino)
 {
-	struct {
-		struct nlmsghdr head;
-		struct unix_diag_req ask;
-	} request = {
+	const struct diag_request request = {
 		.head = { .nlmsg_len = sizeof request,
 			  .nlmsg_type = SOCK_DIAG_BY_FAMILY,
-			  .nlmsg_flags = NLM_F_REQUEST },
+			  .nlmsg_flags = ino ? NLM_F_REQUEST : NLM_F_REQUEST | NLM_F_DUMP },
 		.ask = { .sdiag_family = AF_UNIX,
 			 .udiag_states = ~0u,
 			 .udiag_ino = (uint32_t)ino,
 			 .udiag_show = UDIAG_SHOW_PEER | UDIAG_SHOW_RQLEN,
 			 .udiag_cookie = { ~0u, ~0u } },
 	};
-	char answer[512] __attribute__((aligned(8)));
-	const struct nlmsghdr *head = (const struct nlmsghdr *)answer;
-	const struct unix_diag_msg *message = (const struct unix_diag_msg *)(head + 1);
-	ssize_t n, at = (ssize_t)(sizeof *head + sizeof *message);
 
-	if (s->listening)
-		s->backlog = SOMAXCONN;
-	if (send(diag, &request, sizeof request, 0) < 0)
-		return;
-	n = recv(diag, answer, sizeof answer, MSG_DONTWAIT);
-	if (n < at || head->nlmsg_type != SOCK_DIAG_BY_FAMILY)
-		return;
-	while (at + 4 <= n) {
-		const struct nlattr *attribute = (const struct nlattr *)(answer + at);
+	return send(diag, &request, sizeof request, 0) == sizeof request;
+}
+
+/* What one message of the answer says. */
+static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
+{
+	const struct unix_diag_msg *message = (const struct unix_diag_msg *)(head + 1);
+	size_t at = sizeof *head + sizeof *message;
+
+	while (at + sizeof(struct nlattr) <= head->nlmsg_len) {
+		const struct nlattr *attribute = (const struct nlattr *)((const char *)head + at);
 		struct unix_diag_rqlen queue;
 		uint32_t peer;
 
@@ -200,7 +200,7 @@ static void ask_diag(int diag, uint64_t ino, struct file_socket *s)
 			memcpy(&queue, attribute + 1, sizeof queue);
 			s->backlog = (int)queue.udiag_wqueue;
 		}
-		at += (ssize_t)((attribute->nla_len + 3u) & ~3u);
+		at += (attribute->nla_len + 3u) & ~3u;
 	}
 }
 
@@ -228,41 +228,130 @@ static bool maybe_pair(const struct file *f)
 	       f->socket->remote_bytes <= sizeof(sa_family_t);
 }
 
+static int by_inode(const void *a, const void *b)
+{
+	const struct file *x = *(const struct file *const *)a, *y = *(const struct file *const *)b;
+
+	return (x->ino > y->ino) - (x->ino < y->ino);
+}
+
+#define DIAG_BYTES 32768
+
+/* Until the answer ends, to one question or to that for all sockets. */
+static void hear_all(int diag, struct file **asked, uint32_t count, bool one)
+{
+	char answer[DIAG_BYTES] __attribute__((aligned(8)));
+	ssize_t n;
+
+	while ((n = recv(diag, answer, sizeof answer, MSG_DONTWAIT)) > 0 && budget_step()) {
+		const struct nlmsghdr *head = (const struct nlmsghdr *)answer;
+
+		for (; NLMSG_OK(head, (size_t)n); head = NLMSG_NEXT(head, n)) {
+			const struct unix_diag_msg *message =
+				(const struct unix_diag_msg *)(head + 1);
+			struct file key = { 0 }, *wanted = &key, **found;
+
+			if (head->nlmsg_type != SOCK_DIAG_BY_FAMILY ||
+			    head->nlmsg_len < sizeof *head + sizeof *message)
+				return;
+			key.ino = message->udiag_ino;
+			found = bsearch(&wanted, asked, count, sizeof wanted, by_inode);
+			for (; found && found > asked && by_inode(found - 1, &wanted) == 0; found--)
+				;
+			for (; found && found < asked + count && by_inode(found, &wanted) == 0;
+			     found++)
+				hear_diag(head, (*found)->socket);
+		}
+		if (one)
+			return;
+	}
+}
+
+/* The kernel looks for one socket as long as for all (net/unix/diag.c). */
+#define ASKED_EACH 4
+
 void files_find_peers(struct files *files, pid_t pid)
 {
-	int diag = -1;
+	struct file **asked = calloc(files->count + 1, sizeof *asked);
+	uint32_t count = 0;
+	int diag;
 
-	for (uint32_t i = 0; i < files->count; i++) {
+	for (uint32_t i = 0; asked && i < files->count; i++) {
 		struct file *f = &files->file[i];
 
-		if (!(maybe_pair(f) && !f->socket->peer) &&
-		    !(f->kind == FILE_SOCKET && f->socket && f->socket->backlog < 0))
+		if (f->kind != FILE_SOCKET || !f->socket || f->socket->asked ||
+		    !(maybe_pair(f) || f->socket->backlog < 0))
 			continue;
-		if (diag < 0)
-			diag = diag_open(pid);
-		if (diag < 0)
-			return;
-		ask_diag(diag, f->ino, f->socket);
+		f->socket->asked = true;
+		if (f->socket->listening)
+			f->socket->backlog = SOMAXCONN;
+		asked[count++] = f;
+	}
+	diag = count ? diag_open(pid) : -1;
+	if (diag >= 0) {
+		qsort(asked, count, sizeof(void *), by_inode);
+		if (count > ASKED_EACH && ask_diag(diag, 0))
+			hear_all(diag, asked, count, false);
+		for (uint32_t i = 0; count <= ASKED_EACH && i < count; i++)
+			if (ask_diag(diag, asked[i]->ino))
+				hear_all(diag, asked, count, true);
 	}
 	close_fd(&diag);
+	free(asked);
 }
 
 /* ---- bytes in pipes and socket pairs ------------------------------------------ */
 
-const struct file *files_other_end(const struct files *files, const struct file *file)
+static int by_end(const void *a, const void *b)
 {
-	if (file->kind == FILE_SOCKET && (!file->socket || !file->socket->peer))
-		return NULL;
-	for (uint32_t i = 0; i < files->count; i++) {
-		const struct file *f = &files->file[i];
+	const struct file *x = *(const struct file *const *)a, *y = *(const struct file *const *)b;
 
-		if (file->kind == FILE_PIPE && f->kind == FILE_PIPE && f->ino == file->ino &&
-		    (f->flags & O_ACCMODE) != O_RDONLY && (file->flags & O_ACCMODE) == O_RDONLY)
-			return f;
-		if (file->kind == FILE_SOCKET && f->kind == FILE_SOCKET &&
-		    f->ino == file->socket->peer)
-			return f;
+	if (x->ino != y->ino)
+		return x->ino < y->ino ? -1 : 1;
+	return (x->fd > y->fd) - (x->fd < y->fd);
+}
+
+/* There may be thousands. */
+static bool sort_ends(struct files *files)
+{
+	if (files->ends)
+		return true;
+	files->ends = malloc((files->count + 1) * sizeof *files->ends);
+	for (uint32_t i = 0; files->ends && i < files->count; i++)
+		if (files->file[i].kind == FILE_PIPE || files->file[i].kind == FILE_SOCKET)
+			files->ends[files->end_count++] = &files->file[i];
+	if (files->ends)
+		qsort(files->ends, files->end_count, sizeof(void *), by_end);
+	return files->ends;
+}
+
+static bool is_other_end(const struct file *file, const struct file *f)
+{
+	return file->kind == f->kind &&
+	       (file->kind == FILE_SOCKET ||
+		((f->flags & O_ACCMODE) != O_RDONLY && (file->flags & O_ACCMODE) == O_RDONLY));
+}
+
+const struct file *files_other_end(struct files *files, const struct file *file)
+{
+	const uint64_t ino = file->kind == FILE_SOCKET ? file->socket ? file->socket->peer : 0
+						       : file->ino;
+	uint32_t low = 0, high;
+
+	if (!ino || !sort_ends(files))
+		return NULL;
+	high = files->end_count;
+	while (low < high) {
+		const uint32_t middle = (low + high) / 2;
+
+		if (files->ends[middle]->ino < ino)
+			low = middle + 1;
+		else
+			high = middle;
 	}
+	for (; low < files->end_count && files->ends[low]->ino == ino; low++)
+		if (is_other_end(file, files->ends[low]))
+			return files->ends[low];
 	return NULL;
 }
 

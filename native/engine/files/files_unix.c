@@ -400,7 +400,7 @@ void files_connect_again(struct files_work *work)
 		const struct file *w = &work->want->file[i];
 		int fd;
 
-		if (files_leader(work->want, w) != i || !is_connected(w->socket) ||
+		if (files_leader(work->want, w) != i || work->kept[i] || !is_connected(w->socket) ||
 		    (files_now_of(work, i) && !is_peer_new(work, w->socket)))
 			continue;
 		fd = files_borrow_placed(work, w);

@@ -235,9 +235,12 @@ static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
+		/* An orphan has most in common with the main process, if with anybody. */
+		const int parent = tree->entry[i].parent < 0 ? 0 : tree->entry[i].parent;
 		struct avc_error failed = { 0 };
 
-		if (process && files_prepare(process, &failed) &&
+		if (process &&
+		    files_prepare(process, i ? tree->entry[parent].process : NULL, &failed) &&
 		    (i == 0 || failed.code != AVC_GONE)) {
 			*err = failed;
 			return -1;

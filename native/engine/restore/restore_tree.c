@@ -201,8 +201,8 @@ static int become(struct restore_tree *restored, uint32_t index, struct avc_erro
 	const struct remap *plan = restore_plan_of(restored->generation, index, err);
 	const bool is_mains = restore_plan_place(restored->generation, index)->host == 0;
 
-	if (!plan ||
-	    syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL, err))
+	if (!plan || syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL,
+						   &image->table, err))
 		return -1;
 	if (syscall_batch_change_parasite(batch, image->process, image->slot, err) ||
 	    process_attrs_take_keys(batch, err) ||

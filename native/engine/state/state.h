@@ -23,6 +23,7 @@
 struct image {
 	struct process *process; /* NULL: it had ended, and nobody had waited for it */
 	int parent;              /* the place of its parent's image, or ...         */
+	uint32_t host;           /* the same of the one that forks it in a restore  */
 	pid_t inside;
 	/* Of its session and group, and of the group in the foreground of its terminal; inside, 0:
 	 * outside of the app, or none that could be seen. */

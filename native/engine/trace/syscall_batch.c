@@ -227,10 +227,25 @@ static int fetch(const struct syscall_batch *batch, int fd, struct avc_error *er
 	return ours;
 }
 
-/* Everything its parent had open is closed; descriptor 0 is a socket of which we have the
- * other end. */
+/* What is between those that are kept. */
+static int close_others(struct syscall_batch *batch, uint64_t first, const struct fd_table *table,
+			struct avc_error *err)
+{
+	for (uint32_t i = 0; i < table->count; i++) {
+		const uint64_t fd = (uint64_t)table->entry[i].fd;
+
+		if (table->entry[i].ours >= 0)
+			continue;
+		if (first < fd && syscall_batch_ask(batch, err, SYS_close_range, first, fd - 1))
+			return -1;
+		first = fd + 1;
+	}
+	return syscall_batch_ask(batch, err, SYS_close_range, first, ~0u);
+}
+
+/* Descriptor 0 is a socket of which we have the other end. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
-				  struct avc_error *err)
+				  const struct fd_table *table, struct avc_error *err)
 {
 	avc_remote out;
 
@@ -238,14 +253,16 @@ int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_c
 		if (fd_channel->theirs)
 			syscall_batch_add(batch, SYS_dup3, (uint64_t)fd_channel->theirs, 0,
 					  O_CLOEXEC);
-		syscall_batch_add(batch, SYS_close_range, 1, ~0u);
+		if (close_others(batch, 1, table, err))
+			return -1;
 		batch->socket = fcntl(fd_channel->ours, F_DUPFD_CLOEXEC, 3);
 		return batch->socket < 0 ? fail_errno(err, batch->pid, "restore", "fcntl",
 						      "no descriptor is left for its socket")
 					 : 0;
 	}
 	(void)syscall_batch_data(batch, &out);
-	syscall_batch_add(batch, SYS_close_range, 0, ~0u);
+	if (close_others(batch, 0, table, err))
+		return -1;
 	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out);
 	if (syscall_batch_flush(batch, err))
 		return -1;
@@ -335,15 +352,23 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 		syscall_batch_add(batch, SYS_fcntl, 0, F_DUPFD_CLOEXEC, (uint64_t)socket);
 		syscall_batch_add(batch, SYS_close);
 	}
-	for (uint32_t i = 0, placed = 0; i < table->count; i++) {
+	for (uint32_t i = 0, at = 0; i < table->count; i++) {
 		const int fd = table->entry[i].fd;
 
-		/* The lowest number that is free; of those that are taken `placed` is the
-		 * first that is not below it. */
+		if (table->entry[i].ours < 0) {
+			if (table->entry[i].changed &&
+			    syscall_batch_ask(batch, err, SYS_fcntl, (uint64_t)fd, F_SETFD,
+					      table->entry[i].cloexec ? FD_CLOEXEC : 0))
+				return -1;
+			continue;
+		}
+		/* The lowest number that is free: not those before it, nor what is kept. */
 		for (;; lowest++) {
-			while (placed < i && table->entry[placed].fd < lowest)
-				placed++;
-			if (lowest != socket && !(placed < i && table->entry[placed].fd == lowest))
+			while (at < table->count && table->entry[at].fd < lowest)
+				at++;
+			if (lowest != socket &&
+			    !(at < table->count && table->entry[at].fd == lowest &&
+			      (at < i || table->entry[at].ours < 0)))
 				break;
 		}
 		if (hand_over(batch, socket, table->entry[i].ours, err))

@@ -500,9 +500,10 @@ int fd_send(int socket, int fd);
 struct fd_table {
 	uint32_t count;
 	struct {
-		int fd, ours;
+		int fd, ours; /* -1: it has it from the fork                      */
 		bool cloexec;
-	} * entry; /* by fd, ascending                                        */
+		bool changed; /* not so in the process that forks it              */
+	} * entry;            /* by fd, ascending                                        */
 };
 void fd_table_free(struct fd_table *table);
 
@@ -550,10 +551,12 @@ struct fd_channel {
 	int ours, theirs;
 };
 
-/* Closes what it has from its parent; from here on it can be given descriptors, each to be
- * number 1 until that is closed: by the channel that it has from its parent, if any, or its own. */
+/* Closes what it has from its parent, but for what it keeps of that; from here on it can be given
+ * descriptors, each to be number 1 until that is closed: by the channel that it has from its
+ * parent, if any, or its own. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
-				  struct avc_error *err) warn_unused;
+				  const struct fd_table *table, struct avc_error *err) warn_unused;
+#define FD_KEPT_MIN 2 /* 0 and 1 are for the channel                               */
 /* Of the main process, for its children, who have it from the fork: to make one takes longer than
  * all that comes by it.  None where there is no number left for it. */
 int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
