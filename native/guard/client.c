@@ -459,7 +459,7 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
 					     .until_ns = until_ns };
 
 	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_UNVOUCH)
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_RELEASE)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
 	return guard_send(guard, &request, err);
 }

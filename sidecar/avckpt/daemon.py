@@ -59,6 +59,7 @@ from avckpt.events.journal import Journal
 from avckpt.events.metrics import Metrics
 from avckpt.events.record import EventRecord, of_guard
 from avckpt.events.vocabulary import Kind, Reason, why_not_restored
+from avckpt.evidence.inquests import Inquests
 from avckpt.guard import Command, Event
 from avckpt.policy import Reloaded, Settings, changes, settings_of
 from avckpt.supervision.caretaker import Caretaker
@@ -121,6 +122,7 @@ class Daemon:
         self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
+        self.inquests: Inquests[Watch] = Inquests(self.tell, self.history)
         self.started_at = time.time()
         self._engine = Engine()
         self._watches: dict[int, Watch] = {}
@@ -152,6 +154,7 @@ class Daemon:
         hooks = HookListener(self.run_dir / "hooks.sock", self._hook)
         nodes = looking = None
         try:
+            self.inquests.start()
             self.caretaker.start()
             await api.start()
             self._adopt()
@@ -175,6 +178,7 @@ class Daemon:
                 self._begin_end(watch)
             while self._endings:
                 await asyncio.wait(self._endings)
+            await self.inquests.close()
             loop.remove_reader(self._engine.event_fd)
             self._engine.close()
             self.history.close()
@@ -453,6 +457,7 @@ class Daemon:
                     self._lose_guard(watch, watch.guard)
                 continue
             record = self.tell(watch, self._record(watch, event, at))
+            self.inquests.take(watch, event, record)
             if event.kind is Kind.GUARD_LOST and watch.guard is not None:
                 self._replace_guard(watch, watch.guard)
             _, answer = self._answers.get(event.ticket, (0, None))

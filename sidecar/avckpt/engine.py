@@ -194,6 +194,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.restore_window_ns = _ns("restore window", config.restore_window_s)
     c.shm_bytes = config.shm_bytes
     c.memory_limit_bytes = config.memory_limit_bytes
+    c.remains_ns = _ns("time for remains", config.remains_s)
     c.restore_max = config.restore_max
     c.restore_on_signal = config.restore_on_signal
     c.restore_on_exit = config.restore_on_exit
@@ -222,6 +223,7 @@ def _event(e: Any) -> Event:
         quiescent=bool(e.quiescent),
         restores=e.restores,
         checkpoints=e.checkpoints,
+        remains_pid=e.remains_pid,
         interval_s=e.interval_ns / _NS_PER_S,
         freeze_max_s=e.freeze_max_ns / _NS_PER_S,
         freeze_s=e.freeze_ns / _NS_PER_S,

@@ -24,6 +24,7 @@ class Command(enum.IntEnum):
     VOUCH = 5
     UNHEALTHY = 6
     UNVOUCH = 7
+    RELEASE = 8
 
 
 class Files(enum.IntEnum):
@@ -90,6 +91,8 @@ class GuardConfig:
     """Shared memory of the application's own that is rolled back with it, at most."""
     memory_limit_bytes: int = 0
     """Of the container, with swap; 0: none known."""
+    remains_s: float = 0.0
+    """How long the memory of a dead application is kept for whoever looks at it; 0: it is not."""
     freeze_deadline_s: float = 0.0
     """The longest the app is held to get it stopped; 0: the engine's default."""
     files: Files = Files.REWIND
@@ -122,6 +125,7 @@ class Event:
     quiescent: bool = False
     restores: int = 0
     checkpoints: int = 0
+    remains_pid: int = 0
     interval_s: float = 0.0
     freeze_max_s: float = 0.0
     freeze_s: float = 0.0

@@ -90,8 +90,14 @@ def read_stream(connection: Connection, answer: http.client.HTTPResponse) -> Str
 
 
 def crash(local: LocalSidecar, container: Container, restores: int = 1) -> None:
+    told = crashes_told(local)
     os.kill(container.app_pid, signal.SIGKILL)
     local.wait_for(container, restores=restores, state="protected")
+    wait_until(lambda: crashes_told(local) > told, 10, "what it died of is told", every_s=0.05)
+
+
+def crashes_told(local: LocalSidecar) -> int:
+    return [event["kind"] for event in Client(local.run_dir).history()].count("crash")
 
 
 @pytest.mark.parametrize(
@@ -162,12 +168,12 @@ def test_who_comes_back_with_the_last_id_misses_nothing_and_hears_nothing_twice(
     local.start()
     local.wait_for(web, state="protected")
     again = stream(local, headers={"Last-Event-ID": str(last)})
-    told = [next(again) for _ in range(4)]
-    assert [event["data"]["kind"] for event in told] == ["died", "restored", "registered", "checkpoint"]
-    assert [event["id"] for event in told] == list(range(last + 1, last + 5))
-    assert told[2]["data"]["detail"].startswith("adopted")
-    by_query = stream(local, f"?after={told[2]['id']}")
-    assert next(by_query)["id"] == told[3]["id"]
+    told = [next(again) for _ in range(5)]
+    assert [event["data"]["kind"] for event in told] == ["died", "restored", "crash", "registered", "checkpoint"]
+    assert [event["id"] for event in told] == list(range(last + 1, last + 6))
+    assert told[3]["data"]["detail"].startswith("adopted")
+    by_query = stream(local, f"?after={told[3]['id']}")
+    assert next(by_query)["id"] == told[4]["id"]
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
@@ -176,14 +182,14 @@ def test_the_history_outlives_the_sidecar(local: LocalSidecar, how: signal.Signa
     local.wait_for(web, state="protected")
     crash(local, web)
     before = Client(local.run_dir).history()
-    assert [event["kind"] for event in before] == ["registered", "checkpoint", "died", "restored"]
+    assert [event["kind"] for event in before] == ["registered", "checkpoint", "died", "restored", "crash"]
     local.stop(how)
     local.start()
-    assert Client(local.run_dir).history()[:4] == before
+    assert Client(local.run_dir).history()[:5] == before
     local.wait_for(web, state="protected", adopted=True)
     crash(local, web)
     kinds = [event["kind"] for event in Client(local.run_dir).history()]
-    assert kinds[4:] == ["registered", "checkpoint", "died", "restored"]
+    assert kinds[5:] == ["registered", "checkpoint", "died", "restored", "crash"]
 
 
 def test_a_follower_that_does_not_read_holds_nobody_up(local: LocalSidecar) -> None:
@@ -199,7 +205,7 @@ def test_a_follower_that_does_not_read_holds_nobody_up(local: LocalSidecar) -> N
         stuck.request("GET", "/v1/events?all=1")
         for restores in range(1, 4):
             crash(local, web, restores)
-        assert Client(local.run_dir).history()[-1]["kind"] == "restored"
+        assert Client(local.run_dir).history()[-1]["kind"] == "crash"
         started = time.monotonic()
         assert local.stop() == 0
         assert time.monotonic() - started < 8
@@ -238,13 +244,13 @@ def test_the_command_events(local: LocalSidecar) -> None:
     local.wait_for(web, state="protected")
     crash(local, web)
     lines = local.avckpt("events").stdout.splitlines()
-    assert len(lines) == 4
-    assert "  web: killed by SIGKILL, restored in " in lines[-1]
+    assert len(lines) == 5
+    assert "  web: killed by SIGKILL, restored in " in lines[-2]
     as_json = [json.loads(line) for line in local.avckpt("events", "--json").stdout.splitlines()]
     assert as_json == Client(local.run_dir).history()
     time.sleep(1.1)
     assert local.avckpt("events", "--since", "1s").stdout == ""
-    assert len(local.avckpt("events", "--since", "10m").stdout.splitlines()) == 4
+    assert len(local.avckpt("events", "--since", "10m").stdout.splitlines()) == 5
     assert local.avckpt("events", "web", "--kind", "restored").stdout.splitlines() == [
         line for line in lines if "restored in" in line
     ]
@@ -268,19 +274,19 @@ def test_following_goes_on_over_a_restart_of_the_sidecar(local: LocalSidecar, tm
 
         wait_until(lambda: len(seen()) == 2, 10, "what is kept is told")
         crash(local, web)
-        wait_until(lambda: len(seen()) == 4, 5, "the crash is told at once")
+        wait_until(lambda: len(seen()) == 5, 5, "the crash is told at once")
         local.stop(signal.SIGKILL)
         local.start()
         local.wait_for(web, state="protected")
         crash(local, web)
-        wait_until(lambda: len(seen()) == 8, 10, "what happened meanwhile is told")
+        wait_until(lambda: len(seen()) == 10, 10, "what happened meanwhile is told")
         follower.send_signal(signal.SIGINT)
         assert follower.wait(10) == 0
     finally:
         follower.kill()
         follower.wait()
     numbers = [json.loads(line)["seq"] for line in out.read_text().splitlines()]
-    assert numbers == list(range(numbers[0], numbers[0] + 8))
+    assert numbers == list(range(numbers[0], numbers[0] + 10))
     assert err.read_text().count("waiting for the next one") == 1
 
 

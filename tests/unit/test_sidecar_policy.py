@@ -21,6 +21,7 @@ def test_defaults_are_those_of_the_label_table() -> None:
         restore_window_s=60.0,
         quiesce_s=0.02,
         files=Files.AUTO,
+        remains_s=1.0,
     )
 
 
@@ -51,6 +52,7 @@ def test_every_label_arrives() -> None:
         quiesce_s=0.0,
         files=Files.STRICT,
         tcp=Tcp.RESET_MOVED,
+        remains_s=1.0,
     )
 
 

@@ -154,6 +154,10 @@ static void obey(struct avc_guard *guard, enum avc_command command, uint64_t tic
 	case AVC_COMMAND_UNVOUCH:
 		policy_unvouch(&guard->policy);
 		break;
+	case AVC_COMMAND_RELEASE:
+		if (ticket == (uint64_t)guard->remains.pid)
+			guard_release_remains(guard);
+		break;
 	}
 }
 
@@ -279,7 +283,9 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
 	const uint64_t tell_ns = guard_tell_due(guard);
 	const uint64_t earlier_ns = tell_ns < sooner_ns ? tell_ns : sooner_ns;
-	const uint64_t soon_ns = waits_ns < earlier_ns ? waits_ns : earlier_ns;
+	const uint64_t remains_ns = guard->remains.pid ? guard->remains.until_ns : UINT64_MAX;
+	const uint64_t first_ns = remains_ns < earlier_ns ? remains_ns : earlier_ns;
+	const uint64_t soon_ns = waits_ns < first_ns ? waits_ns : first_ns;
 	const uint64_t due = guard->next_ns < soon_ns ? guard->next_ns : soon_ns;
 	uint64_t ns = due > now ? due - now : 0;
 	struct timespec timeout;
@@ -291,6 +297,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
 	watch(guard, &n, output_fd(&guard->output));
+	if (guard->remains.pid)
+		watch(guard, &n, guard->remains.pidfd);
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
@@ -344,6 +352,7 @@ static void let_go(struct avc_guard *guard)
 	last_pid_forget();
 	output_end(&guard->output);
 	guard_drop_all(guard);
+	guard_release_remains(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
 	/* The end of this process detaches what is left. */
@@ -387,6 +396,7 @@ static void guard_main(struct avc_guard *guard)
 			continue;
 		}
 		guard_reap_dead(guard);
+		guard_tend_remains(guard);
 		guard_tend_tree(guard);
 		if (pidfd_ended(guard->channel.init_pidfd)) {
 			ended = true;

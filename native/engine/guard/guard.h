@@ -76,6 +76,12 @@ struct avc_guard {
 	bool sent;               /* since the last checkpoint                         */
 	struct avc_event untold; /* checkpoints that were not told of yet          */
 	uint64_t told_ns;        /* of the last that were                           */
+	/* The holder of an app that has died, for whoever looks at its memory; 0: there is none */
+	struct {
+		pid_t pid;
+		int pidfd;
+		uint64_t until_ns;
+	} remains;
 };
 
 /* ---- guard.c: what is told ------------------------------------------------- */
@@ -184,6 +190,10 @@ void output_end(struct output *output);
 /* ---- guard_death.c --------------------------------------------------------- */
 
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
+/* Nobody looks at the dead app's memory any more. */
+void guard_release_remains(struct avc_guard *guard);
+/* They were killed, or looked at for long enough. */
+void guard_tend_remains(struct avc_guard *guard);
 
 /* ---- guard.c ---------------------------------------------------------------- */
 

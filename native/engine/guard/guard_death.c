@@ -116,6 +116,33 @@ static void say_working(void *channel)
 	init_channel_working(channel);
 }
 
+void guard_release_remains(struct avc_guard *guard)
+{
+	if (guard->remains.pid)
+		tracee_end(guard->remains.pid, guard->remains.pidfd);
+	guard->remains.pid = 0;
+}
+
+void guard_tend_remains(struct avc_guard *guard)
+{
+	if (guard->remains.pid &&
+	    (now_ns() >= guard->remains.until_ns || pidfd_ended(guard->remains.pidfd)))
+		guard_release_remains(guard);
+}
+
+/* The holder has the dead app's memory; what was open is the restored one's. */
+static void keep_remains(struct avc_guard *guard)
+{
+	if (!guard->config.remains_ns || !guard->main.holder) {
+		process_unhold_soon(&guard->main);
+		return;
+	}
+	guard->remains.pid = process_give_holder(&guard->main, &guard->remains.pidfd);
+	guard->remains.until_ns = now_ns() + guard->config.remains_ns;
+	/* Memory that nobody runs in goes before anybody's. */
+	proc_set_oom_score_adj(guard->remains.pid, "1000");
+}
+
 /* The newest generation; when restores are used up, the one before it.  There were `had`
  * when the app died. */
 static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
@@ -182,8 +209,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		ending = true;
 		guard_kill_lost(guard);
 	}
-	/* It has the dead app's memory, and what was open is the restored one's. */
-	process_unhold_soon(&guard->main);
+	keep_remains(guard);
 	return guard->count > 0;
 }
 
@@ -245,6 +271,8 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	guard->channel.working_ns = now_ns();
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
+	guard_release_remains(guard); /* of the death before */
+	event.remains_pid = guard->config.remains_ns ? guard->main.holder : 0;
 	guard_emit(guard, &event);
 	process_close(&guard->main);
 	guard_kill_lost(guard);

@@ -78,7 +78,7 @@ bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (tracee_is_ending(pid) || guard->dirty.idle.pid == pid)
+	if (tracee_is_ending(pid) || guard->dirty.idle.pid == pid || guard->remains.pid == pid)
 		return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->holder == pid)

@@ -831,9 +831,20 @@ void process_unhold(struct process *process)
 	forget_holder(process);
 }
 
+pid_t process_give_holder(struct process *process, int *pidfd)
+{
+	const pid_t holder = process->holder;
+
+	*pidfd = process->holder_pidfd;
+	forget_holder(process);
+	return holder;
+}
+
 void process_unhold_soon(struct process *process)
 {
-	if (process->holder)
-		tracee_end(process->holder, process->holder_pidfd);
-	forget_holder(process);
+	int pidfd;
+	const pid_t holder = process_give_holder(process, &pidfd);
+
+	if (holder)
+		tracee_end(holder, pidfd);
 }

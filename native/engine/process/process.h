@@ -127,6 +127,8 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		 struct avc_error *err) warn_unused;
 void process_unhold(struct process *process);
 void process_unhold_soon(struct process *process);
+/* The holder is the caller's from here on, with its pidfd (-1: there was none). */
+pid_t process_give_holder(struct process *process, int *pidfd);
 
 /* ---- tracker.c -------------------------------------------------------------------- */
 

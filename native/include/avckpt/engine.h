@@ -85,6 +85,8 @@ struct avc_config {
 	uint64_t restore_window_ns;
 	uint32_t restore_max;
 	uint64_t shm_bytes;             /* shared memory that is rolled back, at most */
+	uint64_t remains_ns;            /* how long a dead app's memory is kept for
+	                                 * whoever looks at it; 0: it is not      */
 	uint64_t memory_limit_bytes;    /* of the container, with swap; 0: none known */
 	uint8_t restore_on_signal;      /* killed by a signal nobody asked for       */
 	uint8_t restore_on_exit;        /* any non-zero exit status                  */
@@ -158,6 +160,9 @@ struct avc_event {
 	uint32_t quiescent;     /* CHECKPOINT: 1 if taken at a quiescent moment  */
 	uint32_t restores;      /* RESTORED: since the guard was started         */
 	uint32_t checkpoints;   /* CHECKPOINT: taken since the last that was told */
+	int32_t remains_pid;    /* DIED: a stopped task that has its memory, until
+	                         * AVC_COMMAND_RELEASE or for remains_ns after the
+	                         * restore; 0: there is none                      */
 	uint64_t interval_ns;   /* CHECKPOINT: between two of them, at present    */
 	uint64_t freeze_max_ns; /* CHECKPOINT: the longest freeze of them         */
 	/* CHECKPOINT, MISSED: first PTRACE_INTERRUPT until the last thread runs
@@ -195,8 +200,10 @@ enum avc_command {
 	AVC_COMMAND_UNHEALTHY = 6,   /* the app hangs: as a crash, but of what is
 	                             * held only what was vouched for is used (the
 	                             * oldest, if nothing was); as RESTORE        */
-	AVC_COMMAND_UNVOUCH = 7      /* nobody says any more whether the app is
+	AVC_COMMAND_UNVOUCH = 7,     /* nobody says any more whether the app is
 	                             * healthy; no answer                         */
+	AVC_COMMAND_RELEASE = 8      /* the memory of `ticket`, a remains_pid, has been
+	                             * looked at; no answer                       */
 };
 
 struct avc_engine;

@@ -14,6 +14,7 @@ from typing import Any
 from avckpt import __version__
 from avckpt.containers.protected import State
 from avckpt.events.record import EventRecord, field_types
+from avckpt.evidence.crash import Crash
 
 Json = dict[str, Any]
 
@@ -37,6 +38,7 @@ def document() -> Json:
                 "Container": _container(),
                 "Event": _event(),
                 "Error": _ERROR,
+                "Crash": _crash(),
                 "Configuration": _CONFIGURATION,
             },
             "responses": {
@@ -183,11 +185,19 @@ def _event() -> Json:
     return _object(properties, optional=tuple(name for name in properties if name not in always))
 
 
+def _crash() -> Json:
+    properties: Json = {
+        each.name: {**_schema_of(type(each.default)), "description": each.metadata["description"]}
+        for each in fields(Crash)
+    }
+    return _object(properties, optional=tuple(properties))
+
+
 def _schema_of(kind: type, values: Iterable[enum.Enum] = ()) -> Json:
     if issubclass(kind, enum.Enum):
         return {"type": "string", "enum": [member.value for member in values or kind]}
     names = {bool: "boolean", int: "integer", float: "number", str: "string"}
-    return {"type": names[kind]} if kind in names else _ref("Error")
+    return {"type": names[kind]} if kind in names else _ref("Crash" if kind is Crash else "Error")
 
 
 def _answer(description: str, schema: Json, media_type: str = "application/json") -> Json:

@@ -95,7 +95,7 @@ def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
             )
 
     def watch(pid: int, supervisor: Supervisor) -> None:
-        supervisor.watch(replace(settings.config, memory_limit_bytes=memory_limit_bytes(pid)))
+        supervisor.watch(replace(settings.config, memory_limit_bytes=memory_limit_bytes(pid), remains_s=0.0))
 
     return _run(argv, Supervisor, watch, verbose, io_uring)
 

@@ -130,7 +130,7 @@ class NodesSupervisor(Supervisor):
             raise Busy(f"there are {units.UNITS_MOST} units already")
         config = settings_of(units.labels_of_node(claim.labels, self._labels)).config
         cookie = next(self._cookies)
-        config = replace(config, memory_limit_bytes=memory_limit_bytes(peer.pid))
+        config = replace(config, memory_limit_bytes=memory_limit_bytes(peer.pid), remains_s=0.0)
         guard = self._engine.start_guard(peer.pidfd, config, cookie)
         name = units.unique_name(claim.name, [node.name for node in self._nodes.values()])
         self._nodes[cookie] = _Node(name, peer, guard)

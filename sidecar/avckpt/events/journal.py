@@ -16,6 +16,7 @@ LEVELS = {
     Kind.ATTACHED: logging.DEBUG,
     Kind.GUARD_LOST: logging.WARNING,
     Kind.DIED: logging.INFO,
+    Kind.CRASH: logging.INFO,
     Kind.RESTORED: logging.WARNING,
     Kind.GAVE_UP: logging.ERROR,
     Kind.DROPPED: logging.WARNING,

@@ -25,6 +25,7 @@ from avckpt.events.vocabulary import (
     why_dropped,
     why_not_restored,
 )
+from avckpt.evidence.crash import Crash
 from avckpt.guard import Event
 
 NUMBERS_BELOW = 1 << 64
@@ -71,12 +72,14 @@ class EventRecord:
         "restores within the time of avckpt.restore.max, this one included; of a dropped generation: its crashes"
     )
     restores: int | None = said("restores since the sidecar protects this run of the container")
+    left: int | None = said("restores that avckpt.restore.max leaves for its time")
     quiescent: bool | None = said("whether the checkpoint was taken at a quiet moment")
     images: str | None = said("how the checkpoint got the memory: fork or dirty")
     fork_reason: str | None = said("why it was forked, where avckpt.images is not fork")
     app_pid: int | None = said("the application's main process, in the sidecar's PID namespace")
     app_pid_inside: int | None = said("the same in the container's")
     detail: str = said("one clause for a person, where the rest does not say it", "")
+    crash: Crash | None = said("what it died of, and where")  # noqa: RUF009
     error: AvckptError | None = said("what went wrong, as in the API's errors")  # noqa: RUF009
 
     @property
@@ -91,7 +94,7 @@ class EventRecord:
             value = getattr(self, each.name)
             if isinstance(value, enum.Enum):
                 value = value.value
-            elif isinstance(value, AvckptError):
+            elif isinstance(value, (AvckptError, Crash)):
                 value = value.to_json()
             if value is not None:
                 data[each.name] = value
@@ -117,6 +120,8 @@ class EventRecord:
 def _value(name: str, kind: type, value: object) -> object:
     if kind is AvckptError and isinstance(value, dict):
         return from_json(value)
+    if kind is Crash and isinstance(value, dict):
+        return Crash.from_json(value)
     if issubclass(kind, enum.Enum):
         return kind(value)
     # JSON has numbers of any length, and Python's JSON has NaN.
@@ -127,7 +132,7 @@ def _value(name: str, kind: type, value: object) -> object:
     raise ValueError(f"{name} is {value!r}")
 
 
-_TYPES: dict[str, type] = {cls.__name__: cls for cls in (Kind, Reason, AvckptError, str, int, float, bool)}
+_TYPES: dict[str, type] = {cls.__name__: cls for cls in (Kind, Reason, AvckptError, Crash, str, int, float, bool)}
 
 
 def field_types() -> dict[str, type]:
@@ -235,6 +240,23 @@ def _restored(record: EventRecord) -> str:
     )
 
 
+def _crashed(record: EventRecord) -> str:
+    crash = record.crash or Crash()
+    often = f"; this crash for the {_ordinal(crash.count)} time" if crash.count > 1 else ""
+    if record.outcome is Reason.RESTORED:
+        lost = f"; went back {record.age_s or 0:.1f} s, {record.lost_s or 0:.2f} s lost, {record.left} restore(s) left"
+    else:
+        lost = "; not restored"
+    what = str(crash) or describe_wait_status(record.wait_status or 0)
+    command = f"{crash.command}: " if crash.command else ""
+    return f"{command}{what}{lost}{often}{f'; {crash.unknown}' if crash.unknown else ''}"
+
+
+def _ordinal(number: int) -> str:
+    last = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{last}"
+
+
 def _nothing_held(record: EventRecord) -> str:
     return "; nothing is held to go back to" if record.generations == 0 else ""
 
@@ -257,6 +279,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     # Whether this is bad news is known only with what follows.
     Kind.DIED: lambda record: f"died: {describe_wait_status(record.wait_status or 0)}",
     Kind.RESTORED: _restored,
+    Kind.CRASH: _crashed,
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
     Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
     Kind.HEALTH: _detail,

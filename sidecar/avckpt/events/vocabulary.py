@@ -54,6 +54,7 @@ class Kind(_Named):
     REGISTERED = "registered"
     HEALTH = "health"
     CONFIGURED = "configured"
+    CRASH = "crash"
     NOTIFIED = "notified"
     NOTIFY_FAILED = "notify_failed"
 

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds out what applications die of, while their guards bring them back."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from avckpt.containers.looks import look
+from avckpt.errors import AvckptError
+from avckpt.events.vocabulary import signal_name
+from avckpt.evidence.crash import Crash, Frame, crash_of, fingerprint, placed
+from avckpt.evidence.deaths import Death, Deaths, Delivery
+from avckpt.evidence.kernel_log import KernelLog
+from avckpt.evidence.remains import Remains
+
+CALLERS_LEAST = 3
+"""Who keeps frame pointers has more callers than that; of others the stack is looked at."""
+
+log = logging.getLogger("avckpt")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A death, as far as the kernel told of it by itself."""
+
+    wait_status: int
+    crash: Crash
+    death: Death
+    hit: Delivery | None
+    remains_pid: int
+    init_pid: int
+
+
+class Collector:
+    """For one event loop; `start()` it there.  What cannot be known is said in the crash, and is no error."""
+
+    def __init__(self) -> None:
+        self._deaths: Deaths | None = None
+        self._log: KernelLog | None = None
+        self._problem = "the sidecar does not listen"
+
+    def start(self) -> None:
+        """Begins to hear of deaths."""
+        try:
+            self._deaths = Deaths()
+        except AvckptError as error:
+            self._problem = str(error)
+            log.info("where applications die will not be known: %s", error)
+            return
+        for fd in self._deaths.fds:
+            asyncio.get_running_loop().add_reader(fd, self._deaths.take)
+        try:
+            self._log = KernelLog()
+        except OSError as error:
+            log.info("addresses of faults will not be known: /dev/kmsg: %s", error.strerror)
+
+    def close(self) -> None:
+        """Hears no more."""
+        if self._deaths is not None:
+            for fd in self._deaths.fds:
+                asyncio.get_running_loop().remove_reader(fd)
+            self._deaths.close()
+        if self._log is not None:
+            self._log.close()
+        self._deaths = self._log = None
+
+    def open_case(self, pid: int, wait_status: int, remains_pid: int, init_pid: int) -> Case:
+        """What the kernel told of the end of a process.  At once, and before its number is another one's."""
+        signum = wait_status & 0x7F
+        name = signal_name(signum) if signum else ""
+        if self._deaths is None:
+            return Case(wait_status, Crash(signal=name, unknown=self._problem), Death(), None, remains_pid, init_pid)
+        death = self._deaths.of(pid)
+        hit = death.fatal(signum) if signum else None
+        fault = self._log.of(hit.tid) if hit is not None and self._log is not None else None
+        crash = crash_of(name, hit, death, fault)
+        if crash.sender_pid:
+            crash = replace(crash, sender=_name_of(crash.sender_pid))
+        if signum and hit is None:
+            crash = replace(crash, unknown="the kernel told of too many deaths at once")
+        return Case(wait_status, crash, death, hit, remains_pid, init_pid)
+
+    async def examine(self, case: Case) -> Crash:
+        """With what the memory of the dead tells."""
+        if not case.remains_pid:
+            return self._identified(case, replace(case.crash, unknown=case.crash.unknown or "its memory was not kept"))
+        try:
+            crash, frames = await look("remains", case.remains_pid, lambda: _examine(case))
+        except (AvckptError, OSError) as error:
+            why = f"its memory cannot be read: {error}"
+            return self._identified(case, replace(case.crash, unknown=case.crash.unknown or why))
+        return self._identified(case, crash, frames)
+
+    @staticmethod
+    def _identified(case: Case, crash: Crash, frames: list[Frame] | None = None) -> Crash:
+        return replace(crash, fingerprint=fingerprint(crash, case.wait_status, frames or []))
+
+
+def _examine(case: Case) -> tuple[Crash, list[Frame]]:
+    """Raises OSError."""
+    parent = Path(f"/proc/{case.remains_pid}/stat").read_text().rpartition(")")[2].split()[1]
+    if int(parent) != case.init_pid:
+        raise ProcessLookupError(f"process {case.remains_pid} is another one")
+    remains = Remains(case.remains_pid)
+    try:
+        frames = _frames(remains, case.hit)
+        return replace(placed(case.crash, frames), command=remains.command), frames
+    finally:
+        remains.close()
+
+
+def _frames(remains: Remains, hit: Delivery | None) -> list[Frame]:
+    if hit is None or not hit.registers:
+        return []
+    kept = remains.frames(hit.callers)
+    if len(kept) >= CALLERS_LEAST:
+        return kept
+    return remains.frames([hit.registers["rip"], *remains.on_stack(hit.registers["rsp"])])
+
+
+def _name_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    except OSError:
+        return ""

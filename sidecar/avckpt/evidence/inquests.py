@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Follows each death: what the kernel told, what the memory says, what came of it, and then one event of all that."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Generic, Protocol, TypeVar
+
+from avckpt.containers.protected import Protected
+from avckpt.engine import Guard
+from avckpt.errors import AvckptError
+from avckpt.events.history import History
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import EXPECTED, Kind, Reason
+from avckpt.evidence.collector import Case, Collector
+from avckpt.evidence.crash import Crash
+from avckpt.guard import Command, Event
+
+log = logging.getLogger("avckpt")
+
+OUTCOME_S = 15.0
+"""How long the end of a restore is waited for."""
+
+
+class Watched(Protocol):
+    """What is needed of the daemon's side of a container."""
+
+    container: Protected
+    guard: Guard | None
+
+
+W = TypeVar("W", bound=Watched)
+
+
+class Inquests(Generic[W]):
+    """One for each death, beside whatever the daemon does.  For one event loop; `start()` it there."""
+
+    def __init__(self, tell: Callable[[W, EventRecord], EventRecord], history: History) -> None:
+        self._tell = tell
+        self._history = history
+        self._collector = Collector()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._open: dict[int, asyncio.Future[EventRecord]] = {}
+        """By the container's cookie: what follows the death that is looked into."""
+
+    def start(self) -> None:
+        """Begins to hear of deaths."""
+        self._collector.start()
+
+    async def close(self) -> None:
+        """Gives up what is not finished."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._collector.close()
+
+    def take(self, watch: W, event: Event, record: EventRecord) -> None:
+        """Hears what a guard has told: of a death, or what followed."""
+        cookie = watch.container.cookie
+        if event.kind is Kind.DIED:
+            case = self._collector.open_case(
+                event.app_pid, event.wait_status, event.remains_pid, watch.container.init_pid
+            )
+            outcome = self._open[cookie] = asyncio.get_running_loop().create_future()
+            task = asyncio.get_running_loop().create_task(self._look_into(watch, case, outcome))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        elif event.kind in (Kind.RESTORED, Kind.GAVE_UP):
+            waiting = self._open.pop(cookie, None)
+            if waiting is not None and not waiting.done():
+                waiting.set_result(record)
+
+    async def _look_into(self, watch: W, case: Case, outcome: asyncio.Future[EventRecord]) -> None:
+        try:
+            crash = await self._collector.examine(case)
+        finally:
+            self._release(watch, case)
+        try:
+            followed = await asyncio.wait_for(outcome, OUTCOME_S)
+        except asyncio.TimeoutError:
+            followed = EventRecord(Kind.GAVE_UP, reason=Reason.SIGNAL, wait_status=case.wait_status)
+        if followed.reason is Reason.COMMAND or followed.outcome in EXPECTED:
+            return  # somebody wanted it
+        self._tell(watch, self._record(watch.container, crash, followed))
+
+    def _record(self, container: Protected, crash: Crash, followed: EventRecord) -> EventRecord:
+        before = [
+            each
+            for each in self._history.after()
+            if each.crash is not None and each.crash.fingerprint == crash.fingerprint and _is_of(each, container)
+        ]
+        left = container.config.restore_max - followed.attempt if followed.attempt is not None else None
+        return EventRecord(
+            Kind.CRASH,
+            reason=followed.reason,
+            outcome=followed.outcome,
+            wait_status=followed.wait_status,
+            generation=followed.generation,
+            age_s=followed.age_s,
+            lost_s=followed.lost_s,
+            attempt=followed.attempt,
+            left=max(left, 0) if left is not None else None,
+            crash=replace(crash, count=len(before) + 1),
+        )
+
+    @staticmethod
+    def _release(watch: W, case: Case) -> None:
+        if case.remains_pid and watch.guard is not None:
+            # One that has just ended has released them.
+            with contextlib.suppress(AvckptError):
+                watch.guard.command(Command.RELEASE, case.remains_pid)
+
+
+def _is_of(record: EventRecord, container: Protected) -> bool:
+    return record.id == container.id or (bool(container.name) and record.container == container.name)

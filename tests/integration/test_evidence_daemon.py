@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an application died of, as its sidecar tells of it: real deaths of real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from testkit.harness import wait_until
+from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
+
+pytestmark = pytest.mark.shared_machine("a sidecar, its guards and containers have to get CPU time within seconds")
+
+# A thread with a name of its own dies of what it is told to.
+VICTIM = """
+import ctypes, os, signal, threading, time
+wanted = []
+def work():
+    ctypes.CDLL(None).prctl(15, b"worker", 0, 0, 0)
+    while not wanted:
+        time.sleep(0.01)
+    if wanted[0] == signal.SIGUSR1:
+        ctypes.string_at(0x10)
+    os.abort()
+for each in (signal.SIGUSR1, signal.SIGUSR2):
+    signal.signal(each, lambda signum, frame: wanted.append(signum))
+signal.signal(signal.SIGHUP, lambda *_: os._exit(3))
+threading.Thread(target=work, daemon=True).start()
+while True:
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture
+def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
+    with local_sidecar(tmp_path) as sidecar:
+        sidecar.start()
+        yield sidecar
+
+
+def crashes(sidecar: LocalSidecar, name: str) -> list[dict[str, Any]]:
+    """The events that say what it died of."""
+    return [json.loads(line) for line in sidecar.avckpt("events", name, "-k", "crash", "--json").stdout.splitlines()]
+
+
+def crash_by(sidecar: LocalSidecar, victim: Container, signum: int) -> dict[str, Any]:
+    """Sends it a signal, waits for what is told of its death, and for the next checkpoint."""
+    before = sidecar.wait_for(victim, state="protected")
+    told = len(crashes(sidecar, victim.name))
+    os.kill(victim.app_pid, signum)
+    wait_until(lambda: len(crashes(sidecar, victim.name)) > told, 10, "the crash is told of", every_s=0.05)
+    wait_until(
+        lambda: sidecar.row(victim)["checkpoints"] > before["checkpoints"] + 1, 10, "it is protected", every_s=0.05
+    )
+    return crashes(sidecar, victim.name)[-1]
+
+
+def test_what_it_died_of(sidecar: LocalSidecar) -> None:
+    victim = sidecar.protected("victim", [sys.executable, "-c", VICTIM])
+
+    event = crash_by(sidecar, victim, signal.SIGUSR1)
+    crash = event["crash"]
+    assert (crash["signal"], crash["code"], crash["fault"]) == ("SIGSEGV", "SEGV_MAPERR", "0x10")
+    assert (crash["thread"], crash["count"]) == ("worker", 1)
+    assert crash["command"] == sys.executable
+    # string_at() reads in the C library, whose build id Debian's own tools know, too.
+    assert crash["module"].endswith("/libc.so.6")
+    assert len(crash["build_id"]) == 40
+    assert "_ctypes" in crash["backtrace"]
+    assert (event["outcome"], event["left"]) == ("restored", 4)
+    assert event["lost_s"] >= event["age_s"] > 0
+
+    again = crash_by(sidecar, victim, signal.SIGUSR1)["crash"]
+    assert (again["fingerprint"], again["count"]) == (crash["fingerprint"], 2)
+
+    aborted = crash_by(sidecar, victim, signal.SIGUSR2)["crash"]
+    assert (aborted["signal"], aborted["code"], aborted["thread"]) == ("SIGABRT", "SI_TKILL", "worker")
+    assert "sender_pid" not in aborted
+    assert aborted["fingerprint"] != crash["fingerprint"]
+
+    killed = crash_by(sidecar, victim, signal.SIGKILL)["crash"]
+    assert (killed["signal"], killed["code"], killed["sender_pid"]) == ("SIGKILL", "SI_USER", os.getpid())
+
+    # The guard keeps nothing that nobody looks at any more.
+    wait_until(lambda: len(_holders(victim)) <= 1, 5, "what the dead have left is gone", every_s=0.05)
+
+
+def test_an_exit_has_no_place(sidecar: LocalSidecar) -> None:
+    victim = sidecar.protected("victim", [sys.executable, "-c", VICTIM])
+    event = crash_by(sidecar, victim, signal.SIGHUP)
+    assert os.waitstatus_to_exitcode(event["wait_status"]) == 3
+    assert not {"signal", "at"} & set(event["crash"])
+    assert event["crash"]["command"] == sys.executable
+
+
+def _holders(victim: Container) -> list[int]:
+    children = Path(f"/proc/{victim.init_pid}/task/{victim.init_pid}/children").read_text().split()
+    return [int(pid) for pid in children if _name_of(pid) == "avckpt-hold"]
+
+
+def _name_of(pid: str) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
