@@ -192,7 +192,7 @@ class LocalSidecar:
             raise AssertionError(f"the sidecar ended with {self.process.returncode}:\n{self.log}")
         try:
             pid: int = Client(self.run_dir).info()["pid"]
-            return pid == self.process.pid
+            return pid in (self.process.pid, *children_of(self.process.pid))  # it may have a watchdog
         except SidecarUnreachable:
             return False
 

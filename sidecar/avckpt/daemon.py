@@ -62,6 +62,7 @@ from avckpt.events.vocabulary import Kind, Reason, why_not_restored
 from avckpt.evidence.inquests import Inquests
 from avckpt.guard import Command, Event
 from avckpt.policy import Reloaded, Settings, changes, settings_of
+from avckpt.supervision import watchdog
 from avckpt.supervision.caretaker import Caretaker
 from avckpt.supervision.notify import Notifier
 
@@ -112,8 +113,9 @@ class Watch:
 class Daemon:
     """All the sidecar's state.  `run()` it once."""
 
-    def __init__(self, run_dir: Path, config_path: Path) -> None:
+    def __init__(self, run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
         self.run_dir = run_dir
+        self._beat_fd = beat_fd
         self.configuration = Configuration(config_path)
         self.registry = Registry()
         self.records = Records(run_dir / "containers")
@@ -154,6 +156,8 @@ class Daemon:
         hooks = HookListener(self.run_dir / "hooks.sock", self._hook)
         nodes = looking = None
         try:
+            if self._beat_fd >= 0:
+                self._beat()
             self.inquests.start()
             self.caretaker.start()
             await api.start()
@@ -182,6 +186,12 @@ class Daemon:
             loop.remove_reader(self._engine.event_fd)
             self._engine.close()
             self.history.close()
+
+    def _beat(self) -> None:
+        """A sign of life for the watchdog, now and as long as the loop turns."""
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
+            os.write(self._beat_fd, b".")
+        asyncio.get_running_loop().call_later(watchdog.LOOK_S, self._beat)
 
     async def command(self, name: str, command: Command) -> tuple[Protected, EventRecord]:
         """Gives a command to a container and waits for the answer.
@@ -576,8 +586,8 @@ def raise_descriptor_limit() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def serve(run_dir: Path, config_path: Path) -> None:
-    """Runs the sidecar in the foreground until it is told to stop.
+def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
+    """Runs the sidecar in the foreground until it is told to stop; gives a sign of life to `beat_fd`, if that is one.
 
     Raises Denied or Unsupported when this process or machine cannot do it,
     Busy when there is a sidecar already.
@@ -590,7 +600,7 @@ def serve(run_dir: Path, config_path: Path) -> None:
         with only_one(run_dir):
             for name in ("containers", "health"):
                 keep_private(run_dir / name)
-            asyncio.run(Daemon(run_dir, config_path).run())
+            asyncio.run(Daemon(run_dir, config_path, beat_fd).run())
     except OSError as error:
         kind = Denied if isinstance(error, PermissionError) else AvckptError
         raise kind(f"{error.filename or run_dir} cannot be used", errno=error.errno or 0) from error

@@ -9,6 +9,7 @@ import signal
 import pytest
 
 from testkit.harness import SIDECAR_NAME, SLOWNESS, Container, ContainerFactory, Sidecar
+from testkit.procfs import children_of
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; podman stop kills after ten seconds"
@@ -80,7 +81,7 @@ def test_stopped_while_the_sidecar_is_stopped(sidecar: Sidecar, container: Conta
     """What stops the sidecar's process (SIGSTOP, a debugger) stops no guard: the container ends as it should."""
     made = container.protected("sleep", "1000", labels=QUICK)
     sidecar.wait_generation(made, 2)
-    daemon = sidecar.podman.inspect(SIDECAR_NAME)["State"]["Pid"]
+    (daemon,) = children_of(sidecar.podman.inspect(SIDECAR_NAME)["State"]["Pid"])
     os.kill(daemon, signal.SIGSTOP)
     try:
         sidecar.podman.run("stop", "--time", "2", made.name)

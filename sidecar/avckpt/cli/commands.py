@@ -116,16 +116,26 @@ def sidecar(verbose: bool, config: Path) -> None:
         stream=sys.stderr,
     )
     logging.getLogger("asyncio").setLevel(logging.WARNING)
+    if "container" not in os.environ:  # podman-run(1)
+        sys.exit(_serve(config, -1))
+    from avckpt.supervision.watchdog import keep_alive
+
+    status = keep_alive(lambda beat_fd: _serve(config, beat_fd))
+    if status == ExitCode.FAILED:
+        # Podman starts its container again at once, for ever (--restart=always).
+        time.sleep(START_AGAIN_S)
+    sys.exit(status)
+
+
+def _serve(config: Path, beat_fd: int) -> int:
     try:
         from avckpt.daemon import serve
 
-        serve(_run_dir(), config)
+        serve(_run_dir(), config, beat_fd)
     except AvckptError as error:
         click.echo(f"avckpt: {error}", err=True)
-        # Podman starts its container again at once, for ever (--restart=always).
-        if "container" in os.environ:  # podman-run(1)
-            time.sleep(START_AGAIN_S)
-        sys.exit(int(ExitCode.FAILED))
+        return int(ExitCode.FAILED)
+    return int(ExitCode.OK)
 
 
 @main.command()

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main process of the sidecar's container, without the container: it outlives a daemon that hangs."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from testkit.harness import wait_until
+from testkit.local_sidecar import LocalSidecar, local_sidecar
+from testkit.procfs import children_of
+
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+
+
+@pytest.fixture
+def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalSidecar]:
+    """A sidecar as Podman starts it, and one container."""
+    monkeypatch.setenv("container", "podman")
+    with local_sidecar(tmp_path) as made:
+        made.start()
+        yield made
+
+
+def daemon_of(local: LocalSidecar) -> int:
+    """The watchdog's child; 0: there is none at this moment."""
+    assert local.process is not None
+    children = children_of(local.process.pid)
+    return children[0] if children else 0
+
+
+def stop_itself(pid: int) -> None:
+    os.kill(pid, signal.SIGSTOP)
+
+
+def die(pid: int) -> None:
+    os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("end", [stop_itself, die])
+def test_another_daemon_takes_over(end: Callable[[int], None], local: LocalSidecar) -> None:
+    web = local.protected("web", ["sleep", "1000"])
+    local.wait_for(web, state="protected")
+    first = daemon_of(local)
+    end(first)
+    wait_until(lambda: daemon_of(local) not in (0, first), 60, "another daemon")
+    wait_until(lambda: "is ready, 1 container(s) found" in local.log, 60, "it has found the container")
+    local.wait_for(web, 60, state="protected")
+    assert ("has given no sign of life for" in local.log) == (end is stop_itself)
+    os.kill(web.app_pid, signal.SIGKILL)
+    local.wait_for(web, restores=1)
+
+
+def test_a_killed_watchdog_leaves_no_daemon(local: LocalSidecar) -> None:
+    daemon = os.pidfd_open(daemon_of(local))
+    assert local.stop(signal.SIGKILL) == -signal.SIGKILL
+    wait_until(lambda: bool(_ended(daemon)), 10, "the daemon has ended")
+    os.close(daemon)
+
+
+def test_it_stops_when_it_is_told_to(local: LocalSidecar) -> None:
+    assert local.stop() == 0
+    assert "asked to stop" in local.log
+
+
+def _ended(pidfd: int) -> bool:
+    return bool(select.select([pidfd], [], [], 0)[0])
