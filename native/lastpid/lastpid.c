@@ -18,8 +18,8 @@
  * What is left is what the container could have by breaking its own restores: to choose
  * its own next PIDs.
  *
- * Two processes: the first waits outside of the namespace for a restore, with the guard's
- * privileges, gives them up, and forks the second, which is in it.  It has no libc.
+ * Two processes: the first waits outside of the namespace for a restore, with what it takes to
+ * enter it, does so, gives that up, and forks the second, which is in it.  It has no libc.
  */
 #include <asm/unistd.h>
 #include <errno.h>
@@ -42,6 +42,7 @@
 
 #define SYS(nr, a, b, c) raw_syscall(nr, (uint64_t)(a), (uint64_t)(b), (uint64_t)(c), 0, 0, 0)
 #define PAGE_BYTES 4096
+#define CAPABILITY(cap) (UINT64_C(1) << (cap))
 #define SIGKILL_ 9
 #define SIGCHLD_ 17
 #define USER_BASE 0x70000000 /* plus its number: a user that nobody else is             */
@@ -159,11 +160,21 @@ static int needed_capability(void)
 		       : CAP_SYS_ADMIN;
 }
 
-static void drop_privileges(void)
+/* Permitted and effective, and no others. */
+static void capabilities(uint64_t which)
 {
 	struct __user_cap_header_struct header = { .version = _LINUX_CAPABILITY_VERSION_3 };
 	struct __user_cap_data_struct data[2] = { 0 };
-	const int keep = needed_capability();
+
+	data[0].permitted = data[0].effective = (uint32_t)which;
+	data[1].permitted = data[1].effective = (uint32_t)(which >> 32);
+	must(SYS(__NR_capset, &header, data, 0));
+}
+
+/* Ahead of time, for these are some ninety calls: all but what it takes to enter the container's
+ * namespaces, which is not the user's that it is from here on. */
+static void drop_privileges(int keep)
+{
 	const long user = USER_BASE + SYS(__NR_getpid, 0, 0, 0);
 
 	for (int cap = 0; SYS(__NR_prctl, PR_CAPBSET_READ, cap, 0) >= 0; cap++)
@@ -173,14 +184,40 @@ static void drop_privileges(void)
 	must(SYS(__NR_setgroups, 0, 0, 0));
 	must(SYS(__NR_setresgid, user, user, user));
 	must(SYS(__NR_setresuid, user, user, user));
-	data[keep / 32].permitted = data[keep / 32].effective = UINT32_C(1) << keep % 32;
-	must(SYS(__NR_capset, &header, data, 0));
+	capabilities(CAPABILITY(CAP_SYS_ADMIN) | CAPABILITY(CAP_SYS_CHROOT) |
+		     CAPABILITY(CAP_SYS_PTRACE) | CAPABILITY(keep));
 	must(SYS(__NR_prctl, PR_SET_NO_NEW_PRIVS, 1, 0));
 	must(SYS(__NR_prctl, PR_SET_DUMPABLE, 0, 0));
 	limit(RLIMIT_NPROC, 2);
-	limit(RLIMIT_NOFILE, 0);
 	limit(RLIMIT_CORE, 0);
 	limit(RLIMIT_RTTIME, RT_MAX_US);
+}
+
+static bool guard_is_there(void)
+{
+	char byte;
+
+	return raw_syscall(__NR_recvfrom, LASTPID_SOCKET, (uint64_t)&byte, 1,
+			   MSG_PEEK | MSG_DONTWAIT, 0, 0) == -EAGAIN;
+}
+
+/* Its working directory and its root are the container's from here on. */
+static void enter(int keep)
+{
+	const uint64_t spaces = CLONE_NEWNS | CLONE_NEWUTS | CLONE_NEWIPC | CLONE_NEWNET |
+				CLONE_NEWPID | CLONE_NEWCGROUP;
+
+	must(SYS(__NR_setns, LASTPID_INIT, spaces, 0));
+	capabilities(CAPABILITY(keep));
+	/* The change of credentials has cleared it; who was gone before is seen by the socket. */
+	SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
+	if (!guard_is_there())
+		end(1);
+	SYS(__NR_close, LASTPID_SOCKET, 0, 0);
+	SYS(__NR_close, LASTPID_PAGE, 0, 0);
+	SYS(__NR_close, LASTPID_INIT, 0, 0);
+	limit(RLIMIT_NOFILE, 0);
+	confine_calls();
 }
 
 /* ---- requests ------------------------------------------------------------------------------ */
@@ -221,7 +258,7 @@ static void sleep_on(uint32_t *word, uint32_t value)
 
 static void serve(void)
 {
-	const int32_t before = read_last_pid();
+	int32_t before = 0;
 	uint32_t spins = 0;
 
 	while (!__atomic_load_n(&page->stop, __ATOMIC_ACQUIRE)) {
@@ -230,8 +267,11 @@ static void serve(void)
 		const uint32_t want = __atomic_load_n(&slot->want, __ATOMIC_ACQUIRE);
 
 		if (want != slot->have) {
-			if (slot->last_pid > 0)
+			if (slot->last_pid > 0) {
+				if (!before) /* with the first request the guard has the lock */
+					before = read_last_pid();
 				page->error = write_last_pid(slot->last_pid);
+			}
 			__atomic_store_n(&slot->have, want, __ATOMIC_RELEASE);
 			SYS(__NR_futex, &slot->have, FUTEX_WAKE, INT32_MAX);
 			spins = 0;
@@ -245,43 +285,28 @@ static void serve(void)
 	 * those of short-lived threads that older generations still name. */
 	if (before > 0)
 		write_last_pid(before);
+	__atomic_store_n(&page->stopped, 1, __ATOMIC_RELEASE);
+	SYS(__NR_futex, &page->stopped, FUTEX_WAKE, INT32_MAX);
 }
 
 /* ---- both ------------------------------------------------------------------------------------ */
-
-static bool guard_is_there(void)
-{
-	char byte;
-
-	return raw_syscall(__NR_recvfrom, LASTPID_SOCKET, (uint64_t)&byte, 1,
-			   MSG_PEEK | MSG_DONTWAIT, 0, 0) == -EAGAIN;
-}
 
 _Noreturn void lastpid_main(void);
 
 __attribute__((force_align_arg_pointer)) _Noreturn void lastpid_main(void)
 {
-	const uint64_t spaces = CLONE_NEWNS | CLONE_NEWUTS | CLONE_NEWIPC | CLONE_NEWNET |
-				CLONE_NEWPID | CLONE_NEWCGROUP;
+	const int keep = needed_capability();
 	long child;
 
 	SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
 	SYS(__NR_prctl, PR_SET_NAME, "avckpt-pid", 0);
 	SYS(__NR_setsid, 0, 0, 0);
 	page = map(LASTPID_PAGE, 0);
+	drop_privileges(keep);
+	SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
 	while (!take_slots())
 		;
-	/* Its working directory and its root are the container's from here on. */
-	must(SYS(__NR_setns, LASTPID_INIT, spaces, 0));
-	drop_privileges();
-	/* The change of credentials has cleared it; who was gone before is seen by the socket. */
-	SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
-	if (!guard_is_there())
-		end(1);
-	SYS(__NR_close, LASTPID_SOCKET, 0, 0);
-	SYS(__NR_close, LASTPID_PAGE, 0, 0);
-	SYS(__NR_close, LASTPID_INIT, 0, 0);
-	confine_calls();
+	enter(keep);
 	child = raw_syscall(__NR_clone, SIGCHLD_, 0, 0, 0, 0, 0);
 	must(child);
 	if (child == 0) {

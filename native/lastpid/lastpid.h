@@ -33,7 +33,8 @@ struct lastpid_message {
 struct lastpid_page {
 	uint32_t serving; /* index of the slot whose requests are served           */
 	uint32_t stop;
-	int32_t error; /* errno of the last request, 0: done                    */
+	int32_t error;    /* errno of the last request, 0: done                    */
+	uint32_t stopped; /* nothing is written any more                           */
 };
 
 #endif

@@ -296,13 +296,15 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		guard->fds[0].events |= POLLOUT;
 	watch(guard, &n, guard->channel.init_pidfd);
 	watch(guard, &n, guard->channel.report_fd);
+	if (guard->foreseen != guard->main.pid)
+		watch(guard, &n, guard->main.pidfd);
 	watch(guard, &n, output_fd(&guard->output));
 	if (guard->remains.pid)
 		watch(guard, &n, guard->remains.pidfd);
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
-		/* Of the main process's end init tells. */
+		/* How the main process ended init tells. */
 		if (process->descendant)
 			watch(guard, &n, process->pidfd);
 		watch(guard, &n, process->holder_pidfd);
@@ -349,6 +351,7 @@ static void let_go(struct avc_guard *guard)
 
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
+	last_pid_end(guard->helper);
 	last_pid_forget();
 	output_end(&guard->output);
 	guard_drop_all(guard);
@@ -395,6 +398,8 @@ static void guard_main(struct avc_guard *guard)
 			guard_app_died(guard, &report);
 			continue;
 		}
+		if (guard->foreseen != guard->main.pid && pidfd_ended(guard->main.pidfd))
+			guard_app_dies(guard);
 		guard_reap_dead(guard);
 		guard_tend_remains(guard);
 		guard_tend_tree(guard);

@@ -49,6 +49,9 @@ struct avc_guard {
 	uint32_t outbox_count;
 	timer_t timer;
 	struct init_channel channel;
+	struct last_pid *helper; /* of the restore that is about to begin           */
+	uint64_t helper_for;     /* number of its generation                        */
+	pid_t foreseen;          /* the main process whose end has been seen        */
 	bool attached, unprotected;
 	struct process main; /* the app's main process                         */
 	struct tree tree;    /* it and the others                              */
@@ -189,6 +192,8 @@ void output_end(struct output *output);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 
+/* The main process has ended; init has not told how yet, and whether it is restored is open. */
+void guard_app_dies(struct avc_guard *guard);
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
 /* Nobody looks at the dead app's memory any more. */
 void guard_release_remains(struct avc_guard *guard);

@@ -165,7 +165,8 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					   .timer = guard->timer,
 					   .died_ns = report->reaped_ns,
 					   .ready = say_restored,
-					   .arg = guard };
+					   .arg = guard,
+					   .helper = guard->helper };
 		struct avc_error failed = { 0 };
 		bool restored;
 
@@ -185,6 +186,7 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_wait_ended();
 		init_channel_working(&guard->channel);
 		(void)last_pid_lock(guard->channel.numbers_fd, true);
+		guard->helper = NULL; /* it is the restore's now, which ends it */
 		restored = restore_app(&restore, &failed) == 0;
 		last_pid_unlock(guard->channel.numbers_fd);
 		if (restored) {
@@ -256,6 +258,37 @@ static void await_killed_holder(struct avc_guard *guard)
 	}
 }
 
+static void drop_helper(struct avc_guard *guard)
+{
+	last_pid_end(guard->helper);
+	guard->helper = NULL;
+}
+
+/* One for the newest generation. */
+static void ready_helper(struct avc_guard *guard)
+{
+	const struct generation *newest;
+
+	if (!guard->count)
+		return;
+	newest = &guard->generations[guard->count - 1];
+	if (guard->helper &&
+	    (guard->helper_for != newest->number || !last_pid_is_there(guard->helper)))
+		drop_helper(guard);
+	if (guard->helper)
+		return;
+	guard->helper = restore_ahead(newest, &guard->channel);
+	guard->helper_for = newest->number;
+}
+
+void guard_app_dies(struct avc_guard *guard)
+{
+	guard->foreseen = guard->main.pid;
+	rt_priority_begin();
+	ready_helper(guard);
+	rt_priority_end();
+}
+
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
@@ -291,6 +324,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 			goto out;
 		}
 	}
+	ready_helper(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->pid)
 			process_kill(guard->tree.process[i]);
@@ -308,6 +342,8 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 		guard_pace_restored(guard);
 	}
 out:
+	drop_helper(guard); /* there was nothing to be restored, after all */
+	guard->foreseen = 0;
 	rt_priority_end();
 	guard->restore_asked = AVC_REASON_NONE;
 	guard->restore_ticket = 0;

@@ -266,9 +266,9 @@ void restore_note(const struct image *image, pid_t pid, struct avc_error *notes)
 /* ---- all of it --------------------------------------------------------------------- */
 
 /* It serves all processes that ask for numbers: those that are no zombies. */
-static struct last_pid *start_helper(const struct restore *restore, struct avc_error *err)
+static struct last_pid *start_helper(const struct generation *generation,
+				     const struct init_channel *channel, struct avc_error *err)
 {
-	const struct generation *generation = restore->generation;
 	struct last_pid_slot *slot = calloc(generation->images, sizeof *slot);
 	struct last_pid *helper = NULL;
 	uint32_t count = 0;
@@ -284,7 +284,7 @@ static struct last_pid *start_helper(const struct restore *restore, struct avc_e
 			slot[count++] = (struct last_pid_slot){ &image->process->parasite,
 								image->slot };
 	}
-	helper = last_pid_start(restore->channel->init_pidfd, slot, count, err);
+	helper = last_pid_start(channel->init_pidfd, slot, count, err);
 	free(slot);
 	return helper;
 }
@@ -383,6 +383,14 @@ static void go(struct restore *restore)
 		generation->image[i].pid = i ? restore_tree_pid(restore->tree, i) : restore->pid;
 }
 
+struct last_pid *restore_ahead(const struct generation *generation,
+			       const struct init_channel *channel)
+{
+	struct avc_error later = { 0 }; /* told when it is needed */
+
+	return start_helper(generation, channel, &later);
+}
+
 int restore_app(struct restore *restore, struct avc_error *err)
 {
 	struct generation *generation = restore->generation;
@@ -391,7 +399,8 @@ int restore_app(struct restore *restore, struct avc_error *err)
 
 	restore->pid = 0;
 	restore->pidfd = -1;
-	restore->helper = start_helper(restore, err);
+	if (!restore->helper)
+		restore->helper = start_helper(generation, restore->channel, err);
 	if (!restore->helper)
 		return -1;
 	tracee_deadline_set(restore->timer, FORK_NS);
@@ -411,6 +420,8 @@ int restore_app(struct restore *restore, struct avc_error *err)
 		take_back(restore);
 	else
 		go(restore);
+	/* The app runs: it need not wait for two processes to end. */
+	last_pid_end(restore->helper);
 	restore_tree_free(restore->tree);
 	close_fd(&restore->pidfd);
 	return result;

@@ -29,17 +29,22 @@ struct restore {
 	/* Called when everything is there, before anything runs: it sends the verdict. */
 	int (*ready)(void *arg, struct avc_error *err);
 	void *arg;
+	struct last_pid *helper; /* of restore_ahead(); NULL: it is started now; is ended    */
 	/* What came of it: the new main process, what it took, what is not as it was. */
 	pid_t pid;
 	uint64_t restore_ns, fork_ns, threads_ns;
 	struct avc_error notes;
 	/* While it lasts. */
 	int pidfd;
-	struct last_pid *helper;
 	struct sandbox *sandbox;
 	struct restore_tree *tree; /* NULL: there is one process                       */
 };
 
+/* What can be begun before it is clear whether the generation is restored: a process enters the
+ * container's PID namespace, while the dead application is cleared away.  NULL: restore_app() tries
+ * again.  last_pid_end() ends it. */
+struct last_pid *restore_ahead(const struct generation *generation,
+			       const struct init_channel *channel);
 int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
 
 /* ---- restore.c, for one process of several ----------------------------------------- */

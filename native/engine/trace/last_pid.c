@@ -41,6 +41,7 @@ extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end");
 #define ENGINE_SPINS 100
 #define SLICE_NS (20 * (long)NS_PER_MS)
 #define END_MS 1000
+#define STOP_NS (100 * NS_PER_MS)
 #define LOCK_NS (300 * NS_PER_MS)
 #define LOCK_URGENT_NS NS_PER_S
 #define LOCK_STEP_US 50
@@ -216,8 +217,10 @@ static void kill_inside(const struct last_pid *helper)
 static void helper_end(struct last_pid *helper)
 {
 	struct pollfd ending = { .fd = helper->pidfd, .events = POLLIN };
+	/* One that serves and was not stopped has written nothing, and the slots may be gone. */
+	const bool unused = helper->slot && !helper->page->stop;
 
-	if (helper->task && (helper->pidfd < 0 || poll(&ending, 1, END_MS) != 1)) {
+	if (helper->task && (unused || helper->pidfd < 0 || poll(&ending, 1, END_MS) != 1)) {
 		kill_inside(helper);
 		kill(helper->task, SIGKILL); /* our child, not reaped: the number is its own */
 	}
@@ -345,6 +348,11 @@ struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot
 	return NULL;
 }
 
+bool last_pid_is_there(const struct last_pid *helper)
+{
+	return !pidfd_ended(helper->pidfd);
+}
+
 static struct inj_slot *served(const struct last_pid *helper)
 {
 	const uint32_t i = __atomic_load_n(&helper->page->serving, __ATOMIC_RELAXED);
@@ -415,9 +423,25 @@ void last_pid_serve(struct last_pid *helper, struct inj_slot *slot)
 
 void last_pid_stop(struct last_pid *helper)
 {
-	if (!helper)
-		return;
+	const uint64_t end = now_ns() + STOP_NS;
+	uint32_t *const stopped = &helper->page->stopped;
+
 	__atomic_store_n(&helper->page->stop, 1, __ATOMIC_RELEASE);
 	rouse(served(helper));
+	for (uint32_t spins = 0; !__atomic_load_n(stopped, __ATOMIC_ACQUIRE); spins++) {
+		if (spins < ENGINE_SPINS) {
+			cpu_relax();
+			continue;
+		}
+		if (now_ns() > end || pidfd_ended(helper->pidfd))
+			break;
+		sleep_on(stopped, 0);
+	}
+}
+
+void last_pid_end(struct last_pid *helper)
+{
+	if (!helper)
+		return;
 	helper_end(helper);
 }

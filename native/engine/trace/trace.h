@@ -593,10 +593,15 @@ void last_pid_forget(void);
  * engine's own request. */
 struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
 				struct avc_error *err);
+/* It lives for a minute, and may have failed. */
+bool last_pid_is_there(const struct last_pid *helper);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
 /* From now on those of another one of the slots. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
+/* Nothing is written any more: the namespace's numbers go on from where they were. */
 void last_pid_stop(struct last_pid *helper);
+/* Stops it, and waits until its processes are gone; NULL: nothing to do. */
+void last_pid_end(struct last_pid *helper);
 
 /* ---- init_channel.c -------------------------------------------------------------- */
 
