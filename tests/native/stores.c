@@ -186,6 +186,15 @@ void __tsan_write_range(void *at, size_t bytes)
 		(void)o;                                                                         \
 		hit(at);                                                                         \
 		return __atomic_fetch_add(at, v, __ATOMIC_SEQ_CST);                              \
+	}                                                                                        \
+	uint##bits##_t __tsan_atomic##bits##_fetch_sub(volatile uint##bits##_t *at,              \
+						       uint##bits##_t v, int o);                 \
+	uint##bits##_t __tsan_atomic##bits##_fetch_sub(volatile uint##bits##_t *at,              \
+						       uint##bits##_t v, int o)                  \
+	{                                                                                        \
+		(void)o;                                                                         \
+		hit(at);                                                                         \
+		return __atomic_fetch_sub(at, v, __ATOMIC_SEQ_CST);                              \
 	}
 
 ATOMIC(8)
