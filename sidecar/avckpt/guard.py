@@ -67,6 +67,7 @@ FORK_REASONS = (
     "it writes too much",
     "the older images are a minute old",
     "the older images have too many pages of their own",
+    "it is small",
 )
 """`enum avc_fork_reason`: why a checkpoint was taken by a fork."""
 

@@ -45,6 +45,8 @@ def row(**fields: object) -> dict[str, object]:
         "automatic": True,
         "last_checkpoint_at": 0.0,
         "last_freeze_s": 0.00251,
+        "last_images": "dirty",
+        "last_fork_reason": "",
         "restores": 1,
         "last_restore_s": 0.0063,
         "reason": "",
@@ -135,18 +137,22 @@ def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [
         row(),
         row(name="", state="starting", last_freeze_s=None, last_checkpoint_at=None, reason="[red]no[/red] " * 20),
+        row(last_images="fork", last_fork_reason="it writes too much"),
     ]
     monkeypatch.setattr(Client, "containers", lambda self, ended: rows)
     lines = avckpt("ps").stdout.splitlines()
     assert lines[0].split()[:3] == ["NAME", "STATE", "GENS"]
     assert lines[1].split()[:3] == ["web", "protected", "2/2"]
     assert "auto, 62 ms" in lines[1]
+    assert "2.51 ms dirty" in lines[1]
+    assert "2.51 ms fork" in lines[3]
+    assert lines[3].rstrip().endswith("forked: it writes too much")
     assert "2.51 ms" in lines[1]
     assert "6.30 ms" in lines[1]
     # The short id where there is no name; markup is text; one line, however long.
     assert lines[2].split()[:2] == ["abababababab", "starting"]
     assert lines[2].count("[red]no[/red]") == 20
-    assert len(lines) == 3
+    assert len(lines) == 4
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@
  * Each thread has a part of MB, and a table that says what stands in each page of it; a page that
  * holds anything else is a violation.  It writes pages, gives some back (MADV_DONTNEED) and protects
  * some for a while.  With --maps it also unmaps and maps again, moves mappings, grows and shrinks
- * the heap, has mappings that come and go, guard pages, and deep stacks.  KB_PER_S (0: as fast as it
+ * the heap, has mappings that come and go or stay, guard pages, and deep stacks.  KB_PER_S (0: as fast as it
  * can) of all threads together.
  */
 #include <pthread.h>
@@ -20,15 +20,31 @@
 #define MADV_GUARD_INSTALL 102
 #define MADV_GUARD_REMOVE 103
 #endif
-enum { THREADS_MAX = 64, RUN_MAX = 16, DEPTH_MAX = 24, NAP_US = 1000 };
+enum {
+	THREADS_MAX = 64,
+	RUN_MAX = 16,
+	DEPTH_MAX = 24,
+	NAP_US = 1000,
+	BLOCKS = 8,
+	BLOCK_PAGES_MAX = 96
+};
 
 static size_t part_pages;
 static int threads;
 static uint64_t rate;
 static bool with_maps;
 
+/* A mapping that stays for a while. */
+struct block {
+	uint64_t *at, stamp;
+	size_t pages;
+	bool read_only;
+};
+
 struct part {
 	int index;
+	struct block block[BLOCKS];
+	uint64_t *heap_at, heap_stamp; /* of the first part: what the heap has grown by     */
 	uint64_t random, stamps;
 	char *memory;
 	uint64_t *expected; /* by page; 0: nothing was written                 */
@@ -181,6 +197,69 @@ static void grow_heap(struct part *part)
 		must(sbrk(-(intptr_t)bytes) != (void *)-1, "sbrk");
 }
 
+static void fill(uint64_t *at, size_t from, size_t pages, uint64_t stamp)
+{
+	for (size_t i = from; i < pages; i++)
+		at[i * WORDS] = mix(stamp, i);
+}
+
+static void check_filled(const uint64_t *at, size_t pages, uint64_t stamp)
+{
+	for (size_t i = 0; i < pages; i++)
+		CHECK(at[i * WORDS] == mix(stamp, i), "page %zu of a block holds %lx", i,
+		      at[i * WORDS]);
+}
+
+/* As malloc(3) does: a block comes, grows, is protected, goes. */
+static void change_block(struct part *part)
+{
+	struct block *block = &part->block[next_random(&part->random) % BLOCKS];
+	const uint64_t stamp = next_random(&part->random);
+	const size_t pages = 1 + stamp % BLOCK_PAGES_MAX, was = block->pages;
+	void *at;
+
+	check_filled(block->at, was, block->stamp);
+	if (was && stamp >> 60 < 4) {
+		block->read_only = !block->read_only;
+		must(!mprotect(block->at, was * PAGE,
+			       block->read_only ? PROT_READ : PROT_READ | PROT_WRITE),
+		     "mprotect");
+	} else if (was && !block->read_only && stamp >> 60 < 10) {
+		at = mremap(block->at, was * PAGE, pages * PAGE, MREMAP_MAYMOVE);
+		if (at == MAP_FAILED)
+			return; /* it is two to the kernel, where it is watched in part */
+		block->at = at;
+		block->pages = pages;
+		fill(block->at, was, pages, block->stamp);
+	} else {
+		must(!was || !munmap(block->at, was * PAGE), "munmap");
+		at = mmap(NULL, pages * PAGE, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS,
+			  -1, 0);
+		must(at != MAP_FAILED, "mmap");
+		*block = (struct block){ .at = at, .stamp = stamp, .pages = pages };
+		fill(block->at, 0, pages, stamp);
+	}
+}
+
+/* By a page and some, which stays until the next time. */
+static void step_heap(struct part *part)
+{
+	enum { BYTES = PAGE + 64 };
+	uint64_t *at = part->heap_at;
+
+	if (at) {
+		CHECK(*at == part->heap_stamp, "the heap holds %lx", *at);
+		part->heap_at = NULL;
+		if (sbrk(0) == (char *)at + BYTES)
+			must(sbrk(-BYTES) != (void *)-1, "sbrk");
+		return;
+	}
+	at = sbrk(BYTES);
+	must(at != (void *)-1, "sbrk");
+	part->heap_at = at;
+	part->heap_stamp = *at = next_random(&part->random);
+}
+
 __attribute__((noinline)) static uint64_t dive(int depth, uint64_t stamp)
 {
 	volatile uint64_t here[WORDS];
@@ -200,7 +279,7 @@ static void change_maps(struct part *part)
 {
 	const uint64_t stamp = next_random(&part->random);
 
-	switch (stamp % 6) {
+	switch (stamp % 8) {
 	case 0:
 		map_again(part);
 		return;
@@ -216,6 +295,13 @@ static void change_maps(struct part *part)
 	case 4:
 		if (!part->index)
 			grow_heap(part);
+		return;
+	case 5:
+		change_block(part);
+		return;
+	case 6:
+		if (!part->index)
+			step_heap(part);
 		return;
 	default:
 		CHECK(dive((int)((stamp >> 8) % DEPTH_MAX), stamp) == stamp, "the stack is torn");

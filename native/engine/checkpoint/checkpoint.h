@@ -4,7 +4,7 @@
  *
  *   freeze.c        stop everything, read it, clone it, let go; see freeze.h
  *   generation.c    templates kept
- *   dirty.c         ... and brought up to date, instead of being forked anew
+ *   dirty*.c        ... and brought up to date, instead of being forked anew
  *   layout.c        ... whose mappings have to be the process's for that
  *   spare.c         ... and forked ahead of the next restore
  *   snapshot.c      mappings and pages of a template
@@ -36,26 +36,30 @@ struct idle_template {
 	struct arch_regs base;
 	struct inherited *inherited;
 	struct pageset *stale;
-	uint64_t tracker, forked_ns, copied;
+	uint64_t tracker, forked_ns, copied, kinds;
 };
 
 /* Checkpoints by copies of what was written, of the main process (dirty.c). */
 struct dirty {
 	struct process *process;
 	struct idle_template idle;
-	bool fork_next;              /* the last attempt has found that it takes a fork     */
-	enum avc_fork_reason reason; /* why this one is forked                          */
-	uint64_t refused_nonce;      /* the parasite with which it could not be watched  */
-	uint64_t fork_ns;            /* what the last fork took                          */
-	long own_pages;              /* of the process, then                             */
-	uint64_t copied;             /* pages, of this checkpoint                       */
+	bool fork_next; /* the last attempt has found that it takes a fork     */
+	/* AVC_IMAGES_AUTO: how many are forked before the next attempt, and why. */
+	uint32_t rest;
+	enum avc_fork_reason rest_reason;
+	uint32_t failures, successes; /* attempts that came to nothing, but for the last ones */
+	enum avc_fork_reason reason;  /* why this one is forked                          */
+	uint64_t refused_nonce;       /* the parasite with which it could not be watched  */
+	uint64_t fork_ns;             /* what the last fork took                          */
+	long own_pages;               /* of the process, then                             */
+	uint64_t copied;              /* pages, of this checkpoint                       */
 	/* Read in the freeze, written to the template when the app runs again. */
 	struct run *run;
 	uint32_t runs, run_room;
 	uint8_t *data;
 	size_t data_bytes, used;
-	char *layout; /* /proc/PID/maps                                       */
-	size_t layout_bytes;
+	char *layout, *other_layout; /* /proc/PID/maps, the last and the one before      */
+	size_t layout_bytes, other_layout_bytes;
 	struct inherited now;
 	int64_t dumpable;
 };
@@ -123,17 +127,41 @@ bool layout_read(pid_t pid, char **text, size_t *bytes);
 /* Whether two of them are of the same mappings, wherever the kernel has them in pieces. */
 bool layout_equal(char *a, char *b);
 
+struct layout_step {
+	avc_remote start, end;
+	enum layout_step_kind {
+		LAYOUT_UNMAP,
+		LAYOUT_MAP, /* private memory of no file                     */
+		LAYOUT_PROTECT,
+		LAYOUT_SHRINK, /* the heap, down to `start`                     */
+		LAYOUT_GROW,   /* ... up to `end`                               */
+		LAYOUT_STACK,  /* the main thread's, down to `start`           */
+	} kind;
+	int protection;
+};
+
+struct layout_steps {
+	struct layout_step *step;
+	uint32_t count, room;
+};
+
+/* What a process has to do to come from the one to the other, in this order.  false: there is no way
+ * but a fork, as to files that are mapped, or no memory. */
+bool layout_steps_find(char *is, char *want, struct layout_steps *steps);
+
 /* ---- dirty.c ------------------------------------------------------------------- */
 
 /* Before a freeze: process.recycling, or why not; what can be copied while the app runs, is. */
 void dirty_prepare(struct dirty *dirty, const struct tree *tree, const struct avc_config *config,
-		   timer_t timer);
+		   uint32_t slot, timer_t timer);
 /* During it, while the main thread answers: what is left is read. */
 int dirty_capture(struct dirty *dirty, const struct generation *generation,
 		  struct avc_error *err) warn_unused;
 /* When the app runs again: the idle template becomes the image's.  AVC_RETRY: it takes a fork. */
 int dirty_apply(struct dirty *dirty, struct image *image, struct avc_error *err) warn_unused;
-/* Of an image of which all is known: from now on it is noted where it gets out of date. */
+/* After that, of an image of which all is known: as above. */
+int dirty_check(struct dirty *dirty, const struct image *image, struct avc_error *err) warn_unused;
+/* From now on it is noted where it gets out of date. */
 void dirty_follow(struct dirty *dirty, struct image *image);
 /* Its template is not needed any more: it becomes the idle one, if it can. */
 void dirty_recycle(struct dirty *dirty, struct generation *generation);

@@ -1,7 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Whether two processes have the same mappings.  A mapping that is watched (tracker.c) and what is
- * mapped beside it later are two to the kernel, and one in a process that is not watched.
+ * Whether two processes have the same mappings, and what it takes.  A mapping that is watched
+ * (tracker.c) and what is mapped beside it later are two to the kernel, and one in a process that is
+ * not watched.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -95,4 +96,120 @@ bool layout_equal(char *a, char *b)
 	free(first.map);
 	free(second.map);
 	return equal;
+}
+
+/* ---- from the one to the other --------------------------------------------------------------- */
+
+#define STACK "[stack]"
+#define HEAP "[heap]"
+
+static bool is_heap(const struct mapping *m)
+{
+	return !strcmp(m->name, HEAP);
+}
+
+static bool is_plain(const struct mapping *m)
+{
+	return m->mode[3] == 'p' && !m->inode &&
+	       (!m->name[0] || is_heap(m) || !strcmp(m->name, STACK));
+}
+
+static bool add_step(struct layout_steps *steps, enum layout_step_kind kind,
+		     const struct stretch *where, int protection)
+{
+	struct layout_step *last = steps->count ? &steps->step[steps->count - 1] : NULL;
+
+	if (last && last->kind == kind && last->end == where->start &&
+	    last->protection == protection) {
+		last->end = where->end;
+		return true;
+	}
+	if (!make_room(&steps->step, steps->count, &steps->room, sizeof *steps->step))
+		return false;
+	steps->step[steps->count++] = (struct layout_step){ where->start, where->end, kind,
+							    protection };
+	return true;
+}
+
+static bool take_away(struct layout_steps *steps, const struct stretch *where,
+		      const struct mapping *was)
+{
+	if (mapping_is_special(was))
+		return false;
+	return add_step(steps, is_heap(was) ? LAYOUT_SHRINK : LAYOUT_UNMAP, where, 0);
+}
+
+static bool bring(struct layout_steps *steps, const struct stretch *where,
+		  const struct mapping *wanted)
+{
+	if (!is_plain(wanted))
+		return false;
+	if (is_heap(wanted))
+		return add_step(steps, LAYOUT_GROW, where, 0);
+	if (wanted->name[0])
+		return add_step(steps, LAYOUT_STACK, where, 0);
+	return add_step(steps, LAYOUT_MAP, where, mapping_protection(wanted));
+}
+
+static bool is_object(const struct mapping *a, const struct mapping *b)
+{
+	return a->mode[3] == b->mode[3] && a->inode == b->inode && a->device == b->device &&
+	       !strcmp(a->name, b->name) &&
+	       (!a->inode || a->offset - a->start == b->offset - b->start);
+}
+
+static bool change(struct layout_steps *steps, const struct stretch *where,
+		   const struct mapping *was, const struct mapping *wanted)
+{
+	if (!wanted)
+		return take_away(steps, where, was);
+	if (!was)
+		return bring(steps, where, wanted);
+	if (!is_object(was, wanted))
+		return take_away(steps, where, was) && bring(steps, where, wanted);
+	if (!strcmp(was->mode, wanted->mode))
+		return true;
+	return wanted->mode[3] == 'p' && !mapping_is_special(wanted) &&
+	       add_step(steps, LAYOUT_PROTECT, where, mapping_protection(wanted));
+}
+
+/* The first that does not end before `at`. */
+static const struct mapping *find(const struct mappings *maps, uint32_t *next, avc_remote at)
+{
+	while (*next < maps->count && maps->map[*next].end <= at)
+		++*next;
+	return *next < maps->count ? &maps->map[*next] : NULL;
+}
+
+static void clip(avc_remote at, const struct mapping **m, avc_remote *end)
+{
+	const avc_remote border = !*m ? *end : (*m)->start > at ? (*m)->start : (*m)->end;
+
+	if (border < *end)
+		*end = border;
+	if (*m && (*m)->start > at)
+		*m = NULL;
+}
+
+bool layout_steps_find(char *is, char *want, struct layout_steps *steps)
+{
+	struct mappings first = { 0 }, second = { 0 };
+	uint32_t i = 0, k = 0;
+	bool found = parse(is, &first) && parse(want, &second);
+
+	steps->count = 0;
+	for (avc_remote at = 0, end; found; at = end) {
+		const struct mapping *was = find(&first, &i, at), *wanted = find(&second, &k, at);
+
+		if (!was && !wanted)
+			break;
+		end = UINT64_MAX;
+		clip(at, &was, &end);
+		clip(at, &wanted, &end);
+		if (was || wanted)
+			found = change(steps, &(struct stretch){ at, end }, was, wanted);
+	}
+	free(first.map);
+	free(second.map);
+	return found;
 }

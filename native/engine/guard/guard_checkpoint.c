@@ -377,7 +377,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
 	watch_files(guard, main);
-	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, guard->timer);
+	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, main->slot, guard->timer);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;
 
@@ -404,6 +404,8 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 	result = guard->main.recycling ? dirty_apply(&guard->dirty, &fresh->image[0], err) : 0;
 	if (!result)
 		result = generation_finish(fresh, err);
+	if (!result)
+		result = dirty_check(&guard->dirty, &fresh->image[0], err);
 	tracee_deadline_clear(guard->timer);
 	return result;
 }

@@ -83,6 +83,25 @@ bool mem_image_has(const struct mem_image *image, enum mapping_flag flag)
 	return false;
 }
 
+uint64_t mem_image_kinds(const struct mem_image *image)
+{
+	uint64_t h = UINT64_C(0xcbf29ce484222325);
+
+	for (uint32_t i = 0; i < image->kinds.count; i++) {
+		const uint32_t flags = image->kinds.area[i].flags;
+		/* Where a stack begins changes as it grows. */
+		const uint64_t part[] = {
+			flags & MAPPING_GROWING ? 0 : image->kinds.area[i].start,
+			image->kinds.area[i].end,
+			flags,
+		};
+
+		for (size_t k = 0; k < sizeof part / sizeof *part; k++)
+			h = (h ^ part[k]) * UINT64_C(0x100000001b3);
+	}
+	return h;
+}
+
 /* ---- before and during a freeze ------------------------------------------------ */
 
 /* Where it is in the table, or is to be. */
@@ -460,7 +479,7 @@ int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 			->flags = INJ_MAY_FAIL;
 	lock_again(process, locked_kb, setup);
 	advise_again(process->memory, setup);
-	if (process->descendant)
+	if (process->descendant || image->recycled)
 		seal_again(process->memory, setup);
 	if (main_thread && main_thread->creds.future_lock)
 		setup_add(setup, INJ_AFTER, "mlockall", SYS_mlockall,

@@ -47,7 +47,7 @@ struct survey {
 	struct areas areas, foreign, unkept;
 	uint64_t layout, shared_bytes, since;
 	uint64_t left_bytes, others_bytes;
-	bool private_huge, too_many, lost_some;
+	bool private_huge, too_many, lost_some, unforked;
 	bool recycled; /* image.recycled                                             */
 };
 
@@ -177,9 +177,11 @@ static int find_area(const struct mapping *m, void *arg)
 			   MAPPING_WIPEONFORK;
 
 	hash_mapping(m, arg);
+	survey->unforked |= survey->recycled && m->flags & MAPPING_DONTFORK &&
+			    m->start < ARCH_USER_END;
 	if (!is_of_parasite(survey->process, m->start)) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
-		if (survey->process->descendant)
+		if (survey->process->descendant || survey->recycled)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
@@ -343,6 +345,10 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 			      AREAS_MAX);
 	else if (!same_areas(&survey->areas, copied))
 		result = remember(survey, err);
+	memory->dontfork |= survey->unforked;
+	if (!result && survey->unforked)
+		result = fail(err, AVC_RETRY, 0, pid, "keep memory", "",
+			      "some of its memory is not inherited by a clone (MADV_DONTFORK)");
 	return result;
 }
 

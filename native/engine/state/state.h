@@ -60,6 +60,7 @@ struct image {
 	struct pageset *stale;        /* ... and where its memory is not the process's       */
 	uint64_t tracker;             /* ... as this one has noted it (struct tracker)        */
 	uint64_t forked_ns, copied;   /* when the template was; pages written to it since     */
+	uint64_t kinds;               /* mem_image_kinds(), then                              */
 	bool recycled;                /* it is an older one that was brought up to date       */
 };
 #define PARENT_INIT (-1)
@@ -145,6 +146,7 @@ void process_attrs_setup_limits(const struct image *image, struct setup *setup);
 
 #define INHERITED_SIGNALS 64
 #define INHERITED_VALUES 10
+#define INHERITED_BREAK 0
 
 /* What a process has from the one that forked it, besides memory and descriptors: as it was then, or
  * as the other has it now.  Compared with memcmp(). */
@@ -212,6 +214,8 @@ void mem_image_free(struct mem_image *image);
  * mapping_flag.  And whether it is so of any. */
 uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
 bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
+/* What its mappings are that /proc/PID/maps does not tell of; a number. */
+uint64_t mem_image_kinds(const struct mem_image *image);
 /* While everything is stopped: copies, what is its own when it stands still, what is shared
  * when everybody does. */
 void memory_copy_own(const struct process *process, struct mem_image *image);

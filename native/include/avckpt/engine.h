@@ -61,7 +61,8 @@ enum avc_fork_reason {
 	AVC_FORK_LAYOUT = 9,    /* its mappings have changed                       */
 	AVC_FORK_WRITES = 10,   /* so much was written that a fork takes less      */
 	AVC_FORK_AGE = 11,      /* the older ones were not forked for a minute     */
-	AVC_FORK_COPIES = 12    /* ... or have too many pages of their own         */
+	AVC_FORK_COPIES = 12,   /* ... or have too many pages of their own         */
+	AVC_FORK_SMALL = 13     /* it is so small that a fork takes less           */
 };
 
 /* What a guard is to do.  Durations in nanoseconds. */

@@ -118,6 +118,8 @@ def _container() -> Json:
             "memory_bytes": _integer("memory that its generations hold and the application does not use, now"),
             "last_checkpoint_at": at,
             "last_freeze_s": s,
+            "last_images": _text("how the last checkpoint got the memory: fork or dirty; empty: avckpt.images is fork"),
+            "last_fork_reason": _text("why it was forked all the same; empty: it was not"),
             "last_quiescent": {"type": ["boolean", "null"]},
             "last_death": _text("in words; empty: none"),
             "last_death_at": at,

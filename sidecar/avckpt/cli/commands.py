@@ -331,7 +331,8 @@ def _print_table(containers: list[Json]) -> None:
 
 
 COLUMNS = ("NAME", "STATE", "GENS", "MEMORY", "INTERVAL", "CHECKPOINT", "FREEZE", "RESTORES", "RESTORE", "NOTE")
-"""Generations, what they hold, time between two; age and freeze time of the newest; restores, the last one's time."""
+"""Generations, what they hold, time between two; age and freeze time of the newest, and whether it was copied (dirty)
+or forked where that is chosen; restores, the last one's time."""
 NOTE_LEAST = 16
 
 
@@ -344,10 +345,10 @@ def _row(c: Json) -> tuple[str, ...]:
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
         "-" if c["state"] == "listening" else _interval(c),
         "-" if age_s is None else _ago(age_s),
-        _ms(c["last_freeze_s"]),
+        f"{_ms(c['last_freeze_s'])} {c['last_images']}".rstrip(),
         str(c["restores"]),
         _ms(c["last_restore_s"]),
-        c["reason"],
+        c["reason"] or (f"forked: {c['last_fork_reason']}" if c["last_fork_reason"] else ""),
     )
 
 

@@ -71,6 +71,9 @@ class Protected:
     memory_bytes: int = 0
     last_checkpoint_at: float | None = None
     last_freeze_s: float | None = None
+    last_images: str = ""
+    """How the last checkpoint got the memory, if it could have been otherwise."""
+    last_fork_reason: str = ""
     last_interval_s: float = 0.0
     """What the guard goes by, as of the last checkpoint; 0: there was none."""
     last_quiescent: bool | None = None
@@ -112,6 +115,8 @@ class Protected:
             self.threads = event.threads
             self.last_checkpoint_at = at
             self.last_freeze_s = event.freeze_s
+            self.last_images = event.images if event.images == "dirty" or event.fork_reason else ""
+            self.last_fork_reason = event.fork_reason
             self.last_quiescent = event.quiescent
         elif kind is Kind.MISSED:
             self.missed += 1
@@ -194,6 +199,8 @@ class Protected:
             "memory_bytes": self.memory_bytes,
             "last_checkpoint_at": self.last_checkpoint_at,
             "last_freeze_s": self.last_freeze_s,
+            "last_images": self.last_images,
+            "last_fork_reason": self.last_fork_reason,
             "last_quiescent": self.last_quiescent,
             "last_death": self.last_death,
             "last_death_at": self.last_death_at,

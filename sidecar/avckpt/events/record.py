@@ -228,6 +228,8 @@ def _why_not(record: EventRecord) -> str:
 def _checkpoint(record: EventRecord) -> str:
     return (
         f"generation {record.generation}, {record.threads} thread(s), frozen {(record.freeze_s or 0) * 1000:.2f} ms"
+        f"{', by copies' if record.images == 'dirty' else ''}"
+        f"{f', forked ({record.fork_reason})' if record.fork_reason else ''}"
         f"{'' if record.quiescent else ', not at a quiet moment'}"
     )
 

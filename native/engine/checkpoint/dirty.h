@@ -1,0 +1,49 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Between the files that bring an idle template up to date:
+ *
+ *   dirty.c           whether, when, and what was written
+ *   dirty_copy.c      copies it
+ *   dirty_template.c  calls that the template makes for it: its mappings become the process's
+ */
+#ifndef AVCKPT_DIRTY_H
+#define AVCKPT_DIRTY_H
+
+#include "checkpoint.h"
+
+/* ---- dirty_template.c -------------------------------------------------------------------------- */
+
+/* Calls that an idle template makes, as many at a time as there is room for. */
+struct template_calls {
+	const struct parasite *parasite;
+	const struct idle_template *idle;
+	uint32_t slot, count;
+	struct inj_syscall *list;
+};
+
+struct template_calls template_calls_begin(const struct parasite *parasite,
+					   const struct idle_template *idle, uint32_t slot);
+int template_call(struct template_calls *calls, const struct inj_syscall *call,
+		  struct avc_error *err) warn_unused;
+/* Those that were not made yet.  AVC_RETRY: one was refused. */
+int template_calls_end(struct template_calls *calls, struct avc_error *err) warn_unused;
+
+/* Its mappings become those of `layout`, which is /proc/PID/maps of the process.  AVC_RETRY: they
+ * cannot. */
+int template_follow_layout(struct template_calls *calls, char *layout,
+			   struct avc_error *err) warn_unused;
+
+/* ---- dirty_copy.c ------------------------------------------------------------------------------ */
+
+#define COPY_BATCH_PAGES 1024 /* copied at a time                                */
+
+bool copy_make_room(struct dirty *dirty, size_t bytes);
+/* What is stale and can be, while the application runs. */
+void copy_stale(struct dirty *dirty, const struct process *process);
+/* While it is stopped: reads what is stale; false: it is too much, or cannot be read. */
+bool copy_read(struct dirty *dirty, const struct process *process);
+/* When it runs again: what was read is written to the template. */
+int copy_write(struct dirty *dirty, struct template_calls *calls,
+	       struct avc_error *err) warn_unused;
+
+#endif
