@@ -12,12 +12,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import fcntl
 import itertools
 import logging
 import math
 import os
-import resource
 import signal
 import socket
 import time
@@ -35,11 +33,13 @@ from avckpt.config import Configuration
 from avckpt.containers import cgroup, units
 from avckpt.containers.listener import HookListener
 from avckpt.containers.looks import in_own_thread
+from avckpt.containers.names import Names
+from avckpt.containers.presence import Presence
 from avckpt.containers.process import has_ended, is_foreign, pid_of
 from avckpt.containers.protected import Protected, State
-from avckpt.containers.records import NOT_SEEN, Records, keep_private
+from avckpt.containers.records import NOT_SEEN, Records
 from avckpt.containers.registry import Registry
-from avckpt.engine import Engine, Guard, probe
+from avckpt.engine import Engine, Guard
 from avckpt.engine import version as native_version
 from avckpt.errors import (
     AvckptError,
@@ -94,6 +94,8 @@ class Watch:
     guard: Guard | None = None
     guard_lost_s: float = -math.inf
     """When a guard was lost last, time.monotonic()."""
+    bundle: str = ""
+    """Its OCI bundle, on the host."""
     connection: socket.socket | None = None
     """Of a unit: when it closes, avckpt-init looks for another sidecar."""
     units: units.Allowance = field(default_factory=units.Allowance)
@@ -133,6 +135,8 @@ class Daemon:
         self._answers: dict[int, tuple[int, asyncio.Future[tuple[Event, EventRecord]]]] = {}
         self._endings: set[asyncio.Task[None]] = set()
         self._host_units = units.Allowance()
+        self._names = Names()
+        self._presence = Presence(run_dir / "present.json")
 
     async def run(self) -> None:
         """Serves until SIGTERM or SIGINT, then lets every container run on unprotected.
@@ -166,8 +170,13 @@ class Daemon:
             nodes = units.UnitListener(self.run_dir / "units" / "units.sock", self._register_unit)
             looking = loop.create_task(self._keep_catching_up())
             log.info("avckpt %s is ready, %d container(s) found", __version__, len(self._watches))
+            outage = self._presence.since_then(self.registry.live())
+            if outage:
+                self._tell_of_itself(Kind.SIDECAR_STARTED, outage)
             await stop.wait()
             log.info("asked to stop: %d container(s) run on unprotected", len(self._watches))
+            self._presence.stop(self.registry.live())
+            self._tell_of_itself(Kind.SIDECAR_STOPPED, f"{len(self._watches)} container(s) run on unprotected")
         finally:
             if looking is not None:
                 looking.cancel()
@@ -299,9 +308,21 @@ class Daemon:
     def _catch_up(self) -> None:
         """Protects whoever could not be when it came: for want of descriptors, threads, memory or an answer."""
         self._adopt()
+        self._look_at_names()
+        self._presence.keep(self.registry.live())
         for watch in list(self._watches.values()):
             if watch.guard is None and watch.settings.policy.guarded and not has_ended(watch.pidfd):
                 self._start_guard(watch)
+
+    def _look_at_names(self) -> None:
+        """`podman rename` tells nobody."""
+        for watch in self._watches.values():
+            container = watch.container
+            before, name = container.name, self._names.of(container.id, watch.bundle, container.init_pid)
+            if name and name != before:
+                container.name = name
+                self.metrics.begin(name)
+                self.tell(watch, EventRecord(Kind.CONFIGURED, detail=f"was called {before or 'nothing'} before"))
 
     async def _keep_catching_up(self) -> None:
         due_s = time.monotonic() + LOOK_S
@@ -393,9 +414,10 @@ class Daemon:
                 node_of=node_of,
             )
             container.group = settings.policy.group
-        watch = Watch(container, pidfd, request.annotations, settings)
+        watch = Watch(container, pidfd, request.annotations, settings, bundle=request.bundle)
         self.registry.add(container)
         self._watches[container.cookie] = watch
+        self._presence.keep(self.registry.live())
         asyncio.get_running_loop().add_reader(pidfd, self._begin_end, watch)
         how = "adopted" if adopted else "registered"
         self.tell(watch, EventRecord(Kind.REGISTERED, detail=f"{how}, init {container.init_pid}"))
@@ -447,6 +469,10 @@ class Daemon:
         self.metrics.take(record)
         self.feed.publish(record)
         return record
+
+    def _tell_of_itself(self, kind: Kind, detail: str) -> None:
+        record = EventRecord(kind, at=time.time(), monotonic_s=time.monotonic(), detail=detail)
+        self.feed.publish(self.history.add(record))
 
     def _tell_of_notification(self, container: Protected, kind: Kind, detail: str) -> None:
         watch = self._watches.get(container.cookie)
@@ -523,6 +549,7 @@ class Daemon:
         del self._watches[container.cookie]
         self.registry.remove(container)
         if ended:
+            self._presence.keep(self.registry.live())
             container.end(time.time())
             self.tell(watch, EventRecord(Kind.ENDED, detail=container.reason))
             self.metrics.forget_all_but(each.label for each in self.registry.live() + self.registry.ended())
@@ -559,48 +586,3 @@ def closed_on_error(fd: int) -> Iterator[None]:
     except BaseException:
         os.close(fd)
         raise
-
-
-@contextmanager
-def only_one(run_dir: Path) -> Iterator[None]:
-    """Holds the lock that says there is a sidecar.  Raises Busy when another one holds it."""
-    fd = os.open(run_dir / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            holder = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
-            raise Busy(
-                f"a sidecar is running already (pid {holder or 'unknown'}, {run_dir}): stop it first, or use that one"
-            ) from error
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
-        yield
-    finally:
-        os.close(fd)  # which unlocks; the file stays, or two could lock two files
-
-
-def raise_descriptor_limit() -> None:
-    """Allows this process as many descriptors as it may allow itself: each container takes a dozen or two."""
-    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-
-
-def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
-    """Runs the sidecar in the foreground until it is told to stop; gives a sign of life to `beat_fd`, if that is one.
-
-    Raises Denied or Unsupported when this process or machine cannot do it,
-    Busy when there is a sidecar already.
-    """
-    probe()
-    cgroup.see_whole_tree()
-    raise_descriptor_limit()
-    try:
-        run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
-        with only_one(run_dir):
-            for name in ("containers", "health"):
-                keep_private(run_dir / name)
-            asyncio.run(Daemon(run_dir, config_path, beat_fd).run())
-    except OSError as error:
-        kind = Denied if isinstance(error, PermissionError) else AvckptError
-        raise kind(f"{error.filename or run_dir} cannot be used", errno=error.errno or 0) from error

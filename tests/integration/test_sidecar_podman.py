@@ -138,6 +138,20 @@ def test_a_crashed_sidecar_comes_back_and_a_stopped_one_does_not(
         sidecar.restart()
 
 
+def test_a_renamed_container_is_known_by_its_new_name(
+    container: ContainerFactory, sidecar: Sidecar, podman: Podman
+) -> None:
+    made = container.protected(*COUNT, labels=QUICK)
+    sidecar.wait_generation(made)
+    anew = f"{made.name}-anew"
+    podman.run("rename", made.name, anew)
+    try:
+        wait_until(lambda: (sidecar.find(made) or {})["name"] == anew, 20, "the new name is known")
+        assert sidecar.avckpt("checkpoint", anew).status == 0
+    finally:
+        podman.run("rename", anew, made.name)
+
+
 def test_a_sidecar_that_can_not_be_started_is_said(sidecar: Sidecar, podman: Podman, base_image: str) -> None:
     sidecar.stop()
     try:

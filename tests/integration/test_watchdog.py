@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from avckpt.cli.client import Client
 
 from testkit.harness import wait_until
 from testkit.local_sidecar import LocalSidecar, local_sidecar
@@ -54,6 +55,27 @@ def test_another_daemon_takes_over(end: Callable[[int], None], local: LocalSidec
     assert ("has given no sign of life for" in local.log) == (end is stop_itself)
     os.kill(web.app_pid, signal.SIGKILL)
     local.wait_for(web, restores=1)
+
+
+def test_an_outage_is_told_with_what_ended_meanwhile(local: LocalSidecar) -> None:
+    web, db = (local.protected(name, ["sleep", "1000"]) for name in ("web", "db"))
+    for each in (web, db):
+        local.wait_for(each, state="protected")
+    app = web.app_pid
+    assert local.stop(signal.SIGKILL) == -signal.SIGKILL
+    wait_until(lambda: children_of(web.init_pid) == [app], 10, "its guard has ended, too")
+    os.kill(app, signal.SIGSEGV)
+    web.status()
+    local.start()
+    local.wait_for(db, state="protected")
+    assert local.stop() == 0
+    local.start()
+    told = [event for event in Client(local.run_dir).history() if event["container"] == ""]
+    assert [event["kind"] for event in told] == ["sidecar_started", "sidecar_stopped", "sidecar_started"]
+    assert "the one before crashed or was killed, " in told[0]["message"]
+    assert told[0]["message"].endswith(" s without protection; meanwhile ended: web")
+    assert "the one before was stopped" in told[2]["message"]
+    assert "meanwhile" not in told[2]["message"]
 
 
 def test_a_killed_watchdog_leaves_no_daemon(local: LocalSidecar) -> None:

@@ -129,7 +129,7 @@ def sidecar(verbose: bool, config: Path) -> None:
 
 def _serve(config: Path, beat_fd: int) -> int:
     try:
-        from avckpt.daemon import serve
+        from avckpt.serve import serve
 
         serve(_run_dir(), config, beat_fd)
     except AvckptError as error:

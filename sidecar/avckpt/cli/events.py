@@ -31,6 +31,7 @@ COLOURS = {
     "notify_failed": "red",
     "refused": "red",
     "checkpoint": "green",
+    "sidecar_stopped": "red",
 }
 
 _UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -140,7 +141,8 @@ def _wait(client: Client) -> None:
 
 def _line(event: Json) -> str:
     at = datetime.fromtimestamp(event["at"]).isoformat(" ", "milliseconds")
-    return f"{at}  {event['container']}: {click.style(event['message'], fg=COLOURS.get(event['kind']))}"
+    whose = f"{event['container']}: " if event["container"] else ""
+    return f"{at}  {whose}{click.style(event['message'], fg=COLOURS.get(event['kind']))}"
 
 
 @click.command()

@@ -169,7 +169,7 @@ class Top(App[None]):
         self._seen.setdefault(event["id"], Seen()).take(event)
         if event["kind"] != "checkpoint":
             self._told.append(event)
-            if self._only in ("", event["id"]):
+            if self._only in ("", event["id"]) or not event["id"]:
                 self._event_log.write(_line(event), expand=True)
 
     # What is shown
@@ -266,7 +266,7 @@ class Top(App[None]):
         self._only = "" if self._only else self._chosen()
         self._event_log.clear()
         for event in self._told:
-            if self._only in ("", event["id"]):
+            if self._only in ("", event["id"]) or not event["id"]:
                 self._event_log.write(_line(event), expand=True)
 
     def action_sort(self) -> None:
@@ -285,5 +285,5 @@ def _ms(seconds: float | None) -> str:
 
 def _line(event: Json) -> Text:
     at = time.strftime("%H:%M:%S", time.localtime(event["at"]))
-    text = Text(f"{at} {event['container']}: ")
+    text = Text(f"{at} {event['container']}: " if event["container"] else f"{at} ")
     return text.append(event["message"], style=COLOURS.get(event["kind"], ""))

@@ -26,6 +26,8 @@ LEVELS = {
     Kind.ENDED: logging.INFO,
     Kind.NOTIFIED: logging.DEBUG,
     Kind.NOTIFY_FAILED: logging.WARNING,
+    Kind.SIDECAR_STARTED: logging.INFO,
+    Kind.SIDECAR_STOPPED: logging.INFO,
 }
 """Levels of the kinds that are always told.  What is below INFO is routine: it is not kept in the history."""
 

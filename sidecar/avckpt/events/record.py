@@ -41,7 +41,9 @@ class EventRecord:
     """`_s` is a duration in seconds.  None: it means nothing for this kind."""
 
     kind: Kind = field(metadata={"description": "what happened", "values": ()})
-    container: str = said("name of the container, or its short id where it has none", "")
+    container: str = said(
+        "name of the container, or its short id where it has none; empty: it is the sidecar's event", ""
+    )
     id: str = said("its id, 64 hex digits", "")
     group: str = said("its `avckpt.group`, empty: none", "")
     at: float = said("time of day, seconds since 1970", 0.0)
@@ -221,6 +223,14 @@ def _death(record: EventRecord) -> str:
     return describe_wait_status(record.wait_status or 0)
 
 
+def _died(record: EventRecord) -> str:
+    if record.reason is Reason.COMMAND:
+        return "its application is ended, to be rolled back on command"
+    if record.reason is Reason.UNHEALTHY:
+        return "its application is ended, to be rolled back: unhealthy"
+    return f"died: {describe_wait_status(record.wait_status or 0)}"
+
+
 def _why_not(record: EventRecord) -> str:
     return why_not_restored(record.outcome or Reason.FAILED, record.error)
 
@@ -279,7 +289,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
     Kind.GUARD_LOST: lambda record: f"runs unprotected: {record.error}",
     # Whether this is bad news is known only with what follows.
-    Kind.DIED: lambda record: f"died: {describe_wait_status(record.wait_status or 0)}",
+    Kind.DIED: _died,
     Kind.RESTORED: _restored,
     Kind.CRASH: _crashed,
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
@@ -290,4 +300,6 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.ENDED: lambda record: f"ended: {record.detail}" if record.detail else "ended",
     Kind.NOTIFIED: lambda record: record.detail,
     Kind.NOTIFY_FAILED: lambda record: f"was not notified: {record.detail}",
+    Kind.SIDECAR_STARTED: lambda record: f"the sidecar has started: {record.detail}",
+    Kind.SIDECAR_STOPPED: lambda record: f"the sidecar was stopped: {record.detail}",
 }

@@ -57,6 +57,8 @@ class Kind(_Named):
     CRASH = "crash"
     NOTIFIED = "notified"
     NOTIFY_FAILED = "notify_failed"
+    SIDECAR_STARTED = "sidecar_started"
+    SIDECAR_STOPPED = "sidecar_stopped"
 
 
 class Reason(_Named):

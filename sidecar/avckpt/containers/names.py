@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What Podman calls its containers now: `podman rename` calls no hook."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import psutil
+from avckpt_hooks.shared.files import read_bounded
+
+LIST = "containers.json"
+"""Of containers/storage: renamed into its place at every change, so that it takes no lock to read it."""
+LIST_BYTES = 32 << 20
+
+
+class Names:
+    """Reads the storage's list of containers again when it has changed."""
+
+    def __init__(self) -> None:
+        self._read: dict[Path, tuple[tuple[int, int, int], dict[str, str]]] = {}
+
+    def of(self, container_id: str, bundle: str, init_pid: int) -> str:
+        """Its name now; "" if that cannot be found out.  A bundle of Podman's is FOLDER/ID/userdata."""
+        path = Path(bundle)
+        if path.name != "userdata" or path.parent.name != container_id:
+            return ""
+        with contextlib.suppress(OSError, ValueError, RecursionError, psutil.Error):
+            # conmon's files are the host's.
+            host = Path(f"/proc/{psutil.Process(init_pid).ppid()}/root")
+            folder = path.parents[1].relative_to("/")
+            return self._names(folder, host / folder / LIST).get(container_id, "")
+        return ""
+
+    def _names(self, folder: Path, path: Path) -> dict[str, str]:
+        """Raises OSError, ValueError, RecursionError."""
+        status = path.stat()
+        seen = (status.st_ino, status.st_mtime_ns, status.st_size)
+        if folder not in self._read or self._read[folder][0] != seen:
+            self._read[folder] = (seen, {})  # what cannot be read is not tried again until it changes
+            self._read[folder] = (seen, _parse(read_bounded(str(path), LIST_BYTES)))
+        return self._read[folder][1]
+
+
+def _parse(text: bytes) -> dict[str, str]:
+    """Names by id.  Raises ValueError, RecursionError."""
+    rows = json.loads(text)
+    if not isinstance(rows, list):
+        raise ValueError("not a list")
+    found = {}
+    for row in rows:
+        names = row.get("names") if isinstance(row, dict) else None
+        if isinstance(names, list) and names and isinstance(names[0], str) and isinstance(row.get("id"), str):
+            found[row["id"]] = names[0]
+    return found
