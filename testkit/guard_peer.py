@@ -109,7 +109,7 @@ class Peer:
             self.burst = Burst(cookie, ticket, int(words[3]))
             self.guards[cookie].command(Command.CHECKPOINT, ticket)
         else:
-            self.guards[cookie].command(Command[words[0].upper()], ticket, *map(float, words[3:]))
+            self.guards[cookie].command(Command[words[0].upper()], ticket, float(words[3]) if len(words) > 3 else 0.0)
 
     def take_events(self) -> None:
         """Tells what happened."""

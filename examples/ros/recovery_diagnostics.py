@@ -52,7 +52,7 @@ LEVELS = {
 }
 """How much each kind of event matters."""
 
-NO_NEWS = ("notified", "configured", "crash")
+NO_NEWS = ("notified", "configured", "crash", "held")
 """Kinds of events that say nothing of how a container stands."""
 
 ASIDE = ("health", "refused", "notify_failed")

@@ -147,9 +147,9 @@ static bool is_text(const char *chars, size_t size)
 static bool event_is_sound(const struct avc_guard *guard, const struct avc_event *event)
 {
 	return event->cookie == guard->cookie && event->kind >= AVC_EVENT_ATTACHED &&
-	       event->kind < AVC_EVENT_GUARD_LOST && event->reason >= AVC_REASON_NONE &&
-	       event->reason <= AVC_REASON_LOOP && event->error.code >= AVC_OK &&
-	       event->error.code <= AVC_RETRY &&
+	       event->kind <= AVC_EVENT_HELD && event->kind != AVC_EVENT_GUARD_LOST &&
+	       event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_LOOP &&
+	       event->error.code >= AVC_OK && event->error.code <= AVC_RETRY &&
 	       is_text(event->error.operation, sizeof event->error.operation) &&
 	       is_text(event->error.syscall, sizeof event->error.syscall) &&
 	       is_text(event->error.detail, sizeof event->error.detail);
@@ -450,16 +450,17 @@ static int guard_send(struct avc_guard *guard, const struct avc_request *request
 }
 
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
-		      uint64_t until_ns, struct avc_error *err)
+		      uint64_t generation, uint64_t until_ns, struct avc_error *err)
 {
 	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
 					     .kind = AVC_REQUEST_COMMAND,
 					     .command = command,
+					     .generation = generation,
 					     .ticket = ticket,
 					     .until_ns = until_ns };
 
 	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_RELEASE)
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_LIST)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
 	return guard_send(guard, &request, err);
 }

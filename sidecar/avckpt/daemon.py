@@ -45,7 +45,6 @@ from avckpt.errors import (
     AvckptError,
     Busy,
     ConfigError,
-    DeadlineMissed,
     Denied,
     LabelsWrong,
     NothingToRestore,
@@ -58,9 +57,10 @@ from avckpt.events.history import History
 from avckpt.events.journal import Journal
 from avckpt.events.metrics import Metrics
 from avckpt.events.record import EventRecord, of_guard
-from avckpt.events.vocabulary import Kind, Reason, why_not_restored
+from avckpt.events.vocabulary import Kind, Reason
 from avckpt.evidence.inquests import Inquests
-from avckpt.guard import Command, Event
+from avckpt.guard import Command, Event, generation_to_json
+from avckpt.orders import Orders
 from avckpt.policy import Reloaded, Settings, changes, settings_of
 from avckpt.supervision import watchdog
 from avckpt.supervision.caretaker import Caretaker
@@ -76,8 +76,6 @@ GUARD_PATIENCE_S = 5.0
 """A guard that gives no sign of life for so long is killed, and another one started."""
 GUARD_AGAIN_S = 30.0
 """A guard that is lost sooner than that after the last one is started anew at the next look, not at once."""
-COMMAND_TIMEOUT_S = 30.0
-"""Seconds that a command waits for the guard's answer."""
 
 
 @dataclass
@@ -131,8 +129,7 @@ class Daemon:
         self._engine = Engine()
         self._watches: dict[int, Watch] = {}
         self._cookies = itertools.count(1)
-        self._tickets = itertools.count(1)
-        self._answers: dict[int, tuple[int, asyncio.Future[tuple[Event, EventRecord]]]] = {}
+        self._orders = Orders()
         self._endings: set[asyncio.Task[None]] = set()
         self._host_units = units.Allowance()
         self._names = Names()
@@ -202,36 +199,39 @@ class Daemon:
             os.write(self._beat_fd, b".")
         asyncio.get_running_loop().call_later(watchdog.LOOK_S, self._beat)
 
-    async def command(self, name: str, command: Command) -> tuple[Protected, EventRecord]:
-        """Gives a command to a container and waits for the answer.
+    async def command(self, name: str, command: Command, generation: int = 0) -> tuple[Protected, EventRecord]:
+        """Gives a command to a container and waits for the answer; `generation` to restore, 0: the newest.
 
         Raises NoSuchContainer, Ambiguous, Unprotected, NothingToRestore, Paused,
         DeadlineMissed, TargetGone, or the engine's own error.
         """
-        container = self.registry.find(name)
-        watch = self._watches[container.cookie]
+        watch = self._watches[self.registry.find(name).cookie]
+        container = watch.container
         if watch.guard is None:
             raise Unprotected(f"{container.label} runs unprotected: {container.reason}")
         if command is Command.RESTORE and container.generations == 0:
             raise NothingToRestore(f"{container.label} has nothing to go back to: {container.reason}")
         if cgroup.is_paused(container.init_pid):
             raise Paused(f"{container.label} is paused: `podman unpause {container.label}` first")
-        ticket = next(self._tickets)
-        answer: asyncio.Future[tuple[Event, EventRecord]] = asyncio.get_running_loop().create_future()
-        self._answers[ticket] = (container.cookie, answer)
         try:
             if command is Command.RESTORE:
                 watch.rolling_back = Reason.COMMAND
-            watch.guard.command(command, ticket, COMMAND_TIMEOUT_S)
-            event, record = await asyncio.wait_for(answer, COMMAND_TIMEOUT_S)
-        except asyncio.TimeoutError as error:
-            raise DeadlineMissed(f"{container.label}: no answer within {COMMAND_TIMEOUT_S:g} s") from error
+            return container, await self._orders.give(watch.guard, container, command, generation)
         finally:
-            del self._answers[ticket]
             if command is Command.RESTORE:
                 watch.rolling_back = None
-        check_answer(container.label, event)
-        return container, record
+
+    async def inspect(self, name: str) -> dict[str, object]:
+        """All that is known of a container.  Raises NoSuchContainer, Ambiguous, DeadlineMissed or TargetGone."""
+        watch = self._watches[self.registry.find(name).cookie]
+        container = watch.container
+        held = await self._orders.held(watch.guard, container) if watch.guard is not None else []
+        return {
+            "container": container.to_json(),
+            "settings": watch.settings.in_force,
+            "generations": [generation_to_json(event) for event in held],
+            "crashes": [record.to_json() for record in self.inquests.crashes_of(container)],
+        }
 
     def reload(self) -> list[Reloaded]:
         """Takes the configuration file as it is now, for every container, those included that were missed so far.
@@ -492,13 +492,14 @@ class Daemon:
                 if watch.guard is not None and not has_ended(watch.pidfd):
                     self._lose_guard(watch, watch.guard)
                 continue
+            if event.kind is Kind.HELD:
+                self._orders.answer(event, None)
+                continue
             record = self.tell(watch, self._record(watch, event, at))
             self.inquests.take(watch, event, record)
             if event.kind is Kind.GUARD_LOST and watch.guard is not None:
                 self._replace_guard(watch, watch.guard)
-            _, answer = self._answers.get(event.ticket, (0, None))
-            if answer is not None and not answer.done():
-                answer.set_result((event, record))
+            self._orders.answer(event, record)
 
     def _lose_guard(self, watch: Watch, guard: Guard) -> None:
         """It could not do its work, and said why; the next one may."""
@@ -510,17 +511,11 @@ class Daemon:
     def _replace_guard(self, watch: Watch, guard: Guard) -> None:
         """Its process died or hung.  One that dies again and again must not keep us busy."""
         self._lose_guard(watch, guard)
-        self._fail_answers(watch, "its guard died before it could be done")
+        self._orders.fail(watch.container, "its guard died before it could be done")
         now = time.monotonic()
         since_s, watch.guard_lost_s = now - watch.guard_lost_s, now
         if since_s > GUARD_AGAIN_S and not has_ended(watch.pidfd):
             self._start_guard(watch)
-
-    def _fail_answers(self, watch: Watch, why: str) -> None:
-        container = watch.container
-        for cookie, answer in list(self._answers.values()):
-            if cookie == container.cookie and not answer.done():
-                answer.set_exception(TargetGone(f"{container.label}: {why}"))
 
     def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
         return of_guard(event, at=at, commanded=watch.rolling_back)
@@ -553,29 +548,7 @@ class Daemon:
             container.end(time.time())
             self.tell(watch, EventRecord(Kind.ENDED, detail=container.reason))
             self.metrics.forget_all_but(each.label for each in self.registry.live() + self.registry.ended())
-        self._fail_answers(watch, "ended before it could be done")
-
-
-def check_answer(label: str, event: Event) -> None:
-    """Raises what the answer to a command says went wrong, with the container's name."""
-    if event.kind in (Kind.CHECKPOINT, Kind.RESTORED):
-        return
-    if event.kind is Kind.GAVE_UP:
-        raise AvckptError(f"{label} was not restored and ended: {why_not_restored(event.reason, event.error)}")
-    if event.kind is Kind.UNPROTECTED:
-        raise Unprotected(f"{label} runs unprotected: {event.error}")
-    if event.error is None:
-        raise AvckptError(f"{label}: answered with {event.kind.name.lower()}")
-    error = event.error
-    raise type(error)(
-        error.detail,
-        container=label,
-        operation=error.operation,
-        syscall=error.syscall,
-        errno=error.errno,
-        pid=error.pid,
-        undo_failures=error.undo_failures,
-    )
+        self._orders.fail(container, "ended before it could be done")
 
 
 @contextmanager

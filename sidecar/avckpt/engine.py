@@ -56,10 +56,11 @@ class Guard:
         # by avc_guard_stop(), so no command may be inside it then.
         self._lock = threading.Lock()
 
-    def command(self, command: Command, ticket: int, within_s: float = 0.0) -> None:
+    def command(self, command: Command, ticket: int, within_s: float = 0.0, generation: int = 0) -> None:
         """Hands a command over; the answer is an event with the same `ticket` (not 0).
 
-        One that the guard has not begun within `within_s` (0: any time) is refused.
+        One that the guard has not begun within `within_s` (0: any time) is refused.  `generation` is
+        the one to restore, 0: the newest.
         Raises TargetGone when the guard has ended.
         """
         err = ffi.new("struct avc_error *")
@@ -67,7 +68,7 @@ class Guard:
         with self._lock:
             if self._guard is None:
                 raise TargetGone("its guard has ended", operation=command.name.lower())
-            if lib.avc_guard_command(self._guard, int(command), ticket, until_ns, err) != 0:
+            if lib.avc_guard_command(self._guard, int(command), ticket, generation, until_ns, err) != 0:
                 raise _error(err)
 
     def configure(self, config: GuardConfig) -> None:

@@ -25,6 +25,7 @@ class Command(enum.IntEnum):
     UNHEALTHY = 6
     UNVOUCH = 7
     RELEASE = 8
+    LIST = 9
 
 
 class Files(enum.IntEnum):
@@ -158,3 +159,14 @@ class Event:
         if self.error is not None:
             data["error"] = self.error.to_json()
         return data
+
+
+def generation_to_json(event: Event) -> dict[str, object]:
+    """A generation that is held, as an event HELD tells of it."""
+    return {
+        "generation": event.generation,
+        "age_s": event.age_s,
+        "freeze_s": event.freeze_s,
+        "threads": event.threads,
+        "crashes": event.attempt,
+    }

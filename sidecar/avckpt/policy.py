@@ -24,6 +24,12 @@ class Settings:
     policy: Policy
     config: GuardConfig
 
+    @property
+    def in_force(self) -> dict[str, str]:
+        """Every setting without its prefix, as in a label; empty: there is none.  Of commands only the program."""
+        texts = {key: self.said.get(key, label.default) for key, label in LABELS.items()}
+        return {key[len(PREFIX) :]: shown(text) if text else "" for key, text in texts.items()}
+
 
 @dataclass(frozen=True)
 class Change:

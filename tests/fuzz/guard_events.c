@@ -36,7 +36,7 @@ static const char *rubbish(void)
 static void check(const struct avc_event *event)
 {
 	must(event->cookie == COOKIE, "a guard speaks of its own container");
-	must(event->kind >= AVC_EVENT_ATTACHED && event->kind <= AVC_EVENT_GUARD_LOST, "its kind");
+	must(event->kind >= AVC_EVENT_ATTACHED && event->kind <= AVC_EVENT_HELD, "its kind");
 	must(event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_LOOP, "its reason");
 	must(memchr(event->error.detail, 0, sizeof event->error.detail) != NULL, "a clause ends");
 }

@@ -328,6 +328,7 @@ def test_what_the_sidecar_answers_is_what_its_description_says(local: LocalSidec
     kinds = {event["kind"] for event in check("GET", "/v1/history", "/v1/history")["events"]}
     assert {"registered", "checkpoint", "died", "restored", "ended"} <= kinds
     check("POST", "/v1/reload", "/v1/reload")
+    assert check("GET", "/v1/containers/web", "/v1/containers/{name}")["crashes"]
     wait_until(lambda: get(local, "/v1/containers/web/checkpoint", "POST")[0] == 200, 10, "a checkpoint")
     check("POST", "/v1/containers/web/restore", "/v1/containers/{name}/restore")
     for target, status, kind in (
@@ -348,6 +349,9 @@ def test_what_the_sidecar_answers_is_what_its_description_says(local: LocalSidec
         ("POST", "/v1/containers/x/explode", 404, "not_found"),
         ("GET", "/v1/containers/x/restore", 405, "method_not_allowed"),
         ("GET", "/v1/events?after=x", 400, "bad_request"),
+        ("GET", "/v1/containers/nobody", 404, "no_such_container"),
+        ("POST", "/v1/containers/x/restore?generation=-1", 400, "bad_request"),
+        ("POST", "/v1/containers/x/checkpoint?generation=1", 400, "bad_request"),
         ("GET", "/v1/history?after=-1", 400, "bad_request"),
         ("GET", "/v1/history?since=noon", 400, "bad_request"),
         ("GET", "/v1/history?since=nan", 400, "bad_request"),

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from testkit.harness import wait_until
-from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
+from testkit.harness import take_checkpoint, wait_until
+from testkit.local_sidecar import ON_COMMAND, Container, LocalSidecar, local_sidecar
 
 pytestmark = pytest.mark.shared_machine("a sidecar, its guards and containers have to get CPU time within seconds")
 
@@ -110,3 +110,34 @@ def _name_of(pid: str) -> str:
         return Path(f"/proc/{pid}/comm").read_text().strip()
     except (FileNotFoundError, ProcessLookupError):
         return ""
+
+
+def test_back_to_an_older_generation(sidecar: LocalSidecar) -> None:
+    program = "import time\ni = 0\nwhile True:\n    i += 1\n    print(i, flush=True)\n    time.sleep(0.01)"
+    counter = sidecar.protected("counter", [sys.executable, "-c", program], {**ON_COMMAND, "avckpt.keep": "3"})
+
+    def numbers() -> list[int]:
+        return [int(line) for line in counter.output.read_text().splitlines()]
+
+    at = []
+    for _ in range(3):
+        begun = len(numbers())
+        wait_until(lambda: len(numbers()) > begun + 20, 10, "it counts on")  # noqa: B023
+        take_checkpoint(sidecar.avckpt, "counter")
+        at.append(numbers()[-1])
+    known = json.loads(sidecar.avckpt("inspect", "counter", "--json").stdout)
+    assert [each["generation"] for each in known["generations"]] == [1, 2, 3]
+    ages = [each["age_s"] for each in known["generations"]]
+    assert ages == sorted(ages, reverse=True)
+    assert (known["settings"]["keep"], known["settings"]["interval"]) == ("3", "1h")
+    assert "  2: " in sidecar.avckpt("inspect", "counter").stdout
+
+    refused = sidecar.avckpt("restore", "counter", "--generation", "7", check=False)
+    assert (refused.status, "that generation is not held" in refused.stderr) == (5, True)
+    length = len(numbers())
+    assert "back at generation 2" in sidecar.avckpt("restore", "counter", "--generation", "2").stdout
+    wait_until(lambda: len(numbers()) > length + 200, 10, "it counts on")
+    lowest = min(numbers()[length:])
+    assert at[0] < lowest <= at[1] + 1
+    known = json.loads(sidecar.avckpt("inspect", "counter", "--json").stdout)
+    assert [each["generation"] for each in known["generations"]] == [1, 2]

@@ -124,7 +124,7 @@ def test_help_documents_the_exit_statuses() -> None:
 
 
 def test_the_sidecars_errors_decide_the_exit_status(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: Client, name: str, command: Command) -> Any:
+    def refuse(self: Client, name: str, command: Command, generation: int = 0) -> Any:
         raise NothingToRestore(f"{name} has nothing to go back to")
 
     monkeypatch.setattr(Client, "command", refuse)

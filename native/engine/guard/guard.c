@@ -100,12 +100,19 @@ static void refill(struct avc_guard *guard)
 		guard->next_ns = now_ns();
 }
 
-static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason reason)
+static void roll_back(struct avc_guard *guard, const struct avc_request *request,
+		      enum avc_reason reason)
 {
+	const uint64_t ticket = request->ticket;
+	const int i = guard_find_generation(guard, request->generation);
 	struct avc_error error = { 0 };
 
 	if (!guard->count || !guard->main.pid) {
 		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held yet");
+		return;
+	}
+	if (i < 0) {
+		guard_refuse(guard, ticket, AVC_EMPTY, "that generation is not held");
 		return;
 	}
 	if (init_channel_stop_asked(&guard->channel)) {
@@ -115,32 +122,54 @@ static void roll_back(struct avc_guard *guard, uint64_t ticket, enum avc_reason 
 	budget_begin(NULL, NULL);
 	/* An app that hangs is better started anew than left as it is. */
 	if (reason == AVC_REASON_COMMAND &&
-	    guard_check_files(guard, &guard->generations[guard->count - 1], guard->main.pid,
-			      guard->main.pidfd, &error)) {
+	    guard_check_files(guard, &guard->generations[i], guard->main.pid, guard->main.pidfd,
+			      &error)) {
 		guard_emit_error(guard, AVC_EVENT_REFUSED, ticket, &error);
 		return;
 	}
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
+	guard->restore_generation = request->generation;
 	/* init reports the death; the rest is as after any other. */
 	process_kill(&guard->main);
 }
 
-static void obey(struct avc_guard *guard, enum avc_command command, uint64_t ticket)
+static void list(struct avc_guard *guard, uint64_t ticket)
 {
+	struct avc_event event = guard_event(guard, AVC_EVENT_HELD);
+
+	event.ticket = ticket;
+	if (!guard->count)
+		guard_emit(guard, &event);
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const struct generation *generation = &guard->generations[i];
+
+		event.generation = generation->number;
+		event.age_ns = event.at_ns - generation->taken_ns;
+		event.freeze_ns = generation->freeze_ns;
+		event.threads = generation_threads(generation);
+		event.attempt = guard->policy.held[i].crashes;
+		guard_emit(guard, &event);
+	}
+}
+
+static void obey(struct avc_guard *guard, const struct avc_request *request)
+{
+	const uint64_t ticket = request->ticket;
+
 	if (!guard->attached) {
 		guard_refuse(guard, ticket, AVC_EMPTY, "avckpt-init has not started yet");
 		return;
 	}
-	switch (command) {
+	switch ((enum avc_command)request->command) {
 	case AVC_COMMAND_CHECKPOINT:
 		guard_checkpoint(guard, ticket);
 		break;
 	case AVC_COMMAND_RESTORE:
-		roll_back(guard, ticket, AVC_REASON_COMMAND);
+		roll_back(guard, request, AVC_REASON_COMMAND);
 		break;
 	case AVC_COMMAND_UNHEALTHY:
-		roll_back(guard, ticket, AVC_REASON_UNHEALTHY);
+		roll_back(guard, request, AVC_REASON_UNHEALTHY);
 		break;
 	case AVC_COMMAND_DROP_OLDEST:
 		drop_oldest(guard, ticket);
@@ -158,6 +187,9 @@ static void obey(struct avc_guard *guard, enum avc_command command, uint64_t tic
 		if (ticket == (uint64_t)guard->remains.pid)
 			guard_release_remains(guard);
 		break;
+	case AVC_COMMAND_LIST:
+		list(guard, ticket);
+		break;
 	}
 }
 
@@ -167,7 +199,7 @@ static void obey_in_time(struct avc_guard *guard, const struct avc_request *requ
 	if (request->until_ns && now_ns() > request->until_ns)
 		guard_refuse(guard, request->ticket, AVC_DEADLINE, "it came too late");
 	else
-		obey(guard, request->command, request->ticket);
+		obey(guard, request);
 }
 
 /* ---- the daemon ------------------------------------------------------------------- */

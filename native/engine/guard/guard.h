@@ -69,6 +69,7 @@ struct avc_guard {
 	uint32_t restores;
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
+	uint64_t restore_generation;   /* by that command; 0: the newest          */
 	struct files_written *written; /* avckpt.files; NULL: not watched           */
 	struct policy_pace pace;       /* avckpt.interval=auto                      */
 	/* Of us, since the last checkpoint and at the begin of what we do now; of the app, at
@@ -108,6 +109,8 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 
 void guard_drop_generation(struct avc_guard *guard, uint32_t i);
 void guard_drop_all(struct avc_guard *guard);
+/* Its index, or -1: it is not held.  0 is the number of the newest. */
+int guard_find_generation(const struct avc_guard *guard, uint64_t number);
 uint32_t guard_free_slot(const struct avc_guard *guard);
 void guard_lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason,
 			   uint64_t ticket);

@@ -289,6 +289,14 @@ void guard_app_dies(struct avc_guard *guard)
 	rt_priority_end();
 }
 
+/* Somebody wants that one: of what came after it nothing is true any more.  If it was lost since
+ * it was asked for, the next older one is as near as it gets. */
+static void drop_newer(struct avc_guard *guard, uint64_t number)
+{
+	while (guard->count && guard->generations[guard->count - 1].number > number)
+		guard_drop_generation(guard, guard->count - 1);
+}
+
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
@@ -324,6 +332,8 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 			goto out;
 		}
 	}
+	if (reason == AVC_REASON_COMMAND && guard->restore_generation)
+		drop_newer(guard, guard->restore_generation);
 	ready_helper(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->pid)
@@ -347,4 +357,5 @@ out:
 	rt_priority_end();
 	guard->restore_asked = AVC_REASON_NONE;
 	guard->restore_ticket = 0;
+	guard->restore_generation = 0;
 }

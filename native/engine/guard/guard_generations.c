@@ -37,6 +37,14 @@ void guard_drop_all(struct avc_guard *guard)
 	dirty_drop_idle(&guard->dirty);
 }
 
+int guard_find_generation(const struct avc_guard *guard, uint64_t number)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (!number || guard->generations[i].number == number)
+			return (int)i;
+	return -1;
+}
+
 uint32_t guard_free_slot(const struct avc_guard *guard)
 {
 	for (uint32_t slot = 0;; slot++) {

@@ -118,9 +118,13 @@ enum avc_event_kind {
 	AVC_EVENT_DROPPED = 10,    /* `generation` was given up before its time;
 	                            * `reason` is why: CRASHED (`attempt` times),
 	                            * UNHEALTHY, MEMORY, KILLED, EXECUTED         */
-	AVC_EVENT_GUARD_LOST = 11  /* the guard's process has died, or hung and was
+	AVC_EVENT_GUARD_LOST = 11, /* the guard's process has died, or hung and was
 	                            * killed; `error` says how.  The application
 	                            * runs on, unprotected.  The guard's last event */
+	AVC_EVENT_HELD = 12        /* answers AVC_COMMAND_LIST, one for each of the
+	                            * `generations`, oldest first: its number, age,
+	                            * freeze and threads, and as `attempt` its
+	                            * crashes; one without a number: none is held */
 };
 
 enum avc_reason {
@@ -190,7 +194,9 @@ enum avc_command {
 	AVC_COMMAND_CHECKPOINT = 1,  /* take one now; answered by CHECKPOINT, MISSED,
 	                             * UNPROTECTED or REFUSED                     */
 	AVC_COMMAND_RESTORE = 2,     /* kill the live app and restore the newest
-	                             * generation; RESTORED, GAVE_UP or REFUSED   */
+	                             * generation, or the one with that number (those
+	                             * after it are given up then); RESTORED, GAVE_UP
+	                             * or REFUSED                                 */
 	AVC_COMMAND_DROP_OLDEST = 3, /* memory is short: give the oldest generation
 	                             * up and hold no more than are left, with none
 	                             * left take no checkpoints; DROPPED, REFUSED */
@@ -203,8 +209,9 @@ enum avc_command {
 	                             * oldest, if nothing was); as RESTORE        */
 	AVC_COMMAND_UNVOUCH = 7,     /* nobody says any more whether the app is
 	                             * healthy; no answer                         */
-	AVC_COMMAND_RELEASE = 8      /* the memory of `ticket`, a remains_pid, has been
+	AVC_COMMAND_RELEASE = 8,     /* the memory of `ticket`, a remains_pid, has been
 	                             * looked at; no answer                       */
+	AVC_COMMAND_LIST = 9         /* what is held; HELD or REFUSED              */
 };
 
 struct avc_engine;
@@ -250,9 +257,10 @@ void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns);
 
 /* Hands a command over.  The answer is an event with the same ticket (not 0).
  * What the guard has not begun by until_ns (CLOCK_MONOTONIC; 0: any time) is refused.
+ * `generation`: which is to be restored, 0: the newest.
  * Errors: AVC_GONE when the guard has ended, AVC_BUSY when it does not take them. */
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
-		      uint64_t until_ns, struct avc_error *err);
+		      uint64_t generation, uint64_t until_ns, struct avc_error *err);
 
 /* New settings for a guard that runs (their init_pidfd is not looked at).  They hold
  * from the next checkpoint and the next death on.  Held generations stay, up to the

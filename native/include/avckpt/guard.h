@@ -31,7 +31,7 @@
 
 enum avc_request_kind {
 	AVC_REQUEST_START = 1,     /* cookie, config                                  */
-	AVC_REQUEST_COMMAND = 2,   /* command, ticket                                 */
+	AVC_REQUEST_COMMAND = 2,   /* command, ticket, generation                     */
 	AVC_REQUEST_CONFIGURE = 3, /* config                                          */
 };
 
@@ -40,9 +40,10 @@ struct avc_request {
 	uint32_t kind;    /* enum avc_request_kind                            */
 	uint32_t command; /* enum avc_command                                 */
 	uint32_t reserved;
-	uint64_t ticket;   /* of the command                                   */
-	uint64_t until_ns; /* CLOCK_MONOTONIC: later it is refused; 0: never too late */
-	uint64_t cookie;   /* of the guard's events                            */
+	uint64_t ticket;     /* of the command                                   */
+	uint64_t until_ns;   /* CLOCK_MONOTONIC: later it is refused; 0: never too late */
+	uint64_t cookie;     /* of the guard's events                            */
+	uint64_t generation; /* AVC_COMMAND_RESTORE: which, 0: the newest      */
 	struct avc_config config;
 };
 

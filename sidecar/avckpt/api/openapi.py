@@ -39,6 +39,7 @@ def document() -> Json:
                 "Event": _event(),
                 "Error": _ERROR,
                 "Crash": _crash(),
+                "Generation": _GENERATION,
                 "Configuration": _CONFIGURATION,
             },
             "responses": {
@@ -146,6 +147,16 @@ _ERROR = _object(
     }
 )
 
+_GENERATION = _object(
+    {
+        "generation": _integer("its number"),
+        "age_s": _seconds("since it was taken"),
+        "freeze_s": _seconds("how long the application stood still for it"),
+        "threads": _integer("in it"),
+        "crashes": _integer("soon after a restore from it, or from what it was taken from"),
+    }
+)
+
 _CONFIGURATION = _object(
     {
         "path": _text("the file with the defaults for all containers"),
@@ -218,20 +229,21 @@ _SINCE = _query("since", {"type": "number"}, "only events at or after this time 
 _COMMAND_ANSWER = _object({"container": _ref("Container"), "event": _ref("Event")})
 
 
-def _command(verb: str, summary: str) -> Json:
+_NAME = {
+    "name": "name",
+    "in": "path",
+    "required": True,
+    "schema": {"type": "string"},
+    "description": "name, id or unique id prefix",
+}
+
+
+def _command(verb: str, summary: str, *parameters: Json) -> Json:
     return {
         "post": {
             "operationId": verb,
             "summary": summary,
-            "parameters": [
-                {
-                    "name": "name",
-                    "in": "path",
-                    "required": True,
-                    "schema": {"type": "string"},
-                    "description": "name, id or unique id prefix",
-                }
-            ],
+            "parameters": [_NAME, *parameters],
             "responses": _answer("done", _COMMAND_ANSWER),
         }
     }
@@ -272,8 +284,36 @@ _PATHS: Json = {
             "responses": _answer("oldest first", _object({"containers": _array(_ref("Container"))})),
         }
     },
+    "/v1/containers/{name}": {
+        "get": {
+            "operationId": "inspect",
+            "summary": "All that is known of a container",
+            "parameters": [_NAME],
+            "responses": _answer(
+                "the container",
+                _object(
+                    {
+                        "container": _ref("Container"),
+                        "settings": {
+                            "type": "object",
+                            "additionalProperties": {"type": "string"},
+                            "description": "every label without its prefix, as it is in force",
+                        },
+                        "generations": _array(_ref("Generation")),
+                        "crashes": _array(_ref("Event")),
+                    }
+                ),
+            ),
+        }
+    },
     "/v1/containers/{name}/checkpoint": _command("checkpoint", "Take a checkpoint now"),
-    "/v1/containers/{name}/restore": _command("restore", "Roll a running container back to its newest checkpoint"),
+    "/v1/containers/{name}/restore": _command(
+        "restore",
+        "Roll a running container back to a checkpoint",
+        _query(
+            "generation", {"type": "integer", "minimum": 0}, "its number; those after it are given up; 0: the newest"
+        ),
+    ),
     "/v1/reload": {
         "post": {
             "operationId": "reload",

@@ -84,8 +84,11 @@ class Backend(Protocol):
     started_at: float
     configuration: Configuration
 
-    async def command(self, name: str, command: Command) -> tuple[Protected, EventRecord]:
+    async def command(self, name: str, command: Command, generation: int = 0) -> tuple[Protected, EventRecord]:
         """Gives a command to a container and waits for the answer.  Raises AvckptError."""
+
+    async def inspect(self, name: str) -> dict[str, object]:
+        """All that is known of a container.  Raises AvckptError."""
 
     def reload(self) -> list[Reloaded]:
         """Takes a new configuration file; for whom it changes something.  Raises ConfigError."""
@@ -102,6 +105,7 @@ class ApiServer:
             [
                 web.get("/v1/info", self._info),
                 web.get("/v1/containers", self._containers),
+                web.get("/v1/containers/{name}", self._inspect),
                 web.post("/v1/containers/{name}/{command:checkpoint|restore}", self._command),
                 web.post("/v1/reload", self._reload),
                 web.get("/v1/events", self._events),
@@ -144,9 +148,15 @@ class ApiServer:
         rows = [container.to_json() for container in containers]
         return web.json_response({"containers": rows})
 
+    async def _inspect(self, request: web.Request) -> web.Response:
+        return web.json_response(await self._backend.inspect(request.match_info["name"]))
+
     async def _command(self, request: web.Request) -> web.Response:
         command = Command[request.match_info["command"].upper()]
-        container, event = await self._backend.command(request.match_info["name"], command)
+        number = request.query.get("generation", "0")
+        if not number.isdecimal() or not number.isascii() or len(number) > 18:
+            raise web.HTTPBadRequest(reason=f"generation is {printable(number)[:40]}, not the number of one")
+        container, event = await self._backend.command(request.match_info["name"], command, int(number))
         return web.json_response({"container": container.to_json(), "event": event.to_json()})
 
     async def _reload(self, request: web.Request) -> web.Response:

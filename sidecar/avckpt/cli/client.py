@@ -49,9 +49,14 @@ class Client:
         answer = self._request("GET", f"/v1/containers?all={int(ended)}&memory={int(memory)}")
         return cast("list[Json]", answer["containers"])
 
-    def command(self, name: str, command: Command) -> Json:
+    def inspect(self, name: str) -> Json:
+        """All that is known of a container; returns {"container": ..., "settings": ..., "generations": ..., ...}."""
+        return self._request("GET", f"/v1/containers/{quote(name, safe='')}")
+
+    def command(self, name: str, command: Command, generation: int = 0) -> Json:
         """Carries out a command; returns {"container": ..., "event": ...}."""
-        return self._request("POST", f"/v1/containers/{quote(name, safe='')}/{command.name.lower()}")
+        query = f"?generation={generation}" if generation else ""
+        return self._request("POST", f"/v1/containers/{quote(name, safe='')}/{command.name.lower()}{query}")
 
     def reload(self) -> Json:
         """Has the configuration file read again; returns {"config": ..., "containers": [...]}."""

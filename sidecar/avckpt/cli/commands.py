@@ -21,6 +21,7 @@ from avckpt import __version__
 from avckpt.cli.bundle import bundle
 from avckpt.cli.compose.commands import check, down, up
 from avckpt.cli.events import called, complete_container, completion, events
+from avckpt.cli.inspect import inspect
 from avckpt.cli.web import web
 from avckpt.errors import AvckptError, ExitCode
 
@@ -65,6 +66,7 @@ def main() -> None:
 
 main.add_command(events)
 main.add_command(completion)
+main.add_command(inspect)
 for command in (check, up, down, web, bundle):
     main.add_command(command)
 
@@ -182,12 +184,16 @@ def checkpoint(name: str, as_json: bool) -> None:
 
 @main.command()
 @click.argument("name", shell_complete=complete_container)
+@click.option("-g", "--generation", type=click.IntRange(1), help="This one, as avckpt inspect lists them.")
 @click.option("--json", "as_json", is_flag=True, help="The answer as JSON.")
-def restore(name: str, as_json: bool) -> None:
-    """Roll the running container NAME back to its newest checkpoint."""
+def restore(name: str, generation: int | None, as_json: bool) -> None:
+    """Roll the running container NAME back to its newest checkpoint.
+
+    With --generation to an older one; those that were taken after it are given up.
+    """
     from avckpt.guard import Command
 
-    answer = _client().command(name, Command.RESTORE)
+    answer = _client().command(name, Command.RESTORE, generation or 0)
     event = answer["event"]
     if as_json:
         click.echo(json.dumps(answer, indent=2))

@@ -25,6 +25,7 @@ LEVELS = {
     Kind.REFUSED: logging.WARNING,
     Kind.ENDED: logging.INFO,
     Kind.NOTIFIED: logging.DEBUG,
+    Kind.HELD: logging.DEBUG,
     Kind.NOTIFY_FAILED: logging.WARNING,
     Kind.SIDECAR_STARTED: logging.INFO,
     Kind.SIDECAR_STOPPED: logging.INFO,

@@ -299,6 +299,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.REFUSED: lambda record: f"command refused: {record.error}",
     Kind.ENDED: lambda record: f"ended: {record.detail}" if record.detail else "ended",
     Kind.NOTIFIED: lambda record: record.detail,
+    Kind.HELD: lambda record: f"generation {record.generation} is held",
     Kind.NOTIFY_FAILED: lambda record: f"was not notified: {record.detail}",
     Kind.SIDECAR_STARTED: lambda record: f"the sidecar has started: {record.detail}",
     Kind.SIDECAR_STOPPED: lambda record: f"the sidecar was stopped: {record.detail}",

@@ -51,6 +51,7 @@ class Kind(_Named):
     REFUSED = "refused", 9
     DROPPED = "dropped", 10
     GUARD_LOST = "guard_lost", 11
+    HELD = "held", 12
     REGISTERED = "registered"
     HEALTH = "health"
     CONFIGURED = "configured"

@@ -74,6 +74,10 @@ class Inquests(Generic[W]):
             if waiting is not None and not waiting.done():
                 waiting.set_result(record)
 
+    def crashes_of(self, container: Protected) -> list[EventRecord]:
+        """Those in the history, oldest first, also of earlier runs of the same name."""
+        return [each for each in self._history.after() if each.kind is Kind.CRASH and _is_of(each, container)]
+
     async def _look_into(self, watch: W, case: Case, outcome: asyncio.Future[EventRecord]) -> None:
         try:
             crash = await self._collector.examine(case)
@@ -89,9 +93,7 @@ class Inquests(Generic[W]):
 
     def _record(self, container: Protected, crash: Crash, followed: EventRecord) -> EventRecord:
         before = [
-            each
-            for each in self._history.after()
-            if each.crash is not None and each.crash.fingerprint == crash.fingerprint and _is_of(each, container)
+            each for each in self.crashes_of(container) if each.crash and each.crash.fingerprint == crash.fingerprint
         ]
         left = container.config.restore_max - followed.attempt if followed.attempt is not None else None
         return EventRecord(

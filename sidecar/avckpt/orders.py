@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands to guards, and their answers."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from dataclasses import dataclass, field
+
+from avckpt.containers.protected import Protected
+from avckpt.engine import Guard
+from avckpt.errors import AvckptError, DeadlineMissed, TargetGone, Unprotected
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind, why_not_restored
+from avckpt.guard import Command, Event
+
+TIMEOUT_S = 30.0
+"""Seconds that a command waits for the guard's answer."""
+
+
+@dataclass
+class _Order:
+    cookie: int
+    done: asyncio.Future[None]
+    events: list[Event] = field(default_factory=list)
+    record: EventRecord | None = None
+
+
+class Orders:
+    """The commands that wait for an answer.  For one event loop."""
+
+    def __init__(self) -> None:
+        self._tickets = itertools.count(1)
+        self._open: dict[int, _Order] = {}
+
+    async def give(self, guard: Guard, container: Protected, command: Command, generation: int = 0) -> EventRecord:
+        """Has a command carried out; what was told of that.
+
+        Raises DeadlineMissed, TargetGone, or what the guard says went wrong.
+        """
+        order = await self._carry_out(guard, container, command, generation)
+        _check(container.label, order.events[-1])
+        assert order.record is not None
+        return order.record
+
+    async def held(self, guard: Guard, container: Protected) -> list[Event]:
+        """The generations that are held, oldest first.  Raises as `give()`."""
+        order = await self._carry_out(guard, container, Command.LIST)
+        if order.events[-1].kind is not Kind.HELD:
+            _check(container.label, order.events[-1])
+        return [event for event in order.events if event.generation]
+
+    def answer(self, event: Event, record: EventRecord | None) -> None:
+        """Takes what a guard has said; `record` is what was told of it."""
+        order = self._open.get(event.ticket)
+        if order is None or order.done.done():
+            return
+        order.events.append(event)
+        order.record = record
+        if event.kind is not Kind.HELD or len(order.events) >= event.generations:
+            order.done.set_result(None)
+
+    def fail(self, container: Protected, why: str) -> None:
+        """Answers all that is open of a container: there will be no other answer."""
+        for order in self._open.values():
+            if order.cookie == container.cookie and not order.done.done():
+                order.done.set_exception(TargetGone(f"{container.label}: {why}"))
+
+    async def _carry_out(self, guard: Guard, container: Protected, command: Command, generation: int = 0) -> _Order:
+        ticket = next(self._tickets)
+        order = self._open[ticket] = _Order(container.cookie, asyncio.get_running_loop().create_future())
+        try:
+            guard.command(command, ticket, TIMEOUT_S, generation)
+            await asyncio.wait_for(order.done, TIMEOUT_S)
+        except asyncio.TimeoutError as error:
+            raise DeadlineMissed(f"{container.label}: no answer within {TIMEOUT_S:g} s") from error
+        finally:
+            del self._open[ticket]
+        return order
+
+
+def _check(label: str, event: Event) -> None:
+    """Raises what the answer to a command says went wrong, with the container's name."""
+    if event.kind in (Kind.CHECKPOINT, Kind.RESTORED):
+        return
+    if event.kind is Kind.GAVE_UP:
+        raise AvckptError(f"{label} was not restored and ended: {why_not_restored(event.reason, event.error)}")
+    if event.kind is Kind.UNPROTECTED:
+        raise Unprotected(f"{label} runs unprotected: {event.error}")
+    if event.error is None:
+        raise AvckptError(f"{label}: answered with {event.kind.name.lower()}")
+    error = event.error
+    raise type(error)(
+        error.detail,
+        container=label,
+        operation=error.operation,
+        syscall=error.syscall,
+        errno=error.errno,
+        pid=error.pid,
+        undo_failures=error.undo_failures,
+    )
