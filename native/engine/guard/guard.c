@@ -305,22 +305,38 @@ static uint64_t end_waits(struct avc_guard *guard)
 	return due;
 }
 
+static uint64_t earlier(uint64_t a, uint64_t b)
+{
+	return a < b ? a : b;
+}
+
+/* When there is something to do, whether anything is heard or not. */
+static uint64_t work_due(struct avc_guard *guard)
+{
+	uint64_t due = earlier(guard->next_ns, end_waits(guard));
+
+	due = earlier(due, guard_tell_due(guard));
+	if (guard->remains.pid)
+		due = earlier(due, guard->remains.until_ns);
+	return earlier(due, tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : tracee_ending_due());
+}
+
+/* Whether there was any. */
+static bool poll_until(struct pollfd *fds, nfds_t n, uint64_t until)
+{
+	const uint64_t now = now_ns();
+	const uint64_t ns = until > now ? until - now : 0;
+	const struct timespec timeout = { .tv_sec = (time_t)(ns / NS_PER_S),
+					  .tv_nsec = (long)(ns % NS_PER_S) };
+	const bool any = ppoll(fds, n, &timeout, NULL) != 0;
+
+	heartbeat();
+	return any;
+}
+
 static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
-	const uint64_t waits_ns = end_waits(guard);
-	const uint64_t now = now_ns();
-	const uint64_t check_ns = guard_exec_check_due(guard);
-	const uint64_t ahead_ns = tracee_ending_pidfd(0) < 0 ? guard->ahead_ns
-							     : tracee_ending_due();
-	const uint64_t sooner_ns = check_ns < ahead_ns ? check_ns : ahead_ns;
-	const uint64_t tell_ns = guard_tell_due(guard);
-	const uint64_t earlier_ns = tell_ns < sooner_ns ? tell_ns : sooner_ns;
-	const uint64_t remains_ns = guard->remains.pid ? guard->remains.until_ns : UINT64_MAX;
-	const uint64_t first_ns = remains_ns < earlier_ns ? remains_ns : earlier_ns;
-	const uint64_t soon_ns = waits_ns < first_ns ? waits_ns : first_ns;
-	const uint64_t due = guard->next_ns < soon_ns ? guard->next_ns : soon_ns;
-	uint64_t ns = due > now ? due - now : 0;
-	struct timespec timeout;
+	uint64_t due = work_due(guard);
 	nfds_t n = 0;
 
 	watch(guard, &n, guard->socket);
@@ -350,16 +366,17 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	for (uint32_t i = 0; tracee_ending_pidfd(i) >= 0; i++)
 		watch(guard, &n, tracee_ending_pidfd(i));
 	if (straggling) {
+		const uint64_t now = now_ns();
 		const bool fresh = now - guard->stragglers_since_ns < NS_PER_S;
-		const uint64_t slice = fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS;
 
-		ns = ns < slice ? ns : slice;
+		due = earlier(due, now + (fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS));
 	}
-	ns = ns < AVC_HEARTBEAT_NS ? ns : AVC_HEARTBEAT_NS;
-	timeout = (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
-				     .tv_nsec = (long)(ns % NS_PER_S) };
-	(void)ppoll(guard->fds, n, &timeout, NULL);
-	heartbeat();
+	/* Most of an idle guard's time: to beat, and to look whether a program was executed. */
+	while (!poll_until(guard->fds, n,
+			   earlier(due, earlier(now_ns() + AVC_HEARTBEAT_NS,
+						guard_exec_check_due(guard)))) &&
+	       now_ns() < due && !guard_let_executed_go(guard, false))
+		;
 }
 
 /* Nobody is to believe that there are checkpoints when there are none. */

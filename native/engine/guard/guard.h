@@ -125,7 +125,7 @@ void guard_let_ended_go(struct avc_guard *guard);
 void guard_tend_tree(struct avc_guard *guard);
 /* Gives up what was brought into processes that have executed another program since;
  * `all`: whether or not it is time to look.  When it is: CLOCK_MONOTONIC, UINT64_MAX: never. */
-void guard_let_executed_go(struct avc_guard *guard, bool all);
+bool guard_let_executed_go(struct avc_guard *guard, bool all);
 uint64_t guard_exec_check_due(const struct avc_guard *guard);
 /* Tracees of ours that nobody knows of. */
 void guard_kill_lost(struct avc_guard *guard);

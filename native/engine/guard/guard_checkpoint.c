@@ -193,7 +193,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		return -1;
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
-	guard_let_executed_go(guard, true);
+	(void)guard_let_executed_go(guard, true);
 	if (tree_look(tree, err) || check_vfork(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {

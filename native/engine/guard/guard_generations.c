@@ -230,10 +230,11 @@ static void lose_program(struct avc_guard *guard)
 
 /* One that executes another program closes what it has marked for that (O_CLOEXEC), and
  * somebody may be waiting for just that.  The kernel does not tell, so it is looked at: often
- * at first, for most do it at once if they do it at all. */
-void guard_let_executed_go(struct avc_guard *guard, bool all)
+ * at first, for most do it at once if they do it at all.  Returns whether there was one. */
+bool guard_let_executed_go(struct avc_guard *guard, bool all)
 {
 	const uint64_t now = now_ns();
+	bool any = false;
 
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
@@ -241,11 +242,13 @@ void guard_let_executed_go(struct avc_guard *guard, bool all)
 		if (!has_ours(process) || (!all && now < process->exec_check_ns) ||
 		    !found_executed(process, now))
 			continue;
+		any = true;
 		if (process->descendant)
 			guard_release(guard, process);
 		else
 			lose_program(guard);
 	}
+	return any;
 }
 
 uint64_t guard_exec_check_due(const struct avc_guard *guard)
@@ -282,7 +285,7 @@ void guard_let_ended_go(struct avc_guard *guard)
 
 void guard_tend_tree(struct avc_guard *guard)
 {
-	guard_let_executed_go(guard, false);
+	(void)guard_let_executed_go(guard, false);
 	guard_let_ended_go(guard);
 }
 
