@@ -51,6 +51,15 @@ test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-trees.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
+deb: setup-build ## a Debian package for this Debian: command line, hooks, init, guard, sidecar as a service (build/*.deb)
+	@scripts/make-deb.sh
+
+wheel: setup-build ## a wheel for pipx or pip, with everything `avckpt install --sidecar` needs (build/wheel)
+	@rm -rf build/wheel && $(VENV)/python -m pip wheel --disable-pip-version-check -q --no-deps --no-build-isolation -w build/wheel . && ls build/wheel
+
+test-packages: setup ## install the wheel and the .deb, build the sidecar's image from the wheel
+	@AVCKPT_LONG=1 $(VENV)/python -m pytest tests/integration/test_packages.py --timeout 900 $(PYTEST_ARGS)
+
 sweep: setup-build ## kill the guard before each of its system calls and stores, one run each: nobody notices (an hour)
 	@AVCKPT_SWEEP=all $(VENV)/python -m pytest tests/native/test_engine_sweep.py $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
@@ -127,5 +136,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
+.PHONY: help deb wheel test-packages setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
 .DEFAULT_GOAL := help

@@ -54,6 +54,8 @@ def data_files(build_lib: Path) -> list[tuple[Path, Path]]:
     package = build_lib / "avckpt"
     programs = ("avckpt-init", "avckpt-exec", "avckpt-guard")
     pairs = [(ROOT / "native" / "build" / name, package / "libexec" / name) for name in programs]
+    share = ("avckpt-sidecar.container", "Containerfile")
+    pairs += [(ROOT / "packaging" / name, package / "packaging" / name) for name in share]
     pairs += [(path, package / "oci-hooks.d" / path.name) for path in sorted((ROOT / "oci-hooks.d").glob("*.json"))]
     return pairs
 

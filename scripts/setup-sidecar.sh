@@ -14,7 +14,7 @@ BUILDER=localhost/avckpt-sidecar-build
 WHEELS=$BUILD/wheels
 
 base_id=$(podman image inspect --format '{{.Id}}' "$BASE:latest") || die "no base image: make setup builds it"
-key=$(content_key Containerfile .containerignore pyproject.toml setup.py LICENSE native sidecar hooks oci-hooks.d -- "$base_id")
+key=$(content_key Containerfile .containerignore pyproject.toml setup.py LICENSE native sidecar hooks oci-hooks.d packaging -- "$base_id")
 if podman image exists "$IMAGE:$key"; then
 	podman tag "$IMAGE:$key" "$IMAGE:latest"
 	note "sidecar image: $IMAGE is there"

@@ -8,6 +8,7 @@ picks up a stray build.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 
@@ -48,6 +49,29 @@ def oci_hooks_source() -> Path:
         if any(path.glob("*.json")):
             return path
     raise ConfigError(_nowhere("the directory oci-hooks.d", candidates, "install avckpt again"))
+
+
+def packaging(name: str) -> Path:
+    """A file of the folder `packaging`.  Raises ConfigError when it is nowhere."""
+    candidates = (PACKAGE / "packaging" / name, CHECKOUT / "packaging" / name)
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise ConfigError(_nowhere(name, candidates, "install avckpt again"))
+
+
+def build_id() -> str:
+    """Twelve hex digits of everything that is run: between two releases all builds have the same version.
+
+    Raises ConfigError.
+    """
+    digest = hashlib.sha256()
+    for package in (PACKAGE, hooks_source()):
+        for path in sorted(package.glob("**/*.py")):
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() + b"\0")
+    for program in (init_binary(), inside_binary(), guard_binary()):
+        digest.update(program.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def _program(name: str) -> Path:

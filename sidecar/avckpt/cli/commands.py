@@ -54,7 +54,14 @@ class Cli(click.Group):
 
 
 @click.group(cls=Cli, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="avckpt", message="%(prog)s %(version)s")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=lambda *a: _print_version(*a),
+    help="Version and build.",
+)
 def main() -> None:
     """Keeps Podman containers alive through crashes.
 
@@ -70,6 +77,19 @@ main.add_command(inspect)
 for command in (check, up, down, web, bundle):
     main.add_command(command)
 
+
+def _print_version(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    from avckpt import artifacts
+
+    if wanted and not ctx.resilient_parsing:
+        try:
+            build = artifacts.build_id()
+        except (AvckptError, OSError):
+            build = "unknown"  # a checkout that is not compiled
+        click.echo(f"avckpt {__version__} (build {build})")
+        ctx.exit()
+
+
 root_option = click.option(
     "--root",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
@@ -80,12 +100,37 @@ root_option = click.option(
 
 @main.command()
 @root_option
+@click.option("--sidecar", is_flag=True, help="Also build the sidecar's image, and start it.")
+@click.option(
+    "--archive",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="With --sidecar: load the image from this file (podman save).",
+)
+@click.option("--base", default="", metavar="IMAGE", help="With --sidecar: the Debian or Ubuntu it is built from.")
+@click.option("--quadlet", is_flag=True, help="Also put a systemd unit for the sidecar's container in place.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON list of what was done.")
-def install(root: Path, as_json: bool) -> None:
-    """Put hooks and avckpt-init in place on this host."""
+def install(*, root: Path, sidecar: bool, archive: Path | None, base: str, quadlet: bool, as_json: bool) -> None:
+    """Put hooks and avckpt-init in place on this host.
+
+    With --sidecar all is done that protection needs: the sidecar's image is
+    built from this installation (which needs no checkout) or loaded, and its
+    container is started, or replaced if it is of another build.
+    """
     from avckpt.cli import install as installer
 
-    _print_lines(installer.install(root), as_json)
+    if (archive or base) and not sidecar:
+        raise click.UsageError("--archive and --base say how --sidecar gets its image")
+    lines = installer.install(root, quadlet=quadlet)
+    if sidecar:
+        from avckpt.cli import sidecar_image
+
+        image = (
+            sidecar_image.load(archive)
+            if archive
+            else sidecar_image.build(base, lambda line: click.echo(line, err=True))
+        )
+        lines += [image, *sidecar_image.start(_run_dir(), by_quadlet=quadlet)]
+    _print_lines(lines, as_json)
 
 
 @main.command()
@@ -108,8 +153,14 @@ def uninstall(root: Path, as_json: bool) -> None:
     show_default=True,
     help="Defaults for all containers.",
 )
-def sidecar(verbose: bool, config: Path) -> None:
-    """Run the sidecar's daemon in the foreground (in its container)."""
+@click.option(
+    "--watchdog",
+    is_flag=True,
+    default="container" in os.environ,  # podman-run(1)
+    help="Kill a daemon that hangs, and start another; so it does in a container.",
+)
+def sidecar(verbose: bool, config: Path, watchdog: bool) -> None:
+    """Run the sidecar's daemon in the foreground (in its container, or as a service)."""
     import logging
 
     logging.basicConfig(
@@ -118,7 +169,7 @@ def sidecar(verbose: bool, config: Path) -> None:
         stream=sys.stderr,
     )
     logging.getLogger("asyncio").setLevel(logging.WARNING)
-    if "container" not in os.environ:  # podman-run(1)
+    if not watchdog:
         sys.exit(_serve(config, -1))
     from avckpt.supervision.watchdog import keep_alive
 

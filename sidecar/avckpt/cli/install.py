@@ -36,6 +36,7 @@ HOOKS_DIR = SHARE / "oci-hooks.d"
 MANIFEST = SHARE / "manifest.json"
 DROP_IN = Path("/etc/containers/containers.conf.d/50-avckpt.conf")
 TMPFILES = Path("/etc/tmpfiles.d/avckpt.conf")
+QUADLET = Path("/etc/containers/systemd/avckpt-sidecar.container")
 CONFIG_DIR = Path("/etc/avckpt")
 """For the user's config.yaml; made here because the sidecar's container mounts it."""
 
@@ -148,11 +149,12 @@ class _Writer:
         self._undo.pop_all()
 
 
-def install(root: Path = _HOST) -> list[str]:
+def install(root: Path = _HOST, *, quadlet: bool = False) -> list[str]:
     """Installs, or brings an installation up to date.
 
     `root` is where the host's file system is (`/host` in a container that has
-    it mounted there).  Returns what was done, a line each; a line that starts
+    it mounted there).  With `quadlet` also a systemd unit for the sidecar; one
+    that an earlier installation has put in place stays.  Returns what was done, a line each; a line that starts
     with "warning: " needs the user.  Raises ConfigError, Denied.
     """
     if os.geteuid() != 0:
@@ -169,6 +171,9 @@ def install(root: Path = _HOST) -> list[str]:
         line = f"# avckpt: where hooks and sidecar meet\nd {_run_dir()} 0755 root root -\n"
         files.append(_File(TMPFILES, line.encode()))
         done.append(f"{TMPFILES}: makes {_run_dir()} when the machine starts")
+    if quadlet or QUADLET in before.files:
+        files.append(_File(QUADLET, artifacts.packaging(QUADLET.name).read_bytes()))
+        done.append(f"{QUADLET}: the sidecar as a unit of systemd (Podman 4.4 or newer; systemctl daemon-reload)")
     # Last: from here on Podman calls the hooks.
     directories = containers_conf.with_directory(root, HOOKS_DIR, without=DROP_IN)
     files.append(_File(DROP_IN, _drop_in(directories).encode()))

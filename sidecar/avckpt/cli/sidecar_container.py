@@ -58,7 +58,7 @@ def _ensure(run_dir: Path, say: Callable[[str], None]) -> None:
         _podman("run", "--detach", "--pull=never", "--name", NAME, *options(run_dir), IMAGE)
     else:
         raise SidecarUnreachable(
-            f"no sidecar is running, and there is no image {IMAGE} to start one from: build it with `make setup`"
+            f"no sidecar is running, and there is no image {IMAGE} to start one from: run sudo avckpt install --sidecar"
         )
     _wait(client, f"the container {NAME} was started, and does not answer on {run_dir}/api.sock")
 
