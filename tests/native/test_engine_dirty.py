@@ -163,12 +163,12 @@ def newest_template(guard: GuardProcess, victim: Victim) -> int:
     return min(points, key=lambda pid: points[pid])
 
 
-@pytest.mark.parametrize("command", ["dirt 24 3 --rate 8000", "dirt 48 3 --rate 60000 --maps"])
+@pytest.mark.parametrize("command", ["dirt 24 3 --rate 8000", "dirt 64 3 --rate 20000 --maps"])
 def test_the_template_is_the_application(command: str, tmp_path: Path) -> None:
     """While it stands still: its newest template is the same in every byte that the kernel does not write."""
     with Victim(command, tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         copies, rounds = 0, 0
-        while copies < 20:
+        while copies < 12:
             rounds += 1
             assert rounds < 100, [event.get("fork_reason") for event in guard.events]
             victim.wait_beats(10)
