@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import SLOWNESS, wait_until
 from testkit.scenario import disturb, restored
 
@@ -34,3 +34,10 @@ def test_what_children_have_from_their_parents(size: str, tmp_path: Path) -> Non
                 disturb(victim)
                 event = restored(victim, guard)
                 assert "error" not in event, event
+
+
+@pytest.mark.parametrize("kind", ["kept", "twins", "saved", "for-good"])
+def test_others_in_their_places(kind: str, tmp_path: Path) -> None:
+    """A child puts another file there, and the parent's back, between the looks of a checkpoint, too."""
+    with Victim(f"redirect {kind}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        kill_at_random(guard, victim, 12, (0.01, 0.12))

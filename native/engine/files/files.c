@@ -31,6 +31,7 @@ struct look {
 	pid_t pid, init;
 	int pidfd, fd_dir;
 	enum files_depth depth;
+	bool trusts; /* heirs are taken for what they were: files_check_heirs()  */
 	uint32_t ours;
 	struct stat init_stdio[3];
 	bool init_known[3];
@@ -212,8 +213,6 @@ static struct file *take_known(const struct look *look, struct file *f)
 			return NULL;
 		}
 	}
-	if (f->inherited)
-		f->cloexec = k->cloexec;
 	f->known = true;
 	f->remote = k->remote;
 	if (look->depth == FILES_NOW) {
@@ -299,22 +298,31 @@ static void copy_of(struct file *f, const struct file *is)
 	f->inherited = is;
 }
 
-static bool copy_before(const struct look *look, const struct file *is, struct file *f)
+/* Only files have locks, each process its own. */
+static bool has_no_lock(const struct look *look, const struct file *is)
 {
 	struct file own = { .fd = is->fd, .kind = is->kind, .told_flags = -1 };
+
+	if (is->kind != FILE_REGULAR)
+		return true;
+	(void)file_read_info(look->pid, &own);
+	free(own.lock);
+	return own.told_flags >= 0 && !own.lock_count;
+}
+
+static bool copy_before(const struct look *look, const struct file *is, struct file *f)
+{
 	size_t bytes;
 	char *name;
 
-	if (is_anonymous(is) || is->lock_count || !is->name || !is_parents(look, is))
+	if (is_anonymous(is) || is->lock_count || !is->name || !is_parents(look, is) ||
+	    !has_no_lock(look, is))
 		return false;
-	(void)file_read_info(look->pid, &own);
-	free(own.lock);
 	bytes = strlen(is->name) + 1;
-	name = own.told_flags < 0 || own.lock_count || !budget_take(bytes) ? NULL : malloc(bytes);
+	name = budget_take(bytes) ? malloc(bytes) : NULL;
 	if (!name)
 		return false;
 	copy_of(f, is);
-	f->cloexec = own.cloexec;
 	f->name = memcpy(name, is->name, bytes);
 	f->socket = is->socket;
 	if (f->socket)
@@ -329,7 +337,8 @@ static bool copy_frozen(const struct look *look, const struct file *is, struct f
 	/* Of locks and of what is watched there is more to know. */
 	if (!k || !is->known || k->remote || k->lock_count || is->lock_count || is->watch_count ||
 	    is->mark_count || k->kind != is->kind || k->id != is->id ||
-	    (is->kind == FILE_REGULAR && is->told_ino) || !is_parents(look, is))
+	    (is->kind == FILE_REGULAR && is->told_ino) ||
+	    !((look->trusts && k->heir) || is_parents(look, is)))
 		return false;
 	copy_of(f, is);
 	return take_known(look, f) != NULL;
@@ -776,19 +785,69 @@ static int walk(struct look *look, uint32_t seen, struct avc_error *err)
 	}
 }
 
-/* Since Linux 6.2 a table says how many it has: when all that were there before are, and are as many,
- * there is no other one. */
-static int walk_all(struct look *look, struct avc_error *err)
+/* Of those that were there before, to the places that they had: the heirs, or all others.  Whether
+ * they all are. */
+static int look_at_known(struct look *look, bool heirs, bool *same, struct avc_error *err)
+{
+	struct files *files = look->files;
+
+	*same = true;
+	for (uint32_t i = 0; i < look->known->count; i++) {
+		const struct file *k = &look->known->file[i];
+
+		if (k->heir != heirs)
+			continue;
+		files->count = i;
+		if (look_at(look, k->fd, err))
+			return -1;
+		if (files->count == i)
+			files->file[i].fd = -1; /* it has been closed             */
+		*same &= files->count > i && files->file[i].known;
+	}
+	return 0;
+}
+
+static void close_gaps(struct files *files, uint32_t count)
+{
+	files->count = 0;
+	for (uint32_t i = 0; i < count; i++)
+		if (files->file[i].fd >= 0)
+			files->file[files->count++] = files->file[i];
+}
+
+/* How many it has, since Linux 6.2. */
+static int64_t size_of_table(const struct look *look)
 {
 	struct stat st;
 
-	if (look->depth != FILES_FROZEN || !look->known)
-		return walk(look, 0, err);
-	if (walk_known(look, err))
+	return fstat(look->fd_dir, &st) ? -1 : st.st_size;
+}
+
+/* Heirs are by far the most, and take their time.  A process that has as many as it had, and
+ * everything of its own just as it was, has them most likely, too, and that is looked at when it
+ * runs again.  With as many as were there before there is no other one. */
+static int walk_frozen(struct look *look, struct avc_error *err)
+{
+	const uint32_t count = look->known->count;
+	const int64_t size = size_of_table(look);
+	bool same;
+
+	if (look_at_known(look, false, &same, err))
 		return -1;
-	return fstat(look->fd_dir, &st) == 0 && st.st_size == look->files->count
-		       ? 0
-		       : walk(look, look->files->count, err);
+	look->trusts = same && size == count && !look->files->process->heirs_vary;
+	look->files->trusted = look->trusts;
+	if (look_at_known(look, true, &same, err))
+		return -1;
+	close_gaps(look->files, count);
+	return size == look->files->count ? 0 : walk(look, look->files->count, err);
+}
+
+static bool are_in_order(const struct files *files)
+{
+	for (uint32_t i = 1; i < files->count; i++)
+		if (files->file[i - 1].fd > files->file[i].fd)
+			return false;
+	return true;
 }
 
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
@@ -816,15 +875,20 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	files->count = 0;
 	clock_gettime(CLOCK_REALTIME, &now);
 	files->taken_ns = (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
-	result = files->missing && !files->missing->count ? walk_known(&look, err)
-							  : walk_all(&look, err);
+	if (files->missing && !files->missing->count)
+		result = walk_known(&look, err);
+	else if (depth == FILES_FROZEN && known && known->count <= files->room)
+		result = walk_frozen(&look, err);
+	else
+		result = walk(&look, 0, err);
 	close(look.fd_dir);
 	if (result) {
 		for (uint32_t i = 0; i < files->count; i++)
 			drop_ours(&files->file[i]);
 		return -1;
 	}
-	qsort(files->file, files->count, sizeof *files->file, by_fd);
+	if (!are_in_order(files))
+		qsort(files->file, files->count, sizeof *files->file, by_fd);
 	if (depth == FILES_FROZEN) {
 		check_shared(files, pid);
 		files_find_peers(files, pid); /* of pairs that are quite new */
@@ -891,6 +955,17 @@ static void survey(struct aside *aside)
 	job->result = files_look(job->files, &job->owner, FILES_BEFORE, NULL, &job->error);
 }
 
+/* Heirs that it has once: what it has twice it can put in another's place, and back. */
+static void note_heirs(struct files *files)
+{
+	for (uint32_t i = 0; i < files->count; i++)
+		files->file[i].heir = files->file[i].inherited;
+	for (uint32_t i = 0; i < files->count; i++)
+		if (files->file[i].shared != files->file[i].fd)
+			files->file[i].heir = files_find(files, files->file[i].shared)->heir =
+				false;
+}
+
 /* Nothing of it is needed after the look. */
 static void forget_parent(struct files *files)
 {
@@ -945,6 +1020,7 @@ static struct files *look_before(const struct process *process, const struct pro
 	} else {
 		files = job->files;
 		job->files = NULL;
+		note_heirs(files);
 		forget_parent(files);
 	}
 	drop_survey(&job->aside);
@@ -968,8 +1044,9 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 	if (!image)
 		return fail_errno(err, process->pid, "look at descriptors", "calloc",
 				  "out of memory");
-	/* Touched now: a first touch costs a fault, then while the app is stopped. */
-	memset(image->file, 0, image->room * sizeof *image->file);
+	/* Touched now: a first touch costs a fault, then while the app is stopped.  (A compiler leaves
+	 * out memset(3) after calloc(3).) */
+	explicit_bzero(image->file, image->room * sizeof *image->file);
 	image->with_tcp = process->tcp_moved;
 	process->files_image = image;
 	return 0;

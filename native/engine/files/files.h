@@ -9,6 +9,7 @@
  *   files_unix.c    names of Unix sockets
  *   files_make.c    opens and makes again what is lost
  *   files_restore.c compares two tables and makes the one the other
+ *   files_heirs.c   what a child has from its parent
  *   files_family.c  all tables of an app: what is between its processes
  *   files_calls.c   what the restored process has to do for that itself
  *   files_watches.c inotify
@@ -50,6 +51,9 @@ void scratch_close(struct scratch *scratch);
  * which may have the other ends of pipes. */
 void files_capture(struct image *image, const struct image *parent, bool several,
 		   struct scratch *scratch);
+/* What the freeze has left out, by the templates (files_heirs.c).  AVC_RETRY: what a process has
+ * from its parent has changed meanwhile. */
+int files_check_heirs(struct image *image, uint32_t images, struct avc_error *err) warn_unused;
 /* After it. */
 void files_settle(struct image *image);
 /* Of cameras, in the template (files_video.c). */
@@ -255,6 +259,7 @@ struct file {
 	/* The same open file description in `parent` of files_look(); NULL: not known to be.
 	 * Afterwards only in the images of a freeze, where all are at the same time. */
 	const struct file *inherited;
+	bool heir; /* of a look before a freeze: it was that                        */
 };
 
 /* What is not where it was. */
@@ -269,6 +274,7 @@ struct files {
 	uint32_t count, room;
 	const struct file **ends; /* pipes and sockets by inode, when it is asked for: allocated */
 	uint32_t end_count;
+	bool trusted;           /* its heirs were not looked at in the freeze               */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */

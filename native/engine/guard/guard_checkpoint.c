@@ -406,6 +406,8 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 		result = generation_finish(fresh, err);
 	if (!result)
 		result = dirty_check(&guard->dirty, &fresh->image[0], err);
+	if (!result)
+		result = files_check_heirs(fresh->image, fresh->images, err);
 	tracee_deadline_clear(guard->timer);
 	return result;
 }

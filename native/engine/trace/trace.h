@@ -206,6 +206,7 @@ struct process {
 	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
+	bool heirs_vary;   /* what it has from its parent changed in a freeze        */
 	bool tcp_moved;    /* bytes of connections are to be counted           */
 	bool tcp_messages; /* quiescent is only who is between two messages    */
 	/* Of a process that is not the main one (tree.c). */
