@@ -124,7 +124,7 @@ class Daemon:
         self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
-        self.inquests: Inquests[Watch] = Inquests(self.tell, self.history)
+        self.inquests: Inquests[Watch] = Inquests(self.tell, self.history, run_dir / "cores")
         self.started_at = time.time()
         self._engine = Engine()
         self._watches: dict[int, Watch] = {}

@@ -11,8 +11,8 @@ from avckpt_hooks.shared.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Pol
 from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Images, Tcp
 
-LOOK_AT_REMAINS_S = 1.0
-"""How long a dead application's memory is kept at most, while the sidecar finds out where it died."""
+REMAINS_S = {"off": 1.0, "mini": 5.0, "on": 30.0}
+"""How long a dead application's memory is kept at most, by `avckpt.core`: to find out where it died, or to write it."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def guard_config(policy: Policy) -> GuardConfig:
         restore_window_s=policy.restore_window_s,
         quiesce_s=policy.quiesce_s,
         shm_bytes=policy.shm_bytes,
-        remains_s=LOOK_AT_REMAINS_S,
+        remains_s=REMAINS_S[policy.core],
         files=Files[policy.files.upper()],
         tcp=Tcp[policy.tcp.upper().replace("-", "_")],
         images=Images[policy.images.upper()],

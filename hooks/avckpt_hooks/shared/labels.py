@@ -105,6 +105,8 @@ class Policy:
     """What is protected: the container as a whole, or the nodes that its launcher starts by avckpt-init."""
     images: str = "fork"
     """How a checkpoint gets the application's memory: fork, dirty or auto."""
+    core: str = "off"
+    """A core file for each death that is undone: off, mini (stacks) or on."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
     notify: Notify | None = None
@@ -391,6 +393,7 @@ LABELS: dict[str, Label] = {
     "avckpt.images": Label("fork", "fork, dirty or auto", _one_of("images", "fork", "dirty", "auto")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
+    "avckpt.core": Label("off", "off, mini or on", _one_of("core", "off", "mini", "on")),
     "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),
     "avckpt.notify": Label("", _NOTIFY, _parse_notify),

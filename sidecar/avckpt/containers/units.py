@@ -50,7 +50,7 @@ LEAST_INTERVAL_S = 0.1
 NOT_INHERITED = frozenset(
     {"avckpt.enable", "avckpt.scope", "avckpt.name", "avckpt.version", "avckpt.notify", "avckpt.io_uring"}
 )
-NOT_A_NODES = ("avckpt.scope", "avckpt.group", "avckpt.io_uring", "avckpt.version")
+NOT_A_NODES = ("avckpt.scope", "avckpt.group", "avckpt.io_uring", "avckpt.core", "avckpt.version")
 """Labels that say something of others than the node itself."""
 
 

@@ -17,6 +17,7 @@ LEVELS = {
     Kind.GUARD_LOST: logging.WARNING,
     Kind.DIED: logging.INFO,
     Kind.CRASH: logging.INFO,
+    Kind.CORE: logging.INFO,
     Kind.RESTORED: logging.WARNING,
     Kind.GAVE_UP: logging.ERROR,
     Kind.DROPPED: logging.WARNING,

@@ -81,6 +81,8 @@ class EventRecord:
     app_pid: int | None = said("the application's main process, in the sidecar's PID namespace")
     app_pid_inside: int | None = said("the same in the container's")
     detail: str = said("one clause for a person, where the rest does not say it", "")
+    core: str | None = said("path of a core file; none: there is none, and `detail` says why")
+    core_bytes: int | None = said("its size, compressed")
     crash: Crash | None = said("what it died of, and where")  # noqa: RUF009
     error: AvckptError | None = said("what went wrong, as in the API's errors")  # noqa: RUF009
 
@@ -292,6 +294,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.DIED: _died,
     Kind.RESTORED: _restored,
     Kind.CRASH: _crashed,
+    Kind.CORE: lambda record: record.detail,
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
     Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
     Kind.HEALTH: _detail,

@@ -56,6 +56,7 @@ class Kind(_Named):
     HEALTH = "health"
     CONFIGURED = "configured"
     CRASH = "crash"
+    CORE = "core"
     NOTIFIED = "notified"
     NOTIFY_FAILED = "notify_failed"
     SIDECAR_STARTED = "sidecar_started"

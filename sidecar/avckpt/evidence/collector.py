@@ -26,6 +26,7 @@ log = logging.getLogger("avckpt")
 class Case:
     """A death, as far as the kernel told of it by itself."""
 
+    app_pid: int
     wait_status: int
     crash: Crash
     death: Death
@@ -72,7 +73,8 @@ class Collector:
         signum = wait_status & 0x7F
         name = signal_name(signum) if signum else ""
         if self._deaths is None:
-            return Case(wait_status, Crash(signal=name, unknown=self._problem), Death(), None, remains_pid, init_pid)
+            crash = Crash(signal=name, unknown=self._problem)
+            return Case(pid, wait_status, crash, Death(), None, remains_pid, init_pid)
         death = self._deaths.of(pid)
         hit = death.fatal(signum) if signum else None
         fault = self._log.of(hit.tid) if hit is not None and self._log is not None else None
@@ -81,7 +83,7 @@ class Collector:
             crash = replace(crash, sender=_name_of(crash.sender_pid))
         if signum and hit is None:
             crash = replace(crash, unknown="the kernel told of too many deaths at once")
-        return Case(wait_status, crash, death, hit, remains_pid, init_pid)
+        return Case(pid, wait_status, crash, death, hit, remains_pid, init_pid)
 
     async def examine(self, case: Case) -> Crash:
         """With what the memory of the dead tells."""

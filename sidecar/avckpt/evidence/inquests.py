@@ -8,6 +8,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from avckpt.containers.protected import Protected
@@ -17,8 +18,10 @@ from avckpt.events.history import History
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 from avckpt.evidence.collector import Case, Collector
+from avckpt.evidence.cores import Cores
 from avckpt.evidence.crash import Crash
 from avckpt.guard import Command, Event
+from avckpt.policy import Settings
 
 log = logging.getLogger("avckpt")
 
@@ -31,6 +34,7 @@ class Watched(Protocol):
 
     container: Protected
     guard: Guard | None
+    settings: Settings
 
 
 W = TypeVar("W", bound=Watched)
@@ -39,10 +43,11 @@ W = TypeVar("W", bound=Watched)
 class Inquests(Generic[W]):
     """One for each death, beside whatever the daemon does.  For one event loop; `start()` it there."""
 
-    def __init__(self, tell: Callable[[W, EventRecord], EventRecord], history: History) -> None:
+    def __init__(self, tell: Callable[[W, EventRecord], EventRecord], history: History, cores: Path) -> None:
         self._tell = tell
         self._history = history
         self._collector = Collector()
+        self._cores = Cores(cores)
         self._tasks: set[asyncio.Task[None]] = set()
         self._open: dict[int, asyncio.Future[EventRecord]] = {}
         """By the container's cookie: what follows the death that is looked into."""
@@ -81,15 +86,19 @@ class Inquests(Generic[W]):
     async def _look_into(self, watch: W, case: Case, outcome: asyncio.Future[EventRecord]) -> None:
         try:
             crash = await self._collector.examine(case)
+            try:
+                followed = await asyncio.wait_for(outcome, OUTCOME_S)
+            except asyncio.TimeoutError:
+                followed = EventRecord(Kind.GAVE_UP, reason=Reason.SIGNAL, wait_status=case.wait_status)
+            if followed.reason is Reason.COMMAND or followed.outcome in EXPECTED:
+                return  # somebody wanted it
+            self._tell(watch, self._record(watch.container, crash, followed))
+            mode = watch.settings.policy.core
+            if mode != "off" and followed.outcome is Reason.RESTORED:
+                path, size, what = await self._cores.make(watch.container, case, crash, mode)
+                self._tell(watch, EventRecord(Kind.CORE, core=path or None, core_bytes=size or None, detail=what))
         finally:
             self._release(watch, case)
-        try:
-            followed = await asyncio.wait_for(outcome, OUTCOME_S)
-        except asyncio.TimeoutError:
-            followed = EventRecord(Kind.GAVE_UP, reason=Reason.SIGNAL, wait_status=case.wait_status)
-        if followed.reason is Reason.COMMAND or followed.outcome in EXPECTED:
-            return  # somebody wanted it
-        self._tell(watch, self._record(watch.container, crash, followed))
 
     def _record(self, container: Protected, crash: Crash, followed: EventRecord) -> EventRecord:
         before = [

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core files of applications that have died: `avckpt.core`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from avckpt_hooks.shared.tell import printable
+
+from avckpt.containers.cgroup import groups_of
+from avckpt.containers.protected import Protected
+from avckpt.containers.records import keep_private
+from avckpt.evidence.collector import Case
+from avckpt.evidence.core import Request, Thread
+from avckpt.evidence.crash import Crash
+from avckpt.policy import REMAINS_S
+
+KEPT_OF_EACH = 5
+"""Of one container; the oldest make way."""
+KEPT_BYTES = 1_000_000_000
+"""Of all together."""
+KEPT_S = 7 * 86400.0
+BYTES_MAX = 500_000_000
+"""Of one, compressed."""
+CRAMPED = 0.9
+"""Of its limit a container may use at most so much, while the memory of the dead is kept, too."""
+AT_ONCE = 2
+"""Written at the same time."""
+SUFFIX = ".core.zst"
+
+
+class Cores:
+    """The folder where they are.  For one event loop."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._turn = asyncio.Semaphore(AT_ONCE)
+
+    async def make(self, container: Protected, case: Case, crash: Crash, mode: str) -> tuple[str, int, str]:
+        """Writes one; its path and size, and in words what it is or why there is none."""
+        if crash.unknown:
+            return "", 0, f"no core: {crash.unknown}"
+        if _is_cramped(case.init_pid):
+            return "", 0, "no core: its container has no memory left to keep what is dead"
+        begun = time.monotonic()
+        async with self._turn:
+            left_s = REMAINS_S[mode] - (time.monotonic() - begun)
+            if left_s <= 0:
+                return "", 0, "no core: too many others were being written"
+            try:
+                keep_private(self._folder)
+                path = self._folder / f"{_file_name(container.label)}.{int(time.time() * 1000)}{SUFFIX}"
+                answer = await _written(_request(case, path, mode, left_s, crash.command), left_s)
+            except (OSError, ValueError, asyncio.TimeoutError) as error:
+                return "", 0, f"no core: {printable(str(error)) or 'it took too long'}"
+        if "problem" in answer:
+            return "", 0, f"no core: {printable(str(answer['problem']))}"
+        size = int(answer["bytes"])
+        kind = "mini core" if mode == "mini" else "core"
+        self._prune(_file_name(container.label), path)
+        what = f"{kind} of {answer['threads']} thread(s), {answer['memory_bytes'] / 1e6:.1f} MB of memory in "
+        return str(path), size, f"{what}{size / 1e6:.1f} MB, after {answer['seconds']:.2f} s: {path}"
+
+    def _prune(self, name: str, newest: Path) -> None:
+        """Makes room, oldest first; the newest stays."""
+        found = []
+        for path in self._folder.glob(f"*{SUFFIX}"):
+            with contextlib.suppress(OSError):
+                found.append((path.stat().st_mtime, path.stat().st_size, path))
+        total = of_it = 0
+        for at, size, path in sorted(found, reverse=True):
+            total += size
+            of_it += path.name.rsplit(".", 3)[0] == name
+            too_many = total > KEPT_BYTES or (of_it > KEPT_OF_EACH and path.name.rsplit(".", 3)[0] == name)
+            if path != newest and (too_many or time.time() - at > KEPT_S):
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                total -= size
+
+
+def _request(case: Case, path: Path, mode: str, seconds_max: float, command: str) -> Request:
+    threads = sorted(case.death.deliveries.values(), key=lambda each: (each is not case.hit, each.tid))
+    signum = case.wait_status & 0x7F
+    return Request(
+        remains_pid=case.remains_pid,
+        path=str(path),
+        mini=mode == "mini",
+        bytes_max=BYTES_MAX,
+        seconds_max=seconds_max,
+        app_pid=case.app_pid,
+        signal=signum,
+        code=case.hit.code if case.hit is not None else 0,
+        fault=int(case.crash.fault or "0", 16),
+        threads=[Thread(each.tid, each.registers) for each in threads],
+        command=command,
+    )
+
+
+async def _written(request: Request, within_s: float) -> dict[str, Any]:
+    """What the program says.  Raises OSError, ValueError, asyncio.TimeoutError."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "avckpt.evidence.core"),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    try:
+        said, _ = await asyncio.wait_for(process.communicate(json.dumps(asdict(request)).encode()), within_s)
+    finally:
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+            with contextlib.suppress(FileNotFoundError):
+                Path(f"{request.path}.new").unlink()
+    answer = json.loads(said)
+    if not isinstance(answer, dict):
+        raise ValueError("its writer makes no sense")
+    return answer
+
+
+def _is_cramped(pid: int) -> bool:
+    try:
+        groups = groups_of(pid)
+    except OSError:
+        return True  # it is just ending
+    limit, used = groups.memory_limit_bytes(), groups.memory_used_bytes()
+    return limit is not None and used is not None and used > CRAMPED * limit
+
+
+def _file_name(label: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]", "_", label)[:100]
