@@ -49,6 +49,7 @@ demo: setup ## kill a protected container's application twice and watch it go on
 test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-system.sh view
 	@scripts/setup-trees.sh
+	@scripts/setup-docker.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
 deb: setup-build ## a Debian package for this Debian: command line, hooks, init, guard, sidecar as a service (build/*.deb)

@@ -22,7 +22,8 @@ PATIENCE_S = 0.1
 def main() -> int:
     """Removes the container's record and tells the sidecar.  Always 0."""
     try:
-        container = json.loads(sys.stdin.buffer.read())["id"]
+        state = json.loads(sys.stdin.buffer.read())
+        container = (state.get("annotations") or {}).get("avckpt.id") or state["id"]
         if not protocol.is_container_id(container):
             return 0
         for path in (protocol.record_path(container), protocol.health_path(container)):

@@ -81,10 +81,11 @@ def rewrite(config: bytes, parent: int) -> bytes:
             )
     if _LOOKALIKE not in spec.lower() and _LOOKALIKE not in config.lower():
         return config
-    return _rewrite_labelled(config, container, spec, parent)
+    return rewrite_labelled(config, container, spec, parent)
 
 
-def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -> bytes:
+def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -> bytes:
+    """The same, of a container whose name and labels are in `spec`.  `parent` 0: Podman is not there (runtime.py)."""
     import json
 
     from avckpt_hooks.shared import labels
@@ -107,6 +108,7 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
     if not policy.enable and not (policy.listens and _is_ours()):
         return config
     annotations = {**annotations, **wanted, "avckpt.name": name, "avckpt.version": VERSION}
+    annotations.pop("avckpt.id", None)  # avckpt-runtime's to say, and nobody else's
     if not policy.enable:
         # Nothing of it is touched: the sidecar only has to know that it runs.
         data["annotations"] = annotations
@@ -131,7 +133,8 @@ def _rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -
     if policy.scope == "nodes":
         return json.dumps(data, separators=(",", ":")).encode()
     # Always: the sidecar's configuration may say avckpt.restore.on=unhealthy, now or later.
-    _ask_for_health(container, name, parent)
+    if parent:
+        _ask_for_health(container, name, parent)
     return json.dumps(data, separators=(",", ":")).encode()
 
 
@@ -214,7 +217,7 @@ def add_hooks(data: dict[str, Any], told: bool) -> None:
     hooks = data.get("hooks") or {}
     for stage, more in (("prestart", ["--told"] if told else []), ("poststop", [])):
         hook = {
-            "path": os.path.abspath(sys.argv[0]),
+            "path": os.path.join(os.path.dirname(os.path.abspath(sys.argv[0])), "avckpt-hook"),
             "args": ["avckpt-hook", stage, *more],
             "env": env,
             "timeout": HOOK_TIMEOUT_S,
@@ -252,6 +255,9 @@ def warn(line: str, parent: int) -> bool:
     """Tells the user and the journal.  True if the user can see it."""
     line = f"avckpt: {line}"
     tell.journal(line)
+    if not parent:
+        print(tell.printable(line), file=sys.stderr)
+        return False
     return tell.parent(line, parent) and not podman.is_service(parent)
 
 

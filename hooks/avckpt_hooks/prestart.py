@@ -40,13 +40,14 @@ def main() -> int:
 
 def register(state: dict[str, Any]) -> str:
     """Registers the container of an OCI state.  Returns what is wrong with its protection, in a clause, or ""."""
-    if not protocol.is_container_id(state["id"]):  # which names files
+    container = state["annotations"].get("avckpt.id") or state["id"]  # the former is avckpt-runtime's
+    if not protocol.is_container_id(container):  # which names files
         raise ValueError("its id is not one of Podman's")
     pid = state["pid"]
     pidfd = os.pidfd_open(pid)
     try:
         registration = protocol.Register(
-            id=state["id"],
+            id=container,
             name=state["annotations"].get("avckpt.name") or state["id"][:12],
             pid=pid,
             starttime=starttime(pid),

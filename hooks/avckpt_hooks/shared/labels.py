@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 PREFIX = "avckpt."
-RESERVED = frozenset({"avckpt.version", "avckpt.name"})
+RESERVED = frozenset({"avckpt.version", "avckpt.name", "avckpt.id"})
 """Stamped on a protected container by the precreate hook; not for users to set."""
 
 KEEP_MAX = 16

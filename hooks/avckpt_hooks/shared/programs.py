@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import os
 
-OTHER_INITS = ("/run/podman-init", "/dev/init")
-"""Where `podman run --init` puts its own, which only reaps and forwards signals."""
+OTHER_INITS = ("/run/podman-init", "/dev/init", "/sbin/docker-init")
+"""Where `podman run --init` and `docker run --init` put their own, which only reaps and forwards signals."""
 _ONLY_AS_PID_1 = ("init", "systemd", "s6-svscan")
 """Programs, wherever they are, that end or do less when they are not PID 1: systemd, s6-overlay (/init), s6."""
 

@@ -92,6 +92,15 @@ def is_container_id(text: str) -> bool:
     return len(text) == 64 and not text.strip("0123456789abcdef")
 
 
+def key_of(container: str) -> str:
+    """What a container is known by here: its id, or 64 hex digits made of one that may be anything (containerd's)."""
+    if is_container_id(container):
+        return container
+    import hashlib
+
+    return hashlib.sha256(container.encode(errors="surrogateescape")).hexdigest()
+
+
 class Register:
     """A container has been created; its main process waits to be started."""
 

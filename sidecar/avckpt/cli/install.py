@@ -41,6 +41,8 @@ CONFIG_DIR = Path("/etc/avckpt")
 """For the user's config.yaml; made here because the sidecar's container mounts it."""
 
 HOOK_PROGRAM = LIBEXEC / "avckpt-hook"
+RUNTIME_PROGRAM = LIBEXEC / "avckpt-runtime"
+"""For Docker and containerd."""
 INIT_PROGRAM = LIBEXEC / "avckpt-init"
 _PACKAGE = LIBEXEC / "avckpt_hooks"
 _CACHES = (_PACKAGE / "__pycache__", _PACKAGE / "shared/__pycache__")
@@ -314,7 +316,7 @@ def _own_files(python: str) -> list[_File]:
         if executable:
             content = content.replace(b"/usr/bin/python3", python.encode(), 1)
         files.append(_File(_PACKAGE / name, content, 0o755 if executable else 0o644))
-    files.append(_File(HOOK_PROGRAM, f"{_PACKAGE.name}/__main__.py".encode(), 0))
+    files += [_File(path, f"{_PACKAGE.name}/__main__.py".encode(), 0) for path in (HOOK_PROGRAM, RUNTIME_PROGRAM)]
     files += [
         _File(HOOKS_DIR / path.name, _hook_json(path)) for path in sorted(artifacts.oci_hooks_source().glob("*.json"))
     ]
