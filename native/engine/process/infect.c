@@ -784,7 +784,6 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER, 1);
 	if (thread_borrow(process, thread, err))
 		return -1;
-	process->waiting = true;
 	result = parasite_run_clone(thread->tid, call, &between, err);
 	if (result) {
 		process->lost = process->lost || err->code != AVC_LIMIT;
@@ -812,7 +811,6 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 		thread->stopped = false;
 		return -1;
 	}
-	process->waiting = false;
 	return thread_give_back(thread, err) || result ? -1 : 0;
 }
 

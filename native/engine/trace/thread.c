@@ -233,10 +233,10 @@ static bool straggle(struct process *process, struct thread *thread)
 		break;
 	}
 	if (arch_regs_get(tid, &now) == 0) {
-		/* Not before it has waited for what it brought forth for us: the app would
-		 * find that. */
-		if (process->waiting && thread->borrowed &&
-		    parasite_contains(&process->parasite, arch_pc(&now)) &&
+		/* Not in the middle of its calls: it may still have to put something back
+		 * (MADV_DONTFORK), or to wait for what it brought forth for us, which the app would
+		 * find. */
+		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now)) &&
 		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
 			seccomp_go_on(tid, NULL);
 			return true;

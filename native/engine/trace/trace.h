@@ -224,7 +224,6 @@ struct process {
 	uint64_t dying_ns;            /* since when it has been in one                     */
 	bool alive;                   /* that was too long ago: it lives there             */
 	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
-	bool waiting;                 /* its main thread is to wait for a task of ours       */
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
 	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An application that reads its own /proc, and asks the kernel for all it knows of it, sees no checkpoint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from avckpt.guard import Images
+
+from testkit.guarded import GuardProcess, Victim, config
+
+pytestmark = pytest.mark.shared_machine("a thousand checkpoints have to be taken in time")
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+@pytest.mark.parametrize(
+    ("command", "images", "checkpoints"),
+    [("mirror", Images.FORK, 1000), ("mirror --in-child", Images.FORK, 200), ("mirror", Images.DIRTY, 200)],
+)
+def test_it_sees_itself_as_it_was(command: str, images: Images, checkpoints: int, tmp_path: Path) -> None:
+    """Mappings, flags of memory, masks, timers, descriptors, limits, options: whatever there is to be read."""
+    with Victim(command, tmp_path) as victim, GuardProcess(config(images=images), [victim.pid]) as guard:
+        said = guard.burst(checkpoints)
+        assert said["taken"] > 0, said["reasons"]
+        victim.wait_beats(3)
+        guard.stop()
+        # And when it is protected no more.
+        victim.wait_beats(3)
