@@ -93,6 +93,8 @@ class GuardConfig:
     """Shared memory of the application's own that is rolled back with it, at most."""
     memory_limit_bytes: int = 0
     """Of the container, with swap; 0: none known."""
+    deadline_s: float = 0.0
+    """A restore that is not there so long after the death is given up; 0: none is."""
     remains_s: float = 0.0
     """How long the memory of a dead application is kept for whoever looks at it; 0: it is not."""
     freeze_deadline_s: float = 0.0

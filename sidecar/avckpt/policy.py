@@ -86,6 +86,7 @@ def guard_config(policy: Policy) -> GuardConfig:
         restore_window_s=policy.restore_window_s,
         quiesce_s=policy.quiesce_s,
         shm_bytes=policy.shm_bytes,
+        deadline_s=policy.deadline_s if policy.deadline_late == "cold" else 0.0,
         remains_s=REMAINS_S[policy.core],
         files=Files[policy.files.upper()],
         tcp=Tcp[policy.tcp.upper().replace("-", "_")],

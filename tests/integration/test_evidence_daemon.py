@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from avckpt.cli.client import Client
 
 from testkit.harness import take_checkpoint, wait_until
-from testkit.local_sidecar import ON_COMMAND, Container, LocalSidecar, local_sidecar
+from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, local_sidecar
 
 pytestmark = pytest.mark.shared_machine("a sidecar, its guards and containers have to get CPU time within seconds")
 
@@ -141,3 +142,40 @@ def test_back_to_an_older_generation(sidecar: LocalSidecar) -> None:
     assert at[0] < lowest <= at[1] + 1
     known = json.loads(sidecar.avckpt("inspect", "counter", "--json").stdout)
     assert [each["generation"] for each in known["generations"]] == [1, 2]
+
+
+# More of them than a restore can make within a millisecond.
+THREADS = """
+import threading, time
+for _ in range(150):
+    threading.Thread(target=time.sleep, args=(1e6,), daemon=True).start()
+while True:
+    time.sleep(0.01)
+"""
+
+
+def test_a_recovery_that_comes_late(sidecar: LocalSidecar) -> None:
+    labels = {**QUICK, "avckpt.deadline": "1ms"}
+    late = sidecar.protected("late", [sys.executable, "-c", THREADS], labels)
+    cold = sidecar.protected("cold", [sys.executable, "-c", THREADS], {**labels, "avckpt.deadline.late": "cold"})
+    for each in (late, cold):
+        sidecar.wait_for(each, timeout_s=20, state="protected", threads=151)
+        os.kill(each.app_pid, signal.SIGKILL)
+
+    def told(name: str, kind: str) -> list[dict[str, Any]]:
+        lines = sidecar.avckpt("events", name, "-k", kind, "--json").stdout.splitlines()
+        return [json.loads(line) for line in lines]
+
+    (event,) = wait_until(lambda: told("late", "late"), 10, "it is told of", every_s=0.1)
+    (crash,) = told("late", "crash")
+    assert event["recovered_s"] == crash["recovered_s"] == crash["detected_s"] + crash["restore_s"] > 0.001
+    assert "later than avckpt.deadline=1ms" in event["message"]
+
+    assert cold.status() == 128 + signal.SIGKILL
+    (given_up,) = wait_until(lambda: told("cold", "gave_up"), 10, "it is told of", every_s=0.1)
+    assert given_up["outcome"] == "late"
+    assert not told("cold", "restored")
+
+    metrics = Client(sidecar.run_dir).metrics()
+    assert 'avckpt_late_total{container="late"} 1.0' in metrics
+    assert f'avckpt_detect_max_seconds{{container="late"}} {crash["detected_s"]}' in metrics

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,6 +15,7 @@ from avckpt.cli import doctor, sidecar_container
 from avckpt.errors import SidecarUnreachable
 
 from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
+from testkit.protected import told
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
@@ -31,8 +33,24 @@ def numbers(container: Container) -> list[int]:
     return [int(line.split()[1]) for line in container.logs().splitlines() if line.startswith("n ")]
 
 
+def check_evidence(sidecar: Sidecar, web: Container) -> None:
+    """A kill and a SIGSEGV from here: who did it, where it was, and what a debugger can see."""
+    wait_until(lambda: len(told(sidecar, web, "core")) == 2, 20, "two core files are told of", every_s=0.2)
+    crashes = [event["crash"] for event in told(sidecar, web, "crash")]
+    assert [crash["signal"] for crash in crashes] == ["SIGKILL", "SIGSEGV"]
+    for crash in crashes:
+        assert (crash["code"], crash["sender_pid"]) == ("SI_USER", os.getpid())
+        assert "python3" in crash["command"]
+        assert "/lib" in crash["module"]
+        assert crash["build_id"]
+    for event in told(sidecar, web, "core"):
+        core = Path(event["core"])  # on the host as in the sidecar
+        assert core.stat().st_size == event["core_bytes"]
+        core.unlink()
+
+
 def test_a_container_lives_through_kill_and_ends_with_stop(container: ContainerFactory, sidecar: Sidecar) -> None:
-    web = container.protected(*COUNT, labels=QUICK)
+    web = container.protected(*COUNT, labels={**QUICK, "core": "mini"})
     entry = sidecar.wait_generation(web, 2)
     assert entry["name"] == web.name
     assert entry["state"] == "protected"
@@ -43,6 +61,7 @@ def test_a_container_lives_through_kill_and_ends_with_stop(container: ContainerF
         entry = sidecar.wait_restores(web, restores)
         assert entry["last_death"] == f"killed by {signum.name}"
     assert (web.status, web.pid) == ("running", init)
+    check_evidence(sidecar, web)
     seen = numbers(web)
     time.sleep(0.5)
     assert max(numbers(web)) > max(seen)

@@ -9,11 +9,13 @@ import struct
 from pathlib import Path
 
 import pytest
+from avckpt.events.vocabulary import Kind
 from avckpt.evidence.collector import Collector
 from avckpt.evidence.crash import Crash, Frame, code_name, crash_of, fingerprint, placed
 from avckpt.evidence.deaths import Death, Delivery, Sent
 from avckpt.evidence.kernel_log import Fault, fault_of
 from avckpt.evidence.remains import Remains, build_id_of, parse_maps
+from avckpt.guard import Event
 
 
 @pytest.mark.parametrize(
@@ -112,7 +114,7 @@ def test_maps_and_notes_may_be_anything() -> None:
 
 
 def test_a_machine_that_tells_nothing_costs_the_place_only() -> None:
-    case = Collector().open_case(1, 11, 0, 1)
+    case = Collector().open_case(Event(Kind.DIED, 1, app_pid=1, wait_status=11), 1)
     assert case.crash == Crash(signal="SIGSEGV", unknown="the sidecar does not listen")
 
 

@@ -105,6 +105,10 @@ class Policy:
     """What is protected: the container as a whole, or the nodes that its launcher starts by avckpt-init."""
     images: str = "fork"
     """How a checkpoint gets the application's memory: fork, dirty or auto."""
+    deadline_s: float = 0.0
+    """A recovery that takes longer is told of; 0: none is."""
+    deadline_late: str = "go-on"
+    """And then: go-on, or cold (it is given up, and the container ends)."""
     core: str = "off"
     """A core file for each death that is undone: off, mini (stacks) or on."""
     group: str = ""
@@ -148,6 +152,10 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
         # A hang is noticed late: by then the newest generation hangs, too.
         raise LabelError(
             "avckpt.keep", mapping["avckpt.keep"], "too few for avckpt.restore.on=unhealthy", "allowed there: 2 to 16"
+        )
+    if policy.deadline_late == "cold" and not policy.deadline_s:
+        raise LabelError(
+            "avckpt.deadline.late", mapping["avckpt.deadline.late"], "there is no deadline", "add avckpt.deadline=50ms"
         )
     if policy.scope == "nodes" and policy.restore_on.unhealthy:
         raise LabelError(
@@ -293,6 +301,10 @@ def _parse_restore_max(text: str) -> dict[str, Any]:
     }
 
 
+def _parse_deadline(text: str) -> dict[str, Any]:
+    return {"deadline_s": _duration_s(text, "1ms", "1h")}
+
+
 def _parse_quiesce(text: str) -> dict[str, Any]:
     return {"quiesce_s": 0.0 if text == "0" else _duration_s(text, "", "1s")}
 
@@ -393,6 +405,8 @@ LABELS: dict[str, Label] = {
     "avckpt.images": Label("fork", "fork, dirty or auto", _one_of("images", "fork", "dirty", "auto")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
+    "avckpt.deadline": Label("", f"{_DURATION}, from 1ms to 1h, as 50ms", _parse_deadline),
+    "avckpt.deadline.late": Label("go-on", "go-on or cold", _one_of("deadline_late", "go-on", "cold")),
     "avckpt.core": Label("off", "off, mini or on", _one_of("core", "off", "mini", "on")),
     "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),

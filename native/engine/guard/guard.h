@@ -70,6 +70,7 @@ struct avc_guard {
 	uint64_t restore_ticket;       /* of a command that has killed the app     */
 	enum avc_reason restore_asked; /* NONE: nobody has                      */
 	uint64_t restore_generation;   /* by that command; 0: the newest          */
+	uint64_t late_ns;              /* when a restore is not wanted any more; 0: never */
 	struct files_written *written; /* avckpt.files; NULL: not watched           */
 	struct policy_pace pace;       /* avckpt.interval=auto                      */
 	/* Of us, since the last checkpoint and at the begin of what we do now; of the app, at

@@ -15,10 +15,19 @@
 
 /* ---- death and restore --------------------------------------------------------- */
 
+static bool is_late(const struct avc_guard *guard)
+{
+	return guard->late_ns && now_ns() > guard->late_ns;
+}
+
+/* Or does not: the app has not run an instruction yet. */
 static int say_restored(void *arg, struct avc_error *err)
 {
 	struct avc_guard *guard = arg;
 
+	if (is_late(guard))
+		return fail(err, AVC_DEADLINE, 0, 0, "restore", "",
+			    "it would come later than avckpt.deadline");
 	return init_channel_verdict(&guard->channel, AVC_VERDICT_RESTORED, err);
 }
 
@@ -170,6 +179,10 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		struct avc_error failed = { 0 };
 		bool restored;
 
+		if (is_late(guard)) {
+			guard_drop_all(guard);
+			break;
+		}
 		budget_begin(say_working, &guard->channel);
 
 		/* What was written since the newest was written since all others, also
@@ -312,6 +325,8 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	guard->channel.working_ns = now_ns();
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
+	if (guard->config.deadline_ns && reason != AVC_REASON_COMMAND)
+		guard->late_ns = report->reaped_ns + guard->config.deadline_ns;
 	guard_release_remains(guard); /* of the death before */
 	event.remains_pid = guard->config.remains_ns ? guard->main.holder : 0;
 	guard_emit(guard, &event);
@@ -345,7 +360,8 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
 		give_up(guard, report, AVC_REASON_EMPTY, &error);
 	} else if (!bring_back(guard, report, reason, had, &error)) {
-		give_up(guard, report, AVC_REASON_FAILED, &error);
+		give_up(guard, report, is_late(guard) ? AVC_REASON_LATE : AVC_REASON_FAILED,
+			&error);
 	} else {
 		if (guard->main.pid)
 			hold_all(guard);
@@ -358,4 +374,5 @@ out:
 	guard->restore_asked = AVC_REASON_NONE;
 	guard->restore_ticket = 0;
 	guard->restore_generation = 0;
+	guard->late_ns = 0;
 }

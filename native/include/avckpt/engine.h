@@ -86,6 +86,8 @@ struct avc_config {
 	uint64_t restore_window_ns;
 	uint32_t restore_max;
 	uint64_t shm_bytes;             /* shared memory that is rolled back, at most */
+	uint64_t deadline_ns;           /* a restore that is not there so long after the
+	                                 * death is given up; 0: none is          */
 	uint64_t remains_ns;            /* how long a dead app's memory is kept for
 	                                 * whoever looks at it; 0: it is not      */
 	uint64_t memory_limit_bytes;    /* of the container, with swap; 0: none known */
@@ -145,7 +147,8 @@ enum avc_reason {
 	AVC_REASON_CRASHED = 13,   /* dropped: what was restored from it, or what
 	                            * it was taken from, keeps crashing           */
 	AVC_REASON_EXECUTED = 14,  /* dropped: the app is another program now     */
-	AVC_REASON_LOOP = 15       /* gave up: the same death again, at once      */
+	AVC_REASON_LOOP = 15,      /* gave up: the same death again, at once      */
+	AVC_REASON_LATE = 16       /* gave up: later than deadline_ns             */
 };
 
 /* One thing that happened.  Fields that mean nothing for a kind are 0. */

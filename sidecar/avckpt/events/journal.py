@@ -18,6 +18,7 @@ LEVELS = {
     Kind.DIED: logging.INFO,
     Kind.CRASH: logging.INFO,
     Kind.CORE: logging.INFO,
+    Kind.LATE: logging.WARNING,
     Kind.RESTORED: logging.WARNING,
     Kind.GAVE_UP: logging.ERROR,
     Kind.DROPPED: logging.WARNING,

@@ -19,6 +19,7 @@ CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 FREEZE_BUCKETS_S = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25)
 RESTORE_BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 LOST_BUCKETS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+DETECT_BUCKETS_S = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0)
 UNWANTED = (Reason.SIGNAL, Reason.EXIT, Reason.UNHEALTHY)
 """Causes of restores whose series exist from the start: an alert on a rate never sees the first of a new series."""
 
@@ -71,13 +72,32 @@ class Metrics:
         self._checkpoint_at = self._gauge(
             "avckpt_last_checkpoint_timestamp_seconds", "When the newest checkpoint was taken, since 1970"
         )
+        self._detect = Histogram(
+            "avckpt_detect_seconds",
+            "Fatal signal to avckpt-init knowing of the death",
+            ["container"],
+            buckets=DETECT_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._late = self._counter("avckpt_late_total", "Recoveries that took longer than avckpt.deadline")
+        self._longest = {
+            metric: self._gauge(f"avckpt_{name}_max_seconds", f"The longest of avckpt_{name}_seconds")
+            for metric, name in (
+                (self._freeze, "freeze"),
+                (self._restore, "restore"),
+                (self._lost, "lost"),
+                (self._detect, "detect"),
+            )
+        }
+        self._maxima: dict[tuple[Histogram, str], float] = {}
         self._last_lost = self._gauge("avckpt_last_lost_seconds", "What the application lost by its last restore")
         self._labels: dict[str, set[tuple[Counter | Gauge | Histogram, tuple[str, ...]]]] = {}
 
     def begin(self, container: str) -> None:
         """Makes the series of a container that is to be protected, at zero."""
         self._of(self._taken, container)
-        for histogram in (self._freeze, self._restore, self._lost):
+        self._of(self._late, container)
+        for histogram in self._longest:
             self._of(histogram, container)
         for cause in UNWANTED:
             for outcome in (Reason.RESTORED, Reason.LIMIT, Reason.FAILED, Reason.EMPTY):
@@ -88,17 +108,21 @@ class Metrics:
         container = record.container
         if record.kind is Kind.CHECKPOINT:
             self._of(self._taken, container).inc(record.checkpoints or 1)
-            self._of(self._freeze, container).observe(record.freeze_max_s or record.freeze_s or 0.0)
+            self._observe(self._freeze, container, record.freeze_max_s or record.freeze_s or 0.0)
         elif record.kind is Kind.MISSED:
             self._of(self._missed, container, record.error.kind if record.error else "failed").inc()
         elif record.kind in (Kind.RESTORED, Kind.GAVE_UP):
             cause = record.reason.value if record.reason else ""
             self._of(self._restores, container, cause, record.outcome.value if record.outcome else "").inc()
             if record.restore_s is not None:
-                self._of(self._restore, container).observe(record.restore_s)
+                self._observe(self._restore, container, record.restore_s)
             if record.lost_s is not None:
-                self._of(self._lost, container).observe(record.lost_s)
+                self._observe(self._lost, container, record.lost_s)
                 self._of(self._last_lost, container).set(record.lost_s)
+        elif record.kind is Kind.CRASH and record.detected_s is not None:
+            self._observe(self._detect, container, record.detected_s)
+        elif record.kind is Kind.LATE:
+            self._of(self._late, container).inc()
         elif record.kind in (Kind.NOTIFIED, Kind.NOTIFY_FAILED):
             outcome = "delivered" if record.kind is Kind.NOTIFIED else "failed"
             self._of(self._notifications, container, outcome).inc()
@@ -108,6 +132,8 @@ class Metrics:
         for gone in set(self._labels) - set(containers):
             for metric, labels in self._labels.pop(gone):
                 metric.remove(*labels)
+            for histogram in self._longest:
+                self._maxima.pop((histogram, gone), None)
 
     def render(self, live: Iterable[Protected]) -> bytes:
         """The text that Prometheus reads, with what the generations of each held at the last look."""
@@ -122,6 +148,11 @@ class Metrics:
             if container.last_checkpoint_at is not None:
                 self._checkpoint_at.labels(container.label).set(container.last_checkpoint_at)
         return generate_latest(self._registry)
+
+    def _observe(self, histogram: Histogram, container: str, seconds: float) -> None:
+        self._of(histogram, container).observe(seconds)
+        longest = self._maxima[histogram, container] = max(seconds, self._maxima.get((histogram, container), 0.0))
+        self._of(self._longest[histogram], container).set(longest)
 
     def _counter(self, name: str, text: str, *labels: str) -> Counter:
         return Counter(name, text, ["container", *labels], registry=self._registry)

@@ -56,7 +56,8 @@ class EventRecord:
     )
     outcome: Reason | None = said(  # noqa: RUF009
         "what followed: `restored`, or why not: `clean_exit`, `stopped` (meant), `policy` (avckpt.restore.on), "
-        "`limit` (avckpt.restore.max), `loop` (the same death at once, twice), `failed`, `empty` (no generation held)",
+        "`limit` (avckpt.restore.max), `loop` (the same death at once, twice), `late` (avckpt.deadline), `failed`, "
+        "`empty` (no generation held)",
         values=OUTCOMES,
     )
     wait_status: int | None = said("of the death, as from waitpid(2)")
@@ -83,6 +84,8 @@ class EventRecord:
     detail: str = said("one clause for a person, where the rest does not say it", "")
     core: str | None = said("path of a core file; none: there is none, and `detail` says why")
     core_bytes: int | None = said("its size, compressed")
+    detected_s: float | None = said("fatal signal to avckpt-init knowing of the death; not known of exits")
+    recovered_s: float | None = said("detected_s and restore_s together")
     crash: Crash | None = said("what it died of, and where")  # noqa: RUF009
     error: AvckptError | None = said("what went wrong, as in the API's errors")  # noqa: RUF009
 
@@ -295,6 +298,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.RESTORED: _restored,
     Kind.CRASH: _crashed,
     Kind.CORE: lambda record: record.detail,
+    Kind.LATE: lambda record: f"{record.detail}: {(record.recovered_s or 0) * 1000:.1f} ms after its death",
     Kind.GAVE_UP: lambda record: f"not restored ({describe_wait_status(record.wait_status or 0)}): {_why_not(record)}",
     Kind.DROPPED: lambda record: f"generation {record.generation} is given up: {record.detail}{_crashes(record)}",
     Kind.HEALTH: _detail,

@@ -57,6 +57,7 @@ class Kind(_Named):
     CONFIGURED = "configured"
     CRASH = "crash"
     CORE = "core"
+    LATE = "late"
     NOTIFIED = "notified"
     NOTIFY_FAILED = "notify_failed"
     SIDECAR_STARTED = "sidecar_started"
@@ -81,6 +82,7 @@ class Reason(_Named):
     CRASHED = "crashed", 13
     EXECUTED = "executed", 14
     LOOP = "loop", 15
+    LATE = "late", 16
     RESTORED = "restored"
 
 
@@ -92,6 +94,7 @@ GAVE_UP_WORDS = {
     Reason.STOPPED: "it was asked to stop",
     Reason.POLICY: "avckpt.restore.on does not name this end",
     Reason.LIMIT: "the restores of avckpt.restore.max are used up",
+    Reason.LATE: "it would have come later than avckpt.deadline",
     Reason.LOOP: "it died the same way within a second of each of two restores",
     Reason.FAILED: "no generation could be restored",
     Reason.EMPTY: "no checkpoint was held",

@@ -15,6 +15,7 @@ from avckpt.evidence.crash import Crash, Frame, crash_of, fingerprint, placed
 from avckpt.evidence.deaths import Death, Deaths, Delivery
 from avckpt.evidence.kernel_log import KernelLog
 from avckpt.evidence.remains import Remains
+from avckpt.guard import Event
 
 CALLERS_LEAST = 3
 """Who keeps frame pointers has more callers than that; of others the stack is looked at."""
@@ -33,6 +34,13 @@ class Case:
     hit: Delivery | None
     remains_pid: int
     init_pid: int
+    died_ns: int
+    """When avckpt-init knew of it, CLOCK_MONOTONIC."""
+
+    @property
+    def detected_s(self) -> float | None:
+        """From the fatal signal until then; None: there was none, or it is not known."""
+        return max(self.died_ns - self.hit.at_ns, 0) / 1e9 if self.hit is not None else None
 
 
 class Collector:
@@ -68,13 +76,14 @@ class Collector:
             self._log.close()
         self._deaths = self._log = None
 
-    def open_case(self, pid: int, wait_status: int, remains_pid: int, init_pid: int) -> Case:
+    def open_case(self, event: Event, init_pid: int) -> Case:
         """What the kernel told of the end of a process.  At once, and before its number is another one's."""
+        pid, wait_status = event.app_pid, event.wait_status
         signum = wait_status & 0x7F
         name = signal_name(signum) if signum else ""
         if self._deaths is None:
             crash = Crash(signal=name, unknown=self._problem)
-            return Case(pid, wait_status, crash, Death(), None, remains_pid, init_pid)
+            return Case(pid, wait_status, crash, Death(), None, event.remains_pid, init_pid, event.died_ns)
         death = self._deaths.of(pid)
         hit = death.fatal(signum) if signum else None
         fault = self._log.of(hit.tid) if hit is not None and self._log is not None else None
@@ -83,7 +92,7 @@ class Collector:
             crash = replace(crash, sender=_name_of(crash.sender_pid))
         if signum and hit is None:
             crash = replace(crash, unknown="the kernel told of too many deaths at once")
-        return Case(pid, wait_status, crash, death, hit, remains_pid, init_pid)
+        return Case(pid, wait_status, crash, death, hit, event.remains_pid, init_pid, event.died_ns)
 
     async def examine(self, case: Case) -> Crash:
         """With what the memory of the dead tells."""

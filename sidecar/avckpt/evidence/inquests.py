@@ -67,9 +67,7 @@ class Inquests(Generic[W]):
         """Hears what a guard has told: of a death, or what followed."""
         cookie = watch.container.cookie
         if event.kind is Kind.DIED:
-            case = self._collector.open_case(
-                event.app_pid, event.wait_status, event.remains_pid, watch.container.init_pid
-            )
+            case = self._collector.open_case(event, watch.container.init_pid)
             outcome = self._open[cookie] = asyncio.get_running_loop().create_future()
             task = asyncio.get_running_loop().create_task(self._look_into(watch, case, outcome))
             self._tasks.add(task)
@@ -92,7 +90,8 @@ class Inquests(Generic[W]):
                 followed = EventRecord(Kind.GAVE_UP, reason=Reason.SIGNAL, wait_status=case.wait_status)
             if followed.reason is Reason.COMMAND or followed.outcome in EXPECTED:
                 return  # somebody wanted it
-            self._tell(watch, self._record(watch.container, crash, followed))
+            record = self._tell(watch, self._record(watch.container, crash, followed, case.detected_s))
+            self._judge(watch, record)
             mode = watch.settings.policy.core
             if mode != "off" and followed.outcome is Reason.RESTORED:
                 path, size, what = await self._cores.make(watch.container, case, crash, mode)
@@ -100,7 +99,9 @@ class Inquests(Generic[W]):
         finally:
             self._release(watch, case)
 
-    def _record(self, container: Protected, crash: Crash, followed: EventRecord) -> EventRecord:
+    def _record(
+        self, container: Protected, crash: Crash, followed: EventRecord, detected_s: float | None
+    ) -> EventRecord:
         before = [
             each for each in self.crashes_of(container) if each.crash and each.crash.fingerprint == crash.fingerprint
         ]
@@ -113,10 +114,19 @@ class Inquests(Generic[W]):
             generation=followed.generation,
             age_s=followed.age_s,
             lost_s=followed.lost_s,
+            restore_s=followed.restore_s,
+            detected_s=detected_s,
+            recovered_s=None if followed.restore_s is None else followed.restore_s + (detected_s or 0.0),
             attempt=followed.attempt,
             left=max(left, 0) if left is not None else None,
             crash=replace(crash, count=len(before) + 1),
         )
+
+    def _judge(self, watch: W, record: EventRecord) -> None:
+        deadline_s = watch.settings.policy.deadline_s
+        if deadline_s and record.recovered_s is not None and record.recovered_s > deadline_s:
+            detail = f"it was back later than avckpt.deadline={deadline_s * 1000:g}ms"
+            self._tell(watch, EventRecord(Kind.LATE, detail=detail, recovered_s=record.recovered_s))
 
     @staticmethod
     def _release(watch: W, case: Case) -> None:
