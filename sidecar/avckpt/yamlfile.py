@@ -53,7 +53,13 @@ class _Loader(yaml.SafeLoader):
 
 
 def read(path: Path) -> yaml.Node | None:
-    """The root of the only document in `path`; None: the file is empty.  Raises Unreadable.
+    """The root of the only document in `path`; None: the file is empty.  Raises Unreadable."""
+    documents = read_all(path, several=False)
+    return documents[0] if documents else None
+
+
+def read_all(path: Path, *, several: bool = True) -> list[yaml.Node]:
+    """The roots of the documents in `path`.  Raises Unreadable, also if there are `several` and may not be.
 
     What is returned may be walked without a thought of its aliases: expanded it
     is not endless, and not larger than `VALUES_MOST`.
@@ -67,9 +73,14 @@ def read(path: Path) -> yaml.Node | None:
     except UnicodeDecodeError as error:
         raise Unreadable(Place(str(path), 1), f"not UTF-8: {error.reason}") from error
     try:
-        root = yaml.compose(text, Loader=_Loader)
-        _expanded(root, path, {})
-        return root
+        if several:
+            roots = list(yaml.compose_all(text, Loader=_Loader))
+        else:
+            root = yaml.compose(text, Loader=_Loader)
+            roots = [] if root is None else [root]
+        for root in roots:
+            _expanded(root, path, {})
+        return roots
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark is not None else 1

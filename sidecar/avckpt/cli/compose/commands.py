@@ -39,7 +39,7 @@ env_file_option = click.option(
 @click.option("--config", "is_config", is_flag=True, help="Of the sidecar; without FILE: /etc/avckpt/config.yaml.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON object instead of text.")
 def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
-    """Check every avckpt.* label and annotation of Compose files.
+    """Check every avckpt.* label and annotation of Compose files, or of Kubernetes' YAML.
 
     Without FILE, those of COMPOSE_FILE, or vehicle.yaml of this folder, or all
     that podman-compose takes: compose.yaml, compose.override.yaml and so on.
@@ -140,9 +140,10 @@ def down(
 
 def check_manifest(files: Sequence[Path], as_json: bool) -> ExitCode:
     """Checks Compose files that belong together.  Raises ConfigError when none is named and none is here."""
-    from avckpt.cli.compose import manifest
+    from avckpt.cli.compose import manifest, pods
 
-    found = manifest.check(manifest.files_meant(files, os.environ))
+    paths = manifest.files_meant(files, os.environ)
+    found = pods.check(paths) if all(map(pods.is_pods, paths)) else manifest.check(paths)
     if as_json:
         click.echo(json.dumps(found.to_json(), indent=2))
     else:

@@ -17,13 +17,13 @@ from pathlib import Path
 
 import yaml
 from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, meant_by, merge, parse_policy
-from avckpt_hooks.shared.programs import must_be_pid_1
 
 from avckpt import yamlfile
+from avckpt.cli.compose import doubts
 from avckpt.errors import ConfigError
 from avckpt.yamlfile import Place, Unreadable
 
-ENABLE = f"{PREFIX}enable"
+ENABLE = doubts.ENABLE
 USUAL_NAME = "vehicle.yaml"
 """Is meant, and nothing else, when no file is named."""
 COMPOSE_NAMES = (
@@ -122,6 +122,7 @@ class Service:
     """It is started with one of these only; none: always.  Nobody inherits them by `extends`."""
     programs: dict[str, str] = field(default_factory=dict)
     """The first words of `entrypoint` and `command`, as far as they are given."""
+    facts: doubts.Facts = field(default_factory=doubts.Facts)
 
     @property
     def enabled(self) -> bool | None:
@@ -211,16 +212,28 @@ def check(files: Sequence[Path]) -> Manifest:
         reader.read(reader.queue.pop(0))
     for service in list(manifest.services.values()):
         reader.resolve(service)
-    for service in manifest.services.values():
+    judge(manifest, "no services: is this a Compose file?")
+    return manifest
+
+
+def judge(manifest: Manifest, nothing: str) -> None:
+    """Adds every problem of its services, or else says that it has none; sorts all."""
+    services = manifest.services
+    for service in services.values():
         found = list(_judge(service))
         # After a mistake (avckpt.enabled=true, say) nobody needs to be told what follows from it.
-        manifest.problems += found or list(_doubts(service))
-    if not manifest.services and not manifest.problems:
-        manifest.problems.append(Problem(Place(str(files[0]), 1), "", "no services: is this a Compose file?"))
+        doubts_of_it = () if found else doubts.of_service(service)
+        found += [Problem(place, service.name, message, Severity.WARNING) for place, message in doubts_of_it]
+        manifest.problems += found
+    for service, place, message in doubts.of_groups(services.values()):
+        manifest.problems.append(Problem(place, service.name, message, Severity.WARNING))
+    for service, message in doubts.of_order(services):
+        manifest.problems.append(Problem(service.place, service.name, message))
+    if nothing and not services and not manifest.problems:
+        manifest.problems.append(Problem(Place(str(manifest.files[0]), 1), "", nothing))
     # What several services share through an anchor is one mistake, not several.
     unique = {(problem.place, problem.message): problem for problem in reversed(manifest.problems)}
     manifest.problems = sorted(unique.values(), key=lambda problem: problem.place)
-    return manifest
 
 
 class _Reader:
@@ -284,6 +297,7 @@ class _Reader:
         for kind, settings in base.settings.items():
             service.settings[kind] = {**settings, **service.settings[kind]}
         service.programs = {**base.programs, **service.programs}
+        service.facts = service.facts.over(base.facts)
 
     def _base(self, service: Service, path: Path, name: str) -> Service | None:
         if path == Path(service.place.file) and name in self._manifest.services:
@@ -305,6 +319,7 @@ class _Reader:
 
     def _service(self, name: str, place: Place, node: yaml.Node, path: Path) -> Service:
         service = Service(name, place, extends=_extends(node, path), profiles=_profiles(node), programs=_programs(node))
+        service.facts = doubts.facts_of(node)
         for kind, key in ((Kind.LABEL, "labels"), (Kind.ANNOTATION, "annotations")):
             for setting in self._settings(yamlfile.lookup(node, key), path, name):
                 known = service.settings[kind].get(setting.key)
@@ -358,6 +373,7 @@ class _Reader:
             service.extends = service.extends or earlier.extends
             service.profiles = (*earlier.profiles, *service.profiles)
             service.programs = {**earlier.programs, **service.programs}
+            service.facts = service.facts.over(earlier.facts)
         self._manifest.services[service.name] = service
 
     def _root(self, path: Path, asked_at: Place | None = None, service: str = "") -> yaml.Node | None:
@@ -431,21 +447,6 @@ def _judge_together(service: Service, settings: Mapping[str, Setting]) -> Iterat
         parse_policy({key: setting.final for key, setting in settings.items()})
     except LabelError as error:
         yield Problem(settings[error.key].place, service.name, str(error))
-
-
-def _doubts(service: Service) -> Iterator[Problem]:
-    """What can be honoured, but is hardly meant."""
-    hears_of_others = {"avckpt.group", "avckpt.notify"} <= set(_keys(service))
-    if service.enabled is False and not hears_of_others and not any(key == ENABLE for key in _keys(service)):
-        for _, setting in service.all_settings():
-            message = f"{setting.key} has no effect: without {ENABLE}=true the container is not protected"
-            yield Problem(setting.place, service.name, message, Severity.WARNING)
-            break
-    program = service.programs.get("entrypoint") or service.programs.get("command", "")
-    if service.enabled and must_be_pid_1(program):
-        unless = "" if "entrypoint" in service.programs else ", unless its image has an entrypoint of its own"
-        message = f"{program} must itself be PID 1: this service runs unprotected{unless}"
-        yield Problem(service.place, service.name, message, Severity.WARNING)
 
 
 def _judge_key(key: str) -> None:

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""examples/kubernetes/ against the schema of Kubernetes' API (kubernetes_schema.json), and avckpt check."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+from avckpt.cli.compose import pods
+
+FOLDER = Path(__file__).parents[2] / "examples/kubernetes"
+FILES = sorted(FOLDER.glob("*.yaml"))
+SCHEMA = json.loads((Path(__file__).parent / "kubernetes_schema.json").read_text())
+
+
+def validate(thing: dict[str, Any]) -> None:
+    jsonschema.validate(thing, {**SCHEMA, "$ref": f"#/$defs/V1{thing['kind']}"})
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_an_example_is_what_the_api_takes(path: Path) -> None:
+    [thing] = yaml.safe_load_all(path.read_text())
+    validate(thing)
+    assert pods.check([path]).problems == []
+
+
+def test_the_schema_knows_what_there_is_not() -> None:
+    pod = yaml.safe_load((FOLDER / "pod.yaml").read_text())
+    pod["spec"]["runtimeClass"] = pod["spec"].pop("runtimeClassName")
+    with pytest.raises(jsonschema.ValidationError, match="runtimeClass"):
+        validate(pod)
+
+
+def test_pod_and_runtime_class_name_the_same_runtime() -> None:
+    named = {path.stem: yaml.safe_load(path.read_text()) for path in FILES}
+    assert named["pod"]["spec"]["runtimeClassName"] == named["runtimeclass"]["metadata"]["name"]
+    assert pods.check([FOLDER / "pod.yaml"]).services["Pod/drive"].enabled
