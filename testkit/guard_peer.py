@@ -9,6 +9,7 @@ JSON on standard output.  Commands are lines on standard input:
     checkpoint COOKIE TICKET       restore COOKIE TICKET      with a time in s behind it: not later
     burst COOKIE TICKET N          N checkpoints back to back; one line {"burst": TICKET, ...} at the end
     check COOKIE MS                kills a guard that has not been heard of for so long
+    start COOKIE PID               another guard in place of that one, for the application below that init
     stop                           stops the guards and ends
 
 The end of the input ends it as `stop` does.  AVCKPT_TEST_GUARD names another avckpt-guard to start.
@@ -25,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import avckpt.engine
-from avckpt.engine import Engine
+from avckpt.engine import Engine, Guard
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command, Event, GuardConfig
 
@@ -75,12 +76,24 @@ class Peer:
 
     def __init__(self, engine: Engine, config: GuardConfig, pids: list[int]) -> None:
         self.engine = engine
-        self.guards = {}
+        self.guards: dict[int, Guard] = {}
+        self.config = config
         for cookie, pid in enumerate(pids, 1):
-            pidfd = os.pidfd_open(pid)
-            self.guards[cookie] = engine.start_guard(pidfd, config, cookie)
-            os.close(pidfd)
+            self.start(cookie, pid)
         self.burst: Burst | None = None
+
+    def start(self, cookie: int, pid: int) -> None:
+        """One guard."""
+        pidfd = os.pidfd_open(pid)
+        self.guards[cookie] = self.engine.start_guard(pidfd, self.config, cookie)
+        os.close(pidfd)
+
+    def start_another(self, cookie: int, pid: int) -> None:
+        """What there is to be told of the one before is told first."""
+        self.guards[cookie].stop()
+        self.take_events()
+        self.start(cookie, pid)
+        tell({"kind": "started", "guards": [guard.pid for guard in self.guards.values()]})
 
     def serve(self) -> None:
         """Until told to stop."""
@@ -104,6 +117,9 @@ class Peer:
         cookie, ticket = int(words[1]), int(words[2])
         if words[0] == "check":
             self.guards[cookie].check(ticket / 1000)
+            return
+        if words[0] == "start":
+            self.start_another(cookie, int(words[2]))
             return
         if words[0] == "burst":
             self.burst = Burst(cookie, ticket, int(words[3]))

@@ -96,6 +96,20 @@ class GuardProcess:
 
     def kill(self) -> None:
         """SIGKILL for the guards, then for the process that started them; returns when they are gone."""
+        self.kill_guards()
+        self.process.kill()
+        self.process.wait()
+
+    def start_another(self, init: int) -> None:
+        """The (first) guard is killed, and another one takes its place: ten times as fast as another GuardProcess."""
+        self.kill_guards()
+        since = self.mark()
+        self._say(f"start 1 {init}")
+        self.guards = self.wait("started", since=since)["guards"]
+        self.wait("attached", since=since)
+
+    def kill_guards(self) -> None:
+        """SIGKILL; returns when they are gone."""
         pidfds = []
         for pid in self.guards:
             with contextlib.suppress(ProcessLookupError):
@@ -106,8 +120,6 @@ class GuardProcess:
         for pidfd in pidfds:
             select.select([pidfd], [], [], PATIENCE_S)
             os.close(pidfd)
-        self.process.kill()
-        self.process.wait()
 
     def fds(self) -> int:
         """How many descriptors it has."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import pytest
+from avckpt.guard import Images
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
 from testkit.harness import ROOT, wait_until
@@ -127,22 +129,37 @@ def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[st
 
 
 VICTIMS = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3")
+WAYS = {
+    "first": (Images.FORK, 0),
+    "next": (Images.FORK, 1),
+    "dirty": (Images.DIRTY, 3),
+}
+"""How checkpoints are made, and how many there are before the one in which the guard dies: everything is brought in
+for the first one; a template that is written to comes with the third."""
 
 
-@pytest.mark.parametrize("known", [False, True], ids=["first", "next"])
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("command", VICTIMS)
-def test_checkpoint(tmp_path: Path, command: str, known: bool, death: Death) -> None:
-    """The first one, for which everything is brought in, and one that finds it there."""
+def test_checkpoint(tmp_path: Path, command: str, way: str, death: Death) -> None:
+    """Whatever the guard was doing, the application goes on, and the next guard protects it."""
+    images, before = WAYS[way]
+    if images is Images.DIRTY and "--in-child" in command:
+        pytest.skip("trees are forked")
     runs = 0
-    with Victim(command, tmp_path) as victim:
+    with (
+        Victim(command, tmp_path) as victim,
+        GuardProcess(config(images=images), [victim.pid]) as guard,
+    ):
+        guard.wait("attached")
         for nth in numbers():
             for _ in range(MISSES):
-                with GuardProcess(config(0.0), [victim.pid]) as guard:
-                    guard.wait("attached")
-                    if known:
-                        protects(guard)
-                    kind = answer(guard, death, nth, "checkpoint")["kind"]
-                    victim.wait_beats(3)
+                for _ in range(before):
+                    protects(guard)
+                kind = answer(guard, death, nth, "checkpoint")["kind"]
+                victim.wait_beats(3)
+                guard.start_another(victim.pid)
+                if images is Images.DIRTY:
+                    no_mark_is_left(victim)
                 runs += 1
                 if kind != "missed":
                     break
@@ -152,9 +169,14 @@ def test_checkpoint(tmp_path: Path, command: str, known: bool, death: Death) -> 
                 break
         else:
             raise AssertionError("it is not done after so many calls")
-        with GuardProcess(config(0.0), [victim.pid]) as guard:
-            protects(guard)
+        protects(guard)
     print(f"{runs} runs, up to {nth}")
+
+
+def no_mark_is_left(victim: Victim) -> None:
+    """No memory is watched any more (userfaultfd), nor any of it write-protected."""
+    smaps = Path(f"/proc/{victim.app}/smaps")
+    wait_until(lambda: not re.search(r"VmFlags:.* uw\b", smaps.read_text()), PATIENCE_S, "nothing is watched", 0.01)
 
 
 def protects(guard: GuardProcess) -> None:
@@ -178,23 +200,29 @@ def wait_goes_on_or_ends(victim: Victim) -> None:
     )
 
 
+@pytest.mark.parametrize("way", ["next", "dirty"])
 @pytest.mark.parametrize("command", ["steady", "steady --in-child"])
-def test_restore(tmp_path: Path, command: str, death: Death) -> None:
+def test_restore(tmp_path: Path, command: str, way: str, death: Death) -> None:
     """Nobody can finish it: then init ends at once, and nothing is left of the application."""
-    for nth in numbers():
-        with Victim(command, tmp_path) as victim:
-            with GuardProcess(config(0.0), [victim.pid]) as guard:
-                protects(guard)
+    images, before = WAYS[way]
+    if images is Images.DIRTY and "--in-child" in command:
+        pytest.skip("trees are forked")
+    with Victim(command, tmp_path) as first, GuardProcess(config(images=images), [first.pid]) as guard:
+        for nth in numbers():
+            with Victim(command, tmp_path) as victim:
+                guard.start_another(victim.pid)
+                for _ in range(before):
+                    protects(guard)
                 kind = answer(guard, death, nth, "restore")["kind"]
                 if kind != "guard_lost":
                     assert kind == "restored"
                     victim.wait_beats(3)
                     print(f"{nth} runs")
                     return
-            # Its own application, or init's end: with what it died of, or restored just in time.
-            wait_goes_on_or_ends(victim)
-            if victim.popen.poll() is None:
-                victim.check()
-            else:
-                assert victim.see().violations == 0, victim.said
+                # Its own application, or init's end: with what it died of, or restored just in time.
+                wait_goes_on_or_ends(victim)
+                if victim.popen.poll() is None:
+                    victim.check()
+                else:
+                    assert victim.see().violations == 0, victim.said
     raise AssertionError("it is not done after so many calls")
