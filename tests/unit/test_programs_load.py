@@ -78,7 +78,7 @@ def load(request: pytest.FixtureRequest, server: Liar) -> Iterator[Load]:
     class ToServer(LineSession):
         port = server.server_address[1]
 
-    load = Load(ToServer, "127.0.0.1", limited=request.param, seed=1, hangs_s=0.3)
+    load = Load(ToServer, "127.0.0.1", limited=request.param, seed=1, hangs_s=1.0)
     load.start()
     wait_until(lambda: load.served(5) or load.failures, 20, "every client is served")
     assert load.failures == []

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes below a launcher: kills random ones of many in one container, again and again.
+
+    python -m bench.nodes [--launcher shell|roslaunch] [--nodes 20] [--kills 1000] [--idle SECONDS]
+
+Every node (tests/victims/crash.c) beats a thousand times a second.  It is killed by a signal from
+outside, or faults, aborts or exits by itself.  What counts is the gap between two beats of the one
+that was killed, and of its siblings, whose longest gap of the same length of time without a kill is
+measured first.  With --idle nothing is killed: what the nodes cost is measured for that time.
+
+Needs root, Podman and what `make setup` builds; roslaunch needs scripts/setup-ros.sh.  Takes the
+machine's sidecar and hooks for itself, as the tests do.  Prints a table and writes
+bench/results/nodes.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import statistics
+import subprocess
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from avckpt.supervision.pressure import held_bytes, templates_of
+from rich.console import Console
+
+from bench.scale import VICTIMS, cpu_s, processes, pss_mb
+from testkit.board import Board
+from testkit.harness import (
+    BASE_IMAGE,
+    ROOT,
+    SIDECAR_NAME,
+    Container,
+    ContainerFactory,
+    Podman,
+    Sidecar,
+    machine_lock,
+    running_sidecar,
+    wait_until,
+)
+from testkit.procfs import children_of, inside
+
+RESULTS = ROOT / "bench/results/nodes.json"
+WITHIN_MS = 20.0
+HOPELESS_S = 10.0
+PAUSE_S = (0.1, 0.3)
+"""Between two kills: there is a checkpoint of every node in it."""
+
+SIGNALS = (
+    *("SIGKILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGTRAP", "SIGSYS", "SIGQUIT"),
+    *("SIGUSR1", "SIGUSR2", "SIGHUP"),  # by itself: a fault, abort(), exit(3)
+)
+NODE = "#!/bin/sh\nexec /victims/crash --board /bench/$NODE.board\n"
+SHELL = """
+for i in {numbers}; do NODE=$i $AVCKPT_INIT --name n$i -- /bench/nodes/node & done
+while wait -n; s=$?; [ $s != 127 ]; do echo ended $s; done
+"""
+PACKAGE = "<package><name>nodes</name><version>1.0.0</version><description>n</description></package>\n"
+LAUNCH_NODE = """ <node pkg="nodes" type="node" name="n{n}" output="screen"
+  launch-prefix="$(env AVCKPT_INIT) --name n{n} --"><env name="NODE" value="{n}"/></node>
+"""
+
+console = Console(highlight=False)
+
+
+@dataclass
+class Result:
+    """One run; gaps in ms."""
+
+    launcher: str
+    nodes: int
+    kills: int
+    restored: int
+    within_20_ms: int
+    gap_median_ms: float
+    gap_p99_ms: float
+    gap_max_ms: float
+    siblings_gap_ms: float
+    """The longest gap of a node that was not killed."""
+    quiet_gap_ms: float
+    """The longest gap of any node in as much time without kills."""
+    not_back: list[str]
+    """Who did not come back, from what."""
+    launcher_said: list[str]
+    """Lines of the launcher that tell of the end of a node."""
+    load: float
+
+
+@dataclass
+class Idle:
+    """What protecting them costs while nothing happens; CPU in per cent of one core."""
+
+    nodes: int
+    seconds: float
+    interval_s: float
+    guards_cpu_percent: float
+    sidecar_cpu_percent: float
+    guards_pss_mb: float
+    generations_mb: float
+    load: float
+
+
+class Nodes:
+    """The container, and a board for each node."""
+
+    def __init__(self, sidecar: Sidecar, container: Container, boards: dict[str, Board]) -> None:
+        self.sidecar, self.container, self.boards = sidecar, container, boards
+
+    def rows(self) -> dict[str, dict[str, Any]]:
+        """By name."""
+        return {
+            row["name"].partition("/")[2]: row
+            for row in self.sidecar.ps()
+            if row["node_of"] == self.container.id and not row["ended_at"]
+        }
+
+    def wait_protected(self) -> dict[str, dict[str, Any]]:
+        def found() -> dict[str, dict[str, Any]]:
+            rows = self.rows()
+            ready = [row for row in rows.values() if row["state"] == "protected" and row["generations"] == row["keep"]]
+            return rows if len(ready) == len(self.boards) else {}
+
+        return wait_until(found, 120, f"{len(self.boards)} nodes are protected", every_s=0.5)
+
+    def quiet_gap_ms(self, seconds: float) -> float:
+        """The longest gap of any of them in that time."""
+        for board in self.boards.values():
+            board.forget_gap()
+        time.sleep(seconds)
+        return max(board.see().gap_ns for board in self.boards.values()) / 1e6
+
+
+def app_pid(row: dict[str, Any]) -> int:
+    """Its application now."""
+    return next((pid for pid in children_of(row["init_pid"]) if inside(pid) == row["app_pid_inside"]), 0)
+
+
+def start(
+    factory: ContainerFactory, sidecar: Sidecar, folder: Path, stack: ExitStack, options: argparse.Namespace
+) -> Nodes:
+    numbers = range(1, options.nodes + 1)
+    boards = {f"n{n}": stack.enter_context(Board(folder / f"{n}.board")) for n in numbers}
+    package = folder / "nodes"
+    package.mkdir()
+    (package / "node").write_text(NODE)
+    (package / "node").chmod(0o755)
+    (package / "package.xml").write_text(PACKAGE)
+    (package / "all.launch").write_text(
+        "<launch>\n" + "".join(LAUNCH_NODE.format(n=n) for n in numbers) + "</launch>\n"
+    )
+    command, image, environment = ["bash", "-c", SHELL.format(numbers=" ".join(map(str, numbers)))], BASE_IMAGE, []
+    if options.launcher == "roslaunch":
+        command, image = ["roslaunch", "nodes", "all.launch"], ros_image(factory.podman)
+        environment = ["-e", "ROS_PACKAGE_PATH=/bench:/usr/share", "-e", "ROS_MASTER_URI=http://localhost:11311"]
+    labels = {"scope": "nodes", "restore.max": "64/1s", "restore.on": "signal,exit", "files": "rewind"}
+    if options.interval:
+        labels["interval"] = options.interval
+    volumes = ["-v", f"{folder}:/bench", "-v", f"{VICTIMS}:/victims:ro"]
+    container = factory.protected(*command, labels=labels, image=image, options=[*volumes, *environment])
+    return Nodes(sidecar, container, boards)
+
+
+def ros_image(podman: Podman) -> str:
+    names = podman.run("images", "--format", "{{.Repository}}:{{.Tag}}").stdout.split()
+    found = [name for name in names if name.startswith("localhost/avckpt-ros:")]
+    if not found:
+        raise SystemExit("error: there is no image of ROS: run scripts/setup-ros.sh")
+    return found[0]
+
+
+def kill_one(nodes: Nodes, name: str, signum: signal.Signals) -> tuple[float, float]:
+    """The gaps of the one and of all others in ms; infinite: it did not come back."""
+    row = nodes.rows()[name]
+    for board in nodes.boards.values():
+        board.forget_gap()
+    pid = wait_until(lambda: app_pid(row), HOPELESS_S, f"{name} runs")
+    os.kill(pid, signum)
+    try:
+        wait_until(lambda: nodes.rows().get(name, row)["restores"] > row["restores"], HOPELESS_S, "it is restored")
+        beats = nodes.boards[name].see().beats
+        wait_until(lambda: nodes.boards[name].see().beats > beats, HOPELESS_S, "it goes on")
+    except TimeoutError:
+        return float("inf"), 0.0
+    gaps = {key: board.see().gap_ns / 1e6 for key, board in nodes.boards.items()}
+    return gaps.pop(name), max(gaps.values(), default=0.0)
+
+
+def run(nodes: Nodes, options: argparse.Namespace) -> Result:
+    dice = random.Random(options.seed)
+    nodes.wait_protected()
+    began = time.monotonic()
+    gaps, siblings, not_back = [], [], []
+    for n in range(options.kills):
+        name, signum = dice.choice(list(nodes.boards)), dice.choice(SIGNALS)
+        gap, others = kill_one(nodes, name, signal.Signals[signum])
+        gaps.append(gap)
+        if gap == float("inf"):
+            row = nodes.rows().get(name, {})
+            not_back.append(f"{name}, {signum}: {row.get('state')}, last death {row.get('last_death')}")
+        siblings.append(others)
+        time.sleep(dice.uniform(*PAUSE_S))
+        print(f"\r{n + 1} of {options.kills} killed", end="", flush=True)
+    quiet = nodes.quiet_gap_ms(time.monotonic() - began)
+    back = sorted(gap for gap in gaps if gap != float("inf"))
+    words = ("ended", "process has died", "process has finished", "exited:")
+    return Result(
+        launcher=options.launcher,
+        nodes=options.nodes,
+        kills=options.kills,
+        restored=len(back),
+        within_20_ms=sum(gap <= WITHIN_MS for gap in back),
+        gap_median_ms=round(statistics.median(back), 2),
+        gap_p99_ms=round(back[int(0.99 * (len(back) - 1))], 2),
+        gap_max_ms=round(back[-1], 2),
+        siblings_gap_ms=round(max(siblings), 2),
+        quiet_gap_ms=round(quiet, 2),
+        not_back=not_back,
+        launcher_said=[line for line in nodes.container.logs().splitlines() if any(word in line for word in words)],
+        load=round(os.getloadavg()[0], 1),
+    )
+
+
+def idle(nodes: Nodes, options: argparse.Namespace) -> Idle:
+    rows = nodes.wait_protected().values()
+    main_pid = int(nodes.container.podman.inspect(SIDECAR_NAME)["State"]["Pid"])
+    own, guards = processes(main_pid)
+    before, guards_before, began = cpu_s(own), cpu_s(guards), time.monotonic()
+    time.sleep(options.idle)
+    took = time.monotonic() - began
+    return Idle(
+        nodes=options.nodes,
+        seconds=round(took, 1),
+        interval_s=max(row["interval_s"] for row in rows),
+        guards_cpu_percent=round(100 * (cpu_s(guards) - guards_before) / took, 2),
+        sidecar_cpu_percent=round(100 * (cpu_s(own) - before) / took, 2),
+        guards_pss_mb=pss_mb(guards),
+        generations_mb=round(sum(held_bytes(app_pid(row), templates_of(row["init_pid"])) for row in rows) / 1e6, 1),
+        load=round(os.getloadavg()[0], 1),
+    )
+
+
+def main() -> None:
+    """Starts, kills or waits, removes; results of other launchers stay in the file."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--launcher", choices=("shell", "roslaunch"), default="shell")
+    parser.add_argument("--nodes", type=int, default=20)
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--interval", default="", help="avckpt.interval of all nodes (that of the release)")
+    parser.add_argument("--idle", type=float, default=0.0, help="measure costs for so many seconds; kill nobody")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    subprocess.run(["make", "-s", "-C", str(VICTIMS.parent), "STATIC=1"], check=True)
+    podman = Podman()
+    factory = ContainerFactory(podman, f"avckpt-nodes-{os.getpid()}")
+    with ExitStack() as stack:
+        stack.enter_context(machine_lock(timeout_s=600))
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="avckpt-nodes-")))
+        folder.chmod(0o777)
+        sidecar = stack.enter_context(running_sidecar(podman))
+        stack.callback(factory.close)
+        nodes = start(factory, sidecar, folder, stack, options)
+        result = idle(nodes, options) if options.idle else run(nodes, options)
+    console.print()
+    for key, value in asdict(result).items():
+        console.print(f"{key.replace('_', ' '):<22} {value}")
+    key = f"idle {options.nodes}" if options.idle else options.launcher
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    RESULTS.write_text(json.dumps({**known, key: asdict(result)}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
