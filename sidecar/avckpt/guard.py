@@ -58,7 +58,7 @@ FORK_REASONS = (
     "",
     "avckpt.images=fork",
     "there is no older image yet",
-    "it has several processes",
+    "a process above it adopts orphans",
     "the kernel cannot watch its memory",
     "it has a seccomp filter of its own",
     "it has memory of a kind that cannot be watched",

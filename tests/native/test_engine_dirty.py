@@ -15,6 +15,7 @@ from avckpt.guard import Images
 
 from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux
 from testkit.harness import wait_until
+from testkit.procfs import children_of
 
 PAGE = 4096
 DIRTY = config(images=Images.DIRTY)
@@ -62,6 +63,8 @@ def until_copied(guard: GuardProcess, tries: int = 60) -> Json:
         "rseq 4",
         "signals 6 --pending",
         "mappings 0 --inherited",
+        "dirt 24 2 --rate 20000 --maps --in-child",
+        "prefork 3 40",
     ],
 )
 def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
@@ -209,11 +212,22 @@ def test_the_same_one_is_restored_many_times(tmp_path: Path) -> None:
         victim.wait_beats(5)
 
 
+def test_each_process_of_a_tree_is_copied_by_itself(tmp_path: Path) -> None:
+    with Victim("prefork 3 40", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        until_copied(guard)
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        until_copied(guard)
+        processes = [victim.app, *children_of(victim.app)]
+        assert len(processes) == 4
+        assert all(marked(pid) > 3 for pid in processes)
+
+
 @pytest.mark.parametrize(
     ("command", "reason"),
     [
         ("idle 1 1", "there is no older image yet"),
-        ("idle 1 1 --in-child", "it has several processes"),
         ("sandbox", "it has a seccomp filter of its own"),
     ],
 )

@@ -39,9 +39,11 @@ struct idle_template {
 	uint64_t tracker, forked_ns, copied, kinds;
 };
 
-/* Checkpoints by copies of what was written, of the main process (dirty.c). */
+/* Checkpoints by copies of what was written, of one process (dirty.c). */
 struct dirty {
 	struct process *process;
+	pid_t leader; /* as long as it is that one                               */
+	uint64_t start;
 	struct idle_template idle;
 	bool fork_next; /* the last attempt has found that it takes a fork     */
 	/* AVC_IMAGES_AUTO: how many are forked before the next attempt, and why. */
@@ -58,10 +60,23 @@ struct dirty {
 	uint32_t runs, run_room;
 	uint8_t *data;
 	size_t data_bytes, used;
+	size_t wanted;               /* room for what is written until the freeze                */
 	char *layout, *other_layout; /* /proc/PID/maps, the last and the one before      */
 	size_t layout_bytes, other_layout_bytes;
 	struct inherited now;
 	int64_t dumpable;
+};
+
+/* ... of all of them (dirty_tree.c). */
+struct dirty_tree {
+	struct dirty **of;
+	uint32_t count, room;
+	uint64_t fork_ns; /* what the clones of the last checkpoint by forks took   */
+	/* Of the last one: why one of them was forked, or none was; pages.         */
+	enum avc_fork_reason reason;
+	uint64_t copied;
+	uint8_t *batch; /* what is copied at a time                                */
+	size_t batch_bytes;
 };
 
 /* What is saved of an app at one instant. */
@@ -85,7 +100,7 @@ struct generation {
 struct freeze {
 	struct tree *tree;
 	struct generation *generation; /* which has an image of the main process          */
-	struct dirty *dirty;           /* process.recycling                                  */
+	struct dirty_tree *dirty;      /* process.recycling                                  */
 	timer_t timer;
 	uint64_t deadline_ns;
 	struct mem_seen seen; /* the shared memory that is prepared for already   */
@@ -149,24 +164,31 @@ struct layout_steps {
  * but a fork, as to files that are mapped, or no memory. */
 bool layout_steps_find(char *is, char *want, struct layout_steps *steps);
 
-/* ---- dirty.c ------------------------------------------------------------------- */
+/* ---- dirty_tree.c -------------------------------------------------------------- */
 
 /* Before a freeze: process.recycling, or why not; what can be copied while the app runs, is. */
-void dirty_prepare(struct dirty *dirty, const struct tree *tree, const struct avc_config *config,
-		   uint32_t slot, timer_t timer);
-/* During it, while the main thread answers: what is left is read. */
-int dirty_capture(struct dirty *dirty, const struct generation *generation,
+void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
+		   const struct avc_config *config, uint32_t slot, timer_t timer);
+/* During it, while main threads answer: what is left is read. */
+int dirty_capture(struct dirty_tree *dirty, const struct generation *generation,
 		  struct avc_error *err) warn_unused;
-/* When the app runs again: the idle template becomes the image's.  AVC_RETRY: it takes a fork. */
-int dirty_apply(struct dirty *dirty, struct image *image, struct avc_error *err) warn_unused;
-/* After that, of an image of which all is known: as above. */
-int dirty_check(struct dirty *dirty, const struct image *image, struct avc_error *err) warn_unused;
-/* From now on it is noted where it gets out of date. */
-void dirty_follow(struct dirty *dirty, struct image *image);
-/* Its template is not needed any more: it becomes the idle one, if it can. */
-void dirty_recycle(struct dirty *dirty, struct generation *generation);
-void dirty_drop_idle(struct dirty *dirty);
-void dirty_free(struct dirty *dirty);
+/* When the app runs again: idle templates become the images'.  AVC_RETRY: it takes a fork. */
+int dirty_apply(struct dirty_tree *dirty, struct generation *generation,
+		struct avc_error *err) warn_unused;
+/* After that, of images of which all is known: as above. */
+int dirty_check(struct dirty_tree *dirty, const struct generation *generation,
+		struct avc_error *err) warn_unused;
+/* From now on it is noted where they get out of date. */
+void dirty_follow(struct dirty_tree *dirty, const struct generation *generation);
+/* Their templates are not needed any more: they become idle ones, if they can. */
+void dirty_recycle(struct dirty_tree *dirty, const struct generation *generation);
+void dirty_drop_idle(struct dirty_tree *dirty);
+/* Those that have been killed. */
+void dirty_drop_ended(struct dirty_tree *dirty);
+/* Of a process that is gone, or another program. */
+void dirty_forget(struct dirty_tree *dirty, const struct process *process);
+bool dirty_owns(const struct dirty_tree *dirty, pid_t pid);
+void dirty_free(struct dirty_tree *dirty);
 
 /* ---- spare.c ------------------------------------------------------------------------ */
 

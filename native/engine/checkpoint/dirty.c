@@ -31,19 +31,15 @@
 #define STALE_SHARE 2 /* of its pages of its own: more than a half is for a fork to bring */
 #define COPIES_SHARE 2
 #define SMALL_PAGES 1024
+#define SLACK_PAGES 64 /* written until the freeze, of one process of many */
+#define FORK_NS 100000 /* a fork of nothing */
+#define FORK_PAGE_NS 90
 #define REST_LEAST 4u /* checkpoints */
 #define FAILURES_MAX 4
 #define CONFIDENCE 8 /* attempts in a row that came to something: it is as if none had failed */
 #define IDLE_OOM_SCORE 1000
 
 /* ---- while the application runs -------------------------------------------------------------- */
-
-/* One attempt. */
-struct attempt {
-	struct process *process;
-	uint32_t slot;
-	timer_t timer;
-};
 
 /* All of it is watched that is mapped now. */
 static bool watch_mappings(struct dirty *dirty, struct process *process)
@@ -67,7 +63,7 @@ static bool follow_layout(struct dirty *dirty, const struct attempt *attempt)
 	result = template_follow_layout(&calls, dirty->layout, &why);
 	tracee_deadline_clear(attempt->timer);
 	if (result)
-		dirty_drop_idle(dirty);
+		dirty_drop_idle_one(dirty);
 	return !result;
 }
 
@@ -133,16 +129,6 @@ static bool has_own_filter(const struct process *process)
 	       status.seccomp_filters > process->plain_filters;
 }
 
-/* Zombies that init is just about to wait for do not count; ours are among them. */
-static bool has_others(const struct tree *tree)
-{
-	for (uint32_t i = 1; i < tree->count; i++)
-		if (tree->entry[i].process ||
-		    (tree->entry[i].pid && tree->entry[i].parent != PARENT_INIT))
-			return true;
-	return false;
-}
-
 /* A fork of it takes no longer than the questions that a copy needs. */
 static bool is_small(const struct process *process)
 {
@@ -153,13 +139,11 @@ static bool is_small(const struct process *process)
 }
 
 /* Why its memory is not even to be watched. */
-static enum avc_fork_reason why_not(const struct tree *tree, const struct avc_config *config)
+static enum avc_fork_reason why_not(const struct process *process, const struct avc_config *config)
 {
-	const struct process *process = tree_main(tree);
-
 	if (config->images == AVC_IMAGES_FORK)
 		return AVC_FORK_CONFIG;
-	if (has_others(tree))
+	if (!process->infected || process->adopts)
 		return AVC_FORK_PROCESSES;
 	if (has_own_filter(process))
 		return AVC_FORK_SANDBOX;
@@ -219,7 +203,7 @@ static enum avc_fork_reason why_not_idle(struct dirty *dirty, const struct proce
 	const struct idle_template *idle = &dirty->idle;
 
 	if (idle->pid && (idle->tracker != process->tracker->number || pidfd_ended(idle->pidfd)))
-		dirty_drop_idle(dirty);
+		dirty_drop_idle_one(dirty);
 	if (!idle->pid || process->old_parasites)
 		return AVC_FORK_FIRST;
 	if (now_ns() - idle->forked_ns > AGE_NS)
@@ -229,22 +213,22 @@ static enum avc_fork_reason why_not_idle(struct dirty *dirty, const struct proce
 	return AVC_FORK_NONE;
 }
 
-void dirty_prepare(struct dirty *dirty, const struct tree *tree, const struct avc_config *config,
-		   uint32_t slot, timer_t timer)
+void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 {
-	struct process *process = tree_main(tree);
-	const struct attempt attempt = { process, slot, timer };
+	const struct avc_config *config = attempt->config;
+	struct process *process = attempt->process;
+	const size_t slack = process->descendant ? SLACK_PAGES : COPY_BATCH_PAGES;
 	uint64_t left = 0;
 
 	process->recycling = false;
 	dirty->copied = 0;
-	dirty->reason = why_not(tree, config);
+	dirty->reason = why_not(process, config);
 	if (dirty->reason) {
-		dirty_drop_idle(dirty);
+		dirty_drop_idle_one(dirty);
 		tracker_end(process);
 		return;
 	}
-	dirty->reason = watch(dirty, process, timer);
+	dirty->reason = watch(dirty, process, attempt->timer);
 	if (dirty->reason)
 		return;
 	if (dirty->fork_next)
@@ -254,7 +238,7 @@ void dirty_prepare(struct dirty *dirty, const struct tree *tree, const struct av
 	dirty->fork_next = false;
 	if (!dirty->reason && !copy_make_room(dirty, COPY_BATCH_PAGES * PAGE))
 		dirty->reason = AVC_FORK_FIRST;
-	if (!dirty->reason && !follow_layout(dirty, &attempt))
+	if (!dirty->reason && !follow_layout(dirty, attempt))
 		give_up(dirty, AVC_FORK_LAYOUT);
 	if (dirty->reason) {
 		/* What is written before the fork is not written since. */
@@ -262,15 +246,16 @@ void dirty_prepare(struct dirty *dirty, const struct tree *tree, const struct av
 			tracker_end(process);
 		return;
 	}
-	if (!copy_rounds(dirty, &attempt, &left)) {
+	if (!copy_rounds(dirty, attempt, &left)) {
 		give_up(dirty, dirty->reason ? dirty->reason : AVC_FORK_LAYOUT);
 		return;
 	}
 	/* Room for what is written until the freeze. */
 	if (config->images == AVC_IMAGES_AUTO && left * READ_PAGE_NS > dirty->fork_ns)
 		give_up(dirty, AVC_FORK_WRITES);
-	else if (copy_make_room(dirty, (4 * left + COPY_BATCH_PAGES) * PAGE))
+	else
 		process->recycling = true;
+	dirty->wanted = (4 * left + slack) * PAGE;
 }
 
 /* ---- in the freeze --------------------------------------------------------------------------- */
@@ -303,19 +288,27 @@ static bool scan_stopped(struct dirty *dirty, struct process *process)
 			!tracker_scan(process->tracker, 0, &pages));
 }
 
-int dirty_capture(struct dirty *dirty, const struct generation *generation, struct avc_error *err)
+/* Limits of one that is not the main process are not its template's (process_attrs_learn()). */
+static int read_inherited(struct inherited *inherited, const struct process *process,
+			  struct avc_error *err)
 {
-	const struct image *image = &generation->image[0];
+	memset(inherited, 0, sizeof *inherited);
+	if (inherited_read(inherited, process->pid, err))
+		return -1;
+	if (process->descendant)
+		memset(inherited->limit, 0, sizeof inherited->limit);
+	return 0;
+}
+
+int dirty_capture_one(struct dirty *dirty, const struct image *image, struct avc_error *err)
+{
 	struct process *process = image->process;
 
-	if (generation->images > 1)
-		return fork_instead(dirty, process, "it has just started another process", err);
 	if (files_may_pin(image->files))
 		return fork_instead(dirty, process, "pages of its may be pinned", err);
 	if (!scan_stopped(dirty, process) || !copy_read(dirty, process))
 		return fork_instead(dirty, process, "too much of it has changed just now", err);
-	memset(&dirty->now, 0, sizeof dirty->now);
-	return inherited_read(&dirty->now, process->pid, err);
+	return read_inherited(&dirty->now, process, err);
 }
 
 /* ---- when the application runs again --------------------------------------------------------- */
@@ -368,7 +361,7 @@ static void hand_over(struct dirty *dirty, struct image *image)
 	*idle = (struct idle_template){ .pidfd = -1 };
 }
 
-int dirty_apply(struct dirty *dirty, struct image *image, struct avc_error *err)
+int dirty_apply_one(struct dirty *dirty, struct image *image, struct avc_error *err)
 {
 	struct process *process = image->process;
 	const struct thread *main_thread = thread_find(process, process->pid);
@@ -382,14 +375,14 @@ int dirty_apply(struct dirty *dirty, struct image *image, struct avc_error *err)
 	if (!main_thread || !inherited_equal(&dirty->now, dirty->idle.inherited))
 		return fork_instead(dirty, process, "what a fork of it inherits has changed", err);
 	if (bring_up_to_date(dirty, &calls, &why)) {
-		dirty_drop_idle(dirty);
+		dirty_drop_idle_one(dirty);
 		return fork_instead(dirty, process, "a template cannot be brought up to date", err);
 	}
 	hand_over(dirty, image);
 	return 0;
 }
 
-int dirty_check(struct dirty *dirty, const struct image *image, struct avc_error *err)
+int dirty_check_one(struct dirty *dirty, const struct image *image, struct avc_error *err)
 {
 	if (!image->recycled)
 		return 0;
@@ -403,13 +396,14 @@ int dirty_check(struct dirty *dirty, const struct image *image, struct avc_error
 
 /* ---- templates ------------------------------------------------------------------------------- */
 
-void dirty_follow(struct dirty *dirty, struct image *image)
+void dirty_follow_one(struct dirty *dirty, struct image *image)
 {
 	const struct process *process = image->process;
 
 	if (image->recycled)
 		return;
 	dirty->own_pages = image->anon_pages;
+	dirty->fork_ns = FORK_NS + (uint64_t)image->anon_pages * FORK_PAGE_NS;
 	if (!process->tracker || !image->inherited)
 		return;
 	image->stale = calloc(1, sizeof *image->stale);
@@ -424,18 +418,16 @@ void dirty_follow(struct dirty *dirty, struct image *image)
 	}
 }
 
-void dirty_recycle(struct dirty *dirty, struct generation *generation)
+void dirty_recycle_one(struct dirty *dirty, struct image *image)
 {
-	struct image *image = &generation->image[0];
 	const struct tracker *tracker = image->process->tracker;
 	struct idle_template *idle = &dirty->idle;
 	char score[16];
 
-	if (generation->images > 1 || generation->spare.work || !image->stale ||
-	    !image->inherited || !image->template || !tracker || tracker->over ||
+	if (!image->stale || !image->inherited || !image->template || !tracker || tracker->over ||
 	    tracker->number != image->tracker)
 		return;
-	dirty_drop_idle(dirty); /* one that could not be used is older */
+	dirty_drop_idle_one(dirty); /* one that could not be used is older */
 	*idle = (struct idle_template){
 		.pid = image->template,
 		.pidfd = image->pidfd,
@@ -456,7 +448,7 @@ void dirty_recycle(struct dirty *dirty, struct generation *generation)
 	proc_set_oom_score_adj(idle->pid, score);
 }
 
-void dirty_drop_idle(struct dirty *dirty)
+void dirty_drop_idle_one(struct dirty *dirty)
 {
 	struct idle_template *idle = &dirty->idle;
 
@@ -471,12 +463,12 @@ void dirty_drop_idle(struct dirty *dirty)
 	*idle = (struct idle_template){ .pidfd = -1 };
 }
 
-void dirty_free(struct dirty *dirty)
+void dirty_free_one(struct dirty *dirty)
 {
-	dirty_drop_idle(dirty);
+	dirty_drop_idle_one(dirty);
 	free(dirty->run);
 	free(dirty->data);
 	free(dirty->layout);
 	free(dirty->other_layout);
-	*dirty = (struct dirty){ .idle.pidfd = -1 };
+	free(dirty);
 }

@@ -2,7 +2,8 @@
  *
  * Between the files that bring an idle template up to date:
  *
- *   dirty.c           whether, when, and what was written
+ *   dirty_tree.c      all processes
+ *   dirty.c           one of them: whether, when, and what was written
  *   dirty_copy.c      copies it
  *   dirty_template.c  calls that the template makes for it: its mappings become the process's
  */
@@ -10,6 +11,28 @@
 #define AVCKPT_DIRTY_H
 
 #include "checkpoint.h"
+
+/* ---- dirty.c ----------------------------------------------------------------------------------- */
+
+/* One attempt. */
+struct attempt {
+	const struct avc_config *config;
+	struct process *process;
+	uint32_t slot;
+	timer_t timer;
+};
+
+/* As those in checkpoint.h, of one process. */
+void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt);
+int dirty_capture_one(struct dirty *dirty, const struct image *image,
+		      struct avc_error *err) warn_unused;
+int dirty_apply_one(struct dirty *dirty, struct image *image, struct avc_error *err) warn_unused;
+int dirty_check_one(struct dirty *dirty, const struct image *image,
+		    struct avc_error *err) warn_unused;
+void dirty_follow_one(struct dirty *dirty, struct image *image);
+void dirty_recycle_one(struct dirty *dirty, struct image *image);
+void dirty_drop_idle_one(struct dirty *dirty);
+void dirty_free_one(struct dirty *dirty);
 
 /* ---- dirty_template.c -------------------------------------------------------------------------- */
 

@@ -272,14 +272,15 @@ static int clone_missing(struct freeze *freeze, struct avc_error *err)
 	/* First who waits in its parasite for us: how long the main process takes is not known
 	 * yet. */
 	if (freeze_hear_all(tree, err) ||
-	    freeze_await_clone(main, &freeze->generation->image[0].template, err) ||
-	    freeze_rest_main(main, thread_find(main, main->pid), err) ||
+	    (main->cloning &&
+	     (freeze_await_clone(main, &freeze->generation->image[0].template, err) ||
+	      freeze_rest_main(main, thread_find(main, main->pid), err))) ||
 	    make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
 
-		if (process && !process->cloning &&
+		if (process && !process->cloning && !process->recycling &&
 		    freeze_start_clone(process, freeze->generation->image[0].slot, err))
 			return -1;
 	}
@@ -325,7 +326,7 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 		return -1;
 	/* While main threads are in their parasites: see parasite_will(). */
 	capture_files(generation);
-	if (tree_main(freeze->tree)->recycling && dirty_capture(freeze->dirty, generation, err))
+	if (dirty_capture(freeze->dirty, generation, err))
 		return -1;
 	if (see_alive(freeze->tree, err))
 		return -1;

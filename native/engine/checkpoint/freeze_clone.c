@@ -416,7 +416,8 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 
 		if (!process || !is_ready(process))
 			continue;
-		takes_ns += process->descendant ? clone_time_ns(process->anon_pages) : 0;
+		if (process->descendant && !process->recycling)
+			takes_ns += clone_time_ns(process->anon_pages);
 		if (takes_ns > CLONES_AHEAD_NS)
 			break;
 		if (begin(process, main->slot, all_ns, err))

@@ -65,16 +65,23 @@ static int hear_template(struct process *process, struct thread *cloned,
 }
 
 /* For the day when it is brought up to date instead of another one being forked. */
-static int keep_inherited(struct image *image, const struct thread *cloned, struct avc_error *err)
+static int keep_inherited(struct image *image, struct avc_error *err)
 {
+	const struct thread *cloned = thread_find(image->process, image->process->pid);
 	int64_t ignored;
 
 	image->inherited = calloc(1, sizeof *image->inherited);
 	if (!image->inherited)
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
 	inherited_answer(&image->process->parasite, image->slot, image->inherited, &ignored);
-	inherited_creds(image->inherited, cloned);
-	return inherited_read(image->inherited, image->template, err);
+	if (cloned)
+		inherited_creds(image->inherited, cloned);
+	if (inherited_read(image->inherited, image->template, err))
+		return -1;
+	/* A descendant's are not its template's (process_attrs_learn()). */
+	if (image->process->descendant)
+		memset(image->inherited->limit, 0, sizeof image->inherited->limit);
+	return 0;
 }
 
 static int quieten(struct image *image, struct avc_error *err)
@@ -125,7 +132,7 @@ static int quieten(struct image *image, struct avc_error *err)
 	image->dumpable = dumpable->result;
 	if (attributes && hear_template(process, cloned, call, attributes, err))
 		return -1;
-	return process->tracker && cloned ? keep_inherited(image, cloned, err) : 0;
+	return process->tracker ? keep_inherited(image, err) : 0;
 }
 
 /* A main thread that has ended while others go on: it is there again until they are,

@@ -523,7 +523,6 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	guard->started_ns = now_ns();
 	init_channel_init(&guard->channel);
 	process_init(&guard->main);
-	guard->dirty = (struct dirty){ .process = &guard->main, .idle.pidfd = -1 };
 	guard->tree = (struct tree){
 		.slots = start->config.keep + 1,
 		.is_ours = guard_owns,

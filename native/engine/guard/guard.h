@@ -59,8 +59,8 @@ struct avc_guard {
 	nfds_t fds_room;
 	struct generation generations[AVC_KEEP_MAX]; /* oldest first            */
 	uint32_t count;
-	struct dirty dirty; /* of the main process                            */
-	uint64_t number;    /* of the last generation taken             */
+	struct dirty_tree dirty;
+	uint64_t number; /* of the last generation taken             */
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* it was found dying: guard_reap_unknown() until then    */
 	bool cramped;            /* there is no room for spares              */

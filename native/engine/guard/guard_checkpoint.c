@@ -401,11 +401,11 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 	if (generation_files_error(fresh, err))
 		return -1;
 	tracee_deadline_set(guard->timer, NS_PER_S);
-	result = guard->main.recycling ? dirty_apply(&guard->dirty, &fresh->image[0], err) : 0;
+	result = dirty_apply(&guard->dirty, fresh, err);
 	if (!result)
 		result = generation_finish(fresh, err);
 	if (!result)
-		result = dirty_check(&guard->dirty, &fresh->image[0], err);
+		result = dirty_check(&guard->dirty, fresh, err);
 	if (!result)
 		result = files_check_heirs(fresh->image, fresh->images, err);
 	tracee_deadline_clear(guard->timer);
@@ -457,13 +457,13 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	fresh->number = ++guard->number;
 	if (!guard->main.recycling)
 		guard->dirty.fork_ns = freeze->clone_ns;
-	dirty_follow(&guard->dirty, &fresh->image[0]);
+	dirty_follow(&guard->dirty, fresh);
 	fresh->clone_ns = guard->dirty.fork_ns;
 	fresh->freeze_ns = freeze->freeze_ns;
 	begin_ahead(guard, fresh);
 	guard_keep_generation(guard, fresh);
 	init_channel_arm(&guard->channel, true);
-	event->images = guard->main.recycling ? AVC_IMAGES_DIRTY : AVC_IMAGES_FORK;
+	event->images = guard->dirty.reason ? AVC_IMAGES_FORK : AVC_IMAGES_DIRTY;
 	event->fork_reason = guard->dirty.reason;
 	event->copied = guard->dirty.copied;
 	event->generation = fresh->number;

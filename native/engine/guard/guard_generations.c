@@ -86,7 +86,7 @@ bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (tracee_is_ending(pid) || guard->dirty.idle.pid == pid || guard->remains.pid == pid)
+	if (tracee_is_ending(pid) || dirty_owns(&guard->dirty, pid) || guard->remains.pid == pid)
 		return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->holder == pid)
@@ -192,6 +192,7 @@ void guard_release(struct avc_guard *guard, struct process *process)
 		if (image)
 			generation_close_files(image);
 	}
+	dirty_forget(&guard->dirty, process);
 	tree_let_go(process);
 }
 
@@ -330,8 +331,7 @@ void guard_reap_dead(struct avc_guard *guard)
 			if (guard->tree.process[i]->holder &&
 			    pidfd_ended(guard->tree.process[i]->holder_pidfd))
 				process_unhold(guard->tree.process[i]);
-		if (guard->dirty.idle.pid && pidfd_ended(guard->dirty.idle.pidfd))
-			dirty_drop_idle(&guard->dirty);
+		dirty_drop_ended(&guard->dirty);
 		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
 			return;
 		if (news[1].revents & POLLIN)

@@ -52,7 +52,7 @@ enum avc_fork_reason {
 	AVC_FORK_NONE = 0,      /* it was not                                      */
 	AVC_FORK_CONFIG = 1,    /* AVC_IMAGES_FORK                                 */
 	AVC_FORK_FIRST = 2,     /* there is no older one yet that could be used    */
-	AVC_FORK_PROCESSES = 3, /* it has several processes                        */
+	AVC_FORK_PROCESSES = 3, /* one above it adopts orphans, or it is new       */
 	AVC_FORK_KERNEL = 4,    /* the kernel cannot watch memory (before 6.7)     */
 	AVC_FORK_SANDBOX = 5,   /* it has a seccomp filter of its own              */
 	AVC_FORK_MEMORY = 6,    /* of a kind that cannot be watched or copied      */
