@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import ctypes
+import errno
+import fcntl
 import json
 import multiprocessing
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -123,8 +126,6 @@ def test_uninstall_leaves_the_program_that_running_containers_will_call(root: Pa
         assert hook[0].exists()
         container.kill()
     install.uninstall(root)
-    folder.rmdir()
-    folder.parent.rmdir()
     assert tree(root) == before
     assert install.uninstall(root) == ["nothing is installed"]
 
@@ -305,6 +306,41 @@ def test_another_run_time_directory(root: Path, monkeypatch: pytest.MonkeyPatch)
         (artifacts.oci_hooks_source() / description.name).read_text(),
         [],
     )
+
+
+def test_uninstall_is_all_or_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install.install(root)
+    before = tree(root)
+    rename = os.rename
+
+    def refuse(source: Path, target: Path) -> None:
+        if Path(source).name == "avckpt-init":
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(source))
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", refuse)
+    with pytest.raises(ConfigError, match="avckpt-init cannot be removed: .*; nothing was changed"):
+        install.uninstall(root)
+    assert tree(root) == before
+
+
+def test_uninstall_leaves_nothing_of_hooks_and_sidecar(root: Path) -> None:
+    before = tree(root)
+    install.install(root)
+    folder = root / "run/avckpt"
+    for name in ("containers/x.json", "health/x.json", "history.jsonl", "present.json", "lock"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("")
+    with socket.socket(socket.AF_UNIX) as left_behind:
+        left_behind.bind(str(folder / "api.sock"))
+    (root / "run/avckpt-init").touch()  # of a container with -v /run:/run
+    with (folder / "lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        install.uninstall(root)
+        assert (folder / "history.jsonl").exists()
+    install.install(root)
+    install.uninstall(root)
+    assert tree(root) == before
 
 
 def test_a_damaged_manifest_is_said(root: Path) -> None:

@@ -106,11 +106,15 @@ class Facts:
     engine_problem: str
     """What the engine's own probe said; empty: it is content."""
     config: ConfigFacts
+    root: bool = True
+    """Without it most of the others cannot be found out."""
 
 
 KERNEL_LEAST = (5, 13)  # PTRACE_GET_RSEQ_CONFIGURATION, the newest call that the engine needs
 PODMAN_LEAST = (4, 3)  # `podman generate spec`, by which the precreate hook learns labels
 MACHINES = ("x86_64",)
+UNKNOWN = "unknown"
+"""Version of an installation whose manifest is damaged."""
 SERVICE = Path("/run/podman/podman.sock")  # root's, where podman.socket has it
 _CAPABILITIES = {"CAP_SYS_PTRACE": 19, "CAP_SYS_ADMIN": 21}
 
@@ -122,6 +126,11 @@ def checks() -> list[Check]:
 
 def judge(facts: Facts) -> list[Check]:
     """The verdicts on what was seen, in the order in which a person should mend things."""
+    if not facts.root:
+        hidden = "privileges", "engine"
+        found = [check for check in _judge_machine(facts) if check.name not in hidden]
+        what = "this is not root: Podman, hooks, engine and sidecar are root's, and were not looked at"
+        return [*found, Check("privileges", Status.FAIL, what, "run: sudo avckpt doctor")]
     found = [*_judge_machine(facts)]
     if facts.in_container and isinstance(facts.podman, str):
         found.append(
@@ -216,6 +225,10 @@ def _judge_installation(facts: Facts) -> Iterator[Check]:
     again = "run: sudo avckpt install"
     if facts.installed_version is None:
         yield Check("hooks", Status.FAIL, "not installed: labels do nothing, and Podman does not say so", again)
+        return
+    if facts.installed_version == UNKNOWN:
+        what, _, remedy = facts.hook_problem.rpartition(": ")
+        yield Check("hooks", Status.FAIL, what, f"{remedy}; then run: sudo avckpt install")
         return
     if facts.missing_files:
         yield Check("hooks", Status.FAIL, f"of the installation is missing: {_few(facts.missing_files)}", again)
@@ -316,6 +329,7 @@ def gather() -> Facts:
         sidecar_outdated=_sidecar_outdated(),
         engine_problem=_engine_problem(),
         config=_config(info),
+        root=os.geteuid() == 0,
     )
 
 
@@ -343,7 +357,7 @@ def _installation() -> tuple[str | None, tuple[str, ...], tuple[str, ...], str]:
     try:
         manifest = Manifest.read()
     except AvckptError as error:
-        return "unknown", (), (), str(error)
+        return UNKNOWN, (), (), str(error)
     if manifest is None:
         return None, (), (), ""
     outdated: tuple[str, ...] = ()

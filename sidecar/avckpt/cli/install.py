@@ -25,7 +25,7 @@ from avckpt_hooks.shared import protocol
 
 import avckpt
 from avckpt import artifacts
-from avckpt.cli import containers_conf
+from avckpt.cli import containers_conf, leftovers
 from avckpt.containers.process import age_s
 from avckpt.containers.records import Records
 from avckpt.errors import ConfigError, Denied, TargetGone
@@ -252,8 +252,8 @@ def uninstall(root: Path = _HOST) -> list[str]:
     protected any more when they are started again.  Those that run with our
     hooks call them once more, when they end: until then the program stays, for
     crun can die of one that is not there (SIGPIPE: it writes to the hook without
-    knowing whether that could be started), and `podman stop` fails.  Raises
-    ConfigError.
+    knowing whether that could be started), and `podman stop` fails.  What cannot
+    be removed leaves all in place.  Raises ConfigError.
     """
     if os.geteuid() != 0:
         raise Denied("this needs root (sudo avckpt uninstall)")
@@ -261,13 +261,14 @@ def uninstall(root: Path = _HOST) -> list[str]:
     if manifest is None:
         return ["nothing is installed"]
     callers = _callers(root)
-    kept = [path for path in manifest.files if callers and (path == HOOK_PROGRAM or _PACKAGE in path.parents)]
+    programs = (HOOK_PROGRAM, RUNTIME_PROGRAM)
+    kept = [path for path in manifest.files if callers and (path in programs or _PACKAGE in path.parents)]
     left = [*kept, MANIFEST] if kept else []
-    done = []
     # Backwards: Podman forgets the hooks before they are gone.
-    for path in (*reversed(manifest.files), MANIFEST):
-        if path not in left and _remove(under(root, path)):
-            done.append(f"removed {path}")
+    doomed = [path for path in (*reversed(manifest.files), MANIFEST) if path not in left]
+    done = [f"removed {path}" for path in _remove_all(root, doomed)]
+    if not callers:
+        done += [f"removed {path}" for path in leftovers.remove(root, _run_dir())]
     if kept:
         try:
             _record(root, kept, list(manifest.directories))
@@ -289,6 +290,27 @@ def uninstall(root: Path = _HOST) -> list[str]:
         else:
             done.append(f"removed {path}")
     return done
+
+
+def _remove_all(root: Path, paths: list[Path]) -> list[Path]:
+    """Removes files, all or none; those that were there.  Raises ConfigError."""
+    aside: dict[Path, Path] = {}
+    with contextlib.ExitStack() as undo:
+        for path in paths:
+            place = under(root, path)
+            temporary = place.with_name(f".{place.name}.{os.getpid()}.old")
+            try:
+                os.rename(place, temporary)
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except OSError as error:
+                raise ConfigError(f"{path} cannot be removed: {error.strerror}; nothing was changed") from error
+            undo.callback(os.rename, temporary, place)
+            aside[path] = temporary
+        undo.pop_all()
+    for temporary in aside.values():
+        _remove(temporary)
+    return list(aside)
 
 
 def _callers(root: Path) -> list[str]:
