@@ -95,6 +95,8 @@ optional|runc|have runc|the tests run on both OCI runtimes
 optional|g++|have c++|compiles the C++ program that the tests kill and restore
 optional|cyclonedds-dev|has_cyclonedds|a test of ROS 2's transport
 optional|cyclonedds-tools|have idlc|a test of ROS 2's transport
+optional|strace|have strace|kills a guard before its system calls, in a test
+optional|stress-ng|have stress-ng|a test of processes of all kinds
 optional|catatonit|has_catatonit|pods and 'podman run --init'
 "
 

@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
 from testkit.harness import wait_until
+from testkit.init_peer import Init
 
 pytestmark = pytest.mark.shared_machine(
     "children are made and checkpoints taken at random moments, and late ones are missed"
 )
 
 CHILDREN = 6000
+STRESS = ("stress-ng", "--clone", "1", "--clone-ops", "30", "--verify")
 
 
 @pytest.fixture(autouse=True)
@@ -37,4 +41,18 @@ def test_children_of_every_kind_end(tmp_path: Path, late_us: int, where: str) ->
             "children",
         )
         victim.check()
+        assert guard.process.poll() is None
+
+
+@pytest.mark.skipif(not shutil.which(STRESS[0]), reason="it makes the children; it is not installed")
+def test_stress_ng_ends_well(tmp_path: Path) -> None:
+    """Flags of clone(2) at random; how long it takes: bench/clones.py."""
+    said = tmp_path / "said"
+    with (
+        said.open("wb") as output,
+        Init([*STRESS, "--temp-path", tmp_path], pid1=True, stdout=output.fileno(), stderr=subprocess.STDOUT) as init,
+        GuardProcess(config(0.05), [init.pid]) as guard,
+    ):
+        guard.wait("attached")
+        assert init.popen.wait(timeout=4 * PATIENCE_S) == 0, said.read_text()
         assert guard.process.poll() is None
