@@ -373,7 +373,7 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("scenario", ["messages", "pidfds", "child", "full"])
+@pytest.mark.parametrize("scenario", ["messages", "flight", "shut", "pidfds", "child", "full"])
 def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
     """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
     with (
@@ -386,6 +386,7 @@ def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
 def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
     with Victim(f"sockets rights {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         checkpoint(guard)
+        disturb(victim)
         victim.kill_app()
         assert "descriptors that were on their way" in guard.wait("restored")["error"]["detail"]
 

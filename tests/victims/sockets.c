@@ -90,6 +90,188 @@ static void rights_setup(void)
 	must(sendmsg(fd[0], &head, 0) == 1, "sendmsg");
 }
 
+static void rights_disturb(void)
+{
+	must(read(fd[1], scratch, 1) == 1, "read");
+}
+
+/* ---- descriptors in flight that stay there -------------------------------------------- */
+
+static void give(int to, const char *text, int f)
+{
+	char control[CMSG_SPACE(sizeof(int))] = { 0 };
+	struct iovec io = { (void *)(uintptr_t)text, strlen(text) };
+	struct msghdr head = { .msg_iov = &io,
+			       .msg_iovlen = 1,
+			       .msg_control = control,
+			       .msg_controllen = sizeof control };
+	struct cmsghdr *c = CMSG_FIRSTHDR(&head);
+
+	c->cmsg_level = SOL_SOCKET;
+	c->cmsg_type = SCM_RIGHTS;
+	c->cmsg_len = CMSG_LEN(sizeof(int));
+	memcpy(CMSG_DATA(c), &f, sizeof f);
+	must(sendmsg(to, &head, 0) == (ssize_t)strlen(text), "sendmsg");
+}
+
+static struct ucred sender;
+
+/* The descriptor that came with it, or -1. */
+static int take(int from, const char *text)
+{
+	char control[256], got[64];
+	struct iovec io = { got, sizeof got };
+	struct msghdr head = { .msg_iov = &io,
+			       .msg_iovlen = 1,
+			       .msg_control = control,
+			       .msg_controllen = sizeof control };
+	const ssize_t n = recvmsg(from, &head, MSG_DONTWAIT);
+	int f = -1;
+
+	CHECK(n == (ssize_t)strlen(text) && !memcmp(got, text, (size_t)n), "%zd of \"%s\"", n,
+	      text);
+	memset(&sender, 0, sizeof sender);
+	for (struct cmsghdr *c = CMSG_FIRSTHDR(&head); c; c = CMSG_NXTHDR(&head, c))
+		if (c->cmsg_type == SCM_RIGHTS)
+			memcpy(&f, CMSG_DATA(c), sizeof f);
+		else if (c->cmsg_type == SCM_CREDENTIALS)
+			memcpy(&sender, CMSG_DATA(c), sizeof sender);
+	return f;
+}
+
+/* `out` and `in` of a pipe; `inner` is a socket of a pair, of which fd[11] is the other one. */
+static void send_flight(int out, int in, int inner)
+{
+	must(write(in, "of it", 5) == 5, "write");
+	give(fd[0], "with a pipe", out);
+	say(fd[0], "with none");
+	give(fd[2], "a record", in);
+	say(fd[4], "before ");
+	give(fd[4], "with", fd[10]);
+	say(fd[4], " after");
+	give(fd[11], "nested", fd[10]);
+	give(fd[6], "outer", inner);
+	say(fd[8], "who am I");
+	close(out);
+	close(in);
+	close(inner);
+}
+
+static void flight_setup(void)
+{
+	const int on = 1;
+	int ends[2], pair[2];
+
+	for (int i = 0; i < 5; i++)
+		must(socketpair(AF_UNIX,
+				i == 1   ? SOCK_SEQPACKET
+				: i == 2 ? SOCK_STREAM
+					 : SOCK_DGRAM,
+				0, fd + 2 * i) == 0,
+		     "socketpair");
+	fd[10] = open("/etc/passwd", O_RDONLY);
+	must(!setsockopt(fd[9], SOL_SOCKET, SO_PASSCRED, &on, sizeof on), "SO_PASSCRED");
+	must(!pipe(ends) && !socketpair(AF_UNIX, SOCK_DGRAM, 0, pair), "pipe");
+	fd[11] = pair[0];
+	send_flight(ends[0], ends[1], pair[1]);
+}
+
+static bool is_passwd(int f)
+{
+	return f >= 0 && syscall(SYS_kcmp, getpid(), getpid(), 0, f, fd[10]) == 0;
+}
+
+static void flight_verify(void)
+{
+	const int out = take(fd[1], "with a pipe");
+	int in, inner, file;
+
+	CHECK(take(fd[1], "with none") < 0, "a descriptor with the second message");
+	in = take(fd[3], "a record");
+	CHECK(out >= 0 && in >= 0, "descriptors of the pipe: %d, %d", out, in);
+	expect_text(out, "of it", "the pipe that was on its way");
+	must(write(in, "new", 3) == 3, "write");
+	expect_text(out, "new", "the pipe whose ends were on their way");
+	file = take(fd[5], "before with"); /* a descriptor ends what is read at once */
+	CHECK(is_passwd(file), "descriptor %d of the stream", file);
+	CHECK(take(fd[5], " after") < 0, "a descriptor with the last bytes");
+	inner = take(fd[7], "outer");
+	CHECK(inner >= 0, "no socket was on its way");
+	close(file);
+	file = take(inner, "nested");
+	CHECK(is_passwd(file), "descriptor %d of what is in it", file);
+	(void)take(fd[9], "who am I");
+	CHECK(sender.pid == getpid(), "it came from %d", sender.pid);
+	close(file);
+	send_flight(out, in, inner);
+}
+
+/* ---- ends that are shut ------------------------------------------------------------------ */
+
+static const int shut_types[] = { SOCK_DGRAM, SOCK_SEQPACKET, SOCK_STREAM };
+
+static void shut_setup(void)
+{
+	struct epoll_event event = { .events = EPOLLIN };
+
+	fd[20] = epoll_create1(0);
+	for (int i = 0; i < 3; i++) {
+		must(socketpair(AF_UNIX, shut_types[i], 0, fd + 6 * i) == 0 &&
+			     socketpair(AF_UNIX, shut_types[i], 0, fd + 6 * i + 2) == 0 &&
+			     socketpair(AF_UNIX, shut_types[i], 0, fd + 6 * i + 4) == 0,
+		     "socketpair");
+		say(fd[6 * i], "the last");
+		must(!shutdown(fd[6 * i], SHUT_WR), "shutdown");
+		say(fd[6 * i + 2], "still open");
+		say(fd[6 * i + 4], "is closed");
+		for (int k = 1; k < 6; k += 2) {
+			event.data.fd = fd[6 * i + k];
+			must(!epoll_ctl(fd[20], EPOLL_CTL_ADD, event.data.fd, &event), "epoll_ctl");
+		}
+	}
+}
+
+/* The third pair is closed. */
+static void shut_disturb(void)
+{
+	for (int i = 0; i < 3; i++) {
+		(void)recv(fd[6 * i + 1], scratch, 8, MSG_DONTWAIT); /* verify() reads it, too */
+		must(!shutdown(fd[6 * i + 2], SHUT_WR), "shutdown");
+		must(!shutdown(fd[6 * i + 3], i == 1 ? SHUT_RDWR : SHUT_WR), "shutdown");
+		close(fd[6 * i + 4]);
+		close(fd[6 * i + 5]);
+	}
+}
+
+static void shut_verify(void)
+{
+	static bool last_is_read; /* before the checkpoint                              */
+	struct epoll_event events[16];
+	int seen = 0;
+
+	for (int i = 0; i < 3; i++) {
+		if (!last_is_read)
+			expect_text(fd[6 * i + 1], "the last", "a pair that is shut");
+		CHECK(send(fd[6 * i], "x", 1, MSG_NOSIGNAL) < 0 && errno == EPIPE, "it is open");
+		CHECK(i == 0 || recv(fd[6 * i + 1], scratch, 1, MSG_DONTWAIT) == 0, "no end");
+		say(fd[6 * i + 1], "back");
+		expect_text(fd[6 * i], "back", "the other way");
+		expect_text(fd[6 * i + 3], "still open", "a pair that is open");
+		expect_text(fd[6 * i + 5], "is closed", "a pair that is closed later");
+		for (int k = 2; k < 6; k++) {
+			say(fd[6 * i + k], "and is");
+			expect_text(fd[6 * i + (k ^ 1)], "and is", "it");
+		}
+		say(fd[6 * i + 2], "still open");
+		say(fd[6 * i + 4], "is closed");
+	}
+	last_is_read = true;
+	for (int n = epoll_wait(fd[20], events, 16, 0), i = 0; i < n; i++)
+		for (int k = 0; k < 18; k++)
+			seen += k % 6 != 1 && events[i].data.fd == fd[k] ? 1 : 0;
+	CHECK(seen == 6, "%d of the open pairs were heard of", seen);
+}
+
 /* ---- pidfds ----------------------------------------------------------------------------- */
 
 static int pidfd_of(pid_t pid, unsigned int flags)
@@ -228,7 +410,9 @@ static const struct scenario scenarios[] = {
 	{ "child", child_setup, child_disturb, child_verify },
 	{ "pidfds", pidfds_setup, pidfds_disturb, pidfds_verify },
 	{ "full", full_setup, nothing, full_verify },
-	{ "rights", rights_setup, nothing, nothing },
+	{ "rights", rights_setup, rights_disturb, nothing },
+	{ "flight", flight_setup, nothing, flight_verify },
+	{ "shut", shut_setup, shut_disturb, shut_verify },
 };
 
 int main(int argc, char **argv)

@@ -460,6 +460,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		f->offset = lseek(fd, 0, SEEK_CUR);
 	f->unread = f->kind == FILE_INOTIFY && !ioctl(fd, FIONREAD, &unread) && unread;
 	socket = known && look->depth == FILES_NOW ? known->socket : f->socket;
+	if (look->depth == FILES_NOW && socket && socket->peer)
+		f->shut = file_shut(fd);
 	if (f->kind == FILE_SOCKET && (look->depth == FILES_NOW || look->files->with_tcp))
 		file_look_at_tcp(fd, f, socket);
 	silent = look->depth != FILES_NOW && file_is_video(f) && file_look_at_video(fd, &f->video);
@@ -653,6 +655,8 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->ended = from->ended;
 	f->content_lost = from->content_lost;
 	f->rights_lost = from->rights_lost;
+	f->senders_lost = from->senders_lost;
+	f->rights = from->rights;
 	/* What is put back once, one has (files_family.c). */
 	if (!from->content_bytes || !from->ended)
 		return;
@@ -668,7 +672,7 @@ static void copy_content(const struct files *parent, struct file *f)
 
 static void keep_content(const struct look *look, struct file *f)
 {
-	struct pollfd end = { .events = POLLIN };
+	struct pollfd end = { .events = POLLIN | POLLRDHUP };
 
 	/* Once for each object, from an end that can be read. */
 	if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) || f->shared != f->fd ||
@@ -687,6 +691,8 @@ static void keep_content(const struct look *look, struct file *f)
 	end.fd = f->ours;
 	if (f->ours < 0 || poll(&end, 1, 0) != 1)
 		return;
+	if (end.revents & POLLRDHUP && f->socket)
+		f->socket->shut |= SHUT_IN;
 	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
 	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
 		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
@@ -1082,6 +1088,7 @@ void files_capture(struct image *image, const struct image *parent, bool several
  * there before it may be of either side, and is left alone at a restore. */
 void files_settle(struct image *image)
 {
+	files_land();
 	files_find_closed(image->files, image->template);
 	file_rights_read(&image->files->rights, image->process->pid);
 	for (uint32_t i = 0; i < image->files->count; i++) {

@@ -5,6 +5,7 @@
  *   files.c         looks at a table
  *   files_info.c    what /proc/PID/fdinfo says
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
+ *   files_messages.c what is in Unix sockets, and who may still send
  *   files_options.c options of sockets, and whether one can be made again
  *   files_unix.c    names of Unix sockets
  *   files_make.c    opens and makes again what is lost
@@ -176,8 +177,9 @@ struct file_socket {
 	uint32_t others; /* tables that have it, too                                  */
 	int domain, type, protocol;
 	bool listening, connected;
-	bool idle;   /* has never been connected, and does not listen                    */
-	int backlog; /* -1: not asked yet                                         */
+	bool idle;    /* has never been connected, and does not listen                    */
+	int backlog;  /* -1: not asked yet                                         */
+	uint8_t shut; /* of a pair's end: SHUT_IN, SHUT_OUT                          */
 	/* Of those that can be made again: file_socket_is_alone()                 */
 	uint32_t uid, gid;
 	struct file_option *option; /* files_options.c, allocated               */
@@ -254,7 +256,10 @@ struct file {
 	uint32_t content_bytes;
 	bool content_lost; /* there was something that cannot be put back          */
 	bool ended;        /* nobody has its other end: what is in it is the last        */
+	uint8_t shut;      /* at a restore, of a socket of now: SHUT_IN, SHUT_OUT      */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
+	bool senders_lost; /* who had sent it (SCM_CREDENTIALS) is seen by who reads it  */
+	uint64_t rights;   /* what these are, as far as it can be told; 0: none        */
 	struct file_video video;
 	/* The same open file description in `parent` of files_look(); NULL: not known to be.
 	 * Afterwards only in the images of a freeze, where all are at the same time. */
@@ -337,6 +342,19 @@ bool file_read_info(pid_t pid, struct file *file);
 bool file_parse_info(struct file *file, char *text);
 /* Of an eventfd of ours. */
 uint64_t file_count(int fd);
+
+/* files_messages.c */
+#define CONTENT_MAX (1 << 20)
+/* What is in a Unix socket, so many bytes. */
+void file_keep_messages(struct process *process, int fd, struct file *file, uint32_t bytes);
+/* Whether that is all just as it was.  At a restore. */
+bool file_has_messages(int fd, const struct file *want);
+/* Closes descriptors that came with what was looked at: not in a freeze. */
+void files_land(void);
+/* As shutdown(2) has left it, of one of ours whose process is dead. */
+#define SHUT_IN 1
+#define SHUT_OUT 2
+uint8_t file_shut(int fd);
 
 /* files_state.c */
 /* So often a count is read at most, to bring it down to what it was. */

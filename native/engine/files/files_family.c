@@ -443,6 +443,92 @@ static void put_contents(const struct tables *tables)
 	}
 }
 
+/* Of both ends of a connection (net/unix/af_unix.c, unix_shutdown()). */
+static uint8_t shut_of(const struct file *f, const struct file *other)
+{
+	const uint8_t others = f->socket->type == SOCK_DGRAM ? 0 : other->socket->shut;
+
+	return (uint8_t)(f->socket->shut | (others & SHUT_OUT ? SHUT_IN : 0) |
+			 (others & SHUT_IN ? SHUT_OUT : 0));
+}
+
+/* As it is now; -1: nobody has it any more. */
+static int shut_now(const struct tables *tables, const struct file *w)
+{
+	EACH_SPOT(at, &tables->ends, w->ino)
+	{
+		const struct file *now = files_now_of(&tables->work[at->table], at->k);
+
+		if (same_end(w, file_at(tables, at)) && now)
+			return now->shut;
+	}
+	return -1;
+}
+
+/* Whether there is something to put back that cannot come by way of `other` to `w` any more. */
+static bool is_blocked(const struct tables *tables, const struct file *w, int is, int others)
+{
+	const struct file *content = content_of(tables, w);
+	bool blocked = is & SHUT_IN || others & SHUT_OUT;
+	int fd;
+
+	if (!blocked || !(content->content_bytes || content->content_lost))
+		return false;
+	if (!find_same(tables, w, &fd))
+		return false;
+	blocked = !file_has_messages(fd, content);
+	close(fd);
+	return blocked;
+}
+
+/* Nothing opens again what shutdown(2) has shut: such a pair is made again, and shut after what was
+ * in it has been put back. */
+static void renew_pair(const struct tables *tables, const struct file *w, const struct file *other)
+{
+	const int is = shut_now(tables, w), others = shut_now(tables, other);
+	int ends[2];
+
+	if (is < 0 || others < 0 || !(is | others))
+		return;
+	if (!(is & ~shut_of(w, other)) && !(others & ~shut_of(other, w)) &&
+	    !is_blocked(tables, w, is, others) && !is_blocked(tables, other, others, is))
+		return;
+	if (file_make_pair(w, other, ends))
+		return;
+	give_end(tables, w, ends[0]);
+	give_end(tables, other, ends[1]);
+}
+
+static void shut_end(const struct tables *tables, const struct file *w, uint8_t shut)
+{
+	int fd;
+
+	if (!shut || !find_same(tables, w, &fd))
+		return;
+	shutdown(fd, shut == SHUT_IN ? SHUT_RD : shut == SHUT_OUT ? SHUT_WR : SHUT_RDWR);
+	close(fd);
+}
+
+/* Renews them, or shuts their ends. */
+static void see_to_pairs(const struct tables *tables, bool renew)
+{
+	for (uint32_t i = 0; i < tables->count; i++)
+		for (uint32_t k = 0; k < tables->work[i].want->count; k++) {
+			const struct file *w = &tables->work[i].want->file[k], *other;
+			bool ignored;
+
+			if (w->kind != FILE_SOCKET || !is_pair(w) || !is_first(tables, w))
+				continue;
+			other = find_other(tables, w, &ignored);
+			if (!other || !other->socket)
+				continue;
+			if (renew)
+				renew_pair(tables, w, other);
+			else
+				shut_end(tables, w, shut_of(w, other));
+		}
+}
+
 static struct files_work *work_of(const struct tables *tables, const struct process *process)
 {
 	for (uint32_t i = 0; i < tables->count; i++)
@@ -487,6 +573,7 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 		result = fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 		goto out;
 	}
+	see_to_pairs(&tables, true);
 	if (tables.count > 1)
 		join(&tables);
 	for (uint32_t i = 0; i < tables.count; i++) {
@@ -496,6 +583,7 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 			goto out;
 	}
 	put_contents(&tables);
+	see_to_pairs(&tables, false);
 	for (uint32_t i = 0; i < tables.count; i++) {
 		struct files_work *work = &tables.work[i];
 

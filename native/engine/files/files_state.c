@@ -31,11 +31,9 @@
 
 #include "files.h"
 
-#define CONTENT_MAX (1 << 20)
 #define DRAIN_READS 16384 /* more than the small messages that a socket has room for */
 #define TCP_TRIES 8
 #define SET_TICKS _IOW('T', 0, uint64_t) /* linux/timerfd.h, which does not go with the libc's */
-#define MESSAGE_MAX (256 << 10)          /* as large as the buffer of a socket, by default */
 /* fcntl(F_SETFL) changes these. */
 #define STATUS_FLAGS (O_APPEND | O_NONBLOCK | O_DIRECT | O_NOATIME)
 
@@ -196,6 +194,8 @@ static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
 			memcpy(&peer, attribute + 1, sizeof peer);
 			s->peer = peer;
 		}
+		if (attribute->nla_type == UNIX_DIAG_SHUTDOWN)
+			memcpy(&s->shut, attribute + 1, sizeof s->shut);
 		if (attribute->nla_type == UNIX_DIAG_RQLEN && s->listening) {
 			memcpy(&queue, attribute + 1, sizeof queue);
 			s->backlog = (int)queue.udiag_wqueue;
@@ -397,87 +397,14 @@ static void keep_pipe(int fd, struct file *file, uint32_t bytes, struct scratch 
 		scratch_close(scratch); /* with what is left in it */
 }
 
-/* One look into a Unix socket, nothing taken out.  Bytes, or -1; a message is cut, and its
- * whole length the answer. */
-static ssize_t peek(int fd, struct file *file, void *to, size_t room)
-{
-	struct iovec io = { to, room };
-	struct msghdr head = { .msg_iov = &io, .msg_iovlen = 1 };
-	const ssize_t n = recvmsg(fd, &head, MSG_PEEK | MSG_DONTWAIT | MSG_TRUNC);
-
-	/* There is no room for them: so it is said that there are some. */
-	if (n >= 0 && head.msg_flags & MSG_CTRUNC && option(fd, SOL_SOCKET, SO_PASSCRED) <= 0)
-		file->rights_lost = true;
-	return n;
-}
-
-/* Datagrams, or records: the kernel moves on with every look, if it is told where to begin.  It
- * is told by an option of the app's own socket, which gets its value back also if we die. */
-static void keep_messages(struct process *process, int fd, struct file *file)
-{
-	const int first = 0, before = option(fd, SOL_SOCKET, SO_PEEK_OFF);
-	size_t used = 0;
-
-	if (parasite_will(process, SYS_setsockopt,
-			  ARGUMENTS((uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
-				    (uint64_t)(int64_t)before, sizeof before))) {
-		file->content_lost = true;
-		return;
-	}
-	if (setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &first, sizeof first)) {
-		parasite_will_done(process);
-		file->content_lost = true;
-		return;
-	}
-	for (;;) {
-		uint8_t *more = realloc(file->content, used + sizeof(uint32_t) + MESSAGE_MAX);
-		uint32_t bytes;
-		ssize_t n;
-
-		if (more)
-			file->content = more;
-		n = more ? peek(fd, file, more + used + sizeof bytes, MESSAGE_MAX)
-			 : MESSAGE_MAX + 1;
-		/* An empty datagram cannot be looked past; for others it is the end. */
-		file->content_lost |=
-			n > MESSAGE_MAX ||
-			(n > 0 && (used + (size_t)n > CONTENT_MAX || !budget_has((uint64_t)n))) ||
-			(n == 0 && file->socket->type == SOCK_DGRAM);
-		if (n <= 0 || file->content_lost)
-			break;
-		bytes = (uint32_t)n;
-		(void)budget_take(bytes);
-		memcpy(file->content + used, &bytes, sizeof bytes);
-		used += sizeof bytes + bytes;
-	}
-	file->content_bytes = (uint32_t)used;
-	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
-	parasite_will_done(process);
-}
-
-/* There was room for the largest. */
-static void trim_messages(struct file *file)
-{
-	uint8_t *less = file->content_bytes ? realloc(file->content, file->content_bytes) : NULL;
-
-	if (!file->content_bytes) {
-		free(file->content);
-		file->content = NULL;
-	} else if (less) {
-		file->content = less;
-	}
-}
-
 void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch)
 {
 	int bytes = 0;
-	ssize_t n;
 
 	if (ioctl(fd, FIONREAD, &bytes) || bytes <= 0)
 		return;
-	if (file->kind == FILE_SOCKET && file->socket->type != SOCK_STREAM) {
-		keep_messages(process, fd, file);
-		trim_messages(file);
+	if (file->kind == FILE_SOCKET) {
+		file_keep_messages(process, fd, file, (uint32_t)bytes);
 		return;
 	}
 	if (bytes > CONTENT_MAX || !budget_has((uint64_t)bytes)) {
@@ -490,13 +417,7 @@ void file_keep_content(struct process *process, int fd, struct file *file, struc
 		file->content_lost = true;
 		return;
 	}
-	if (file->kind == FILE_PIPE) {
-		keep_pipe(fd, file, (uint32_t)bytes, scratch);
-		return;
-	}
-	n = peek(fd, file, file->content, (size_t)bytes);
-	file->content_bytes = n > 0 ? (uint32_t)n : 0;
-	file->content_lost = n != bytes; /* a descriptor in flight ends what is seen */
+	keep_pipe(fd, file, (uint32_t)bytes, scratch);
 }
 
 /* A description of our own of the same pipe, so that its O_NONBLOCK is ours. */
@@ -532,6 +453,9 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	uint32_t put = 0;
 	bool emptied;
 
+	/* As it is, its senders are known, too, and what came with it. */
+	if (!pipe && file_has_messages(fd, want))
+		return NULL;
 	emptied = in >= 0 && out >= 0 && drain(in, want);
 	if (emptied) {
 		while (put < want->content_bytes) {
@@ -558,6 +482,8 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 		problem = "descriptors that were on their way through it are lost";
 	else if (want->content_lost)
 		problem = "what was in it is lost";
+	else if (want->senders_lost)
+		problem = "who had sent what was in it is not known any more";
 	if (pipe) {
 		close_fd(&in);
 		close_fd(&out);
