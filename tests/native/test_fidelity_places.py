@@ -43,9 +43,10 @@ def test_sessions_and_groups_whose_leader_is_gone(kind: str, where: str, tmp_pat
     run(f"places {kind} {where}", tmp_path)
 
 
-def test_orphans_of_sessions_whose_leaders_are_gone(tmp_path: Path) -> None:
-    """They are init's, and there are two of these sessions."""
-    with Victim("places orphans", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+@pytest.mark.parametrize("kind", ["orphans", "unwaited"])
+def test_orphans_of_sessions_whose_leaders_are_gone(kind: str, tmp_path: Path) -> None:
+    """They are init's, and there are two of these sessions; or the leader has ended, and is there still."""
+    with Victim(f"places {kind}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         for _ in range(12):
             since = guard.mark()
             guard.wait("checkpoint", since=since)

@@ -11,6 +11,7 @@
  *   stayed     children that were there before their parent began a session
  *   orphans    the children of a session's leader that is gone
  *   adopted    likewise, of the main process, which adopts orphans; some have ended
+ *   unwaited   the same where the leader was not waited for
  *   groups     processes in groups whose leaders are gone, in several sessions
  */
 #include <signal.h>
@@ -268,6 +269,24 @@ static void setup_orphans(void)
 	make_orphans(4, false);
 }
 
+/* Their session's leader has ended, and nobody has waited for it. */
+static void setup_unwaited(void)
+{
+	const pid_t pid = fork();
+
+	must(pid >= 0, "fork");
+	if (!pid) {
+		setsid();
+		if (!begin(0))
+			rest(0);
+		wait_told(0);
+		_exit(7);
+	}
+	wait_ended(pid);
+	keep(pid, true);
+	others[0] = shared->pid[0];
+}
+
 static void setup_adopted(void)
 {
 	must(!prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0), "PR_SET_CHILD_SUBREAPER");
@@ -360,7 +379,7 @@ static const struct {
 } kinds[] = {
 	{ "ended", setup_ended },     { "leader", setup_leader }, { "terminal", setup_terminal },
 	{ "front", setup_front },     { "stayed", setup_stayed }, { "orphans", setup_orphans },
-	{ "adopted", setup_adopted }, { "groups", setup_groups },
+	{ "adopted", setup_adopted }, { "groups", setup_groups }, { "unwaited", setup_unwaited },
 };
 
 int main(int argc, char **argv)

@@ -265,7 +265,8 @@ void remap_free(struct remap *plan);
 
 /* Of one image. */
 struct place {
-	uint32_t host; /* the image of the process that forks it, or whose keeper does  */
+	uint32_t host;   /* the image of the process that forks it, or whose keeper does  */
+	uint32_t memory; /* the same, or whose memory that has: it may be one that ends again */
 	/* The session that it is forked in; 0: the one that the main process was started in. */
 	pid_t born;
 	pid_t before; /* of one that begins a session: where it has a keeper before that     */

@@ -110,8 +110,10 @@ int places_find(const struct generation *generation, struct place *place, struct
 	for (uint32_t i = 0; i < generation->images; i++) {
 		const int parent = generation->image[i].parent;
 
-		place[i] = (struct place){ i && parent != PARENT_INIT ? (uint32_t)parent : 0,
-					   PLACE_ANY, PLACE_ANY, false };
+		place[i] = (struct place){ .host = i && parent != PARENT_INIT ? (uint32_t)parent
+									      : 0,
+					   .born = PLACE_ANY,
+					   .before = PLACE_ANY };
 	}
 	for (uint32_t i = generation->images; i-- > 1;) {
 		const struct image *image = &generation->image[i];
@@ -123,5 +125,10 @@ int places_find(const struct generation *generation, struct place *place, struct
 	}
 	for (uint32_t i = 1; i < generation->images; i++)
 		place_renewed(generation, i, place);
+	for (uint32_t i = 1; i < generation->images; i++) {
+		place[i].memory = place[i].host;
+		while (!generation->image[place[i].memory].process)
+			place[i].memory = place[place[i].memory].host;
+	}
 	return 0;
 }

@@ -82,7 +82,7 @@ static void rest(const struct generation *generation, uint32_t index)
 
 	for (uint32_t i = 1; i < all->entries; i++)
 		if (generation->image[i].process && !all->entry[i].plan &&
-		    (all->place[i].host == index || i == index))
+		    (all->place[i].memory == index || i == index))
 			return;
 	snapshot_rest(all->entry[index].snapshot);
 }
@@ -91,7 +91,7 @@ const struct remap *restore_plan_of(struct generation *generation, uint32_t inde
 				    struct avc_error *err)
 {
 	struct plan_entry *entry = &generation->plan->entry[index];
-	const uint32_t host = generation->plan->place[index].host;
+	const uint32_t host = generation->plan->place[index].memory;
 	struct snapshot *want, *is;
 
 	if (entry->plan)
@@ -112,10 +112,10 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 	int result = places_find(generation, place, err);
 
 	for (uint32_t i = 1; !result && i < generation->images; i++)
-		generation->image[i].host = place[i].host;
+		generation->image[i].host = place[i].memory;
 	for (uint32_t i = 1; !result && i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
-		const struct image *host = &generation->image[place[i].host];
+		const struct image *host = &generation->image[place[i].memory];
 		struct snapshot *want, *is;
 
 		/* Few have anything of the kind. */

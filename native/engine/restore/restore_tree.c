@@ -199,7 +199,7 @@ static int become(struct restore_tree *restored, uint32_t index, struct avc_erro
 	struct forked *forked = &restored->forked[index];
 	struct syscall_batch *batch = &forked->batch;
 	const struct remap *plan = restore_plan_of(restored->generation, index, err);
-	const bool is_mains = restore_plan_place(restored->generation, index)->host == 0;
+	const bool is_mains = restore_plan_place(restored->generation, index)->memory == 0;
 
 	if (!plan || syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL,
 						   &image->table, err))
