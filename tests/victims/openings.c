@@ -1,8 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * openings N KIND [--closes]: SIGUSR1 opens N descriptors of that kind (null, file, eventfd,
+ * openings N KIND [--closes] [--again]: SIGUSR1 opens N descriptors of that kind (null, file, eventfd,
  * pair, tcp).  With --closes a file of its own that was open from the start is closed before.
- * counter[0] is how often it has done so.  Beats every 1 ms.
+ * With --again it closes them and opens them anew, for ever.  counter[0] is how often it has opened
+ * them.  Beats every 1 ms.
  */
 #include <signal.h>
 #include <sys/eventfd.h>
@@ -42,10 +43,11 @@ static int open_more(const char *kind)
 int main(int argc, char **argv)
 {
 	const bool closes = victim_flag(&argc, argv, "--closes");
+	const bool again = victim_flag(&argc, argv, "--again");
 	struct sigaction act = { .sa_handler = on_signal, .sa_flags = SA_RESTART };
 	struct rlimit limit;
 
-	victim_start(&argc, argv, 2, "N KIND [--closes]");
+	victim_start(&argc, argv, 2, "N KIND [--closes] [--again]");
 	must(!getrlimit(RLIMIT_NOFILE, &limit), "getrlimit");
 	limit.rlim_cur = limit.rlim_max;
 	must(!setrlimit(RLIMIT_NOFILE, &limit), "setrlimit");
@@ -66,5 +68,11 @@ int main(int argc, char **argv)
 		for (int i = 0; i < atoi(argv[1]);)
 			i += open_more(argv[2]);
 		count(0, 1);
+		if (again) {
+			must(!syscall(SYS_close_range, OWN + 1, ~0u, 0), "close_range");
+			for (int fd = STDERR_FILENO + 1; fd < OWN; fd++)
+				close(fd);
+			asked = 1;
+		}
 	}
 }
