@@ -171,6 +171,19 @@ def test_a_renamed_container_is_known_by_its_new_name(
         podman.run("rename", anew, made.name)
 
 
+def test_the_remedy_for_a_stopped_sidecar_works_when_pasted(sidecar: Sidecar, podman: Podman) -> None:
+    podman.run("stop", SIDECAR_NAME)
+    try:
+        said = sidecar.avckpt("ps", check=False)
+        assert said.status == 3
+        remedy = said.stderr.partition("start it with: ")[2].split()
+        assert remedy[:2] == ["podman", "run"]
+        podman.run(*remedy[1:])
+        wait_until(sidecar.answers, 20, "the sidecar answers")
+    finally:
+        sidecar.restart()
+
+
 def test_a_sidecar_that_can_not_be_started_is_said(sidecar: Sidecar, podman: Podman, base_image: str) -> None:
     sidecar.stop()
     try:

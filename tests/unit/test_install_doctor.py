@@ -100,7 +100,7 @@ def test_a_good_machine() -> None:
         ({"config": ConfigFacts("/c", False, "")}, "config", "ok", "no /c: the built-in defaults hold", ""),
         ({"sidecar_version": None, "sidecar_problem": "is away: start it"}, "sidecar", "fail", "is away", "start it"),
         ({"sidecar_version": "0.0.1"}, "sidecar", "warn", "version 0.0.1", "build its image again"),
-        ({"sidecar_outdated": True}, "sidecar", "warn", "of another build", "podman rm -f avckpt-sidecar; then"),
+        ({"sidecar_outdated": True}, "sidecar", "warn", "of another build", "podman run -d --replace"),
     ],
 )
 def test_what_is_wrong_is_said_with_a_remedy(

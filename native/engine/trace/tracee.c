@@ -217,7 +217,8 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 			fail(err, AVC_GONE, 0, tid, "stop", "", "it has ended");
 			return stop.kind;
 		case STOP_DEADLINE:
-			fail(err, AVC_DEADLINE, 0, tid, "stop", "", "it did not stop in time");
+			fail(err, AVC_DEADLINE, 0, tid, "stop", "",
+			     "it did not stop in time: it is paused, or waits in the kernel for a device");
 			return stop.kind;
 		}
 		/* Any stop takes a pending interrupt away (kernel/signal.c, ptrace_stop):

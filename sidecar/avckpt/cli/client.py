@@ -21,9 +21,10 @@ Json = dict[str, Any]
 TIMEOUT_S = 40.0
 """For a whole request; longer than the sidecar itself waits for the engine."""
 
+# --replace: one of that name that is stopped, or hangs, is no obstacle.
 START_IT = (
-    "start it with: podman run -d --restart=always --name avckpt-sidecar --privileged --pid=host --network=none "
-    "-v /run/avckpt:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
+    "start it with: podman run -d --replace --restart=always --name avckpt-sidecar --privileged --pid=host "
+    "--network=none -v /run/avckpt:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
 )
 
 

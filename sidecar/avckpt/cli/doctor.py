@@ -286,8 +286,7 @@ def _judge_sidecar(facts: Facts) -> Check:
             "build its image again and start it anew",
         )
     if facts.sidecar_outdated:
-        remedy = f"sudo podman rm -f {sidecar_container.NAME}; then {START_IT}"
-        return Check("sidecar", Status.WARN, sidecar_container.OUTDATED, remedy)
+        return Check("sidecar", Status.WARN, sidecar_container.OUTDATED, START_IT)
     return Check("sidecar", Status.OK, f"answers, version {facts.sidecar_version}")
 
 
