@@ -52,7 +52,7 @@ LEVELS = {
 }
 """How much each kind of event matters."""
 
-NO_NEWS = ("notified", "configured", "crash", "core", "late", "held", "sidecar_started", "sidecar_stopped")
+NO_NEWS = ("notified", "configured", "crash", "core", "late", "held", "waits", "sidecar_started", "sidecar_stopped")
 """Kinds of events that say nothing of how a container stands."""
 
 ASIDE = ("health", "refused", "notify_failed")

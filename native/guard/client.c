@@ -147,8 +147,8 @@ static bool is_text(const char *chars, size_t size)
 static bool event_is_sound(const struct avc_guard *guard, const struct avc_event *event)
 {
 	return event->cookie == guard->cookie && event->kind >= AVC_EVENT_ATTACHED &&
-	       event->kind <= AVC_EVENT_HELD && event->kind != AVC_EVENT_GUARD_LOST &&
-	       event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_LATE &&
+	       event->kind <= AVC_EVENT_WAITS && event->kind != AVC_EVENT_GUARD_LOST &&
+	       event->reason >= AVC_REASON_NONE && event->reason <= AVC_REASON_GROUP &&
 	       event->error.code >= AVC_OK && event->error.code <= AVC_RETRY &&
 	       is_text(event->error.operation, sizeof event->error.operation) &&
 	       is_text(event->error.syscall, sizeof event->error.syscall) &&
@@ -278,30 +278,39 @@ int avc_engine_probe(const char *program, struct avc_error *err)
 
 /* ---- one guard ----------------------------------------------------------------------- */
 
+static ssize_t send_with(int socket, const struct avc_request *request, const int *fds,
+			 size_t count)
+{
+	union {
+		char bytes[CMSG_SPACE(2 * sizeof *fds)];
+		struct cmsghdr align;
+	} control = { { 0 } };
+	struct iovec data = { (void *)request, sizeof *request };
+	struct msghdr message = { .msg_iov = &data, .msg_iovlen = 1 };
+	struct cmsghdr *header;
+
+	if (count) {
+		message.msg_control = &control;
+		message.msg_controllen = CMSG_SPACE(count * sizeof *fds);
+		header = CMSG_FIRSTHDR(&message);
+		header->cmsg_level = SOL_SOCKET;
+		header->cmsg_type = SCM_RIGHTS;
+		header->cmsg_len = CMSG_LEN(count * sizeof *fds);
+		memcpy(CMSG_DATA(header), fds, count * sizeof *fds);
+	}
+	return sendmsg(socket, &message, MSG_NOSIGNAL | MSG_DONTWAIT);
+}
+
 static int send_start(int socket, const struct avc_config *config, uint64_t cookie,
 		      int heartbeat_fd)
 {
-	struct avc_request request = { .magic = AVC_GUARD_MAGIC,
-				       .kind = AVC_REQUEST_START,
-				       .cookie = cookie,
-				       .config = *config };
+	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
+					     .kind = AVC_REQUEST_START,
+					     .cookie = cookie,
+					     .config = *config };
 	const int fds[2] = { config->init_pidfd, heartbeat_fd };
-	union {
-		char bytes[CMSG_SPACE(sizeof fds)];
-		struct cmsghdr align;
-	} control = { { 0 } };
-	struct iovec data = { &request, sizeof request };
-	struct msghdr message = { .msg_iov = &data,
-				  .msg_iovlen = 1,
-				  .msg_control = &control,
-				  .msg_controllen = sizeof control };
-	struct cmsghdr *header = CMSG_FIRSTHDR(&message);
 
-	header->cmsg_level = SOL_SOCKET;
-	header->cmsg_type = SCM_RIGHTS;
-	header->cmsg_len = CMSG_LEN(sizeof fds);
-	memcpy(CMSG_DATA(header), fds, sizeof fds);
-	return sendmsg(socket, &message, MSG_NOSIGNAL | MSG_DONTWAIT) < 0 ? -1 : 0;
+	return send_with(socket, &request, fds, 2) < 0 ? -1 : 0;
 }
 
 static void guard_free(struct avc_guard *guard)
@@ -431,7 +440,8 @@ void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
 	pthread_mutex_unlock(&guard->engine->lock);
 }
 
-static int guard_send(struct avc_guard *guard, const struct avc_request *request,
+/* `fd` goes with it; -1: none. */
+static int guard_send(struct avc_guard *guard, const struct avc_request *request, int fd,
 		      struct avc_error *err)
 {
 	int result = 0;
@@ -439,7 +449,7 @@ static int guard_send(struct avc_guard *guard, const struct avc_request *request
 	pthread_mutex_lock(&guard->engine->lock);
 	if (guard->ended || guard->stopping)
 		result = fail(err, AVC_GONE, ESRCH, 0, "command", "", "the container has ended");
-	else if (send(guard->socket, request, sizeof *request, MSG_DONTWAIT | MSG_NOSIGNAL) < 0)
+	else if (send_with(guard->socket, request, &fd, fd >= 0) < 0)
 		result = errno == EAGAIN || errno == ENOBUFS
 				 ? fail(err, AVC_BUSY, errno, 0, "command", "send",
 					"too many commands are waiting")
@@ -460,9 +470,9 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
 					     .until_ns = until_ns };
 
 	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_LIST)
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_ABANDON)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
-	return guard_send(guard, &request, err);
+	return guard_send(guard, &request, -1, err);
 }
 
 int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config,
@@ -473,7 +483,55 @@ int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config
 					     .config = *config };
 
 	*err = (struct avc_error){ 0 };
-	return config_check(config, err) ? -1 : guard_send(guard, &request, err);
+	return config_check(config, err) ? -1 : guard_send(guard, &request, -1, err);
+}
+
+int avc_meeting_new(uint32_t members, struct avc_error *err)
+{
+	const struct avc_meeting meeting = { .members = members };
+	int fd = memfd_create("avckpt-meeting", MFD_CLOEXEC | MFD_ALLOW_SEALING);
+
+	*err = (struct avc_error){ 0 };
+	if (fd >= 0 && pwrite(fd, &meeting, sizeof meeting, 0) == sizeof meeting &&
+	    fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW) == 0)
+		return fd;
+	fail_errno(err, 0, "meet", "memfd_create", "no memory to share");
+	close_fd(&fd);
+	return -1;
+}
+
+int avc_guard_line(struct avc_guard *guard, int meeting, uint64_t line, uint64_t ticket,
+		   struct avc_error *err)
+{
+	const struct avc_request request = {
+		.magic = AVC_GUARD_MAGIC, .kind = AVC_REQUEST_LINE, .line = line, .ticket = ticket
+	};
+
+	*err = (struct avc_error){ 0 };
+	return guard_send(guard, &request, meeting, err);
+}
+
+int avc_guard_recall(struct avc_guard *guard, int meeting, uint64_t line, uint64_t generation,
+		     uint64_t ticket, struct avc_error *err)
+{
+	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
+					     .kind = AVC_REQUEST_RECALL,
+					     .line = line,
+					     .generation = generation,
+					     .ticket = ticket };
+
+	*err = (struct avc_error){ 0 };
+	return guard_send(guard, &request, meeting, err);
+}
+
+int avc_guard_forget(struct avc_guard *guard, uint64_t generation, struct avc_error *err)
+{
+	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
+					     .kind = AVC_REQUEST_FORGET,
+					     .generation = generation };
+
+	*err = (struct avc_error){ 0 };
+	return guard_send(guard, &request, -1, err);
 }
 
 void avc_guard_stop(struct avc_guard *guard)

@@ -64,6 +64,7 @@ from avckpt.orders import Orders
 from avckpt.policy import Reloaded, Settings, changes, settings_of
 from avckpt.supervision import watchdog
 from avckpt.supervision.caretaker import Caretaker
+from avckpt.supervision.groups import Groups
 from avckpt.supervision.notify import Notifier
 
 log = logging.getLogger("avckpt")
@@ -129,11 +130,12 @@ class Daemon:
         self._engine = Engine()
         self._watches: dict[int, Watch] = {}
         self._cookies = itertools.count(1)
-        self._orders = Orders()
+        self.orders = Orders()
         self._endings: set[asyncio.Task[None]] = set()
         self._host_units = units.Allowance()
         self._names = Names()
         self._presence = Presence(run_dir / "present.json")
+        self.groups = Groups(self.orders)
 
     async def run(self) -> None:
         """Serves until SIGTERM or SIGINT, then lets every container run on unprotected.
@@ -182,6 +184,7 @@ class Daemon:
                 nodes.close()
             self.feed.close()
             await api.close()
+            await self.groups.close()
             await self.notifier.close()
             await self.caretaker.close()
             for watch in list(self._watches.values()):
@@ -213,10 +216,12 @@ class Daemon:
             raise NothingToRestore(f"{container.label} has nothing to go back to: {container.reason}")
         if cgroup.is_paused(container.init_pid):
             raise Paused(f"{container.label} is paused: `podman unpause {container.label}` first")
+        if watch.settings.policy.together and command in (Command.CHECKPOINT, Command.RESTORE):
+            return container, await self.groups.command(watch, command, generation)
         try:
             if command is Command.RESTORE:
                 watch.rolling_back = Reason.COMMAND
-            return container, await self._orders.give(watch.guard, container, command, generation)
+            return container, await self.orders.give(watch.guard, container, command, generation)
         finally:
             if command is Command.RESTORE:
                 watch.rolling_back = None
@@ -225,7 +230,7 @@ class Daemon:
         """All that is known of a container.  Raises NoSuchContainer, Ambiguous, DeadlineMissed or TargetGone."""
         watch = self._watches[self.registry.find(name).cookie]
         container = watch.container
-        held = await self._orders.held(watch.guard, container) if watch.guard is not None else []
+        held = await self.orders.held(watch.guard, container) if watch.guard is not None else []
         return {
             "container": container.to_json(),
             "settings": watch.settings.in_force,
@@ -263,9 +268,11 @@ class Daemon:
         except AvckptError as error:
             self.tell(watch, EventRecord(Kind.CONFIGURED, detail="goes on with its old settings", error=error))
             return Reloaded(container.label, (), str(error))
+        self.groups.leave(watch)
         watch.settings = after
         container.config = config
         container.group = after.policy.group
+        self.groups.join(watch)
         self.caretaker.change(watch, after.policy)
         outcome = Reloaded(container.label, changed)
         self.tell(watch, EventRecord(Kind.CONFIGURED, detail=f"new settings: {outcome.what}"))
@@ -443,6 +450,7 @@ class Daemon:
         else:
             container.guard_pid = watch.guard.pid
             self.caretaker.begin(watch, watch.settings.policy)
+            self.groups.join(watch)
 
     # Events
 
@@ -493,17 +501,19 @@ class Daemon:
                     self._lose_guard(watch, watch.guard)
                 continue
             if event.kind is Kind.HELD:
-                self._orders.answer(event, None)
+                self.orders.answer(event, None)
                 continue
             record = self.tell(watch, self._record(watch, event, at))
             self.inquests.take(watch, event, record)
+            self.groups.hear(watch, event)
             if event.kind is Kind.GUARD_LOST and watch.guard is not None:
                 self._replace_guard(watch, watch.guard)
-            self._orders.answer(event, record)
+            self.orders.answer(event, record)
 
     def _lose_guard(self, watch: Watch, guard: Guard) -> None:
         """It could not do its work, and said why; the next one may."""
         self.caretaker.end(watch)
+        self.groups.leave(watch)
         guard.stop()  # its process has ended
         watch.guard = None
         watch.container.guard_pid = 0
@@ -511,7 +521,7 @@ class Daemon:
     def _replace_guard(self, watch: Watch, guard: Guard) -> None:
         """Its process died or hung.  One that dies again and again must not keep us busy."""
         self._lose_guard(watch, guard)
-        self._orders.fail(watch.container, "its guard died before it could be done")
+        self.orders.fail(watch.container, "its guard died before it could be done")
         now = time.monotonic()
         since_s, watch.guard_lost_s = now - watch.guard_lost_s, now
         if since_s > GUARD_AGAIN_S and not has_ended(watch.pidfd):
@@ -527,6 +537,7 @@ class Daemon:
         if not loop.remove_reader(watch.pidfd):
             return  # it has begun already
         self.caretaker.end(watch)
+        self.groups.leave(watch)
         task = loop.create_task(self._end(watch))
         self._endings.add(task)
         task.add_done_callback(self._endings.discard)
@@ -548,7 +559,7 @@ class Daemon:
             container.end(time.time())
             self.tell(watch, EventRecord(Kind.ENDED, detail=container.reason))
             self.metrics.forget_all_but(each.label for each in self.registry.live() + self.registry.ended())
-        self._orders.fail(container, "ended before it could be done")
+        self.orders.fail(container, "ended before it could be done")
 
 
 @contextmanager

@@ -11,6 +11,8 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -44,6 +46,19 @@ def probe() -> None:
     err = ffi.new("struct avc_error *")
     if lib.avc_engine_probe(_path(guard_binary()), err) != 0:
         raise _error(err)
+
+
+@contextmanager
+def meeting(members: int) -> Iterator[int]:
+    """A descriptor of what so many guards meet at, for `Guard.line()` or `Guard.recall()`.  Raises KernelError."""
+    err = ffi.new("struct avc_error *")
+    fd = lib.avc_meeting_new(members, err)
+    if fd < 0:
+        raise _error(err)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
 
 
 class Guard:
@@ -82,6 +97,26 @@ class Guard:
             if self._guard is None:
                 raise TargetGone("its guard has ended", operation="configure")
             if lib.avc_guard_configure(self._guard, _config(-1, config), err) != 0:
+                raise _error(err)
+
+    def line(self, meeting: int, line: int, ticket: int) -> None:
+        """Has it take part in a line of its group; answered as a checkpoint.  Raises TargetGone, Busy."""
+        self._tell("line", lambda guard, err: lib.avc_guard_line(guard, meeting, line, ticket, err))
+
+    def recall(self, meeting: int, line: int, generation: int, ticket: int) -> None:
+        """Has it go back to that generation together with its group.  Raises TargetGone, Busy."""
+        self._tell("recall", lambda guard, err: lib.avc_guard_recall(guard, meeting, line, generation, ticket, err))
+
+    def forget(self, generation: int) -> None:
+        """Has it give up a generation of a line that others have not got.  Raises TargetGone, Busy."""
+        self._tell("forget", lambda guard, err: lib.avc_guard_forget(guard, generation, err))
+
+    def _tell(self, operation: str, tell: Callable[[Any, Any], int]) -> None:
+        err = ffi.new("struct avc_error *")
+        with self._lock:
+            if self._guard is None:
+                raise TargetGone("its guard has ended", operation=operation)
+            if tell(self._guard, err) != 0:
                 raise _error(err)
 
     @property
@@ -186,7 +221,8 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c = ffi.new("struct avc_config *")
     c.init_pidfd = init_pidfd
     c.keep = config.keep
-    c.interval_ns = _ns("interval", config.interval_s)
+    c.interval_ns = 0 if config.together else _ns("interval", config.interval_s)
+    c.together = config.together
     c.interval_min_ns = _ns("least interval", config.interval_min_s)
     c.budget_freeze_ppm = round(config.budget_freeze * 1e6)
     c.budget_cpu_ppm = round(config.budget_cpu * 1e6)
@@ -220,6 +256,7 @@ def _event(e: Any) -> Event:
         wait_status=e.wait_status,
         threads=e.threads,
         generation=e.generation,
+        line=e.line,
         generations=e.generations,
         attempt=e.attempt,
         quiescent=bool(e.quiescent),

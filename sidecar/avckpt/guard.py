@@ -26,6 +26,7 @@ class Command(enum.IntEnum):
     UNVOUCH = 7
     RELEASE = 8
     LIST = 9
+    ABANDON = 10
 
 
 class Files(enum.IntEnum):
@@ -102,6 +103,8 @@ class GuardConfig:
     files: Files = Files.REWIND
     tcp: Tcp = Tcp.RESET_MOVED
     images: Images = Images.FORK
+    together: bool = False
+    """Its checkpoints are those of its group's lines, which the daemon commands at `interval_s`."""
     interval_min_s: float = 0.0
     """Not 0: as often as the budgets allow, between this and `interval_s` apart."""
     budget_freeze: float = 0.03
@@ -124,6 +127,8 @@ class Event:
     wait_status: int = 0
     threads: int = 0
     generation: int = 0
+    line: int = 0
+    """Of its group; 0: it is of none."""
     generations: int = 0
     attempt: int = 0
     quiescent: bool = False

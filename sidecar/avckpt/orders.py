@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from avckpt.containers.protected import Protected
@@ -38,16 +39,25 @@ class Orders:
 
         Raises DeadlineMissed, TargetGone, or what the guard says went wrong.
         """
-        order = await self._carry_out(guard, container, command, generation)
-        _check(container.label, order.events[-1])
+        order = await self._carry_out(container, _of_command(guard, command, generation))
+        check(container.label, order.events[-1])
         assert order.record is not None
         return order.record
 
+    async def ask(self, container: Protected, tell: Callable[[int], None]) -> tuple[Event, EventRecord]:
+        """Has `tell` tell a guard something with a new ticket; the answer, whatever it says.
+
+        Raises DeadlineMissed, TargetGone, or what `tell` raises.
+        """
+        order = await self._carry_out(container, tell)
+        assert order.record is not None
+        return order.events[-1], order.record
+
     async def held(self, guard: Guard, container: Protected) -> list[Event]:
         """The generations that are held, oldest first.  Raises as `give()`."""
-        order = await self._carry_out(guard, container, Command.LIST)
+        order = await self._carry_out(container, _of_command(guard, Command.LIST))
         if order.events[-1].kind is not Kind.HELD:
-            _check(container.label, order.events[-1])
+            check(container.label, order.events[-1])
         return [event for event in order.events if event.generation]
 
     def answer(self, event: Event, record: EventRecord | None) -> None:
@@ -66,11 +76,11 @@ class Orders:
             if order.cookie == container.cookie and not order.done.done():
                 order.done.set_exception(TargetGone(f"{container.label}: {why}"))
 
-    async def _carry_out(self, guard: Guard, container: Protected, command: Command, generation: int = 0) -> _Order:
+    async def _carry_out(self, container: Protected, tell: Callable[[int], None]) -> _Order:
         ticket = next(self._tickets)
         order = self._open[ticket] = _Order(container.cookie, asyncio.get_running_loop().create_future())
         try:
-            guard.command(command, ticket, TIMEOUT_S, generation)
+            tell(ticket)
             await asyncio.wait_for(order.done, TIMEOUT_S)
         except asyncio.TimeoutError as error:
             raise DeadlineMissed(f"{container.label}: no answer within {TIMEOUT_S:g} s") from error
@@ -79,7 +89,11 @@ class Orders:
         return order
 
 
-def _check(label: str, event: Event) -> None:
+def _of_command(guard: Guard, command: Command, generation: int = 0) -> Callable[[int], None]:
+    return lambda ticket: guard.command(command, ticket, TIMEOUT_S, generation)
+
+
+def check(label: str, event: Event) -> None:
     """Raises what the answer to a command says went wrong, with the container's name."""
     if event.kind in (Kind.CHECKPOINT, Kind.RESTORED):
         return

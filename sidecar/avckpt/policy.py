@@ -91,6 +91,7 @@ def guard_config(policy: Policy) -> GuardConfig:
         files=Files[policy.files.upper()],
         tcp=Tcp[policy.tcp.upper().replace("-", "_")],
         images=Images[policy.images.upper()],
+        together=policy.together,
     )
 
 

@@ -63,7 +63,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 
 		data += 3;
 		size -= 3;
-		request = request_of(data, bytes, begun ? kind % 5 : AVC_REQUEST_START);
+		request = request_of(data, bytes, begun ? kind % 8 : AVC_REQUEST_START);
 		if (!begun) {
 			if (how & 1)
 				request.config.keep = 1 + request.config.keep % AVC_KEEP_MAX;

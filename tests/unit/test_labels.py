@@ -25,6 +25,33 @@ from avckpt_hooks.shared.labels import (
 ON = {"avckpt.enable": "true"}
 
 
+TOGETHER = {**ON, "avckpt.group": "g", "avckpt.group.recovery": "together"}
+
+
+def test_a_group_that_goes_back_together() -> None:
+    assert parse_policy(TOGETHER).together
+    assert not parse_policy({**ON, "avckpt.group": "g"}).together
+    assert not parse_policy({**TOGETHER, "avckpt.enable": "false"}).together
+
+
+@pytest.mark.parametrize(
+    ("labels", "says"),
+    [
+        ({"avckpt.group": None}, "label avckpt.group.recovery=together: there is no group; add avckpt.group=NAME"),
+        ({"avckpt.tcp": "keep"}, "label avckpt.tcp=keep: what was sent since the checkpoint would be received"),
+        ({"avckpt.tcp": "messages"}, "label avckpt.tcp=messages: what was sent since"),
+        ({"avckpt.interval": "auto"}, "label avckpt.interval=auto: a group that goes back together has one interval"),
+        ({"avckpt.deadline": "50ms", "avckpt.deadline.late": "cold"}, "label avckpt.deadline.late=cold: nobody of a"),
+        ({"avckpt.scope": "nodes"}, "label avckpt.scope=nodes: nodes do not go back together"),
+    ],
+)
+def test_what_does_not_go_with_a_return_together(labels: dict[str, str | None], says: str) -> None:
+    merged = {key: value for key, value in {**TOGETHER, **labels}.items() if value is not None}
+    with pytest.raises(LabelError) as raised:
+        parse_policy(merged)
+    assert str(raised.value).startswith(says)
+
+
 def test_no_label_means_no_protection_and_the_defaults_of_the_table() -> None:
     policy = parse_policy({"unrelated": "x"})
     assert policy == Policy(

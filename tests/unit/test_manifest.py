@@ -320,6 +320,21 @@ def test_one_that_hears_of_its_group_is_no_mistake(path: Path) -> None:
     ]
 
 
+def test_groups_that_go_back_together(path: Path) -> None:
+    labels = "avckpt.group={}, avckpt.group.recovery=together"
+    service = "  {}:\n    labels: [{}]\n"
+    whole = "".join(service.format(name, "avckpt.enable=true, " + labels.format("g")) for name in "ab")
+    assert lines(checked(path, f"services:\n{whole}")) == []
+    odd = service.format("c", "avckpt.enable=true, avckpt.group=g") + service.format("d", labels.format("g"))
+    alone = service.format("e", "avckpt.enable=true, " + labels.format("h"))
+    assert [line.split(": ", 2)[2] for line in lines(checked(path, f"services:\n{whole}{odd}{alone}"))] == [
+        "warning: it does not go back with the others of group g: avckpt.group.recovery=together is missing",
+        "warning: avckpt.group.recovery=together has no effect: without avckpt.enable=true nothing of it goes back",
+        "warning: avckpt.group has no effect: without avckpt.enable=true the container is not protected",
+        "warning: no other service here is in the group h: nobody hears of anybody",
+    ]
+
+
 def test_values_that_do_not_go_together(path: Path) -> None:
     labels = "      avckpt.enable: true\n      avckpt.restore.on: unhealthy\n      avckpt.keep: 1\n"
     text = f"services:\n  a:\n    labels:\n{labels}"

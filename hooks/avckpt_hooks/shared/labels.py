@@ -113,6 +113,8 @@ class Policy:
     """A core file for each death that is undone: off, mini (stacks) or on."""
     group: str = ""
     """Containers that hear of each other's recoveries; empty: none."""
+    recovery: str = "apart"
+    """Of the group: apart, or together, from checkpoints of one instant."""
     notify: Notify | None = None
     """Of the recoveries of others in the group."""
     notify_self: Notify | None = None
@@ -122,6 +124,11 @@ class Policy:
     def guarded(self) -> bool:
         """It has a guard: it is to be protected, and by itself."""
         return self.enable and self.scope == "container"
+
+    @property
+    def together(self) -> bool:
+        """It goes back with its group."""
+        return self.guarded and self.recovery == "together"
 
     @property
     def listens(self) -> bool:
@@ -171,7 +178,35 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
             "without a group there is nobody to hear of",
             "add avckpt.group=NAME, or use avckpt.notify.self for its own recoveries",
         )
+    if policy.recovery == "together":
+        _check_together(policy, mapping)
     return policy
+
+
+def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
+    """Raises LabelError for what does not go with avckpt.group.recovery=together."""
+    if not policy.group:
+        raise LabelError("avckpt.group.recovery", "together", "there is no group", "add avckpt.group=NAME")
+    if policy.scope == "nodes":
+        raise LabelError(
+            "avckpt.scope", "nodes", "nodes do not go back together with others", "use avckpt.scope=container there"
+        )
+    if policy.automatic:
+        raise LabelError(
+            "avckpt.interval", "auto", "a group that goes back together has one interval", "give it a time, as 500ms"
+        )
+    if policy.deadline_late == "cold":
+        raise LabelError(
+            "avckpt.deadline.late", "cold", "nobody of a group that goes back together starts anew alone", "use go-on"
+        )
+    if policy.tcp not in ("reset-moved", "reset"):
+        # Bytes that were sent since the checkpoint would be received, and sent once more.
+        raise LabelError(
+            "avckpt.tcp",
+            mapping.get("avckpt.tcp"),
+            "what was sent since the checkpoint would be received by a group that goes back together",
+            "allowed there: reset-moved or reset",
+        )
 
 
 def merge(labels: Mapping[str, str], annotations: Mapping[str, str]) -> dict[str, str]:
@@ -410,6 +445,7 @@ LABELS: dict[str, Label] = {
     "avckpt.core": Label("off", "off, mini or on", _one_of("core", "off", "mini", "on")),
     "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),
+    "avckpt.group.recovery": Label("apart", "apart or together", _one_of("recovery", "apart", "together")),
     "avckpt.notify": Label("", _NOTIFY, _parse_notify),
     "avckpt.notify.self": Label("", _NOTIFY, _parse_notify_self),
 }

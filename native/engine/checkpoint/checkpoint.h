@@ -104,6 +104,10 @@ struct freeze {
 	timer_t timer;
 	uint64_t deadline_ns;
 	struct mem_seen seen; /* the shared memory that is prepared for already   */
+	/* Of one that is part of a line: called when everything has been read and cloned, or
+	 * (not `whole`) could not be, and before anything is let go.  NULL: it is not. */
+	int (*meet)(void *arg, bool whole, struct avc_error *err);
+	void *arg;
 	/* What it took. */
 	uint64_t freeze_ns, stop_ns, clone_ns;
 };

@@ -351,6 +351,37 @@ static int hear_and_await(struct freeze *freeze, int result, struct avc_error *e
 	return result;
 }
 
+/* Others may take their time to stand still, and who waits in its parasite goes home before that. */
+static int rest_all(struct freeze *freeze, struct avc_error *err)
+{
+	struct process *main = tree_main(freeze->tree);
+
+	for (uint32_t i = 0; i < freeze->tree->processes; i++) {
+		struct process *process = freeze->tree->process[i];
+
+		for (uint32_t k = 0; k < process->thread_count; k++) {
+			struct thread *thread = &process->threads[k];
+			const bool is_main = process == main && thread->tid == main->pid;
+
+			if (thread->borrowed && (is_main ? freeze_rest_main(main, thread, err)
+							 : thread_give_back(thread, err)))
+				return -1;
+		}
+	}
+	return 0;
+}
+
+static int meet_others(struct freeze *freeze, int result, struct avc_error *err)
+{
+	struct avc_error failed = { 0 };
+
+	if (!freeze->meet)
+		return result;
+	if (!result)
+		result = rest_all(freeze, err);
+	return freeze->meet(freeze->arg, !result, result ? &failed : err) ? -1 : result;
+}
+
 /* The main thread first: it would have to share the CPUs with everybody else. */
 static void let_go(struct freeze *freeze)
 {
@@ -387,6 +418,7 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 		result = read_and_clone(freeze, err);
 	result = hear_and_await(freeze, result, err);
 	freeze->clone_ns = now_ns() - generation->taken_ns;
+	result = meet_others(freeze, result, err);
 	let_go(freeze);
 	freeze->freeze_ns = now_ns() - start;
 	tracee_deadline_clear(freeze->timer);

@@ -97,6 +97,10 @@ bool files_is_older(const struct image *image, int fd, const struct stat *st);
 int files_check_auto(const struct image *image, int pidfd, pid_t init,
 		     struct avc_error *err) warn_unused;
 
+/* files_group.c: what others have sent to a dead app since the checkpoint, by datagrams and Unix
+ * sockets.  `pidfd` is that of a process that has its table as it is now. */
+void files_forget_others(const struct image *image, int pidfd, const struct avc_config *config);
+
 /* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
  * out of memory. */
 struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);
@@ -247,7 +251,8 @@ struct file {
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
-	bool tcp_counted;                /* these two are exact                    */
+	uint64_t tcp_unread;             /* that have come, and were not taken yet */
+	bool tcp_counted;                /* these three are exact                  */
 	int tcp_state; /* 0: no connection over a network                           */
 	/* In the middle of a message, as far as can be told (files_stream.c)      */
 	bool tcp_coming, tcp_going;

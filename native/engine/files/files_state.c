@@ -150,6 +150,7 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	file->tcp_state = info.head.tcpi_state;
 	file->tcp_written = info.bytes_acked + (uint64_t)unacknowledged;
 	file->tcp_taken = info.bytes_received - (uint64_t)unread;
+	file->tcp_unread = (uint64_t)unread;
 	file->tcp_coming = file_was_coming(&info.head, unread);
 	file->tcp_going = file_is_going(fd);
 }

@@ -22,6 +22,7 @@
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
 #define LAST_WORDS_MS 1000
+#define DEAD_LOOK_NS (50 * NS_PER_MS) /* at one that waits for its group: init is told */
 #define GUARD_UNTOLD 3 /* exit status: nobody of our build has told it what to do      */
 
 /* ---- telling ---------------------------------------------------------------- */
@@ -162,7 +163,14 @@ static void obey(struct avc_guard *guard, const struct avc_request *request)
 		return;
 	}
 	switch ((enum avc_command)request->command) {
+	case AVC_COMMAND_ABANDON:
+		guard_abandon(guard, ticket);
+		break;
 	case AVC_COMMAND_CHECKPOINT:
+		if (guard->dead.waits) {
+			guard_refuse(guard, ticket, AVC_BUSY, "it waits for its group");
+			break;
+		}
 		guard_checkpoint(guard, ticket);
 		break;
 	case AVC_COMMAND_RESTORE:
@@ -204,30 +212,65 @@ static void obey_in_time(struct avc_guard *guard, const struct avc_request *requ
 
 /* ---- the daemon ------------------------------------------------------------------- */
 
-/* 1: there is one; 0: none now; -1: there will be no more. */
-static int next_request(struct avc_guard *guard, struct avc_request *request)
+/* 1: there is one; 0: none now; -1: there will be no more.  *fd: what came with it, or -1. */
+static int next_request(struct avc_guard *guard, struct avc_request *request, int *fd)
 {
-	const ssize_t n = recv(guard->socket, request, sizeof *request, MSG_DONTWAIT);
+	union {
+		char bytes[CMSG_SPACE(sizeof *fd)];
+		struct cmsghdr align;
+	} control;
+	struct iovec data = { request, sizeof *request };
+	struct msghdr message = { .msg_iov = &data,
+				  .msg_iovlen = 1,
+				  .msg_control = &control,
+				  .msg_controllen = sizeof control };
+	const ssize_t n = recvmsg(guard->socket, &message, MSG_DONTWAIT | MSG_CMSG_CLOEXEC);
+	struct cmsghdr *header;
 
+	*fd = -1;
 	if (n < 0)
 		return errno == EAGAIN || errno == EINTR ? 0 : -1;
+	header = CMSG_FIRSTHDR(&message);
+	if (header && header->cmsg_type == SCM_RIGHTS && header->cmsg_len == CMSG_LEN(sizeof *fd))
+		memcpy(fd, CMSG_DATA(header), sizeof *fd);
 	return n == sizeof *request && request->magic == AVC_GUARD_MAGIC ? 1 : -1;
+}
+
+static void carry_out_one(struct avc_guard *guard, const struct avc_request *request, int fd)
+{
+	struct avc_error error = { 0 };
+
+	switch (request->kind) {
+	case AVC_REQUEST_COMMAND:
+		obey_in_time(guard, request);
+		break;
+	case AVC_REQUEST_CONFIGURE:
+		if (!config_check(&request->config, &error))
+			guard_take_config(guard, &request->config);
+		break;
+	case AVC_REQUEST_LINE:
+		guard_take_line(guard, request, fd);
+		break;
+	case AVC_REQUEST_RECALL:
+		guard_recall(guard, request, fd);
+		break;
+	case AVC_REQUEST_FORGET:
+		guard_forget(guard, request->generation);
+		break;
+	}
 }
 
 static void carry_out(struct avc_guard *guard)
 {
 	struct avc_request request;
-	struct avc_error error = { 0 };
-	int found;
+	int found, fd;
 
 	send_outbox(guard);
-	while ((found = next_request(guard, &request)) > 0) {
-		if (request.kind == AVC_REQUEST_COMMAND)
-			obey_in_time(guard, &request);
-		else if (request.kind == AVC_REQUEST_CONFIGURE &&
-			 !config_check(&request.config, &error))
-			guard_take_config(guard, &request.config);
+	while ((found = next_request(guard, &request, &fd)) > 0) {
+		carry_out_one(guard, &request, fd);
+		close_fd(&fd);
 	}
+	close_fd(&fd);
 	guard->stop = found < 0;
 }
 
@@ -318,6 +361,8 @@ static uint64_t work_due(struct avc_guard *guard)
 	due = earlier(due, guard_tell_due(guard));
 	if (guard->remains.pid)
 		due = earlier(due, guard->remains.until_ns);
+	if (guard->dead.waits)
+		due = earlier(due, now_ns() + DEAD_LOOK_NS);
 	return earlier(due, tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : tracee_ending_due());
 }
 
@@ -398,6 +443,7 @@ static void let_go(struct avc_guard *guard)
 {
 	const uint64_t end = now_ns() + NS_PER_S;
 
+	guard_leave_meeting(guard);
 	if (guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
 	last_pid_end(guard->helper);
@@ -457,6 +503,8 @@ static void guard_main(struct avc_guard *guard)
 			break;
 		}
 		carry_out(guard);
+		if (guard->dead.waits)
+			guard_tend_dead(guard);
 		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
 			guard_tell_untold(guard);

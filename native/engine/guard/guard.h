@@ -7,6 +7,7 @@
  *   guard_generations.c which generations are held
  *   guard_checkpoint.c  when and how a checkpoint is taken
  *   guard_death.c       what follows a death
+ *   guard_group.c       ... together with others
  *   guard_pace.c        when the next checkpoint is worth its price
  *   output.c            hears that the app sends
  *   policy.c            what is decided in these
@@ -38,6 +39,15 @@ struct output {
 	bool armed;
 	uint32_t count;
 	struct output_event *event;
+};
+
+/* A death that is undone together with the group. */
+struct group_death {
+	bool waits; /* for the group                                    */
+	struct avc_report report;
+	enum avc_reason reason;
+	uint64_t ticket, until_ns;
+	uint32_t had; /* generations when it died                         */
 };
 
 struct avc_guard {
@@ -77,8 +87,12 @@ struct avc_guard {
 	 * the last checkpoint. */
 	uint64_t pace_cpu_ns, pace_began_ns, pace_app_cpu_ns, pace_faults;
 	struct output output;
-	uint64_t sent_ns;        /* when it was heard last; 0: never                  */
-	bool sent;               /* since the last checkpoint                         */
+	uint64_t sent_ns;              /* when it was heard last; 0: never                  */
+	bool sent;                     /* since the last checkpoint                         */
+	struct avc_meeting *meeting;   /* of the group, that is under way; NULL: none     */
+	uint32_t members, steps, step; /* of it; the step that comes next           */
+	uint64_t line, recall;         /* ... its line, and the generation to go back to */
+	struct group_death dead;
 	struct avc_event untold; /* checkpoints that were not told of yet          */
 	uint64_t told_ns;        /* of the last that were                           */
 	/* The holder of an app that has died, for whoever looks at its memory; 0: there is none */
@@ -203,6 +217,36 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
 void guard_release_remains(struct avc_guard *guard);
 /* They were killed, or looked at for long enough. */
 void guard_tend_remains(struct avc_guard *guard);
+/* The newest generation; when restores are used up, the one before it.  There were `had` when
+ * the app died.  Of a group: the newest, or none. */
+bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
+		      enum avc_reason reason, uint32_t had, struct avc_error *error);
+void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enum avc_reason reason,
+		   const struct avc_error *error);
+/* After a restore: a death in quick succession should be as cheap as the first. */
+void guard_hold_all(struct avc_guard *guard);
+
+/* ---- guard_group.c --------------------------------------------------------- */
+
+/* What the daemon wants; `fd` stays the caller's. */
+void guard_take_line(struct avc_guard *guard, const struct avc_request *request, int fd);
+void guard_recall(struct avc_guard *guard, const struct avc_request *request, int fd);
+void guard_forget(struct avc_guard *guard, uint64_t generation);
+void guard_abandon(struct avc_guard *guard, uint64_t ticket);
+/* Of a checkpoint: it is ready; it stands still (freeze.meet). */
+int guard_meet_ready(struct avc_guard *guard, struct avc_error *err) warn_unused;
+int guard_meet_frozen(void *guard, bool whole, struct avc_error *err) warn_unused;
+/* Of a restore: everything is there. */
+int guard_meet_restored(struct avc_guard *guard, struct avc_error *err) warn_unused;
+/* There is no meeting, or it is one to which it can still come. */
+bool guard_may_meet(const struct avc_guard *guard);
+/* Whatever was not reached of it will not be. */
+void guard_leave_meeting(struct avc_guard *guard);
+/* The app has died, and its own processes with it: it goes back with the group. */
+void guard_go_back(struct avc_guard *guard, const struct avc_report *report, enum avc_reason reason,
+		   uint32_t had);
+/* Looks after one that waits for its group. */
+void guard_tend_dead(struct avc_guard *guard);
 
 /* ---- guard.c ---------------------------------------------------------------- */
 

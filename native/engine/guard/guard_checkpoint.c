@@ -385,6 +385,8 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 			touch_slot(&process->parasite, main->slot, process->thread_count);
 	}
 	wait_quiescent(guard, &freeze->generation->quiescent);
+	if (guard->meeting && guard_meet_ready(guard, err))
+		return -1;
 	for (uint32_t i = 0; i < guard->tree.count; i++)
 		if (guard->tree.entry[i].process)
 			waits_prepare(guard->tree.entry[i].process);
@@ -467,6 +469,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	event->fork_reason = guard->dirty.reason;
 	event->copied = guard->dirty.copied;
 	event->generation = fresh->number;
+	event->line = guard->line;
 	event->generations = guard->count;
 	event->quiescent = fresh->quiescent;
 	guard_tend_tree(guard);
@@ -485,6 +488,10 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 
 	if (generation_new(&fresh, &guard->main, guard_free_slot(guard), err))
 		return -1;
+	if (guard->meeting) {
+		freeze.meet = guard_meet_frozen;
+		freeze.arg = guard;
+	}
 	result = take_by(guard, &freeze, event, err);
 	mem_seen_free(&freeze.seen);
 	return result;
@@ -516,7 +523,8 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 		budget_begin(NULL, NULL);
 		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
 			return 0;
-		if (tries < TAKE_TRIES && (make_way(guard, err) || err->code == AVC_RETRY))
+		if (tries < TAKE_TRIES && guard_may_meet(guard) &&
+		    (make_way(guard, err) || err->code == AVC_RETRY))
 			continue;
 		if (err->code == AVC_RETRY)
 			err->code = AVC_DEADLINE;

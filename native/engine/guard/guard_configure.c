@@ -15,7 +15,7 @@ void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 	/* A generation whose bytes were not counted has none: its connections all moved. */
 	guard->main.tcp_messages = config->tcp == AVC_TCP_MESSAGES;
 	guard->main.tcp_moved = config->tcp == AVC_TCP_RESET_MOVED ||
-				config->tcp == AVC_TCP_MESSAGES;
+				config->tcp == AVC_TCP_MESSAGES || config->together;
 }
 
 /* A death that comes next is judged by the new settings. */

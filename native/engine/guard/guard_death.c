@@ -28,11 +28,13 @@ static int say_restored(void *arg, struct avc_error *err)
 	if (is_late(guard))
 		return fail(err, AVC_DEADLINE, 0, 0, "restore", "",
 			    "it would come later than avckpt.deadline");
+	if (guard->meeting && guard_meet_restored(guard, err))
+		return -1;
 	return init_channel_verdict(&guard->channel, AVC_VERDICT_RESTORED, err);
 }
 
-static void give_up(struct avc_guard *guard, const struct avc_report *report,
-		    enum avc_reason reason, const struct avc_error *error)
+void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enum avc_reason reason,
+		   const struct avc_error *error)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_GAVE_UP);
 	struct avc_error ignored = { 0 };
@@ -88,13 +90,19 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 	guard->main.childless = generation->images == 1;
 }
 
+/* Of a restore that is nobody's fault. */
+static bool is_command(enum avc_reason reason)
+{
+	return reason == AVC_REASON_COMMAND || reason == AVC_REASON_GROUP;
+}
+
 static void note_restore(struct avc_guard *guard, enum avc_reason reason)
 {
 	const uint64_t now = now_ns();
 
 	guard->ahead_ns = now + AHEAD_AFTER_NS;
 	guard->restores++;
-	policy_restored(&guard->policy, guard->count - 1, reason != AVC_REASON_COMMAND, now);
+	policy_restored(&guard->policy, guard->count - 1, !is_command(reason), now);
 }
 
 /* `error`: of a newer generation that would not. */
@@ -111,6 +119,7 @@ static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 	event->threads_ns = restore->threads_ns;
 	event->threads = generation_threads(generation);
 	event->generation = generation->number;
+	event->line = guard->line;
 	event->generations = guard->count;
 	event->restores = guard->restores;
 	event->error = error->code ? *error : restore->notes;
@@ -152,20 +161,46 @@ static void keep_remains(struct avc_guard *guard)
 	proc_set_oom_score_adj(guard->remains.pid, "1000");
 }
 
-/* The newest generation; when restores are used up, the one before it.  There were `had`
- * when the app died. */
-static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
-		       enum avc_reason reason, uint32_t had, struct avc_error *error)
+static void drop_helper(struct avc_guard *guard)
+{
+	last_pid_end(guard->helper);
+	guard->helper = NULL;
+}
+
+/* One for the newest generation. */
+static void ready_helper(struct avc_guard *guard)
+{
+	const struct generation *newest;
+
+	if (!guard->count)
+		return;
+	newest = &guard->generations[guard->count - 1];
+	if (guard->helper &&
+	    (guard->helper_for != newest->number || !last_pid_is_there(guard->helper)))
+		drop_helper(guard);
+	if (guard->helper)
+		return;
+	guard->helper = restore_ahead(newest, &guard->channel);
+	guard->helper_for = newest->number;
+}
+
+bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
+		      enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
-	bool ending = guard->count < had, again = false;
+	bool ending = guard->count < had, again = false, back = false;
+	const bool together = guard->meeting != NULL;
 
 	event.ticket = guard->restore_ticket;
 	event.reason = reason;
 	event.wait_status = report->status;
 	event.died_ns = report->reaped_ns;
-	event.attempt = policy_restores_within(&guard->policy, &guard->config, now_ns()) + 1;
-	while (guard->count) {
+	event.attempt = policy_restores_within(&guard->policy, &guard->config, now_ns()) +
+			(reason != AVC_REASON_GROUP);
+	if (together)
+		ready_helper(guard); /* it may be another one than the newest of then */
+	/* Of a group: an older one is of another line. */
+	while (guard->count && (guard->meeting || !together)) {
 		struct generation *generation = &guard->generations[guard->count - 1];
 		const struct image *image = &generation->image[0];
 		struct restore restore = { .generation = generation,
@@ -177,7 +212,6 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 					   .arg = guard,
 					   .helper = guard->helper };
 		struct avc_error failed = { 0 };
-		bool restored;
 
 		if (is_late(guard)) {
 			guard_drop_all(guard);
@@ -200,13 +234,19 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 		init_channel_working(&guard->channel);
 		(void)last_pid_lock(guard->channel.numbers_fd, true);
 		guard->helper = NULL; /* it is the restore's now, which ends it */
-		restored = restore_app(&restore, &failed) == 0;
+		back = restore_app(&restore, &failed) == 0;
 		last_pid_unlock(guard->channel.numbers_fd);
-		if (restored) {
+		if (back) {
 			adopt_family(guard, generation);
 			generation->spare.tried = false; /* that one is used up */
 			note_restore(guard, reason);
 			tell_restored(guard, &event, &restore, error);
+			break;
+		}
+		if (!guard_may_meet(guard)) {
+			/* Another one could not be restored, and this one could. */
+			*error = failed;
+			guard_kill_lost(guard);
 			break;
 		}
 		/* Perhaps because the spare was killed when it was needed, or was one
@@ -220,17 +260,19 @@ static bool bring_back(struct avc_guard *guard, const struct avc_report *report,
 				*error = failed;
 			guard_drop_generation(guard, guard->count - 1);
 			again = false;
+			guard_leave_meeting(guard);
 		}
 		ending = true;
 		guard_kill_lost(guard);
 	}
 	keep_remains(guard);
-	return guard->count > 0;
+	if (together)
+		drop_helper(guard);
+	return back;
 }
 
-/* A death in quick succession should be as cheap as the first; and of the processes that
- * are not the main one only the holder keeps what they have open. */
-static void hold_all(struct avc_guard *guard)
+/* Of the processes that are not the main one only the holder keeps what they have open. */
+void guard_hold_all(struct avc_guard *guard)
 {
 	if (!last_pid_lock(guard->channel.numbers_fd, false))
 		return;
@@ -269,29 +311,6 @@ static void await_killed_holder(struct avc_guard *guard)
 		init_channel_working(&guard->channel);
 		usleep(HOLDER_STEP_US);
 	}
-}
-
-static void drop_helper(struct avc_guard *guard)
-{
-	last_pid_end(guard->helper);
-	guard->helper = NULL;
-}
-
-/* One for the newest generation. */
-static void ready_helper(struct avc_guard *guard)
-{
-	const struct generation *newest;
-
-	if (!guard->count)
-		return;
-	newest = &guard->generations[guard->count - 1];
-	if (guard->helper &&
-	    (guard->helper_for != newest->number || !last_pid_is_there(guard->helper)))
-		drop_helper(guard);
-	if (guard->helper)
-		return;
-	guard->helper = restore_ahead(newest, &guard->channel);
-	guard->helper_for = newest->number;
 }
 
 void guard_app_dies(struct avc_guard *guard)
@@ -333,17 +352,17 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	process_close(&guard->main);
 	guard_kill_lost(guard);
 	if (!verdict.restore) {
-		give_up(guard, report, reason, &error);
+		guard_give_up(guard, report, reason, &error);
 		goto out;
 	}
-	if (reason != AVC_REASON_COMMAND && guard->count) {
+	if (!is_command(reason) && guard->count) {
 		const enum avc_reason over = guard_fall_back(guard, report->status,
 							     reason == AVC_REASON_UNHEALTHY);
 
 		if (!guard->count) {
 			fail(&error, AVC_EMPTY, 0, 0, "restore", "",
 			     "it was restored %u time(s) already", guard->restores);
-			give_up(guard, report, over, &error);
+			guard_give_up(guard, report, over, &error);
 			goto out;
 		}
 	}
@@ -355,22 +374,26 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 			process_kill(guard->tree.process[i]);
 	await_killed_holder(guard);
 	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
-		give_up(guard, report, AVC_REASON_FAILED, &error);
+		guard_give_up(guard, report, AVC_REASON_FAILED, &error);
 	} else if (!guard->count) {
 		fail(&error, AVC_EMPTY, 0, 0, "restore", "", "no generation is held");
-		give_up(guard, report, AVC_REASON_EMPTY, &error);
-	} else if (!bring_back(guard, report, reason, had, &error)) {
-		give_up(guard, report, is_late(guard) ? AVC_REASON_LATE : AVC_REASON_FAILED,
-			&error);
+		guard_give_up(guard, report, AVC_REASON_EMPTY, &error);
+	} else if (guard->config.together || guard->meeting) {
+		guard_go_back(guard, report, reason, had);
+	} else if (!guard_bring_back(guard, report, reason, had, &error)) {
+		guard_give_up(guard, report, is_late(guard) ? AVC_REASON_LATE : AVC_REASON_FAILED,
+			      &error);
 	} else {
 		if (guard->main.pid)
-			hold_all(guard);
+			guard_hold_all(guard);
 		guard_pace_restored(guard);
 	}
 out:
-	drop_helper(guard); /* there was nothing to be restored, after all */
+	if (!guard->dead.waits)
+		drop_helper(guard); /* there was nothing to be restored, after all */
 	guard->foreseen = 0;
 	rt_priority_end();
+	guard_leave_meeting(guard);
 	guard->restore_asked = AVC_REASON_NONE;
 	guard->restore_ticket = 0;
 	guard->restore_generation = 0;

@@ -96,6 +96,8 @@ struct avc_config {
 	uint8_t files;                  /* enum avc_files                            */
 	uint8_t tcp;                    /* enum avc_tcp                              */
 	uint8_t images;                 /* enum avc_images                           */
+	uint8_t together;               /* one of a group: checkpoints are those of its
+	                                 * lines, and it goes back with the others   */
 	uint8_t restore_on_status[256]; /* [n] != 0: exit status n is abnormal    */
 };
 
@@ -123,10 +125,14 @@ enum avc_event_kind {
 	AVC_EVENT_GUARD_LOST = 11, /* the guard's process has died, or hung and was
 	                            * killed; `error` says how.  The application
 	                            * runs on, unprotected.  The guard's last event */
-	AVC_EVENT_HELD = 12        /* answers AVC_COMMAND_LIST, one for each of the
+	AVC_EVENT_HELD = 12,       /* answers AVC_COMMAND_LIST, one for each of the
 	                            * `generations`, oldest first: its number, age,
 	                            * freeze and threads, and as `attempt` its
 	                            * crashes; one without a number: none is held */
+	AVC_EVENT_WAITS = 13       /* the app died, and waits for its group to go
+	                            * back with it; `generation` is the newest that
+	                            * it may go back to; `error`: why it has to once
+	                            * more.  avc_guard_recall() or ABANDON is due */
 };
 
 enum avc_reason {
@@ -148,7 +154,8 @@ enum avc_reason {
 	                            * it was taken from, keeps crashing           */
 	AVC_REASON_EXECUTED = 14,  /* dropped: the app is another program now     */
 	AVC_REASON_LOOP = 15,      /* gave up: the same death again, at once      */
-	AVC_REASON_LATE = 16       /* gave up: later than deadline_ns             */
+	AVC_REASON_LATE = 16,      /* gave up: later than deadline_ns             */
+	AVC_REASON_GROUP = 17      /* rolled back by avc_guard_recall()           */
 };
 
 /* One thing that happened.  Fields that mean nothing for a kind are 0. */
@@ -163,6 +170,7 @@ struct avc_event {
 	int32_t wait_status;    /* DIED, RESTORED, GAVE_UP: as from waitpid(2)   */
 	uint32_t threads;       /* of the checkpoint or restore                  */
 	uint64_t generation;    /* number of the generation, from 1              */
+	uint64_t line;          /* of the group, that it is of; 0: of none       */
 	uint32_t generations;   /* held now                                      */
 	uint32_t attempt;       /* RESTORED: restores within the window          */
 	uint32_t quiescent;     /* CHECKPOINT: 1 if taken at a quiescent moment  */
@@ -214,7 +222,9 @@ enum avc_command {
 	                             * healthy; no answer                         */
 	AVC_COMMAND_RELEASE = 8,     /* the memory of `ticket`, a remains_pid, has been
 	                             * looked at; no answer                       */
-	AVC_COMMAND_LIST = 9         /* what is held; HELD or REFUSED              */
+	AVC_COMMAND_LIST = 9,        /* what is held; HELD or REFUSED              */
+	AVC_COMMAND_ABANDON = 10     /* the group cannot go back: an app that WAITS for
+	                             * it ends; GAVE_UP, or no answer             */
 };
 
 struct avc_engine;
@@ -272,6 +282,25 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
  * Errors: AVC_CONFIG, and nothing changes; AVC_GONE when the guard has ended. */
 int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config,
 			struct avc_error *err);
+
+/* What the guards of a group meet at (avckpt/guard.h), once: for one line or one return to
+ * one.  A descriptor, or -1. */
+int avc_meeting_new(uint32_t members, struct avc_error *err);
+
+/* Has a guard take a checkpoint that is part of a line of its group: nobody's app is let go
+ * before all of `meeting` stand still, or else nobody keeps anything of it.  Each member is
+ * told with the same meeting.  Answered as AVC_COMMAND_CHECKPOINT. */
+int avc_guard_line(struct avc_guard *guard, int meeting, uint64_t line, uint64_t ticket,
+		   struct avc_error *err);
+
+/* Has it go back to `generation`, of that line: nobody's app is killed before all can, none is
+ * restored before all are dead, and none runs before all are restored.  RESTORED; or REFUSED,
+ * and nothing has changed; or WAITS or GAVE_UP. */
+int avc_guard_recall(struct avc_guard *guard, int meeting, uint64_t line, uint64_t generation,
+		     uint64_t ticket, struct avc_error *err);
+
+/* A generation of a line that others have not got is of no use.  No answer. */
+int avc_guard_forget(struct avc_guard *guard, uint64_t generation, struct avc_error *err);
 
 /* Lets the app go (it runs on, unprotected), gives up every generation, waits for the
  * process to end (it is killed after 15 s) and frees the guard.  Blocks for as long as a

@@ -33,6 +33,10 @@ enum avc_request_kind {
 	AVC_REQUEST_START = 1,     /* cookie, config                                  */
 	AVC_REQUEST_COMMAND = 2,   /* command, ticket, generation                     */
 	AVC_REQUEST_CONFIGURE = 3, /* config                                          */
+	/* With the memfd of a struct avc_meeting (SCM_RIGHTS).                       */
+	AVC_REQUEST_LINE = 4,   /* line, ticket                                       */
+	AVC_REQUEST_RECALL = 5, /* line, generation, ticket                           */
+	AVC_REQUEST_FORGET = 6, /* generation                                         */
 };
 
 struct avc_request {
@@ -44,8 +48,25 @@ struct avc_request {
 	uint64_t until_ns;   /* CLOCK_MONOTONIC: later it is refused; 0: never too late */
 	uint64_t cookie;     /* of the guard's events                            */
 	uint64_t generation; /* AVC_COMMAND_RESTORE: which, 0: the newest      */
+	uint64_t line;       /* of the group                                     */
 	struct avc_config config;
 };
+
+/* Shared memory of the guards of a group.  They go through steps, in order, each when all have
+ * arrived at it.  `state` is the step that is gathered for, or AVC_MEETING_BROKEN: whoever
+ * cannot go on, or has waited for too long, breaks it, and it changes by compare and exchange
+ * alone.  So all of them find the same.  Nobody waits for one that has died longer than that,
+ * and what a guard writes here that has been talked into anything concerns its own group. */
+enum { AVC_MEETING_STEPS = 3 };
+
+struct avc_meeting {
+	uint32_t members; /* how many are expected                            */
+	uint32_t state;
+	uint32_t arrived[AVC_MEETING_STEPS];
+	uint32_t clone_ms; /* what the slowest of them expects its clone to take */
+};
+
+#define AVC_MEETING_BROKEN UINT32_C(99)
 
 /* Shared memory of the two.  The guard counts up at least once in AVC_HEARTBEAT_NS while it
  * has nothing to do, and wherever it gets on with something long. */

@@ -96,6 +96,7 @@ def _container() -> Json:
             "id": _text("64 hex digits"),
             "name": _text("as Podman has it"),
             "group": _text("avckpt.group, empty: none"),
+            "line": _integer("of the group, that this generation is part of; 0: of none"),
             "node_of": _text("id of the container in which it is a node; host; empty: it is a container"),
             "state": {"type": "string", "enum": [state.value for state in State]},
             "reason": _text("why it is not (quite) protected, or how it ended; empty when all is well"),

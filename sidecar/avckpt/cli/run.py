@@ -70,7 +70,7 @@ def settings_of_run(labels: Mapping[str, str]) -> Settings:
     for key in labels:
         if not key.startswith("avckpt."):
             raise LabelsWrong(f"label {key}: avckpt run knows only avckpt.* labels")
-        if key == "avckpt.group" or key.startswith("avckpt.notify"):
+        if key.startswith(("avckpt.group", "avckpt.notify")):
             raise LabelsWrong(f"label {key}: it takes containers and the sidecar, leave it out")
     settings = settings_of({"avckpt.enable": "true", **labels})
     if settings.policy.restore_on.unhealthy:

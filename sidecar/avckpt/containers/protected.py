@@ -45,6 +45,8 @@ class Protected:
     registered_at: float
     group: str = ""
     """`avckpt.group`; empty: none."""
+    line: int = 0
+    """Of its group, that the newest generation is part of, or the one restored last; 0: of none."""
     node_of: str = ""
     """Id of the container in which it is a node, "host", or empty: it is a container."""
     adopted: bool = False
@@ -112,6 +114,7 @@ class Protected:
             self.checkpoints += event.checkpoints or 1
             self.last_interval_s = event.interval_s
             self.generation = event.generation
+            self.line = event.line
             self.threads = event.threads
             self.last_checkpoint_at = at
             self.last_freeze_s = event.freeze_s
@@ -132,6 +135,7 @@ class Protected:
             self.restores = event.restores
             self.attempt = event.attempt
             self.generation = event.generation
+            self.line = event.line
             self.threads = event.threads
             self.last_restore_s = event.restore_s
             self.last_restore_age_s = event.age_s
@@ -176,6 +180,7 @@ class Protected:
             "id": self.id,
             "name": self.name,
             "group": self.group,
+            "line": self.line,
             "node_of": self.node_of,
             "state": self.state.value,
             "reason": self.reason,

@@ -50,7 +50,14 @@ LEAST_INTERVAL_S = 0.1
 NOT_INHERITED = frozenset(
     {"avckpt.enable", "avckpt.scope", "avckpt.name", "avckpt.version", "avckpt.notify", "avckpt.io_uring"}
 )
-NOT_A_NODES = ("avckpt.scope", "avckpt.group", "avckpt.io_uring", "avckpt.core", "avckpt.version")
+NOT_A_NODES = (
+    "avckpt.scope",
+    "avckpt.group",
+    "avckpt.group.recovery",
+    "avckpt.io_uring",
+    "avckpt.core",
+    "avckpt.version",
+)
 """Labels that say something of others than the node itself."""
 
 
@@ -126,6 +133,8 @@ def labels_of_host_unit(claimed: Mapping[str, str]) -> dict[str, str]:
         raise LabelsWrong(str(error)) from error
     if policy.restore_on.unhealthy:
         raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
+    if policy.together:
+        raise LabelsWrong("label avckpt.group.recovery=together: only containers go back together")
     if policy.scope != "container":
         raise LabelsWrong("label avckpt.scope=nodes: here each program is a unit already, leave it out")
     if not policy.enable:

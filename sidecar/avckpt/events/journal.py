@@ -19,6 +19,7 @@ LEVELS = {
     Kind.CRASH: logging.INFO,
     Kind.CORE: logging.INFO,
     Kind.LATE: logging.WARNING,
+    Kind.WAITS: logging.DEBUG,
     Kind.RESTORED: logging.WARNING,
     Kind.GAVE_UP: logging.ERROR,
     Kind.DROPPED: logging.WARNING,

@@ -50,8 +50,9 @@ class EventRecord:
     monotonic_s: float = said("the same instant on CLOCK_MONOTONIC, for differences", 0.0)
     seq: int = said("number in the history, growing; 0: routine (every checkpoint), told once and not kept", 0)
     reason: Reason | None = said(  # noqa: RUF009
-        "why the application died: `signal`, `exit`, `unhealthy` or `manual`; why a generation was dropped: `crashed`, "
-        "`unhealthy`, `memory`, `killed` (its template) or `executed` (another program)",
+        "why the application died: `signal`, `exit`, `unhealthy`, `manual` or `group` (it went back with others); "
+        "why a generation was dropped: `crashed`, `unhealthy`, `memory`, `killed` (its template) or `executed` "
+        "(another program)",
         values=tuple(dict.fromkeys((*CAUSES, *DROPPED_WORDS))),
     )
     outcome: Reason | None = said(  # noqa: RUF009
@@ -62,6 +63,7 @@ class EventRecord:
     )
     wait_status: int | None = said("of the death, as from waitpid(2)")
     generation: int | None = said("number of the generation taken, restored or dropped, from 1")
+    line: int | None = said("the line of its group (avckpt.group.recovery) that this generation is part of")
     generations: int | None = said("generations held now")
     age_s: float | None = said("age of the restored generation when the application died, or of the dropped one")
     lost_s: float | None = said("what the application lost: age_s and restore_s together")
@@ -148,7 +150,7 @@ def field_types() -> dict[str, type]:
     return {each.name: _TYPES[str(each.type).partition(" ")[0]] for each in fields(EventRecord)}
 
 
-_DEATHS = frozenset({Kind.DIED, Kind.RESTORED, Kind.GAVE_UP})
+_DEATHS = frozenset({Kind.DIED, Kind.WAITS, Kind.RESTORED, Kind.GAVE_UP})
 _COUNTED = frozenset({Kind.CHECKPOINT, Kind.RESTORED, Kind.DROPPED})
 
 
@@ -179,7 +181,8 @@ def of_guard(
         reason=event.reason if kind is Kind.DROPPED else _cause(event, commanded) if kind in _DEATHS else None,
         outcome=_outcome(event),
         wait_status=event.wait_status if kind in _DEATHS else None,
-        generation=event.generation if counted else None,
+        generation=event.generation if counted or kind is Kind.WAITS else None,
+        line=event.line or None,
         generations=event.generations if counted or kind is Kind.MISSED else None,
         age_s=event.age_s if restored or kind is Kind.DROPPED else None,
         lost_s=event.age_s + event.restore_s if restored else None,
@@ -204,6 +207,8 @@ def of_guard(
 def _cause(event: Event, commanded: Reason | None) -> Reason:
     if event.reason is Reason.COMMAND or commanded is not None:
         return commanded or Reason.COMMAND
+    if event.reason is Reason.GROUP:
+        return Reason.GROUP
     if event.reason is Reason.UNHEALTHY:
         return Reason.UNHEALTHY
     return Reason.SIGNAL if event.wait_status & 0x7F else Reason.EXIT
@@ -225,6 +230,8 @@ def _death(record: EventRecord) -> str:
         return "rolled back on command"
     if record.reason is Reason.UNHEALTHY and record.kind is not Kind.GAVE_UP:
         return "unhealthy, rolled back"
+    if record.reason is Reason.GROUP and record.kind is not Kind.GAVE_UP:
+        return "rolled back with its group"
     return describe_wait_status(record.wait_status or 0)
 
 
@@ -240,9 +247,13 @@ def _why_not(record: EventRecord) -> str:
     return why_not_restored(record.outcome or Reason.FAILED, record.error)
 
 
+def _generation(record: EventRecord) -> str:
+    return f"generation {record.generation}" + (f" (line {record.line})" if record.line else "")
+
+
 def _checkpoint(record: EventRecord) -> str:
     return (
-        f"generation {record.generation}, {record.threads} thread(s), frozen {(record.freeze_s or 0) * 1000:.2f} ms"
+        f"{_generation(record)}, {record.threads} thread(s), frozen {(record.freeze_s or 0) * 1000:.2f} ms"
         f"{', by copies' if record.images == 'dirty' else ''}"
         f"{f', forked ({record.fork_reason})' if record.fork_reason else ''}"
         f"{'' if record.quiescent else ', not at a quiet moment'}"
@@ -251,7 +262,7 @@ def _checkpoint(record: EventRecord) -> str:
 
 def _restored(record: EventRecord) -> str:
     return (
-        f"{_death(record)}, restored in {(record.restore_s or 0) * 1000:.1f} ms from generation {record.generation} "
+        f"{_death(record)}, restored in {(record.restore_s or 0) * 1000:.1f} ms from {_generation(record)} "
         f"({record.age_s or 0:.1f} s old), {record.threads} thread(s), restore {record.restores}"
         f"{'' if record.error is None else f'; but {record.error}'}"
     )
@@ -272,6 +283,10 @@ def _crashed(record: EventRecord) -> str:
 def _ordinal(number: int) -> str:
     last = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
     return f"{number}{last}"
+
+
+def _why(record: EventRecord) -> str:
+    return f", once more: {record.error}" if record.error else ""
 
 
 def _nothing_held(record: EventRecord) -> str:
@@ -295,6 +310,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.GUARD_LOST: lambda record: f"runs unprotected: {record.error}",
     # Whether this is bad news is known only with what follows.
     Kind.DIED: _died,
+    Kind.WAITS: lambda record: f"waits for its group to go back with it{_why(record)}",
     Kind.RESTORED: _restored,
     Kind.CRASH: _crashed,
     Kind.CORE: lambda record: record.detail,

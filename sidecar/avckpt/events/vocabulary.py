@@ -52,6 +52,7 @@ class Kind(_Named):
     DROPPED = "dropped", 10
     GUARD_LOST = "guard_lost", 11
     HELD = "held", 12
+    WAITS = "waits", 13
     REGISTERED = "registered"
     HEALTH = "health"
     CONFIGURED = "configured"
@@ -83,10 +84,11 @@ class Reason(_Named):
     EXECUTED = "executed", 14
     LOOP = "loop", 15
     LATE = "late", 16
+    GROUP = "group", 17
     RESTORED = "restored"
 
 
-CAUSES = (Reason.SIGNAL, Reason.EXIT, Reason.UNHEALTHY, Reason.COMMAND)
+CAUSES = (Reason.SIGNAL, Reason.EXIT, Reason.UNHEALTHY, Reason.COMMAND, Reason.GROUP)
 """Why an application died, or was rolled back."""
 
 GAVE_UP_WORDS = {

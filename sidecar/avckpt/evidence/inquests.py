@@ -88,7 +88,7 @@ class Inquests(Generic[W]):
                 followed = await asyncio.wait_for(outcome, OUTCOME_S)
             except asyncio.TimeoutError:
                 followed = EventRecord(Kind.GAVE_UP, reason=Reason.SIGNAL, wait_status=case.wait_status)
-            if followed.reason is Reason.COMMAND or followed.outcome in EXPECTED:
+            if followed.reason in (Reason.COMMAND, Reason.GROUP) or followed.outcome in EXPECTED:
                 return  # somebody wanted it
             record = self._tell(watch, self._record(watch.container, crash, followed, case.detected_s))
             self._judge(watch, record)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from avckpt.yamlfile import Place
 
 ENABLE = f"{PREFIX}enable"
+RECOVERY = f"{PREFIX}group.recovery"
 _GPUS = ("/dev/nvidia", "/dev/dri", "/dev/kfd", "nvidia.com/gpu", "amd.com/gpu")
 
 
@@ -79,6 +80,22 @@ def of_groups(services: Iterable[Service]) -> Iterator[tuple[Service, Place, str
         if len(found) == 1 and group and "$" not in group:
             service, place = found[0]
             yield service, place, f"no other service here is in the group {group}: nobody hears of anybody"
+
+
+def of_returns(services: Iterable[Service]) -> Iterator[tuple[Service, str]]:
+    """Of groups that go back together: members that do not."""
+    groups: dict[str, list[tuple[Service, str]]] = {}
+    for service in services:
+        says = {setting.key: setting.value for _, setting in service.all_settings()}
+        groups.setdefault(says.get("avckpt.group", ""), []).append((service, says.get(RECOVERY, "")))
+    for group, members in groups.items():
+        if not group or "$" in group or all(recovery != "together" for _, recovery in members):
+            continue
+        for service, recovery in members:
+            if recovery == "together" and service.enabled is False:
+                yield service, f"{RECOVERY}=together has no effect: without {ENABLE}=true nothing of it goes back"
+            elif recovery in ("", "apart") and service.enabled:
+                yield service, f"it does not go back with the others of group {group}: {RECOVERY}=together is missing"
 
 
 def of_order(services: Mapping[str, Service]) -> Iterator[tuple[Service, str]]:

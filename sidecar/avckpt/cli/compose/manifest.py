@@ -227,6 +227,8 @@ def judge(manifest: Manifest, nothing: str) -> None:
         manifest.problems += found
     for service, place, message in doubts.of_groups(services.values()):
         manifest.problems.append(Problem(place, service.name, message, Severity.WARNING))
+    for service, message in doubts.of_returns(services.values()):
+        manifest.problems.append(Problem(service.place, service.name, message, Severity.WARNING))
     for service, message in doubts.of_order(services):
         manifest.problems.append(Problem(service.place, service.name, message))
     if nothing and not services and not manifest.problems:

@@ -1,0 +1,360 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * avckpt.group.recovery=together: what guards of one group do in the same instant.
+ *
+ * The daemon has them meet (struct avc_meeting) for one line, or for one return to a line.
+ * From there on they go by what they share alone: the daemon is not waited for while anything
+ * stands still.  Every wait is bounded, and whoever waits for too long breaks the meeting for
+ * all of them.
+ *
+ *   a line     0 ready        the app still runs; what takes its time is done
+ *              1 frozen       everything is read and cloned: now all are let go
+ *   a return   0 able         the app still runs, if it does: it could go back
+ *              1 dead         nothing runs any more that could send
+ *              2 restored     everything is there: now all run
+ */
+#include <limits.h>
+#include <linux/futex.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "guard.h"
+
+#define MEMBERS_MAX 1024
+#define SLICE_NS (2 * NS_PER_MS) /* between looks whether the app has died               */
+#define READY_NS (1 * NS_PER_S)  /* the app runs                                         */
+#define CLONES 4                 /* so many times as long as the slowest clone may take  */
+#define FIRST_CLONE_MS 250       /* nobody knows yet how long it takes                   */
+#define DEAD_NS (3 * NS_PER_S)
+#define RESTORED_NS (3 * NS_PER_S) /* init is told meanwhile; INJ_GO_S is longer          */
+#define WAITS_NS (5 * NS_PER_S)    /* for the daemon to say what is gone back to           */
+
+enum line_step { LINE_READY = 0, LINE_FROZEN = 1, LINE_STEPS };
+enum recall_step { RECALL_ABLE = 0, RECALL_DEAD = 1, RECALL_RESTORED = 2, RECALL_STEPS };
+
+/* ---- a meeting ---------------------------------------------------------------- */
+
+static int fail_broken(const struct avc_guard *guard, struct avc_error *err)
+{
+	return fail(err, AVC_BUSY, 0, guard->main.pid, "meet", "",
+		    "another member of its group could not, or came too late");
+}
+
+static bool enter_meeting(struct avc_guard *guard, const struct avc_request *request, int fd)
+{
+	struct stat st;
+	void *map;
+
+	guard_leave_meeting(guard);
+	if (fd < 0 || fstat(fd, &st) || st.st_size < (off_t)sizeof *guard->meeting)
+		return false;
+	map = mmap(NULL, sizeof *guard->meeting, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	if (map == MAP_FAILED)
+		return false;
+	guard->meeting = map;
+	guard->members = guard->meeting->members;
+	guard->line = request->line;
+	guard->recall = request->generation;
+	guard->step = 0;
+	guard->steps = request->kind == AVC_REQUEST_LINE ? LINE_STEPS : RECALL_STEPS;
+	if (guard->members && guard->members <= MEMBERS_MAX)
+		return true;
+	guard_leave_meeting(guard);
+	return false;
+}
+
+static void wake_all(struct avc_meeting *meeting)
+{
+	syscall(SYS_futex, &meeting->state, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
+}
+
+/* Only from the step for which it is gathered: nobody is told two things. */
+static bool move(struct avc_meeting *meeting, uint32_t from, uint32_t to)
+{
+	if (!__atomic_compare_exchange_n(&meeting->state, &from, to, false, __ATOMIC_ACQ_REL,
+					 __ATOMIC_ACQUIRE))
+		return false;
+	wake_all(meeting);
+	return true;
+}
+
+static uint32_t state_of(const struct avc_meeting *meeting)
+{
+	return __atomic_load_n(&meeting->state, __ATOMIC_ACQUIRE);
+}
+
+/* If all have arrived at the step that is gathered for, it is too late for that. */
+static void break_at(struct avc_guard *guard, uint32_t step)
+{
+	(void)move(guard->meeting, step, AVC_MEETING_BROKEN);
+}
+
+void guard_leave_meeting(struct avc_guard *guard)
+{
+	if (!guard->meeting)
+		return;
+	if (guard->step < guard->steps)
+		break_at(guard, guard->step);
+	munmap(guard->meeting, sizeof *guard->meeting);
+	guard->meeting = NULL;
+	guard->line = 0;
+}
+
+bool guard_may_meet(const struct avc_guard *guard)
+{
+	return !guard->meeting || state_of(guard->meeting) == guard->step;
+}
+
+/* Whether there is something that does not wait: the app has died, or init. */
+static bool is_called_away(const struct avc_guard *guard)
+{
+	struct pollfd news[] = {
+		{ .fd = guard->dead.waits ? -1 : guard->channel.report_fd, .events = POLLIN },
+		{ .fd = guard->channel.init_pidfd, .events = POLLIN },
+	};
+
+	return poll(news, 2, 0) > 0;
+}
+
+/* Until all have arrived at this step, for `ns` at most. */
+static int meet(struct avc_guard *guard, uint32_t step, uint64_t ns, struct avc_error *err)
+{
+	struct avc_meeting *meeting = guard->meeting;
+	const struct timespec slice = { .tv_nsec = SLICE_NS };
+	const uint64_t end = now_ns() + ns;
+
+	if (guard->step != step || state_of(meeting) != step)
+		return fail_broken(guard, err);
+	guard->step = step + 1;
+	if (__atomic_add_fetch(&meeting->arrived[step], 1, __ATOMIC_ACQ_REL) == guard->members)
+		(void)move(meeting, step, step + 1);
+	while (state_of(meeting) == step) {
+		if (now_ns() > end || is_called_away(guard))
+			break_at(guard, step);
+		else
+			syscall(SYS_futex, &meeting->state, FUTEX_WAIT, step, &slice, NULL, 0);
+		heartbeat();
+		if (guard->dead.waits)
+			init_channel_working(&guard->channel);
+	}
+	return state_of(meeting) == AVC_MEETING_BROKEN ? fail_broken(guard, err) : 0;
+}
+
+int guard_meet_restored(struct avc_guard *guard, struct avc_error *err)
+{
+	return meet(guard, RECALL_RESTORED, RESTORED_NS, err);
+}
+
+/* ---- lines --------------------------------------------------------------------- */
+
+void guard_take_line(struct avc_guard *guard, const struct avc_request *request, int fd)
+{
+	if (!enter_meeting(guard, request, fd) || !guard->attached || guard->dead.waits)
+		guard_refuse(guard, request->ticket, AVC_EMPTY,
+			     "it has no part in a line of its group now");
+	else
+		guard_checkpoint(guard, request->ticket);
+	guard_leave_meeting(guard);
+}
+
+static uint64_t expected_ms(const struct avc_guard *guard)
+{
+	return guard->dirty.fork_ns ? guard->dirty.fork_ns / NS_PER_MS : FIRST_CLONE_MS;
+}
+
+int guard_meet_ready(struct avc_guard *guard, struct avc_error *err)
+{
+	const uint64_t own = expected_ms(guard);
+	uint32_t *most = &guard->meeting->clone_ms, was = __atomic_load_n(most, __ATOMIC_RELAXED);
+
+	while (was < own && !__atomic_compare_exchange_n(most, &was, (uint32_t)own, false,
+							 __ATOMIC_RELAXED, __ATOMIC_RELAXED))
+		;
+	return meet(guard, LINE_READY, READY_NS, err);
+}
+
+/* Nothing of the app is in the parasite any more: if this process dies, all of it goes on. */
+int guard_meet_frozen(void *arg, bool whole, struct avc_error *err)
+{
+	struct avc_guard *guard = arg;
+	uint64_t ms = __atomic_load_n(&guard->meeting->clone_ms, __ATOMIC_RELAXED);
+
+	if (!whole) {
+		break_at(guard, guard->step);
+		return fail_broken(guard, err);
+	}
+	ms = ms < NS_PER_S / NS_PER_MS ? ms : NS_PER_S / NS_PER_MS;
+	return meet(guard, LINE_FROZEN, guard->config.freeze_deadline_ns + CLONES * ms * NS_PER_MS,
+		    err);
+}
+
+void guard_forget(struct avc_guard *guard, uint64_t generation)
+{
+	for (uint32_t i = guard->count; i-- > 0;)
+		if (guard->policy.held[i].number == generation)
+			guard_drop_generation(guard, i);
+}
+
+/* ---- a return -------------------------------------------------------------------- */
+
+static bool has_recalled(const struct avc_guard *guard)
+{
+	for (uint32_t i = 0; i < guard->count; i++)
+		if (guard->policy.held[i].number == guard->recall)
+			return true;
+	return false;
+}
+
+static void wait_for_group(struct avc_guard *guard, const struct avc_error *error)
+{
+	struct avc_event event = guard_event(guard, AVC_EVENT_WAITS);
+
+	guard->dead.waits = true;
+	guard->dead.until_ns = now_ns() + WAITS_NS;
+	guard->next_ns = POLICY_NEVER;
+	event.generation = guard->policy.held[guard->count - 1].number;
+	event.reason = guard->dead.reason;
+	event.wait_status = guard->dead.report.status;
+	event.died_ns = guard->dead.report.reaped_ns;
+	event.ticket = guard->dead.ticket;
+	event.error = *error;
+	guard_emit(guard, &event);
+}
+
+static void end_dead(struct avc_guard *guard, enum avc_reason reason, const struct avc_error *error)
+{
+	guard->dead.waits = false;
+	guard->restore_ticket = guard->dead.ticket;
+	guard_give_up(guard, &guard->dead.report, reason, error);
+	guard->restore_ticket = 0;
+}
+
+/* All are dead. */
+static void forget_others(const struct generation *generation, const struct avc_config *config)
+{
+	for (uint32_t i = 0; i < generation->images; i++) {
+		const struct image *image = &generation->image[i];
+
+		if (!image->process)
+			continue;
+		if (!image->process->descendant)
+			files_forget_others(image, image->pidfd, config);
+		else if (image->process->holder)
+			files_forget_others(image, image->process->holder_pidfd, config);
+	}
+}
+
+/* The app is dead, and all others are to be. */
+static void go_back(struct avc_guard *guard)
+{
+	struct avc_error error = { 0 };
+	bool back = false;
+
+	rt_priority_begin();
+	guard->dead.waits = true; /* init is told that we are at work */
+	if (has_recalled(guard) && meet(guard, RECALL_DEAD, DEAD_NS, &error) == 0) {
+		while (guard->policy.held[guard->count - 1].number > guard->recall)
+			guard_drop_generation(guard, guard->count - 1);
+		forget_others(&guard->generations[guard->count - 1], &guard->config);
+		guard->restore_ticket = guard->dead.ticket;
+		back = guard_bring_back(guard, &guard->dead.report, guard->dead.reason,
+					guard->dead.had, &error);
+	}
+	guard_leave_meeting(guard);
+	guard->dead.waits = false;
+	if (back) {
+		if (guard->main.pid)
+			guard_hold_all(guard);
+		guard_pace_restored(guard);
+	} else if (guard->count) {
+		wait_for_group(guard, &error);
+	} else {
+		end_dead(guard, AVC_REASON_FAILED, &error);
+	}
+	guard->restore_ticket = 0;
+	rt_priority_end();
+}
+
+void guard_go_back(struct avc_guard *guard, const struct avc_report *report, enum avc_reason reason,
+		   uint32_t had)
+{
+	const struct avc_error none = { 0 };
+
+	guard->dead = (struct group_death){
+		.report = *report, .reason = reason, .ticket = guard->restore_ticket, .had = had
+	};
+	if (guard->meeting)
+		go_back(guard);
+	else
+		wait_for_group(guard, &none);
+}
+
+/* One that lives could be killed for nothing. */
+static int check_able(struct avc_guard *guard, struct avc_error *err)
+{
+	if (!has_recalled(guard))
+		return fail(err, AVC_EMPTY, 0, guard->main.pid, "go back", "",
+			    "it does not hold that line");
+	if (guard->dead.waits)
+		return 0;
+	if (!guard->main.pid || init_channel_stop_asked(&guard->channel))
+		return fail(err, AVC_GONE, 0, guard->main.pid, "go back", "",
+			    "it has ended, or has been asked to stop");
+	for (uint32_t i = 0; i < guard->count; i++)
+		if (guard->policy.held[i].number == guard->recall)
+			return guard_check_files(guard, &guard->generations[i], guard->main.pid,
+						 guard->main.pidfd, err);
+	return 0;
+}
+
+void guard_recall(struct avc_guard *guard, const struct avc_request *request, int fd)
+{
+	struct avc_error error = { 0 };
+
+	budget_begin(NULL, NULL);
+	if (!enter_meeting(guard, request, fd) || !guard->attached) {
+		guard_leave_meeting(guard);
+		guard_refuse(guard, request->ticket, AVC_EMPTY, "it cannot go back now");
+		return;
+	}
+	if (check_able(guard, &error) || meet(guard, RECALL_ABLE, READY_NS, &error)) {
+		guard_leave_meeting(guard);
+		guard_emit_error(guard, AVC_EVENT_REFUSED, request->ticket, &error);
+		return;
+	}
+	if (guard->dead.waits) {
+		guard->dead.ticket = request->ticket;
+		go_back(guard);
+		return;
+	}
+	guard->restore_asked = AVC_REASON_GROUP;
+	guard->restore_ticket = request->ticket;
+	/* init reports the death. */
+	process_kill(&guard->main);
+}
+
+void guard_abandon(struct avc_guard *guard, uint64_t ticket)
+{
+	struct avc_error error = { 0 };
+
+	if (!guard->dead.waits)
+		return;
+	guard->dead.ticket = ticket;
+	fail(&error, AVC_EMPTY, 0, 0, "restore", "",
+	     "its group has no line to go back to together");
+	end_dead(guard, AVC_REASON_FAILED, &error);
+}
+
+void guard_tend_dead(struct avc_guard *guard)
+{
+	struct avc_error error = { 0 };
+
+	init_channel_working(&guard->channel);
+	if (guard->count && now_ns() < guard->dead.until_ns)
+		return;
+	fail(&error, AVC_DEADLINE, 0, 0, "restore", "", "its group did not go back with it");
+	end_dead(guard, AVC_REASON_FAILED, &error);
+}

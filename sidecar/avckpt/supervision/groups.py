@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""avckpt.group.recovery=together: containers with one recovery line.
+
+A line is a checkpoint of every member, of one instant: the guards see to that among themselves
+(native/engine/guard/guard_group.c), and are only told here when, with whom, and which line is
+gone back to.  What is wrong with a member costs a line or leaves the member out, and is told;
+members go back together or not at all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from avckpt_hooks.shared.labels import KEEP_MAX
+
+from avckpt.containers import cgroup
+from avckpt.engine import Guard, meeting
+from avckpt.errors import AvckptError, Busy, NothingToRestore
+from avckpt.events.record import EventRecord
+from avckpt.events.vocabulary import Kind
+from avckpt.guard import Command, Event
+from avckpt.orders import Orders, check
+
+if TYPE_CHECKING:
+    from avckpt.daemon import Watch
+
+log = logging.getLogger("avckpt")
+
+FIRST_S = 0.3
+"""From the coming of a member to a line with it, at most: others may be coming, too."""
+PATIENCE = 2
+"""Lines that a member may break in a row before some are taken without it."""
+SKIPPED = 10
+"""How many these are."""
+
+Answer = tuple[Event, EventRecord]
+
+
+@dataclass
+class Line:
+    """What all its members hold."""
+
+    number: int
+    generations: dict[int, int]
+    """By cookie."""
+
+
+@dataclass
+class Group:
+    """Members are those of whom there is a guard."""
+
+    name: str
+    members: dict[int, Watch] = field(default_factory=dict)
+    lines: list[Line] = field(default_factory=list)
+    """Oldest first."""
+    number: int = 0
+    """Of the last line."""
+    dead: dict[int, int] = field(default_factory=dict)
+    """By cookie: the newest generation that one may go back to that waits for the group."""
+    broken: dict[int, int] = field(default_factory=dict)
+    """By cookie: lines in a row that this member broke; above PATIENCE: how many are taken without it."""
+    coming: asyncio.Event = field(default_factory=asyncio.Event)
+    busy: asyncio.Lock = field(default_factory=asyncio.Lock)
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+
+    @property
+    def interval_s(self) -> float:
+        """The shortest of its members'."""
+        return min((each.settings.config.interval_s for each in self.members.values()), default=1.0)
+
+
+class Groups:
+    """All groups that go back together.  For one event loop."""
+
+    def __init__(self, orders: Orders) -> None:
+        self._orders = orders
+        self._groups: dict[str, Group] = {}
+
+    def join(self, watch: Watch) -> None:
+        """There is a guard for it."""
+        policy = watch.settings.policy
+        if not policy.together or watch.guard is None:
+            return
+        group = self._groups.setdefault(policy.group, Group(policy.group))
+        group.members[watch.container.cookie] = watch
+        if not group.tasks:
+            self._begin(group, self._take_lines(group))
+
+    def leave(self, watch: Watch) -> None:
+        """There is none any more, or it is to be in no group or another one: lines with it are no lines."""
+        cookie = watch.container.cookie
+        group = self._group_of(watch)
+        if group is None:
+            return
+        del group.members[cookie]
+        for known in (group.dead, group.broken):
+            known.pop(cookie, None)
+        group.lines = [line for line in group.lines if cookie not in line.generations]
+        if not group.members:
+            del self._groups[group.name]
+            for task in group.tasks:
+                task.cancel()
+
+    def hear(self, watch: Watch, event: Event) -> None:
+        """What a guard has told."""
+        group = self._group_of(watch)
+        if group is None:
+            return
+        cookie = watch.container.cookie
+        if event.kind is Kind.ATTACHED:
+            group.coming.set()
+        elif event.kind is Kind.DROPPED:
+            group.lines = [line for line in group.lines if line.generations.get(cookie) != event.generation]
+        elif event.kind is Kind.UNPROTECTED:
+            group.lines = [line for line in group.lines if cookie not in line.generations]
+        elif event.kind is Kind.WAITS:
+            if not group.dead:
+                self._begin(group, self._go_back(group))
+            group.dead[cookie] = event.generation
+        elif event.kind in (Kind.RESTORED, Kind.GAVE_UP):
+            group.dead.pop(cookie, None)
+
+    async def command(self, watch: Watch, command: Command, generation: int = 0) -> EventRecord:
+        """A checkpoint or a roll back of one is that of all; what was told of this one.
+
+        Raises Busy, NothingToRestore, or what went wrong.
+        """
+        group = self._group_of(watch)
+        if group is None:
+            raise Busy(f"{watch.container.label} is in no group at this moment")
+        async with group.busy:
+            if command is Command.CHECKPOINT:
+                answers = await self._take_line(group)
+            else:
+                cookie = watch.container.cookie
+                lines = [line for line in group.lines if generation in (0, line.generations.get(cookie))]
+                if not lines:
+                    raise NothingToRestore(f"group {group.name} holds no such line to go back to")
+                answers = await self._recall(group, lines[-1])
+        answer = answers.get(watch.container.cookie)
+        if answer is None:
+            raise Busy(f"{watch.container.label}: the line was taken without it")
+        if isinstance(answer, AvckptError):
+            raise answer
+        check(watch.container.label, answer[0])
+        return answer[1]
+
+    async def close(self) -> None:
+        """No more lines, and nobody goes back together."""
+        tasks = [task for group in self._groups.values() for task in group.tasks]
+        self._groups.clear()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _group_of(self, watch: Watch) -> Group | None:
+        cookie = watch.container.cookie
+        return next((group for group in self._groups.values() if cookie in group.members), None)
+
+    def _begin(self, group: Group, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        group.tasks.add(task)
+        task.add_done_callback(group.tasks.discard)
+
+    # Lines
+
+    async def _take_lines(self, group: Group) -> None:
+        while True:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(group.coming.wait(), group.interval_s)
+                group.coming.clear()
+                await asyncio.sleep(min(FIRST_S, group.interval_s))
+            async with group.busy:
+                try:
+                    if not group.dead:
+                        await self._take_line(group)
+                except (AvckptError, OSError) as error:
+                    log.error("group %s: a line could not be taken: %s", group.name, error)
+
+    async def _take_line(self, group: Group) -> dict[int, Answer | AvckptError]:
+        members = {cookie: guard for cookie, guard in self._able(group).items() if not self._is_skipped(group, cookie)}
+        if not members:
+            return {}
+        group.number += 1
+        number = group.number
+        with meeting(len(members)) as fd:
+            answers = await self._ask(group, members, lambda cookie, guard, ticket: guard.line(fd, number, ticket))
+        taken = {
+            cookie: answer[0].generation
+            for cookie, answer in answers.items()
+            if isinstance(answer, tuple) and answer[0].kind is Kind.CHECKPOINT
+        }
+        if len(taken) == len(members):
+            group.broken = {cookie: n for cookie, n in group.broken.items() if cookie not in members}
+            # A line from before somebody came: what that one has said since would have been said by nobody.
+            older = [line for line in group.lines if taken.keys() <= line.generations.keys()]
+            group.lines = [*older[1 - KEEP_MAX :], Line(number, taken)]
+            return answers
+        for cookie, generation in taken.items():
+            with contextlib.suppress(AvckptError):
+                members[cookie].forget(generation)
+        for cookie in self._breakers(answers):
+            group.broken[cookie] = group.broken.get(cookie, 0) + 1
+        return answers
+
+    def _able(self, group: Group) -> dict[int, Guard]:
+        """Those that can be frozen at all."""
+        return {
+            cookie: watch.guard
+            for cookie, watch in group.members.items()
+            if watch.guard is not None and watch.container.app_pid and not cgroup.is_paused(watch.container.init_pid)
+        }
+
+    def _is_skipped(self, group: Group, cookie: int) -> bool:
+        """One that breaks line after line is left out of some, and then tried again."""
+        if group.broken.get(cookie, 0) < PATIENCE:
+            return False
+        group.broken[cookie] += 1
+        if group.broken[cookie] > PATIENCE + SKIPPED:
+            group.broken[cookie] = PATIENCE - 1
+        elif group.broken[cookie] == PATIENCE + 1:
+            label = group.members[cookie].container.label
+            log.warning("group %s: the next %d lines are taken without %s", group.name, SKIPPED, label)
+        return True
+
+    def _breakers(self, answers: dict[int, Answer | AvckptError]) -> list[int]:
+        """Who could not, for a reason of its own."""
+        return [
+            cookie
+            for cookie, answer in answers.items()
+            if isinstance(answer, AvckptError)
+            or (answer[0].kind is not Kind.CHECKPOINT and not isinstance(answer[0].error, Busy))
+        ]
+
+    async def _ask(
+        self, group: Group, members: dict[int, Guard], tell: Callable[[int, Guard, int], None]
+    ) -> dict[int, Answer | AvckptError]:
+        """Tells all of them the same, and waits for all answers."""
+
+        async def ask(cookie: int, guard: Guard) -> Answer | AvckptError:
+            try:
+                watch = group.members[cookie]
+                return await self._orders.ask(watch.container, lambda ticket: tell(cookie, guard, ticket))
+            except AvckptError as error:
+                return error
+
+        answers = await asyncio.gather(*(ask(cookie, guard) for cookie, guard in members.items()))
+        return dict(zip(members, answers))
+
+    # Returns
+
+    async def _go_back(self, group: Group) -> None:
+        """Somebody has died: to the newest line that all of it have."""
+        async with group.busy:
+            while group.dead:
+                line = self._line_for(group)
+                if line is None:
+                    break
+                try:
+                    await self._recall(group, line)
+                except (AvckptError, OSError) as error:
+                    log.error("group %s: it cannot go back to line %d: %s", group.name, line.number, error)
+                    break
+            for cookie in list(group.dead):
+                watch = group.members[cookie]
+                log.error("group %s: there is no line to go back to with %s", group.name, watch.container.label)
+                with contextlib.suppress(AvckptError):
+                    if watch.guard is not None:
+                        watch.guard.command(Command.ABANDON, 0)
+            group.dead.clear()
+
+    def _line_for(self, group: Group) -> Line | None:
+        """The newest that the dead may go back to."""
+        for line in reversed(group.lines):
+            if all(line.generations.get(cookie, newest + 1) <= newest for cookie, newest in group.dead.items()):
+                return line
+        return None
+
+    async def _recall(self, group: Group, line: Line) -> dict[int, Answer | AvckptError]:
+        able = self._able(group)
+        members = {cookie: able[cookie] for cookie in line.generations if cookie in able}
+        for cookie in line.generations.keys() - members.keys():
+            label = group.members[cookie].container.label
+            log.warning("group %s: %s is paused, and is not rolled back", group.name, label)
+        # Whatever comes of it: newer ones are of no use, and this one comes back if it was good.
+        group.lines = group.lines[: group.lines.index(line)]
+        with meeting(len(members)) as fd:
+            answers = await self._ask(
+                group,
+                members,
+                lambda cookie, guard, ticket: guard.recall(fd, line.number, line.generations[cookie], ticket),
+            )
+        if all(isinstance(answer, tuple) and answer[0].kind is Kind.RESTORED for answer in answers.values()):
+            group.lines.append(line)
+            log.warning("group %s: went back to line %d together (%d members)", group.name, line.number, len(members))
+        return answers
