@@ -125,6 +125,11 @@ bench-ros2: setup ## measure CycloneDDS and zenoh over restores: outages against
 	@scripts/setup-ros2.sh
 	@$(VENV)/python -m bench.ros2
 
+bench-cri: setup ## a pod of two containers through containerd's CRI socket: KILLS=500 crashes
+	@scripts/setup-docker.sh
+	@$(VENV)/python -c 'import grpc_tools' 2>/dev/null || $(VENV)/python -m pip install --disable-pip-version-check -q 'grpcio-tools>=1.50'
+	@$(VENV)/python -m bench.cri --kills $(if $(filter file,$(origin KILLS)),500,$(KILLS))
+
 bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
 	@$(VENV)/python -m bench.trees
 
@@ -137,5 +142,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help deb wheel test-packages setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-trees clean clean-system
+.PHONY: help deb wheel test-packages setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees clean clean-system
 .DEFAULT_GOAL := help
