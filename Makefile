@@ -133,6 +133,11 @@ bench-cri: setup ## a pod of two containers through containerd's CRI socket: KIL
 bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
 	@$(VENV)/python -m bench.trees
 
+campaign: setup-build ## inject faults into protected programs in C++, Python and Go: what becomes of them (RUNS=50 WINDOW=60; hours)
+	@scripts/setup-campaign.sh
+	@$(VENV)/python -m bench.campaign --runs $(or $(RUNS),50) --seconds $(or $(WINDOW),60)
+	@$(VENV)/python -m bench.campaign_show
+
 clean: ## remove what was built here (images and the base's cache stay)
 	rm -rf build .venv native/build native/build-san native/build-fuzz native/build-stores tests/fuzz/build tests/fuzz/build-seeds .pytest_cache .mypy_cache .ruff_cache
 	rm -rf tests/victims/build sidecar/avckpt/_native.c sidecar/avckpt/_native*.so *.egg-info
@@ -142,5 +147,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help deb wheel test-packages setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees clean clean-system
+.PHONY: help deb wheel test-packages setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
 .DEFAULT_GOAL := help

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from testkit.harness import ContainerFactory, Sidecar, wait_until
+from testkit.protected import told
 
 pytestmark = pytest.mark.shared_machine("the sidecar is given a time to protect")
 
@@ -35,13 +36,14 @@ def read(path: Path) -> dict[str, str]:
 def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
     crashing = container.protected(
         *("sh", "-c", "echo it has started; while :; do sleep 1; done"),
-        labels={"interval": "100ms"},
+        labels={"interval": "100ms", "core": "mini"},
         options=("--env", f"TOKEN={SECRET}", "--label", "owner=somebody"),
     )
     sidecar.wait_generation(crashing)
     os.kill(sidecar.app_pid(crashing), signal.SIGSEGV)
     sidecar.wait_restores(crashing)
     wait_until(lambda: "restored in" in sidecar.logs(), 20, "the restore is told")
+    wait_until(lambda: told(sidecar, crashing, "core"), 20, "its core file is told of")
     path = tmp_path / "bundle.tar.gz"
     said = sidecar.avckpt("bundle", crashing.name, "-o", str(path))
     assert said.stdout == f"{path}\n"
@@ -63,6 +65,13 @@ def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: Container
     assert SECRET not in "".join(found.values())
     # What could not be had is told, and nothing that is there is written over.
     assert ("config.yaml" in found) != ("config.yaml" in found.get("missing.txt", ""))
+    with_core = tmp_path / "core.tar.gz"
+    sidecar.avckpt("bundle", crashing.name, "-o", str(with_core), "--core")
+    with tarfile.open(with_core) as archive:
+        (member,) = [each for each in archive.getmembers() if each.name.endswith("/core.zst")]
+        file = archive.extractfile(member)
+        assert file is not None
+        assert file.read(4) == bytes.fromhex("28b52ffd")  # of zstd
     again = sidecar.avckpt("bundle", crashing.name, "-o", str(path), check=False)
     assert again.status == 1
     assert "cannot be written" in again.stderr

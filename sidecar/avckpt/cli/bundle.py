@@ -28,6 +28,7 @@ COMMAND_TIMEOUT_S = 30.0
 LOG_LINES = 2000
 MOST_BYTES = 8 << 20
 """Of what one program says; the end is what matters."""
+CORE_MOST_BYTES = 256 << 20
 README = """What avckpt knows of {name}, {at}.
 
 events.jsonl      what happened to it, one JSON object a line, oldest first
@@ -41,6 +42,7 @@ metrics.txt       the sidecar's metrics
 doctor.json       what avckpt doctor says of the machine
 config.yaml       defaults for all containers, where there are any
 versions.txt      kernel, Podman, runtime
+core.zst          with --core: its newest core file (zstd -d, gdb)
 missing.txt       what could not be had, and why, if anything
 """
 INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCount", "Mounts")
@@ -55,7 +57,10 @@ INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCou
     type=click.Path(path_type=Path, dir_okay=False),
     help="Where to put it; default avckpt-NAME-TIME.tar.gz here.",
 )
-def bundle(name: str, output: Path | None) -> None:
+@click.option(
+    "--core", is_flag=True, help="With its newest core file (avckpt.core): all that it knew, secrets included."
+)
+def bundle(name: str, output: Path | None, core: bool) -> None:
     """Collect all that is known of container NAME in one archive.
 
     Events, state, labels, logs, metrics, versions and what "avckpt doctor" says; no
@@ -73,7 +78,7 @@ def bundle(name: str, output: Path | None) -> None:
     try:
         # Only its owner may read it: a log may say more than others should know.
         with open(path, "xb", opener=_open_private) as file:
-            missing = write(file, stem, list(contents(Client(run_dir), container, events)))
+            missing = write(file, stem, list(contents(Client(run_dir), container, events, core=core)))
     except OSError as error:
         raise AvckptError(f"{path} cannot be written", errno=error.errno or 0) from error
     for each in missing:
@@ -96,7 +101,9 @@ def find(client: Client, name: str) -> tuple[Json, list[Json]]:
     return {"name": events[-1]["container"], "id": events[-1]["id"], "state": "ended"}, events
 
 
-def contents(client: Client, container: Json, events: list[Json]) -> Iterator[tuple[str, Callable[[], str]]]:
+def contents(
+    client: Client, container: Json, events: list[Json], *, core: bool = False
+) -> Iterator[tuple[str, Callable[[], str | bytes]]]:
     """Names of the files, and how to get what is in them; this may raise AvckptError or OSError."""
     from avckpt.cli import doctor, sidecar_container
 
@@ -125,15 +132,28 @@ def contents(client: Client, container: Json, events: list[Json]) -> Iterator[tu
     yield "doctor.json", lambda: _pretty([asdict(check) for check in doctor.checks()])
     yield "config.yaml", lambda: _tail(Path(client.info()["config"]["path"]).read_bytes())
     yield "versions.txt", versions
+    if core:
+        yield "core.zst", lambda: _core(events)
 
 
-def write(file: io.BufferedIOBase, folder: str, files: list[tuple[str, Callable[[], str]]]) -> list[str]:
+def _core(events: list[Json]) -> bytes:
+    """The newest that is still there.  Raises AvckptError when there is none, or it is too large to send on."""
+    paths = [Path(event["core"]) for event in events if "core" in event]
+    for path in reversed(paths):
+        if path.is_file():
+            if path.stat().st_size > CORE_MOST_BYTES:
+                raise AvckptError(f"{path} is too large, send it by itself")
+            return path.read_bytes()
+    raise AvckptError("there is none: avckpt.core=mini or on makes one of each death")
+
+
+def write(file: io.BufferedIOBase, folder: str, files: list[tuple[str, Callable[[], str | bytes]]]) -> list[str]:
     """Writes the archive; returns what could not be had, with the reasons, which missing.txt has, too."""
     missing = []
     with tarfile.open(fileobj=file, mode="w:gz") as archive:
 
-        def add(name: str, text: str) -> None:
-            data = text.encode("utf-8", "backslashreplace")
+        def add(name: str, said: str | bytes) -> None:
+            data = said.encode("utf-8", "backslashreplace") if isinstance(said, str) else said
             entry = tarfile.TarInfo(f"{folder}/{name}")
             entry.size, entry.mtime, entry.mode = len(data), int(time.time()), 0o600
             archive.addfile(entry, io.BytesIO(data))

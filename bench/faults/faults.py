@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A program with a fault in it, as faults.cpp: `python faults.py FAULT PORT`."""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import random
+import resource
+import signal
+import socket
+import sys
+import threading
+import time
+
+triggered = 0
+
+
+def on_trigger(*_: object) -> None:
+    """Brings the fault out."""
+    global triggered
+    triggered += 1
+
+
+def recurse(n: int) -> int:
+    return recurse(n + 1) + 1
+
+
+def limit(what: int, most: int) -> None:
+    resource.setrlimit(what, (most, most))
+
+
+def deadlock() -> None:
+    one, other = threading.Lock(), threading.Lock()
+
+    def work() -> None:
+        with one:
+            time.sleep(0.05)
+            other.acquire()
+
+    threading.Thread(target=work, daemon=True).start()
+    with other:
+        time.sleep(0.1)
+        one.acquire()
+
+
+def break_down(fault: str) -> None:
+    libc = ctypes.CDLL(None)
+    libc.malloc.restype = ctypes.c_void_p
+    if fault == "null pointer":
+        ctypes.string_at(0)
+    elif fault == "double free":
+        block = ctypes.c_void_p(libc.malloc(40))
+        libc.free(block)
+        libc.free(block)
+    elif fault == "stack overflow":
+        limit(resource.RLIMIT_DATA, 512 << 20)
+        sys.setrecursionlimit(10**9)
+        recurse(0)
+    elif fault == "uncaught exception":
+        raise RuntimeError("nobody catches this")
+    elif fault == "assertion":
+        raise AssertionError
+    elif fault == "index out of range":
+        [][7]
+    elif fault == "abort":
+        os.abort()
+    elif fault == "exit with a status":
+        sys.exit(3)
+    elif fault == "truncated mapped file":
+        fd = os.memfd_create("mapped")
+        os.ftruncate(fd, 8192)
+        mapped = mmap.mmap(fd, 8192, mmap.MAP_SHARED)
+        os.ftruncate(fd, 0)
+        mapped[4096]
+    elif fault == "memory leak to a limit":
+        limit(resource.RLIMIT_DATA, 512 << 20)
+        eaten = []
+        while True:
+            eaten.append(bytearray(b"x" * (1 << 20)))
+    elif fault == "descriptor leak":
+        limit(resource.RLIMIT_NOFILE, 256)
+        opened = []
+        while True:
+            opened.append(os.open("/dev/null", os.O_RDONLY))
+    elif fault.startswith("deadlock"):
+        deadlock()
+    elif fault.startswith("livelock"):
+        while True:
+            pass
+    elif fault.startswith("lost wake-up"):
+        condition = threading.Condition()
+        with condition:
+            condition.wait()
+    elif fault == "killed from outside":
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif fault == "poison input" or (fault == "poison input, one in four" and random.randrange(4) == 0):
+        raise ValueError("poison")
+
+
+def main() -> None:
+    """Computes, sends, and breaks down when it is told to."""
+    fault, port = sys.argv[1], int(sys.argv[2])
+    out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    kept, number, seen, bad_in = [0] * 1000, 0, 0, 0
+    signal.signal(signal.SIGUSR1, on_trigger)
+    child = 0
+    if fault == "death of a child":
+        child = os.fork()
+        while not child:
+            time.sleep(1000)
+    while True:
+        if "own watchdog" in fault:
+            signal.alarm(2)
+        kept[(number + 1) % 1000] = (kept[number % 1000] * 6364136223846793005 + 1442695040888963407) % 2**64
+        number += 1
+        out.sendto(f"{number} {kept[number % 1000]}".encode(), ("127.0.0.1", port))
+        if child and os.waitpid(child, os.WNOHANG)[0] == child:
+            sys.exit(4)
+        if bad_in:
+            bad_in -= 1
+            if not bad_in:
+                ctypes.string_at(8)
+        if seen != triggered:
+            seen = triggered
+            if fault == "corruption before the checkpoint":
+                bad_in = 50
+            elif fault == "wrong value, no crash":
+                kept[number % 1000] ^= 1 << 20
+            elif fault == "death of a child":
+                os.kill(child, signal.SIGKILL)
+            elif fault == "fault in another thread":
+                threading.Thread(target=lambda: ctypes.string_at(0)).start()
+            else:
+                break_down(fault)
+        time.sleep(0.01)
+
+
+if __name__ == "__main__":
+    main()
