@@ -52,6 +52,11 @@ test: setup ## every test (T=expression selects, TESTS=folder narrows)
 	@scripts/setup-docker.sh
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
+.PHONY: build-aarch64
+build-aarch64: setup-build ## cross-compile everything for aarch64, below build/aarch64
+	@scripts/setup-system.sh aarch64
+	@scripts/build-aarch64.sh
+
 deb: setup-build ## a Debian package for this Debian: command line, hooks, init, guard, sidecar as a service (build/*.deb)
 	@scripts/make-deb.sh
 

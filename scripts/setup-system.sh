@@ -20,6 +20,13 @@ has_static_libc() { # avckpt-init is static: it must run in any container
 	rm -f "$out"
 	return "$status"
 }
+has_cross_libc() {
+	local out status=0
+	out=$(mktemp)
+	echo 'int main(void) { return 0; }' | aarch64-linux-gnu-gcc -x c -static -o "$out" - 2>/dev/null || status=1
+	rm -f "$out"
+	return "$status"
+}
 has_python() { have "$PYTHON" && "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 9))'; }
 has_venv() { has_python && "$PYTHON" -c 'import venv, ensurepip' 2>/dev/null; }
 has_python_headers() {
@@ -85,6 +92,9 @@ optional|iptables|have iptables|bridge networks for containers (Podman 4)
 optional|nftables|have nft|bridge networks for containers (Podman 5)
 lint|clang-format|have clang-format|checks the C code's style
 lint|shellcheck|have shellcheck|checks the shell scripts
+aarch64|gcc-aarch64-linux-gnu|has_cross_libc|compiles for aarch64
+aarch64|libc6-dev-arm64-cross|has_cross_libc|headers and the static C library for aarch64
+aarch64|g++-aarch64-linux-gnu|have aarch64-linux-gnu-g++|compiles the C++ program that the tests kill and restore
 fuzz|clang|have clang|compiles fuzz targets
 fuzz|libclang-rt-dev|has_libfuzzer|libFuzzer and the sanitizers
 fuzz|llvm|have llvm-symbolizer|names the lines of what a sanitizer finds

@@ -58,6 +58,16 @@ static struct inj_slot *slots[LASTPID_SLOTS_MAX];
 static uint32_t slot_count;
 static struct lastpid_page *page;
 
+/* Some compilers call it even in a program without libc. */
+void *memset(void *at, int byte, size_t n);
+
+void *memset(void *at, int byte, size_t n)
+{
+	for (size_t i = 0; i < n; i++)
+		((volatile uint8_t *)at)[i] = (uint8_t)byte;
+	return at;
+}
+
 static _Noreturn void end(int status)
 {
 	for (;;)
@@ -133,7 +143,7 @@ static void confine_calls(void)
 		/* Of the first process, and of the second in its first moments. */
 		ALLOW(__NR_clone), /* a third one is beyond RLIMIT_NPROC */
 		ALLOW(__NR_wait4),
-		ALLOW(__NR_alarm),
+		ALLOW(__NR_setitimer),
 		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, __NR_prctl, 0, 3),
 		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, WORD(args[0])),
 		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, PR_SET_PDEATHSIG, 0, 1),
@@ -293,9 +303,10 @@ static void serve(void)
 
 _Noreturn void lastpid_main(void);
 
-__attribute__((force_align_arg_pointer)) _Noreturn void lastpid_main(void)
+RAW_ENTRY _Noreturn void lastpid_main(void)
 {
 	const int keep = needed_capability();
+	const int64_t life[4] = { 0, 0, LIFE_S, 0 }; /* struct itimerval */
 	long child;
 
 	SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
@@ -311,7 +322,7 @@ __attribute__((force_align_arg_pointer)) _Noreturn void lastpid_main(void)
 	must(child);
 	if (child == 0) {
 		SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
-		SYS(__NR_alarm, LIFE_S, 0, 0); /* if that came too late */
+		SYS(__NR_setitimer, 0 /* ITIMER_REAL */, life, 0); /* if that came too late */
 		serve();
 		end(0);
 	}

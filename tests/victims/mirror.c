@@ -24,6 +24,10 @@
 
 #include "victim.h"
 
+#ifndef SYS_poll
+#define SYS_poll SYS_ppoll /* newer CPUs */
+#endif
+
 #define VIEW_BYTES (1 << 20)
 #define REGION_PAGES 64
 #define OPTIONS 90

@@ -48,6 +48,10 @@ int guard_probe(struct avc_error *err)
 	*err = (struct avc_error){ 0 };
 	if (!arch_xstate_bytes())
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "probe", "", "this CPU has no XSAVE");
+	if (sysconf(_SC_PAGESIZE) != ARCH_PAGE_BYTES)
+		return fail(err, AVC_UNSUPPORTED, 0, 0, "probe", "",
+			    "the kernel's pages have %ld bytes: avckpt needs pages of %d",
+			    sysconf(_SC_PAGESIZE), ARCH_PAGE_BYTES);
 	/* Owned by the kernel: opening it for writing needs root, writing it a
 	 * capability.  Writing back what is there changes nothing. */
 	fd = open("/proc/sys/kernel/ns_last_pid", O_WRONLY | O_CLOEXEC);

@@ -34,12 +34,12 @@
 
 #include "process.h"
 
-#define CAVE_BYTES 256
+/* At the end of a page: what is in it is aligned. */
+#define CAVE_BYTES ((ARCH_STUB_BYTES + 255) & ~255)
 #define PADS_START UINT64_C(0x200000000000)
 #define PADS (UINT64_C(1) << 19)
 #define PARASITE_DISTANCE (UINT64_C(64) << 20)
 #define PARASITE_SHARE 16 /* of what may be mapped, the parasite is a 16th at most */
-_Static_assert(CAVE_BYTES >= ARCH_STUB_BYTES, "the stub must fit");
 
 /* True if the last bytes of the mapping are a stub that a guard which died could not
  * take away. */
@@ -492,6 +492,9 @@ static int check_task(struct process *process, const struct thread *t, struct av
 	if (!arch_is_native(&t->regs))
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "infect", "",
 			    "it is a 32-bit program");
+	if (arch_is_delicate(t->tid))
+		return fail(err, AVC_DEADLINE, 0, t->tid, "infect", "",
+			    "it is in the middle of vector code");
 	return 0;
 }
 
@@ -526,6 +529,8 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	home = thread->regs;
 	arch_resume(&home);
 	bytes = arch_stub_build(stub, &home, thread->sigmask);
+	if (arch_stub_read_xstate(thread->tid, stub))
+		return fail_errno(err, thread->tid, "infect", "ptrace(GETREGSET)", "it has ended");
 	if (pwrite(process->mem_fd, stub, bytes, (off_t)cave) != (ssize_t)bytes)
 		return fail_errno(err, process->pid, "infect", "write(mem)",
 				  "its code cannot be written");

@@ -481,6 +481,9 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 
 	if (!thread->vetted && thread_vet(process, thread, err))
 		return -1;
+	if (arch_is_delicate(thread->tid))
+		return fail(err, AVC_RETRY, 0, thread->tid, "run injected code", "",
+			    "it is in the middle of vector code");
 	home = thread->regs;
 	arch_resume(&home);
 	arch_home_set(&control->home, &home, thread->sigmask);

@@ -43,6 +43,13 @@
 #define FDS_PER_WORD 64
 #define FD_WORDS_MAX 16384 /* of an fd_set: a million descriptors */
 
+/* Newer CPUs are without these. */
+#ifndef SYS_epoll_wait
+#define SYS_epoll_wait (-2)
+#define SYS_select (-2)
+#define SYS_poll SYS_ppoll
+#endif
+
 enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND };
 
 /* Calls that answer EINTR to a stop, have done nothing when they do, and may be
@@ -299,7 +306,8 @@ void rewind_prepare(struct thread *thread)
 	struct sleeper *s = &thread->sleeper;
 	struct proc_stat stat;
 
-	s->known = (has_timeout(thread->call.nr) || !thread->stopped_ns) &&
+	s->known = (has_timeout(thread->call.nr) || arch_may_continue(thread->call.nr) ||
+		    !thread->stopped_ns) &&
 		   proc_sched(thread->tid, &s->sched) == 0 && proc_stat(thread->tid, &stat) == 0 &&
 		   stat.state == 'S';
 }
@@ -360,6 +368,8 @@ void rewind_call(struct process *process, struct thread *thread)
 	const uint64_t now = now_ns();
 
 	thread->stopped_ns = now;
+	if (arch_may_continue(arch_syscall_nr(regs)) && waited_ns(thread))
+		arch_note_slept(regs);
 	note_call(process, thread);
 	if (arch_syscall_nr(regs) < 0 || is_about_to_rewind(thread))
 		return;

@@ -26,6 +26,9 @@ static inline long raw_syscall(long nr, uint64_t a, uint64_t b, uint64_t c, uint
 	return ret;
 }
 
+/* Where the kernel begins a program: the stack is not as after a call. */
+#define RAW_ENTRY __attribute__((force_align_arg_pointer))
+
 static inline void cpu_relax(void)
 {
 	__asm__ volatile("pause");

@@ -109,6 +109,26 @@ long arch_syscall_nr_before(const uint8_t code[ARCH_CODE_BYTES]);
 #define ARCH_SYSCALL_BYTES 2
 bool arch_is_syscall(const uint8_t code[ARCH_SYSCALL_BYTES]);
 
+/* Whether a stopped thread does not tell that the kernel goes on with such a call and does not
+ * begin it again, but by its having slept in it. */
+static inline bool arch_may_continue(long nr)
+{
+	(void)nr;
+	return false;
+}
+static inline void arch_note_slept(struct arch_regs *regs)
+{
+	(void)regs;
+}
+
+/* Whether the thread has registers that no system call leaves alone, so that it is not to be
+ * borrowed now. */
+static inline bool arch_is_delicate(pid_t tid)
+{
+	(void)tid;
+	return false;
+}
+
 /* Like arch_rewind(), for the *same* task going on without the kernel's help:
  * a restart block is still there and is continued, not begun again. */
 void arch_resume(struct arch_regs *regs);
@@ -166,6 +186,12 @@ bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, s
 #define ARCH_STUB_WAIT SYS_wait4
 #define ARCH_STUB_BYTES 224
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
+/* Adds the extended state, where going back needs it. */
+static inline int arch_stub_read_xstate(pid_t tid, uint8_t *code)
+{
+	(void)tid, (void)code;
+	return 0;
+}
 /* Whether `code` is what arch_stub_build() has written once. */
 bool arch_is_stub(const uint8_t *code);
 /* `last`: the task ends after the call, and does not go back. */
