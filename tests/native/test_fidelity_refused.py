@@ -54,6 +54,7 @@ def built(init_built: None, victims_built: Path) -> None:
         ("unsupported secret --in-child", "no other process can map: /secretmem"),
         ("unsupported future --in-child", "no other process can map: /memfd:future"),
         ("unsupported stuck", "mseal"),
+        ("unsupported vdso", "its parent has unmapped its own"),
     ],
 )
 def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path) -> None:

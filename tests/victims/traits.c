@@ -7,6 +7,7 @@
  *   exit-signal   a child whose end is told by SIGUSR1, one that had ended so, and one that had
  *                 ended with what is no signal
  *   zombie-group  a process in the group of one that has ended, which nobody waited for
+ *   vdso          a child that has unmapped its vDSO
  *   limits        a child that has more than its parent may have, which has lowered its limits
  *   hard-limits   a child that may give itself more than its parent, which has lowered its own
  *                 hard limits; it has given up the right to raise such (CAP_SYS_RESOURCE)
@@ -128,6 +129,32 @@ static void look_at_zombie_group(char *to, size_t size)
 		 getpgid(kid));
 }
 
+/* It has what it is to have, and stops itself to tell. */
+static void await_kid(void)
+{
+	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
+	must(!kill(kid, SIGCONT), "kill");
+}
+
+/* ---- vdso --------------------------------------------------------------------------------- */
+
+static void setup_vdso(void)
+{
+	kid = fork();
+	if (!kid) {
+		(void)victim_vdso(getpid(), true);
+		kill(getpid(), SIGSTOP);
+		rest();
+	}
+	await_kid();
+}
+
+static void look_at_vdso(char *to, size_t size)
+{
+	snprintf(to, size, "%d of the kernel's mappings, its child %d",
+		 victim_vdso(getpid(), false), victim_vdso(kid, false));
+}
+
 /* ---- limits ------------------------------------------------------------------------------- */
 
 /* Soft ones: to have more than a hard one takes a right (CAP_SYS_RESOURCE) that not every
@@ -139,13 +166,6 @@ static void set_limit(int which, rlim_t value)
 	must(!getrlimit(which, &limit), "getrlimit");
 	limit.rlim_cur = value;
 	must(!setrlimit(which, &limit), "setrlimit");
-}
-
-/* It has what it is to have, and stops itself to tell. */
-static void await_kid(void)
-{
-	must(waitpid(kid, NULL, WUNTRACED) == kid, "waitpid");
-	must(!kill(kid, SIGCONT), "kill");
 }
 
 static void setup_limits(void)
@@ -453,6 +473,7 @@ static const struct {
 } kinds[] = {
 	{ "exit-signal", setup_exit_signal, look_at_exit_signal },
 	{ "zombie-group", setup_zombie_group, look_at_zombie_group },
+	{ "vdso", setup_vdso, look_at_vdso },
 	{ "limits", setup_limits, look_at_limits },
 	{ "hard-limits", setup_hard_limits, look_at_hard_limits },
 	{ "barriers", setup_barriers, look_at_barriers },

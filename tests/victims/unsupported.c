@@ -27,6 +27,7 @@
  *             not kept over that
  *   dropped   one thread of another user, and the main thread has become a third one's
  *   vfork     a thread waits for a child that never executes a program (vfork(2))
+ *   vdso      a child of a process that has unmapped its vDSO since
  *   shared-files, shared-folder   a child process with the descriptors, or the working
  *             directory, of its parent
  *   dispatch  its system calls are dispatched by itself, and while it makes none are blocked
@@ -407,6 +408,19 @@ static bool start_locked_child(void)
 	return start_child(0) && lock_securebits(SECBIT_NOROOT | SECBIT_NOROOT_LOCKED);
 }
 
+/* A child of a process that has unmapped its vDSO afterwards. */
+static bool start_vdso(void)
+{
+	const pid_t pid = fork();
+
+	if (pid)
+		return pid > 0;
+	if (fork())
+		(void)victim_vdso(getpid(), true);
+	for (;;)
+		pause();
+}
+
 static bool start_shared_files(void)
 {
 	return start_child(CLONE_FILES);
@@ -564,6 +578,7 @@ static const struct kind {
 	{ "dropped", start_dropped, NULL },
 	{ "vfork", start_vfork, NULL },
 	{ "shared-files", start_shared_files, NULL },
+	{ "vdso", start_vdso, NULL },
 	{ "shared-folder", start_shared_folder, NULL },
 	{ "dispatch", start_dispatch, stop_dispatch },
 	{ "limited", start_limited, stop_limited },

@@ -164,6 +164,29 @@ static inline bool victim_flag(int *argc, char **argv, const char *name)
 	return false;
 }
 
+/* How much the kernel maps for it: the vDSO and what belongs to it.  `unmap`: not any more. */
+static inline int victim_vdso(pid_t pid, bool unmap)
+{
+	char path[48], line[512], *name;
+	unsigned long start, end;
+	int count = 0;
+	FILE *maps;
+
+	snprintf(path, sizeof path, "/proc/%d/maps", pid);
+	maps = fopen(path, "re");
+	must(maps != NULL, path);
+	while (fgets(line, sizeof line, maps)) {
+		name = strchr(line, '[');
+		if (!name || (strncmp(name, "[vdso", 5) && strncmp(name, "[vvar", 5)))
+			continue;
+		count++;
+		must(sscanf(line, "%lx-%lx", &start, &end) == 2, "sscanf");
+		must(!unmap || !munmap((void *)start, end - start), "munmap");
+	}
+	fclose(maps);
+	return count;
+}
+
 /* Anonymous memory that nothing has touched.  With `thp` of transparent huge pages, as far as
  * there are any; it ends within a page of the other kind. */
 static inline void *victim_memory(size_t bytes, bool thp)

@@ -214,6 +214,10 @@ int remap_check(const struct process *process, struct snapshot *want, struct sna
 			      "process %d has executed another program, and the kernel seals its "
 			      "vDSO (mseal(2))",
 			      process->inside);
+	if (!result && b && !a)
+		result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
+			      "process %d has a vDSO, and its parent has unmapped its own",
+			      process->inside);
 	for (uint32_t i = 0; !result && i < r.pieces; i++) {
 		if (is_lost(&r.piece[i]))
 			result = fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",

@@ -119,8 +119,10 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 		struct snapshot *want, *is;
 
 		/* Few have anything of the kind. */
-		if (!image->process || (!mem_image_has(image->memory, MAPPING_ONLY_HERE) &&
-					!mem_image_has(host->memory, MAPPING_SEALED)))
+		if (!image->process ||
+		    (!mem_image_has(image->memory, MAPPING_ONLY_HERE) &&
+		     !mem_image_has(host->memory, MAPPING_SEALED) &&
+		     (!mem_image_is_special(image->memory) || mem_image_is_special(host->memory))))
 			continue;
 		want = look_at(image, err);
 		is = want ? look_at(host, err) : NULL;

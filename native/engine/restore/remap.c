@@ -46,8 +46,12 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
 			const struct mapping *b = mappings_find(&r->want->maps, names[i]);
 			const uint64_t bytes = a ? a->end - a->start : 0;
 
-			if (!a || !b || a->start == b->start)
+			if (!a || (b && a->start == b->start) || (!b && !away))
 				continue;
+			if (!b) { /* it has unmapped it */
+				syscall_batch_add(batch, SYS_munmap, a->start, bytes);
+				continue;
+			}
 			if (b->end - b->start != bytes)
 				return fail(err, AVC_UNSUPPORTED, 0, batch->pid, "restore memory",
 					    "", "its vDSO is of another size");

@@ -83,6 +83,11 @@ bool mem_image_has(const struct mem_image *image, enum mapping_flag flag)
 	return false;
 }
 
+bool mem_image_is_special(const struct mem_image *image)
+{
+	return image && image->special;
+}
+
 uint64_t mem_image_kinds(const struct mem_image *image)
 {
 	uint64_t h = UINT64_C(0xcbf29ce484222325);

@@ -74,6 +74,7 @@ struct memory {
 	struct marks advised;  /* what madvise(2) was told, where a restore maps it anew */
 	struct marks locked;
 	struct marks kinds; /* as mem_image.kinds                              */
+	bool special;       /* the same                                        */
 	int64_t locked_kb;
 	uint64_t locked_layout, locked_read_ns, locked_cost_ns;
 };
@@ -94,6 +95,7 @@ struct wiped {
 struct mem_image {
 	struct areas areas;
 	struct marks kinds;    /* what a restore has to know of mappings          */
+	bool special;          /* it has a vDSO                                   */
 	bool whole;            /* everything could be read                        */
 	bool too_much;         /* ... of what is wiped, not                       */
 	uint64_t left_bytes;   /* of shared memory, for all processes together     */

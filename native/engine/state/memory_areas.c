@@ -181,6 +181,7 @@ static int find_area(const struct mapping *m, void *arg)
 			    m->start < ARCH_USER_END;
 	if (!is_of_parasite(survey->process, m->start)) {
 		marks_add(&survey->memory->kinds, m, kind_of(survey, m));
+		survey->memory->special |= mapping_is_special(m);
 		if (survey->process->descendant || survey->recycled)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
@@ -319,6 +320,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 	int result = 0;
 
 	memory->advised.count = memory->kinds.count = 0;
+	memory->special = false;
 	/* What the process has been told since its template was forked, that does not know. */
 	if (proc_mappings(survey->recycled ? pid : survey->template, "smaps", find_area, survey))
 		return fail_errno(err, survey->template, "keep memory", "read(smaps)",
@@ -481,6 +483,7 @@ int areas_check(const struct image *image, struct avc_error *err)
 	const int result = check_layout(image, err);
 
 	image->memory->kinds = process->memory->kinds;
+	image->memory->special = process->memory->special;
 	if (!result && image->memory->too_much)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
 			    "more than %u MB of its memory are wiped in a clone (MADV_WIPEONFORK), "

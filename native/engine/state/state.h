@@ -214,6 +214,8 @@ void mem_image_free(struct mem_image *image);
  * mapping_flag.  And whether it is so of any. */
 uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
 bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
+/* Whether it has a vDSO. */
+bool mem_image_is_special(const struct mem_image *image);
 /* What its mappings are that /proc/PID/maps does not tell of; a number. */
 uint64_t mem_image_kinds(const struct mem_image *image);
 /* While everything is stopped: copies, what is its own when it stands still, what is shared
