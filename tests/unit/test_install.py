@@ -343,6 +343,22 @@ def test_uninstall_leaves_nothing_of_hooks_and_sidecar(root: Path) -> None:
     assert tree(root) == before
 
 
+def test_uninstall_leaves_the_runtime_that_docker_would_miss(root: Path) -> None:
+    before = tree(root)
+    install.install(root)
+    config = root / "etc/docker/daemon.json"
+    config.parent.mkdir()
+    runtime = root / "usr/local/libexec/avckpt/avckpt-runtime"
+    config.write_text(json.dumps({"runtimes": {"avckpt": {"path": "/usr/local/libexec/avckpt/avckpt-runtime"}}}))
+    assert any("/etc/docker/daemon.json names it" in line for line in install.uninstall(root))
+    done = subprocess.run([runtime, "--avckpt-runtime=/bin/echo", "kill"], capture_output=True, text=True, check=True)
+    assert done.stdout == "kill\n"
+    config.unlink()
+    config.parent.rmdir()
+    install.uninstall(root)
+    assert tree(root) == before
+
+
 def test_a_damaged_manifest_is_said(root: Path) -> None:
     install.install(root)
     (root / "usr/local/share/avckpt/manifest.json").write_text("{")

@@ -43,6 +43,12 @@ CONFIG_DIR = Path("/etc/avckpt")
 HOOK_PROGRAM = LIBEXEC / "avckpt-hook"
 RUNTIME_PROGRAM = LIBEXEC / "avckpt-runtime"
 """For Docker and containerd."""
+RUNTIME_USERS = (
+    "/etc/docker/daemon.json",
+    "/etc/containerd/config.toml",
+    "/etc/crio/crio.conf",
+    "/etc/crio/crio.conf.d/*",
+)
 INIT_PROGRAM = LIBEXEC / "avckpt-init"
 _PACKAGE = LIBEXEC / "avckpt_hooks"
 _CACHES = (_PACKAGE / "__pycache__", _PACKAGE / "shared/__pycache__")
@@ -261,8 +267,9 @@ def uninstall(root: Path = _HOST) -> list[str]:
     if manifest is None:
         return ["nothing is installed"]
     callers = _callers(root)
+    naming = _naming_the_runtime(root)
     programs = (HOOK_PROGRAM, RUNTIME_PROGRAM)
-    kept = [path for path in manifest.files if callers and (path in programs or _PACKAGE in path.parents)]
+    kept = [path for path in manifest.files if (callers or naming) and (path in programs or _PACKAGE in path.parents)]
     left = [*kept, MANIFEST] if kept else []
     # Backwards: Podman forgets the hooks before they are gone.
     doomed = [path for path in (*reversed(manifest.files), MANIFEST) if path not in left]
@@ -274,9 +281,12 @@ def uninstall(root: Path = _HOST) -> list[str]:
             _record(root, kept, list(manifest.directories))
         except OSError as error:
             raise ConfigError(f"{MANIFEST} cannot be written: {error.strerror}; run avckpt uninstall again") from error
-        done.append(
-            f"left {HOOK_PROGRAM}: {', '.join(callers)} will call it when ended; run avckpt uninstall again then"
-        )
+        if callers:
+            who = ", ".join(callers)
+            done.append(f"left {HOOK_PROGRAM}: {who} will call it when ended; run avckpt uninstall again then")
+        if naming:
+            what = f"left {RUNTIME_PROGRAM}: {naming} names it, and containers started by it end by it"
+            done.append(f"{what}; take it out there, make them anew, and run avckpt uninstall again")
     in_use = {folder for path in left for folder in path.parents}
     for path in reversed(manifest.directories):
         if path in in_use:
@@ -290,6 +300,16 @@ def uninstall(root: Path = _HOST) -> list[str]:
         else:
             done.append(f"removed {path}")
     return done
+
+
+def _naming_the_runtime(root: Path) -> str:
+    """The configuration file of Docker, containerd or CRI-O that has avckpt-runtime; "" if none has."""
+    for pattern in RUNTIME_USERS:
+        for path in sorted(root.glob(pattern.lstrip("/"))):
+            with contextlib.suppress(OSError):
+                if RUNTIME_PROGRAM.name.encode() in path.read_bytes():
+                    return f"/{path.relative_to(root)}"
+    return ""
 
 
 def _remove_all(root: Path, paths: list[Path]) -> list[Path]:
