@@ -146,9 +146,9 @@ def test_a_guard_that_stops_or_dies_leaves_nobody_stopped(local: LocalSidecar, r
         os.kill(guard_pid, signum)
         # A line is under way all the time.
         time.sleep(0.5)
-        check_ledgers(ring)
         if signum == signal.SIGSTOP:
             os.kill(guard_pid, signal.SIGCONT)
+        check_ledgers(ring)
         wait_for_line(local, ring, line)
     assert row(local, ring[1])["restores"] == 0
     assert [event["container"] for event in told(local, "guard_lost")] == ["member1"]

@@ -34,7 +34,7 @@ log = logging.getLogger("avckpt")
 FIRST_S = 0.3
 """From the coming of a member to a line with it, at most: others may be coming, too."""
 PATIENCE = 2
-"""Lines that a member may break in a row before some are taken without it."""
+"""Lines that a member which cannot be protected breaks in a row, before some are taken without it."""
 SKIPPED = 10
 """How many these are."""
 
@@ -138,7 +138,7 @@ class Groups:
                 answers = await self._take_line(group)
             else:
                 cookie = watch.container.cookie
-                lines = [line for line in group.lines if generation in (0, line.generations.get(cookie))]
+                lines = [line for line in self._lines_of_all(group) if generation in (0, line.generations.get(cookie))]
                 if not lines:
                     raise NothingToRestore(f"group {group.name} holds no such line to go back to")
                 answers = await self._recall(group, lines[-1])
@@ -217,7 +217,7 @@ class Groups:
         }
 
     def _is_skipped(self, group: Group, cookie: int) -> bool:
-        """One that breaks line after line is left out of some, and then tried again."""
+        """One that cannot be protected is left out of some, and then tried again."""
         if group.broken.get(cookie, 0) < PATIENCE:
             return False
         group.broken[cookie] += 1
@@ -229,12 +229,11 @@ class Groups:
         return True
 
     def _breakers(self, answers: dict[int, Answer | AvckptError]) -> list[int]:
-        """Who could not, for a reason of its own."""
+        """Who cannot be protected.  Whoever was only too late is waited for: it would not go back with the others."""
         return [
             cookie
             for cookie, answer in answers.items()
-            if isinstance(answer, AvckptError)
-            or (answer[0].kind is not Kind.CHECKPOINT and not isinstance(answer[0].error, Busy))
+            if isinstance(answer, tuple) and answer[0].kind is Kind.UNPROTECTED
         ]
 
     async def _ask(
@@ -275,11 +274,16 @@ class Groups:
             group.dead.clear()
 
     def _line_for(self, group: Group) -> Line | None:
-        """The newest that the dead may go back to."""
-        for line in reversed(group.lines):
+        """The newest that the dead may go back to, and all who hold something with them."""
+        for line in reversed(self._lines_of_all(group)):
             if all(line.generations.get(cookie, newest + 1) <= newest for cookie, newest in group.dead.items()):
                 return line
         return None
+
+    def _lines_of_all(self, group: Group) -> list[Line]:
+        """Without those that somebody has no part in who is protected and runs: one that was paused then, say."""
+        holders = {cookie for cookie in self._able(group) if group.members[cookie].container.generations}
+        return [line for line in group.lines if holders <= line.generations.keys()]
 
     async def _recall(self, group: Group, line: Line) -> dict[int, Answer | AvckptError]:
         able = self._able(group)
