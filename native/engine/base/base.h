@@ -292,6 +292,8 @@ bool page_is_own(uint64_t entry);
 int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
 		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
 
+/* Whether the mapping there is watched so: see pagemap_written(). */
+bool pagemap_is_watched(int pagemap, avc_remote address);
 /* Which of them were written since they were asked for the last time, and asks anew: fn is told of
  * each stretch.  Of a stretch of mappings that are all watched so (userfaultfd(2), WP_ASYNC): EPERM,
  * it is not.  0, or -1 with errno. */

@@ -78,6 +78,23 @@ int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
 	return 0;
 }
 
+bool pagemap_is_watched(int pagemap, avc_remote address)
+{
+	struct scan_region region;
+	struct scan scan = {
+		.size = sizeof scan,
+		.flags = SCAN_CHECK_ASYNC,
+		.start = address,
+		.end = address + ARCH_PAGE_BYTES,
+		.vec = (uint64_t)(uintptr_t)&region,
+		.vec_len = 1,
+		.category_mask = SCAN_WRITTEN,
+		.return_mask = SCAN_WRITTEN,
+	};
+
+	return ioctl(pagemap, SCAN, &scan) >= 0;
+}
+
 int pagemap_written(int pagemap, avc_remote start, avc_remote end,
 		    int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg)
 {

@@ -189,12 +189,22 @@ static bool is_private(const struct mapping *m)
 	return !m->shared && m->start < ARCH_USER_END && !mapping_is_special(m);
 }
 
-static bool register_area(const struct tracker *tracker, avc_remote start, avc_remote end)
+/* A mapping that mremap(2) moves is not watched any more, nor is all of the one that it becomes a part
+ * of there.  Marks of the time before stay in the page table, also of what is written then: they are
+ * taken off, so that all of it counts as written.  What is watched is left as it is: it may cease to
+ * be at any moment, and that has to be seen. */
+static bool register_area(struct tracker *tracker, avc_remote start, avc_remote end)
 {
 	struct uffdio_register area = { .range = { start, end - start },
 					.mode = UFFDIO_REGISTER_MODE_WP };
+	struct uffdio_writeprotect none = { .range = { start, end - start } };
 
-	return ioctl(tracker->uffd, UFFDIO_REGISTER, &area) == 0;
+	if (pagemap_is_watched(tracker->pagemap, start))
+		return true;
+	if (ioctl(tracker->uffd, UFFDIO_REGISTER, &area))
+		return false;
+	tracker->broken |= ioctl(tracker->uffd, UFFDIO_WRITEPROTECT, &none) != 0;
+	return true;
 }
 
 static int watch_mapping(const struct mapping *m, void *arg)
