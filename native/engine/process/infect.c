@@ -225,17 +225,22 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 					? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM
 				: process->descendant ? 0
 						      : CLONE_PARENT | SIGCHLD;
-	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared };
+	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared }, nothing[6] = { 0 };
 	const long options = (long)(porter->is_thread ? TRACE_OPTIONS_APP : TRACE_OPTIONS_OURS);
 	const struct sched_param first = { .sched_priority = 1 };
-	struct arch_regs regs;
+	struct arch_regs homeward, regs;
 	long refused;
 	int born;
 
+	/* If we die before its signals are blocked, it may not make a porter, which would take the
+	 * app's signals on its stack: it makes a call that is refused (a mask of 0 bytes) and goes
+	 * home.  But never is it in the app with every signal blocked. */
+	arch_stub_call(&homeward, &thread->regs, porter->cave, false, SYS_rt_sigprocmask, nothing);
 	arch_stub_call(&regs, &thread->regs, porter->cave, false, SYS_clone, arg);
 	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
-	    arch_regs_set(thread->tid, &regs) ||
-	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all))
+	    arch_regs_set(thread->tid, &homeward) ||
+	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all) ||
+	    arch_regs_set(thread->tid, &regs))
 		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
 	thread->borrowed_for = NULL;
