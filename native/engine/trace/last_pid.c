@@ -30,8 +30,10 @@ __asm__(".pushsection .rodata\n"
 	"lastpid_program: .incbin \"avckpt-pid\"\n"
 	"lastpid_program_end:\n"
 	".popsection\n");
-extern const uint8_t lastpid_program[] __asm__("lastpid_program");
-extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end");
+/* Hidden, or aarch64's linker finds both by one entry of its table. */
+#define HIDDEN __attribute__((visibility("hidden")))
+extern const uint8_t lastpid_program[] __asm__("lastpid_program") HIDDEN;
+extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end") HIDDEN;
 
 #ifndef MFD_EXEC
 #define MFD_EXEC 0x10U /* since Linux 6.3 */
