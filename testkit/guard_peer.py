@@ -17,6 +17,7 @@ The end of the input ends it as `stop` does.  AVCKPT_TEST_GUARD names another av
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -27,6 +28,7 @@ from pathlib import Path
 
 import avckpt.engine
 from avckpt.engine import Engine, Guard
+from avckpt.errors import TargetGone
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command, Event, GuardConfig
 
@@ -110,7 +112,8 @@ class Peer:
                 for line in lines:
                     if line == b"stop":
                         return
-                    self.obey(line.decode().split())
+                    with contextlib.suppress(TargetGone):  # guard_lost tells
+                        self.obey(line.decode().split())
 
     def obey(self, words: list[str]) -> None:
         """One line of the input."""
