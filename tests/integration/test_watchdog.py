@@ -16,7 +16,10 @@ from testkit.harness import wait_until
 from testkit.local_sidecar import LocalSidecar, local_sidecar
 from testkit.procfs import children_of
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="needs root"),
+    pytest.mark.shared_machine("what gets no CPU for seconds has hung, to a watchdog"),
+]
 
 
 @pytest.fixture
