@@ -55,7 +55,7 @@ int main(int argc, char **argv)
 		goto failed;
 	news.fd = avc_engine_event_fd(engine);
 	for (int i = 0; i < atoi(argv[4]); i++)
-		if (avc_guard_command(guard, AVC_COMMAND_CHECKPOINT, (uint64_t)i + 1, 0, &error))
+		if (avc_guard_command(guard, AVC_COMMAND_CHECKPOINT, (uint64_t)i + 1, 0, 0, &error))
 			goto failed;
 	while (!stop && !ended) {
 		struct avc_event event;

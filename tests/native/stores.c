@@ -187,6 +187,19 @@ void __tsan_write_range(void *at, size_t bytes)
 		hit(at);                                                                         \
 		return __atomic_fetch_add(at, v, __ATOMIC_SEQ_CST);                              \
 	}                                                                                        \
+	int __tsan_atomic##bits##_compare_exchange_strong(volatile uint##bits##_t *at,           \
+							  uint##bits##_t *expected,              \
+							  uint##bits##_t v, int o, int failed);  \
+	int __tsan_atomic##bits##_compare_exchange_strong(volatile uint##bits##_t *at,           \
+							  uint##bits##_t *expected,              \
+							  uint##bits##_t v, int o, int failed)   \
+	{                                                                                        \
+		(void)o;                                                                         \
+		(void)failed;                                                                    \
+		hit(at);                                                                         \
+		return __atomic_compare_exchange_n(at, expected, v, false, __ATOMIC_SEQ_CST,     \
+						   __ATOMIC_SEQ_CST);                            \
+	}                                                                                        \
 	uint##bits##_t __tsan_atomic##bits##_fetch_sub(volatile uint##bits##_t *at,              \
 						       uint##bits##_t v, int o);                 \
 	uint##bits##_t __tsan_atomic##bits##_fetch_sub(volatile uint##bits##_t *at,              \

@@ -457,6 +457,7 @@ static void let_go(struct avc_guard *guard)
 	tracee_end_now();
 	while ((guard_tend_stragglers(guard) || tracee_reap_ending()) && now_ns() < end)
 		usleep(200);
+	dirty_free(&guard->dirty); /* it knows processes of the tree */
 	tree_free(&guard->tree);
 	process_close(&guard->main);
 	parasite_close(&guard->main.parasite);
