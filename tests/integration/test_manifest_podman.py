@@ -310,7 +310,7 @@ def test_without_a_sidecar_to_start_it_says_so(
     sidecar.stop()
     try:
         monkeypatch.setattr(sidecar_container, "IMAGE", "localhost/avckpt-no-such-image")
-        with pytest.raises(SidecarUnreachable, match="make setup"):
+        with pytest.raises(SidecarUnreachable, match="avckpt install --sidecar"):
             sidecar_container.ensure(Path("/run/avckpt"), lambda line: None)
     finally:
         sidecar.restart()
