@@ -22,6 +22,11 @@ def make_private(directory: str) -> None:
 def write_private(path: str, content: bytes) -> None:
     """Writes a file at once or not at all, in a directory that is made private, too.  Raises OSError."""
     make_private(os.path.dirname(path))
+    write_at_once(path, content)
+
+
+def write_at_once(path: str, content: bytes) -> None:
+    """Writes a private file at once or not at all, in a directory that others may look into.  Raises OSError."""
     temporary = f"{path}.{os.getpid()}"
     with contextlib.suppress(FileNotFoundError):
         os.unlink(temporary)  # of an earlier process with our number

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from avckpt_hooks.shared.files import read_bounded, write_private
+from avckpt_hooks.shared.files import read_bounded, write_at_once
 from avckpt_hooks.shared.tell import printable
 
 from avckpt.containers.protected import Protected
@@ -44,7 +44,7 @@ class Presence:
             if content == self._written:
                 os.utime(self._path)
                 return
-            write_private(str(self._path), content)
+            write_at_once(str(self._path), content)
             self._written = content
 
     def stop(self, live: Iterable[Protected]) -> None:
