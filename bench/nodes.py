@@ -55,7 +55,7 @@ PAUSE_S = (0.1, 0.3)
 """Between two kills: there is a checkpoint of every node in it."""
 
 SIGNALS = (
-    *("SIGKILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGTRAP", "SIGSYS", "SIGQUIT"),
+    *("SIGKILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT", "SIGTRAP", "SIGSYS"),
     *("SIGUSR1", "SIGUSR2", "SIGHUP"),  # by itself: a fault, abort(), exit(3)
 )
 NODE = "#!/bin/sh\nexec /victims/crash --board /bench/$NODE.board\n"
