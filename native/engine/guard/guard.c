@@ -22,6 +22,7 @@
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
 #define LAST_WORDS_MS 1000
+#define REQUEST_FDS 2                 /* that come with one, at most                             */
 #define DEAD_LOOK_NS (50 * NS_PER_MS) /* at one that waits for its group: init is told */
 #define GUARD_UNTOLD 3 /* exit status: nobody of our build has told it what to do      */
 
@@ -105,7 +106,8 @@ static void roll_back(struct avc_guard *guard, const struct avc_request *request
 		      enum avc_reason reason)
 {
 	const uint64_t ticket = request->ticket;
-	const int i = guard_find_generation(guard, request->generation);
+	const int i = request->generation ? guard_find_generation(guard, request->generation)
+					  : (int)guard->count - 1;
 	struct avc_error error = { 0 };
 
 	if (!guard->count || !guard->main.pid) {
@@ -212,11 +214,12 @@ static void obey_in_time(struct avc_guard *guard, const struct avc_request *requ
 
 /* ---- the daemon ------------------------------------------------------------------- */
 
-/* 1: there is one; 0: none now; -1: there will be no more.  *fd: what came with it, or -1. */
-static int next_request(struct avc_guard *guard, struct avc_request *request, int *fd)
+/* As recvmsg(2); *count: of the descriptors that came with it, no more than there is room for. */
+static ssize_t receive(int socket, struct avc_request *request, int flags, int fds[REQUEST_FDS],
+		       size_t *count)
 {
 	union {
-		char bytes[CMSG_SPACE(sizeof *fd)];
+		char bytes[CMSG_SPACE(REQUEST_FDS * sizeof *fds)];
 		struct cmsghdr align;
 	} control;
 	struct iovec data = { request, sizeof *request };
@@ -224,15 +227,29 @@ static int next_request(struct avc_guard *guard, struct avc_request *request, in
 				  .msg_iovlen = 1,
 				  .msg_control = &control,
 				  .msg_controllen = sizeof control };
-	const ssize_t n = recvmsg(guard->socket, &message, MSG_DONTWAIT | MSG_CMSG_CLOEXEC);
-	struct cmsghdr *header;
+	const ssize_t n = recvmsg(socket, &message, flags | MSG_CMSG_CLOEXEC);
+	const struct cmsghdr *header = n < 0 ? NULL : CMSG_FIRSTHDR(&message);
 
-	*fd = -1;
+	*count = 0;
+	if (header && header->cmsg_type == SCM_RIGHTS) {
+		*count = (header->cmsg_len - CMSG_LEN(0)) / sizeof *fds;
+		memcpy(fds, CMSG_DATA(header), *count * sizeof *fds);
+	}
+	return n;
+}
+
+/* 1: there is one; 0: none now; -1: there will be no more.  *fd: what came with it, or -1. */
+static int next_request(struct avc_guard *guard, struct avc_request *request, int *fd)
+{
+	int fds[REQUEST_FDS];
+	size_t count;
+	const ssize_t n = receive(guard->socket, request, MSG_DONTWAIT, fds, &count);
+
+	*fd = count ? fds[0] : -1;
+	if (count > 1)
+		close_fd(&fds[1]); /* nobody sends two */
 	if (n < 0)
 		return errno == EAGAIN || errno == EINTR ? 0 : -1;
-	header = CMSG_FIRSTHDR(&message);
-	if (header && header->cmsg_type == SCM_RIGHTS && header->cmsg_len == CMSG_LEN(sizeof *fd))
-		memcpy(fd, CMSG_DATA(header), sizeof *fd);
 	return n == sizeof *request && request->magic == AVC_GUARD_MAGIC ? 1 : -1;
 }
 
@@ -536,25 +553,12 @@ static void guard_main(struct avc_guard *guard)
 static int receive_start(int socket, struct avc_request *request, int *init_pidfd,
 			 int *heartbeat_fd)
 {
-	union {
-		char bytes[CMSG_SPACE(2 * sizeof(int))];
-		struct cmsghdr align;
-	} control;
-	struct iovec data = { request, sizeof *request };
-	struct msghdr message = { .msg_iov = &data,
-				  .msg_iovlen = 1,
-				  .msg_control = &control,
-				  .msg_controllen = sizeof control };
-	struct cmsghdr *header;
-	int fds[2];
+	int fds[REQUEST_FDS];
+	size_t count;
 
-	if (recvmsg(socket, &message, MSG_CMSG_CLOEXEC) != sizeof *request)
+	if (receive(socket, request, 0, fds, &count) != sizeof *request ||
+	    request->magic != AVC_GUARD_MAGIC || request->kind != AVC_REQUEST_START || count != 2)
 		return -1;
-	header = CMSG_FIRSTHDR(&message);
-	if (request->magic != AVC_GUARD_MAGIC || request->kind != AVC_REQUEST_START || !header ||
-	    header->cmsg_type != SCM_RIGHTS || header->cmsg_len != CMSG_LEN(sizeof fds))
-		return -1;
-	memcpy(fds, CMSG_DATA(header), sizeof fds);
 	*init_pidfd = fds[0];
 	*heartbeat_fd = fds[1];
 	return 0;
@@ -585,7 +589,6 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 static void guard_free(struct avc_guard *guard)
 {
 	files_written_free(guard->written);
-	dirty_free(&guard->dirty);
 	process_free_room(&guard->main);
 	tree_free(&guard->tree);
 	mem_others_free(guard->main.others);

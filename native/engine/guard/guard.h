@@ -124,8 +124,11 @@ void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 
 void guard_drop_generation(struct avc_guard *guard, uint32_t i);
 void guard_drop_all(struct avc_guard *guard);
-/* Its index, or -1: it is not held.  0 is the number of the newest. */
+/* Its index, or -1: it is not held. */
 int guard_find_generation(const struct avc_guard *guard, uint64_t number);
+/* Somebody wants that one: of what came after it nothing is true any more.  If it was lost since
+ * it was asked for, the next older one is as near as it gets. */
+void guard_drop_newer(struct avc_guard *guard, uint64_t number);
 uint32_t guard_free_slot(const struct avc_guard *guard);
 void guard_lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason,
 			   uint64_t ticket);

@@ -321,14 +321,6 @@ void guard_app_dies(struct avc_guard *guard)
 	rt_priority_end();
 }
 
-/* Somebody wants that one: of what came after it nothing is true any more.  If it was lost since
- * it was asked for, the next older one is as near as it gets. */
-static void drop_newer(struct avc_guard *guard, uint64_t number)
-{
-	while (guard->count && guard->generations[guard->count - 1].number > number)
-		guard_drop_generation(guard, guard->count - 1);
-}
-
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_DIED);
@@ -367,7 +359,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 		}
 	}
 	if (reason == AVC_REASON_COMMAND && guard->restore_generation)
-		drop_newer(guard, guard->restore_generation);
+		guard_drop_newer(guard, guard->restore_generation);
 	ready_helper(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->pid)

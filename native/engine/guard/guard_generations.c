@@ -40,9 +40,15 @@ void guard_drop_all(struct avc_guard *guard)
 int guard_find_generation(const struct avc_guard *guard, uint64_t number)
 {
 	for (uint32_t i = guard->count; i-- > 0;)
-		if (!number || guard->generations[i].number == number)
+		if (guard->generations[i].number == number)
 			return (int)i;
 	return -1;
+}
+
+void guard_drop_newer(struct avc_guard *guard, uint64_t number)
+{
+	while (guard->count && guard->generations[guard->count - 1].number > number)
+		guard_drop_generation(guard, guard->count - 1);
 }
 
 uint32_t guard_free_slot(const struct avc_guard *guard)

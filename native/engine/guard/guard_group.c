@@ -193,20 +193,13 @@ int guard_meet_frozen(void *arg, bool whole, struct avc_error *err)
 
 void guard_forget(struct avc_guard *guard, uint64_t generation)
 {
-	for (uint32_t i = guard->count; i-- > 0;)
-		if (guard->policy.held[i].number == generation)
-			guard_drop_generation(guard, i);
+	const int i = guard_find_generation(guard, generation);
+
+	if (i >= 0)
+		guard_drop_generation(guard, (uint32_t)i);
 }
 
 /* ---- a return -------------------------------------------------------------------- */
-
-static bool has_recalled(const struct avc_guard *guard)
-{
-	for (uint32_t i = 0; i < guard->count; i++)
-		if (guard->policy.held[i].number == guard->recall)
-			return true;
-	return false;
-}
 
 static void wait_for_group(struct avc_guard *guard, const struct avc_error *error)
 {
@@ -255,9 +248,9 @@ static void go_back(struct avc_guard *guard)
 
 	rt_priority_begin();
 	guard->dead.waits = true; /* init is told that we are at work */
-	if (has_recalled(guard) && meet(guard, RECALL_DEAD, DEAD_NS, &error) == 0) {
-		while (guard->policy.held[guard->count - 1].number > guard->recall)
-			guard_drop_generation(guard, guard->count - 1);
+	if (guard_find_generation(guard, guard->recall) >= 0 &&
+	    meet(guard, RECALL_DEAD, DEAD_NS, &error) == 0) {
+		guard_drop_newer(guard, guard->recall);
 		forget_others(&guard->generations[guard->count - 1], &guard->config);
 		guard->restore_ticket = guard->dead.ticket;
 		back = guard_bring_back(guard, &guard->dead.report, guard->dead.reason,
@@ -295,7 +288,9 @@ void guard_go_back(struct avc_guard *guard, const struct avc_report *report, enu
 /* One that lives could be killed for nothing. */
 static int check_able(struct avc_guard *guard, struct avc_error *err)
 {
-	if (!has_recalled(guard))
+	const int i = guard_find_generation(guard, guard->recall);
+
+	if (i < 0)
 		return fail(err, AVC_EMPTY, 0, guard->main.pid, "go back", "",
 			    "it does not hold that line");
 	if (guard->dead.waits)
@@ -303,11 +298,8 @@ static int check_able(struct avc_guard *guard, struct avc_error *err)
 	if (!guard->main.pid || init_channel_stop_asked(&guard->channel))
 		return fail(err, AVC_GONE, 0, guard->main.pid, "go back", "",
 			    "it has ended, or has been asked to stop");
-	for (uint32_t i = 0; i < guard->count; i++)
-		if (guard->policy.held[i].number == guard->recall)
-			return guard_check_files(guard, &guard->generations[i], guard->main.pid,
-						 guard->main.pidfd, err);
-	return 0;
+	return guard_check_files(guard, &guard->generations[i], guard->main.pid, guard->main.pidfd,
+				 err);
 }
 
 void guard_recall(struct avc_guard *guard, const struct avc_request *request, int fd)
