@@ -115,8 +115,7 @@ static bool await(struct worker *on, uint64_t ns)
 
 	while (on->job) {
 		const uint64_t now = now_ns(), next = now + BEAT_NS < end ? now + BEAT_NS : end;
-		const struct timespec until = { .tv_sec = (time_t)(next / NS_PER_S),
-						.tv_nsec = (long)(next % NS_PER_S) };
+		const struct timespec until = timespec_of(next);
 		const uint32_t so_far = __atomic_load_n(&on->steps, __ATOMIC_RELAXED);
 
 		if (so_far != steps)

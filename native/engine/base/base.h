@@ -28,6 +28,7 @@
 #include <stdio.h>
 #include <sys/socket.h>
 #include <sys/types.h>
+#include <time.h>
 
 #include "arch.h"
 #include "avckpt/engine.h"
@@ -48,6 +49,7 @@ int fail(struct avc_error *err, enum avc_code code, int errnum, pid_t pid, const
 int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const char *syscall,
 	       const char *detail, ...) __attribute__((format(printf, 5, 6)));
 uint64_t now_ns(void);
+struct timespec timespec_of(uint64_t ns);
 void close_fd(int *fd);
 /* As much of it as there is; -1: it cannot be read. */
 ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);

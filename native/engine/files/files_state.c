@@ -520,12 +520,6 @@ static const char *put_count(int fd, const struct file *want, const struct file 
 	return NULL;
 }
 
-static struct timespec timespec_of(uint64_t ns)
-{
-	return (struct timespec){ .tv_sec = (time_t)(ns / NS_PER_S),
-				  .tv_nsec = (long)(ns % NS_PER_S) };
-}
-
 /* Beyond the instants at which it would have gone off: how often that was; 0: never again. */
 static uint64_t next_of(const struct file *want, uint64_t now_of_clock, uint64_t *ticks)
 {

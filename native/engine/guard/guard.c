@@ -387,9 +387,7 @@ static uint64_t work_due(struct avc_guard *guard)
 static bool poll_until(struct pollfd *fds, nfds_t n, uint64_t until)
 {
 	const uint64_t now = now_ns();
-	const uint64_t ns = until > now ? until - now : 0;
-	const struct timespec timeout = { .tv_sec = (time_t)(ns / NS_PER_S),
-					  .tv_nsec = (long)(ns % NS_PER_S) };
+	const struct timespec timeout = timespec_of(until > now ? until - now : 0);
 	const bool any = ppoll(fds, n, &timeout, NULL) != 0;
 
 	heartbeat();

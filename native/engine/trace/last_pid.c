@@ -375,28 +375,38 @@ static void wake(uint32_t *word)
 	syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
-int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
+/* Until *word is what the helper is to make of it; false: not within `ns`, or it has ended. */
+static bool await_word(const struct last_pid *helper, uint32_t *word, uint32_t wanted, uint64_t ns)
 {
-	const uint64_t end = now_ns() + NS_PER_S;
-	struct inj_slot *slot = served(helper);
-	uint32_t want, have;
-	int32_t error;
+	const uint64_t end = now_ns() + ns;
+	uint32_t value;
 
-	slot->last_pid = value;
-	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
-	wake(&slot->want);
-	for (uint32_t spins = 0; (have = __atomic_load_n(&slot->have, __ATOMIC_ACQUIRE)) != want;
+	for (uint32_t spins = 0; (value = __atomic_load_n(word, __ATOMIC_ACQUIRE)) != wanted;
 	     spins++) {
 		if (spins < ENGINE_SPINS) {
 			cpu_relax();
 			continue;
 		}
 		if (now_ns() > end || pidfd_ended(helper->pidfd))
-			return fail(err, AVC_KERNEL, ETIMEDOUT, 0, "restore", "write(ns_last_pid)",
-				    "the helper does not answer (setns(2) into the container takes "
-				    "CAP_SYS_ADMIN and CAP_SYS_CHROOT)");
-		sleep_on(&slot->have, have);
+			return false;
+		sleep_on(word, value);
 	}
+	return true;
+}
+
+int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
+{
+	struct inj_slot *slot = served(helper);
+	uint32_t want;
+	int32_t error;
+
+	slot->last_pid = value;
+	want = __atomic_add_fetch(&slot->want, 1, __ATOMIC_ACQ_REL);
+	wake(&slot->want);
+	if (!await_word(helper, &slot->have, want, NS_PER_S))
+		return fail(err, AVC_KERNEL, ETIMEDOUT, 0, "restore", "write(ns_last_pid)",
+			    "the helper does not answer (setns(2) into the container takes "
+			    "CAP_SYS_ADMIN and CAP_SYS_CHROOT)");
 	error = __atomic_load_n(&helper->page->error, __ATOMIC_RELAXED);
 	if (error)
 		return fail(
@@ -425,20 +435,9 @@ void last_pid_serve(struct last_pid *helper, struct inj_slot *slot)
 
 void last_pid_stop(struct last_pid *helper)
 {
-	const uint64_t end = now_ns() + STOP_NS;
-	uint32_t *const stopped = &helper->page->stopped;
-
 	__atomic_store_n(&helper->page->stop, 1, __ATOMIC_RELEASE);
 	rouse(served(helper));
-	for (uint32_t spins = 0; !__atomic_load_n(stopped, __ATOMIC_ACQUIRE); spins++) {
-		if (spins < ENGINE_SPINS) {
-			cpu_relax();
-			continue;
-		}
-		if (now_ns() > end || pidfd_ended(helper->pidfd))
-			break;
-		sleep_on(stopped, 0);
-	}
+	(void)await_word(helper, &helper->page->stopped, 1, STOP_NS);
 }
 
 void last_pid_end(struct last_pid *helper)
