@@ -39,7 +39,7 @@ struct process_attrs {
 	struct action action[SIGNALS];
 	int64_t brk;
 	uint32_t personality;
-	uint64_t state_permitted;       /* arch.h, ARCH_STATE_PERMITTED                   */
+	uint64_t state_permitted;       /* arch_cpu.h, ARCH_STATE_PERMITTED               */
 	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
 	int64_t barriers;               /* membarrier(2): commands that register it          */
 	uint32_t keys;                  /* pkey_alloc(2): by number; 0: the CPU has none     */

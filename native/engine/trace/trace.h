@@ -66,7 +66,7 @@ struct creds {
 	uint32_t fsuid, fsgid;
 	uint32_t caps[6]; /* as capget(2) has them                            */
 	uint64_t bounding, ambient;
-	uint64_t state_permitted; /* arch.h, ARCH_STATE_PERMITTED                     */
+	uint64_t state_permitted; /* arch_cpu.h, ARCH_STATE_PERMITTED                 */
 	uint32_t personality;
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;

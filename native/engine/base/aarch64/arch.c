@@ -458,7 +458,7 @@ static const uint32_t stub_code[] = {
 };
 _Static_assert(SYS_wait4 == 260 && SYS_exit == 93 && SYS_rt_sigreturn == 139, "stub_code");
 _Static_assert(sizeof stub_code <= sizeof((struct inj_home *)0)->siginfo, "stub_code");
-_Static_assert(sizeof(struct inj_home) <= ARCH_STUB_BYTES, "arch.h");
+_Static_assert(sizeof(struct inj_home) <= ARCH_STUB_BYTES, "arch_cpu.h");
 
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask)
 {

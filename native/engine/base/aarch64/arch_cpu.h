@@ -1,8 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Everything the engine knows about the CPU (aarch64).  The names are those of x86_64/arch.h,
- * where they are explained; here is what is different.  ptrace(2) errors are returned as -1
- * with errno.
+ * What of arch.h is the CPU's own (aarch64).  The names are those of x86_64/arch_cpu.h, where they
+ * are explained; here is what is different.
  *
  * When a thread stops that was in a system call, the kernel has put its registers back to
  * where the call is made again, if it is to be, and tells neither that it was in one nor
@@ -10,17 +9,12 @@
  * struct arch_regs is as x86-64 has it all the same: arch_regs_get() finds it out from the
  * instruction at the program counter, and arch_regs_set() puts it back.
  */
+#ifndef AVCKPT_ARCH_CPU_H
+#define AVCKPT_ARCH_CPU_H
+
 #ifndef AVCKPT_ARCH_H
-#define AVCKPT_ARCH_H
-
-#include <linux/audit.h>
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <sys/types.h>
-#include <sys/user.h>
-
-#include "home.h"
+#error "include arch.h"
+#endif
 
 #define ARCH_NAME "aarch64"
 #define ARCH_AUDIT AUDIT_ARCH_AARCH64
@@ -34,13 +28,6 @@ struct arch_regs {
 	long result;
 };
 
-/* An address in a process, never to be dereferenced here. */
-typedef uint64_t avc_remote;
-
-int arch_regs_get(pid_t tid, struct arch_regs *regs);
-int arch_regs_set(pid_t tid, const struct arch_regs *regs);
-int arch_result_set(pid_t tid, long result);
-
 static inline long arch_syscall_nr(const struct arch_regs *regs)
 {
 	return regs->nr;
@@ -52,7 +39,6 @@ static inline uint32_t arch_call_mark(const struct arch_regs *regs)
 {
 	return regs->nr >= 0 ? (uint32_t)(regs->r.regs[8] >> 32) : 0;
 }
-int arch_call_mark_set(pid_t tid, struct arch_regs *regs, uint32_t mark);
 /* A thread that is about to make the call is no different from one that is in it. */
 static inline uint32_t arch_result_mark(const struct arch_regs *regs)
 {
@@ -108,14 +94,8 @@ static inline void arch_pc_set(struct arch_regs *regs, avc_remote pc)
 	regs->r.pc = pc;
 }
 
-bool arch_is_native(const struct arch_regs *regs);
-void arch_rewind(struct arch_regs *regs);
-
 #define ARCH_CODE_BYTES 8
-long arch_syscall_nr_before(const uint8_t code[ARCH_CODE_BYTES]);
-
 #define ARCH_SYSCALL_BYTES 4
-bool arch_is_syscall(const uint8_t code[ARCH_SYSCALL_BYTES]);
 
 /* Whether the kernel goes on with such a call, and does not begin it again, and does not say so:
  * only of a thread that slept in it is that known. */
@@ -125,44 +105,15 @@ void arch_note_slept(struct arch_regs *regs);
 /* Whether the thread has registers that no system call leaves alone: it is not to be borrowed now. */
 bool arch_is_delicate(pid_t tid);
 
-void arch_resume(struct arch_regs *regs);
-void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
-	       uint64_t arg);
-void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
-		uint64_t b);
-void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
-
-size_t arch_xstate_bytes(void);
-size_t arch_frame_bytes(void);
-/* ENOTSUP: SME is in use, or vectors are longer than a frame has room for. */
-int arch_frame_read_xstate(pid_t tid, void *frame);
-/* Vectors of a length of their own (SVE). */
-bool arch_frame_needs_room(const void *frame);
 /* Nobody has to ask for anything: PR_SVE_GET_VL stores nothing. */
 #define ARCH_STATE_CALL SYS_prctl
 #define ARCH_STATE_PERMITTED 51
 #define ARCH_STATE_ASK 51
 #define ARCH_STATE_NUMBER 63
-avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
-			    uint64_t sigmask, const uint64_t altstack[3]);
-
-struct arch_signal_frame {
-	avc_remote at;
-	uint64_t sigmask;
-	int signal;
-};
-#define ARCH_SIGNAL_FRAME_BYTES 1024
-bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, size_t *next,
-			    struct arch_signal_frame *found);
 
 /* The stub goes back from a signal frame that it brings along, by rt_sigreturn(2). */
-#define ARCH_STUB_WAIT SYS_wait4
 #define ARCH_STUB_BYTES 1152
-size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
 /* The vector registers, without which there is no signal frame. */
 int arch_stub_read_xstate(pid_t tid, uint8_t *code);
-bool arch_is_stub(const uint8_t *code);
-void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub,
-		    bool last, long nr, const uint64_t arg[6]);
 
 #endif
