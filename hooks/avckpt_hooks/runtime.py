@@ -122,7 +122,8 @@ def _rewrite(path: str, container: str) -> None:
     if docker is not None and docker["Config"].get("Healthcheck"):
         answer = {"healthcheck": docker["Config"]["Healthcheck"], "startup_healthcheck": None}
         files.write_private(protocol.health_path(key), json.dumps(answer).encode())
-    _replace(path, json.dumps(data, separators=(",", ":")).encode())
+    # As readable as it was.
+    files.write_at_once(path, json.dumps(data, separators=(",", ":")).encode(), os.stat(path).st_mode & 0o777)
 
 
 def _docker(config: bytes, container: str) -> dict[str, Any] | None:
@@ -164,21 +165,6 @@ def _signal_number(text: str) -> str:
     name = text.upper() if text.upper().startswith("SIG") else f"SIG{text.upper()}"
     number = getattr(signal, name, None)
     return str(int(number)) if isinstance(number, signal.Signals) else ""
-
-
-def _replace(path: str, content: bytes) -> None:
-    """Writes a file anew, at once or not at all, as readable as it was.  Raises OSError."""
-    temporary = f"{path}.avckpt"
-    mode = os.stat(path).st_mode & 0o777
-    try:
-        fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
-        with open(fd, "wb") as file:
-            file.write(content)
-        os.replace(temporary, path)
-    except OSError:
-        if os.path.exists(temporary):
-            os.unlink(temporary)
-        raise
 
 
 def _complain(line: str, log: str) -> None:

@@ -25,13 +25,13 @@ def write_private(path: str, content: bytes) -> None:
     write_at_once(path, content)
 
 
-def write_at_once(path: str, content: bytes) -> None:
-    """Writes a private file at once or not at all, in a directory that others may look into.  Raises OSError."""
+def write_at_once(path: str, content: bytes, mode: int = 0o600) -> None:
+    """Writes a file at once or not at all, in a directory that is left as it is.  Raises OSError."""
     temporary = f"{path}.{os.getpid()}"
     with contextlib.suppress(FileNotFoundError):
         os.unlink(temporary)  # of an earlier process with our number
     # The mode is there from the start: whoever opens a file while it is readable goes on reading it.
-    fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
     try:
         with open(fd, "wb") as file:
             file.write(content)

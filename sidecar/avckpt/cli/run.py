@@ -24,13 +24,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
 from avckpt.artifacts import init_binary
 from avckpt.cli.namespace import spawn_pid1
 from avckpt.containers.cgroup import groups_of
+from avckpt.containers.process import stat_fields
 from avckpt.engine import Engine, probe
 from avckpt.errors import AvckptError, LabelsWrong
 from avckpt.events.journal import Journal
@@ -230,7 +230,7 @@ class Job:
             if group == os.getpgrp():
                 self.go_on()  # a shell has brought us back to the foreground
                 return
-            state, parent = Path(f"/proc/{group}/stat").read_text().rpartition(")")[2].split()[:2]
+            state, parent = stat_fields(group)[:2]
         except OSError:
             return
         if int(parent) != self._init_pid:

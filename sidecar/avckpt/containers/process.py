@@ -11,18 +11,25 @@ from pathlib import Path
 from avckpt.errors import TargetGone
 
 
+def stat_fields(pid: int) -> list[str]:
+    """Those of /proc/PID/stat, proc(5), from the third on: state, parent, ...
+
+    Raises OSError, also when there is no such process.
+    """
+    text = Path(f"/proc/{pid}/stat").read_text(errors="replace")
+    # Field 2 is the name in parentheses and may hold anything, parentheses too.
+    return text.rpartition(")")[2].split()
+
+
 def start_time(pid: int) -> int:
     """When `pid` started, in clock ticks since boot: field 22 of /proc/PID/stat, proc(5).
 
     Raises TargetGone when there is no such process.
     """
     try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
+        return int(stat_fields(pid)[22 - 3])
     except (FileNotFoundError, ProcessLookupError) as error:
         raise TargetGone("no such process", pid=pid) from error
-    # Field 2 is the name in parentheses and may hold anything, parentheses too.
-    fields = stat[stat.rindex(b")") + 2 :].split()
-    return int(fields[22 - 3])
 
 
 def age_s(pid: int) -> float:

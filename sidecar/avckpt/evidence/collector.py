@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avckpt.containers.looks import look
+from avckpt.containers.process import stat_fields
 from avckpt.errors import AvckptError
 from avckpt.events.vocabulary import signal_name
 from avckpt.evidence.crash import Crash, Frame, crash_of, fingerprint, placed
@@ -112,8 +113,7 @@ class Collector:
 
 def _examine(case: Case) -> tuple[Crash, list[Frame]]:
     """Raises OSError."""
-    parent = Path(f"/proc/{case.remains_pid}/stat").read_text().rpartition(")")[2].split()[1]
-    if int(parent) != case.init_pid:
+    if int(stat_fields(case.remains_pid)[1]) != case.init_pid:
         raise ProcessLookupError(f"process {case.remains_pid} is another one")
     remains = Remains(case.remains_pid)
     try:

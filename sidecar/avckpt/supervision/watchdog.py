@@ -15,7 +15,8 @@ import select
 import signal
 import time
 from collections.abc import Callable
-from pathlib import Path
+
+from avckpt.containers.process import stat_fields
 
 log = logging.getLogger("avckpt")
 
@@ -112,6 +113,6 @@ def _watch(child: int, signs: int) -> int:
 
 def _state(pid: int) -> str:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return stat_fields(pid)[0]
     except OSError:
         return ""
