@@ -46,7 +46,7 @@ from testkit.harness import (
     running_sidecar,
     wait_until,
 )
-from testkit.procfs import children_of, inside
+from testkit.nodes import app_pid, nodes_of
 
 RESULTS = ROOT / "bench/results/nodes.json"
 WITHIN_MS = 20.0
@@ -116,11 +116,7 @@ class Nodes:
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """By name."""
-        return {
-            row["name"].partition("/")[2]: row
-            for row in self.sidecar.ps()
-            if row["node_of"] == self.container.id and not row["ended_at"]
-        }
+        return nodes_of(self.sidecar, self.container)
 
     def wait_protected(self) -> dict[str, dict[str, Any]]:
         def found() -> dict[str, dict[str, Any]]:
@@ -136,11 +132,6 @@ class Nodes:
             board.forget_gap()
         time.sleep(seconds)
         return max(board.see().gap_ns for board in self.boards.values()) / 1e6
-
-
-def app_pid(row: dict[str, Any]) -> int:
-    """Its application now."""
-    return next((pid for pid in children_of(row["init_pid"]) if inside(pid) == row["app_pid_inside"]), 0)
 
 
 def start(

@@ -10,11 +10,13 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
 
 import pytest
 
 from testkit import devices, harness
 from testkit.harness import CommandFailed, ContainerFactory, Podman, Sidecar
+from testkit.local_sidecar import LocalSidecar, local_sidecar
 
 CONTAINERS = pytest.StashKey[ContainerFactory]()
 
@@ -89,6 +91,14 @@ def attempt(look: Callable[[], str]) -> str:
         return look()[-8000:]
     except (CommandFailed, subprocess.TimeoutExpired, OSError) as error:
         return f"(could not be had: {error})"
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Iterator[LocalSidecar]:
+    """A sidecar without Podman, which runs."""
+    with local_sidecar(tmp_path) as sidecar:
+        sidecar.start()
+        yield sidecar
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from jsonschema import Draft202012Validator
 from prometheus_client.parser import text_string_to_metric_families
 
 from testkit.harness import avckpt_command, take_checkpoint, wait_until
-from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
+from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended
 
 SLEEPER = ["sleep", "1000"]
 Stream = Generator[dict[str, Any], None, None]
@@ -35,13 +35,6 @@ pytestmark = [
         "init waits two seconds for its guard, which may get no CPU for as long; events are given a time to come"
     ),
 ]
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
 
 
 class Connection(http.client.HTTPConnection):

@@ -9,7 +9,6 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import pytest
 from avckpt.cli.client import Client
 
 from testkit.harness import ROOT, wait_until
-from testkit.local_sidecar import Container, LocalSidecar, ended, local_sidecar
+from testkit.local_sidecar import Container, LocalSidecar, ended
 from testkit.procfs import children_of
 
 TOGETHER = {
@@ -32,13 +31,6 @@ pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
     pytest.mark.shared_machine("init waits two seconds for its guard, and members for each other, for 50 ms at least"),
 ]
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
 
 
 def free_ports(count: int) -> int:

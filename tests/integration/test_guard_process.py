@@ -6,27 +6,19 @@ from __future__ import annotations
 import os
 import resource
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from testkit.harness import wait_until
-from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
+from testkit.local_sidecar import Container, LocalSidecar
 
 pytestmark = pytest.mark.shared_machine("a guard that gets no CPU for long is taken for one that hangs")
 
 SLEEPER = ["sleep", "infinity"]
 
 CAP_SYS_MODULE, CAP_SYS_PTRACE, CAP_SYS_RAWIO, CAP_SYS_BOOT, CAP_SYS_TIME, CAP_MKNOD = 16, 19, 17, 22, 25, 27
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
 
 
 def guard_of(local: LocalSidecar, container: Container) -> int:

@@ -20,7 +20,7 @@ import pytest
 from avckpt.artifacts import init_binary
 
 from testkit.harness import avckpt_command, run, wait_until
-from testkit.local_sidecar import LocalSidecar, local_sidecar
+from testkit.local_sidecar import LocalSidecar
 from testkit.procfs import children_of, inside
 
 pytestmark = [
@@ -40,13 +40,6 @@ for i in range(10**9):
 COUNT = [sys.executable, "-c", COUNTER]
 QUICK = ("--label", "avckpt.interval=100ms")
 Json = dict[str, Any]
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from testkit.harness import RUN_DIR, wait_until
-from testkit.procfs import children_of, inside
+from testkit.nodes import app_pid, nodes_of
 
 if TYPE_CHECKING:
     from testkit.harness import Container, ContainerFactory, Podman, Sidecar
@@ -47,22 +47,13 @@ def node(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def rows(sidecar: Sidecar, container: Container) -> dict[str, dict[str, Any]]:
-    """The container's nodes by their names, as `avckpt ps` has them."""
-    return {
-        row["name"].partition("/")[2]: row
-        for row in sidecar.ps()
-        if row["node_of"] == container.id and not row["ended_at"]
-    }
-
-
 def wait_nodes(
     sidecar: Sidecar, container: Container, count: int, timeout_s: float = 60.0
 ) -> dict[str, dict[str, Any]]:
     """Waits until so many nodes are protected, with two generations."""
 
     def found() -> dict[str, dict[str, Any]]:
-        known = rows(sidecar, container)
+        known = nodes_of(sidecar, container)
         ready = [row for row in known.values() if row["state"] == "protected" and row["generations"] >= 2]
         return known if len(ready) >= count else {}
 
@@ -74,11 +65,6 @@ def wait_nodes(
 
 def numbers(path: Path) -> list[list[str]]:
     return [line.split() for line in path.read_text().splitlines()]
-
-
-def app_pid(row: dict[str, Any]) -> int:
-    """Its application now: in our namespace it has another number after each restore."""
-    return next((pid for pid in children_of(row["init_pid"]) if inside(pid) == row["app_pid_inside"]), 0)
 
 
 def test_a_shell_launcher(container: ContainerFactory, sidecar: Sidecar, node: Path) -> None:
@@ -94,10 +80,10 @@ def test_a_shell_launcher(container: ContainerFactory, sidecar: Sidecar, node: P
     assert car.logs().split()[0] == "1"
     for restores, signum in enumerate(SIGNALS, 1):
         for name, file in (("a", "a"), ("python3", "b")):
-            before = rows(sidecar, car)[name]
+            before = nodes_of(sidecar, car)[name]
             os.kill(app_pid(before), signum)
             row = wait_until(
-                lambda: (lambda r: r if r["restores"] >= restores else {})(rows(sidecar, car)[name]),  # noqa: B023
+                lambda: (lambda r: r if r["restores"] >= restores else {})(nodes_of(sidecar, car)[name]),  # noqa: B023
                 20,
                 f"{name} is restored",
             )
@@ -116,7 +102,7 @@ def test_a_shell_launcher(container: ContainerFactory, sidecar: Sidecar, node: P
     done = car.stop(9)
     assert done.took_s < 8
     assert car.logs().split("\n")[1:3] == ["a 143", "b 143"]
-    assert rows(sidecar, car) == {}
+    assert nodes_of(sidecar, car) == {}
 
 
 def test_a_restarted_sidecar_knows_them_again(container: ContainerFactory, sidecar: Sidecar, node: Path) -> None:
@@ -126,7 +112,7 @@ def test_a_restarted_sidecar_knows_them_again(container: ContainerFactory, sidec
     after = wait_nodes(sidecar, car, 2)
     assert {row["init_pid"] for row in before.values()} == {row["init_pid"] for row in after.values()}
     os.kill(app_pid(after["a"]), signal.SIGKILL)
-    wait_until(lambda: rows(sidecar, car)["a"]["restores"] == 1, 20, "it is restored")
+    wait_until(lambda: nodes_of(sidecar, car)["a"]["restores"] == 1, 20, "it is restored")
     assert "ended" not in car.logs()
 
 
@@ -144,7 +130,7 @@ def test_what_a_container_may_not_do(container: ContainerFactory, sidecar: Sidec
         web = container.protected("sh", "-c", script, labels=labels, options=options)
         web.wait_for_log("status 0")
         assert says in web.logs()
-        assert rows(sidecar, web) == {}
+        assert nodes_of(sidecar, web) == {}
     car = container.protected(
         "sh", "-c", "$AVCKPT_INIT --label avckpt.group=x -- sleep 3; echo status $?", labels={"scope": "nodes"}
     )
@@ -198,9 +184,9 @@ def test_supervisord(container: ContainerFactory, sidecar: Sidecar, node: Path) 
     dice = random.Random(1)
     for restores in range(1, 6):
         for name in "ab":
-            wait_until(lambda: rows(sidecar, car)[name]["generations"] == 2, 20, "two generations")  # noqa: B023
-            os.kill(app_pid(rows(sidecar, car)[name]), dice.choice(SIGNALS))
-            wait_until(lambda: rows(sidecar, car)[name]["restores"] == restores, 20, f"{name} is restored")  # noqa: B023
+            wait_until(lambda: nodes_of(sidecar, car)[name]["generations"] == 2, 20, "two generations")  # noqa: B023
+            os.kill(app_pid(nodes_of(sidecar, car)[name]), dice.choice(SIGNALS))
+            wait_until(lambda: nodes_of(sidecar, car)[name]["restores"] == restores, 20, f"{name} is restored")  # noqa: B023
     log = car.logs()
     assert log.count("exited:") == 1, log
     assert log.count("spawned:") == 3, log

@@ -8,7 +8,6 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import pytest
 from avckpt.cli.client import Client
 
 from testkit.harness import wait_until
-from testkit.local_sidecar import QUICK, Container, LocalSidecar, ended, local_sidecar
+from testkit.local_sidecar import QUICK, Container, LocalSidecar, ended
 from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
@@ -36,13 +35,6 @@ pytestmark = [
         "init waits two seconds for its guard, which may get no CPU for as long; notifications have time limits"
     ),
 ]
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
 
 
 def listener(local: LocalSidecar, name: str, labels: dict[str, str]) -> Container:

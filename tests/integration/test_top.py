@@ -10,8 +10,7 @@ import select
 import signal
 import subprocess
 import time
-from collections.abc import Awaitable, Callable, Iterator
-from pathlib import Path
+from collections.abc import Awaitable, Callable
 
 import pytest
 from avckpt.cli.client import Client
@@ -20,7 +19,7 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable, RichLog
 
 from testkit.harness import avckpt_command, wait_until
-from testkit.local_sidecar import LocalSidecar, local_sidecar
+from testkit.local_sidecar import LocalSidecar
 
 SLEEPER = ["sleep", "1000"]
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "300ms"}
@@ -29,13 +28,6 @@ pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
     pytest.mark.shared_machine("a screen is given a time to show what it should"),
 ]
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
 
 
 def cells(app: Top, column: str) -> list[str]:

@@ -60,13 +60,6 @@ class Site:
             return answer.status, answer.read().decode()
 
 
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[LocalSidecar]:
-    with local_sidecar(tmp_path) as sidecar:
-        sidecar.start()
-        yield sidecar
-
-
 @contextlib.contextmanager
 def site(local: LocalSidecar, *options: str) -> Iterator[Site]:
     process = subprocess.Popen(
