@@ -4,8 +4,8 @@
 
 Called avckpt-runtime, it is an OCI runtime.
 
--I and -S keep the user's and the site's Python out of it (and are faster), -B
-leaves no caches behind that nobody would remove.
+-I and -S keep the user's and the site's Python out of it (and are faster), -B leaves no caches
+behind that nothing would remove.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds out a container's health check for the sidecar, after the container has started.
 
-`restore.on` with `unhealthy`, in a label or in the sidecar's configuration,
-needs the health check that Podman knows of the container, whoever gave it: the
-command line, the image, Compose, the API.  Only `podman inspect` tells it, and
-that waits for the container's lock, which is
-held as long as a hook runs.  So the precreate hook leaves a process behind that
-asks when the lock is free, and writes the answer to `protocol.health_path()`.
+`restore.on` with `unhealthy`, in a label or in the sidecar's configuration, needs the
+container's health check as Podman has it, from the command line, the image, Compose or
+the API. Only `podman inspect` reports it, and that waits for the container's lock, which
+is held while a hook runs. So the precreate hook leaves a process behind that asks when
+the lock is free, and writes the answer to `protocol.health_path()`.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 GIVE_UP_S = 60.0
-"""How long the answer is waited for: as long as a slow image may take to start."""
+"""How long to wait for the answer: as long as a slow image may take to start."""
 
 
 def ask_later(container: str, parent: int) -> None:
     """Returns at once; the answer comes when the container has started.  Raises OSError."""
-    ask = podman.inspector(container, parent)  # while the parent is still there to be looked at
+    ask = podman.inspector(container, parent)  # while the parent is still there to be examined
     first = os.fork()
     if first:
         os.waitpid(first, 0)
         return
-    # An orphan with nothing of Podman's: it must not wait for us, nor for our output.
+    # An orphan that shares nothing with Podman, which must wait neither for us nor for our output.
     status = 1
     try:
         os.setsid()
@@ -50,7 +49,7 @@ def ask_later(container: str, parent: int) -> None:
 
 
 def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
-    """Asks, and writes what is said: the health checks as `podman inspect` has them, or null."""
+    """Asks, and writes the answer: the health checks as `podman inspect` has them, or null."""
     try:
         config = json.loads(ask(time.monotonic() + GIVE_UP_S))[0]["Config"]
         # The latter since Podman 4.5.
@@ -68,7 +67,7 @@ def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
     if len(content) > protocol.MAX_BYTES:
         content = json.dumps({"healthcheck": None, "error": "its health check is too long"}).encode()
     files.write_private(path, content)
-    if _has_ended(container):  # and the poststop hook was here already
+    if _has_ended(container):  # and the poststop hook has run already
         with contextlib.suppress(FileNotFoundError):
             os.unlink(path)
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a precreate hook can learn about the container it is called for.
 
-Podman gives it neither the container's id nor its labels, and holds the
-container's lock meanwhile, so that most ways to ask for them never return.
-`podman generate spec` takes no lock.
+Podman passes it neither the container's id nor its labels, and holds the
+container's lock meanwhile, so that most queries would never return. `podman
+generate spec` takes no lock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _ID_LENGTH = 64
 _TIMEOUT_S = 20.0
 _MOST_BYTES = 16 << 20
-"""Of what a program says: labels and health checks are an image's, which may say anything."""
+"""Limit for a program's output: labels and health checks come from an image, which is not trusted."""
 _SIGKILL = 9  # importing signal takes 4 ms
 _DEFAULT_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
@@ -66,7 +66,7 @@ _OTHER_FLAGS = {
 
 
 class Unknown(Exception):
-    """What was asked for cannot be found out; the text says why."""
+    """The answer cannot be found out; the text says why."""
 
 
 def container_id(config: bytes) -> str:
@@ -76,8 +76,8 @@ def container_id(config: bytes) -> str:
     --cgroups=disabled the paths of files that Podman mounts.
     """
     # Searched, not parsed: reading 25 kB of JSON is half of what an unlabelled
-    # container would pay for this hook.  From the end: annotations, which are
-    # the user's and may be called anything, come before.
+    # container would pay for this hook. From the end: annotations, whose names
+    # the user chooses, come before.
     start, end = b'"cgroupsPath":"', b'"'
     at = config.rfind(start)
     if at >= 0:
@@ -128,9 +128,8 @@ def generate_spec(container: str, parent_pid: int) -> bytes:
 def inspector(container: str, parent_pid: int) -> Callable[[float], bytes]:
     """A function of a deadline (CLOCK_MONOTONIC, s) that returns what `podman inspect` prints for a container.
 
-    It asks as `generate_spec()` does, and may be called when the parent is
-    gone.  It waits for the container's lock: never call it in a hook.  Raises
-    Unknown.
+    It asks as `generate_spec()` does, and may be called when the parent has exited. It waits for the
+    container's lock: never call it in a hook. Raises Unknown.
     """
     argv = _cmdline(parent_pid)
     env = _environment(parent_pid)
@@ -152,7 +151,7 @@ def inspector(container: str, parent_pid: int) -> Callable[[float], bytes]:
 
 
 def is_service(pid: int) -> bool:
-    """True if `pid` is Podman's REST service: its standard error is no user's."""
+    """True if `pid` is Podman's REST service, whose standard error no user reads."""
     argv = _cmdline(pid)
     return "system" in argv and "service" in argv
 
@@ -160,8 +159,8 @@ def is_service(pid: int) -> bool:
 def store_flags(argv: list[str], anywhere: bool = False) -> list[str]:
     """The options of a Podman command line that decide where containers are.
 
-    Looks before the subcommand; with `anywhere` at all of it, which may take
-    an option of the container's own command for one of Podman's.
+    Searches before the subcommand; with `anywhere` the whole line, which may
+    mistake an option of the container's own command for one of Podman's.
     """
     flags: list[str] = []
     words = iter(argv[1:])
@@ -217,7 +216,7 @@ def _environment(pid: int) -> dict[str, str]:
                     env[name] = value
     except OSError:
         pass
-    # These would make it a client of some other Podman.
+    # These would make it a client of another Podman.
     env.pop("CONTAINER_HOST", None)
     env.pop("CONTAINER_CONNECTION", None)
     env.setdefault("PATH", os.environ.get("PATH") or _DEFAULT_PATH)
@@ -273,7 +272,7 @@ def _run(program: str, argv: list[str], env: dict[str, str], deadline: float) ->
             wait_s = deadline - time.monotonic()
             ready = poll.poll(wait_s * 1000) if wait_s > 0 else []
             if not ready:
-                os.kill(pid, _SIGKILL)  # our child, which nobody else waits for: the number is its own
+                os.kill(pid, _SIGKILL)  # our child, which only we reap: the PID cannot have been reused
                 raise Unknown(f"podman {_asked(argv)} took too long")
             for fd, _ in ready:
                 part = os.read(fd, 65536)

@@ -2,8 +2,8 @@
 """The poststop hook: a protected container has stopped.
 
 The OCI runtime runs it on the host with the container's state on standard
-input.  It never fails; a sidecar that is away finds out by itself (the record
-is gone, and so is the process).
+input. It never fails; a sidecar that is not running finds out by itself (the
+record is gone, and so is the process).
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
 
 Podman runs it on the host for *every* container it starts, with the OCI
 configuration on standard input, and takes the configuration from its standard
-output.  Anything that is not a protected container passes byte for byte.
+output. The configuration of any other container passes unchanged, byte for byte.
 
-It is the only hook that Podman's hooks directory names.  The other two it adds
-to the configuration of a protected container itself: Podman matches hooks
-before this one has stamped its annotations, so that they would have to be
-started for every container to find out that they have nothing to do.
+It is the only hook in Podman's hooks directory. It adds the other two to the
+configuration of a protected container itself: Podman matches hooks before this one
+has stamped its annotations, so otherwise they would run for every container, mostly
+in vain.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ WAIT_MS = 2000
 IO_URING = ("io_uring_setup", "io_uring_enter", "io_uring_register")
 
 HOOK_TIMEOUT_S = 120
-"""After this the OCI runtime kills our hooks, and then the container does not start: for what nobody has
-thought of.  They bound their own waits to seconds, but on a machine that is overloaded, while it boots for
-example, the start of Python alone may take as long as that."""
+"""After this the OCI runtime kills our hooks, and the container does not start: a last resort. They bound
+their own waits to seconds, but on an overloaded machine, for example while it boots, starting Python alone
+may take as long as that."""
 
 _MARK = b'"avckpt.'
-"""Without it in a text of JSON, no label or annotation of ours is in there."""
+"""A JSON text without it contains no label or annotation of ours."""
 _LOOKALIKE = b'"avckpt'
-"""Without it in a text of JSON in lower case, none that was meant for us is."""
+"""A JSON text that, in lower case, lacks it contains none that was meant for us."""
 
 
 class Refused(Exception):
@@ -85,7 +85,8 @@ def rewrite(config: bytes, parent: int) -> bytes:
 
 
 def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) -> bytes:
-    """The same, of a container whose name and labels are in `spec`.  `parent` 0: Podman is not there (runtime.py)."""
+    """The same, of a container whose name and labels are in `spec`. `parent` 0: there is no Podman
+    (runtime.py)."""
     import json
 
     from avckpt_hooks.shared import labels
@@ -108,9 +109,9 @@ def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) ->
     if not policy.enable and not (policy.listens and _is_ours()):
         return config
     annotations = {**annotations, **wanted, "avckpt.name": name, "avckpt.version": VERSION}
-    annotations.pop("avckpt.id", None)  # avckpt-runtime's to say, and nobody else's
+    annotations.pop("avckpt.id", None)  # only avckpt-runtime may set it
     if not policy.enable:
-        # Nothing of it is touched: the sidecar only has to know that it runs.
+        # Left unchanged: the sidecar only has to know that it runs.
         data["annotations"] = annotations
         add_hooks(data, told=True)
         return json.dumps(data, separators=(",", ":")).encode()
@@ -118,7 +119,7 @@ def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) ->
     if reason:
         warn(f"container {name} runs unprotected: {reason}", parent)
         return config
-    # The hook stands in two directories.
+    # The hook is in two directories.
     if data["process"]["args"][0] == INIT_PATH or INIT_PATH in map(_destination, data.get("mounts") or []):
         return config
     told = _tell_if_alone(name, parent)
@@ -152,7 +153,7 @@ def put_init_in_front(data: dict[str, Any]) -> None:
     from avckpt_hooks.shared.programs import OTHER_INITS
 
     args = data["process"]["args"]
-    # --init's own init would only stand between ours and the app.
+    # --init's own init would only get between ours and the app.
     if args[0] in OTHER_INITS:
         args = args[2:] if args[1:2] == ["--"] else args[1:]
     stop_signal = (data.get("annotations") or {}).get("org.opencontainers.image.stopSignal", "15")
@@ -171,10 +172,11 @@ def put_init_in_front(data: dict[str, Any]) -> None:
 
 
 def lend_init(data: dict[str, Any]) -> None:
-    """Leaves the main process, a launcher, as it is, and gives it what it takes to start units.  Changes `data`."""
+    """Leaves the main process, a launcher, as it is, and gives it what it needs to start units. Changes
+    `data`."""
     from avckpt_hooks.shared import protocol
 
-    # Not the socket itself: each sidecar makes a new one.
+    # Not the socket itself: each sidecar creates a new one.
     os.makedirs(protocol.units_dir(), mode=0o755, exist_ok=True)
     _mount(data, init_binary(), INIT_PATH)
     _mount(data, protocol.units_dir(), protocol.UNITS_IN_CONTAINER)
@@ -197,7 +199,7 @@ def _mount(data: dict[str, Any], source: str, destination: str) -> None:
 
 
 def take_io_uring_away(data: dict[str, Any]) -> None:
-    """Has io_uring answer as on a kernel that has none, by the container's seccomp profile.  Changes `data`."""
+    """Makes io_uring fail as on a kernel without it, by the container's seccomp profile.  Changes `data`."""
     linux = data.setdefault("linux", {})
     # A container without a profile (--privileged, seccomp=unconfined) gets one that allows all else.
     profile = linux.get("seccomp") or {"defaultAction": "SCMP_ACT_ALLOW"}
@@ -229,9 +231,9 @@ def add_hooks(data: dict[str, Any], told: bool) -> None:
 def spoil(config: bytes, line: str) -> bytes:
     """A configuration that cannot start, so that `line` is the reason given.
 
-    A client of Podman's REST service sees what Podman says, and of a failed
-    precreate hook that is the exit status only.  Of a hook that is not there,
-    runtimes say the path.
+    A client of Podman's REST service sees Podman's message, which for a
+    failed precreate hook has the exit status only. For a missing hook,
+    runtimes report the path.
     """
     import json
 
@@ -266,7 +268,7 @@ def _destination(mount: dict[str, Any]) -> object:
 
 
 def _unprotectable(data: dict[str, Any], container: str, scope: str) -> str:
-    """Why a container is better left as it is; "" if nothing speaks against it."""
+    """Why a container is better left as it is; "" if it can be protected."""
     from avckpt_hooks.shared.programs import must_be_pid_1
 
     if not _is_ours():
@@ -282,7 +284,7 @@ def _unprotectable(data: dict[str, Any], container: str, scope: str) -> str:
             f"its command is {command}, which must itself be PID 1; "
             "to protect its program, start that without it (--entrypoint)"
         )
-    # What Podman tells a systemd, and nothing else (--systemd, by default for some commands).
+    # What Podman sets for systemd only (--systemd, by default for some commands).
     if container and f"container_uuid={container[:32]}" in (process.get("env") or []):
         return "Podman starts it as systemd, which must itself be PID 1; if it is none, give --systemd=false"
     return ""

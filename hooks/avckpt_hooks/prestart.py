@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The prestart hook: tells the sidecar of a protected container that is about to start.
 
-The OCI runtime runs it on the host with the container's state on standard
-input, while the container's main process waits to be let go.  It never fails:
-without a sidecar the container runs on, unprotected.
+The OCI runtime runs it on the host with the container's state on standard input, while
+the container's main process waits to be started. It never fails: without a sidecar the
+container runs on, unprotected.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ def main() -> int:
         line = f"avckpt: container {name} {problem}"
         tell.journal(line)
         if "--told" not in sys.argv[2:]:
-            # runc passes our standard error on, crun does not; both have the
-            # container's as their own.
+            # runc passes our standard error on, crun does not; the standard error of both is the container's.
             tell.parent(line)
     return 0
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The OCI runtime avckpt-runtime: what the precreate hook does, for those who call no such hook.
+"""The OCI runtime avckpt-runtime: does the precreate hook's work for engines that call no such
+hook.
 
-Docker, containerd and CRI-O call it as they call runc.  Of `create` and `run` it
-rewrites the bundle's config.json if the container's labels or annotations ask
-for protection; everything is then done by the real runtime, in this process.
-Whatever goes wrong here, the container starts as without us, but for a label
-that is wrong: that is an error, told as the runtime's own errors are.
+Docker, containerd and CRI-O call it as they call runc. For `create` and `run` it rewrites the
+bundle's config.json if the container's labels or annotations ask for protection; then it
+executes the real runtime in this process. Whatever goes wrong here, the container starts as
+without us, except for a wrong label: that is an error, reported like the runtime's own errors.
 
 Its own options come before the command: --avckpt-runtime=PROGRAM (otherwise
 runc or crun, whichever is found first) and --avckpt-run-dir=DIRECTORY.
@@ -33,7 +33,7 @@ _CONFIG_BYTES = 16 << 20
 
 
 def main() -> int:
-    """Becomes the real runtime; returns only when that cannot be."""
+    """Executes the real runtime; returns only when that fails."""
     own, argv = _split(sys.argv[1:])
     if own.get("run-dir"):
         os.environ["AVCKPT_RUN_DIR"] = own["run-dir"]
@@ -105,7 +105,7 @@ def _rewrite(path: str, container: str) -> None:
     if annotations.get("io.kubernetes.cri.container-type") == "sandbox" or (
         annotations.get("io.kubernetes.cri-o.ContainerType") == "sandbox"
     ):
-        return  # the pod's annotations are its, too, and it runs nothing but a pause
+        return  # it has the pod's annotations, too, but runs only a pause program
     key = protocol.key_of(container)
     about: dict[str, Any] = {"name": _name(annotations) or (container if key != container else ""), "labels": {}}
     if docker is not None:
@@ -122,14 +122,14 @@ def _rewrite(path: str, container: str) -> None:
     if docker is not None and docker["Config"].get("Healthcheck"):
         answer = {"healthcheck": docker["Config"]["Healthcheck"], "startup_healthcheck": None}
         files.write_private(protocol.health_path(key), json.dumps(answer).encode())
-    # As readable as it was.
+    # Keep its mode.
     files.write_at_once(path, json.dumps(data, separators=(",", ":")).encode(), os.stat(path).st_mode & 0o777)
 
 
 def _docker(config: bytes, container: str) -> dict[str, Any] | None:
     """What Docker knows of the container, with its labels; None: it is not Docker's.
 
-    The root file system is below Docker's own folder, and so is config.v2.json.
+    The root file system is below Docker's data directory, and so is config.v2.json.
     """
     if not protocol.is_container_id(container):
         return None
@@ -146,7 +146,7 @@ def _docker(config: bytes, container: str) -> dict[str, Any] | None:
 
 
 def _name(annotations: dict[str, str]) -> str:
-    """As Kubernetes or nerdctl call it; "" where nobody says it."""
+    """Its name in Kubernetes or nerdctl; "" if there is none."""
     for sandbox, container in (
         ("io.kubernetes.cri.sandbox-name", "io.kubernetes.cri.container-name"),
         ("io.kubernetes.pod.name", "io.kubernetes.container.name"),
@@ -168,7 +168,7 @@ def _signal_number(text: str) -> str:
 
 
 def _complain(line: str, log: str) -> None:
-    """As runc tells an error: on standard error, and in the log of who called us."""
+    """Reports an error as runc does: on standard error, and in the caller's log file."""
     print(line, file=sys.stderr)
     if log:
         entry = {"level": "error", "msg": line, "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}

@@ -9,11 +9,11 @@ import stat
 
 
 class TooLong(ValueError):
-    """There is more in a file than anybody may have meant to put there."""
+    """A file is longer than anything that belongs there."""
 
 
 def make_private(directory: str) -> None:
-    """Makes `directory`, or takes away what others may do in one that is there.  Raises OSError."""
+    """Creates `directory`, or removes the access of others to an existing one.  Raises OSError."""
     os.makedirs(directory, mode=0o700, exist_ok=True)
     if stat.S_IMODE(os.stat(directory).st_mode) != 0o700:
         os.chmod(directory, 0o700)
@@ -29,8 +29,9 @@ def write_at_once(path: str, content: bytes, mode: int = 0o600) -> None:
     """Writes a file at once or not at all, in a directory that is left as it is.  Raises OSError."""
     temporary = f"{path}.{os.getpid()}"
     with contextlib.suppress(FileNotFoundError):
-        os.unlink(temporary)  # of an earlier process with our number
-    # The mode is there from the start: whoever opens a file while it is readable goes on reading it.
+        os.unlink(temporary)  # of an earlier process with our PID
+    # The mode is set from the start: a process that opens the file while it is readable could keep reading
+    # it.
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
     try:
         with open(fd, "wb") as file:
@@ -43,10 +44,10 @@ def write_at_once(path: str, content: bytes, mode: int = 0o600) -> None:
 
 
 def read_bounded(path: str, most_bytes: int) -> bytes:
-    """What is in a file, at most so much of it.  Raises TooLong, OSError."""
+    """The contents of a file of at most `most_bytes`.  Raises TooLong, OSError."""
     with open(path, "rb", buffering=0) as file:
         content = bytearray()
-        # One byte more than there may be, and /proc gives a page or so at a time.
+        # One byte more than allowed; /proc returns about a page at a time.
         while len(content) <= most_bytes:
             part = file.read(most_bytes + 1 - len(content))
             if not part:

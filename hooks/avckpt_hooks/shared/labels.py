@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `avckpt.*` labels: what they may say, and what they mean.
 
-Hook and sidecar read labels through this module only, so that a container that
-was let through by the one is understood by the other.
+Hook and sidecar read labels through this module only, so that what one accepts
+is understood by the other.
 
-Decided here, because no label table says it:
-- Labels and annotations of the same name mean the same.  One name with two
-  different values is an error: nobody can know which was meant.
+Rules that the table of labels does not express:
+- Labels and annotations of the same name mean the same. One name with two
+different values is an error, because either may be meant.
 - Unknown names and malformed values are errors whether `avckpt.enable` is true
   or not: `avckpt.enabled=true` must not quietly start an unprotected container.
 - Without `avckpt.enable` a container is not protected, whatever else is set;
-  with `avckpt.group` and `avckpt.notify` it hears of the recoveries of others.
+  with `avckpt.group` and `avckpt.notify` it is notified of the recoveries of others.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RESERVED = frozenset({"avckpt.version", "avckpt.name", "avckpt.id"})
 KEEP_MAX = 16
 """AVC_KEEP_MAX of the engine."""
 RESTORES_MAX = 64
-"""AVC_RESTORES_MAX of the engine: how many it remembers."""
+"""AVC_RESTORES_MAX of the engine: the number that it remembers."""
 
 SHM_MAX_BYTES = 1_000_000_000
 AUTOMATIC_MAX = "3s"
@@ -35,7 +35,7 @@ AUTOMATIC_MAX = "3s"
 
 
 class LabelError(ValueError):
-    """A label that cannot be honoured.  The text is one line for a person."""
+    """A label that cannot be honoured. The text is one line for users."""
 
     def __init__(self, key: str, value: str | None, why: str, allowed: str) -> None:
         setting = shown(key) if value is None else f"{shown(key)}={shown(value)}"
@@ -48,10 +48,10 @@ class LabelError(ValueError):
 
 @dataclass(frozen=True)
 class RestoreOn:
-    """Which ends of the app are abnormal."""
+    """Which kinds of exit of the app are abnormal."""
 
     signal: bool = True
-    """Killed by a signal nobody asked for."""
+    """Killed by a signal that was not requested."""
     exit: bool = True
     """Any non-zero exit status."""
     statuses: frozenset[int] = frozenset()
@@ -62,7 +62,7 @@ class RestoreOn:
 
 @dataclass(frozen=True)
 class Notify:
-    """How a container wants to hear of a recovery: by a signal, or by a command run in it."""
+    """How to notify a container of a recovery: by a signal, or by a command run in it."""
 
     signal: int = 0
     """0: none."""
@@ -78,13 +78,13 @@ class Policy:
     interval_s: float = 3.0
     """Time between checkpoints; with `automatic` the longest."""
     automatic: bool = False
-    """As often as the budgets allow, and not while the application does nothing."""
+    """As often as the budgets allow, and not while the application is idle."""
     interval_min_s: float = 0.02
     """With `automatic`: the shortest time between two."""
     budget_freeze: float = 0.03
-    """With `automatic`: how much of its time checkpoints may hold the application, a fraction."""
+    """With `automatic`: the fraction of its time that checkpoints may stop the application."""
     budget_cpu: float = 0.05
-    """With `automatic`: how much of one CPU they may use, a fraction."""
+    """With `automatic`: the fraction of one CPU that they may use."""
     keep: int = 2
     """Generations kept, 1..KEEP_MAX."""
     restore_on: RestoreOn = field(default_factory=RestoreOn)
@@ -92,13 +92,13 @@ class Policy:
     """At most so many restores within `restore_window_s`."""
     restore_window_s: float = 60.0
     quiesce_s: float = 0.02
-    """How long to look for a quiescent moment; 0: not at all."""
+    """How long to wait for a quiescent moment; 0: not at all."""
     shm_bytes: int = 4_000_000
     """Shared memory of the application's own that is rolled back with it, at most."""
     files: str = "auto"
     """Regular files at a restore: auto, rewind, keep or strict."""
     io_uring: bool = True
-    """Whether the kernel has it for the container; an application that uses it cannot be protected."""
+    """Whether the container may use it; an application that does cannot be protected."""
     tcp: str = "reset-moved"
     """Established TCP connections at a restore: reset-moved, reset, keep or messages."""
     scope: str = "container"
@@ -106,33 +106,33 @@ class Policy:
     images: str = "fork"
     """How a checkpoint gets the application's memory: fork, dirty or auto."""
     deadline_s: float = 0.0
-    """A recovery that takes longer is told of; 0: none is."""
+    """A recovery that takes longer is reported; 0: none is."""
     deadline_late: str = "go-on"
-    """And then: go-on, or cold (it is given up, and the container ends)."""
+    """What then happens: go-on, or cold (it is abandoned, and the container ends)."""
     core: str = "off"
     """A core file for each death that is undone: off, mini (stacks) or on."""
     group: str = ""
-    """Containers that hear of each other's recoveries; empty: none."""
+    """Containers that can be notified of each other's recoveries; empty: none."""
     recovery: str = "apart"
-    """Of the group: apart, or together, from checkpoints of one instant."""
+    """How its members recover: apart, or together, from checkpoints of one instant."""
     notify: Notify | None = None
-    """Of the recoveries of others in the group."""
+    """For recoveries of others in the group."""
     notify_self: Notify | None = None
-    """Of its own."""
+    """For its own recoveries."""
 
     @property
     def guarded(self) -> bool:
-        """It has a guard: it is to be protected, and by itself."""
+        """It has a guard: it is to be protected, and as a whole."""
         return self.enable and self.scope == "container"
 
     @property
     def together(self) -> bool:
-        """It goes back with its group."""
+        """It is rolled back with its group."""
         return self.guarded and self.recovery == "together"
 
     @property
     def listens(self) -> bool:
-        """It wants to hear of others, which takes no protection of its own."""
+        """It is notified of others' recoveries, which needs no protection of its own."""
         return self.notify is not None and bool(self.group)
 
 
@@ -156,7 +156,7 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
             raise LabelError(key, value, str(error), "allowed: " + label.allowed) from None
     policy = Policy(**fields)
     if policy.restore_on.unhealthy and policy.keep < 2:
-        # A hang is noticed late: by then the newest generation hangs, too.
+        # A hang is detected late: by then the newest generation hangs, too.
         raise LabelError(
             "avckpt.keep", mapping["avckpt.keep"], "too few for avckpt.restore.on=unhealthy", "allowed there: 2 to 16"
         )
@@ -184,7 +184,7 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
 
 
 def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
-    """Raises LabelError for what does not go with avckpt.group.recovery=together."""
+    """Raises LabelError for settings that cannot be combined with avckpt.group.recovery=together."""
     if not policy.group:
         raise LabelError("avckpt.group.recovery", "together", "there is no group", "add avckpt.group=NAME")
     if policy.scope == "nodes":
@@ -200,7 +200,7 @@ def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
             "avckpt.deadline.late", "cold", "nobody of a group that goes back together starts anew alone", "use go-on"
         )
     if policy.tcp not in ("reset-moved", "reset"):
-        # Bytes that were sent since the checkpoint would be received, and sent once more.
+        # Bytes sent since the checkpoint would be received, and then sent once more.
         raise LabelError(
             "avckpt.tcp",
             mapping.get("avckpt.tcp"),
@@ -453,12 +453,12 @@ LABELS: dict[str, Label] = {
 
 
 LOOKALIKE = re.compile(r"avckpt[._-]", re.IGNORECASE)
-"""How names begin that were meant for us, right or wrong."""
+"""Prefixes of names that were meant for us, right or wrong."""
 
 
 def meant_by(name: str) -> str:
     """The label that was probably meant by a name that is not ours; "" if it looks like none."""
-    import difflib  # costs milliseconds: not for names that are nothing like ours
+    import difflib  # costs milliseconds: not for names unlike ours
 
     plain = name.lower().replace("_", ".").replace("-", ".")
     near = difflib.get_close_matches(plain, LABELS, n=1, cutoff=0.9)
@@ -466,7 +466,7 @@ def meant_by(name: str) -> str:
 
 
 def _unknown(key: str) -> LabelError:
-    import difflib  # a mistake may cost the milliseconds that this takes, a start may not
+    import difflib  # takes milliseconds, which an error may cost, but not every start
 
     near = difflib.get_close_matches(key, LABELS, n=1)
     if near:
@@ -475,7 +475,7 @@ def _unknown(key: str) -> LabelError:
 
 
 def shown(text: str) -> str:
-    """One printable word or two of a value, whatever somebody put into it.
+    """A short, printable form of any value.
 
     Of a command only the program: its arguments may be secrets, and messages end
     up in logs that others read.

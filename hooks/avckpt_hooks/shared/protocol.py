@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a hook and the sidecar say to each other.
+"""The protocol between a hook and the sidecar.
 
-Transport: a Unix socket of type SOCK_SEQPACKET at `hooks_socket()`.  One
-connection carries one request and one reply, each a single packet of JSON
-(UTF-8, at most `MAX_BYTES`), so that nobody has to find the end of a message.
+Transport: a Unix socket of type SOCK_SEQPACKET at `hooks_socket()`. One connection
+carries one request and one reply, each a single packet of JSON (UTF-8, at most
+`MAX_BYTES`), so that messages need no framing.
 
 Requests (`Register.encode()`, `Deregister.encode()`; `decode_request()` reads both):
 
     {"version": 1, "op": "register", "id": ..., "name": ..., "pid": ...,
      "starttime": ..., "bundle": ..., "annotations": {...}}
-        (annotations: ours, which begin with "avckpt.") with exactly one
+        (annotations: only those that begin with "avckpt.") with exactly one
         descriptor (SCM_RIGHTS): a pidfd of the container's main process.  "pid"
-        and "starttime" are numbers of the *hook's* PID namespace, for logs only:
-        the receiver's own may be another one.
+        and "starttime" belong to the *hook's* PID namespace, for logs only: the receiver's may be another one.
     {"version": 1, "op": "deregister", "id": ...}
 
 Reply (`encode_reply()`, `decode_reply()`):
@@ -23,9 +22,9 @@ Reply (`encode_reply()`, `decode_reply()`):
 Podman holds the container's lock while a hook runs, so the receiver answers at
 once and calls neither `podman ps` nor `podman inspect` before it has answered.
 
-Registration must be idempotent.  The hook writes `record_path(id)` *before* it
-connects, and a starting sidecar listens *before* it reads the records, so that
-no container can fall between the two; the price is that one may come twice.
+Registration must be idempotent. The hook writes `record_path(id)` *before* it connects, and a starting
+sidecar listens *before* it reads the records, so that no container is missed between the two; in return, one
+may be registered twice.
 """
 
 from __future__ import annotations
@@ -41,15 +40,15 @@ MAX_BYTES = 128 * 1024
 """Longest packet; below the default SO_SNDBUF, so that a send never splits."""
 
 TIMEOUT_S = 1.0
-"""All the time a hook gives the sidecar, connect to reply."""
+"""A hook's total timeout for the sidecar, from connect to reply."""
 
 
 class ProtocolError(ValueError):
-    """The other side said something that is not in this protocol."""
+    """The peer violated this protocol."""
 
 
 def run_dir() -> str:
-    """The run-time directory: $AVCKPT_RUN_DIR, or /run/avckpt."""
+    """The runtime directory: $AVCKPT_RUN_DIR, or /run/avckpt."""
     return os.environ.get("AVCKPT_RUN_DIR") or "/run/avckpt"
 
 
@@ -63,7 +62,7 @@ UNITS_IN_CONTAINER = "/run/avckpt-units"
 
 
 def units_dir() -> str:
-    """The directory of the socket for units: containers see it, and nothing else of ours."""
+    """The directory of the socket for units: containers see it, and nothing else of avckpt."""
     return os.path.join(run_dir(), "units")
 
 
@@ -93,7 +92,7 @@ def is_container_id(text: str) -> bool:
 
 
 def key_of(container: str) -> str:
-    """What a container is known by here: its id, or 64 hex digits made of one that may be anything (containerd's)."""
+    """A container's id in avckpt: its own, or 64 hex digits derived from one of any form (containerd's)."""
     if is_container_id(container):
         return container
     import hashlib
@@ -125,7 +124,7 @@ class Register:
         self.annotations = annotations
 
     def record(self) -> dict[str, object]:
-        """The fields as they stand in the container's record."""
+        """The fields as in the container's record."""
         return {
             "version": VERSION,
             "id": self.id,
@@ -180,7 +179,7 @@ class Deregister:
 
 
 def decode_request(packet: bytes) -> Register | Deregister:
-    """What a hook sent.  Raises ProtocolError with a clause for a person."""
+    """What a hook sent. Raises ProtocolError with a clause for users."""
     data = _decode(packet)
     op = data.get("op")
     if op == "register":
@@ -210,7 +209,7 @@ def decode_reply(packet: bytes) -> str | None:
 
 
 def received_fds(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    """The descriptors in what recvmsg(2) got beside the data; they become the caller's to close."""
+    """The descriptors in the ancillary data of recvmsg(2); the caller must close them."""
     fds: list[int] = []
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
@@ -222,11 +221,11 @@ def received_fds(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 def receive_request(connection: socket.socket) -> tuple[Register | Deregister, int | None]:
     """Reads one request from an accepted connection (the sidecar's side).
 
-    Returns it with the pidfd (which becomes the caller's to close) for a
-    Register, None for a Deregister.  Raises ProtocolError, OSError (timeouts
-    and EAGAIN of the socket included); no descriptor is kept then.  A hook that
-    hangs up without a request only looked whether a sidecar listens (precreate
-    does): ConnectionResetError, an OSError.
+    Returns it with the pidfd (which the caller must close) for a Register, None
+    for a Deregister. Raises ProtocolError, OSError (timeouts and EAGAIN of the
+    socket included); no descriptor is kept then. A hook that hangs up without a
+    request only checked whether a sidecar listens (as precreate does):
+    ConnectionResetError, an OSError.
     """
     room = socket.CMSG_SPACE(4 * struct.calcsize("i"))
     packet, ancillary, flags, _ = connection.recvmsg(MAX_BYTES, room, socket.MSG_CMSG_CLOEXEC)
@@ -252,10 +251,9 @@ def receive_request(connection: socket.socket) -> tuple[Register | Deregister, i
 def exchange(packet: bytes, pidfd: int | None = None, timeout_s: float = TIMEOUT_S) -> str | None:
     """Sends one request to the sidecar and waits for its reply (the hook's side).
 
-    Returns None when the sidecar agreed, else its error.  Raises TimeoutError
-    when it does not answer, another OSError when there is no sidecar,
-    ProtocolError when the answer makes no sense.  Never takes longer than
-    `timeout_s`.
+    Returns None when the sidecar agreed, else its error. Raises TimeoutError when
+    it does not answer, another OSError when there is no sidecar, ProtocolError
+    when the answer is invalid. Never takes longer than `timeout_s`.
     """
     deadline = time.monotonic() + timeout_s
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:

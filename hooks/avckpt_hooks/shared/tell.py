@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a hook says something to the person who started a container.
+"""How a hook reports something to the user who started a container.
 
-Podman throws the standard error of a precreate hook away, and crun that of
-every stage.  Their own standard error is where a person looks: `podman run`'s
+Podman discards the standard error of a precreate hook, and crun that of every
+stage. Users see the standard error of Podman and crun: `podman run`'s
 terminal for a hook that Podman runs, the container's log (`podman logs`) for
 one that the OCI runtime runs, as conmon gives the runtime the container's.
 """
@@ -21,8 +21,8 @@ _SYS_PIDFD_GETFD = 438  # the same on every architecture
 def parent(line: str, pid: int | None = None) -> bool:
     """Writes one line, made printable, to the standard error of the parent (or `pid`).
 
-    True if somebody can read it there.  Never raises, never waits longer than
-    _WAIT_MS for a reader.
+    True if a user can read it there. Never raises, never waits longer than _WAIT_MS
+    for a reader.
     """
     try:
         fd = _stderr_of(os.getppid() if pid is None else pid)
@@ -41,30 +41,29 @@ def journal(line: str) -> None:
     import socket
     import time
 
-    # Not syslog(3): while journald hangs and its queue is full, that waits for
-    # ever, and the container for us.
+    # Not syslog(3): while journald hangs and its queue is full, that blocks, and the container waits for us.
     packet = f"<{_DAEMON_WARNING}>{time.strftime('%b %e %T')} avckpt[{os.getpid()}]: {printable(line)[:_LINE_MAX]}"
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as log:
             log.sendto(packet.encode(errors="replace"), "/dev/log")
     except OSError:
-        pass  # nobody listens, or has no time
+        pass  # no listener, or a busy one
 
 
 def printable(line: str) -> str:
-    r"""One line with the same visible characters: all others read as their escapes (`\n`, `\x1b`, `\u202e`).
+    r"""One line with the same visible characters; all others become escapes (`\n`, `\x1b`, `\u202e`).
 
-    Images and applications have a say in names, labels and output: they must not
-    write lines of their own into root's log, or do anything to root's terminal.
+    Images and applications influence names, labels and output: they must not be able to forge lines
+    in root's log, or to control root's terminal.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 def _stderr_of(pid: int) -> int:
     """A descriptor for `pid`'s standard error.  Raises OSError."""
-    # The descriptor itself, by pidfd_getfd(2), and not a second opening of the
-    # same file: with `2>file` a second one has an offset of its own and each
-    # writer overwrites the other; a socket cannot be opened at all.
+    # The descriptor itself, by pidfd_getfd(2), instead of reopening the file: with `2>file` a second open
+    # file description has its own offset, so that the writers overwrite each other; a socket cannot be opened
+    # at all.
     try:
         return _borrow(pid, 2)
     except OSError:
@@ -92,7 +91,7 @@ def _write(fd: int, line: str) -> bool:
     status = os.fstat(fd)
     if stat.S_ISCHR(status.st_mode) and status.st_rdev == os.makedev(1, 3):  # /dev/null
         return False
-    # A raw terminal (podman run -t has set it so) does not go to column 1 by itself.
+    # A raw terminal (as set by podman run -t) does not return to column 1 by itself.
     end = "\r\n" if os.isatty(fd) else "\n"
     poll = select.poll()
     poll.register(fd, select.POLLOUT)
