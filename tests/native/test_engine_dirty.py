@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import re
+import select
 import signal
 import time
 from pathlib import Path
@@ -13,6 +15,7 @@ from pathlib import Path
 import pytest
 from avckpt.guard import Images
 
+from testkit.family import ours
 from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux
 from testkit.harness import wait_until
 from testkit.procfs import children_of
@@ -157,13 +160,18 @@ def read_at(mem: int, size: int, at: int) -> bytes:
 
 
 def newest_template(guard: GuardProcess, victim: Victim) -> int:
-    """By the OOM killer's points, of which it has fewer than the others."""
-    points = {}
-    for pid in victim.others():
-        with contextlib.suppress(OSError):
-            if Path(f"/proc/{pid}/comm").read_text() == "avckpt-tmpl\n":
-                points[pid] = int(Path(f"/proc/{pid}/oom_score_adj").read_text())
-    return min(points, key=lambda pid: points[pid])
+    """By the OOM killer's points, of which it has fewer than the others, once one that was dropped is gone."""
+
+    def fewest() -> list[int]:
+        points: dict[int, list[int]] = {}
+        for pid in victim.others():
+            with contextlib.suppress(OSError):
+                if Path(f"/proc/{pid}/comm").read_text() == "avckpt-tmpl\n":
+                    points.setdefault(int(Path(f"/proc/{pid}/oom_score_adj").read_text()), []).append(pid)
+        found = points[min(points)]
+        return found if len(found) == 1 else []
+
+    return wait_until(fewest, 5.0, "one newest template", every_s=0.001)[0]
 
 
 @pytest.mark.parametrize("command", ["dirt 24 3 --rate 8000", "dirt 64 3 --rate 20000 --maps"])
@@ -210,6 +218,70 @@ def test_the_same_one_is_restored_many_times(tmp_path: Path) -> None:
             victim.wait_beats(5)
         until_copied(guard)
         victim.wait_beats(5)
+
+
+def until_near(guard: GuardProcess) -> Json:
+    """Until the last two checkpoints were copies: there is a template that can take the newest one's place."""
+    before = until_copied(guard)
+    while (taken := until_copied(guard))["generation"] != before["generation"] + 1:
+        before = taken
+    return taken
+
+
+@pytest.mark.parametrize("command", ["dirt 24 2 --rate 20000 --maps --in-child", "prefork 3 40"])
+def test_trees_are_restored_twice_right_after_a_checkpoint(command: str, tmp_path: Path) -> None:
+    with Victim(command, tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        for _ in range(8):
+            taken = until_near(guard)
+            for _ in range(2):
+                since = guard.mark()
+                victim.kill_app()
+                assert guard.wait("restored", since=since)["generation"] == taken["generation"]
+                victim.wait_beats(3)
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+@pytest.mark.parametrize("command", ["dirt 60 2 --rate 4000", "dirt 32 2 --rate 20000 --maps"])
+def test_a_restore_right_after_a_checkpoint_forks_nothing(command: str, tmp_path: Path) -> None:
+    """The template gives its memory away, and the one before it takes its place, also for the next restore."""
+    with Victim(command, tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        given = 0
+        for number in range(12):
+            taken = until_near(guard)
+            template = os.pidfd_open(newest_template(guard, victim))
+            time.sleep(number % 3 * 0.01)
+            for _ in range(2):
+                since = guard.mark()
+                victim.kill_app()
+                assert guard.wait("restored", since=since)["generation"] == taken["generation"]
+                victim.wait_beats(3)
+            given += select.select([template], [], [], 0.1)[0] != []
+            os.close(template)
+        # Not while it is just being brought up to date for the next checkpoint, say.
+        assert given > 8, given
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
+
+
+def test_templates_are_killed_while_one_gives_its_memory_away(tmp_path: Path) -> None:
+    """From inside the container: the application comes back, if need be as it was a checkpoint earlier."""
+    rng = random.Random(5)
+    with Victim("dirt 60 2 --rate 20000", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        for _ in range(40):
+            until_near(guard)
+            template, since = os.pidfd_open(rng.choice(ours(victim, "avckpt-tmpl"))), guard.mark()
+            dead = os.pidfd_open(victim.app)
+            after_s = rng.uniform(0, 0.004)
+            victim.kill_app()
+            select.select([dead], [], [])
+            until = time.monotonic() + after_s
+            while time.monotonic() < until:
+                pass
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(template, signal.SIGKILL)
+            os.close(template)
+            os.close(dead)
+            guard.wait("restored", since=since)
+            victim.wait_beats(5)
 
 
 def test_each_process_of_a_tree_is_copied_by_itself(tmp_path: Path) -> None:

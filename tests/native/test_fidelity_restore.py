@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.guard import Tcp
+from avckpt.guard import Images, Tcp
 
 from testkit.family import look
 from testkit.guarded import GuardProcess, Victim, config, parasites
@@ -71,7 +71,8 @@ def test_restore_on_command(tmp_path: Path) -> None:
 
 def test_names_in_the_process_list(tmp_path: Path) -> None:
     """Templates, spare and holder say what they are; the restored application is called what it was."""
-    with Victim("idle 1 5", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+    forks = config(images=Images.FORK)
+    with Victim("idle 1 5", tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
         before = threads(victim.app)
         command_line = Path(f"/proc/{victim.app}/cmdline").read_bytes()
         for _ in range(3):
@@ -136,7 +137,8 @@ def test_a_template_that_is_killed_is_a_lost_generation(tmp_path: Path) -> None:
 
 def test_nothing_is_left_behind(tmp_path: Path) -> None:
     """No process, zombie, mapping or descriptor more after many checkpoints and restores, and none after the end."""
-    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+    forks = config(images=Images.FORK)
+    with Victim("threads 4 1", tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
 
         def cycle(restores: int) -> tuple[int, int, int, int]:
             guard.burst(30)

@@ -135,6 +135,18 @@ uint64_t pageset_count(const struct pageset *set)
 	return pages;
 }
 
+bool pageset_take(struct pageset *from, uint64_t pages, struct pageset *to)
+{
+	while (from->count && pageset_count(to) < pages) {
+		if (!make_room(&to->chunk, to->count, &to->room, sizeof *to->chunk))
+			return false;
+		memmove(&to->chunk[1], to->chunk, to->count * sizeof *to->chunk);
+		to->chunk[0] = from->chunk[--from->count];
+		to->count++;
+	}
+	return true;
+}
+
 void pageset_free(struct pageset *set)
 {
 	free(set->chunk);

@@ -7,6 +7,7 @@
  *   dirty*.c        ... and brought up to date, instead of being forked anew
  *   layout.c        ... whose mappings have to be the process's for that
  *   spare.c         ... and forked ahead of the next restore
+ *   stand_in.c      ... or given to it, while an older one takes their place
  *   snapshot.c      mappings and pages of a template
  *   remap_plan.c    how the memory of one differs from another's
  *   restore_plan.c  ... of all the processes from that of their parents
@@ -17,10 +18,12 @@
 
 #include "process.h"
 
-/* A fork of a template, for the next restore (spare.c). */
+/* For the next restore: a fork of a template (spare.c), or one that another stands in for
+ * (stand_in.c). */
 struct spare {
 	pid_t pid; /* 0: none                                           */
 	int pidfd;
+	struct arch_regs base;
 	bool tried;    /* it was begun to make one                               */
 	bool unwanted; /* it was one process too many for a restore              */
 	/* What the template has been told to do for it and has not done yet. */
@@ -37,6 +40,11 @@ struct idle_template {
 	struct inherited *inherited;
 	struct pageset *stale;
 	uint64_t tracker, forked_ns, copied, kinds;
+	/* Where it may differ from the template of a generation, which has this number: what was
+	 * stale when that was taken, and what was written, and copied, since.  0: anywhere. */
+	uint64_t near;
+	struct pageset differs;
+	bool catching_up; /* it is the same as what is stale: nothing was looked for since */
 };
 
 /* Checkpoints by copies of what was written, of one process (dirty.c). */
@@ -65,6 +73,7 @@ struct dirty {
 	size_t layout_bytes, other_layout_bytes;
 	struct inherited now;
 	int64_t dumpable;
+	bool standing_in; /* the idle one is a generation's already, but not whole yet */
 };
 
 /* ... of all of them (dirty_tree.c). */
@@ -186,12 +195,16 @@ int dirty_check(struct dirty_tree *dirty, const struct generation *generation,
 void dirty_follow(struct dirty_tree *dirty, const struct generation *generation);
 /* Their templates are not needed any more: they become idle ones, if they can. */
 void dirty_recycle(struct dirty_tree *dirty, const struct generation *generation);
+/* Once a generation is kept: where the idle template of the main process differs from it. */
+void dirty_compare(struct dirty_tree *dirty, const struct generation *generation);
 void dirty_drop_idle(struct dirty_tree *dirty);
 /* Those that have been killed. */
 void dirty_drop_ended(struct dirty_tree *dirty);
 /* Of a process that is gone, or another program. */
 void dirty_forget(struct dirty_tree *dirty, const struct process *process);
 bool dirty_owns(const struct dirty_tree *dirty, pid_t pid);
+/* Of the main process. */
+struct dirty *dirty_find(const struct dirty_tree *dirty, const struct process *process);
 void dirty_free(struct dirty_tree *dirty);
 
 /* ---- spare.c ------------------------------------------------------------------------ */
@@ -208,6 +221,21 @@ bool spare_is_there(struct generation *generation);
 /* There may be one that only the kernel knows of (init_channel_kill_lost). */
 bool spare_is_unknown(const struct generation *generation);
 void spare_drop(struct generation *generation);
+
+/* ---- stand_in.c --------------------------------------------------------------------- */
+
+/* Whether a restore of the generation could do without a fork. */
+bool stand_in_is_there(const struct dirty_tree *dirty, const struct generation *generation);
+/* While the app is dead: the idle template becomes the generation's, whose own one becomes its
+ * spare.  What they differ in is read from that now, and written to the other one by
+ * stand_in_finish(), before anything else is made of it.  If it cannot be, nothing has changed. */
+void stand_in_begin(struct dirty_tree *dirty, struct generation *generation, timer_t timer);
+/* While it runs, and nothing else is to be done: copies some of that, so that a restore need not, nor
+ * the next checkpoint; false: there is no more. */
+bool stand_in_catch_up(struct dirty_tree *dirty, const struct generation *generation,
+		       timer_t timer);
+/* false: nothing can be restored from the generation any more. */
+bool stand_in_finish(struct dirty_tree *dirty, struct generation *generation, timer_t timer);
 
 /* ---- snapshot.c --------------------------------------------------------------------- */
 

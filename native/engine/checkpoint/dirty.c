@@ -37,7 +37,6 @@
 #define REST_LEAST 4u /* checkpoints */
 #define FAILURES_MAX 4
 #define CONFIDENCE 8 /* attempts in a row that came to something: it is as if none had failed */
-#define IDLE_OOM_SCORE 1000
 
 /* ---- while the application runs -------------------------------------------------------------- */
 
@@ -221,6 +220,7 @@ void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 	uint64_t left = 0;
 
 	process->recycling = false;
+	dirty->idle.catching_up = false;
 	dirty->copied = 0;
 	dirty->reason = why_not(process, config);
 	if (dirty->reason) {
@@ -313,30 +313,24 @@ int dirty_capture_one(struct dirty *dirty, const struct image *image, struct avc
 
 /* ---- when the application runs again --------------------------------------------------------- */
 
-/* The end of the heap, to the byte: mappings tell of its pages only. */
-static int set_break(const struct dirty *dirty, struct template_calls *calls, struct avc_error *err)
-{
-	const int64_t end = dirty->now.value[INHERITED_BREAK];
-	const struct inj_syscall call = { .nr = SYS_brk, .arg = { (uint64_t)end } };
-
-	if (dirty->idle.inherited->value[INHERITED_BREAK] == end)
-		return 0;
-	if (template_call(calls, &call, err) || template_calls_end(calls, err))
-		return -1;
-	dirty->idle.inherited->value[INHERITED_BREAK] = end;
-	return 0;
-}
-
 static int bring_up_to_date(struct dirty *dirty, struct template_calls *calls,
 			    struct avc_error *err)
 {
-	if (set_break(dirty, calls, err) || template_follow_layout(calls, dirty->layout, err) ||
-	    copy_write(dirty, calls, err))
+	if (template_set_break(calls, dirty->now.value[INHERITED_BREAK], err) ||
+	    template_follow_layout(calls, dirty->layout, err) || copy_write(dirty, calls, err))
 		return -1;
 	return dirty->idle.inherited->value[INHERITED_BREAK] == dirty->now.value[INHERITED_BREAK]
 		       ? 0
 		       : fail(err, AVC_RETRY, 0, dirty->idle.pid, "keep template", "brk",
 			      "its heap is not where the kernel has it");
+}
+
+static void forget_differences(struct dirty *dirty)
+{
+	if (dirty->process->tracker)
+		tracker_remove(dirty->process->tracker, &dirty->idle.differs);
+	pageset_free(&dirty->idle.differs);
+	dirty->idle.near = 0;
 }
 
 static void hand_over(struct dirty *dirty, struct image *image)
@@ -358,6 +352,7 @@ static void hand_over(struct dirty *dirty, struct image *image)
 	image->oom_known = true;
 	image->recycled = true;
 	image->stale->count = 0;
+	forget_differences(dirty);
 	*idle = (struct idle_template){ .pidfd = -1 };
 }
 
@@ -448,19 +443,43 @@ void dirty_recycle_one(struct dirty *dirty, struct image *image)
 	proc_set_oom_score_adj(idle->pid, score);
 }
 
-void dirty_drop_idle_one(struct dirty *dirty)
+/* Of what was written between the scan before a fork and the fork, only the next scan tells. */
+void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t number)
 {
+	struct tracker *tracker = image->process->tracker;
 	struct idle_template *idle = &dirty->idle;
 
 	if (!idle->pid)
 		return;
-	tracee_end(idle->pid, idle->pidfd);
+	forget_differences(dirty);
+	if (!image->recycled || !tracker || idle->tracker != tracker->number ||
+	    !pageset_add_all(&idle->differs, idle->stale) || !tracker_add(tracker, &idle->differs))
+		return;
+	idle->near = number;
+	idle->catching_up = true;
+	/* Room now, and not when it is needed. */
+	(void)copy_make_room(dirty, 2 * pageset_count(&idle->differs) * PAGE);
+}
+
+void dirty_leave_idle_one(struct dirty *dirty)
+{
+	struct idle_template *idle = &dirty->idle;
+
 	free(idle->inherited);
+	forget_differences(dirty);
 	if (dirty->process->tracker)
 		tracker_remove(dirty->process->tracker, idle->stale);
 	pageset_free(idle->stale);
 	free(idle->stale);
 	*idle = (struct idle_template){ .pidfd = -1 };
+}
+
+void dirty_drop_idle_one(struct dirty *dirty)
+{
+	if (!dirty->idle.pid)
+		return;
+	tracee_end(dirty->idle.pid, dirty->idle.pidfd);
+	dirty_leave_idle_one(dirty);
 }
 
 void dirty_free_one(struct dirty *dirty)

@@ -5,12 +5,15 @@
  *   dirty_tree.c      all processes
  *   dirty.c           one of them: whether, when, and what was written
  *   dirty_copy.c      copies it
+ *   stand_in.c        gives a restore another one's memory
  *   dirty_template.c  calls that the template makes for it: its mappings become the process's
  */
 #ifndef AVCKPT_DIRTY_H
 #define AVCKPT_DIRTY_H
 
 #include "checkpoint.h"
+
+#define IDLE_OOM_SCORE 1000
 
 /* ---- dirty.c ----------------------------------------------------------------------------------- */
 
@@ -31,6 +34,9 @@ int dirty_check_one(struct dirty *dirty, const struct image *image,
 		    struct avc_error *err) warn_unused;
 void dirty_follow_one(struct dirty *dirty, struct image *image);
 void dirty_recycle_one(struct dirty *dirty, struct image *image);
+void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t number);
+/* All that is known of it; it lives on. */
+void dirty_leave_idle_one(struct dirty *dirty);
 void dirty_drop_idle_one(struct dirty *dirty);
 void dirty_free_one(struct dirty *dirty);
 
@@ -39,13 +45,13 @@ void dirty_free_one(struct dirty *dirty);
 /* Calls that an idle template makes, as many at a time as there is room for. */
 struct template_calls {
 	const struct parasite *parasite;
-	const struct idle_template *idle;
+	struct idle_template *idle;
 	uint32_t slot, count;
 	struct inj_syscall *list;
 };
 
 struct template_calls template_calls_begin(const struct parasite *parasite,
-					   const struct idle_template *idle, uint32_t slot);
+					   struct idle_template *idle, uint32_t slot);
 int template_call(struct template_calls *calls, const struct inj_syscall *call,
 		  struct avc_error *err) warn_unused;
 /* Those that were not made yet.  AVC_RETRY: one was refused. */
@@ -55,6 +61,9 @@ int template_calls_end(struct template_calls *calls, struct avc_error *err) warn
  * cannot. */
 int template_follow_layout(struct template_calls *calls, char *layout,
 			   struct avc_error *err) warn_unused;
+/* And its heap ends there, to the byte: mappings tell of its pages only. */
+int template_set_break(struct template_calls *calls, int64_t end,
+		       struct avc_error *err) warn_unused;
 
 /* ---- dirty_copy.c ------------------------------------------------------------------------------ */
 
@@ -63,6 +72,8 @@ int template_follow_layout(struct template_calls *calls, char *layout,
 bool copy_make_room(struct dirty *dirty, size_t bytes);
 /* What is stale and can be, while the application runs. */
 void copy_stale(struct dirty *dirty, const struct process *process);
+/* Of what another template of the process has there, which cannot be stopped: as the next one. */
+bool copy_read_template(struct dirty *dirty, pid_t template, const struct pageset *pages);
 /* While it is stopped: reads what is stale; false: it is too much, or cannot be read. */
 bool copy_read(struct dirty *dirty, const struct process *process);
 /* When it runs again: what was read is written to the template. */

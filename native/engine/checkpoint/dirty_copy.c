@@ -169,18 +169,37 @@ void copy_stale(struct dirty *dirty, const struct process *process)
 
 /* ---- in the freeze, and after it --------------------------------------------------------------- */
 
-bool copy_read(struct dirty *dirty, const struct process *process)
+/* What there is to be read, as far as there is room for it. */
+static bool sort(struct dirty *dirty, int pagemap, const struct pageset *pages)
 {
 	struct page_cursor at = { 0 };
 	avc_remote start, end;
 
 	dirty->runs = 0;
 	dirty->used = 0;
-	while (pageset_next(dirty->idle.stale, &at, &start, &end))
-		if (!sort_stretch(dirty, process->tracker->pagemap, start, end) ||
-		    dirty->used > dirty->data_bytes || dirty->used > FREEZE_PAGES * PAGE)
+	while (pageset_next(pages, &at, &start, &end))
+		if (!sort_stretch(dirty, pagemap, start, end) || dirty->used > dirty->data_bytes ||
+		    dirty->used > FREEZE_PAGES * PAGE)
 			return false;
-	return move(dirty, process->pid, process->mem_fd, true);
+	return true;
+}
+
+bool copy_read(struct dirty *dirty, const struct process *process)
+{
+	return sort(dirty, process->tracker->pagemap, dirty->idle.stale) &&
+	       move(dirty, process->pid, process->mem_fd, true);
+}
+
+bool copy_read_template(struct dirty *dirty, pid_t template, const struct pageset *pages)
+{
+	int pagemap = proc_open(template, "pagemap", O_RDONLY);
+	int mem = proc_open(template, "mem", O_RDONLY);
+	const bool read = pagemap >= 0 && mem >= 0 && sort(dirty, pagemap, pages) &&
+			  move(dirty, template, mem, true);
+
+	close_fd(&pagemap);
+	close_fd(&mem);
+	return read;
 }
 
 static int advise(struct template_calls *calls, avc_remote start, avc_remote end, int advice,

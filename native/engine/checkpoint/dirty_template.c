@@ -14,7 +14,7 @@
 #define LAYOUT_TRIES 3 /* a heap that has grown is protected in the second                */
 
 struct template_calls template_calls_begin(const struct parasite *parasite,
-					   const struct idle_template *idle, uint32_t slot)
+					   struct idle_template *idle, uint32_t slot)
 {
 	return (struct template_calls){
 		.parasite = parasite,
@@ -100,6 +100,8 @@ static struct inj_syscall call_of(const struct layout_step *step)
 static int take_steps(struct template_calls *calls, const struct layout_steps *steps,
 		      struct avc_error *err)
 {
+	/* What stood in memory that is given back is noted nowhere. */
+	calls->idle->near = 0;
 	for (uint32_t i = 0; i < steps->count; i++) {
 		const struct layout_step *step = &steps->step[i];
 		const struct inj_syscall call = call_of(step);
@@ -136,4 +138,16 @@ int template_follow_layout(struct template_calls *calls, char *layout, struct av
 	free(steps.step);
 	free(theirs);
 	return result;
+}
+
+int template_set_break(struct template_calls *calls, int64_t end, struct avc_error *err)
+{
+	const struct inj_syscall call = { .nr = SYS_brk, .arg = { (uint64_t)end } };
+
+	if (calls->idle->inherited->value[INHERITED_BREAK] == end)
+		return 0;
+	if (template_call(calls, &call, err) || template_calls_end(calls, err))
+		return -1;
+	calls->idle->inherited->value[INHERITED_BREAK] = end;
+	return 0;
 }

@@ -9,7 +9,7 @@
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 
-static struct dirty *find(const struct dirty_tree *tree, const struct process *process)
+struct dirty *dirty_find(const struct dirty_tree *tree, const struct process *process)
 {
 	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->of[i]->process == process)
@@ -50,7 +50,7 @@ static void forget_ended(struct dirty_tree *tree)
 /* The process is not freed as long as something is known of it here. */
 static struct dirty *get(struct dirty_tree *tree, struct process *process)
 {
-	struct dirty *dirty = find(tree, process);
+	struct dirty *dirty = dirty_find(tree, process);
 
 	if (dirty)
 		return dirty;
@@ -126,7 +126,7 @@ int dirty_capture(struct dirty_tree *dirty, const struct generation *generation,
 		const struct image *image = &generation->image[i];
 
 		if (image->process && image->process->recycling &&
-		    dirty_capture_one(find(dirty, image->process), image, err))
+		    dirty_capture_one(dirty_find(dirty, image->process), image, err))
 			return -1;
 	}
 	return 0;
@@ -137,7 +137,7 @@ int dirty_apply(struct dirty_tree *dirty, struct generation *generation, struct 
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct image *image = &generation->image[i];
 		struct dirty *one = image->process && image->process->recycling
-					    ? find(dirty, image->process)
+					    ? dirty_find(dirty, image->process)
 					    : NULL;
 
 		if (!one)
@@ -156,7 +156,8 @@ int dirty_check(struct dirty_tree *dirty, const struct generation *generation,
 	for (uint32_t i = 0; i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
 
-		if (image->recycled && dirty_check_one(find(dirty, image->process), image, err))
+		if (image->recycled &&
+		    dirty_check_one(dirty_find(dirty, image->process), image, err))
 			return -1;
 	}
 	return 0;
@@ -168,7 +169,7 @@ void dirty_follow(struct dirty_tree *dirty, const struct generation *generation)
 {
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct image *image = &generation->image[i];
-		struct dirty *one = image->process ? find(dirty, image->process) : NULL;
+		struct dirty *one = image->process ? dirty_find(dirty, image->process) : NULL;
 
 		if (one)
 			dirty_follow_one(one, image);
@@ -181,11 +182,19 @@ void dirty_recycle(struct dirty_tree *dirty, const struct generation *generation
 		return;
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct image *image = &generation->image[i];
-		struct dirty *one = image->process ? find(dirty, image->process) : NULL;
+		struct dirty *one = image->process ? dirty_find(dirty, image->process) : NULL;
 
 		if (one)
 			dirty_recycle_one(one, image);
 	}
+}
+
+void dirty_compare(struct dirty_tree *dirty, const struct generation *generation)
+{
+	struct dirty *one = dirty_find(dirty, generation->image[0].process);
+
+	if (one)
+		dirty_compare_one(one, &generation->image[0], generation->number);
 }
 
 void dirty_drop_idle(struct dirty_tree *dirty)

@@ -85,6 +85,7 @@ static int end_fork(struct generation *generation, struct avc_error *err)
 		generation->image[0].process->lost = true;
 	}
 	spare->pidfd = proc_pidfd_open(spare->pid);
+	spare->base = generation->image[0].base;
 	spare->work = SPARE_REST;
 	return 0;
 }
@@ -100,7 +101,7 @@ static bool name_spare(const struct generation *generation)
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(parasite, call->out));
 	return generation->spare.pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
-	       parasite_send(parasite, spare, &generation->image[0].base, call, &gone) == 0 &&
+	       parasite_send(parasite, spare, &generation->spare.base, call, &gone) == 0 &&
 	       parasite_run(spare, call, &gone) == 0;
 }
 

@@ -74,6 +74,7 @@ struct avc_guard {
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* it was found dying: guard_reap_unknown() until then    */
 	bool cramped;            /* there is no room for spares              */
+	uint64_t spare_ns;       /* when the last one was made               */
 	uint64_t ahead_ns;       /* when to guard_work_ahead(); UINT64_MAX: never  */
 	struct policy policy;    /* held[i] is of generations[i]             */
 	uint32_t restores;

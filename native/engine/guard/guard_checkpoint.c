@@ -297,7 +297,9 @@ static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
 	struct avc_error later = { 0 };
 
-	guard->ahead_ns = now_ns() + AHEAD_AFTER_NS;
+	guard->ahead_ns = now_ns();
+	if (!stand_in_is_there(&guard->dirty, fresh))
+		guard->ahead_ns += AHEAD_AFTER_NS;
 	if (fresh->images > 1 &&
 	    restore_plan_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX,
 			       &later))
@@ -317,12 +319,21 @@ static bool drop_old_spare(struct avc_guard *guard)
 	return any;
 }
 
-static bool wants_spare(const struct avc_guard *guard, struct generation *newest)
+/* Where checkpoints are copies, there is none to be made after each of them, but after a restore, say:
+ * it may take its share of the time since the last one. */
+static bool may_make_spare(const struct avc_guard *guard, const struct generation *newest)
 {
 	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
 
+	return !interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE ||
+	       (newest->image[0].inherited &&
+		newest->clone_ns <= (now_ns() - guard->spare_ns) / SPARE_SHARE);
+}
+
+static bool wants_spare(const struct avc_guard *guard, const struct generation *newest)
+{
 	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
-	       (!interval_ns || newest->clone_ns <= interval_ns / SPARE_SHARE);
+	       !stand_in_is_there(&guard->dirty, newest) && may_make_spare(guard, newest);
 }
 
 static void make_spare(struct avc_guard *guard, struct generation *newest)
@@ -331,6 +342,7 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 
 	if (!last_pid_lock(guard->channel.numbers_fd, false))
 		return;
+	guard->spare_ns = now_ns();
 	tracee_deadline_set(guard->timer, SPARE_NS);
 	/* A template that was killed is seen to by guard_reap_dead(), as soon as that shows. */
 	if (spare_make(newest, &error) && error.code != AVC_GONE &&
@@ -350,7 +362,7 @@ static void work_ahead(struct avc_guard *guard)
 		return;
 	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
-	if (drop_old_spare(guard))
+	if (stand_in_catch_up(&guard->dirty, newest, guard->timer) || drop_old_spare(guard))
 		; /* which has to end first */
 	else if (wants_spare(guard, newest))
 		make_spare(guard, newest);
@@ -462,8 +474,9 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	dirty_follow(&guard->dirty, fresh);
 	fresh->clone_ns = guard->dirty.fork_ns;
 	fresh->freeze_ns = freeze->freeze_ns;
-	begin_ahead(guard, fresh);
 	guard_keep_generation(guard, fresh);
+	dirty_compare(&guard->dirty, fresh);
+	begin_ahead(guard, &guard->generations[guard->count - 1]);
 	init_channel_arm(&guard->channel, true);
 	event->images = guard->dirty.reason ? AVC_IMAGES_FORK : AVC_IMAGES_DIRTY;
 	event->fork_reason = guard->dirty.reason;

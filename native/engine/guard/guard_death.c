@@ -188,7 +188,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		      enum avc_reason reason, uint32_t had, struct avc_error *error)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_RESTORED);
-	bool ending = guard->count < had, again = false, back = false;
+	bool ending = guard->count < had, again = false, back = false, whole;
 	const bool together = guard->meeting != NULL;
 
 	event.ticket = guard->restore_ticket;
@@ -234,13 +234,19 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		init_channel_working(&guard->channel);
 		(void)last_pid_lock(guard->channel.numbers_fd, true);
 		guard->helper = NULL; /* it is the restore's now, which ends it */
+		stand_in_begin(&guard->dirty, generation, guard->timer);
 		back = restore_app(&restore, &failed) == 0;
 		last_pid_unlock(guard->channel.numbers_fd);
+		whole = stand_in_finish(&guard->dirty, generation, guard->timer);
 		if (back) {
 			adopt_family(guard, generation);
 			generation->spare.tried = false; /* that one is used up */
 			note_restore(guard, reason);
 			tell_restored(guard, &event, &restore, error);
+			guard_rank_generations(guard);
+			if (!whole)
+				guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED,
+						      0);
 			break;
 		}
 		if (!guard_may_meet(guard)) {
@@ -251,7 +257,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		}
 		/* Perhaps because the spare was killed when it was needed, or was one
 		 * process too many.  The template is as good as before. */
-		if (generation->spare.pid && !again) {
+		if (whole && generation->spare.pid && !again) {
 			spare_drop(generation);
 			generation->spare.unwanted = failed.errnum == EAGAIN;
 			again = true;

@@ -133,7 +133,7 @@ pid_t process_give_holder(struct process *process, int *pidfd);
 /* ---- tracker.c -------------------------------------------------------------------- */
 
 /* Sets that are added to. */
-#define TRACKER_SETS (AVC_KEEP_MAX + 2)
+#define TRACKER_SETS (AVC_KEEP_MAX + 3)
 
 /* Whose private memory is watched: the kernel notes which pages are written, in the process's page
  * table and by no fault that anybody waits for.  With the last descriptor, which is ours, all of it

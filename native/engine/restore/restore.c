@@ -109,13 +109,14 @@ static int fork_template(struct restore *restore, bool again, struct avc_error *
 	struct inj_call *call = &slot->template_call;
 	const bool spare = spare_is_there(generation);
 	const pid_t from = spare ? generation->spare.pid : image->template;
+	const struct arch_regs *base = spare ? &generation->spare.base : &image->base;
 	pid_t child = 0;
 
 	/* The first time there are calls of files_restore() before it. */
 	if (again)
 		call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, (spare ? CLONE_VM : 0) | CLONE_FILES | CLONE_PARENT | SIGCHLD);
-	if (parasite_send(parasite, from, &image->base, call, err) ||
+	if (parasite_send(parasite, from, base, call, err) ||
 	    parasite_run_clone(from, call, &child, err))
 		return -1;
 	if (tracee_await(child, NULL, err) != STOP_TRAP)
