@@ -61,7 +61,7 @@ def write_answer(container: str, ask: Callable[[float], bytes]) -> None:
         answer = {"healthcheck": None, "error": str(error)}
         if _has_ended(container):
             return
-        tell.journal(f"avckpt: container {container[:12]}: its health check cannot be found out: {error}")
+        tell.journal(f"avckpt: container {container[:12]}: its health check cannot be determined: {error}")
     path = protocol.health_path(container)
     content = json.dumps(answer).encode()
     if len(content) > protocol.MAX_BYTES:

@@ -98,7 +98,7 @@ def container_id(config: bytes) -> str:
                     return found
     except (ValueError, AttributeError) as error:
         raise Unknown("its configuration is not what was expected") from error
-    raise Unknown("its configuration does not tell its id")
+    raise Unknown("its configuration does not contain its id")
 
 
 def generate_spec(container: str, parent_pid: int) -> bytes:
@@ -279,7 +279,7 @@ def _run(program: str, argv: list[str], env: dict[str, str], deadline: float) ->
                 texts[fd] += part
                 if len(texts[fd]) > _MOST_BYTES:
                     os.kill(pid, _SIGKILL)
-                    raise Unknown(f"podman {_asked(argv)} says too much")
+                    raise Unknown(f"podman {_asked(argv)} printed too much")
                 if not part:
                     poll.unregister(fd)
                     open_fds -= 1

@@ -145,7 +145,7 @@ def _ask_for_health(container: str, name: str, parent: int) -> None:
     try:
         health.ask_later(container, parent)
     except (OSError, podman.Unknown) as error:
-        tell.journal(f"avckpt: container {name}: its health check cannot be found out: {error}")
+        tell.journal(f"avckpt: container {name}: its health check cannot be determined: {error}")
 
 
 def put_init_in_front(data: dict[str, Any]) -> None:

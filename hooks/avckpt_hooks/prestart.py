@@ -72,7 +72,7 @@ def ask(registration: protocol.Register, pidfd: int) -> str:
     try:
         packet = registration.encode()
     except protocol.ProtocolError as error:
-        return f"its labels are too much for the sidecar: {error}"
+        return f"its labels are too large for the sidecar: {error}"
     try:
         refusal = protocol.exchange(packet, pidfd)
     except TimeoutError:
@@ -80,7 +80,7 @@ def ask(registration: protocol.Register, pidfd: int) -> str:
     except OSError as error:
         return f"no sidecar listens on {protocol.hooks_socket()} ({error.strerror})"
     except protocol.ProtocolError as error:
-        return f"the sidecar's answer makes no sense: {error}"
+        return f"the sidecar's answer is invalid: {error}"
     return f"the sidecar said: {refusal}" if refusal else ""
 
 

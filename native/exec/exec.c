@@ -6,17 +6,15 @@
  *   avckpt-exec PIDFD PID TIMEOUT_MS ERROR_FD ENV_FD CREDENTIALS NGROUPS GROUP...
  *                 NCGROUPS FILE... COMMAND [ARG...]
  *
- * PIDFD and PID name a process of the container (avckpt-init) whose namespaces,
- * working directory, resource limits and seccomp filters the command gets.
- * CREDENTIALS is UID:GID:INH:PRM:EFF:BND:AMB:NNP, the capability sets in hex.
- * ENV_FD holds the environment, NUL-terminated strings.  Each FILE is a
- * cgroup.procs.  For the sidecar only, which starts it from a sealed memfd:
- * what runs in a container must not be able to write to our program through
+ * PIDFD and PID name a process of the container (avckpt-init) whose namespaces, working directory,
+ * resource limits and seccomp filters the command gets. CREDENTIALS is
+ * UID:GID:INH:PRM:EFF:BND:AMB:NNP, the capability sets in hex. ENV_FD holds the environment,
+ * NUL-terminated strings. Each FILE is a cgroup.procs. For the sidecar only, which starts it from a
+ * sealed memfd: processes of a container must not be able to write to our program through
  * /proc/PID/exe.
  *
- * Ends with the command's status, 128+N if signal N killed it.  What went wrong
- * on the way is a line on ERROR_FD; "timeout" there says that time was up and
- * the command, with its process group, was killed.
+ * Exits with the command's status, 128+N if signal N killed it. An error is a line on ERROR_FD;
+ * "timeout" there means that the command, with its process group, was killed at the timeout.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -149,8 +147,8 @@ static void read_arguments(char **argv)
 	take(argv, "COMMAND");
 	job.command = argv;
 
-	/* The environment is the container's and not to be ours: it can hold
-	 * what our own C library listens to. */
+	/* The environment is for the command, not for us: it can hold variables that affect our own
+	 * C library. */
 	{
 		struct stat st;
 		char *text;
@@ -171,8 +169,8 @@ static void read_arguments(char **argv)
 	}
 }
 
-/* The filters of the container's main process.  The kernel gives them to a tracer
- * only, so it is stopped for a moment; our end, however it comes, lets it go. */
+/* The filters of the container's main process. The kernel shows them only to a tracer, so it is
+ * stopped briefly; our exit, however it comes about, releases it. */
 static void read_filters(void)
 {
 	int status;
@@ -239,14 +237,14 @@ static void read_model(void)
 	must(job.cwd_fd >= 0, path);
 	for (int i = 0; i < RLIM_NLIMITS; i++)
 		if (prlimit(job.pid, (__rlimit_resource_t)i, NULL, &job.limits[i]))
-			/* Of another user's process only with CAP_SYS_RESOURCE. */
+			/* Another user's process needs CAP_SYS_RESOURCE. */
 			must(getrlimit((__rlimit_resource_t)i, &job.limits[i]) == 0, "getrlimit");
 	if (has_filters())
 		read_filters();
 }
 
-/* Only the user namespace that we come from has the right to a higher hard limit; the command,
- * in the container's, only ever lowers what it has. */
+/* Only our original user namespace may raise a hard limit; the command, in the container's, can
+ * only lower it. */
 static void raise_limits(void)
 {
 	for (int i = 0; i < RLIM_NLIMITS; i++) {
@@ -257,7 +255,7 @@ static void raise_limits(void)
 			continue;
 		own.rlim_max = job.limits[i].rlim_max;
 		if (setrlimit((__rlimit_resource_t)i, &own))
-			errno = 0; /* we may not: ours stays */
+			errno = 0; /* not permitted: ours stays */
 	}
 }
 
@@ -285,7 +283,7 @@ static void install_filters(void)
 
 static void drop_privileges(void)
 {
-	/* What it takes to install a filter without no_new_privs. */
+	/* Needed to install a filter without no_new_privs. */
 	const unsigned long long admin = UINT64_C(1) << CAP_SYS_ADMIN | UINT64_C(1) << CAP_SETUID |
 					 UINT64_C(1) << CAP_SETGID;
 
@@ -313,11 +311,11 @@ static void drop_privileges(void)
 		must(prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0, "prctl(NO_NEW_PRIVS)");
 }
 
-/* Whoever has CAP_SYS_PTRACE in the container's PID namespace can take a process in there
- * over, also one that is not dumpable.  So what is born there is what the command will be,
- * with nothing more: its parent, which is outside, has become that before.  What the
- * container can make last for as long as it likes comes when it is there: its control
- * groups (a CPU quota, a freezer) and its working directory (FUSE). */
+/* A process with CAP_SYS_PTRACE in the container's PID namespace can take over any process in
+ * there, even one that is not dumpable. So a process that is created there has no more privileges
+ * than the command will have: its parent, which is outside, has dropped the rest before. Steps that
+ * the container can delay at will come once it is inside: its control groups (a CPU quota, a
+ * freezer) and its working directory (FUSE). */
 static _Noreturn void become_command(int gate)
 {
 	char go;
@@ -325,11 +323,11 @@ static _Noreturn void become_command(int gate)
 	if (job.no_new_privs)
 		install_filters();
 	must(setsid() >= 0, "setsid");
-	/* A parent that has died before that has closed the gate. */
+	/* If the parent has died before, the gate is closed. */
 	must(prctl(PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0) == 0, "prctl(SET_PDEATHSIG)");
 	must(write(gate, "", 1) == 1 && read(gate, &go, 1) == 1, "avckpt-exec has ended");
-	/* Who may not enter the main process's directory could do nothing there, and
-	 * stays in the root directory. */
+	/* If it may not enter the main process's directory, it could do nothing there, and stays in
+	 * the root directory. */
 	must(fchdir(job.cwd_fd) == 0 || errno == EACCES, "fchdir");
 	for (int sig = 1; sig < NSIG; sig++)
 		signal(sig, SIG_DFL);
@@ -359,8 +357,8 @@ static void keep_only(const int *fds, size_t count)
 	must(close_range(3, ~0U, CLOSE_RANGE_CLOEXEC) == 0, "close_range");
 }
 
-/* Outside of the PID namespace, until it has become the container's.  The command is a child of
- * its parent's. */
+/* Stays outside of the PID namespace until it has the container's privileges. The command is a
+ * child of its parent. */
 static _Noreturn void go_inside(int gate, int namespaces)
 {
 	long child;
@@ -381,8 +379,8 @@ static _Noreturn void go_inside(int gate, int namespaces)
 	_exit(0);
 }
 
-/* What go_inside() has brought forth: our only child now.  Whatever it says itself is the
- * container's.  0: it has not come to that, and has said why. */
+/* The process created by go_inside(): our only child now. Whatever it reports is the container's.
+ * 0: it was not created, and the reason has been reported. */
 static pid_t find_command(pid_t between)
 {
 	char path[64], text[64] = "";
@@ -398,8 +396,8 @@ static pid_t find_command(pid_t between)
 	return atoi(text);
 }
 
-/* Waits until the child has given up its privileges, and lets it go on in the
- * container's control groups.  A child that ends before that has said why. */
+/* Waits until the child has dropped its privileges, and lets it continue in the container's control
+ * groups. A child that exits before has reported why. */
 static void let_go(pid_t child, int gate)
 {
 	char ready, pid[16];
@@ -433,7 +431,7 @@ int main(int argc, char **argv)
 	read_arguments(argv + 1);
 	deadline = now_ms() + job.timeout_ms;
 	must(prctl(PR_SET_DUMPABLE, 0, 0, 0, 0) == 0, "prctl(SET_DUMPABLE)");
-	/* Until there is a command to be killed, being late ends us. */
+	/* Until there is a command to kill, the timeout ends us. */
 	signal(SIGALRM, SIG_DFL);
 	setitimer(ITIMER_REAL,
 		  &(struct itimerval){
@@ -467,13 +465,13 @@ int main(int argc, char **argv)
 			continue;
 		if (left > 0 && errno == EINTR)
 			continue;
-		/* SIGTERM says that the sidecar is no longer interested. */
+		/* SIGTERM means that the sidecar has cancelled the command. */
 		kill(-child, SIGKILL);
 		kill(child, SIGKILL);
 		dprintf(error_fd, "timeout\n");
 		waitpid(child, &status, 0);
 		break;
 	}
-	/* What the command has left running was its own business. */
+	/* What the command has left running stays. */
 	return WIFSIGNALED(status) ? 128 + WTERMSIG(status) : WEXITSTATUS(status);
 }

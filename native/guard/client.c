@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The daemon's side of its guards: starts them, tells them what to do, queues what they
- * say.  This is all of the native code that runs in the daemon.
+ * The daemon's side of its guards: starts them, sends them requests, queues their events. This is
+ * all of the native code that runs in the daemon.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -23,10 +23,10 @@
 #include "base.h"
 
 #define QUEUE_MAX 4096
-#define STOP_MS 15000     /* a guard may be in the middle of a restore                    */
-#define END_MS 1000       /* from the end of its socket to the end of the process         */
-#define EVENTS_AT_ONCE 64 /* that are taken from one of them before it is the others' turn */
-#define STARVED_FACTOR 10 /* so much more patience with who only waits for a CPU          */
+#define STOP_MS 15000     /* a guard may be in the middle of a restore */
+#define END_MS 1000       /* from the end of its socket to the exit of the process */
+#define EVENTS_AT_ONCE 64 /* taken from one guard before it is the others' turn */
+#define STARVED_FACTOR 10 /* factor of patience for one that only waits for a CPU */
 
 extern char **environ;
 
@@ -37,11 +37,11 @@ struct avc_guard {
 	pid_t pid;
 	int pidfd, socket;
 	const struct avc_heartbeat *heartbeat;
-	uint64_t beats, beats_ns; /* the last that were seen, and when              */
-	bool stopping;            /* somebody has asked for its end                 */
-	bool ended;               /* its socket says so                             */
+	uint64_t beats, beats_ns; /* the last ones seen, and when */
+	bool stopping;            /* its exit was requested */
+	bool ended;               /* its socket is at end of file */
 	bool hung;                /* and we have killed it                          */
-	bool mad;                 /* likewise, for what it said                     */
+	bool mad;                 /* likewise, for an invalid message */
 	int status;               /* of the ended process, as from waitpid(2)       */
 };
 
@@ -101,7 +101,7 @@ static void queue_event(struct avc_engine *engine, const struct avc_event *event
 	eventfd_write(engine->queue_fd, 1);
 }
 
-/* Reaps it.  It may take a moment from the end of its socket to its own. */
+/* Reaps it. It may exit a moment after the end of its socket. */
 static void guard_reap(struct avc_guard *guard, int patience_ms)
 {
 	struct pollfd ending = { .fd = guard->pidfd, .events = POLLIN };
@@ -115,7 +115,7 @@ static void guard_reap(struct avc_guard *guard, int patience_ms)
 	guard->pid = 0;
 }
 
-/* It has ended, and nobody had asked for that: the daemon is to start another one. */
+/* It has exited without a request: the daemon must start another one. */
 static void guard_lost(struct avc_guard *guard)
 {
 	struct avc_event event = { .kind = AVC_EVENT_GUARD_LOST,
@@ -142,8 +142,8 @@ static bool is_text(const char *chars, size_t size)
 	return memchr(chars, 0, size) != NULL;
 }
 
-/* A guard reads what containers show it, and may have been talked into anything: what it says of
- * its own container goes for that one, and nothing else does. */
+/* A guard reads data of containers, and may have been compromised: its events are accepted for its
+ * own container only. */
 static bool event_is_sound(const struct avc_guard *guard, const struct avc_event *event)
 {
 	return event->cookie == guard->cookie && event->kind >= AVC_EVENT_ATTACHED &&
@@ -155,7 +155,8 @@ static bool event_is_sound(const struct avc_guard *guard, const struct avc_event
 	       is_text(event->error.detail, sizeof event->error.detail);
 }
 
-/* Queues what it has said so far, or a part of that: one that never ends must not keep us. */
+/* Queues its events so far, or a part of them: one that never stops sending must not keep us
+ * busy. */
 static void guard_listen(struct avc_guard *guard)
 {
 	struct avc_event event;
@@ -168,7 +169,7 @@ static void guard_listen(struct avc_guard *guard)
 		guard->mad = n != sizeof event || !event_is_sound(guard, &event);
 		if (guard->mad)
 			break;
-		/* Its last word, after which it ends by itself. */
+		/* Its last event, after which it exits by itself. */
 		guard->stopping |= event.kind == AVC_EVENT_ENDED;
 		queue_event(guard->engine, &event);
 	}
@@ -219,8 +220,8 @@ void avc_engine_free(struct avc_engine *engine)
 
 /* ---- processes ------------------------------------------------------------------- */
 
-/* `program`, with `socket` as AVC_GUARD_FD, no signal blocked or ignored, and in a session of
- * its own: what is typed at our terminal is not for it. */
+/* `program`, with `socket` as AVC_GUARD_FD, no signal blocked or ignored, and in its own session:
+ * keys of our terminal must not reach it. */
 static int spawn(const char *program, char *const argv[], int socket, pid_t *pid)
 {
 	posix_spawn_file_actions_t actions;
@@ -322,7 +323,7 @@ static void guard_free(struct avc_guard *guard)
 	free(guard);
 }
 
-/* Its memory, its process; what fails is left to guard_free(). */
+/* Its memory, its process; guard_free() cleans up after a failure. */
 static int guard_spawn(struct avc_guard *guard, const struct avc_config *config,
 		       struct avc_error *err)
 {
@@ -346,7 +347,7 @@ static int guard_spawn(struct avc_guard *guard, const struct avc_config *config,
 		return fail_errno(err, 0, "start guard", "socketpair", "no descriptors");
 	}
 	guard->socket = ends[0];
-	/* Before it is there: the message waits for it. */
+	/* Before it starts: the message waits for it. */
 	result = send_start(guard->socket, config, guard->cookie, heartbeat_fd);
 	if (result)
 		fail_errno(err, 0, "start guard", "sendmsg", "it cannot be told what to do");
@@ -362,7 +363,7 @@ static int guard_spawn(struct avc_guard *guard, const struct avc_config *config,
 	if (guard->pidfd >= 0)
 		return 0;
 	fail_errno(err, 0, "start guard", "pidfd_open", "no descriptor");
-	kill(guard->pid, SIGKILL); /* our child, not reaped: the number is its own */
+	kill(guard->pid, SIGKILL); /* our unreaped child: the PID is still its own */
 	waitpid(guard->pid, NULL, 0);
 	return -1;
 }
@@ -413,7 +414,7 @@ int32_t avc_guard_pid(struct avc_guard *guard)
 	return pid;
 }
 
-/* Whether it would run if it got a CPU; a loop without end is told by its patience. */
+/* Whether it is runnable but gets no CPU; an endless loop is caught by STARVED_FACTOR. */
 static bool is_runnable(pid_t pid)
 {
 	struct proc_stat stat;
@@ -440,7 +441,7 @@ void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
 	pthread_mutex_unlock(&guard->engine->lock);
 }
 
-/* `fd` goes with it; -1: none. */
+/* `fd` is sent along; -1: none. */
 static int guard_send(struct avc_guard *guard, const struct avc_request *request, int fd,
 		      struct avc_error *err)
 {
@@ -543,7 +544,7 @@ void avc_guard_stop(struct avc_guard *guard)
 	pthread_mutex_lock(&engine->lock);
 	guard->stopping = true;
 	shutdown(guard->socket, SHUT_WR);
-	/* What it still says is queued, or it could not say all of it. */
+	/* Its remaining events are queued, or it could not send all of them. */
 	while (!guard->ended && now_ns() < end) {
 		struct pollfd news = { .fd = guard->socket, .events = POLLIN };
 

@@ -3,11 +3,11 @@
  * avckpt-guard: the process that protects one container.  The daemon starts it
  * (client.c), with its end of a socket as descriptor AVC_GUARD_FD.
  *
- *   avckpt-guard          guards, as the daemon says (avckpt/guard.h)
+ *   avckpt-guard guards, as the daemon requests (avckpt/guard.h)
  *   avckpt-guard --probe  writes a struct avc_error there: whether it could
  *
- * What goes wrong in here costs one container its protection for a moment, and nobody else
- * anything: the memory, the descriptors and the privileges are this process's own.
+ * A failure in here costs only one container its protection, briefly: memory, descriptors and
+ * privileges are separate for each guard.
  */
 #include <linux/capability.h>
 #include <string.h>
@@ -19,11 +19,11 @@
 #include "avckpt/guard.h"
 #include "guard.h"
 
-#define DESCRIPTORS_MAX 32768 /* a template's are looked at one by one, and a few of each kept */
+#define DESCRIPTORS_MAX 32768 /* a template's are examined one by one, and a few of each kept */
 #define MEMORY_MAX (UINT64_C(1) << 30)
 #define REFUSED 4 /* exit status: it could not be confined                          */
 
-/* What a guard does with each.  All others are given up for good. */
+/* What a guard uses each for. All others are dropped for good. */
 static const uint8_t needed[] = {
 	CAP_SYS_PTRACE,         /* ptrace(2), process_vm_*(2), /proc/PID of others         */
 	CAP_SYS_ADMIN,          /* PTRACE_O_SUSPEND_SECCOMP, setns(2), pagemap, perf events */
@@ -38,9 +38,9 @@ static const uint8_t needed[] = {
 	CAP_FSETID,
 	CAP_SETUID, /* the same, as its users                                  */
 	CAP_SETGID,
-	CAP_SETPCAP,    /* to give capabilities up                                 */
+	CAP_SETPCAP,    /* to drop capabilities */
 	CAP_NET_ADMIN,  /* TCP_REPAIR, SO_*BUFFORCE                                */
-	CAP_NET_RAW,    /* raw sockets that are made again                         */
+	CAP_NET_RAW,    /* raw sockets that are recreated */
 	CAP_SYS_CHROOT, /* setns(2) into a mount namespace                         */
 	CAP_IPC_OWNER,  /* System V objects                                        */
 	CAP_IPC_LOCK,   /* locked memory of the application                        */
@@ -66,7 +66,7 @@ static int drop_capabilities(void)
 
 	for (size_t i = 0; i < sizeof needed / sizeof *needed; i++)
 		keep |= UINT64_C(1) << needed[i];
-	/* Those that the kernel does not know end it. */
+	/* The first one unknown to the kernel ends the loop. */
 	for (int cap = 0; prctl(PR_CAPBSET_READ, cap, 0, 0, 0) >= 0; cap++)
 		if (!(keep >> cap & 1) && prctl(PR_CAPBSET_DROP, cap, 0, 0, 0))
 			return -1;
@@ -83,11 +83,11 @@ static int drop_capabilities(void)
 		       : 0;
 }
 
-/* Its memory holds pieces of applications: no core, and nobody without CAP_SYS_PTRACE looks. */
+/* Its memory holds parts of applications: no core file, no access without CAP_SYS_PTRACE. */
 static int confine(void)
 {
 #ifdef __SANITIZE_ADDRESS__
-	return drop_capabilities(); /* it wants terabytes, and looks for leaks by ptrace(2) */
+	return drop_capabilities(); /* it reserves terabytes, and finds leaks by ptrace(2) */
 #endif
 	return limit(RLIMIT_NOFILE, DESCRIPTORS_MAX) || limit(RLIMIT_DATA, MEMORY_MAX) ||
 			       limit(RLIMIT_CORE, 0) || drop_capabilities() ||

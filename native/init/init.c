@@ -8,14 +8,13 @@
  *
  *   avckpt-init [--name NAME] [--label avckpt.KEY=VALUE ...] [--] PROGRAM [ARG...]
  *
- * It does what every container init does (forwards signals, reaps zombies,
- * ends with the app's status), and one thing more: when the app dies in a way
- * nobody asked for, it does not end but reports the death to the guard, and
- * goes on as the parent of the process that the guard puts in the app's place.
- * What the two say to each other is written down in avckpt/ctl.h.
+ * It does what every container init does (forwards signals, reaps zombies, ends with the app's
+ * status), and one thing more: when the app dies unrequested, it does not exit but reports the
+ * death to the guard, and becomes the parent of the process that the guard puts in the app's place.
+ * Their protocol is in avckpt/ctl.h.
  *
- * The app comes first.  Whatever fails in here before the app is started makes
- * it run unprotected, under a plain init; it never keeps it from running.
+ * The app comes first. Whatever fails in here before the app is started makes it run unprotected,
+ * under a plain init, but never prevents it from running.
  *
  * Nothing is allocated after the start, and nothing blocks but one ppoll(2).
  * All signals are blocked for good and read from a signalfd, so there are no
@@ -45,9 +44,9 @@
 #include "keys.h"
 
 #define NAME "avckpt-init"
-#define EXIT_USAGE 125 /* init's own failure, as Podman's own are */
+#define EXIT_USAGE 125 /* init's own failure, as for Podman */
 #define END_CHILDREN_MS 500
-#define KEYS_MS 10000 /* an end so long after Ctrl-C is one that was asked for */
+#define KEYS_MS 10000 /* an exit within this time after Ctrl-C was requested */
 #define VERDICTS_PER_ROUND 1024
 
 #ifndef MFD_NOEXEC_SEAL
@@ -72,14 +71,14 @@ enum {
 
 static struct {
 	struct avc_ctl *ctl; /* NULL: this is a plain init */
-	int fd[FDS];         /* -1: not there */
+	int fd[FDS];         /* -1: none */
 	pid_t pid;
 	pid_t app_pid;
 	const char *app_name;
 	int stop_signal;
 	uint32_t wait_ms;
 	bool is_unit;      /* below a launcher: unit.c */
-	bool shares_group; /* the program is in ours */
+	bool shares_group; /* the program is in our process group */
 
 	bool waiting; /* reported death `seq`, waits for the verdict */
 	uint32_t seq;
@@ -87,8 +86,8 @@ static struct {
 	int attempt_status;      /* of the last app that died while waiting ... */
 	uint64_t attempt_ns;     /* ... and when */
 	uint64_t deadline_ns;    /* of the wait */
-	uint64_t deferred;       /* SIGBITs that came while there was no app */
-	uint64_t stop_ns;        /* when a stop was asked for last, 0: never */
+	uint64_t deferred;       /* SIGBITs that arrived while there was no app */
+	uint64_t stop_ns;        /* when a stop was last requested, 0: never */
 	uint64_t sent_ns[_NSIG]; /* when each signal was forwarded last */
 
 	uint64_t mask;         /* the signal mask we were started with */
@@ -103,7 +102,7 @@ uint64_t now_ns(void)
 	return (uint64_t)ts.tv_sec * 1000 * NS_PER_MS + (uint64_t)ts.tv_nsec;
 }
 
-/* One line on stderr, in one write so that it is not torn apart. */
+/* One line on stderr, in one write so that it is not torn. */
 void say(const char *format, ...)
 {
 	char line[PIPE_BUF] = NAME ": ";
@@ -118,7 +117,7 @@ void say(const char *format, ...)
 		return;
 	len += (size_t)n < sizeof(line) - len - 1 ? (size_t)n : sizeof(line) - len - 2;
 	line[len++] = '\n';
-	/* Nobody to tell if this fails. */
+	/* Nowhere to report a failure. */
 	if (write(STDERR_FILENO, line, len) < 0)
 		return;
 }
@@ -130,8 +129,8 @@ static int mask_set(uint64_t mask, uint64_t *old)
 	return (int)syscall(SYS_rt_sigprocmask, SIG_SETMASK, &mask, old, sizeof(mask));
 }
 
-/* Moves a new descriptor above stderr: when we are started with closed 0..2,
- * new ones land there, and a message of ours would be written into them. */
+/* Moves a new descriptor above stderr: if 0..2 were closed at our start, new ones land there, and
+ * our messages would be written into them. */
 int above_stdio(int fd)
 {
 	int high;
@@ -170,7 +169,7 @@ static int make_ctl_memfd(void)
 	return above_stdio(fd);
 }
 
-/* Makes all that the guard needs.  On failure says so and leaves ctl NULL. */
+/* Creates all that the guard needs. On failure reports it and leaves ctl NULL. */
 static void protect(void)
 {
 	const char *what;
@@ -184,7 +183,7 @@ static void protect(void)
 	what = "ftruncate";
 	if (ftruncate(self.fd[CTL], sizeof(*ctl)) < 0)
 		goto fail;
-	/* Neither side can pull the page from under the other (SIGBUS). */
+	/* Neither side can truncate the page under the other (SIGBUS). */
 	what = "seal";
 	if (fcntl(self.fd[CTL], F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL) < 0)
 		goto fail;
@@ -196,10 +195,10 @@ static void protect(void)
 	if (make_pipe(REPORT_READ, REPORT_WRITE) < 0 || make_pipe(VERDICT, VERDICT_WRITE) < 0 ||
 	    make_pipe(EXEC, EXEC_WRITE) < 0)
 		goto fail;
-	/* The guard's will be the only write end: it is how we see it die. */
+	/* The guard's will be the only write end: that is how we see it die. */
 	close_fd(VERDICT_WRITE);
-	/* An app of the same user must not reach all this through /proc/PID/fd.
-	 * The app's own exec makes it dumpable again. */
+	/* An app of the same user must not reach all this through /proc/PID/fd. The app's exec
+	 * makes it dumpable again. */
 	what = "prctl(PR_SET_DUMPABLE)";
 	if (prctl(PR_SET_DUMPABLE, 0, 0, 0, 0) < 0)
 		goto fail;
@@ -219,11 +218,10 @@ fail:
 		close_fd(i);
 }
 
-/* Keeps a descriptor of the terminal if it is ours to give to the app: we are
- * the session's leader, or in its foreground group.  (A group whose leader is
- * outside our PID namespace is number 0 to us; so is the foreground group if
- * it is outside.  Then there is no telling, and foreground is the likely case:
- * who starts init in the background gives it a group of its own.) */
+/* Keeps a descriptor of the terminal if we may give it to the app: we are the session leader, or in
+ * the foreground group. (A group whose leader is outside our PID namespace is number 0 to us; so is
+ * the foreground group if it is outside. Then it is unknown, and foreground is the likely case: a
+ * background init would have its own group.) */
 static void find_terminal(void)
 {
 	pid_t foreground = tcgetpgrp(STDIN_FILENO);
@@ -235,8 +233,7 @@ static void find_terminal(void)
 	self.fd[TTY] = fcntl(STDIN_FILENO, F_DUPFD_CLOEXEC, STDERR_FILENO + 1);
 }
 
-/* The child's way to the app.  Everything the app inherits must be as we got
- * it ourselves. */
+/* The child's way to the app. Everything the app inherits must be as we inherited it. */
 static _Noreturn void become_app(char **argv)
 {
 	char number[16];
@@ -244,8 +241,8 @@ static _Noreturn void become_app(char **argv)
 	int err;
 
 	if (self.is_unit) {
-		/* What stands in the launcher's group stays there, and who kills the one
-		 * that the launcher knows, us, means the program. */
+		/* A unit stays in the launcher's group, and a signal that kills us, the process
+		 * known to the launcher, is meant for the program. */
 		unit_mark_environment();
 		if (getpid() != self.pid) {
 			prctl(PR_SET_PDEATHSIG, SIGKILL, 0, 0, 0);
@@ -254,8 +251,8 @@ static _Noreturn void become_app(char **argv)
 		}
 	}
 	if (!self.shares_group) {
-		/* A group of its own, so that a kill(0) of the app's does not come back
-		 * to it through us, and the terminal's signals are the app's alone. */
+		/* A group of its own, so that the app's kill(0) does not come back to it through
+		 * us, and only the app gets the terminal's signals. */
 		setpgid(0, 0);
 	}
 	if (self.fd[TTY] >= 0)
@@ -271,15 +268,14 @@ static _Noreturn void become_app(char **argv)
 	err = errno;
 	if (self.ctl)
 		__atomic_store_n(&self.ctl->exec_errno, err, __ATOMIC_RELEASE);
-	/* Without an init in front, Podman's runtime says this before the container
-	 * is even started.  Here it is a container that ends with the same status. */
+	/* Without an init in front, Podman's runtime says this before the container is even
+	 * started. Here the container ends with the same status. */
 	say("%s: %s", argv[0], strerror(err));
 	_exit(err == ENOENT ? 127 : 126);
 }
 
-/* Closes what we inherited and do not use.  What the app closes must be closed:
- * a listening port would stay taken, a pipe's reader would see no end.  stderr
- * stays, it is where we say things. */
+/* Closes what we inherited and do not use. What the app closes must be closed: a listening port
+ * would stay taken, a pipe's reader would see no end. stderr stays for our messages. */
 static void drop_inherited(void)
 {
 	unsigned int from = STDERR_FILENO + 1;
@@ -308,7 +304,7 @@ static void drop_inherited(void)
 		close(null_fd);
 }
 
-/* Who presses a key of the terminal; the guard is to know that this task is ours. */
+/* Watches the keys of the terminal; the guard must know that this task is ours. */
 static void listen_to_keys(void)
 {
 	const pid_t pid = self.ctl && !self.is_unit && self.fd[TTY] >= 0 ? keys_listen(self.app_pid)
@@ -331,7 +327,7 @@ static void start_app(char **argv)
 	listen_to_keys();
 }
 
-/* Only now may the guard look at the app: before, it was a copy of us. */
+/* Only now may the guard examine the app: before, it was a copy of us. */
 static void app_started(void)
 {
 	close_fd(EXEC);
@@ -360,7 +356,7 @@ static void end_children(void)
 			while (len > 0 && text[len - 1] != ' ')
 				len--; /* a number may be cut in two */
 		text[len > 0 ? len : 0] = '\0';
-		/* Unreaped children of ours: no number in here can be stale. */
+		/* Unreaped children of ours: no PID in here can be stale. */
 		for (;; at = end) {
 			pid_t pid = (pid_t)strtol(at, &end, 10);
 
@@ -373,13 +369,13 @@ static void end_children(void)
 			;
 		if (waitpid(-1, NULL, WNOHANG | __WALL) < 0 && errno == ECHILD)
 			return;
-		/* Killing a child hands us its own children: look again. */
+		/* Killing a child gives us its own children: repeat. */
 		nanosleep(&nap, NULL);
 	} while (now_ns() < deadline_ns);
 }
 
-/* Ends as the app ended.  Nobody can see a PID 1 die by a signal, so the shell's
- * way of saying it is used, as every container init does. */
+/* Ends as the app ended. A PID 1 cannot die by a signal, so the shell's convention is used, as in
+ * every container init. */
 static _Noreturn void finish(int status)
 {
 	if (self.is_unit) {
@@ -389,8 +385,8 @@ static _Noreturn void finish(int status)
 	}
 	if (self.pid != 1)
 		end_children();
-	/* A shell that started us takes its terminal back itself, a plain program
-	 * does not.  The session's leader has nobody to give it to. */
+	/* A shell that started us takes its terminal back itself, a plain program does not. The
+	 * session leader has no one to give it to. */
 	if (self.fd[TTY] >= 0 && getsid(0) != self.pid && getpgrp() > 0)
 		tcsetpgrp(self.fd[TTY], getpgrp());
 	_exit(WIFSIGNALED(status) ? 128 + WTERMSIG(status) : WEXITSTATUS(status));
@@ -412,10 +408,9 @@ static bool within_stop_time(uint64_t then_ns, uint64_t at_ns)
 	return then_ns && at_ns - then_ns < AVC_CTL_STOP_MS * NS_PER_MS;
 }
 
-/* Was this end wanted?  By a stop, by somebody who sent the very signal that it
- * died of, or by the keys of a terminal: `keys_ns` is when one was pressed last.
- * Of its hang-up we see what the app died of, or the status by which shells and
- * their kin say so. */
+/* Was this exit requested? By a stop, by a sender of the very signal that it died of, or by the
+ * keys of a terminal: `keys_ns` is when one was pressed last. A hang-up is recognized by the signal
+ * that the app died of, or the status that shells use for it. */
 static bool was_wanted(int status, uint64_t at_ns, uint64_t keys_ns)
 {
 	static const int fatal[] = { SIGABRT, SIGSEGV, SIGBUS, SIGFPE, SIGILL, SIGTRAP, SIGSYS };
@@ -427,17 +422,17 @@ static bool was_wanted(int status, uint64_t at_ns, uint64_t keys_ns)
 		return true;
 	if (WIFSIGNALED(status) && within_stop_time(self.sent_ns[sig], at_ns))
 		return true;
-	/* These mean nothing else: who handles one tears down, and ends with a status of
-	 * its own. */
+	/* These have no other meaning: a program that handles one shuts down, and exits with its
+	 * own status. */
 	for (size_t i = 0; WIFEXITED(status) && i < sizeof(fatal) / sizeof(*fatal); i++)
 		if (within_stop_time(self.sent_ns[fatal[i]], at_ns))
 			return true;
 	return self.fd[TTY] >= 0 && (sig == SIGINT || sig == SIGQUIT || sig == SIGHUP);
 }
 
-/* The app's main process was reaped, and it was not a failed attempt to restore
- * it.  Reports every death, the final ones too (the guard wants to know why it
- * ended); waits for an answer only where there can be one. */
+/* The app's main process was reaped, and was not a failed attempt to restore it. Reports every
+ * death, including final ones (the guard reports the reason); waits for an answer only if there can
+ * be one. */
 static void app_died(int status, uint64_t at_ns)
 {
 	bool wanted = was_wanted(status, at_ns, keys_pressed());
@@ -454,8 +449,8 @@ static void app_died(int status, uint64_t at_ns)
 	self.status = status;
 	if (!self.ctl)
 		finish(status);
-	/* Both ends are ours: this neither blocks nor raises SIGPIPE.  It fails
-	 * only if nobody has read for a long time. */
+	/* Both ends are ours: this neither blocks nor raises SIGPIPE. It fails only if the guard
+	 * has not read for a long time. */
 	told = write(self.fd[REPORT_WRITE], &report, sizeof(report)) == (ssize_t)sizeof(report);
 	if (wanted || (WIFEXITED(status) && WEXITSTATUS(status) == 0))
 		finish(status);
@@ -479,8 +474,8 @@ static void note_stop(uint64_t at_ns)
 		__atomic_store_n(&self.ctl->stop_asked_ns, at_ns, __ATOMIC_RELEASE);
 }
 
-/* Hands one signal to the app's main process.  `info` is NULL for one that
- * waited for a restore. */
+/* Forwards one signal to the app's main process. `info` is NULL for one that waited for a
+ * restore. */
 static void forward(int sig, const struct signalfd_siginfo *info)
 {
 	uint64_t at_ns = now_ns();
@@ -505,7 +500,7 @@ static void app_restored(void)
 	int sig;
 
 	self.waiting = false;
-	/* It may have died, and been reaped, before we heard of it: see reap(). */
+	/* It may have died, and been reaped, before we read this: see reap(). */
 	if (waitid(P_PID, (id_t)self.app_pid, &info, WEXITED | WNOHANG | WNOWAIT | __WALL) < 0) {
 		app_died(self.attempt_status, self.attempt_ns);
 		return;
@@ -523,8 +518,8 @@ static void app_restored(void)
 	}
 }
 
-/* Reads what the guard has answered; call it only while waiting.  Returns still
- * waiting, or with the app restored, or not at all. */
+/* Reads the guard's answer; call it only while waiting. Returns still waiting, or with the app
+ * restored, or not at all. */
 static void take_verdict(void)
 {
 	struct avc_verdict verdict;
@@ -540,7 +535,7 @@ static void take_verdict(void)
 		if (n != (ssize_t)sizeof(verdict))
 			finish_unrestored("the guard does not speak our protocol");
 		if (verdict.seq != self.seq)
-			continue; /* the late answer to a death long past */
+			continue; /* a late answer to an earlier death */
 		if (verdict.kind == AVC_VERDICT_RESTORED) {
 			app_restored();
 			return;
@@ -552,17 +547,16 @@ static void take_verdict(void)
 	}
 }
 
-/* Reaps every child that has ended, and sees whether the app is among them.
+/* Reaps every child that has exited, and checks whether the app is among them.
  *
- * While we wait for a verdict, a process with the app's PID that dies is either
- * a failed attempt to restore it (the guard's business) or the restored app
- * itself, dead again before we have read the verdict (a new death).  Which, the
- * verdict tells, but only one that is read *after* the reaping: as long as the
- * zombie is there its PID is taken, and once it is gone the guard may make the
- * next attempt and speak of that.  So a death while waiting is only noted, and
- * app_restored() looks whether the process it hears of is there.
+ * While we wait for a verdict, a process with the app's PID that dies is either a failed attempt to
+ * restore it (the guard's business) or the restored app itself, dead again before we have read the
+ * verdict (a new death). The verdict tells which, but only one that is read *after* the reaping:
+ * while the zombie exists its PID is taken, and once it is gone the guard may make the next attempt
+ * and report that. So a death while waiting is only noted, and app_restored() checks whether the
+ * process of the verdict exists.
  *
- * A child that somebody traces shows up here after its tracer has reaped it. */
+ * A traced child shows up here after its tracer has reaped it. */
 static void reap(void)
 {
 	pid_t pid;
@@ -581,8 +575,8 @@ static void reap(void)
 			app_died(status, at_ns);
 		}
 	}
-	/* No child at all, and no death was seen: never to be, but an init that
-	 * waits for nobody would hang for ever. */
+	/* No child at all, and no death was seen: this should not happen, but init would hang
+	 * forever. */
 	if (pid < 0 && errno == ECHILD && !self.waiting)
 		finish(self.status);
 }
@@ -598,9 +592,9 @@ static void stop_along(void)
 		kill(self.pid, SIGSTOP);
 }
 
-/* The stop key stops the app, and where init leads the session there is no shell
- * that could continue it: the terminal would be dead for good.  As the main process
- * of its container the app would not have been stopped in the first place. */
+/* The stop key stops the app, and if init leads the session no shell could continue it: the
+ * terminal would be dead for good. As the main process of its container the app would not have been
+ * stopped in the first place. */
 static void continue_stopped(void)
 {
 	siginfo_t info = { 0 };
@@ -616,7 +610,8 @@ static void continue_stopped(void)
 		kill(-self.app_pid, SIGCONT);
 }
 
-/* The terminal's signals come to the whole group, a unit's program is in it, and has its own. */
+/* The terminal signals the whole group, which a unit's program is in, so it has got this one
+ * itself. */
 static bool app_has_it(int sig, const struct signalfd_siginfo *info)
 {
 	if (!self.shares_group || info->ssi_code != SI_KERNEL || self.waiting)
@@ -634,8 +629,8 @@ static void take_signals(void)
 	while (read(self.fd[SIGNALS], &info, sizeof(info)) == (ssize_t)sizeof(info)) {
 		int sig = (int)info.ssi_signo;
 
-		/* Our own SIGPIPE is ours.  A SIGSEGV in here was sent by somebody:
-		 * a fault of our own would not be blocked but kill. */
+		/* A SIGPIPE of our own is not for the app. A SIGSEGV read here was sent by a
+		 * process: our own fault would kill us despite the mask. */
 		if (sig == SIGCHLD || (pid_t)info.ssi_pid == self.pid)
 			continue;
 		if (app_has_it(sig, &info))
@@ -647,8 +642,8 @@ static void take_signals(void)
 			forward(sig, &info);
 			continue;
 		}
-		/* No app to give it to.  A stop is passed on to the restored app, so
-		 * that it ends in its own way; who asks twice does not want to wait. */
+		/* There is no app at the moment. A stop is passed on to the restored app, so that
+		 * it shuts down in its own way; a second request does not wait. */
 		if (is_stop(sig)) {
 			if (self.deferred & SIGBIT(sig))
 				finish_unrestored("told to stop");
@@ -661,8 +656,8 @@ static void take_signals(void)
 /* Sleeps until there is something to do. */
 static void wait_event(void)
 {
-	/* With no guard the verdict pipe has no writer, and would say POLLHUP all
-	 * the time: it is looked at only while an answer is due. */
+	/* Without a guard the verdict pipe has no writer, and would report POLLHUP all the time: it
+	 * is polled only while an answer is due. */
 	struct pollfd fds[] = {
 		{ .fd = self.fd[SIGNALS], .events = POLLIN },
 		{ .fd = self.waiting ? self.fd[VERDICT] : -1, .events = POLLIN },
@@ -677,7 +672,7 @@ static void wait_event(void)
 			finish_unrestored("the guard did not answer in time");
 		due_ns = self.deadline_ns;
 	}
-	/* Whoever fails to execute the program is not worth being protected. */
+	/* A child that fails to execute the program needs no protection. */
 	if (self.is_unit && self.fd[EXEC] < 0 && unit_due_ns() < due_ns)
 		due_ns = unit_due_ns();
 	due_ns = due_ns > at_ns ? due_ns - at_ns : 0;
@@ -737,7 +732,7 @@ static char **take_options(char **argv)
 	}
 	if (!*argv)
 		usage();
-	/* The hook, too, starts us where an image may have set any environment. */
+	/* The hook, too, starts us with an environment that the image may have set. */
 	self.is_unit = !of_container && unit_is_wanted();
 	return argv;
 }
@@ -770,9 +765,9 @@ int main(int argc, char **argv)
 		say("signalfd: %s; %s runs without an init", strerror(errno), self.app_name);
 		become_app(argv);
 	}
-	/* Orphans come to us also where we are not PID 1. */
+	/* Become the parent of orphans even if we are not PID 1. */
 	prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0);
-	/* A group that is outside our PID namespace cannot be entered again: number 0. */
+	/* A group that is outside our PID namespace (number 0) cannot be entered again. */
 	self.shares_group = self.is_unit && getpgrp() > 0;
 	if (!self.is_unit)
 		find_terminal();

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt-init in two files: init.c is an init, unit.c is what it is more where it stands in
- * front of one program below a launcher.
+ * avckpt-init in two files: init.c is an init; unit.c adds what it does in front of one program
+ * below a launcher.
  */
 #ifndef AVCKPT_INIT_H
 #define AVCKPT_INIT_H
@@ -20,25 +20,25 @@ int above_stdio(int fd);
 
 /* ---- unit.c ------------------------------------------------------------------------- */
 
-/* --label and --name make this the init of a unit.  False: the value is none. */
+/* --label and --name make this the init of a unit. False: the value is invalid. */
 bool unit_take_label(const char *text);
 bool unit_take_name(const char *text);
 /* Whether it is to be one: it was given a label or a name, or, for a container's launcher,
  * AVCKPT_INIT in the environment. */
 bool unit_is_wanted(void);
-/* Finds out where the sidecar is to be reached.  False: nowhere, which has been said. */
+/* Finds the sidecar's socket. False: there is none, which has been reported. */
 bool unit_begin(const char *program);
 /* Makes the environment of the program that of a unit. */
 void unit_mark_environment(void);
-/* The connection to the sidecar, which closes it when it ends; -1: there is none. */
+/* The connection to the sidecar, which closes it when it exits; -1: there is none. */
 int unit_fd(void);
-/* When unit_tend() is due without any news; UINT64_MAX: never. */
+/* When unit_tend() is due without any input; UINT64_MAX: never. */
 uint64_t unit_due_ns(void);
-/* Connects when it is time to, and takes in what the sidecar has said. */
+/* Connects when it is time to, and reads the sidecar's answer. */
 void unit_tend(const char *program);
-/* Ends those children of ours that are avckpt's own, as the launcher must not inherit them. */
+/* Kills those children that belong to avckpt, because the launcher must not inherit them. */
 void unit_end_templates(void);
-/* Ends as the program did, also by a signal. */
+/* Exits as the program did, also by a signal. */
 _Noreturn void unit_finish(int status);
 
 #endif

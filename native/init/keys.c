@@ -18,7 +18,7 @@
 #include "keys.h"
 
 #define NAME "avckpt-keys"
-#define END_NS 20000000 /* it has been given so long to tell; then it is stopped, or gets no CPU */
+#define END_NS 20000000 /* how long it has to answer; after that it is stopped, or gets no CPU */
 #define NAP_NS 100000
 
 static uint64_t *pressed_ns; /* shared with the task */
@@ -36,7 +36,7 @@ static _Noreturn void listen_to(pid_t app, pid_t init)
 		_exit(0);
 	for (;;) {
 		siginfo_t info;
-		/* glibc's own hides two signals, and would return for them for ever. */
+		/* glibc's version hides two signals, for which it would return forever. */
 		const int sig = (int)syscall(SYS_rt_sigtimedwait, &all, &info, NULL, sizeof all);
 
 		if ((sig == SIGINT || sig == SIGQUIT) && info.si_code == SI_KERNEL)
@@ -58,7 +58,7 @@ pid_t keys_listen(pid_t app)
 			return 0;
 		pressed_ns = page;
 	}
-	setpgid(app, app); /* as it does itself; it may not have come to that yet */
+	setpgid(app, app); /* as it does itself, but perhaps not yet */
 	task = fork();
 	if (task == 0)
 		listen_to(app, init);

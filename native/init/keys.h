@@ -1,14 +1,14 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Whether somebody has pressed Ctrl-C or Ctrl-\ on the application's terminal.
+ * Whether Ctrl-C or Ctrl-\ was pressed on the application's terminal.
  *
- * The terminal sends the signal to its foreground group, and that is the app's alone.  An app that
- * handles it by ending in its own way ends with any status.  So a task of init's is in that
- * group, too, and gets the same signals at the same instant (kill_pgrp(), under one lock).  The
- * kernel says of a signal whether a terminal has sent it (SI_KERNEL) or a process.
+ * The terminal sends the signal to its foreground group, which is the app's. An app that handles it
+ * may exit with any status. So a task of init is in that group, too, and gets the same signals at
+ * the same instant (kill_pgrp(), under one lock). The kernel tells whether a signal came from a
+ * terminal (SI_KERNEL) or a process.
  *
- * As long as there is that task, the app's number is taken (it is the group's), so it is ended
- * before the guard hears of a death.
+ * While that task exists, the app's PID is taken (as its process group), so it is killed before a
+ * death is reported to the guard.
  */
 #ifndef AVCKPT_KEYS_H
 #define AVCKPT_KEYS_H
@@ -16,12 +16,12 @@
 #include <stdint.h>
 #include <sys/types.h>
 
-/* Begins to listen in the group of the app: the task's number, 0 if that cannot be done.  All
- * signals are blocked. */
+/* Starts the task in the group of the app; returns its PID, 0 on failure. All signals are
+ * blocked. */
 pid_t keys_listen(pid_t app);
-/* That task has ended, and has been waited for. */
+/* That task has exited, and has been reaped. */
 void keys_ended(pid_t pid);
-/* Ends it: CLOCK_MONOTONIC ns when a key was pressed last, 0: never. */
+/* Kills it; returns the CLOCK_MONOTONIC ns of the last key, 0: never. */
 uint64_t keys_pressed(void);
 
 #endif

@@ -1,15 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A unit of protection below a launcher: who it is, told to the sidecar.
+ * A unit of protection below a launcher: registers itself with the sidecar.
  *
  *   $AVCKPT_INIT [--name NAME] [--label avckpt.KEY=VALUE ...] -- PROGRAM [ARG...]
  *
  * It connects to the sidecar's socket for units and sends one packet, with a pidfd of its own:
  * fields that end with a NUL, "avckpt-unit 1", "name=NAME", "program=PROGRAM" and any number of
- * "label=KEY=VALUE".  The answer is one packet, too: "ok", "later WHY" or "no WHY".  The
- * connection stays: its end says that the sidecar has ended, and the next one is looked for.
+ * "label=KEY=VALUE". The answer is one packet, too: "ok", "later WHY" or "no WHY". The connection
+ * stays open: when it closes, the sidecar has exited, and init looks for the next one.
  *
- * Nothing of it is waited for: the program runs, protected or not.
+ * The program does not wait for any of this: it runs, protected or not.
  */
 #include "init.h"
 
@@ -36,8 +36,8 @@
 #define RETRY_NS (2000 * NS_PER_MS)
 #define END_MS 500
 
-/* Where the sidecar's socket may be, in this order: as `avckpt run` says, where the hook has put it
- * into a container, and on the host. */
+/* Where the sidecar's socket may be, in this order: as set by `avckpt run`, where the hook has put
+ * it in a container, and on the host. */
 #define UNITS_ENV "AVCKPT_UNITS"
 #define UNITS_IN_CONTAINER "/run/avckpt-units/units.sock"
 #define UNITS_ON_HOST "/units/units.sock"
@@ -89,7 +89,7 @@ bool unit_is_wanted(void)
 	return unit.wanted || getenv("AVCKPT_INIT");
 }
 
-/* Blanks between them: what has blanks in it takes the option. */
+/* Separated by blanks: a value with blanks needs the option. */
 static bool add_labels_of_environment(void)
 {
 	const char *at = getenv("AVCKPT_LABELS");
@@ -112,7 +112,7 @@ static bool add_labels_of_environment(void)
 	return true;
 }
 
-/* Whether a socket is there, or can come to be there. */
+/* Whether a socket exists, or can appear there. */
 static bool try_path(const char *directory, const char *file)
 {
 	char folder[PATH_MAX];
@@ -150,7 +150,7 @@ bool unit_begin(const char *program)
 		say("%s is part of %s, and is protected with it", program, outer);
 		return false;
 	}
-	/* What was said last holds: options over the environment. */
+	/* The last one wins: options over the environment. */
 	if (unit.used) {
 		static char options[PACKET_MAX];
 		const size_t from = strlen(GREETING) + 1, length = unit.used - from;
@@ -242,7 +242,7 @@ static int connect_and_send(void)
 	return send_packet();
 }
 
-/* Everything the sidecar says is for a person, but for its first word. */
+/* The sidecar's answer is a message for the user, except for its first word. */
 static void take_answer(const char *program, char *answer)
 {
 	const bool later = !strncmp(answer, "later ", 6);
@@ -302,7 +302,7 @@ static bool file_begins(pid_t pid, const char *file, const char *start)
 	return n > 0 && !strncmp(text, start, strlen(start));
 }
 
-/* A child of ours that never runs the program's code; a zombie has its name still. */
+/* A child of ours that never runs the program's code; a zombie still has its name. */
 static bool is_template(pid_t pid)
 {
 	return file_begins(pid, "comm", "avckpt-tmpl\n") ||
@@ -356,11 +356,11 @@ void unit_finish(int status)
 
 	if (!WIFSIGNALED(status))
 		_exit(WEXITSTATUS(status));
-	/* The launcher asks what killed it, and a core of ours is not what it is after. */
+	/* The launcher wants the signal that killed it, but not a core of ours. */
 	setrlimit(RLIMIT_CORE, &none);
 	sigaction(WTERMSIG(status), &plain, NULL);
 	mask = ~(UINT64_C(1) << (WTERMSIG(status) - 1));
 	syscall(SYS_rt_sigprocmask, SIG_SETMASK, &mask, NULL, sizeof(mask));
 	syscall(SYS_kill, getpid(), WTERMSIG(status));
-	_exit(128 + WTERMSIG(status)); /* PID 1 cannot be killed so */
+	_exit(128 + WTERMSIG(status)); /* PID 1 cannot be killed that way */
 }

@@ -2,9 +2,9 @@
  *
  * The helper that chooses the next PID in a container's PID namespace.
  *
- * /proc/sys/kernel/ns_last_pid (pid_namespaces(7)) acts on the namespace of the task that
- * writes it, so a task of ours has to be in there, where a container with CAP_SYS_PTRACE
- * can take it over.  So it has nothing that would be worth it:
+ * /proc/sys/kernel/ns_last_pid (pid_namespaces(7)) acts on the namespace of the task that writes
+ * it, so a task of ours has to be in there, where a container with CAP_SYS_PTRACE can take it over.
+ * So it has nothing worth taking:
  *
  *   memory        this program, a stack, one page shared with the guard, and pages that are
  *                 the application's own (its parasites)
@@ -15,11 +15,10 @@
  *                 own, who may have two processes and open no file
  *   system calls  those of serve(), by a seccomp filter that is there before the task is
  *
- * What is left is what the container could have by breaking its own restores: to choose
- * its own next PIDs.
+ * What remains is that the container can choose its own next PIDs, and so break its own restores.
  *
- * Two processes: the first waits outside of the namespace for a restore, with what it takes to
- * enter it, does so, gives that up, and forks the second, which is in it.  It has no libc.
+ * Two processes: the first waits outside of the namespace for a restore, with the privileges to
+ * enter it, enters it, drops them, and forks the second, which is inside. No libc.
  */
 #include <asm/unistd.h>
 #include <errno.h>
@@ -45,14 +44,13 @@
 #define CAPABILITY(cap) (UINT64_C(1) << (cap))
 #define SIGKILL_ 9
 #define SIGCHLD_ 17
-#define USER_BASE 0x70000000 /* plus its number: a user that nobody else is             */
-/* Requests come in quick succession, for a restore is a matter of microseconds:
- * look at the word for a while before sleeping on it.  Only for a while: on a busy machine
- * the other side could not run. */
+#define USER_BASE 0x70000000 /* plus its PID: a user of its own */
+/* Requests come in quick succession, microseconds apart: spin on the word for a while before
+ * sleeping on it. Only for a while: on a busy machine the other side could not run. */
 #define SPINS 4000
 #define SLICE_NS 20000000
-#define LIFE_S 60        /* that a restore may take; whatever happens, this ends then        */
-#define RT_MAX_US 200000 /* it has the guard's priority, and is not to keep a CPU with it  */
+#define LIFE_S 60        /* the longest a restore may take; the helper exits then in any case */
+#define RT_MAX_US 200000 /* it has the guard's priority, and must not keep a CPU busy */
 
 static struct inj_slot *slots[LASTPID_SLOTS_MAX];
 static uint32_t slot_count;
@@ -74,7 +72,7 @@ static _Noreturn void end(int status)
 		SYS(__NR_exit_group, status, 0, 0);
 }
 
-/* The guard sees that it has ended. */
+/* The guard sees that it has exited. */
 static void must(long result)
 {
 	if (result < 0 && result > -4096)
@@ -109,7 +107,7 @@ static bool take_slots(void)
 	const int *fd = (const int *)CMSG_DATA(&control.align);
 
 	if (SYS(__NR_recvmsg, LASTPID_SOCKET, &head, 0) != sizeof message)
-		end(0); /* the guard has ended, or has no more use for us */
+		end(0); /* the guard has exited, or does not need us any more */
 	if (message.count > LASTPID_MESSAGE_SLOTS ||
 	    message.count > LASTPID_SLOTS_MAX - slot_count ||
 	    head.msg_controllen < sizeof *rights ||
@@ -162,7 +160,7 @@ static void limit(int which, uint64_t most)
 	must(raw_syscall(__NR_prlimit64, 0, (uint64_t)which, (uint64_t)both, 0, 0, 0));
 }
 
-/* Before Linux 5.9 there is none but CAP_SYS_ADMIN for it. */
+/* Before Linux 5.9 this takes CAP_SYS_ADMIN. */
 static int needed_capability(void)
 {
 	return SYS(__NR_prctl, PR_CAPBSET_READ, CAP_CHECKPOINT_RESTORE, 0) == 1
@@ -181,8 +179,8 @@ static void capabilities(uint64_t which)
 	must(SYS(__NR_capset, &header, data, 0));
 }
 
-/* Ahead of time, for these are some ninety calls: all but what it takes to enter the container's
- * namespaces, which is not the user's that it is from here on. */
+/* Ahead of time, because these are some ninety calls: drops all but what is needed to enter the
+ * container's namespaces, and becomes a user of its own. */
 static void drop_privileges(int keep)
 {
 	const long user = USER_BASE + SYS(__NR_getpid, 0, 0, 0);
@@ -211,7 +209,7 @@ static bool guard_is_there(void)
 			   MSG_PEEK | MSG_DONTWAIT, 0, 0) == -EAGAIN;
 }
 
-/* Its working directory and its root are the container's from here on. */
+/* From here on its working directory and root are the container's. */
 static void enter(int keep)
 {
 	const uint64_t spaces = CLONE_NEWNS | CLONE_NEWUTS | CLONE_NEWIPC | CLONE_NEWNET |
@@ -219,7 +217,8 @@ static void enter(int keep)
 
 	must(SYS(__NR_setns, LASTPID_INIT, spaces, 0));
 	capabilities(CAPABILITY(keep));
-	/* The change of credentials has cleared it; who was gone before is seen by the socket. */
+	/* The change of credentials has cleared it; a parent that died before shows on the
+	 * socket. */
 	SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
 	if (!guard_is_there())
 		end(1);
@@ -278,7 +277,7 @@ static void serve(void)
 
 		if (want != slot->have) {
 			if (slot->last_pid > 0) {
-				if (!before) /* with the first request the guard has the lock */
+				if (!before) /* at the first request the guard holds the lock */
 					before = read_last_pid();
 				page->error = write_last_pid(slot->last_pid);
 			}
@@ -291,8 +290,8 @@ static void serve(void)
 			sleep_on(&slot->want, want);
 		}
 	}
-	/* Numbers go on from where they were.  Else the next templates would get
-	 * those of short-lived threads that older generations still name. */
+	/* PIDs continue from where they were. Otherwise the next templates would get those of
+	 * short-lived threads that older generations still refer to. */
 	if (before > 0)
 		write_last_pid(before);
 	__atomic_store_n(&page->stopped, 1, __ATOMIC_RELEASE);
@@ -322,7 +321,7 @@ RAW_ENTRY _Noreturn void lastpid_main(void)
 	must(child);
 	if (child == 0) {
 		SYS(__NR_prctl, PR_SET_PDEATHSIG, SIGKILL_, 0);
-		SYS(__NR_setitimer, 0 /* ITIMER_REAL */, life, 0); /* if that came too late */
+		SYS(__NR_setitimer, 0 /* ITIMER_REAL */, life, 0); /* if that was set too late */
 		serve();
 		end(0);
 	}

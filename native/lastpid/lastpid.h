@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the guard (last_pid.c) and the helper that writes ns_last_pid say to each other.
+ * The protocol between the guard (last_pid.c) and the helper that writes ns_last_pid.
  *
  * The guard starts the helper (lastpid.c, from a sealed memfd) ahead of time, with four
  * descriptors and nothing else.  At a restore it sends the slots whose requests are to be
@@ -28,13 +28,13 @@ struct lastpid_message {
 	uint64_t offset[LASTPID_MESSAGE_SLOTS]; /* of the struct inj_slot, a page's   */
 };
 
-/* Shared by the two, and within reach of a container that has CAP_SYS_PTRACE: the guard
- * believes nothing of it that could do more harm than a failed restore. */
+/* Shared by the two, and accessible to a container that has CAP_SYS_PTRACE: false contents can do
+ * no more harm than a failed restore. */
 struct lastpid_page {
 	uint32_t serving; /* index of the slot whose requests are served           */
 	uint32_t stop;
 	int32_t error;    /* errno of the last request, 0: done                    */
-	uint32_t stopped; /* nothing is written any more                           */
+	uint32_t stopped; /* no more writes */
 };
 
 #endif

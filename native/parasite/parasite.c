@@ -25,7 +25,7 @@
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
 
-/* For the answer of the engine's helper, which is quick when it has a CPU. */
+/* For the answer of the engine's helper, which is fast when it has a CPU. */
 #define ASK_SPINS 2000
 #define ASK_SLEEPS 200
 #define ASK_SLEEP_MS 10
@@ -49,7 +49,7 @@ static void futex_wake(uint32_t *word)
 	SYS3(__NR_futex, word, FUTEX_WAKE, 0x7fffffff);
 }
 
-/* Waits while *word == value, `ms` at most (< 0: for ever).  Returns 0 or -errno. */
+/* Waits while *word == value, `ms` at most (< 0: forever). Returns 0 or -errno. */
 static long futex_wait(uint32_t *word, uint32_t value, int64_t ms)
 {
 	struct inj_timespec t = { ms / 1000, ms % 1000 * 1000000 };
@@ -57,9 +57,9 @@ static long futex_wait(uint32_t *word, uint32_t value, int64_t ms)
 	return SYS4(__NR_futex, word, FUTEX_WAIT, value, ms < 0 ? 0 : (uint64_t)&t);
 }
 
-/* Does nothing for a while (< 0: for ever).  By ppoll(2), because it has no restart
- * block: a timed futex wait or a nanosleep that the tracer interrupts would put
- * its own in place of the one that the borrowed thread's call still needs. */
+/* Sleeps for a while (< 0: forever). By ppoll(2), because it has no restart block: a timed futex
+ * wait or a nanosleep that the tracer interrupts would overwrite the one that the borrowed thread's
+ * call still needs. */
 static void park(int64_t ms)
 {
 	struct inj_timespec t = { ms / 1000, ms % 1000 * 1000000 };
@@ -81,8 +81,8 @@ static void make_list(struct inj_syscall *s, uint64_t count)
 					  s[i].arg[3], s[i].arg[4], s[i].arg[5]);
 }
 
-/* Nothing tells but new memory: what is locked cannot be dropped, and is there at once
- * if it is not to be locked on fault only. */
+/* Only new memory shows it: locked memory cannot be dropped, and is present at once unless it is
+ * locked on fault. */
 static long find_future_lock(void)
 {
 	const long at = raw_syscall(__NR_mmap, 0, 4096, PROT_READ | PROT_WRITE,
@@ -106,12 +106,12 @@ static long capability(uint64_t option, uint64_t ambient, uint64_t number)
 					: SYS2(__NR_prctl, option, number);
 }
 
-/* There is no call that tells more than one of them. */
+/* Each call returns only one of them. */
 static long find_caps(uint64_t option, const uint32_t *others)
 {
 	long set = 0, r;
 
-	/* What is ambient is inheritable, and hardly anything is. */
+	/* Ambient capabilities are inheritable, of which there are few. */
 	if (option == PR_CAP_AMBIENT && !(others[2] | others[5]))
 		return 0;
 	for (uint64_t i = 0; i < 63; i++) {
@@ -134,7 +134,7 @@ static long change_caps(uint64_t option, uint64_t set)
 	return 0;
 }
 
-/* Nobody interrupts it meanwhile: see park(). */
+/* No tracer interrupts it meanwhile: see park(). */
 static void make_pause(struct inj_call *call)
 {
 	__atomic_store_n(&call->pause, INJ_PAUSED, __ATOMIC_RELEASE);
@@ -171,8 +171,8 @@ __attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
 	}
 	__atomic_store_n(&call->done, 1, __ATOMIC_RELEASE);
 	futex_wake(&call->done);
-	/* The tracer now stops this task and sends it back.  If there is no
-	 * tracer any more, a thread of the app finds home by itself. */
+	/* The tracer now stops this task and sends it back. If there is no tracer any more, a
+	 * thread of the app returns by itself. */
 	if (call->after == INJ_AFTER_HOME) {
 		park(call->park_ms);
 		make_list(call->will, call->wills < INJ_WILLS_MAX ? call->wills : INJ_WILLS_MAX);
@@ -218,8 +218,8 @@ static struct inj_thread *thread_of(struct inj_slot *slot, uint32_t i)
 #define CLOCK_MONOTONIC_ 1
 #define NS_PER_S INT64_C(1000000000)
 
-/* timer_create(2) with the id *id.  An older kernel counts up: what it gives in between
- * is given back. */
+/* timer_create(2) with the id *id. On an older kernel the ids count up: those in between are
+ * deleted. */
 static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t wanted)
 {
 	long r = SYS2(__NR_prctl, PR_TIMER_CREATE_RESTORE_IDS_, 1);
@@ -239,7 +239,7 @@ static long make_timer(uint64_t clock, uint64_t event, int32_t *id, int32_t want
 	return -17; /* EEXIST */
 }
 
-/* At the last moment: what is left shrinks while the process is put together. */
+/* At the last moment: the remaining time shrinks during the restore. */
 static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, uint64_t asked_ns)
 {
 	const int64_t unit = nr == __NR_setitimer ? 1000 : 1;
@@ -252,7 +252,7 @@ static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, 
 		return r;
 	left -= now[0] * NS_PER_S + now[1] - (int64_t)asked_ns;
 	if (left <= 0 && interval > 0)
-		left = interval - -left % interval; /* on its beat */
+		left = interval - -left % interval; /* in phase */
 	if (left < unit)
 		left = unit; /* at once; 0 would be never */
 	is.interval[0] = was->interval[0];
@@ -288,8 +288,9 @@ static long put_limit(uint64_t which, const uint64_t *limit)
 	return r;
 }
 
-/* Made of the other kind for a moment: then nobody gets in who waits to write.  Where others read, too,
- * it cannot be made so, and they keep out who would write while it is given back. */
+/* Briefly converted to the other kind, so that no waiting writer gets it. Where others hold a read
+ * lock, too, it cannot be converted, and they keep writers out while it is released and taken
+ * again. */
 static long own_lock(uint64_t fd, uint64_t command, struct inj_flock *lock)
 {
 	const int16_t type = lock->type;
@@ -322,7 +323,7 @@ static long make_call(const struct inj_syscall *s)
 	return raw_syscall(s->nr, arg[0], arg[1], arg[2], arg[3], arg[4], arg[5]);
 }
 
-/* Goes through a list of calls. */
+/* Makes the calls of a list. */
 static void run_setup(struct inj_slot *slot, int32_t tid, uint64_t list)
 {
 	while (list) {
@@ -340,7 +341,7 @@ static void run_setup(struct inj_slot *slot, int32_t tid, uint64_t list)
 	}
 }
 
-/* What every thread has to do for itself, before anybody runs. */
+/* What every thread has to do itself, before any of them runs. */
 static void set_up(struct inj_slot *slot, struct inj_thread *t)
 {
 	long r;
@@ -352,7 +353,7 @@ static void set_up(struct inj_slot *slot, struct inj_thread *t)
 		if (r)
 			fail(slot, INJ_STEP_ROBUST, t->tid, r);
 	}
-	/* A CPU that is there no more is no reason not to run. */
+	/* A CPU that is gone is no reason not to run. */
 	if (t->affinity_bytes)
 		SYS3(__NR_sched_setaffinity, 0, t->affinity_bytes, t->affinity);
 	if (t->rseq) {
@@ -372,15 +373,15 @@ static void set_up(struct inj_slot *slot, struct inj_thread *t)
 	run_setup(slot, t->tid, t->setup);
 }
 
-/* Of one thread, not of its process. */
+/* Per thread, not per process. */
 __attribute__((section(".text.entry"))) void inj_end(void)
 {
 	for (;;)
 		SYS1(__NR_exit, 0);
 }
 
-/* Waits until the engine says that everybody goes.  An engine that died never
- * will: then init ends the container, and this process must not linger. */
+/* Waits for the engine's `go`. An engine that died never sends it: then init ends the container,
+ * and this process must not linger. */
 static void wait_for_go(struct inj_slot *slot, enum inj_go stage)
 {
 	uint32_t go;
@@ -430,10 +431,10 @@ static void spawn(struct inj_slot *slot, struct inj_thread *t, int32_t *last)
 	for (int i = 0; i < SPAWN_TRIES; i++) {
 		long tid;
 
-		/* Somebody else's fork took the number, or the dead app's thread still
-		 * has it: the kernel lets its leader be reaped a little before it gives
-		 * the number back (kernel/exit.c, release_task(), free_pids()), and the
-		 * dying thread may be waiting for a CPU just then. */
+		/* Another process's fork took the number, or the dead app's thread still has it:
+		 * the kernel lets its leader be reaped slightly before it frees the number
+		 * (kernel/exit.c, release_task(), free_pids()), and the dying thread may be waiting
+		 * for a CPU just then. */
 		if (i >= SPAWN_TRIES_AT_ONCE)
 			pause_us(SPAWN_PAUSE_US);
 		if (*last + 1 != t->tid)
@@ -460,7 +461,7 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 		leave();
 	}
 	if (slot->placed) {
-		/* by the engine: its children were to have them, too */
+		/* by the engine, because its children need them, too */
 	} else if (slot->session_leader) {
 		r = SYS0(__NR_setsid);
 		if (r < 0)
@@ -470,9 +471,9 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 		if (r)
 			fail(slot, INJ_STEP_GROUP, me->tid, r);
 	}
-	/* The terminal's foreground group is a reference to the dead leader, not
-	 * a number.  SIGTTOU is blocked here, so this is allowed.  One that becomes a session's is in
-	 * the foreground of it; of several processes the engine has seen to that. */
+	/* The terminal's foreground group is a reference to the dead leader's struct pid, not a
+	 * number. SIGTTOU is blocked here, so this is allowed. A terminal that becomes controlling
+	 * has the leader's group in the foreground; with several processes the engine sets it. */
 	if (slot->tty_fd >= 0 && !(slot->session_leader && slot->placed)) {
 		r = slot->session_leader
 			    ? SYS3(__NR_ioctl, slot->tty_fd, 0x540e /* TIOCSCTTY */, 0)

@@ -32,11 +32,11 @@
 #define INJ_WILLS_MAX 4
 #define INJ_STACK_BYTES 4096
 #define INJ_SETUP_BYTES (512 * 1024)
-/* The same for INJ_DESCRIPTORS and INJ_OWNERS, and as much again for lists of calls
- * that a template makes (INJ_LIST). */
+/* The same for INJ_DESCRIPTORS and INJ_OWNERS, and as much again for lists of calls that a template
+ * makes (INJ_LIST). */
 #define INJ_FILES_BYTES (2 * INJ_SETUP_BYTES)
 
-/* How long code that found no tracer waits for one before it helps itself, if no more is said. */
+/* Default time for which code without a tracer waits for one before it returns by itself. */
 #define INJ_PARK_MS 100
 #define INJ_GO_S 10
 
@@ -53,19 +53,19 @@ struct inj_timer {
 
 /* Instead of a number of a system call: arg[1] calls, struct inj_syscall at arg[0]. */
 #define INJ_LIST (-1)
-/* wait4(2) for what the call before it has brought forth. */
+/* wait4(2) for the task that the previous call has created. */
 #define INJ_WAIT (-3)
-/* Waits until the tracer says so (inj_call.pause), park_ms at most. */
+/* Waits for the tracer (inj_call.pause), park_ms at most. */
 #define INJ_PAUSE (-4)
-/* Likewise, with what mlockall(2) was told of memory to come for a result. */
+/* Likewise; the result is mlockall(2)'s setting for future memory. */
 #define INJ_FUTURE_LOCK (-2)
-/* With a set of capabilities for a result: the bounding set (arg[0] PR_CAPBSET_READ) or the
- * ambient one (PR_CAP_AMBIENT; arg[1]: where capget(2) has left the others). */
+/* The result is a set of capabilities: the bounding set (arg[0] PR_CAPBSET_READ) or the ambient one
+ * (PR_CAP_AMBIENT; arg[1]: where capget(2) has stored the others). */
 #define INJ_CAPS (-5)
 
 enum inj_after {
 	INJ_AFTER_HOME = 0, /* go back to the interrupted context (struct inj_home) */
-	INJ_AFTER_PARK = 1  /* wait for ever: templates and holders                */
+	INJ_AFTER_PARK = 1  /* wait forever: templates and holders */
 };
 
 enum inj_pause { INJ_PAUSE_NONE = 0, INJ_PAUSED = 1, INJ_PAUSE_OVER = 2 };
@@ -78,8 +78,8 @@ struct inj_call {
 	uint32_t after;   /* enum inj_after                                      */
 	uint32_t park_ms; /* INJ_AFTER_HOME: how long it waits for the tracer    */
 	struct inj_syscall call[INJ_CALLS_MAX];
-	/* INJ_AFTER_HOME: what a thread that finds no tracer any more does before it goes home:
-	 * the tracer's own changes to what is the app's are undone. */
+	/* INJ_AFTER_HOME: calls of a thread without a tracer before it returns, to undo the
+	 * tracer's changes to the app. */
 	uint32_t wills;
 	struct inj_syscall will[INJ_WILLS_MAX];
 	uint64_t will_data[INJ_WILLS_MAX];
@@ -99,8 +99,8 @@ struct inj_control {
 };
 _Static_assert(sizeof(struct inj_control) <= INJ_SLOTS_OFFSET - INJ_CODE_BYTES, "control area");
 
-/* A call that a process makes while it is put together: one of a list.  Lists are
- * made once, with the generation, and gone through at every restore from it. */
+/* A call that a process makes while it is restored: one of a list. Lists are made once, with the
+ * generation, and executed at every restore from it. */
 struct inj_setup {
 	uint64_t next;  /* address of the one after it, 0: the last             */
 	uint64_t store; /* where the result is put as well, e.g. an argument of
@@ -114,18 +114,18 @@ struct inj_setup {
 #define INJ_TIMER_CREATE (-1)
 /* Likewise: pidfd_open(arg[1], arg[2]), as the descriptor arg[0] with the flags arg[3]. */
 #define INJ_PIDFD_OPEN (-2)
-/* Likewise, for each capability of the set arg[1]: out of the bounding set (arg[0]
- * PR_CAPBSET_DROP) or into the ambient one (PR_CAP_AMBIENT). */
+/* Likewise, for each capability of the set arg[1]: removes it from the bounding set (arg[0]
+ * PR_CAPBSET_DROP) or adds it to the ambient one (PR_CAP_AMBIENT). */
 #define INJ_CAPS_CHANGE (-3)
-/* Likewise: setrlimit(arg[0], arg[1]), or as much of that as a process may that has no right to a
- * higher hard limit than it has. */
+/* Likewise: setrlimit(arg[0], arg[1]), as far as permitted for a process that may not raise its
+ * hard limit. */
 #define INJ_LIMIT (-4)
 /* Likewise: timer_settime(2) or setitimer(2) (arg[0], their number) of the timer arg[1], with what
- * is left now of the struct inj_timer at arg[2], which it was at arg[3] ns of CLOCK_MONOTONIC,
- * that of the process: there are time namespaces. */
+ * is left of the struct inj_timer at arg[2], read at arg[3] ns of the process's CLOCK_MONOTONIC (it
+ * may be in a time namespace). */
 #define INJ_TIMER_SET (-5)
-/* Likewise: fcntl(arg[0], arg[1], arg[2]), a lock that is the caller's own in any case.  To set one that
- * is there already changes nothing, not even whose it is said to be. */
+/* Likewise: fcntl(arg[0], arg[1], arg[2]), so that the caller is recorded as the owner of the lock.
+ * Setting an existing one again changes nothing, not even its recorded owner. */
 #define INJ_LOCK (-6)
 
 enum inj_setup_flag {
@@ -134,10 +134,10 @@ enum inj_setup_flag {
 };
 
 enum inj_stage {
-	INJ_DESCRIPTORS, /* before INJ_BEFORE; made up at each restore          */
+	INJ_DESCRIPTORS, /* before INJ_BEFORE; built at each restore */
 	INJ_OWNERS,      /* before INJ_AFTER; likewise                           */
 	INJ_BEFORE,      /* by the main thread, before there are others              */
-	INJ_AFTER,       /* by the main thread, when all others are ready            */
+	INJ_AFTER,       /* by the main thread, when all others are ready */
 	INJ_STAGES
 };
 
@@ -152,7 +152,7 @@ struct inj_thread {
 	uint64_t robust_bytes;
 	uint64_t rseq;        /* address, 0: none registered                      */
 	uint64_t other_base;  /* a second base register (x86: gs), 0: none       */
-	uint64_t large_state; /* registers there is no room for yet, 0: none     */
+	uint64_t large_state; /* registers without room yet, 0: none */
 	uint64_t setup;       /* list of struct inj_setup, by the thread itself   */
 	uint32_t rseq_bytes;
 	uint32_t rseq_signature;
@@ -164,7 +164,7 @@ struct inj_thread {
 
 enum inj_state {
 	INJ_IDLE = 0,
-	INJ_WRONG_PID = 1, /* somebody else took the number: try again          */
+	INJ_WRONG_PID = 1, /* another process took the PID: try again */
 	INJ_FAILED = 2,    /* error, error_at, error_tid say what               */
 	INJ_READY = 3      /* all threads exist and wait for `go`               */
 };
@@ -188,12 +188,12 @@ enum inj_step {
 	INJ_STEP_SETUP
 };
 
-/* One generation's restore, in the restored process. */
+/* A generation's restore, in the restored process. */
 struct inj_slot {
 	uint32_t state;   /* futex, enum inj_state                          */
 	uint32_t go;      /* futex, enum inj_go, set by the engine          */
 	uint32_t ready;   /* threads that have set themselves up            */
-	uint32_t running; /* threads that are about to return to the app    */
+	uint32_t running; /* threads about to return to the app */
 	/* ns_last_pid, written by the engine's helper on request               */
 	uint32_t want;     /* incremented by R for each request              */
 	uint32_t have;     /* set to `want` by the helper                    */
@@ -204,9 +204,9 @@ struct inj_slot {
 	int32_t pid;   /* the app's, inside                              */
 	int32_t group; /* process group, inside                          */
 	uint32_t session_leader;
-	uint32_t placed; /* session and group are right already                */
-	/* -1, or a descriptor of the terminal that is its session's, or that it was in the
-	 * foreground of */
+	uint32_t placed; /* session and group are already right */
+	/* -1, or a descriptor of its session's terminal, or of the one whose foreground it was
+	 * in */
 	int32_t tty_fd;
 	uint32_t threads;
 	uint32_t block_bytes;       /* of one thread's block                          */

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the things are that avckpt installs or starts.
+"""Locates the files that avckpt installs or starts.
 
-There are two homes: inside the installed package (a wheel), and a checkout of
-the sources.  The package's own copy wins, so that an installed avckpt never
-picks up a stray build.
+They are either inside the installed package (a wheel) or in a source
+checkout. The package's own copy takes precedence, so that an installed avckpt
+never picks up a stray build.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ CHECKOUT = PACKAGE.parent.parent
 
 
 def init_binary() -> Path:
-    """The static program avckpt-init.  Raises ConfigError when it is nowhere."""
+    """The static program avckpt-init.  Raises ConfigError when it is missing."""
     return _program("avckpt-init")
 
 
 def inside_binary() -> Path:
-    """The static program avckpt-exec (`inside.py`).  Raises ConfigError when it is nowhere."""
+    """The static program avckpt-exec (`inside.py`).  Raises ConfigError when it is missing."""
     return _program("avckpt-exec")
 
 
 def guard_binary() -> Path:
-    """The static program avckpt-guard (`native.py`).  Raises ConfigError when it is nowhere."""
+    """The static program avckpt-guard (`native.py`).  Raises ConfigError when it is missing."""
     return _program("avckpt-guard")
 
 
 def hooks_source() -> Path:
-    """The directory of the Python package avckpt_hooks.  Raises ConfigError when it is nowhere."""
+    """The directory of the Python package avckpt_hooks.  Raises ConfigError when it is missing."""
     candidates = (PACKAGE.parent / "avckpt_hooks", CHECKOUT / "hooks" / "avckpt_hooks")
     for path in candidates:
         if (path / "__init__.py").is_file():
@@ -43,7 +43,7 @@ def hooks_source() -> Path:
 
 
 def oci_hooks_source() -> Path:
-    """The directory of the hook JSON files.  Raises ConfigError when it is nowhere."""
+    """The directory of the hook JSON files.  Raises ConfigError when it is missing."""
     candidates = (PACKAGE / "oci-hooks.d", CHECKOUT / "oci-hooks.d")
     for path in candidates:
         if any(path.glob("*.json")):
@@ -52,7 +52,7 @@ def oci_hooks_source() -> Path:
 
 
 def packaging(name: str) -> Path:
-    """A file of the folder `packaging`.  Raises ConfigError when it is nowhere."""
+    """A file of the folder `packaging`.  Raises ConfigError when it is missing."""
     candidates = (PACKAGE / "packaging" / name, CHECKOUT / "packaging" / name)
     for path in candidates:
         if path.is_file():
@@ -61,7 +61,7 @@ def packaging(name: str) -> Path:
 
 
 def build_id() -> str:
-    """Twelve hex digits of everything that is run: between two releases all builds have the same version.
+    """Twelve hex digits of a hash of all programs: builds between two releases share one version.
 
     Raises ConfigError.
     """

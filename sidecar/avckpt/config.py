@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/etc/avckpt/config.yaml: what holds for containers whose labels do not say otherwise.
+"""/etc/avckpt/config.yaml: defaults for what the labels of a container leave out.
 
     defaults:
       interval: 500ms
@@ -8,8 +8,8 @@
       "*_lidar_*":
         interval: 100ms
 
-Keys are those of the labels, without their prefix.  The labels' own parser checks
-every value, so that the file and a label can never disagree on what is allowed.
+Keys are those of the labels, without their prefix. The labels' own parser checks
+every value, so that file and labels always agree on what is allowed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PATH = Path("/etc/avckpt/config.yaml")
 ENABLE = f"{PREFIX}enable"
 GROUP = f"{PREFIX}group"
 AT_START = (ENABLE, f"{PREFIX}io_uring", f"{PREFIX}scope")
-"""What is decided when a container starts, by its own labels."""
+"""Settings that take effect when a container starts: only its own labels set them."""
 NOTIFY = f"{PREFIX}notify"
 
 
@@ -44,23 +44,24 @@ def default_path() -> Path:
 
 @dataclass(frozen=True)
 class Defaults:
-    """What a configuration file says.  Keys have their prefix; the empty one changes nothing."""
+    """What a configuration file says.  Keys have their prefix; an empty file changes nothing."""
 
     common: Mapping[str, str] = field(default_factory=dict)
     by_name: tuple[tuple[str, Mapping[str, str]], ...] = ()
     """Patterns of container names, in the order of the file."""
 
     def under(self, labels: Mapping[str, str], name: str) -> dict[str, str]:
-        """What holds for a container.
+        """The effective settings of a container.
 
-        Its labels win; then the patterns that fit its name, later over earlier; then `common`.
+        Its labels take precedence, then the patterns that match its name, later over earlier,
+        then `common`.
         """
         merged = dict(self.common)
         for pattern, settings in self.by_name:
             if fnmatch.fnmatchcase(name, pattern):
                 merged.update(settings)
         merged.update(labels)
-        # Without a group there is nobody to hear of; who writes that into a label is told so.
+        # Meaningless without a group; as a label it is refused.
         if GROUP not in merged and NOTIFY not in labels:
             merged.pop(NOTIFY, None)
         return merged
@@ -78,7 +79,7 @@ class Problem:
 
 
 class Configuration:
-    """The file a sidecar goes by, and what it said when it was read last."""
+    """The configuration file of a sidecar, and its contents as last read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -86,14 +87,14 @@ class Configuration:
         self.problem = ""
         """Why the file as it is now was refused; empty: it is in force."""
         self.loaded_at: float | None = None
-        """When what is in force was read; None: nothing was, the built-in defaults hold."""
+        """When the configuration in force was read; None: the built-in defaults are in force."""
         self.found = False
         """Whether there was a file then."""
 
     def load(self) -> None:
-        """Takes the file as it is now; a file that is not there says nothing.
+        """Loads the current file; a missing file is empty.
 
-        Raises ConfigError, and all stays as it was, when anything in it is wrong.
+        Raises ConfigError, and changes nothing, when anything in it is wrong.
         """
         found = self.path.exists()
         try:
@@ -136,12 +137,12 @@ def examine(path: Path) -> tuple[Defaults, list[Problem]]:
 
 @dataclass
 class _Reader:
-    """Takes a file apart, and remembers what is wrong with it."""
+    """Parses a file, and collects its errors."""
 
     path: Path
     wrong: list[Problem] = field(default_factory=list)
     repeated: list[Problem] = field(default_factory=list)
-    """YAML lets the last one win; a person who wrote both should be told."""
+    """In YAML the last one wins; a duplicate is more likely an error."""
 
     def whole(self, root: yaml.Node | None) -> Defaults:
         common: dict[str, str] = {}
@@ -197,7 +198,7 @@ def _is_null(node: yaml.Node | None) -> bool:
 
 
 def _contradictions(defaults: Defaults, root: yaml.Node | None, path: Path) -> Iterator[Problem]:
-    """Values that are right by themselves, and not together."""
+    """Values that are valid separately, but not together."""
     names = yamlfile.lookup(root, "names")
     common = yamlfile.lookup(root, "defaults")
     seen = set()

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sidecar's daemon: one guard per protected container.
 
-asyncio, one thread.  It sleeps until something happens: a hook's request, an
-event of a guard, an init that ends, a request on the API, a signal, or it is time to
-look at guards and records.  What is urgent (death to resume) happens in the guards, which are
-processes of their own, not here.
+asyncio, one thread. It sleeps until something happens: a hook's request, an event of a guard,
+an init that exits, an API request, a signal, or a timer to check guards and records. What is
+urgent (death to resume) happens in the guards, which are separate processes.
 """
 
 from __future__ import annotations
@@ -72,11 +71,11 @@ log = logging.getLogger("avckpt")
 LOOK_S = 5.0
 """Seconds between retries for containers that could not be protected at start."""
 GUARD_LOOK_S = 1.0
-"""Seconds between looks whether guards are alive."""
+"""Seconds between checks whether guards are alive."""
 GUARD_PATIENCE_S = 5.0
-"""A guard that gives no sign of life for so long is killed, and another one started."""
+"""A guard that gives no sign of life for this long is killed and replaced."""
 GUARD_AGAIN_S = 30.0
-"""A guard that is lost sooner than that after the last one is started anew at the next look, not at once."""
+"""A guard that is lost sooner than this after the previous one is replaced at the next scan, not at once."""
 
 
 @dataclass
@@ -88,7 +87,7 @@ class Watch:
     labels: Mapping[str, str]
     settings: Settings
     rolling_back: Reason | None = None
-    """Why a roll back was commanded whose answer has not come yet."""
+    """The reason for a commanded rollback that is still unanswered."""
     journal: Journal = field(default_factory=Journal)
     guard: Guard | None = None
     guard_lost_s: float = -math.inf
@@ -96,23 +95,23 @@ class Watch:
     bundle: str = ""
     """Its OCI bundle, on the host."""
     connection: socket.socket | None = None
-    """Of a unit: when it closes, avckpt-init looks for another sidecar."""
+    """A unit's connection: when it closes, avckpt-init looks for another sidecar."""
     units: units.Allowance = field(default_factory=units.Allowance)
     """Of a launcher's container."""
 
     @property
     def notify(self) -> Notify | None:
-        """How it wants to hear of others."""
+        """How to notify it of others."""
         return self.settings.policy.notify
 
     @property
     def notify_self(self) -> Notify | None:
-        """How it wants to hear of its own recoveries."""
+        """How to notify it of its own recoveries."""
         return self.settings.policy.notify_self
 
 
 class Daemon:
-    """All the sidecar's state.  `run()` it once."""
+    """The whole state of the sidecar. `run()` it once."""
 
     def __init__(self, run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
         self.run_dir = run_dir
@@ -138,7 +137,7 @@ class Daemon:
         self.groups = Groups(self.orders)
 
     async def run(self) -> None:
-        """Serves until SIGTERM or SIGINT, then lets every container run on unprotected.
+        """Serves until SIGTERM or SIGINT, then releases every container, unprotected.
 
         Raises OSError when a socket cannot be made.
         """
@@ -150,12 +149,11 @@ class Daemon:
         try:
             self.configuration.load()
         except ConfigError as error:
-            # A wrong interval protects better than no sidecar does.
+            # A wrong interval is better than no sidecar.
             log.error("the built-in defaults hold: %s", error)
         loop.add_reader(self._engine.event_fd, self._take_events)
         api = ApiServer(self, self.run_dir / "api.sock")
-        # Listen first, adopt second: a container that starts in between then
-        # comes twice, not never.
+        # Listen first, adopt second: a container that starts in between is then seen twice, not missed.
         hooks = HookListener(self.run_dir / "hooks.sock", self._hook)
         nodes = looking = None
         try:
@@ -197,7 +195,7 @@ class Daemon:
             self.history.close()
 
     def _beat(self) -> None:
-        """A sign of life for the watchdog, now and as long as the loop turns."""
+        """Gives signs of life to the watchdog, from now on while the loop runs."""
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._beat_fd, b".")
         asyncio.get_running_loop().call_later(watchdog.LOOK_S, self._beat)
@@ -227,7 +225,8 @@ class Daemon:
                 watch.rolling_back = None
 
     async def inspect(self, name: str) -> dict[str, object]:
-        """All that is known of a container.  Raises NoSuchContainer, Ambiguous, DeadlineMissed or TargetGone."""
+        """All that is known about a container. Raises NoSuchContainer, Ambiguous, DeadlineMissed or
+        TargetGone."""
         watch = self._watches[self.registry.find(name).cookie]
         container = watch.container
         held = await self.orders.held(watch.guard, container) if watch.guard is not None else []
@@ -239,11 +238,11 @@ class Daemon:
         }
 
     def reload(self) -> list[Reloaded]:
-        """Takes the configuration file as it is now, for every container, those included that were missed so far.
+        """Reloads the configuration file for all containers, including those missed so far.
 
-        Running ones keep their guard and what it holds.  Returns those for which
-        something changed, or should have.  Raises ConfigError, and nothing
-        changes, when the file is wrong.
+        Running ones keep their guard and its generations. Returns those for which something
+        changed, or should have. Raises ConfigError, and nothing changes, when the file is
+        wrong.
         """
         self.configuration.load()
         log.info("%s was read", self.configuration.path)
@@ -289,7 +288,8 @@ class Daemon:
         return settings_of(self.configuration.defaults.under(labels, name))
 
     def _settings_at_start(self, labels: Mapping[str, str], name: str) -> tuple[Settings, LabelsWrong | None]:
-        """The same, and what is wrong: then the labels alone hold.  Raises LabelsWrong when they are the problem."""
+        """The same, and what is wrong: then only the labels apply. Raises LabelsWrong when they are the
+        problem."""
         try:
             return self._settings_of(labels, name), None
         except LabelsWrong as error:
@@ -299,8 +299,7 @@ class Daemon:
 
     def _hook(self, request: Register | Deregister, pidfd: int | None) -> None:
         if isinstance(request, Deregister):
-            # Nothing to do: init's pidfd says the same, and cannot be taken
-            # for that of a later run.
+            # Nothing to do: init's pidfd tells the same, and cannot be confused with a later run's.
             log.debug("%s: stopped, says its hook", request.id[:12])
         elif pidfd is not None:
             self._watch(request, pidfd, adopted=False)
@@ -313,7 +312,8 @@ class Daemon:
                 self.records.complain(record.id, f"{record.name or record.id[:12]}: runs unprotected: {error}")
 
     def _catch_up(self) -> None:
-        """Protects whoever could not be when it came: for want of descriptors, threads, memory or an answer."""
+        """Retries containers that could not be protected at start, for lack of descriptors, threads, memory
+        or an answer."""
         self._adopt()
         self._look_at_names()
         self._presence.keep(self.registry.live())
@@ -322,7 +322,7 @@ class Daemon:
                 self._start_guard(watch)
 
     def _look_at_names(self) -> None:
-        """`podman rename` tells nobody."""
+        """`podman rename` causes no event."""
         for watch in self._watches.values():
             container = watch.container
             before, name = container.name, self._names.of(container.id, watch.bundle, container.init_pid)
@@ -368,7 +368,7 @@ class Daemon:
                 raise Denied(f"it is part of {inits[pid].container.label}, which is protected as a whole")
         unit = units.unit_id(owner, peer.pid)
         if has_ended(peer.pidfd):
-            raise TargetGone("it has ended already")  # then what was read may be of another process
+            raise TargetGone("it has ended already")  # then what was read may belong to another process
         allowance.take()
         if self._live_run(unit) is None:
             siblings = [each.name for each in self.registry.live() if each.node_of == owner]
@@ -396,7 +396,7 @@ class Daemon:
         return None
 
     def _watch(self, request: Register, pidfd: int, *, adopted: bool, node_of: str = "") -> None:
-        """Starts protecting a container.  `pidfd` is ours from here on, whatever happens."""
+        """Starts protecting a container. Takes ownership of `pidfd`, even on failure."""
         with closed_on_error(pidfd):
             if has_ended(pidfd):
                 raise TargetGone("the container has ended already")
@@ -440,7 +440,7 @@ class Daemon:
             container.listen()
 
     def _start_guard(self, watch: Watch) -> None:
-        """What keeps it from starting is told, and it is tried again at the next look."""
+        """A failure to start is reported, and retried at the next scan."""
         container = watch.container
         try:
             watch.guard = self._engine.start_guard(watch.pidfd, container.config, container.cookie)
@@ -455,9 +455,9 @@ class Daemon:
     # Events
 
     def tell(self, watch: Watch, record: EventRecord) -> EventRecord:
-        """Tells everybody of something that has happened to a container; returns it as it was told.
+        """Distributes an event of a container; returns it as distributed.
 
-        Says whose it is, and when (now), where the record does not.
+        Fills in the container and the time (now) where the record lacks them.
         """
         container = watch.container
         record = dataclasses.replace(
@@ -491,12 +491,12 @@ class Daemon:
         while (event := self._engine.next_event()) is not None:
             watch = self._watches.get(event.cookie)
             if watch is None:
-                continue  # the last words of a guard that has been stopped
+                continue  # the last events of a guard that has been stopped
             container = watch.container
             at = time.time() - (time.monotonic_ns() - event.at_ns) / 1e9
             container.apply(event, at)
             if event.kind is Kind.ENDED:
-                # The container's own end is told once it is known.
+                # The end of the container is reported once it is known.
                 if watch.guard is not None and not has_ended(watch.pidfd):
                     self._lose_guard(watch, watch.guard)
                 continue
@@ -511,7 +511,7 @@ class Daemon:
             self.orders.answer(event, record)
 
     def _lose_guard(self, watch: Watch, guard: Guard) -> None:
-        """It could not do its work, and said why; the next one may."""
+        """It could not do its work, and said why; the next one may succeed."""
         self.caretaker.end(watch)
         self.groups.leave(watch)
         guard.stop()  # its process has ended
@@ -519,7 +519,7 @@ class Daemon:
         watch.container.guard_pid = 0
 
     def _replace_guard(self, watch: Watch, guard: Guard) -> None:
-        """Its process died or hung.  One that dies again and again must not keep us busy."""
+        """Its process died or hung. One that dies repeatedly must not keep us busy."""
         self._lose_guard(watch, guard)
         self.orders.fail(watch.container, "its guard died before it could be done")
         now = time.monotonic()
@@ -547,7 +547,7 @@ class Daemon:
         if watch.guard is not None:
             # Blocks for as long as a checkpoint that is under way.
             await in_own_thread(watch.guard.stop)
-            self._take_events()  # it may just have said how the container ended
+            self._take_events()  # it may have reported how the container ended
         ended = has_ended(watch.pidfd)
         os.close(watch.pidfd)
         if watch.connection is not None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine (`avckpt/engine.h`) for Python: the only module that touches cffi.
 
-Thin on purpose: it starts guard processes (avckpt-guard) and converts what they are told
-and tell, and decides nothing.  Every call may be made from any thread; cffi lets go of the
-GIL while it is in C.
+Thin on purpose: it starts guard processes (avckpt-guard) and converts commands and events,
+and decides nothing. Every call may be made from any thread; cffi releases the GIL while it
+is in C.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def version() -> str:
 
 
 def probe() -> None:
-    """Can this machine and a guard that we start do it at all?
+    """Whether this machine can support checkpoints, and a guard that we start
+    may take them.
 
     Raises Unsupported, Denied or KernelError with the reason.
     """
@@ -50,7 +51,8 @@ def probe() -> None:
 
 @contextmanager
 def meeting(members: int) -> Iterator[int]:
-    """A descriptor of what so many guards meet at, for `Guard.line()` or `Guard.recall()`.  Raises KernelError."""
+    """A descriptor of the memory where `members` guards meet, for `Guard.line()` or `Guard.recall()`. Raises
+    KernelError."""
     err = ffi.new("struct avc_error *")
     fd = lib.avc_meeting_new(members, err)
     if fd < 0:
@@ -72,7 +74,7 @@ class Guard:
         self._lock = threading.Lock()
 
     def command(self, command: Command, ticket: int, within_s: float = 0.0, generation: int = 0) -> None:
-        """Hands a command over; the answer is an event with the same `ticket` (not 0).
+        """Sends a command; the answer is an event with the same `ticket` (not 0).
 
         One that the guard has not begun within `within_s` (0: any time) is refused.  `generation` is
         the one to restore, 0: the newest.
@@ -87,10 +89,9 @@ class Guard:
                 raise _error(err)
 
     def configure(self, config: GuardConfig) -> None:
-        """Has it go by other settings from its next checkpoint and the next death on; what it holds stays.
+        """Changes its settings from the next checkpoint and the next death on; its generations stay.
 
-        Raises ConfigError for values that make no sense, TargetGone when the
-        guard has ended.
+        Raises ConfigError for invalid values, TargetGone when the guard has ended.
         """
         err = ffi.new("struct avc_error *")
         with self._lock:
@@ -108,7 +109,7 @@ class Guard:
         self._tell("recall", lambda guard, err: lib.avc_guard_recall(guard, meeting, line, generation, ticket, err))
 
     def forget(self, generation: int) -> None:
-        """Has it give up a generation of a line that others have not got.  Raises TargetGone, Busy."""
+        """Has it drop a generation of a line that other members lack.  Raises TargetGone, Busy."""
         self._tell("forget", lambda guard, err: lib.avc_guard_forget(guard, generation, err))
 
     def _tell(self, operation: str, tell: Callable[[Any, Any], int]) -> None:
@@ -121,21 +122,22 @@ class Guard:
 
     @property
     def pid(self) -> int:
-        """Its process, 0 when that has ended."""
+        """Its PID, 0 when it has exited."""
         with self._lock:
             return 0 if self._guard is None else int(lib.avc_guard_pid(self._guard))
 
     def check(self, patience_s: float) -> None:
-        """Kills it when it has given no sign of life for so long; an event GUARD_LOST follows.
+        """Kills it when it has given no sign of life for this long; an event GUARD_LOST
+        follows.
 
-        It is given ten times as long while it only waits for a CPU.
+        It has ten times as long while it only waits for a CPU.
         """
         with self._lock:
             if self._guard is not None:
                 lib.avc_guard_check(self._guard, _ns("patience", patience_s))
 
     def stop(self) -> None:
-        """Lets the app run on unprotected, gives up every generation and ends the process.
+        """Releases the app unprotected, drops every generation and ends the process.
 
         Blocks for as long as a checkpoint or restore that is under way.
         A second call does nothing.
@@ -185,9 +187,9 @@ class Engine:
     def start_guard(self, init_pidfd: int, config: GuardConfig, cookie: int) -> Guard:
         """Starts protecting the container of which `init_pidfd` is avckpt-init.
 
-        `init_pidfd` stays the caller's.  Returns at once; what happens comes as
-        events with `cookie`.  Raises ConfigError for values that make no sense,
-        TargetGone, KernelError.
+        `init_pidfd` stays the caller's. Returns at once; what happens comes as
+        events with `cookie`. Raises ConfigError for invalid values, TargetGone,
+        KernelError.
         """
         err = ffi.new("struct avc_error *")
         guard = lib.avc_guard_start(self._engine, _config(init_pidfd, config), cookie, err)

@@ -2,8 +2,8 @@
 """Everything that can go wrong, as exceptions.
 
 One tree for the engine's errors (made from `struct avc_error`, every field
-kept) and for those between command line and sidecar.  `str(error)` is the one
-line a person sees; `kind` and the fields are for programs, and cross the API
+kept) and for those between command line and sidecar. `str(error)` is the one
+line for users; `kind` and the fields are for programs, and cross the API
 unaltered (`to_json()`, `from_json()`).
 """
 
@@ -43,12 +43,12 @@ class ExitCode(enum.IntEnum):
 
 
 class AvckptError(Exception):
-    """Something failed.  `detail` is one clause for a person.
+    """Something failed. `detail` is one clause for users.
 
     `operation` is what was being done, `syscall` and `errno` the call that
-    failed ("" and 0: none), `pid` whom it happened to (0: nobody),
+    failed ("" and 0: none), `pid` the process concerned (0: none),
     `undo_failures` how many steps could not be undone afterwards, and
-    `container` how to call the container ("": none, or `detail` names it).
+    `container` the container's name ("": none, or `detail` names it).
     """
 
     kind: ClassVar[str] = "failed"
@@ -130,7 +130,7 @@ class Unsupported(AvckptError):
 
 
 class Busy(AvckptError):
-    """Somebody else traces or guards it."""
+    """Another process traces or protects it."""
 
     kind = "busy"
     code = Code.BUSY
@@ -151,14 +151,14 @@ class Paused(AvckptError):
 
 
 class ProtocolError(AvckptError):
-    """The other side is not a matching avckpt-init, hook or sidecar."""
+    """The peer is not a matching avckpt-init, hook or sidecar."""
 
     kind = "protocol"
     code = Code.PROTOCOL
 
 
 class ConfigError(AvckptError):
-    """A value that makes no sense."""
+    """An invalid value."""
 
     kind = "config"
     code = Code.CONFIG
@@ -172,14 +172,14 @@ class LabelsWrong(AvckptError):
 
 
 class KernelError(AvckptError):
-    """The kernel said no where it should not have."""
+    """The kernel refused what it should have allowed."""
 
     kind = "kernel"
     code = Code.KERNEL
 
 
 class NoRoom(AvckptError):
-    """A limit of processes, or of memory, leaves no room for one more process."""
+    """A limit on processes or memory leaves no room for another process."""
 
     kind = "limit"
     code = Code.LIMIT
@@ -253,7 +253,7 @@ def class_of_code(code: int) -> type[AvckptError]:
 
 
 def of_any(error: Exception) -> AvckptError:
-    """An exception as one of ours: itself, or what Python or the kernel said."""
+    """Converts any exception to one of ours."""
     if isinstance(error, AvckptError):
         return error
     if isinstance(error, OSError) and error.errno:

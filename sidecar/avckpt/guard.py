@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a guard is told and what it tells: the plain data of `avckpt/engine.h`.
+"""Commands, settings and events of guards: the plain data of
+`avckpt/engine.h`.
 
-Nothing here needs the native library, so that what decides on events can be
-read and tested without it.
+Nothing here needs the native library, so that decisions on events can be read
+and tested without it.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Tcp(enum.IntEnum):
 
 
 class Images(enum.IntEnum):
-    """`enum avc_images`: how a checkpoint gets the memory of a process."""
+    """`enum avc_images`: how a checkpoint saves the memory of a process."""
 
     FORK = 0
     DIRTY = 1
@@ -89,17 +90,17 @@ class GuardConfig:
     """Restores within `restore_window_s`."""
     restore_window_s: float
     quiesce_s: float
-    """How long to look for a quiescent moment."""
+    """How long to wait for a quiescent moment."""
     shm_bytes: int = 4_000_000
     """Shared memory of the application's own that is rolled back with it, at most."""
     memory_limit_bytes: int = 0
     """Of the container, with swap; 0: none known."""
     deadline_s: float = 0.0
-    """A restore that is not there so long after the death is given up; 0: none is."""
+    """A restore that takes longer than this after the death is abandoned; 0: none is."""
     remains_s: float = 0.0
-    """How long the memory of a dead application is kept for whoever looks at it; 0: it is not."""
+    """How long the memory of a dead application is kept for analysis; 0: it is not."""
     freeze_deadline_s: float = 0.0
-    """The longest the app is held to get it stopped; 0: the engine's default."""
+    """The longest time to wait for the app to stop; 0: the engine's default."""
     files: Files = Files.REWIND
     tcp: Tcp = Tcp.RESET_MOVED
     images: Images = Images.FORK
@@ -108,9 +109,9 @@ class GuardConfig:
     interval_min_s: float = 0.0
     """Not 0: as often as the budgets allow, between this and `interval_s` apart."""
     budget_freeze: float = 0.03
-    """Of the application's time, a fraction."""
+    """The fraction of the application's time."""
     budget_cpu: float = 0.05
-    """Of one CPU's, a fraction."""
+    """The fraction of one CPU's time."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class Event:
     threads: int = 0
     generation: int = 0
     line: int = 0
-    """Of its group; 0: it is of none."""
+    """The line of its group; 0: none."""
     generations: int = 0
     attempt: int = 0
     quiescent: bool = False
@@ -154,7 +155,7 @@ class Event:
     error: AvckptError | None = None
 
     def to_json(self) -> dict[str, object]:
-        """The fields that say something, for programs."""
+        """The non-empty fields, for programs."""
         data: dict[str, object] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -169,7 +170,7 @@ class Event:
 
 
 def generation_to_json(event: Event) -> dict[str, object]:
-    """A generation that is held, as an event HELD tells of it."""
+    """A generation that is held, as an event HELD reports it."""
     return {
         "generation": event.generation,
         "age_s": event.age_s,

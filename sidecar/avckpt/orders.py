@@ -35,9 +35,9 @@ class Orders:
         self._open: dict[int, _Order] = {}
 
     async def give(self, guard: Guard, container: Protected, command: Command, generation: int = 0) -> EventRecord:
-        """Has a command carried out; what was told of that.
+        """Carries out a command; returns the resulting event.
 
-        Raises DeadlineMissed, TargetGone, or what the guard says went wrong.
+        Raises DeadlineMissed, TargetGone, or the guard's error.
         """
         order = await self._carry_out(container, _of_command(guard, command, generation))
         check(container.label, order.events[-1])
@@ -45,7 +45,7 @@ class Orders:
         return order.record
 
     async def ask(self, container: Protected, tell: Callable[[int], None]) -> tuple[Event, EventRecord]:
-        """Has `tell` tell a guard something with a new ticket; the answer, whatever it says.
+        """Calls `tell` with a new ticket; returns the answer, whatever it is.
 
         Raises DeadlineMissed, TargetGone, or what `tell` raises.
         """
@@ -61,7 +61,7 @@ class Orders:
         return [event for event in order.events if event.generation]
 
     def answer(self, event: Event, record: EventRecord | None) -> None:
-        """Takes what a guard has said; `record` is what was told of it."""
+        """Takes an event of a guard; `record` is its distributed form."""
         order = self._open.get(event.ticket)
         if order is None or order.done.done():
             return
@@ -71,7 +71,7 @@ class Orders:
             order.done.set_result(None)
 
     def fail(self, container: Protected, why: str) -> None:
-        """Answers all that is open of a container: there will be no other answer."""
+        """Answers all pending commands of a container: no other answer will come."""
         for order in self._open.values():
             if order.cookie == container.cookie and not order.done.done():
                 order.done.set_exception(TargetGone(f"{container.label}: {why}"))
@@ -94,7 +94,7 @@ def _of_command(guard: Guard, command: Command, generation: int = 0) -> Callable
 
 
 def check(label: str, event: Event) -> None:
-    """Raises what the answer to a command says went wrong, with the container's name."""
+    """Raises the error in the answer to a command, with the container's name."""
     if event.kind in (Kind.CHECKPOINT, Kind.RESTORED):
         return
     if event.kind is Kind.GAVE_UP:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a container's labels to what its guard is told."""
+"""From a container's labels to its guard's settings."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Images, Tcp
 
 REMAINS_S = {"off": 1.0, "mini": 5.0, "on": 30.0}
-"""How long a dead application's memory is kept at most, by `avckpt.core`: to find out where it died, or to write it."""
+"""How long a dead application's memory is kept at most, by `avckpt.core`: to find out where it died, or to
+write a core."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What holds for one container."""
+    """The effective settings of one container."""
 
     said: Mapping[str, str]
-    """Label by label, as somebody wrote it; what is not there is the built-in default."""
+    """Label by label, as written; missing ones have the built-in default."""
     policy: Policy
     config: GuardConfig
 
     @property
     def in_force(self) -> dict[str, str]:
-        """Every setting without its prefix, as in a label; empty: there is none.  Of commands only the program."""
+        """Every setting without its prefix, as in a label; empty: there is none. Of commands only the
+        program."""
         texts = {key: self.said.get(key, label.default) for key, label in LABELS.items()}
         return {key[len(PREFIX) :]: shown(text) if text else "" for key, text in texts.items()}
 
 
 @dataclass(frozen=True)
 class Change:
-    """One setting that is another one now.  Texts as in a label; empty: there is none."""
+    """A changed setting. Texts as in a label; empty: there is none."""
 
     setting: str
     """The label without its prefix."""
@@ -47,12 +49,12 @@ class Change:
 
 @dataclass(frozen=True)
 class Reloaded:
-    """A container that goes by other settings now, or, with a `problem`, by its old ones."""
+    """A container with new settings, or, with a `problem`, with its old ones."""
 
     container: str
     changes: tuple[Change, ...]
     problem: str = ""
-    """Why the file does not hold for it; empty: it does."""
+    """Why the file does not apply to it; empty: it does."""
 
     @property
     def what(self) -> str:
@@ -71,13 +73,14 @@ class Reloaded:
 
 
 def guard_config(policy: Policy) -> GuardConfig:
-    """The part of a policy that is the engine's."""
+    """The engine's part of a policy."""
     return GuardConfig(
         interval_s=policy.interval_s,
         interval_min_s=policy.interval_min_s if policy.automatic else 0.0,
         budget_freeze=policy.budget_freeze,
         budget_cpu=policy.budget_cpu,
-        # One more to go back to from a hang, and one where the newest is only a moment old: see docs/policy.md.
+        # One more for rollbacks from a hang, and one where the newest is only a moment old: see
+        # docs/policy.md.
         keep=min(policy.keep + policy.restore_on.unhealthy + policy.automatic, KEEP_MAX),
         restore_on_signal=policy.restore_on.signal,
         restore_on_exit=policy.restore_on.exit,
@@ -96,7 +99,7 @@ def guard_config(policy: Policy) -> GuardConfig:
 
 
 def settings_of(labels: Mapping[str, str]) -> Settings:
-    """What the labels (or annotations) of a container say.  Raises LabelsWrong with one line for a person."""
+    """The policy of a container's labels (or annotations). Raises LabelsWrong with one line for users."""
     try:
         policy = parse_policy(labels)
     except LabelError as error:
@@ -106,7 +109,7 @@ def settings_of(labels: Mapping[str, str]) -> Settings:
 
 
 def changes(before: Settings, after: Settings) -> list[Change]:
-    """What is different, in alphabetical order; 3s and 3000ms are not."""
+    """The differences, in alphabetical order; 3s and 3000ms are equal."""
     found = []
     for key in sorted(LABELS):
         texts = [settings.said.get(key, LABELS[key].default) for settings in (before, after)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sidecar as a process: one for each run-time directory, with the limits and the view that it needs."""
+"""The sidecar as a process: one for each runtime directory, with the limits and namespaces that it needs."""
 
 from __future__ import annotations
 
@@ -34,20 +34,21 @@ def only_one(run_dir: Path) -> Iterator[None]:
         os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
-        os.close(fd)  # which unlocks; the file stays, or two could lock two files
+        os.close(fd)  # which unlocks; the file stays, or two sidecars could lock different files
 
 
 def raise_descriptor_limit() -> None:
-    """Allows this process as many descriptors as it may allow itself: each container takes a dozen or two."""
+    """Raises this process's descriptor limit as far as it may: each container takes a dozen or two."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def serve(run_dir: Path, config_path: Path, beat_fd: int = -1) -> None:
-    """Runs the sidecar in the foreground until it is told to stop; gives a sign of life to `beat_fd`, if that is one.
+    """Runs the sidecar in the foreground until it is asked to stop; gives signs of life on `beat_fd`, if
+    given.
 
-    Raises Denied or Unsupported when this process or machine cannot do it,
-    Busy when there is a sidecar already.
+    Raises Denied or Unsupported when this process or machine cannot run it, Busy when there is a sidecar
+    already.
     """
     probe()
     cgroup.see_whole_tree()

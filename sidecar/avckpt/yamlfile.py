@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files whose every value still knows its line.
+"""YAML files with line numbers of all values.
 
 A loaded document has lost its lines; a composed one (PyYAML's nodes) has them,
-but not yet its merge keys.  Here is what reading it for messages takes.
+but not yet its merge keys. This module adds what is needed for messages.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _PLAIN = ("int", "float", "bool", "null")
 FILE_BYTES = 1 << 20
 BRACKETS_MOST = 50
 VALUES_MOST = 100_000
-"""Keys and values of a file when every alias is replaced by what it stands for."""
+"""Most keys and values of a file after expansion of aliases."""
 
 
 @dataclass(frozen=True, order=True)
@@ -44,7 +44,7 @@ class Unreadable(Exception):
 
 
 class _Loader(yaml.SafeLoader):
-    """Not deeper than anybody writes: each token takes PyYAML's scanner as long as the brackets around it are many."""
+    """Deepest nesting: PyYAML's scanner takes time per token in proportion to the brackets around it."""
 
     def fetch_flow_collection_start(self, token: type[yaml.Token]) -> None:
         super().fetch_flow_collection_start(token)
@@ -61,8 +61,8 @@ def read(path: Path) -> yaml.Node | None:
 def read_all(path: Path, *, several: bool = True) -> list[yaml.Node]:
     """The roots of the documents in `path`.  Raises Unreadable, also if there are `several` and may not be.
 
-    What is returned may be walked without a thought of its aliases: expanded it
-    is not endless, and not larger than `VALUES_MOST`.
+    The result may be walked without regard to aliases: expanded it is finite, and not larger than
+    `VALUES_MOST`.
     """
     try:
         text = read_bounded(str(path), FILE_BYTES).decode()
@@ -93,7 +93,8 @@ def read_all(path: Path, *, several: bool = True) -> list[yaml.Node]:
 
 
 def _expanded(node: yaml.Node | None, path: Path, known: dict[int, int]) -> int:
-    """How many nodes this one is without aliases; each is counted once, so that counting takes no longer than reading.
+    """The number of nodes after expansion; each is counted once, so that counting takes no longer than
+    reading.
 
     Raises Unreadable where there are too many.
     """
@@ -123,8 +124,8 @@ def place_of(node: yaml.Node, path: Path) -> Place:
 def entries(node: yaml.Node | None) -> list[tuple[yaml.ScalarNode, yaml.Node]]:
     """The keys and values of a mapping, merge keys (`<<`) resolved; of anything else, none.
 
-    A key that is written twice in one mapping comes twice.  What the mapping
-    says itself comes after what it merges in, and hides it.
+    A key that is written twice in one mapping is returned twice. The mapping's own keys
+    come after merged ones, and override them.
     """
     if not isinstance(node, yaml.MappingNode):
         return []
@@ -153,7 +154,8 @@ def lookup(node: yaml.Node | None, key: str) -> yaml.Node | None:
 
 
 def text_of(node: yaml.Node) -> str:
-    """A single value as text, as a program sees it that loads the file and calls str().
+    """A single value as text, as a program would see it by loading the file and calling
+    str().
 
     Raises ValueError for a list or a mapping.
     """

@@ -351,7 +351,7 @@ def test_scope_nodes_takes_no_health_check() -> None:
         check=False,
     )
     assert done.status == 2
-    assert "a health check is of a whole container" in done.stderr
+    assert "a health check covers a whole container" in done.stderr
 
 
 def test_a_launcher_without_avckpt_starts_its_nodes_all_the_same(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_prestart_sends_what_is_ours_and_says_when_that_is_too_long(
         thread.join()
         assert (said, seen) == ("", [ours])
     else:
-        assert "web runs unprotected: its labels are too much for the sidecar: the message is too long (131" in said
+        assert "web runs unprotected: its labels are too large for the sidecar: the message is too long (131" in said
 
 
 def test_prestart_registers_also_without_a_record(

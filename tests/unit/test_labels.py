@@ -40,7 +40,10 @@ def test_a_group_that_goes_back_together() -> None:
         ({"avckpt.group": None}, "label avckpt.group.recovery=together: there is no group; add avckpt.group=NAME"),
         ({"avckpt.tcp": "keep"}, "label avckpt.tcp=keep: what was sent since the checkpoint would be received"),
         ({"avckpt.tcp": "messages"}, "label avckpt.tcp=messages: what was sent since"),
-        ({"avckpt.interval": "auto"}, "label avckpt.interval=auto: a group that goes back together has one interval"),
+        (
+            {"avckpt.interval": "auto"},
+            "label avckpt.interval=auto: a group that recovers together needs a fixed interval",
+        ),
         ({"avckpt.deadline": "50ms", "avckpt.deadline.late": "cold"}, "label avckpt.deadline.late=cold: nobody of a"),
         ({"avckpt.scope": "nodes"}, "label avckpt.scope=nodes: nodes do not go back together"),
     ],
@@ -189,7 +192,7 @@ def test_the_engine_takes_every_number_of_restores_that_a_label_may_ask_for() ->
 
 def test_a_container_that_would_hear_of_nobody_is_told() -> None:
     label = {"avckpt.notify": "signal:USR1"}
-    with pytest.raises(LabelError, match=r"without a group there is nobody to hear of; add avckpt\.group=NAME"):
+    with pytest.raises(LabelError, match=r"without a group there are no recoveries to report; add avckpt\.group=NAME"):
         parse_policy({**ON, **label})
     assert parse_policy(label).notify is not None
     assert not parse_policy(label).listens

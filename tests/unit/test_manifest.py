@@ -315,7 +315,7 @@ def test_one_that_hears_of_its_group_is_no_mistake(path: Path) -> None:
     assert [service.enabled for service in both.services.values()] == [False, True]
     alone = checked(path, "services:\n  a:\n    labels:\n    - avckpt.enable=true\n    - avckpt.notify=signal:USR1\n")
     assert lines(alone) == [
-        "v.yaml:5: service a: label avckpt.notify=signal:USR1: without a group there is nobody to hear of; "
+        "v.yaml:5: service a: label avckpt.notify=signal:USR1: without a group there are no recoveries to report; "
         "add avckpt.group=NAME, or use avckpt.notify.self for its own recoveries"
     ]
 

@@ -151,7 +151,7 @@ def test_a_process_registers_itself_and_nobody_else() -> None:
         (packet("name=a"), [other], b"no it can register itself only"),
         (packet("name=a"), [], b"no one descriptor wanted, 0 came"),
         (packet("name=a"), [own, own], b"no one descriptor wanted, 2 came"),
-        (b"x" * units.UNIT_BYTES * 2, [own], b"no it says too much"),
+        (b"x" * units.UNIT_BYTES * 2, [own], b"no its message is too long"),
         (packet("name=a"), [0], None),
     ):
         with connected() as (ours, theirs):

@@ -168,14 +168,14 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
         raise LabelError(
             "avckpt.restore.on",
             mapping.get("avckpt.restore.on"),
-            "a health check is of a whole container",
+            "a health check covers a whole container",
             "leave unhealthy out, or avckpt.scope=nodes",
         )
     if policy.enable and policy.notify is not None and not policy.group:
         raise LabelError(
             "avckpt.notify",
             mapping["avckpt.notify"],
-            "without a group there is nobody to hear of",
+            "without a group there are no recoveries to report",
             "add avckpt.group=NAME, or use avckpt.notify.self for its own recoveries",
         )
     if policy.recovery == "together":
@@ -189,22 +189,25 @@ def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
         raise LabelError("avckpt.group.recovery", "together", "there is no group", "add avckpt.group=NAME")
     if policy.scope == "nodes":
         raise LabelError(
-            "avckpt.scope", "nodes", "nodes do not go back together with others", "use avckpt.scope=container there"
+            "avckpt.scope", "nodes", "nodes cannot recover together with others", "use avckpt.scope=container there"
         )
     if policy.automatic:
         raise LabelError(
-            "avckpt.interval", "auto", "a group that goes back together has one interval", "give it a time, as 500ms"
+            "avckpt.interval",
+            "auto",
+            "a group that recovers together needs a fixed interval",
+            "give it a time, as 500ms",
         )
     if policy.deadline_late == "cold":
         raise LabelError(
-            "avckpt.deadline.late", "cold", "nobody of a group that goes back together starts anew alone", "use go-on"
+            "avckpt.deadline.late", "cold", "no member of a group that recovers together restarts alone", "use go-on"
         )
     if policy.tcp not in ("reset-moved", "reset"):
         # Bytes sent since the checkpoint would be received, and then sent once more.
         raise LabelError(
             "avckpt.tcp",
             mapping.get("avckpt.tcp"),
-            "what was sent since the checkpoint would be received by a group that goes back together",
+            "a group that recovers together would receive what was sent since the checkpoint",
             "allowed there: reset-moved or reset",
         )
 
@@ -406,7 +409,7 @@ def _signal_number(text: str) -> int:
     if number not in signal.valid_signals() or signal.SIGSYS < number < signal.SIGRTMIN:
         raise ValueError(f"{shown(text)} is no signal")
     if number in (signal.SIGKILL, signal.SIGSTOP):
-        raise ValueError("nobody can be told by that signal, it cannot be caught")
+        raise ValueError("that signal cannot be caught")
     return number
 
 

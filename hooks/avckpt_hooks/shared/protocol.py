@@ -240,7 +240,7 @@ def receive_request(connection: socket.socket) -> tuple[Register | Deregister, i
         request = decode_request(packet)
         wanted = 1 if isinstance(request, Register) else 0
         if len(fds) != wanted or flags & socket.MSG_CTRUNC:
-            raise ProtocolError(f"{wanted} descriptor(s) wanted with the request, {len(fds)} came")
+            raise ProtocolError(f"{wanted} descriptor(s) expected with the request, got {len(fds)}")
     except ProtocolError:
         for fd in fds:
             os.close(fd)

@@ -1,9 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What avckpt-init and the guard (avckpt-guard, one process for each container) say
- * to each other.
+ * The protocol between avckpt-init and the guard (avckpt-guard, one process for each container).
  *
- * init makes, before it starts the app:
+ * init creates, before it starts the app:
  *   - a memfd named AVC_CTL_NAME that holds one struct avc_ctl.  The guard
  *     finds it in /proc/INIT/fd by its name, maps it, and takes flock(2)
  *     LOCK_EX|LOCK_NB on a description of its own: one guard per container.
@@ -29,38 +28,37 @@
 /* How long init waits for a verdict from a guard that lives but is silent. */
 #define AVC_CTL_WAIT_MS_DEFAULT 2000
 
-/* While a stop was asked for less than this long ago, the app's end is final. */
+/* If a stop was requested less than this long ago, the app's exit is final. */
 #define AVC_CTL_STOP_MS 60000
 
 struct avc_ctl {
 	uint64_t magic;   /* AVC_CTL_MAGIC, written last by init               */
 	uint32_t version; /* AVC_CTL_VERSION                                   */
 	int32_t init_pid;
-	int32_t app_pid;    /* the app's main process; 0 until it was started    */
+	int32_t app_pid;    /* the app's main process; 0 until it is started */
 	int32_t report_fd;  /* init's number of the report pipe's read end       */
 	int32_t verdict_fd; /* init's number of the verdict pipe's read end      */
-	uint32_t wait_ms;   /* how long init waits to hear of a verdict          */
-	/* Written by the guard: 1 while at least one generation is held.  With 0
-	 * init does not ask, it ends with the app's status.                     */
+	uint32_t wait_ms;   /* how long init waits for a verdict */
+	/* Written by the guard: 1 while at least one generation is held. With 0 init does not ask,
+	 * and exits with the app's status. */
 	uint32_t armed;
-	/* Written by init: CLOCK_MONOTONIC ns when a stop was forwarded to the
-	 * app last, 0 if never.  The guard takes no checkpoint for
-	 * AVC_CTL_STOP_MS after it: an app that is ending is no good image.     */
+	/* Written by init: CLOCK_MONOTONIC ns when a stop was forwarded to the app last, 0 if
+	 * never. The guard takes no checkpoint for AVC_CTL_STOP_MS after it: an app that is
+	 * shutting down makes no useful image. */
 	uint64_t stop_asked_ns;
-	/* Written by init: set once it has been told to start the app and exec
-	 * failed (errno), else 0.                                               */
+	/* Written by init: errno if exec of the app failed, else 0. */
 	int32_t exec_errno;
-	/* Written by init: 1 where there may be others of our kind in its PID namespace. */
+	/* Written by init: 1 if there may be other avckpt-inits in its PID namespace. */
 	int32_t is_unit;
-	/* Written by init: its child that listens to the keys of a terminal, 0: none.  It is
-	 * no process of the app's, and ended while a death is reported.         */
+	/* Written by init: its child that watches the keys of a terminal, 0: none. It does not
+	 * belong to the app, and is killed before a death is reported. */
 	int32_t keys_pid;
 };
 
 enum avc_report_kind { AVC_REPORT_DEATH = 1 };
 
 enum avc_report_flag {
-	AVC_REPORT_STOP_ASKED = 1 /* the app was told to stop: this end is final */
+	AVC_REPORT_STOP_ASKED = 1 /* the app was asked to stop: this exit is final */
 };
 
 struct avc_report {
@@ -74,10 +72,10 @@ struct avc_report {
 };
 
 enum avc_verdict_kind {
-	AVC_VERDICT_RESTORED = 1, /* the app is there again under the same PID;
-	                           * written before it starts to run             */
+	AVC_VERDICT_RESTORED = 1, /* the app exists again under the same PID; written before it
+	                           * runs */
 	AVC_VERDICT_GIVE_UP = 2,  /* end with the app's status                   */
-	AVC_VERDICT_WORKING = 3   /* none yet: wait for wait_ms from now on       */
+	AVC_VERDICT_WORKING = 3   /* none yet: wait for another wait_ms */
 };
 
 struct avc_verdict {

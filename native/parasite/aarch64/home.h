@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The context a borrowed thread goes back to by itself (aarch64).  There is no jump that leaves
- * all registers alone: it goes back by rt_sigreturn(2), from a signal frame.
+ * The context a borrowed thread goes back to by itself (aarch64). No jump preserves all registers,
+ * so it goes back by rt_sigreturn(2), from a signal frame.
  */
 #ifndef AVCKPT_HOME_H
 #define AVCKPT_HOME_H

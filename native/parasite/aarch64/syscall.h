@@ -22,7 +22,7 @@ static inline long raw_syscall(long nr, uint64_t a, uint64_t b, uint64_t c, uint
 	register uint64_t x4 __asm__("x4") = e;
 	register uint64_t x5 __asm__("x5") = f;
 
-	/* The kernel itself changes x8 when it takes a call up again. */
+	/* The kernel itself changes x8 when it restarts a call. */
 	__asm__ volatile("svc #0"
 			 : "+r"(x0), "+r"(x8)
 			 : "r"(x1), "r"(x2), "r"(x3), "r"(x4), "r"(x5)

@@ -140,7 +140,7 @@ def _decode(body: bytes) -> Json:
     except ValueError as error:
         raise ProtocolError(f"the sidecar's answer is not JSON: {body[:80]!r}") from error
     if not isinstance(answer, dict):
-        raise ProtocolError(f"the sidecar's answer makes no sense: {body[:80]!r}")
+        raise ProtocolError(f"the sidecar's answer is invalid: {body[:80]!r}")
     # An event may have an error of its own, and always has a kind.
     if isinstance(answer.get("error"), dict) and "kind" not in answer:
         raise from_json(answer["error"])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The containers that the sidecar knows, and where it learns of them."""
+"""The containers that the sidecar knows, and how it learns of them."""

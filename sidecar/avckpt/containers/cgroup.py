@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control groups of a container as files: where they are, memory and limit, frozen or not.
 
-Version 1, 2 and hybrids of both.  Paths are the host's: the sidecar's own view
-may be a namespace with a part of the tree only, so process 1's mounts are asked
-first (the sidecar runs with the host's PID namespace).
+Version 1, 2 and hybrids of both. Paths are the host's: the sidecar's own view may be a
+namespace with a part of the tree only, so process 1's mounts are read first (the sidecar
+runs with the host's PID namespace).
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ UNLIMITED_BYTES = 1 << 62
 def see_whole_tree() -> None:
     """Makes every container's groups visible to this process.  Best effort; call it before there are threads.
 
-    In a cgroup namespace of our own /proc/PID/cgroup would read as
-    `/../../...`, and of version 1 even a privileged container has only its own
-    part of each hierarchy mounted: what is missing is mounted once more.
+    In a cgroup namespace of our own /proc/PID/cgroup would read as `/../../...`, and of version 1 even a
+    privileged container has only its own part of each hierarchy mounted: missing ones are mounted again.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     with contextlib.suppress(OSError):
@@ -95,7 +94,7 @@ class Groups:
         return limit if limit < UNLIMITED_BYTES else None
 
     def memory_and_swap_bytes(self) -> int | None:
-        """How much there is before the OOM killer comes: the hard limit, and what may be swapped; None: no limit."""
+        """The limit at which the OOM killer acts: the hard limit, plus allowed swap; None: no limit."""
         limit = self.memory_limit_bytes()
         if limit is None or self.memory is None:
             return None
@@ -106,7 +105,7 @@ class Groups:
         return limit + min(swap, _host_swap_bytes())
 
     def memory_used_bytes(self) -> int | None:
-        """What counts against the limit and cannot simply be given back: usage less clean file pages."""
+        """What counts against the limit and cannot simply be reclaimed: usage less clean file pages."""
         if self.memory is None:
             return None
         text = _read(self.memory / ("memory.current" if self.memory_version == 2 else "memory.usage_in_bytes"))
@@ -168,7 +167,7 @@ def _directory(controllers: frozenset[str], path: str) -> Path | None:
             if inner.startswith(".."):
                 continue
             directory = Path(f"{prefix}{mount.where}") / inner
-            if os.path.isdir(directory):  # pathlib raises where we may not look
+            if os.path.isdir(directory):  # pathlib raises without permission
                 return directory
     return None
 
@@ -199,7 +198,7 @@ def _host_swap_bytes() -> int:
 
 
 def _lines(path: Path) -> list[str]:
-    """A file of /proc with names in it: they may be any bytes, and only blanks, newlines and backslashes are escaped.
+    """A file of /proc that contains names: any bytes, with only blanks, newlines and backslashes escaped.
 
     Raises OSError.
     """

@@ -29,7 +29,7 @@ Handler = Callable[[Union[Register, Deregister], Union[int, None]], None]
 MAX_WAITING = 64
 """Connections that have not sent their request yet."""
 PAUSE_S = 0.2
-"""How long nobody is accepted when the kernel has nothing left for it."""
+"""How long to stop accepting when the kernel is out of resources."""
 SHORT_OF = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
@@ -37,8 +37,8 @@ def bind_socket(path: Path, kind: socket.SocketKind) -> socket.socket:
     """A listening Unix socket that only root may connect to; replaces what a killed sidecar left behind."""
     path.unlink(missing_ok=True)
     listening = socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
-    # The mode must be right before anybody can connect: connect(2) is checked
-    # against the inode, and fchmod(2) on a socket does not reach it.
+    # The mode must be right before any process can connect: connect(2) is
+    # checked against the inode, and fchmod(2) on a socket does not reach it.
     old = os.umask(0o177)
     try:
         listening.bind(str(path))
@@ -61,7 +61,7 @@ class HookListener:
         self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
         self._pause: asyncio.TimerHandle | None = None
         self._is_short = False
-        """Nobody could be accepted the last time, which has been said."""
+        """The last accept failed, which has been logged."""
         self._socket = bind_socket(path, socket.SOCK_SEQPACKET)
         self._loop.add_reader(self._socket, self._accept)
 
@@ -94,7 +94,7 @@ class HookListener:
         self._loop.add_reader(connection, self._serve, connection)
 
     def _wait(self, error: OSError) -> None:
-        """Accepts nobody for a moment.  Clients go on waiting, so that the socket stays readable."""
+        """Pauses accepting. Clients keep waiting, so the socket stays readable."""
         if not self._is_short:
             log.error(
                 "hooks cannot be answered (%s): containers that start now run unprotected at first; "

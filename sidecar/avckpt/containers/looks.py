@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that a container may hold up for as long as it likes, kept away from everybody else's.
+"""Reads that a container may delay for as long as it likes, isolated from all other work.
 
-What /proc tells of a process's memory (environ, smaps_rollup, mem) waits for its
-mmap_lock, which a process can hold for seconds, the longer the shorter memory is.
-So each look has a thread of its own and is waited for no longer than `WAIT_S`. One
-that does not come back costs a thread until its process ends, and the next look at
-the same thing fails at once.
+Reading a process's memory through /proc (environ, smaps_rollup, mem) waits for its
+mmap_lock, which a process can hold for seconds, especially when memory is short. So each
+read has its own thread and is awaited for at most `WAIT_S`. One that does not return
+costs a thread until its process exits, and the next read of the same file fails at once.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ T = TypeVar("T")
 WAIT_S = 1.0
 
 _under_way: dict[tuple[str, int], tuple[float, asyncio.Future[Any]]] = {}
-"""Looks under way, by subject and process: when each began (the loop's time), and its result."""
+"""Reads under way, by subject and process: when each began (the loop's time), and its result."""
 
 
 async def look(what: str, pid: int, function: Callable[[], T]) -> T:
@@ -52,16 +51,16 @@ async def look(what: str, pid: int, function: Callable[[], T]) -> T:
 
 
 def in_own_thread(function: Callable[[], T]) -> asyncio.Future[T]:
-    """What `function` returns, or raises, in a thread that nobody else's work waits for.
+    """What `function` returns, or raises, in a thread of its own.
 
-    Precondition: an event loop runs.  Raises RuntimeError when there can be no more threads.
+    Precondition: an event loop runs. Raises RuntimeError when no thread can be created.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
 
     def settle(result: T | None, error: BaseException | None) -> None:
         if future.done():
-            return  # whoever asked has been cancelled
+            return  # the caller has been cancelled
         if error is not None:
             future.set_exception(error)
         else:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Podman calls its containers now: `podman rename` calls no hook."""
+"""Podman's current names of containers: `podman rename` calls no hook."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import psutil
 from avckpt_hooks.shared.files import read_bounded
 
 LIST = "containers.json"
-"""Of containers/storage: renamed into its place at every change, so that it takes no lock to read it."""
+"""Of containers/storage, which replaces it by rename(2) at every change, so that reading it takes no lock."""
 LIST_BYTES = 32 << 20
 
 
@@ -22,12 +22,12 @@ class Names:
         self._read: dict[Path, tuple[tuple[int, int, int], dict[str, str]]] = {}
 
     def of(self, container_id: str, bundle: str, init_pid: int) -> str:
-        """Its name now; "" if that cannot be found out.  A bundle of Podman's is FOLDER/ID/userdata."""
+        """Its current name; "" if unknown. A bundle of Podman is FOLDER/ID/userdata."""
         path = Path(bundle)
         if path.name != "userdata" or path.parent.name != container_id:
             return ""
         with contextlib.suppress(OSError, ValueError, RecursionError, psutil.Error):
-            # conmon's files are the host's.
+            # conmon's files are on the host.
             host = Path(f"/proc/{psutil.Process(init_pid).ppid()}/root")
             folder = path.parents[1].relative_to("/")
             return self._names(folder, host / folder / LIST).get(container_id, "")
@@ -38,7 +38,7 @@ class Names:
         status = path.stat()
         seen = (status.st_ino, status.st_mtime_ns, status.st_size)
         if folder not in self._read or self._read[folder][0] != seen:
-            self._read[folder] = (seen, {})  # what cannot be read is not tried again until it changes
+            self._read[folder] = (seen, {})  # after an error, retry only when it has changed
             self._read[folder] = (seen, _parse(read_bounded(str(path), LIST_BYTES)))
         return self._read[folder][1]
 

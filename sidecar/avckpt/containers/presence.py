@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is protected, in a file that outlives the sidecar: the next one tells what ended while there was none."""
+"""The protected containers, in a file that outlives the sidecar: the next one reports what ended
+meanwhile."""
 
 from __future__ import annotations
 
@@ -20,11 +21,11 @@ log = logging.getLogger("avckpt")
 
 FILE_BYTES = 4 << 20
 NAMED = 20
-"""So many are named in one line."""
+"""At most this many are named in one line."""
 
 
 class Presence:
-    """The file's time says when the sidecar lived last.  A disk that is full costs the telling, no more."""
+    """The file's time says when the sidecar was last alive. On a full disk only this report is lost."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -32,7 +33,8 @@ class Presence:
         self._told = False
 
     def keep(self, live: Iterable[Protected], *, stopped: bool = False) -> None:
-        """Writes who is there now, and that we are.  Units are not in it: they come back by themselves.
+        """Writes the protected containers and a sign of life. Units are left out: they register again
+        by themselves.
 
         Does nothing before `since_then()`.
         """
@@ -48,13 +50,14 @@ class Presence:
             self._written = content
 
     def stop(self, live: Iterable[Protected]) -> None:
-        """We end because we were told to."""
+        """Records that we exit on request."""
         self.keep(live, stopped=True)
 
     def since_then(self, live: Iterable[Protected]) -> str:
-        """How long there was no sidecar, why, and which containers have ended meanwhile; "": there was none before.
+        """How long there was no sidecar, why, and which containers have ended meanwhile; "": this is the
+        first one.
 
-        Then writes who is there now.
+        Then writes the current containers.
         """
         live = list(live)
         detail = self._outage({each.id: each.init_pid for each in live}) if self._path.exists() else ""

@@ -33,10 +33,10 @@ def start_time(pid: int) -> int:
 
 
 def age_s(pid: int) -> float:
-    """Seconds since `pid` started, time asleep with the machine included.
+    """Seconds since `pid` started, including suspend.
 
     By the kernel's clock: the time of day of a vehicle jumps by decades when it
-    first hears what time it is.  Raises TargetGone when there is no such process.
+    is first set. Raises TargetGone when there is no such process.
     """
     started = start_time(pid) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started
@@ -52,15 +52,14 @@ def status(pid: int) -> dict[str, str]:
 def open_pidfd(pid: int, started: int) -> int:
     """A pidfd of the process that has this PID *and* this start time; the caller closes it.
 
-    Raises TargetGone when that process has ended, whoever has its PID now.
+    Raises TargetGone when that process has exited, even if its PID is in use again.
     """
     try:
         pidfd = os.pidfd_open(pid)
     except ProcessLookupError as error:
         raise TargetGone("no such process", syscall="pidfd_open", errno=error.errno or 0, pid=pid) from error
-    # Looked at only now: the pidfd holds one process for good, so if the start
-    # time is right after it was opened it was opened on the right one.  The
-    # other way round the PID could change hands in between.
+    # Checked only now: the pidfd refers to one process for good, so if the start time is right after it was
+    # opened, it is the right one. In the other order the PID could be reused in between.
     try:
         found = start_time(pid)
         if found != started or has_ended(pidfd):
@@ -86,13 +85,14 @@ def is_foreign(pidfd: int) -> bool:
 def pid_of(pidfd: int) -> int:
     """The PID behind a pidfd, in our own PID namespace; 0 when it is not visible here or has ended.
 
-    For people, and for telling whether two *live* pidfds are the same process.
+    For messages, and for telling whether two *live* pidfds are the same process.
     """
     return max(_fdinfo_pid(pidfd), 0)
 
 
 def _fdinfo_pid(pidfd: int) -> int:
-    """0: it has no number in our namespace; -1: it has ended and was waited for (pidfd_show_fdinfo() in the kernel)."""
+    """0: it has no PID in our namespace; -1: it has exited and was reaped (pidfd_show_fdinfo() in the
+    kernel)."""
     for line in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines():
         if line.startswith("Pid:"):
             return int(line.split()[1])

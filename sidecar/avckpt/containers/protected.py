@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of one protected container, and how events change it.  No I/O."""
+"""The state of one protected container, and how events change it. No I/O."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from avckpt.guard import Event, GuardConfig
 
 
 class State(enum.Enum):
-    """Where a container stands."""
+    """The state of a container."""
 
     STARTING = "starting"
     """Guarded, but no checkpoint yet: a death now is final."""
@@ -20,9 +20,9 @@ class State(enum.Enum):
     UNPROTECTED = "unprotected"
     """It runs as if avckpt were not there; `reason` says why."""
     NODES = "nodes"
-    """A launcher, which is left alone: what it starts by avckpt-init is protected."""
+    """A launcher, which is left alone: what it starts through avckpt-init is protected."""
     LISTENING = "listening"
-    """Not to be protected: it only wants to hear of others in its group."""
+    """Not to be protected: it is only notified of others in its group."""
     RESTORING = "restoring"
     """The app died; nothing runs at this moment."""
     ENDED = "ended"
@@ -46,14 +46,14 @@ class Protected:
     group: str = ""
     """`avckpt.group`; empty: none."""
     line: int = 0
-    """Of its group, that the newest generation is part of, or the one restored last; 0: of none."""
+    """The line of its group that the newest generation, or the one restored last, is part of; 0: none."""
     node_of: str = ""
     """Id of the container in which it is a node, "host", or empty: it is a container."""
     adopted: bool = False
     """It ran already when the sidecar started."""
     state: State = State.STARTING
     reason: str = "avckpt-init has not started yet"
-    """Why it is not (quite) protected, or how it ended; empty when all is well."""
+    """Why it is not (fully) protected, or how it ended; empty when all is well."""
     app_pid: int = 0
     app_pid_inside: int = 0
     guard_pid: int = 0
@@ -67,17 +67,17 @@ class Protected:
     attempt: int = 0
     """Restores within the time of avckpt.restore.max, at the last one."""
     dropped: int = 0
-    """Generations given up before their time."""
+    """Generations dropped early."""
     last_dropped: str = ""
     """Which, and why."""
     memory_bytes: int = 0
     last_checkpoint_at: float | None = None
     last_freeze_s: float | None = None
     last_images: str = ""
-    """How the last checkpoint got the memory, if it could have been otherwise."""
+    """How the last checkpoint saved the memory, if there was a choice."""
     last_fork_reason: str = ""
     last_interval_s: float = 0.0
-    """What the guard goes by, as of the last checkpoint; 0: there was none."""
+    """The guard's interval as of the last checkpoint; 0: there was none."""
     last_quiescent: bool | None = None
     last_death: str = ""
     last_death_at: float | None = None
@@ -85,21 +85,21 @@ class Protected:
     """The same on CLOCK_MONOTONIC, for durations; 0: has not happened."""
     last_restore_s: float | None = None
     last_restore_age_s: float | None = None
-    """How old the generation was that the last restore went back to."""
+    """The age of the generation of the last restore."""
     ended_at: float | None = None
 
     @property
     def label(self) -> str:
-        """How to call it in a message: its name, or the short id."""
+        """Its name in messages: the name, or the short id."""
         return self.name or self.id[:12]
 
     @property
     def interval_s(self) -> float:
-        """Time between checkpoints, at present."""
+        """The current time between checkpoints."""
         return (self.config.interval_min_s and self.last_interval_s) or self.config.interval_s
 
     def apply(self, event: Event, at: float) -> None:
-        """Takes in an event of this container's guard that happened at `at`."""
+        """Applies an event of this container's guard that happened at `at`."""
         if event.app_pid:
             self.app_pid = event.app_pid
             self.app_pid_inside = event.app_pid_inside
@@ -161,7 +161,7 @@ class Protected:
         self.ended_at = at
 
     def listen(self) -> None:
-        """It is told of others, and has no guard: its main process is its application."""
+        """It is notified of others, and has no guard: its main process is its application."""
         self.app_pid = self.init_pid
         self._to(State.LISTENING, "only hears of others in its group: avckpt.enable is not true")
 
@@ -171,11 +171,11 @@ class Protected:
         self._to(State.NODES, "what it starts by $AVCKPT_INIT is protected, each by itself")
 
     def fail(self, reason: str) -> None:
-        """There is no guard for it, and why."""
+        """It has no guard, and why."""
         self._to(State.UNPROTECTED, reason)
 
     def to_json(self) -> dict[str, object]:
-        """Every field a person or a program may want; the keys are part of the API."""
+        """All fields for users and programs; the keys are part of the API."""
         return {
             "id": self.id,
             "name": self.name,
@@ -217,7 +217,7 @@ class Protected:
         }
 
     def _crashing(self, at_ns: int) -> str:
-        """What is tried against a crash that comes back; empty: nothing."""
+        """What is being done about a recurring crash; empty: nothing."""
         window_s = self.config.restore_window_s
         if self.attempt < 2 or at_ns - self.last_death_ns > window_s * 1e9:
             return ""
@@ -225,7 +225,7 @@ class Protected:
         return f"{text}; given up: {self.last_dropped}" if self.last_dropped else text
 
     def _suffer(self, reason: str) -> None:
-        """Something went wrong: what is held protects as before, if anything is."""
+        """A checkpoint failed: generations already held still protect it."""
         if self.state is State.PROTECTED and not self.generations:
             self._to(State.UNPROTECTED, f"{reason}; checkpoints go on as soon as they can")
         else:

@@ -19,7 +19,7 @@ from avckpt.errors import Denied, TargetGone
 log = logging.getLogger("avckpt")
 
 RECORD_BYTES = 2 * MAX_BYTES
-"""The hook registers what it has written, in a packet."""
+"""The hook sends what it has written in a packet."""
 PID_MOST = 1 << 22
 """PID_MAX_LIMIT, include/linux/threads.h."""
 OWN_NAMESPACE = os.stat("/proc/self/ns/pid").st_ino
@@ -27,7 +27,7 @@ NOT_SEEN = "the sidecar does not see the host's processes: start it with --pid=h
 
 
 def keep_private(directory: Path) -> None:
-    """Takes from others what they may do with the files that hooks leave in a directory, and makes it.
+    """Creates the directory of the hooks' files, and removes the access of others to existing ones.
 
     Earlier versions left them readable by everybody.  Raises OSError.
     """
@@ -38,20 +38,21 @@ def keep_private(directory: Path) -> None:
 
 
 class Records:
-    """The records in a directory, which may be looked at again and again.  What is wrong with one is logged once."""
+    """The records in a directory, for repeated scans. An error in one is logged once."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._complaints: dict[str, str] = {}
-        """By file name, as long as there is the file."""
+        """By file name, while the file exists."""
 
     def adoptable(self, is_known: Callable[[str], bool]) -> Iterator[tuple[Register, int]]:
-        """Every recorded container whose init still lives, with a pidfd that becomes the caller's.
+        """Every recorded container whose init still lives, with a pidfd that the caller must
+        close.
 
-        Those whose id `is_known` are left out, at the cost of a listing.  Records
-        of containers that have ended are removed; those that cannot be read, or
-        whose PID means nothing here, are left where they are and logged.  Raises
-        nothing: whatever is wrong now may be right at the next look.
+        Those whose id `is_known` are left out, at the cost of a listing. Records of
+        containers that have ended are removed; those that cannot be read, or whose PID means
+        nothing here, are left where they are and logged. Raises nothing: errors are retried
+        at the next scan.
         """
         try:
             names = sorted(name for name in os.listdir(self._directory) if name.endswith(".json"))
@@ -79,7 +80,7 @@ class Records:
                     yield found
 
     def complain(self, container_id: str, line: str) -> None:
-        """Logs what is wrong with a record ("": with all of them), unless that was said at the last look."""
+        """Logs what is wrong with a record ("": with all of them), unless it was logged at the last scan."""
         name = f"{container_id}.json"
         if self._complaints.get(name) != line:
             log.error("%s", line)
@@ -117,8 +118,8 @@ def _parse(text: bytes) -> Register:
 def remove_if(path: Path, text: bytes) -> None:
     """Removes a record if it still says `text`.
 
-    A container that is being restarted replaces its record at any moment, so it
-    is taken aside first, looked at, and put back if it is a new one.  Raises OSError.
+    A container that is being restarted replaces its record at any moment, so it is
+    moved aside first, checked, and moved back if it is a new one. Raises OSError.
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protected containers a sidecar knows, and finding one by what a person calls it.  No I/O."""
+"""The protected containers that a sidecar knows, and finding one by name. No I/O."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Registry:
         self._ended: deque[Protected] = deque(maxlen=ENDED_KEPT)
 
     def add(self, container: Protected) -> None:
-        """Takes in a container; an earlier run with the same id goes on until it is `remove`d."""
+        """Adds a container; an earlier run with the same id stays until it is `remove`d."""
         self._live[container.id] = container
         self._cookies.add(container.cookie)
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Units of protection that no hook registers: an avckpt-init below a launcher, or of the host.
 
-Each connects to the sidecar's socket for units and says who it is (native/init/unit.c).  All
-of it may be a container's, which may lie: what is believed is what the kernel says of the
-process at the other end.  It can register itself and nobody else, in the container that it is
-in, if that was started with avckpt.scope=nodes.
+Each connects to the sidecar's socket for units and identifies itself (native/init/unit.c). As
+it may be in a container, its message is not trusted, only what the kernel reports about the
+peer. It can register only itself, in the container that it is in, if that was started with
+avckpt.scope=nodes.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ UNIT_BYTES = 16384
 GREETING = b"avckpt-unit 1"
 FIELDS_MOST = 64
 MAX_WAITING = 64
-"""Connections that have not said who they are yet, ..."""
+"""Connections that have not sent their request yet, ..."""
 MAX_WAITING_EACH = 16
 """... and of these, of one PID namespace."""
 WAIT_S = 1.0
 UNITS_MOST = 128
 """Of one container, or of the host."""
 REGISTRATIONS_PER_S = 4.0
-"""What a container may go on with when it has registered UNITS_MOST at once: each starts a guard."""
+"""Further registrations per second after UNITS_MOST at once: each starts a guard."""
 ANCESTORS_MOST = 64
 HOST = "host"
-"""What stands in front of a unit's name when it is in no container."""
+"""Prefix of a unit's name when it is in no container."""
 LEAST_INTERVAL_S = 0.1
-"""A node may ask for that, or for what its container has been given."""
+"""A node may ask for this, or for what its container has been granted."""
 NOT_INHERITED = frozenset(
     {"avckpt.enable", "avckpt.scope", "avckpt.name", "avckpt.version", "avckpt.notify", "avckpt.io_uring"}
 )
@@ -58,19 +58,19 @@ NOT_A_NODES = (
     "avckpt.core",
     "avckpt.version",
 )
-"""Labels that say something of others than the node itself."""
+"""Labels that concern more than the node itself."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """What a unit says of itself."""
+    """What a unit says about itself."""
 
     name: str
     labels: Mapping[str, str]
 
 
 def decode_claim(packet: bytes) -> Claim:
-    """Raises ProtocolError with a clause for a person."""
+    """Raises ProtocolError with a clause for users."""
     fields = packet.split(b"\0")
     if fields.pop() or not fields or fields[0] != GREETING:
         raise ProtocolError("it does not speak our protocol: avckpt-init and sidecar must be of the same release")
@@ -94,14 +94,14 @@ def decode_claim(packet: bytes) -> Claim:
             raise ProtocolError(f"unknown field {key[:60]!r}")
     name = names.get("name") or labels.pop("avckpt.name", "") or names.get("program", "")
     labels.pop("avckpt.name", None)
-    # It becomes a file name nowhere, but part of lines and of arguments everywhere.
+    # It is never used as a file name, but in messages and arguments.
     return Claim(re.sub(r"[^A-Za-z0-9_.-]", "_", name).strip(".-")[:63] or "node", labels)
 
 
 def labels_of_node(claimed: Mapping[str, str], container: Mapping[str, str]) -> dict[str, str]:
-    """What holds for a node: its own labels over its container's.
+    """The effective labels of a node: its own over its container's.
 
-    Raises LabelsWrong when they are wrong, or more than whoever started the container has allowed.
+    Raises LabelsWrong when they are wrong, or exceed what the container was granted.
     """
     for key in NOT_A_NODES:
         if key in claimed:
@@ -150,7 +150,7 @@ def unique_name(name: str, taken: Iterable[str]) -> str:
     return next(f"{name}-{i}" for i in range(2, len(names) + 3) if f"{name}-{i}" not in names)
 
 
-# Who it is, as the kernel says
+# Its identity, according to the kernel
 
 
 def check_sender(pidfd: int, pid: int) -> None:
@@ -164,7 +164,7 @@ def check_sender(pidfd: int, pid: int) -> None:
 
 
 def pid_namespace(pid: int) -> int:
-    """Which it is in.  Raises OSError when it is gone."""
+    """The namespaces that it is in. Raises OSError when it is gone."""
     return os.stat(f"/proc/{pid}/ns/pid").st_ino
 
 
@@ -237,7 +237,7 @@ class Allowance:
 
 @dataclass(frozen=True)
 class Peer:
-    """Who is at the other end of a connection; the connection is its registration."""
+    """The peer of a connection; the connection is its registration."""
 
     connection: socket.socket
     pidfd: int
@@ -247,7 +247,8 @@ class Peer:
 
 
 Handler = Callable[[Claim, Peer], None]
-"""Registers a unit; connection and pidfd are its own from then on.  Raises AvckptError or OSError to refuse."""
+"""Registers a unit; connection and pidfd then belong to the registration. Raises AvckptError or OSError to
+refuse."""
 
 
 class UnitListener:
@@ -263,7 +264,7 @@ class UnitListener:
         self._loop.add_reader(self._socket, self._accept)
 
     def close(self) -> None:
-        """Ends every connection that is not a unit's yet, and removes the socket."""
+        """Closes every connection that is not a unit's yet, and removes the socket."""
         self._loop.remove_reader(self._socket)
         self._socket.close()
         for connection in list(self._waiting):
@@ -320,7 +321,8 @@ class UnitListener:
 
 
 def listen(path: Path) -> socket.socket:
-    """A listening socket that everybody may connect to who can see it; replaces what a killed sidecar left behind."""
+    """A listening socket that any process that can see it may connect to; replaces what a killed sidecar left
+    behind."""
     path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
@@ -341,9 +343,9 @@ def credentials(connection: socket.socket) -> tuple[int, int]:
 
 
 def serve(connection: socket.socket, handler: Handler) -> str | None:
-    """Takes what a unit says, and answers.  The refusal, or None: then the connection is the handler's.
+    """Reads a unit's request, and answers. The refusal, or None: then the connection is the handler's.
 
-    Raises BlockingIOError when it has said nothing yet.
+    Raises BlockingIOError when there is no request yet.
     """
     name = "a unit"
     fds: list[int] = []
@@ -376,7 +378,7 @@ def _receive(connection: socket.socket) -> tuple[Claim, list[int]]:
     fds = received_fds(ancillary)
     try:
         if flags & socket.MSG_TRUNC:
-            raise ProtocolError("it says too much")
+            raise ProtocolError("its message is too long")
         return decode_claim(packet), fds
     except ProtocolError:
         for fd in fds:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hands events to those who follow them."""
+"""Delivers events to followers."""
 
 from __future__ import annotations
 

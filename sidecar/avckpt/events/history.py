@@ -24,7 +24,7 @@ log = logging.getLogger("avckpt")
 LIMIT = 1000
 """Events kept."""
 AGAIN_S = 10.0
-"""What could not be written is tried again with the first event after this time: a full disk may not stay full."""
+"""A failed write is retried with the first event after this time: a full disk may not stay full."""
 
 
 class History:
@@ -41,11 +41,11 @@ class History:
         self._fd = -1
         self._closed = False
         self._failed_s: float | None = None
-        """When it could not be written (CLOCK_MONOTONIC); None: all is well."""
+        """When a write failed (CLOCK_MONOTONIC); None: none has."""
         whole = self._load()
         # The time of day as the first number: numbers given out before a
-        # history was lost are smaller, so that nobody who resumes after one of
-        # them misses anything.
+        # history was lost are smaller, so that a client that resumes after one
+        # of them misses nothing.
         self._next = self._kept[-1].seq + 1 if self._kept else int(time.time())
         if not whole or self._lines >= 2 * limit:
             self._compact()
@@ -62,7 +62,8 @@ class History:
         return record
 
     def after(self, seq: int | None = None, since: float | None = None) -> list[EventRecord]:
-        """What is kept, oldest first: later than number `seq`, and not before the time of day `since`."""
+        """The stored events, oldest first: later than number `seq`, and not before the time of day
+        `since`."""
         if seq is not None and seq >= self._next:
             seq = None  # of another history: this one was lost, or the clock was set back
         return [
@@ -79,7 +80,7 @@ class History:
         self._closed = True
 
     def _load(self) -> bool:
-        """Reads the file; False when there is something in it that must go before it is added to."""
+        """Reads the file; False when it must be rewritten before events are appended."""
         try:
             content = self._path.read_bytes()
         except FileNotFoundError:
@@ -119,7 +120,7 @@ class History:
             self._compact()
 
     def _compact(self) -> None:
-        """Replaces the file by what is kept, at once or not at all."""
+        """Replaces the file by the stored events, atomically."""
         if self._closed:
             return
         aside = self._path.with_name(f"{self._path.name}.new")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which events are worth a line, and how it reads.  One line per event of interest."""
+"""Which events are logged, and at which level. One line per event."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 
 SELDOM_S = 60.0
-"""What may go wrong at every interval (a checkpoint, a health check) is told at most this often, of one container."""
+"""Failures that may recur at every interval (a checkpoint, a health check) are logged at most this often per
+container."""
 
 LEVELS = {
     Kind.REGISTERED: logging.INFO,
@@ -33,11 +34,11 @@ LEVELS = {
     Kind.SIDECAR_STARTED: logging.INFO,
     Kind.SIDECAR_STOPPED: logging.INFO,
 }
-"""Levels of the kinds that are always told.  What is below INFO is routine: it is not kept in the history."""
+"""Levels of the kinds that are always logged. Those below INFO are routine, and not stored in the history."""
 
 
 class _Seldom:
-    """Lines of something that is told at most every `SELDOM_S`; the others are counted."""
+    """Limits lines to one per `SELDOM_S`; the others are counted."""
 
     def __init__(self) -> None:
         self._told_s = 0.0
@@ -53,7 +54,8 @@ class _Seldom:
 
 
 class Journal:
-    """Makes the lines of one container.  Remembers what it has said, so that nothing is said every interval."""
+    """Makes the log lines of one container. Remembers what it has logged, so that nothing is repeated at
+    every interval."""
 
     def __init__(self) -> None:
         self._held = False
@@ -71,7 +73,7 @@ class Journal:
         if record.generations == 0 or kind is Kind.GUARD_LOST:
             self._held = False
         if kind is Kind.MISSED:
-            # One that cost what was held is always told.
+            # One that lost the generations is always logged.
             return (logging.WARNING, record.message) if was_held and not self._held else self._missed.line(record)
         if kind is Kind.HEALTH and record.error is not None:
             return self._unhealthy.line(record)
@@ -98,7 +100,7 @@ class Journal:
         return logging.DEBUG, record.message
 
     def _lost(self, record: EventRecord) -> tuple[int, str] | None:
-        # The guard looks again every interval: say it once per reason.
+        # The guard retries every interval: log it once per reason.
         self._held = False
         if record.message == self._unprotected:
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prometheus metrics: counted as events come, gauges looked at when somebody asks."""
+"""Prometheus metrics: counters updated by events, gauges read when scraped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ RESTORE_BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 LOST_BUCKETS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 DETECT_BUCKETS_S = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0)
 UNWANTED = (Reason.SIGNAL, Reason.EXIT, Reason.UNHEALTHY)
-"""Causes of restores whose series exist from the start: an alert on a rate never sees the first of a new series."""
+"""Causes of restores whose series exist from the start: a rate never shows the first sample of a new
+series."""
 
 
 class Metrics:
@@ -94,7 +95,7 @@ class Metrics:
         self._labels: dict[str, set[tuple[Counter | Gauge | Histogram, tuple[str, ...]]]] = {}
 
     def begin(self, container: str) -> None:
-        """Makes the series of a container that is to be protected, at zero."""
+        """Creates the series of a container that is to be protected, at zero."""
         self._of(self._taken, container)
         self._of(self._late, container)
         for histogram in self._longest:
@@ -128,7 +129,7 @@ class Metrics:
             self._of(self._notifications, container, outcome).inc()
 
     def forget_all_but(self, containers: Iterable[str]) -> None:
-        """Drops the series of containers that nobody knows any more, or a year of new names would fill memory."""
+        """Drops the series of forgotten containers; otherwise a year of new names would fill memory."""
         for gone in set(self._labels) - set(containers):
             for metric, labels in self._labels.pop(gone):
                 metric.remove(*labels)
@@ -136,7 +137,7 @@ class Metrics:
                 self._maxima.pop((histogram, gone), None)
 
     def render(self, live: Iterable[Protected]) -> bytes:
-        """The text that Prometheus reads, with what the generations of each held at the last look."""
+        """The text for Prometheus, with the memory of each container's generations as last read."""
         for gauge in (self._generations, self._memory, self._protected, self._checkpoint_at):
             gauge.clear()
         for container in live:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thing that happened to a container, as everybody is told of it.
+"""One event of a container, as all receivers get it.
 
-Log, API, history, notifications and metrics all use `EventRecord`, and what a
-field means is written here and nowhere else: the API's description and
-docs/events.md are checked against it.  No I/O.
+Log, API, history, notifications and metrics all use `EventRecord`, and the
+meaning of a field is defined here only: the API's description and
+docs/events.md are checked against it. No I/O.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ NUMBERS_BELOW = 1 << 64
 
 
 def said(description: str, default: Any = None, values: tuple[Reason, ...] = ()) -> Any:
-    """A field of EventRecord with its meaning, and the values it may have where these are not all of its type."""
+    """A field of EventRecord with its meaning, and its values where these are fewer than its type has."""
     return field(default=default, metadata={"description": description, "values": values})
 
 
 @dataclass(frozen=True)
 class EventRecord:
-    """`_s` is a duration in seconds.  None: it means nothing for this kind."""
+    """`_s` is a duration in seconds.  None: not applicable to this kind."""
 
     kind: Kind = field(metadata={"description": "what happened", "values": ()})
     container: str = said(
@@ -93,11 +93,11 @@ class EventRecord:
 
     @property
     def message(self) -> str:
-        """One line for a person, without the container's name."""
+        """One line for users, without the container's name."""
         return _MESSAGES[self.kind](self)
 
     def to_json(self) -> dict[str, object]:
-        """The fields that mean something, and `message`."""
+        """The fields that apply, and `message`."""
         data: dict[str, object] = {}
         for each in fields(self):
             value = getattr(self, each.name)
@@ -112,7 +112,7 @@ class EventRecord:
 
     @classmethod
     def from_json(cls, data: Mapping[str, object]) -> EventRecord:
-        """What `to_json()` made; what this release does not know is left out.
+        """The inverse of `to_json()`; unknown fields are left out.
 
         Raises ValueError when it is no event.
         """
@@ -163,9 +163,9 @@ def of_guard(
     at: float = 0.0,
     commanded: Reason | None = None,
 ) -> EventRecord:
-    """What a guard said, as a record.
+    """An event of a guard, as a record.
 
-    `commanded` is why a roll back was asked for, if one was.
+    `commanded` is the reason for a commanded rollback, if any.
     """
     kind = event.kind
     restored = kind is Kind.RESTORED
@@ -308,7 +308,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.MISSED: lambda record: f"checkpoint missed: {record.error}{_nothing_held(record)}",
     Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
     Kind.GUARD_LOST: lambda record: f"runs unprotected: {record.error}",
-    # Whether this is bad news is known only with what follows.
+    # Whether this is bad is known only from what follows.
     Kind.DIED: _died,
     Kind.WAITS: lambda record: f"waits for its group to go back with it{_why(record)}",
     Kind.RESTORED: _restored,

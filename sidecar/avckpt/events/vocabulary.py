@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The words for what happens to a container, from the guard's numbers to the API's names.
+"""The vocabulary of events: from the guard's numbers to the API's names.
 
-Here alone stands which number of `avckpt/engine.h` is called what; logs, API, history and
+The only mapping from numbers of `avckpt/engine.h` to names; logs, API, history and
 metrics use these names, and docs/events.md lists them.
 """
 
@@ -18,7 +18,7 @@ E = TypeVar("E", bound="_Named")
 
 
 class _Named(str, enum.Enum):
-    """`value` is the name in the API, `number` the engine's; 0: the engine has no such thing."""
+    """`value` is the name in the API, `number` the engine's; 0: not an engine's."""
 
     number: int
 
@@ -38,7 +38,7 @@ class _Named(str, enum.Enum):
 
 
 class Kind(_Named):
-    """What happened: `enum avc_event_kind`, and what the daemon tells itself."""
+    """What happened: `enum avc_event_kind`, and kinds of the daemon."""
 
     ATTACHED = "attached", 1
     CHECKPOINT = "checkpoint", 2
@@ -110,17 +110,17 @@ DROPPED_WORDS = {
     Reason.KILLED: "its template was killed (by the OOM killer, or from inside)",
     Reason.EXECUTED: "the application has executed another program",
 }
-"""Why a generation was given up before its time."""
+"""Why a generation was dropped early."""
 
 OUTCOMES = (Reason.RESTORED, *GAVE_UP_WORDS)
 """What followed a death."""
 
 EXPECTED = frozenset({Reason.CLEAN_EXIT, Reason.STOPPED})
-"""Ends that somebody meant: not worth a warning."""
+"""Intended exits: not worth a warning."""
 
 
 def why_dropped(reason: Reason | None) -> str:
-    """Why a generation was given up, in words."""
+    """Why a generation was dropped, in words."""
     return "" if reason is None else DROPPED_WORDS.get(reason, "")
 
 

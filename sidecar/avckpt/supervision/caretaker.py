@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks after the daemon's containers beyond deaths: their health, and the memory generations hold.
+"""Supervises the daemon's containers beyond deaths: their health, and the memory of their
+generations.
 
-One per daemon, in its event loop.  It only gives orders to guards; what comes
-of them it hears like everybody else.
+One per daemon, in its event loop. It only sends commands to guards; the results reach it
+as events.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from avckpt.supervision.pressure import (
 log = logging.getLogger("avckpt")
 
 LOOK_S = 1.0
-"""Seconds between two looks at limits."""
+"""Seconds between checks of limits."""
 W = TypeVar("W", bound=Ward)
 
 
@@ -77,7 +78,7 @@ class Caretaker(Generic[W]):
         self._look_if_needed()
 
     def change(self, ward: W, policy: Policy) -> None:
-        """Another policy holds from now on; a health check that goes on keeps its count."""
+        """Another policy applies from now on; a continuing health check keeps its count."""
         care = self._cares.get(ward.container.cookie)
         if care is None:
             return
@@ -149,7 +150,7 @@ class Caretaker(Generic[W]):
         return care.allowance.advise(used, limit, held, container.generations, now_s())
 
     def _tell_limit(self, care: _Care[W]) -> None:
-        """Its guard ranks what it holds by it.  It may be another one each time (podman update --memory)."""
+        """Its guard ranks the generations by it. It can change (podman update --memory)."""
         container, guard = care.ward.container, care.ward.guard
         limit = care.groups.memory_and_swap_bytes() or 0
         if guard is None or limit == container.config.memory_limit_bytes:
@@ -159,7 +160,7 @@ class Caretaker(Generic[W]):
             guard.configure(container.config)
 
     def _host_is_short(self) -> None:
-        # Pressure that lasts is told every second; to look who holds most may take longer.
+        # Lasting pressure is reported every second; finding who holds most may take longer.
         if self._relieving is None or self._relieving.done():
             self._relieving = asyncio.get_running_loop().create_task(self._relieve())
             self._relieving.add_done_callback(_log_failure)
@@ -169,7 +170,7 @@ class Caretaker(Generic[W]):
         for care in list(self._cares.values()):
             container = care.ward.container
             held = await held_by(container)
-            # Older generations of everybody go before the newest of anybody.
+            # All older generations are dropped before any container's newest.
             rank = (container.generations > 1, held)
             if is_worth_it(container, held) and rank > held_most:
                 most, held_most = care, rank

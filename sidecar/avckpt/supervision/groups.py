@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """avckpt.group.recovery=together: containers with one recovery line.
 
-A line is a checkpoint of every member, of one instant: the guards see to that among themselves
-(native/engine/guard/guard_group.c), and are only told here when, with whom, and which line is
-gone back to.  What is wrong with a member costs a line or leaves the member out, and is told;
-members go back together or not at all.
+A line is a checkpoint of every member at one instant: the guards coordinate that among
+themselves (native/engine/guard/guard_group.c), and are only told here when, with whom, and
+which line to restore. A problem with a member costs a line or leaves the member out, and is
+reported; members are rolled back together or not at all.
 """
 
 from __future__ import annotations
@@ -32,18 +32,19 @@ if TYPE_CHECKING:
 log = logging.getLogger("avckpt")
 
 FIRST_S = 0.3
-"""From the coming of a member to a line with it, at most: others may be coming, too."""
+"""Longest time from a member's start to a line with it: others may be starting, too."""
 PATIENCE = 2
-"""Lines that a member which cannot be protected breaks in a row, before some are taken without it."""
+"""Number of lines in a row that a member that cannot be protected may break, before some are taken without
+it."""
 SKIPPED = 10
-"""How many these are."""
+"""The number of lines taken without it."""
 
 Answer = tuple[Event, EventRecord]
 
 
 @dataclass
 class Line:
-    """What all its members hold."""
+    """The lines that all its members hold."""
 
     number: int
     generations: dict[int, int]
@@ -52,7 +53,7 @@ class Line:
 
 @dataclass
 class Group:
-    """Members are those of whom there is a guard."""
+    """Members are containers with a guard."""
 
     name: str
     members: dict[int, Watch] = field(default_factory=dict)
@@ -61,9 +62,9 @@ class Group:
     number: int = 0
     """Of the last line."""
     dead: dict[int, int] = field(default_factory=dict)
-    """By cookie: the newest generation that one may go back to that waits for the group."""
+    """By cookie: the newest generation allowed for a dead member that waits for the group."""
     broken: dict[int, int] = field(default_factory=dict)
-    """By cookie: lines in a row that this member broke; above PATIENCE: how many are taken without it."""
+    """By cookie: lines in a row that this member broke; above PATIENCE: counts those taken without it."""
     coming: asyncio.Event = field(default_factory=asyncio.Event)
     busy: asyncio.Lock = field(default_factory=asyncio.Lock)
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
@@ -75,14 +76,14 @@ class Group:
 
 
 class Groups:
-    """All groups that go back together.  For one event loop."""
+    """All groups with a common recovery. For one event loop."""
 
     def __init__(self, orders: Orders) -> None:
         self._orders = orders
         self._groups: dict[str, Group] = {}
 
     def join(self, watch: Watch) -> None:
-        """There is a guard for it."""
+        """A guard for it has started."""
         policy = watch.settings.policy
         if not policy.together or watch.guard is None:
             return
@@ -92,7 +93,7 @@ class Groups:
             self._begin(group, self._take_lines(group))
 
     def leave(self, watch: Watch) -> None:
-        """There is none any more, or it is to be in no group or another one: lines with it are no lines."""
+        """Its guard is gone, or it leaves the group: lines with it are void."""
         cookie = watch.container.cookie
         group = self._group_of(watch)
         if group is None:
@@ -107,7 +108,7 @@ class Groups:
                 task.cancel()
 
     def hear(self, watch: Watch, event: Event) -> None:
-        """What a guard has told."""
+        """An event of a guard."""
         group = self._group_of(watch)
         if group is None:
             return
@@ -126,7 +127,8 @@ class Groups:
             group.dead.pop(cookie, None)
 
     async def command(self, watch: Watch, command: Command, generation: int = 0) -> EventRecord:
-        """A checkpoint or a roll back of one is that of all; what was told of this one.
+        """A checkpoint or rollback of one is that of all; returns the event of this
+        one.
 
         Raises Busy, NothingToRestore, or what went wrong.
         """
@@ -151,7 +153,7 @@ class Groups:
         return answer[1]
 
     async def close(self) -> None:
-        """No more lines, and nobody goes back together."""
+        """Stops taking lines and common rollbacks."""
         tasks = [task for group in self._groups.values() for task in group.tasks]
         self._groups.clear()
         for task in tasks:
@@ -197,7 +199,8 @@ class Groups:
         }
         if len(taken) == len(members):
             group.broken = {cookie: n for cookie, n in group.broken.items() if cookie not in members}
-            # A line from before somebody came: what that one has said since would have been said by nobody.
+            # A line from before a member started: what it has sent since would have no sender after a
+            # rollback.
             older = [line for line in group.lines if taken.keys() <= line.generations.keys()]
             group.lines = [*older[1 - KEEP_MAX :], Line(number, taken)]
             return answers
@@ -217,7 +220,7 @@ class Groups:
         }
 
     def _is_skipped(self, group: Group, cookie: int) -> bool:
-        """One that cannot be protected is left out of some, and then tried again."""
+        """One that cannot be protected is left out of some, and then retried."""
         if group.broken.get(cookie, 0) < PATIENCE:
             return False
         group.broken[cookie] += 1
@@ -229,7 +232,8 @@ class Groups:
         return True
 
     def _breakers(self, answers: dict[int, Answer | AvckptError]) -> list[int]:
-        """Who cannot be protected.  Whoever was only too late is waited for: it would not go back with the others."""
+        """Members that cannot be protected. One that was only too late is not left out: it would not be
+        rolled back with the others."""
         return [
             cookie
             for cookie, answer in answers.items()
@@ -239,7 +243,7 @@ class Groups:
     async def _ask(
         self, group: Group, members: dict[int, Guard], tell: Callable[[int, Guard, int], None]
     ) -> dict[int, Answer | AvckptError]:
-        """Tells all of them the same, and waits for all answers."""
+        """Sends all of them the same command, and waits for all answers."""
 
         async def ask(cookie: int, guard: Guard) -> Answer | AvckptError:
             try:
@@ -254,7 +258,7 @@ class Groups:
     # Returns
 
     async def _go_back(self, group: Group) -> None:
-        """Somebody has died: to the newest line that all of it have."""
+        """A member has died: back to the newest line that all members have."""
         async with group.busy:
             while group.dead:
                 line = self._line_for(group)
@@ -274,14 +278,14 @@ class Groups:
             group.dead.clear()
 
     def _line_for(self, group: Group) -> Line | None:
-        """The newest that the dead may go back to, and all who hold something with them."""
+        """The newest line allowed for the dead, and all members that hold it."""
         for line in reversed(self._lines_of_all(group)):
             if all(line.generations.get(cookie, newest + 1) <= newest for cookie, newest in group.dead.items()):
                 return line
         return None
 
     def _lines_of_all(self, group: Group) -> list[Line]:
-        """Without those that somebody has no part in who is protected and runs: one that was paused then, say."""
+        """Without lines that lack a running, protected member: one that was paused then, for example."""
         holders = {cookie for cookie in self._able(group) if group.members[cookie].container.generations}
         return [line for line in group.lines if holders <= line.generations.keys()]
 
@@ -291,7 +295,7 @@ class Groups:
         for cookie in line.generations.keys() - members.keys():
             label = group.members[cookie].container.label
             log.warning("group %s: %s is paused, and is not rolled back", group.name, label)
-        # Whatever comes of it: newer ones are of no use, and this one comes back if it was good.
+        # Whatever the outcome, newer ones are useless, and this one is added again if it succeeds.
         group.lines = group.lines[: group.lines.index(line)]
         with meeting(len(members)) as fd:
             answers = await self._ask(

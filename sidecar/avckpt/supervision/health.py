@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Health checks of containers whose `avckpt.restore.on` names `unhealthy`.
 
-The sidecar runs the container's own check (`podman run --health-cmd ...`, or
-its image's HEALTHCHECK) by itself, at the check's own interval: Podman leaves
-that to systemd timers, which are not everywhere.  Where they are, both run,
-and neither minds.
+The sidecar runs the container's own check (`podman run --health-cmd ...`, or its image's
+HEALTHCHECK) itself, at the check's own interval: Podman leaves that to systemd timers, which do
+not exist everywhere. Where they do, both run without conflict.
 
-A check that passes vouches for the generations that were held at the pass before
-it: the application that went on from them was healthy later.  When `retries` checks in a row have
-failed, the application is rolled back to the newest generation that was vouched
-for; those taken since may hold the very hang.
+A check that passes vouches for the generations that were held at the pass before it: the
+application that continued from them was healthy later. When `retries` checks in a row have
+failed, the application is rolled back to the newest generation that was vouched for; those taken
+since may contain the hang.
 """
 
 from __future__ import annotations
@@ -41,9 +40,9 @@ if TYPE_CHECKING:
     from avckpt.engine import Guard
 
 LOOK_S = 0.2
-"""Seconds between two looks for the answer of the hook's process."""
+"""Seconds between polls for the answer of the hook's process."""
 KNOWN_WITHIN_S = 90.0
-"""How long it is waited for: longer than that process tries."""
+"""How long to wait for it: longer than that process tries."""
 LEAST_INTERVAL_S = 0.1
 OUTPUT_SHOWN = 120
 
@@ -54,7 +53,7 @@ class HealthCheck:
 
     command: tuple[str, ...]
     interval_s: float
-    """0: it is switched off."""
+    """0: disabled."""
     timeout_s: float = 30.0
     retries: int = 3
     start_period_s: float = 0.0
@@ -66,9 +65,9 @@ class HealthCheck:
 def health_check_of(found: object, *, has_startup_check: bool = False) -> HealthCheck | None:
     """A health check from `podman inspect` (`Config.Healthcheck`); None: the container has none.
 
-    Durations there are nanoseconds, and what is 0 is not there.  An interval of 0 is
-    `--health-interval=disable`: who names none has got Podman's default by then.
-    Raises ValueError for what is not such a thing.
+    Durations there are nanoseconds, and zeros are omitted. An interval of 0 is
+    `--health-interval=disable`: without the option Podman has filled in its default. Raises
+    ValueError for anything else.
     """
     if not found:
         return None
@@ -113,7 +112,8 @@ class Pulse:
     """Ever."""
 
     def take(self, healthy: bool, age_s: float) -> bool:
-        """A check of an application that runs for `age_s`; True: it is unhealthy now, and counting starts anew."""
+        """A check of an application that runs for `age_s`; True: it is unhealthy now, and counting
+        restarts."""
         if healthy:
             self.failures, self.passed = 0, True
             return False
@@ -127,11 +127,11 @@ class Pulse:
 
 
 Tell = Callable[[EventRecord], EventRecord]
-"""Tells everybody; returns the event as it was told, with a number (`seq`) if it is kept."""
+"""Distributes it; returns the event as distributed, with a number (`seq`) if it is stored."""
 
 
 class Ward(Protocol):
-    """What is needed of a container's watch."""
+    """The part of a container's watch that is needed here."""
 
     container: Protected
     pidfd: int
@@ -188,10 +188,10 @@ class _Watcher:
     tell: Tell
     pulse: Pulse
     troubled: bool = False
-    """Something went wrong since a check has passed, and somebody was told."""
+    """A failure since the last pass has been reported."""
 
     async def look(self) -> None:
-        """One check, and what comes of it.  Raises TargetGone when the container has ended, and nothing else."""
+        """One check, and its consequences. Raises only TargetGone, when the container has ended."""
         container = self.ward.container
         if not container.app_pid or is_paused(container.init_pid):
             return
@@ -202,11 +202,11 @@ class _Watcher:
         except TargetGone:
             raise
         except Exception as error:  # noqa: BLE001 - whatever stops this check, the next one may work
-            # Ours to mend, and nothing that a rollback would: not counted.
+            # Our failure, which no rollback would fix: not counted.
             self._complain("its health check cannot be run", of_any(error))
             return
         if container.restores != restores or is_paused(container.init_pid):
-            return  # the check has seen two applications, or one that could not answer
+            return  # the check spanned two applications, or one that could not answer
         unhealthy = self.pulse.take(done.status == 0, app_age_s)
         if done.status == 0:
             self._passed()
@@ -246,7 +246,7 @@ class _Watcher:
                 self.tell(EventRecord(Kind.HEALTH, detail=f"{detail}: rolled back ({why})"))
 
     def _complain(self, detail: str, error: AvckptError) -> None:
-        # Only if the trouble was told (not every interval tells) is its end worth telling.
+        # Its end is reported only if the failure was (not every interval reports it).
         self.troubled |= self.tell(EventRecord(Kind.HEALTH, detail=detail, error=error)).seq > 0
 
     def _order(self, command: Command) -> None:

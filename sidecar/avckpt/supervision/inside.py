@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs a command in a container, bounded in time: health checks, notifications.
 
-The command is what `podman exec` would make of it: in the container's
-namespaces and control groups, with the user, groups, capabilities, resource
-limits, seccomp filters, environment and working directory of the container's
-main process.  It has a session of its own and is nobody's child in there, so
-that neither the application nor a checkpoint of it notices.  What the program
-`avckpt-exec` does is in native/exec/exec.c; here it is started and waited
-for, without a thread.
+The command runs as with `podman exec`: in the container's namespaces and
+control groups, with the user, groups, capabilities, resource limits, seccomp
+filters, environment and working directory of the container's main process. It
+has its own session and no parent in there, so that neither the application nor
+its checkpoints notice. What the program `avckpt-exec` does is in
+native/exec/exec.c; here it is started and waited for, without a thread.
 
-AppArmor profiles and SELinux labels of the container are not taken on.
+AppArmor profiles and SELinux labels of the container are not applied.
 """
 
 from __future__ import annotations
@@ -35,18 +34,18 @@ from avckpt.containers.process import has_ended, pid_of, status
 from avckpt.errors import AvckptError, KernelError, TargetGone
 
 ENVIRONMENT_BYTES = 1 << 20
-"""A process says itself where its environment is, and how long (PR_SET_MM); execve(2) would allow it 6 MB."""
+"""A process can set the place and length of its environment itself (PR_SET_MM); execve(2) allows 6 MB."""
 OUTPUT_BYTES = 4096
-"""How much of a command's output is kept; the rest is read and thrown away."""
+"""How much of a command's output is kept; the rest is read and discarded."""
 GRACE_S = 2.0
-"""How much later than its time the helper itself is killed: it should have done that to the command."""
+"""How long after the timeout the helper itself is killed, which should have killed the command."""
 KILL_S = 0.5
-"""How long the helper has to kill its command when nobody waits for that any more."""
+"""How long the helper has to kill its command after a cancellation."""
 
 
 @dataclass(frozen=True)
 class Done:
-    """A command that has ended, or was ended."""
+    """A command that has exited, or was killed."""
 
     status: int
     """Exit status, 128+N if signal N killed it, 127 if there is no such program."""
@@ -95,7 +94,7 @@ async def run_inside(
             *(str(failure_end), str(env_fd), credentials, str(len(groups)), *groups),
             *(str(len(procs)), *procs, *command),
         ]
-        # Looked at only now: what was read above is this container's, no other's.
+        # Checked only now: what was read above belongs to this container.
         if has_ended(init_pidfd):
             raise TargetGone("the container has ended", pid=pid)
         started = time.monotonic()
@@ -150,8 +149,8 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
         loop.remove_reader(output)
         os.close(pidfd)
         if not ended.is_set():
-            # Told so, it kills the command's whole process group; killed itself,
-            # it takes only the command with it (PR_SET_PDEATHSIG).
+            # On request, it kills the command's whole process group; if killed itself, only the command dies
+            # with it (PR_SET_PDEATHSIG).
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(KILL_S)
@@ -162,10 +161,11 @@ async def _wait(process: subprocess.Popen[bytes], output: int, timeout_s: float)
 
 
 def _credentials(pid: int) -> tuple[str, list[str]]:
-    """What avckpt-exec wants of /proc/PID/status: UID:GID:capabilities:NNP, and the groups.
+    """What avckpt-exec needs from /proc/PID/status: UID:GID:capabilities:NNP, and the
+    groups.
 
-    The numbers are those of the container's user namespace, in which they are
-    asked for: /proc gives them as we have them.
+    The ids are converted to the container's user namespace, where they are set: /proc
+    shows those of ours.
     """
     fields = status(pid)
     uid = _inside(int(fields["Uid"].split()[1]), Path(f"/proc/{pid}/uid_map").read_text())
@@ -174,7 +174,7 @@ def _credentials(pid: int) -> tuple[str, list[str]]:
     if uid is None or gid is None:
         raise AvckptError("its main process has a user or group that its user namespace does not", pid=pid)
     sets = [fields[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")]
-    # A group without a number in there (one of the host's, kept) cannot be asked for.
+    # A group without an id in there (one kept from the host) cannot be set.
     groups = [_inside(int(group), gid_map) for group in fields["Groups"].split()]
     return (
         ":".join([str(uid), str(gid), *sets, fields["NoNewPrivs"]]),
@@ -183,7 +183,7 @@ def _credentials(pid: int) -> tuple[str, list[str]]:
 
 
 def _inside(number: int, id_map: str) -> int | None:
-    """A UID or GID of ours in the user namespace of a uid_map or gid_map; None: it has none there."""
+    """Converts a UID or GID of ours to the user namespace of a uid_map or gid_map; None: unmapped."""
     for line in id_map.splitlines():
         first, ours, count = map(int, line.split())
         if ours <= number < ours + count:
@@ -234,7 +234,7 @@ def _readable(fd: int) -> bool:
 
 @functools.cache
 def _sealed_program() -> int:
-    """avckpt-exec in memory that nobody can write to, also not through /proc/PID/exe in a container."""
+    """avckpt-exec in sealed memory, which cannot be written even through /proc/PID/exe in a container."""
     fd = os.memfd_create("avckpt-exec", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         content = inside_binary().read_bytes()

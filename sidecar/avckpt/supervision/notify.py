@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells containers of recoveries, as their labels avckpt.notify and avckpt.notify.self ask for.
+"""Notifies containers of recoveries, as their labels avckpt.notify and avckpt.notify.self
+request.
 
-Nothing here is waited for by a restore, or by another receiver: each receiver
-has a short queue and a task of its own, and each delivery its deadline.
+No restore and no other receiver waits for a delivery: each receiver has its own short
+queue and task, and each delivery has a deadline.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ from avckpt.supervision.inside import run_inside
 EXEC_TIMEOUT_S = 5.0
 """A command that runs for longer is killed."""
 APP_TIMEOUT_S = 5.0
-"""How long a receiver that is being restored itself is waited for."""
+"""How long to wait for a receiver that is being restored itself."""
 SHOWN = 160
-"""Characters of a program's name, and of what it said."""
+"""Characters of a program's name, and of its output."""
 BACKLOG = 16
-"""Notifications that wait for one receiver; what comes on top is dropped, and said."""
+"""Notifications that may wait for one receiver; further ones are dropped, which is reported."""
 
 
 class Watched(Protocol):
-    """What is needed of a container that may be told: the daemon's Watch."""
+    """The part of the daemon's Watch that is needed of a receiver."""
 
     container: Protected
     pidfd: int
@@ -55,13 +56,13 @@ class Watched(Protocol):
 
 
 Tell = Callable[[Protected, Kind, str], None]
-"""Tells of a notification that was delivered, or not, in a clause for a person."""
+"""Reports a notification as delivered, or not, in a clause for users."""
 
 
 @dataclass
 class _Receiver:
     pidfd: int
-    """Its init's, our own duplicate."""
+    """Our duplicate of its init's pidfd."""
     container: Protected
     waiting: deque[tuple[Notify, EventRecord]] = field(default_factory=deque)
     task: asyncio.Task[None] | None = None
@@ -75,7 +76,7 @@ class Notifier:
         self._receivers: dict[int, _Receiver] = {}
 
     def take(self, record: EventRecord, subject: Protected, watches: Iterable[Watched]) -> None:
-        """Sees to it that those who asked for it hear of `record`, which is about `subject`.  Never blocks."""
+        """Queues `record`, which is about `subject`, for all containers that asked for it. Never blocks."""
         if record.kind is Kind.GAVE_UP:
             if record.outcome in EXPECTED:
                 return
@@ -83,14 +84,14 @@ class Notifier:
             return
         for watch in list(watches):
             if watch.container is subject:
-                # After it gave up there is nobody to be told.
+                # After gave_up there is no application left to notify.
                 if watch.notify_self is not None and record.kind is Kind.RESTORED:
                     self._enqueue(watch, watch.notify_self, record)
             elif watch.notify is not None and subject.group and watch.container.group == subject.group:
                 self._enqueue(watch, watch.notify, record)
 
     async def close(self) -> None:
-        """Drops what has not been delivered; commands that run are killed."""
+        """Drops undelivered notifications; running commands are killed."""
         tasks = [receiver.task for receiver in self._receivers.values() if receiver.task is not None]
         for task in tasks:
             task.cancel()
@@ -150,7 +151,7 @@ async def _deliver(receiver: _Receiver, how: Notify, record: EventRecord) -> str
         stdin=json.dumps(record.to_json()).encode() + b"\n",
         env=environment_of(record),
     )
-    # Not its arguments: whoever reads the log may not be allowed to read the label.
+    # Not its arguments: readers of the log may not be allowed to read the label.
     program = printable(how.command[0])[:SHOWN]
     said = _one_line(done.output)
     if done.timed_out:
@@ -161,7 +162,7 @@ async def _deliver(receiver: _Receiver, how: Notify, record: EventRecord) -> str
 
 
 def environment_of(record: EventRecord) -> Mapping[str, str]:
-    """What a command finds in its environment: AVCKPT_EVENT, and AVCKPT_<FIELD> for every other plain field."""
+    """The environment of a command: AVCKPT_EVENT, and AVCKPT_<FIELD> for every other plain field."""
     variables = {}
     for name, value in record.to_json().items():
         if name == "kind":
@@ -172,7 +173,7 @@ def environment_of(record: EventRecord) -> Mapping[str, str]:
 
 
 async def _app_of(receiver: _Receiver) -> int:
-    """A pidfd of the receiver's application, which may be away for the moment of a restore.
+    """A pidfd of the receiver's application, which may be absent during a restore.
 
     Raises TargetGone when there is none in time.
     """
@@ -188,7 +189,7 @@ async def _app_of(receiver: _Receiver) -> int:
 
 
 def _open_app(container: Protected, init_pidfd: int) -> int:
-    """A pidfd of its application as it is known at this moment.  Raises TargetGone."""
+    """A pidfd of its application as currently known.  Raises TargetGone."""
     pid = container.app_pid
     if pid == container.init_pid:  # there is no avckpt-init
         return os.dup(init_pidfd)
@@ -196,8 +197,8 @@ def _open_app(container: Protected, init_pidfd: int) -> int:
         pidfd = os.pidfd_open(pid)
     except OSError as error:
         raise TargetGone("its application does not run", pid=pid) from error
-    # Looked at only now: the pidfd holds one process for good.  A number that
-    # has changed hands is not init's child, or is one of our templates.
+    # Checked only now: the pidfd refers to one process for good. A reused PID is not init's child, or is one
+    # of our templates.
     status = _status(pid)
     is_ours = int(status.get("PPid", 0)) == container.init_pid and not status["Name"].startswith("avckpt-")
     if not is_ours or has_ended(pidfd):
@@ -218,7 +219,7 @@ async def _send(app: int, number: int) -> None:
 
 
 def _is_ready(pid: int, number: int) -> bool:
-    """Waits until it has settled; whether a signal would not kill it.  In a thread of its own."""
+    """Waits until it has settled; whether a signal would not kill it. Runs in a separate thread."""
     _settle(pid)
     for _ in range(_TRIES):
         if _is_prepared(pid, number):
@@ -231,9 +232,9 @@ def _is_ready(pid: int, number: int) -> bool:
 def _settle(pid: int) -> None:
     """Waits, 100 ms at most, until the application's main thread is in a system call.
 
-    A restored thread makes the call again in which it was.  A signal that comes
-    just before that runs its handler, but does not interrupt the call, as it would
-    have a moment later: a program that acts on the interruption would sleep on.
+    A restored thread restarts the call it was in. A signal that arrives just before
+    that runs its handler, but does not interrupt the call, as it would have a moment
+    later: a program that relies on the interruption would keep sleeping.
     """
     for _ in range(10):
         with suppress(OSError):
@@ -243,7 +244,7 @@ def _settle(pid: int) -> None:
 
 
 _HARMLESS = frozenset({signal.SIGCHLD, signal.SIGURG, signal.SIGWINCH, signal.SIGCONT})
-"""What they do to a program that does not care: nothing."""
+"""Their default action: none."""
 
 _RT_SIGTIMEDWAIT = {"x86_64": "128", "aarch64": "137"}
 
@@ -253,7 +254,7 @@ _BETWEEN_LOOKS_S = 0.003
 
 
 def _is_prepared(pid: int, number: int) -> bool:
-    """Whether a signal is caught or ignored, or taken care of by every thread: blocked or waited for."""
+    """Whether a signal is caught or ignored, or blocked or waited for by every thread."""
     if number in _HARMLESS:
         return True
     bit = 1 << (number - 1)
@@ -264,8 +265,8 @@ def _is_prepared(pid: int, number: int) -> bool:
         threads = os.listdir(f"/proc/{pid}/task")
     except OSError:
         return False
-    # A thread that the guard has stopped, or that was restored this instant, has every
-    # signal blocked for a moment; one that blocks it itself does so at every look.
+    # A thread that the guard has stopped, or that was just restored, briefly has every signal blocked; one
+    # that blocks it itself does so at every check.
     for again in range(_LOOKS):
         if again:
             time.sleep(_BETWEEN_LOOKS_S)
@@ -275,13 +276,13 @@ def _is_prepared(pid: int, number: int) -> bool:
 
 
 def _is_blocked(tid: str, bit: int) -> bool:
-    """Whether a thread that nobody traces has the signal blocked."""
+    """Whether an untraced thread has the signal blocked."""
     status = _status(int(tid))
     return status.get("TracerPid", "0").strip() == "0" and bool(int(status.get("SigBlk", "0"), 16) & bit)
 
 
 def _waits_for(tid: str, bit: int) -> bool:
-    """Whether a thread is in sigwait(3) or the like for a signal, which is not blocked for just so long."""
+    """Whether a thread is in sigwait(3) or the like for a signal, which meanwhile is not blocked."""
     try:
         words = Path(f"/proc/{tid}/syscall").read_text().split()
         if words[0] != _RT_SIGTIMEDWAIT.get(os.uname().machine):
@@ -302,7 +303,7 @@ def _status(pid: int) -> dict[str, str]:
 
 
 def _one_line(output: str) -> str:
-    """The end of what a command said, as an addition to a message."""
+    """The end of a command's output, as an addition to a message."""
     last = output.strip().rpartition("\n")[2]
     shown = printable(last)[:SHOWN]
     return f": {shown}" if shown else ""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory: when generations are given up so that applications do not suffer, and when they come back.
+"""Memory: when generations are dropped to spare applications, and when they come back.
 
-A container near its own limit gives up its oldest generation; under pressure on
-the whole host, the container whose generations hold most does.  What would free
-next to nothing is kept.  Generations come back, at first after `BACK_AFTER_S`,
-and each time later when that was too early.
+A container near its own limit loses its oldest generation; under pressure on the whole
+host, the container whose generations hold most does. Generations that would free next
+to nothing are kept. They come back, at first after `BACK_AFTER_S`, and each time later
+if that was too early.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ from avckpt.containers.protected import Protected
 from avckpt.errors import DeadlineMissed
 
 NEAR = 0.90
-"""Of the limit: from here on generations are given up."""
+"""Fraction of the limit above which generations are dropped."""
 BACK_AFTER_S = 15.0
 BACK_AFTER_MOST_S = 600.0
 WORTH = 0.01
-"""Of the limit (or of the host's memory / 100): generations that hold less are no help."""
+"""Fraction of the limit (or of the host's memory / 100): dropping generations that hold less does not
+help."""
 LEAST_WORTH_BYTES = 1 << 20
 NEWEST_WORTH = 0.25
-"""Of what the application has itself: a newest generation that holds less is kept when the host is short."""
+"""Fraction of the application's own memory: a newest generation that holds less is kept when the host is
+short."""
 
 PSI = Path("/proc/pressure/memory")
 TRIGGERS = (b"some 150000 1000000", b"some 300000 2000000")
 """Microseconds stalled of a window; the second needs no privilege (Documentation/accounting/psi.rst)."""
 AVAILABLE = 0.05
-"""Of the host's memory, where there is no PSI: less than this available is pressure."""
+"""Fraction of the host's memory, without PSI: less than this available is pressure."""
 
 
 class Advice(enum.Enum):
@@ -49,22 +51,22 @@ class Advice(enum.Enum):
 
 @dataclass
 class Allowance:
-    """How one container stands.  Decides; no I/O.  Times are CLOCK_MONOTONIC seconds."""
+    """The state of one container. Decides; no I/O.  Times are CLOCK_MONOTONIC seconds."""
 
     short: bool = False
-    """Generations were given up and are not back yet."""
+    """Generations were dropped and are not back yet."""
     back_at_s: float = 0.0
     back_after_s: float = BACK_AFTER_S
     refilled_at_s: float = -BACK_AFTER_MOST_S
 
     def near_limit(self, used_bytes: int, limit_bytes: int) -> bool:
-        """Is it worth a look at what the generations hold?"""
+        """Whether reading the generations' memory is worthwhile."""
         return used_bytes >= NEAR * limit_bytes
 
     def advise(self, used_bytes: int, limit_bytes: int, held_bytes: int, generations: int, now_s: float) -> Advice:
-        """For a container with a limit.  `held_bytes`: by its generations alone (0: not looked).
+        """For a container with a limit. `held_bytes`: by its generations alone (0: not read).
 
-        The newest one is not given up: an application that leaks needs it in a moment, and the kernel takes it
+        The newest one is not dropped: an application that leaks needs it in a moment, and the kernel takes it
         where the application would have room without it (native/engine/guard/guard_memory.c).
         """
         if self.near_limit(used_bytes, limit_bytes):
@@ -75,7 +77,7 @@ class Allowance:
         return self.come_back(now_s)
 
     def gave_up(self, now_s: float) -> None:
-        """A generation was given up now."""
+        """A generation was dropped now."""
         if not self.short:
             # Soon after they had come back: that was too early.
             early = now_s - self.refilled_at_s < 2 * self.back_after_s
@@ -84,7 +86,7 @@ class Allowance:
         self.back_at_s = now_s + self.back_after_s
 
     def come_back(self, now_s: float) -> Advice:
-        """Memory is there again."""
+        """Memory is available again."""
         if not self.short or now_s < self.back_at_s:
             return Advice.KEEP
         self.short = False
@@ -93,11 +95,10 @@ class Allowance:
 
 
 class HostPressure:
-    """Tells when the host is short of memory: a PSI trigger, or else a look at MemAvailable.
+    """Detects when the host is short of memory: a PSI trigger, or else MemAvailable.
 
-    `fd` is readable (poll(2)) once per window in which there was pressure, and no
-    longer once somebody has waited on it; None: there is no PSI, ask
-    `is_high()` now and then.
+    `fd` is readable (poll(2)) once per window with pressure, until it has been
+    polled; None: there is no PSI, poll `is_high()`.
     """
 
     def __init__(self, psi: Path | None = None) -> None:
@@ -129,7 +130,7 @@ class HostPressure:
         return available < AVAILABLE * total
 
     def close(self) -> None:
-        """Takes the trigger away."""
+        """Removes the trigger."""
         if self._epoll is not None:
             self._epoll.close()
             os.close(self._trigger)
@@ -139,8 +140,8 @@ class HostPressure:
 def held_bytes(app_pid: int, template_pids: Iterable[int]) -> int:
     """Memory that templates hold and the application does not use: what giving them all up would free.
 
-    Walks page tables, the application's too: milliseconds for gigabytes.  What
-    is gone counts as nothing.
+    Walks page tables, the application's too: milliseconds per gigabyte. Processes that are gone count
+    as 0.
     """
     templates = [_rollup(pid) for pid in template_pids]
     app = _rollup(app_pid)
@@ -169,7 +170,7 @@ async def held_by(container: Protected) -> int:
 
 
 def is_worth_it(container: Protected, held: int) -> bool:
-    """Whether a host that is short of memory gains by it if this container gives its oldest generation up."""
+    """Whether a host short of memory gains if this container drops its oldest generation."""
     if container.generations > 1:
         return held >= LEAST_WORTH_BYTES
     return held >= max(NEWEST_WORTH * _own_bytes(container.app_pid), LEAST_WORTH_BYTES)

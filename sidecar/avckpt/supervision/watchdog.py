@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main process of the sidecar's container: kills a daemon that gives no sign of life, and starts another.
 
-Guards protect their containers without the daemon; but nobody new is protected, and nobody is told anything,
-until somebody ends one that hangs.
+Guards protect their containers without the daemon; but without it no new container is protected, and no event
+is reported.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from avckpt.containers.process import stat_fields
 log = logging.getLogger("avckpt")
 
 LOOK_S = 1.0
-"""Between signs of life, and between looks for them."""
+"""Seconds between signs of life, and between checks for them."""
 PATIENCE = 10
-"""So many looks in vain, and it is killed.  Looks are counted, not time: who is paused is paused as a whole."""
+"""After this many checks in vain it is killed. Checks are counted, not time: a pause stops both."""
 START = 50
-"""So many more before the first sign: it has to be loaded from a disk."""
+"""This many more before the first sign: it has to be loaded from a disk."""
 STARVED = 10
-"""One that is ready to run, and gets no CPU, has so many times as long."""
+"""A factor for one that is runnable but gets no CPU."""
 AGAIN_S = 3.0
-"""A daemon that ended by itself within this time has something that will not go away at once."""
+"""A daemon that exits by itself within this time has a persistent problem."""
 PR_SET_PDEATHSIG = 1
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -91,7 +91,7 @@ def _become_daemon(serve: Callable[[int], int], beat: int, numbers: tuple[signal
 
 
 def _watch(child: int, signs: int) -> int:
-    """Until it has ended; its wait status."""
+    """Waits until it has ended; its wait status."""
     silent = -START
     while True:
         ended, status = os.waitpid(child, os.WNOHANG)
