@@ -124,7 +124,7 @@ static void guard_lost(struct avc_guard *guard)
 
 	if (guard->mad)
 		fail(&event.error, AVC_PROTOCOL, 0, 0, "", "",
-		     "its guard said what makes no sense and was killed");
+		     "its guard sent an invalid message and was killed");
 	else if (guard->hung)
 		fail(&event.error, AVC_DEADLINE, 0, 0, "", "",
 		     "its guard gave no sign of life and was killed");

@@ -84,7 +84,7 @@ def test_an_answer_that_is_no_sidecars(run_dir: Path) -> None:
         server.stdout.readline()
         result = avckpt("ps")
     assert result.exit_code == 1
-    assert "makes no sense" in result.stderr
+    assert "is invalid" in result.stderr
 
 
 @pytest.mark.parametrize(

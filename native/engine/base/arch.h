@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Everything the engine knows about the CPU.  Each has a folder: arch_cpu.h for what is its own,
- * arch.c for what it does.  ptrace(2) errors are returned as -1 with errno.
+ * Everything CPU-specific in the engine. Each CPU has a folder with arch_cpu.h (definitions) and
+ * arch.c (functions). ptrace(2) errors are returned as -1 with errno.
  */
 #ifndef AVCKPT_ARCH_H
 #define AVCKPT_ARCH_H
@@ -30,8 +30,8 @@ int arch_call_mark_set(pid_t tid, struct arch_regs *regs, uint32_t mark);
 /* False for a task in 32-bit mode. */
 bool arch_is_native(const struct arch_regs *regs);
 
-/* `regs` as of a stop inside a system call that is to be made again: as the
- * kernel would leave them, but in one piece.  Not in a call: unchanged. */
+/* `regs` as of a stop inside a system call that is to be restarted: sets them as the kernel would.
+ * Not in a call: unchanged. */
 void arch_rewind(struct arch_regs *regs);
 
 /* The call number a compiler would have loaded with the instruction before the
@@ -39,11 +39,11 @@ void arch_rewind(struct arch_regs *regs);
  * before `pc`. */
 long arch_syscall_nr_before(const uint8_t code[ARCH_CODE_BYTES]);
 
-/* Whether `code` is the instruction for a system call. */
+/* Whether `code` is a system call instruction. */
 bool arch_is_syscall(const uint8_t code[ARCH_SYSCALL_BYTES]);
 
-/* Like arch_rewind(), for the *same* task going on without the kernel's help:
- * a restart block is still there and is continued, not begun again. */
+/* Like arch_rewind(), for the *same* task continuing without the kernel's help: its restart block
+ * is still there and is continued, not restarted. */
 void arch_resume(struct arch_regs *regs);
 
 /* `base` (a live user context of the task) sent to `pc` with one argument. */
@@ -54,22 +54,21 @@ void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote 
 void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
 		uint64_t b);
 
-/* Fills in the context that inj_go_home() goes back to. */
+/* Fills in the context that inj_go_home() returns to. */
 void arch_home_set(struct inj_home *home, const struct arch_regs *regs, uint64_t sigmask);
 
-/* The extended (FPU, vector) state of a stopped thread.  `arch_xstate_bytes` is
- * its size on this machine, 0 if it cannot be found out. */
+/* The extended (FPU, vector) state of a stopped thread. `arch_xstate_bytes` is its size on this
+ * machine, 0 if unknown. */
 size_t arch_xstate_bytes(void);
 
-/* Room one thread's signal frame takes, and how it is built: first, while the
- * thread is stopped, the extended state is read straight into the frame; later
- * the rest is filled in.  `frame` is where the engine sees it (aligned to 64),
- * `remote` where the process will.  Returns the stack pointer for
- * inj_sigreturn().  ENOTSUP: the thread has state that a frame has no room for. */
+/* The size of a thread's signal frame, and how it is built: first, while the thread is stopped, the
+ * extended state is read straight into the frame; later the rest is filled in. `frame` is where the
+ * engine sees it (aligned to 64), `remote` where the process will. Returns the stack pointer for
+ * inj_sigreturn(). ENOTSUP: the thread has state that does not fit in a frame. */
 size_t arch_frame_bytes(void);
 int arch_frame_read_xstate(pid_t tid, void *frame);
-/* Whether the frame, which was read, has state that the kernel gives a new thread no room
- * for until it uses it (AMX tiles, SVE): inj_make_room() has to be called before. */
+/* Whether the frame, as read, has state for which the kernel allocates room in a new thread only at
+ * first use (AMX tiles, SVE): inj_make_room() has to be called before. */
 bool arch_frame_needs_room(const void *frame);
 avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_regs *regs,
 			    uint64_t sigmask, const uint64_t altstack[3]);
@@ -78,22 +77,22 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 struct arch_signal_frame {
 	avc_remote at;    /* what the handler gets as its third argument            */
 	uint64_t sigmask; /* before the handler                                     */
-	int signal;       /* 0: it does not say                                        */
+	int signal;       /* 0: unknown */
 };
 #define ARCH_SIGNAL_FRAME_BYTES 1024
 /* The next one in the `bytes` bytes of a stack that begin at `at` (a multiple of 16); *next is
- * where to look on, at first 0.  What only looks like one is not told from one. */
+ * where to continue, initially 0. Data that looks like one is not distinguished. */
 bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, size_t *next,
 			    struct arch_signal_frame *found);
 
-/* A stub that makes one system call (registers preset by arch_stub_call), clone(2) as a rule, and
- * then goes back to `regs` by itself, signal mask included.  A new task ends; who made it waits for
- * it before it goes home, by ARCH_STUB_WAIT.  Writes at most ARCH_STUB_BYTES to `code`. */
+/* A stub that makes one system call (registers preset by arch_stub_call), usually clone(2), and
+ * then returns to `regs` by itself, signal mask included. A new task exits; its creator reaps it by
+ * ARCH_STUB_WAIT before it returns. Writes at most ARCH_STUB_BYTES to `code`. */
 #define ARCH_STUB_WAIT SYS_wait4
 size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sigmask);
-/* Whether `code` is what arch_stub_build() has written once. */
+/* Whether `code` was written by arch_stub_build(). */
 bool arch_is_stub(const uint8_t *code);
-/* `last`: the task ends after the call, and does not go back. */
+/* `last`: the task exits after the call instead of returning. */
 void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote stub,
 		    bool last, long nr, const uint64_t arg[6]);
 

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Aside: calls that may not come back for as long as somebody else likes.  A file server does not
- * answer; a thread that waits in splice(2) holds the lock of its pipe.  Such a call cannot be
- * ended, not even by killing who makes it, so a thread of its own makes it, which can be left
- * behind.  The guard's main thread waits for that one and does nothing else meanwhile, so the two
- * need no locks for what they share.
+ * Aside: system calls that another process can block for as long as it likes: a file server does
+ * not answer; a thread that waits in splice(2) holds the lock of its pipe. Such a call cannot be
+ * interrupted, not even by killing the caller, so a separate thread makes it, which can be left
+ * behind. The guard's main thread waits for it and does nothing else meanwhile, so the two need no
+ * locks for shared data.
  */
 #include <errno.h>
 #include <limits.h>
@@ -23,9 +23,9 @@
 struct worker {
 	pthread_mutex_t lock;
 	pthread_cond_t changed;
-	struct aside *job; /* NULL: it is done                                    */
-	pid_t tid;         /* 0: it has not come up yet                           */
-	bool urgent;       /* as the main thread was when it had its job          */
+	struct aside *job; /* NULL: it is done */
+	pid_t tid;         /* 0: it has not started yet */
+	bool urgent;       /* as the main thread was when it posted the job */
 	bool left_behind;
 	uint32_t steps; /* of the job, so far                                    */
 };
@@ -75,7 +75,7 @@ static void *work(void *arg)
 	return NULL;
 }
 
-/* One that no signal of the guard's comes to. */
+/* Blocks all signals of the guard. */
 static struct worker *worker_new(void)
 {
 	struct worker *fresh = calloc(1, sizeof *fresh);

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What one checkpoint or restore may cost.  How much there is to read and to keep is for the
- * application to say, which may be hostile or broken: every loop that goes on for as long as it says
- * asks here.  A guard is one process for one container, so there is one budget.
+ * What one checkpoint or restore may cost. The application, which may be hostile or broken,
+ * determines how much there is to read and to keep: every loop whose length it controls checks this
+ * budget. A guard is one process for one container, so there is one budget.
  */
 #include "base.h"
 

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Whether a guard's settings make sense: asked by the daemon before it sends them, and by
- * the guard, which believes nobody.
+ * Whether a guard's settings are valid: checked by the daemon before it sends them, and again by
+ * the guard.
  */
 #include <errno.h>
 

@@ -9,8 +9,8 @@
 
 #include "base.h"
 
-/* No byte more is read than there is room for: names come out of the parasite, too, where the end
- * of one may just be overwritten. */
+/* Never reads beyond the size of the buffer: names also come from the parasite, where the
+ * application may overwrite the terminator. */
 static void copy(char *to, size_t size, const char *from)
 {
 	snprintf(to, size, "%.*s", (int)size - 1, from ? from : "");
@@ -50,7 +50,8 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 	enum avc_code code = AVC_KERNEL;
 	va_list args;
 
-	/* Of one that has just been reaped, Yama (ptrace_scope 1, as on Ubuntu) says EPERM. */
+	/* For a process that has just been reaped, Yama (ptrace_scope 1, as on Ubuntu) returns
+	 * EPERM. */
 	if (errnum == ESRCH || errnum == ENOENT)
 		code = AVC_GONE;
 	else if (errnum == EPERM || errnum == EACCES)

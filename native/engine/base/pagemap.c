@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Which pages of a process are there: /proc/PID/pagemap
+ * Which pages of a process are present: /proc/PID/pagemap
  * (Documentation/admin-guide/mm/pagemap.rst).
  */
 #include <errno.h>
@@ -29,8 +29,8 @@ struct scan {
 #define SCAN_PRESENT (1u << 3)
 #define SCAN_SWAPPED (1u << 4)
 
-/* Where it stands in the page table: a swap entry of the last type, which is none, with
- * PTE_MARKER_GUARD (include/linux/swapops.h) for an offset. */
+/* As encoded in the page table: a swap entry of the last type, which is unused, with
+ * PTE_MARKER_GUARD (include/linux/swapops.h) as its offset. */
 #define GUARD_MARKER (UINT64_C(4) << 5 | 31)
 #define WATCH_MARKER (UINT64_C(1) << 5 | 31) /* PTE_MARKER_UFFD_WP                   */
 
@@ -116,8 +116,8 @@ int pagemap_written(int pagemap, avc_remote start, avc_remote end,
 		memset(region, 0, sizeof region);
 		found = ioctl(pagemap, SCAN, &scan);
 		errnum = errno;
-		/* What it has found before something failed it tells, but not how many: these pages
-		 * are protected again, and nobody else would know of them. */
+		/* After an error it reports what it had found, but not how many: these pages are
+		 * protected again, and would otherwise be missed. */
 		for (int i = 0; i < (found < 0 ? REGIONS : found) && region[i].end; i++)
 			if (fn(region[i].start, region[i].end, arg))
 				return -1;

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Sets of pages: bits, for each 2 MB in which there is one.
+ * Sets of pages: a bitmap for each 2 MB that has any.
  */
 #include <stdlib.h>
 #include <string.h>
@@ -20,7 +20,7 @@ static uint32_t find(const struct pageset *set, avc_remote start)
 {
 	uint32_t low = 0, high = set->count;
 
-	/* What is added comes in order, as a rule. */
+	/* Pages are usually added in order. */
 	if (high && set->chunk[high - 1].start < start)
 		return high;
 	while (low < high) {

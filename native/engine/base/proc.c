@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * /proc, see proc(5): opened and read here, understood in proc_text.c.
+ * /proc, see proc(5): opened and read here, parsed in proc_text.c.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -57,7 +57,7 @@ int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags)
 	return open(mapped_path(pid, start, end).text, flags | O_CLOEXEC);
 }
 
-/* From the start, also of one that was read before; what is read is terminated. */
+/* Reads from the start, even if it was read before; the result is terminated. */
 static ssize_t read_text(int fd, char *buf, size_t size)
 {
 	const ssize_t n = pread(fd, buf, size - 1, 0);
@@ -141,7 +141,7 @@ int proc_stat(pid_t pid, struct proc_stat *stat)
 	return proc_read(pid, "stat", buf, sizeof buf) < 0 ? -1 : proc_parse_stat(buf, stat);
 }
 
-/* pthread_getcpuclockid(3): to be read of any process. */
+/* pthread_getcpuclockid(3): readable for any process. */
 uint64_t proc_cpu_ns(pid_t pid)
 {
 	struct timespec used;
@@ -222,7 +222,7 @@ int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max)
 	fd = openat(task_dirfd, name, O_RDONLY | O_CLOEXEC);
 	if (fd < 0)
 		return -1;
-	/* One read(2) of many is a page at most. */
+	/* A read(2) of many of these files returns at most a page. */
 	n = read_whole(fd, (uint8_t *)buf, sizeof buf - 1, 0);
 	close(fd);
 	if (n < 0)
@@ -367,7 +367,7 @@ int proc_sched(pid_t tid, struct proc_sched *sched)
 	return proc_read(tid, "sched", buf, sizeof buf) <= 0 ? -1 : proc_parse_sched(buf, sched);
 }
 
-/* A task gets the flag before it closes anything (kernel/exit.c, do_exit()). */
+/* A task gets the flag before it closes any descriptor (kernel/exit.c, do_exit()). */
 bool proc_is_exiting(pid_t tid)
 {
 	struct proc_stat stat;

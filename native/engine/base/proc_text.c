@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the texts of /proc say, see proc(5).
+ * Parses files of /proc, see proc(5).
  *
- * The kernel writes them, but names, paths and lengths in them are the application's: nothing here
- * takes a line's end, a field or its length for granted (tests/fuzz).
+ * The kernel writes them, but the application controls names, paths and lengths in them: nothing
+ * here assumes the end of a line, a field or its length (tests/fuzz).
  */
 #include <errno.h>
 #include <limits.h>
@@ -57,7 +57,8 @@ int proc_parse_statm(const char *text, long *pages, long *anonymous)
 
 int proc_parse_sched(const char *text, struct proc_sched *sched)
 {
-	/* In front is the name, as it is, line feeds included: too short for both this and a key. */
+	/* The name comes first, unescaped, line feeds included: too short to contain both a line
+	 * feed and a key. */
 	const char *rest = strstr(text, "\n------"), *ran, *switches, *migrations;
 	unsigned long long ms, ns;
 
@@ -140,7 +141,7 @@ int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *
 			void *arg)
 {
 	struct mapping m = { 0 };
-	bool known = false; /* smaps: the lines are about m                    */
+	bool known = false; /* smaps: the lines belong to m */
 	char *line = NULL;
 	size_t size = 0;
 	int result = 0;
@@ -211,7 +212,7 @@ static void parse_groups(const char *p, struct proc_status *status)
 	}
 }
 
-/* Which of the above the line is. */
+/* Which of the above the line has. */
 static uint32_t parse_status_line(const char *line, size_t length, struct proc_status *status)
 {
 	static const char *const caps[5] = { "CapInh:", "CapPrm:", "CapEff:", "CapBnd:",
@@ -278,7 +279,7 @@ int proc_parse_status(const char *text, struct proc_status *status)
 		has |= parse_status_line(text, length, status);
 		text += length + (text[length] == '\n');
 	}
-	/* Half of it would be an application without capabilities or filters. */
+	/* Half of it would look like an application without capabilities or filters. */
 	return has == HAS_ALL ? 0 : not_understood();
 }
 

@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Out of turn.  While an app is stopped, or dead, it waits for its guard; on a busy
- * machine the guard must not wait for its own turn in between, nor lose the CPU to
- * each thread that it wakes.  So it becomes a real-time thread for those moments.
+ * Real-time priority. While an app is stopped, or dead, it waits for its guard; on a busy machine
+ * the guard must not wait for a time slice, nor lose the CPU to each thread that it wakes. So it
+ * becomes a real-time thread for those moments.
  *
- * The rule that comes with it: between rt_priority_begin() and rt_priority_end() nobody may
- * spin on what another task has to do; it may need this very CPU.
+ * Therefore, between rt_priority_begin() and rt_priority_end() the guard must not spin on another
+ * task, which may need this very CPU.
  */
 #include <sched.h>
 
@@ -24,8 +24,8 @@ void rt_priority_begin(void)
 	if (before.depth++)
 		return;
 	before.policy = sched_getscheduler(0);
-	/* Somebody who gave us a real-time policy meant it.  Without CAP_SYS_NICE, or
-	 * in a cgroup without real-time budget, it goes on as it was, only slower. */
+	/* Keeps a real-time policy that was set from outside. Without CAP_SYS_NICE, or in a cgroup
+	 * without real-time budget, the guard keeps its priority, and is slower. */
 	before.changed = before.policy != SCHED_FIFO && before.policy != SCHED_RR &&
 			 before.policy != SCHED_DEADLINE && sched_getparam(0, &before.param) == 0 &&
 			 sched_setscheduler(0, SCHED_FIFO, &lowest) == 0;

@@ -2,15 +2,15 @@
  *
  * libavckpt: freeze, clone and restore.
  *
- * An *engine* owns a queue of events.  A *guard* protects one container: it is a process
- * of its own (avckpt-guard), which makes every ptrace(2) call for that container, takes
- * checkpoints on the interval, and restores when avckpt-init reports a death, with no call
- * back into the caller between death and resume.  What the two say to each other is in
- * avckpt/guard.h.  When the caller ends, its guards let their containers go and end.
+ * An *engine* owns a queue of events. A *guard* protects one container: it is a separate process
+ * (avckpt-guard), which makes every ptrace(2) call for that container, takes checkpoints on the
+ * interval, and restores when avckpt-init reports a death, with no call back into the caller
+ * between death and resume. Their protocol is in avckpt/guard.h. When the caller exits, its guards
+ * release their containers and exit.
  *
- * Functions return 0, or -1 with *err filled in, unless said otherwise.  All of them may
- * be called from any thread; none blocks for longer than it takes to hand a message over,
- * except avc_guard_stop(), avc_engine_probe() and avc_engine_free().
+ * Functions return 0, or -1 with *err filled in, unless said otherwise. All of them may be called
+ * from any thread; none blocks for longer than it takes to send a message, except avc_guard_stop(),
+ * avc_engine_probe() and avc_engine_free().
  */
 #ifndef AVCKPT_ENGINE_H
 #define AVCKPT_ENGINE_H
@@ -28,7 +28,7 @@ enum avc_files {
 	AVC_FILES_KEEP = 1,   /* their offsets stay                               */
 	AVC_FILES_STRICT = 2, /* as REWIND; and no restore if one that is open for
 	                       * writing was written since the checkpoint         */
-	AVC_FILES_AUTO = 3    /* the same if one was written otherwise than at its end */
+	AVC_FILES_AUTO = 3    /* the same if one was written other than at its end */
 };
 
 /* Established TCP connections at a restore. */
@@ -39,20 +39,20 @@ enum avc_tcp {
 	AVC_TCP_MESSAGES = 3     /* those that it leaves in the middle of a message */
 };
 
-/* How a checkpoint gets the memory of a process. */
+/* How a checkpoint saves the memory of a process. */
 enum avc_images {
 	AVC_IMAGES_FORK = 0,  /* by a fork of it                                    */
 	AVC_IMAGES_DIRTY = 1, /* by a copy of what was written since an older one, where
 	                       * that is possible                                   */
-	AVC_IMAGES_AUTO = 2   /* and where it holds the application up for less     */
+	AVC_IMAGES_AUTO = 2   /* and where it stops the application for less time */
 };
 
-/* Why one was forked that could have been copied. */
+/* Why a process was forked instead of copied. */
 enum avc_fork_reason {
 	AVC_FORK_NONE = 0,      /* it was not                                      */
 	AVC_FORK_CONFIG = 1,    /* AVC_IMAGES_FORK                                 */
-	AVC_FORK_FIRST = 2,     /* there is no older one yet that could be used    */
-	AVC_FORK_PROCESSES = 3, /* one above it adopts orphans, or it is new       */
+	AVC_FORK_FIRST = 2,     /* there is no older one to be used yet */
+	AVC_FORK_PROCESSES = 3, /* a process above it adopts orphans, or it is new */
 	AVC_FORK_KERNEL = 4,    /* the kernel cannot watch memory (before 6.7)     */
 	AVC_FORK_SANDBOX = 5,   /* it has a seccomp filter of its own              */
 	AVC_FORK_MEMORY = 6,    /* of a kind that cannot be watched or copied      */
@@ -65,21 +65,21 @@ enum avc_fork_reason {
 	AVC_FORK_SMALL = 13     /* it is so small that a fork takes less           */
 };
 
-/* What a guard is to do.  Durations in nanoseconds. */
+/* The settings of a guard. Durations in nanoseconds. */
 struct avc_config {
 	int32_t init_pidfd;   /* pidfd of avckpt-init; duplicated, stays the
 	                              * caller's                                  */
 	uint32_t keep;        /* generations kept, 1..AVC_KEEP_MAX         */
 	uint64_t interval_ns; /* between checkpoints; 0: only on command   */
-	/* Not 0: as often as the budgets allow, between this and interval_ns apart; not
-	 * while the app does nothing.  Budgets in millionths of the time: how long
-	 * checkpoints may hold the app, and what they may use of one CPU.         */
+	/* Not 0: as often as the budgets allow, between this and interval_ns apart; not while the
+	 * app does nothing. Budgets in millionths of the time: for which checkpoints may stop the
+	 * app, and that they may use of one CPU. */
 	uint64_t interval_min_ns;
 	uint32_t budget_freeze_ppm;
 	uint32_t budget_cpu_ppm;
 	uint64_t freeze_deadline_ns; /* the app is never held longer than this to
 	                              * get it stopped; 0: 50 ms                  */
-	uint64_t quiesce_ns;         /* how long to look for a quiescent moment   */
+	uint64_t quiesce_ns;         /* how long to wait for a quiescent moment */
 	/* restore_max restores within this time, then one of each older generation
 	 * that has not crashed, then give up.  A generation that dies again before
 	 * a checkpoint was possible gets half of them if there is an older one.  */
@@ -91,7 +91,7 @@ struct avc_config {
 	uint64_t remains_ns;            /* how long a dead app's memory is kept for
 	                                 * whoever looks at it; 0: it is not      */
 	uint64_t memory_limit_bytes;    /* of the container, with swap; 0: none known */
-	uint8_t restore_on_signal;      /* killed by a signal nobody asked for       */
+	uint8_t restore_on_signal;      /* killed by an unrequested signal */
 	uint8_t restore_on_exit;        /* any non-zero exit status                  */
 	uint8_t files;                  /* enum avc_files                            */
 	uint8_t tcp;                    /* enum avc_tcp                              */
@@ -102,16 +102,16 @@ struct avc_config {
 };
 
 enum avc_event_kind {
-	AVC_EVENT_ATTACHED = 1,    /* init found and agreed with; app_pid is set  */
+	AVC_EVENT_ATTACHED = 1,    /* init found, versions agree; app_pid is set */
 	AVC_EVENT_CHECKPOINT = 2,  /* a generation was taken.  With interval_min_ns
 	                            * once a second at most; `checkpoints`        */
 	AVC_EVENT_MISSED = 3,      /* a checkpoint could not be taken; `error`.
 	                            * The guard tries again at the next interval.
 	                            * What was held is, unless it was to make way
 	                            * for this one: see `generations`             */
-	AVC_EVENT_UNPROTECTED = 4, /* the app cannot be protected as it is;
-	                            * `error` is why.  Held generations are given
-	                            * up.  The guard looks again every interval   */
+	AVC_EVENT_UNPROTECTED = 4, /* the app cannot be protected as it is; `error` is why. Held
+	                            * generations are given up. The guard looks again every
+	                            * interval */
 	AVC_EVENT_DIED = 5,        /* the app died; wait_status, died_ns          */
 	AVC_EVENT_RESTORED = 6,    /* and runs again                              */
 	AVC_EVENT_GAVE_UP = 7,     /* a death that was not followed by a restore;
@@ -158,7 +158,7 @@ enum avc_reason {
 	AVC_REASON_GROUP = 17      /* rolled back by avc_guard_recall()           */
 };
 
-/* One thing that happened.  Fields that mean nothing for a kind are 0. */
+/* An event. Fields that do not apply to a kind are 0. */
 struct avc_event {
 	int32_t kind;           /* enum avc_event_kind                           */
 	int32_t reason;         /* enum avc_reason                               */
@@ -196,8 +196,8 @@ struct avc_event {
 	uint64_t fork_ns;    /* of it, cloning the template                   */
 	uint64_t threads_ns; /* of it, creating threads                       */
 	uint64_t age_ns;     /* of the generation when the app died           */
-	/* CHECKPOINT: what of it cannot be put back, RESTORED: what was not (or why
-	 * not from a newer generation); else why                                 */
+	/* CHECKPOINT: what of it cannot be restored, RESTORED: what was not (or why not from a
+	 * newer generation); else why */
 	struct avc_error error;
 };
 
@@ -233,78 +233,76 @@ struct avc_guard;
 /* The library's version, "MAJOR.MINOR.PATCH"; static. */
 const char *avc_version(void);
 
-/* A new engine whose guards are processes of `program` (avckpt-guard).
- * Errors: AVC_KERNEL. */
+/* Creates an engine whose guards are processes of `program` (avckpt-guard). Errors: AVC_KERNEL. */
 struct avc_engine *avc_engine_new(const char *program, struct avc_error *err);
 
-/* A descriptor that is readable (poll(2)) while events are queued.  It stays
- * the engine's.  Read the events with avc_engine_next_event(), not the fd. */
+/* A descriptor that is readable (poll(2)) while events are queued. It belongs to the engine. Read
+ * the events with avc_engine_next_event(), not the fd. */
 int avc_engine_event_fd(struct avc_engine *engine);
 
-/* Takes the oldest event: 1 with *event filled in, 0 if there is none.  The
- * queue is bounded (4096); when nobody takes them, the oldest are dropped. */
+/* Takes the oldest event: 1 with *event filled in, 0 if there is none. The queue is bounded (4096);
+ * when it is full, the oldest are dropped. */
 int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event);
 
 /* Frees the engine.  Every guard must have been stopped. */
 void avc_engine_free(struct avc_engine *engine);
 
-/* Can this machine and a guard do it at all?  Has `program` check architecture, kernel
- * features and privileges; it touches no process but a child of its own.
- * Errors: AVC_UNSUPPORTED, AVC_DENIED, AVC_KERNEL. */
+/* Whether this machine and a guard support it. Has `program` check architecture, kernel features
+ * and privileges; it touches no process but its own child. Errors: AVC_UNSUPPORTED, AVC_DENIED,
+ * AVC_KERNEL. */
 int avc_engine_probe(const char *program, struct avc_error *err);
 
-/* Starts a guard for the container of which config->init_pidfd is init.
- * Returns NULL with *err filled in when the config makes no sense or the guard
- * cannot be started; what goes wrong later comes as events with `cookie`.
- * The guard waits for init to have set itself up (bounded), then says ATTACHED.
+/* Starts a guard for the container of which config->init_pidfd is init. Returns NULL with *err
+ * filled in when the config is invalid or the guard cannot be started; later errors come as events
+ * with `cookie`. The guard waits for init to have set itself up (bounded), then says ATTACHED.
  * Precondition: init is visible in the caller's PID namespace and /proc. */
 struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_config *config,
 				  uint64_t cookie, struct avc_error *err);
 
-/* The process, or 0 when it has ended. */
+/* The PID, or 0 when it has exited. */
 int32_t avc_guard_pid(struct avc_guard *guard);
 
-/* Kills a guard that has given no sign of life for `patience_ns`, unless it is only
- * waiting for a CPU; then GUARD_LOST follows.  To be called every now and then. */
+/* Kills a guard that has given no sign of life for `patience_ns`, unless it is only waiting for a
+ * CPU; then GUARD_LOST follows. To be called periodically. */
 void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns);
 
-/* Hands a command over.  The answer is an event with the same ticket (not 0).
- * What the guard has not begun by until_ns (CLOCK_MONOTONIC; 0: any time) is refused.
- * `generation`: which is to be restored, 0: the newest.
- * Errors: AVC_GONE when the guard has ended, AVC_BUSY when it does not take them. */
+/* Sends a command. The answer is an event with the same ticket (not 0). What the guard has not
+ * begun by until_ns (CLOCK_MONOTONIC; 0: any time) is refused. `generation`: which is to be
+ * restored, 0: the newest. Errors: AVC_GONE when the guard has ended, AVC_BUSY when it does not
+ * accept them. */
 int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_t ticket,
 		      uint64_t generation, uint64_t until_ns, struct avc_error *err);
 
-/* New settings for a guard that runs (their init_pidfd is not looked at).  They hold
- * from the next checkpoint and the next death on.  Held generations stay, up to the
- * new `keep`; when that is more than the guard was ever told, they give way to new ones
- * at the next checkpoint.  Returns before they are in force.
- * Errors: AVC_CONFIG, and nothing changes; AVC_GONE when the guard has ended. */
+/* New settings for a running guard (their init_pidfd is ignored). They apply from the next
+ * checkpoint and the next death on. Held generations stay, up to the new `keep`; when that is more
+ * than the guard has had before, they are replaced by new ones at the next checkpoint. Returns
+ * before they are in force. Errors: AVC_CONFIG, and nothing changes; AVC_GONE when the guard has
+ * ended. */
 int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config,
 			struct avc_error *err);
 
-/* What the guards of a group meet at (avckpt/guard.h), once: for one line or one return to
- * one.  A descriptor, or -1. */
+/* Creates the memory where the guards of a group meet (avckpt/guard.h), once: for one line or one
+ * rollback to one. A descriptor, or -1. */
 int avc_meeting_new(uint32_t members, struct avc_error *err);
 
-/* Has a guard take a checkpoint that is part of a line of its group: nobody's app is let go
- * before all of `meeting` stand still, or else nobody keeps anything of it.  Each member is
- * told with the same meeting.  Answered as AVC_COMMAND_CHECKPOINT. */
+/* Has a guard take a checkpoint that is part of a line of its group: no app is released before all
+ * members of `meeting` are stopped, or else all of them discard it. Each member gets the same
+ * meeting. Answered as AVC_COMMAND_CHECKPOINT. */
 int avc_guard_line(struct avc_guard *guard, int meeting, uint64_t line, uint64_t ticket,
 		   struct avc_error *err);
 
-/* Has it go back to `generation`, of that line: nobody's app is killed before all can, none is
- * restored before all are dead, and none runs before all are restored.  RESTORED; or REFUSED,
- * and nothing has changed; or WAITS or GAVE_UP. */
+/* Has it go back to `generation`, of that line: no app is killed before all members are able to,
+ * none is restored before all are dead, and none runs before all are restored. RESTORED; or
+ * REFUSED, and nothing has changed; or WAITS or GAVE_UP. */
 int avc_guard_recall(struct avc_guard *guard, int meeting, uint64_t line, uint64_t generation,
 		     uint64_t ticket, struct avc_error *err);
 
-/* A generation of a line that others have not got is of no use.  No answer. */
+/* Drops a generation of a line that other members lack. No answer. */
 int avc_guard_forget(struct avc_guard *guard, uint64_t generation, struct avc_error *err);
 
-/* Lets the app go (it runs on, unprotected), gives up every generation, waits for the
- * process to end (it is killed after 15 s) and frees the guard.  Blocks for as long as a
- * checkpoint or restore that is under way.  Events that it sent until then are queued. */
+/* Releases the app (it keeps running, unprotected), drops every generation, waits for the process
+ * to exit (it is killed after 15 s) and frees the guard. Blocks for as long as a checkpoint or
+ * restore that is under way. Events that it sent until then are queued. */
 void avc_guard_stop(struct avc_guard *guard);
 
 #endif

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the daemon and a guard process (avckpt-guard) say to each other.
+ * The protocol between the daemon and a guard process (avckpt-guard).
  *
  * The daemon starts one guard per protected container, with one end of a SOCK_SEQPACKET
  * pair as descriptor AVC_GUARD_FD.  Each message is one struct:
@@ -10,12 +10,12 @@
  *                     holds one struct avc_heartbeat
  *   guard to daemon   struct avc_event (engine.h)
  *
- * End of file tells the guard to stop: it lets the application go (which runs on,
- * unprotected), gives up its generations and ends with 0.  That is also what happens when
- * the daemon dies; a restore under way is finished first.  End of file tells the daemon
- * that the guard has ended; if it did so unasked, its status says why.
+ * End of file tells the guard to stop: it releases the application (which keeps running,
+ * unprotected), drops its generations and exits with 0. The same happens when the daemon dies; a
+ * restore under way is finished first. End of file tells the daemon that the guard has exited; if
+ * unrequested, its status says why.
  *
- * Both are of one build: `magic` says so.
+ * Both are of one build, as `magic` confirms.
  */
 #ifndef AVCKPT_GUARD_PROTOCOL_H
 #define AVCKPT_GUARD_PROTOCOL_H
@@ -52,11 +52,12 @@ struct avc_request {
 	struct avc_config config;
 };
 
-/* Shared memory of the guards of a group.  They go through steps, in order, each when all have
- * arrived at it.  `state` is the step that is gathered for, or AVC_MEETING_BROKEN: whoever
- * cannot go on, or has waited for too long, breaks it, and it changes by compare and exchange
- * alone.  So all of them find the same.  Nobody waits for one that has died longer than that,
- * and what a guard writes here that has been talked into anything concerns its own group. */
+/* Shared memory of the guards of a group: a barrier with steps, in order, each taken when all
+ * members have arrived at it. `state` is the step that is being gathered for, or
+ * AVC_MEETING_BROKEN: a member that cannot continue, or has waited too long, breaks it, and it
+ * changes only by compare and exchange, so that all members see the same. So none waits longer than
+ * that for one that has died, and what a compromised guard writes here affects only its own
+ * group. */
 enum { AVC_MEETING_STEPS = 3 };
 
 struct avc_meeting {

@@ -123,7 +123,7 @@ async def _written(request: Request, within_s: float) -> dict[str, Any]:
                 Path(f"{request.path}.new").unlink()
     answer = json.loads(said)
     if not isinstance(answer, dict):
-        raise ValueError("its writer makes no sense")
+        raise ValueError("invalid answer from its writer")
     return answer
 
 

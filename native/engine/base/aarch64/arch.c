@@ -44,7 +44,7 @@ static bool is_again(long result)
 	       result == -ERESTART_RESTARTBLOCK;
 }
 
-/* What the call has answered, by what calls of its kind answer. */
+/* What the call has returned, judging by what calls of its kind return. */
 static long answer_of(const struct arch_regs *regs)
 {
 	if (regs->r.regs[8] >> 32)
@@ -65,8 +65,8 @@ static long answer_of(const struct arch_regs *regs)
 	}
 }
 
-/* The first argument, of which only the kernel still knows: it says so in /proc of a thread
- * that is in a call. */
+/* The first argument, which only the kernel still has: /proc shows it for a thread that is in a
+ * call. */
 static int first_argument(pid_t tid, int nr, unsigned long long *argument)
 {
 	const int none = -1;
@@ -196,7 +196,7 @@ bool arch_may_continue(long nr)
 	return nr == SYS_nanosleep || nr == SYS_clock_nanosleep || nr == SYS_futex;
 }
 
-/* One until a moment, not for a time, is made again: that ends at the same moment. */
+/* One with an absolute deadline is restarted: it ends at the same moment. */
 void arch_note_slept(struct arch_regs *regs)
 {
 	const bool relative = regs->nr == SYS_nanosleep ||
@@ -267,8 +267,8 @@ struct sve_record {
 	uint16_t vl, flags, reserved[2];
 };
 
-/* The stack_t of a frame that is to leave things as they are: to refuse it is no error of
- * rt_sigreturn(2) (kernel/signal.c, restore_altstack()). */
+/* A stack_t that leaves the alternate stack unchanged: rt_sigreturn(2) ignores that it is refused
+ * (kernel/signal.c, restore_altstack()). */
 #define NO_ALTSTACK (UINT64_C(0x7f))
 
 static void fill_frame(struct inj_home *frame, const struct arch_regs *regs, uint64_t sigmask)

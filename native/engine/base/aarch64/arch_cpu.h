@@ -1,13 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What of arch.h is the CPU's own (aarch64).  The names are those of x86_64/arch_cpu.h, where they
- * are explained; here is what is different.
+ * The CPU-specific part of arch.h (aarch64). The names are those of x86_64/arch_cpu.h, where they
+ * are explained; differences are noted here.
  *
- * When a thread stops that was in a system call, the kernel has put its registers back to
- * where the call is made again, if it is to be, and tells neither that it was in one nor
- * with what the call has answered (arch/arm64/kernel/signal.c, do_signal()).  What is in
- * struct arch_regs is as x86-64 has it all the same: arch_regs_get() finds it out from the
- * instruction at the program counter, and arch_regs_set() puts it back.
+ * When a thread stops in a system call, the kernel has already reset its registers to restart the
+ * call, if it is to be restarted, and reveals neither that it was in one nor what the call returned
+ * (arch/arm64/kernel/signal.c, do_signal()). struct arch_regs still has the meaning that it has on
+ * x86-64: arch_regs_get() derives it from the instruction at the program counter, and
+ * arch_regs_set() converts it back.
  */
 #ifndef AVCKPT_ARCH_CPU_H
 #define AVCKPT_ARCH_CPU_H
@@ -32,14 +32,13 @@ static inline long arch_syscall_nr(const struct arch_regs *regs)
 {
 	return regs->nr;
 }
-/* The upper half of x8, which the kernel takes no notice of (do_el0_svc()).  The call leaves
- * it there; but x8 is not the app's to rely on, for what the kernel takes up again finds the
- * number of restart_syscall(2) in it. */
+/* The upper half of x8, which the kernel ignores (do_el0_svc()). The call preserves it; but the app
+ * cannot rely on x8, because a restarted call has the number of restart_syscall(2) in it. */
 static inline uint32_t arch_call_mark(const struct arch_regs *regs)
 {
 	return regs->nr >= 0 ? (uint32_t)(regs->r.regs[8] >> 32) : 0;
 }
-/* A thread that is about to make the call is no different from one that is in it. */
+/* A thread that is about to make the call looks like one that is in it. */
 static inline uint32_t arch_result_mark(const struct arch_regs *regs)
 {
 	(void)regs;
@@ -97,21 +96,21 @@ static inline void arch_pc_set(struct arch_regs *regs, avc_remote pc)
 #define ARCH_CODE_BYTES 8
 #define ARCH_SYSCALL_BYTES 4
 
-/* Whether the kernel goes on with such a call, and does not begin it again, and does not say so:
- * only of a thread that slept in it is that known. */
+/* Whether the kernel continues such a call instead of restarting it cannot be seen: it is known
+ * only for a thread that slept in it. */
 bool arch_may_continue(long nr);
 void arch_note_slept(struct arch_regs *regs);
 
-/* Whether the thread has registers that no system call leaves alone: it is not to be borrowed now. */
+/* Whether the thread has registers that no system call preserves: it must not be borrowed now. */
 bool arch_is_delicate(pid_t tid);
 
-/* Nobody has to ask for anything: PR_SVE_GET_VL stores nothing. */
+/* No permission is needed: PR_SVE_GET_VL stores nothing. */
 #define ARCH_STATE_CALL SYS_prctl
 #define ARCH_STATE_PERMITTED 51
 #define ARCH_STATE_ASK 51
 #define ARCH_STATE_NUMBER 63
 
-/* The stub goes back from a signal frame that it brings along, by rt_sigreturn(2). */
+/* The stub returns by rt_sigreturn(2), from a signal frame that it contains. */
 #define ARCH_STUB_BYTES 1152
 /* The vector registers, without which there is no signal frame. */
 int arch_stub_read_xstate(pid_t tid, uint8_t *code);

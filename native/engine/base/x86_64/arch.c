@@ -19,8 +19,8 @@
 #define FLAG_DF 0x400
 #define FLAG_OF 0x800
 
-/* The kernel's own codes for "make this call again" (include/linux/errno.h);
- * they never reach user space, ptrace sees them. */
+/* The kernel's own codes for "make this call again" (include/linux/errno.h); they never reach user
+ * space, but ptrace sees them. */
 #define ERESTARTSYS 512
 #define ERESTARTNOINTR 513
 #define ERESTARTNOHAND 514
@@ -220,9 +220,8 @@ struct sw_bytes {
 
 size_t arch_xstate_bytes(void)
 {
-	/* Asked once: under a hypervisor every cpuid is a trap of microseconds, and
-	 * this is called for each thread of a stopped app.  Racing guards write the
-	 * same value. */
+	/* Queried once: under a hypervisor every cpuid traps, which takes microseconds, and this is
+	 * called for each thread of a stopped app. Racing threads write the same value. */
 	static size_t bytes;
 	unsigned int a, b, c, d;
 
@@ -232,9 +231,9 @@ size_t arch_xstate_bytes(void)
 	return __atomic_load_n(&bytes, __ATOMIC_RELAXED);
 }
 
-/* AMX tile data (arch/x86/kernel/fpu/xstate.c, XFEATURE_MASK_USER_DYNAMIC).  Of these 8 kB
- * a thread has nothing until it first uses them, and its signal frames are by so much
- * smaller: in one of another size rt_sigreturn(2) finds no more than the SSE registers. */
+/* AMX tile data (arch/x86/kernel/fpu/xstate.c, XFEATURE_MASK_USER_DYNAMIC). A thread has these 8 kB
+ * only from their first use, and until then its signal frames are smaller: from one of another size
+ * rt_sigreturn(2) restores only the SSE registers. */
 #define DYNAMIC (UINT64_C(1) << 18)
 #define FEATURES_OFFSET 512 /* of XSTATE_BV */
 #define LEGACY_BYTES 576    /* with the header behind it */
@@ -247,7 +246,7 @@ static uint64_t enabled_features(void)
 	return (uint64_t)high << 32 | low;
 }
 
-/* Of a thread without. */
+/* For a thread without tiles. */
 static size_t plain_bytes(void)
 {
 	static size_t bytes; /* see above */
@@ -316,7 +315,7 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 			       .xstate_bytes = (uint32_t)bytes };
 	struct frame *f = (struct frame *)(xstate + xstate_room());
 
-	/* ptrace leaves XCR0 where the signal frame wants its features. */
+	/* ptrace stores XCR0 where the signal frame has its feature mask. */
 	memcpy(&sw.features, xstate + SW_OFFSET, sizeof sw.features);
 	if (!dynamic)
 		sw.features &= ~DYNAMIC;
@@ -357,7 +356,7 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 #define FLAGS_KNOWN 0x3fffff
 #define XSTATE_NEAR 4096
 
-/* arch/x86/kernel/signal_64.c, x64_setup_rt_frame(): what it puts there is the same for every
+/* arch/x86/kernel/signal_64.c, x64_setup_rt_frame(): what it stores there is the same for every
  * program. */
 static bool is_signal_frame(const struct frame *f, avc_remote at)
 {
@@ -415,9 +414,9 @@ static void put_mov(struct writer *w, unsigned int reg, uint64_t value)
 	put(w, &value, sizeof value);
 }
 
-/* What comes after the system call: a task that it has made ends at once, and who made one waits
- * for it, whether or not it is its child (ECHILD).  And a call after which the task ends.  Nothing
- * is written to memory. */
+/* What follows the system call: a new task exits at once, and its creator waits for it, whether or
+ * not it is its child (ECHILD). And a call after which the task exits. Nothing is written to
+ * memory. */
 /* clang-format off */
 #define STUB_LAST 29
 static const uint8_t stub_start[] = {
@@ -453,8 +452,8 @@ size_t arch_stub_build(uint8_t *code, const struct arch_regs *regs, uint64_t sig
 	int32_t disp = 0;
 
 	put(&w, stub_start, sizeof stub_start);
-	/* rt_sigprocmask(SIG_SETMASK, &mask, NULL, 8), the stack pointer being
-	 * the app's own all the time: a signal may come as soon as it returns. */
+	/* rt_sigprocmask(SIG_SETMASK, &mask, NULL, 8), the stack pointer being the app's own
+	 * throughout: a signal may arrive as soon as it returns. */
 	put_mov(&w, 0, SYS_rt_sigprocmask);
 	put_mov(&w, 7, 2);
 	put(&w, lea_rsi, 3);

@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What of arch.h is the CPU's own (x86-64): its registers, its numbers, and what is so short that
- * it is inline.
+ * The CPU-specific part of arch.h (x86-64): registers, numbers, and inline functions.
  */
 #ifndef AVCKPT_ARCH_CPU_H
 #define AVCKPT_ARCH_CPU_H
@@ -25,9 +24,9 @@ static inline long arch_syscall_nr(const struct arch_regs *regs)
 {
 	return (int32_t)regs->r.orig_rax;
 }
-/* A mark on a call that is to be made again: it stays on that call over all stops, and
- * nobody but us sees it.  It is the upper half of rax, which the kernel keeps beside the
- * number and loads again with it, and which holds the result when the call returns. */
+/* A mark on a call that is to be restarted: it stays on that call over all stops, invisible to the
+ * app. It is the upper half of rax, which the kernel saves and reloads with the syscall number, and
+ * which the result overwrites when the call returns. */
 static inline uint32_t arch_call_mark(const struct arch_regs *regs)
 {
 	return (uint32_t)(regs->r.orig_rax >> 32);
@@ -81,8 +80,8 @@ static inline void arch_pc_set(struct arch_regs *regs, avc_remote pc)
 #define ARCH_CODE_BYTES 7
 #define ARCH_SYSCALL_BYTES 2
 
-/* Whether a stopped thread does not tell that the kernel goes on with such a call and does not
- * begin it again, but by its having slept in it. */
+/* Whether only a thread's having slept in such a call shows that the kernel continues it instead of
+ * restarting it. */
 static inline bool arch_may_continue(long nr)
 {
 	(void)nr;
@@ -93,25 +92,25 @@ static inline void arch_note_slept(struct arch_regs *regs)
 	(void)regs;
 }
 
-/* Whether the thread has registers that no system call leaves alone, so that it is not to be
- * borrowed now. */
+/* Whether the thread has registers that no system call preserves, so that it must not be borrowed
+ * now. */
 static inline bool arch_is_delicate(pid_t tid)
 {
 	(void)tid;
 	return false;
 }
 
-/* A process has to ask for the permission to have state for which there is no room before it is
- * used (arch_frame_needs_room()), once: the call, what it is
- * asked with (what is permitted comes as 64 bits, the address is the next argument), what it
- * asks with, for the state with this number (arch/x86/kernel/fpu/xstate.c). */
+/* A process has to request permission, once, for state without room before its first use
+ * (arch_frame_needs_room()): the call, its code to query the permissions (64 bits; the address is
+ * the next argument), its code to request one, and the number of the state
+ * (arch/x86/kernel/fpu/xstate.c). */
 #define ARCH_STATE_CALL SYS_arch_prctl
 #define ARCH_STATE_PERMITTED 0x1022 /* ARCH_GET_XCOMP_PERM */
 #define ARCH_STATE_ASK 0x1023       /* ARCH_REQ_XCOMP_PERM */
 #define ARCH_STATE_NUMBER 18        /* XFEATURE_XTILE_DATA */
 
 #define ARCH_STUB_BYTES 224
-/* Adds the extended state, where going back needs it. */
+/* Adds the extended state, where returning needs it. */
 static inline int arch_stub_read_xstate(pid_t tid, uint8_t *code)
 {
 	(void)tid, (void)code;
