@@ -1,20 +1,20 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The lowest of the engine's layers: errors, /proc, and a CPU at once.  It knows nothing of
+ * The lowest of the engine's layers: errors, /proc, real-time priority. It knows nothing about
  * applications.
  *
  * Everything in the engine runs in the guard's main thread unless said otherwise: a process can
  * only be traced by one thread.  A layer's header includes those below it, and no layer calls one above
  * (native/layers.py).
  *
- *   error.c         what went wrong
- *   config.c        whether settings make sense
+ *   error.c         errors
+ *   config.c        validity of settings
  *   heartbeat.c     the guard's sign of life
  *   budget.c        what one checkpoint or restore may cost
- *   aside.c         calls that may not come back
+ *   aside.c         calls that may block forever
  *   proc.c          /proc
- *   proc_text.c     what its texts say
- *   pagemap.c       which pages of a process are there
+ *   proc_text.c     parsers of its files
+ *   pagemap.c       which pages of a process are present
  *   pageset.c       sets of them
  *   rt_priority.c   a CPU at once while an app waits for us
  *   CPU/arch.c      everything about the CPU
@@ -51,7 +51,7 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 uint64_t now_ns(void);
 struct timespec timespec_of(uint64_t ns);
 void close_fd(int *fd);
-/* As much of it as there is; -1: it cannot be read. */
+/* Returns the bytes read; -1: unreadable. */
 ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 /* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,
  * and nothing has changed. */
@@ -61,40 +61,40 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 
 /* Takes the memory for it, and closes the descriptor.  0 or -1. */
 int heartbeat_open(int fd) warn_unused;
-/* We get on: the daemon kills a guard of which it has not heard for seconds. */
+/* A sign of progress: the daemon kills a guard that has been silent for seconds. */
 void heartbeat(void);
 
 /* ---- budget.c --------------------------------------------------------------- */
 
-/* Of a checkpoint or restore.  `working` is called now and then, NULL: nothing. */
+/* Begins a checkpoint or restore. `working` is called periodically; may be NULL. */
 void budget_begin(void (*working)(void *arg), void *arg);
-/* From now on there is so much time; 0: as much as it takes. */
+/* Sets the time left from now; 0: unlimited. */
 void budget_deadline(uint64_t ns);
-/* It is over for that reason, in words that stay. */
+/* Marks it as exceeded, for that reason (a static string). */
 void budget_exceed(enum avc_code code, const char *what);
-/* Memory that is to be kept: whether there is room, and if so takes it.  budget_has() only asks. */
+/* Memory that is to be kept: takes it if there is room. budget_has() only checks. */
 bool budget_has(uint64_t bytes);
 bool budget_take(uint64_t bytes);
-/* We get on.  False when the budget is exceeded. */
+/* Progress. False when the budget is exceeded. */
 bool budget_step(void);
-/* -1 with that code and the reason in words when it is. */
+/* -1 with that code and the reason as text when it is exceeded. */
 int budget_check(pid_t pid, struct avc_error *err) warn_unused;
 
 /* ---- aside.c ---------------------------------------------------------------- */
 
-/* The beginning of a job, in memory of its own. */
+/* The head of a job, in its own memory. */
 struct aside {
 	void (*work)(struct aside *job);
-	void (*drop)(struct aside *job); /* frees it: nobody waits for it any more       */
-	int *left_behind;                /* of this kind there is one that was given up   */
+	void (*drop)(struct aside *job); /* frees it: no thread waits for it any more */
+	int *left_behind;                /* set while a job of this kind is left behind */
 };
 
-/* Has a thread of its own do it.  False: one step of it was not done in so long, and job->drop() is
- * called as soon as it is; or at once, while another of its kind is not yet done.  Main thread only. */
+/* Runs it in a separate thread. False: a step took too long, and job->drop() is called as soon as
+ * it ends; or at once, while another job of its kind is left behind. Main thread only. */
 bool aside_run(struct aside *job, uint64_t ns);
-/* The calling thread gets on with its job, if it has one. */
+/* The calling thread makes progress with its job, if it has one. */
 void aside_step(void);
-/* Nobody waits any more for what this thread does. */
+/* Whether the main thread no longer waits for this thread. */
 bool aside_is_left_behind(void);
 
 /* ---- config.c -------------------------------------------------------------- */
@@ -108,41 +108,40 @@ struct proc_stat {
 	pid_t parent, group, session, tty_group;
 	uint32_t tty, flags; /* PF_*                                            */
 	int threads;
-	uint64_t faults; /* that took no reading, of all its threads          */
+	uint64_t faults; /* minor faults, of all its threads */
 	uint64_t start;  /* clock ticks after boot                            */
-	int exit_signal; /* that its parent gets when it ends, 0: none        */
-	int exit_status; /* of a zombie, as wait(2) says it                   */
+	int exit_signal; /* sent to its parent when it exits, 0: none */
+	int exit_status; /* of a zombie, as from wait(2) */
 	char name[16];
 };
 
 /* Reads a whole small file of /proc.  Returns its length or -1 with errno. */
 ssize_t proc_read(pid_t pid, const char *name, char *buf, size_t size);
-/* All of one, as a string: in `first` if that is large enough, else allocated, for the application
- * makes it as long as it likes.  NULL with errno; EFBIG: that is too long. */
-#define PROC_TEXT_MAX (8u << 20) /* about 100,000 descriptors, or 60,000 files, that are watched  */
+/* Reads a whole file, as a string: into `first` if that is large enough, else allocated, because
+ * the application determines its length. NULL with errno; EFBIG: too long. */
+#define PROC_TEXT_MAX (8u << 20) /* about 100,000 watched descriptors, or 60,000 files */
 char *proc_text(pid_t pid, const char *name, char *first, size_t first_bytes);
 int proc_stat(pid_t pid, struct proc_stat *stat);
-/* What all threads of a process have used of the CPUs until now; 0: it is gone. */
+/* The CPU time of all threads of a process so far; 0: it is gone. */
 uint64_t proc_cpu_ns(pid_t pid);
-/* By an open /proc/PID/stat, which stands for that very process: -1, when it is gone. */
+/* From an open /proc/PID/stat, which refers to that very process: -1 when it is gone. */
 int proc_stat_of(int stat_fd, struct proc_stat *stat);
 /* The number of a task in its own (innermost) PID namespace, or -1. */
 pid_t proc_inside(pid_t tid);
-/* A thread of the process that has not ended: the main thread, as long as it has not.
- * 0: none. */
+/* A live thread of the process: the main thread, if it has not exited. 0: none. */
 pid_t proc_live_thread(pid_t pid);
-/* Until that thread has ended; a second at most. */
+/* Waits until that thread has exited; a second at most. */
 void proc_await_end(pid_t tid);
 /* Children of a (single-threaded) process; returns how many (at most max), or -1. */
 int proc_children(pid_t pid, pid_t *children, int max);
-/* The same of one thread, by the open /proc/PID/task of its process. */
+/* The same for one thread, from the open /proc/PID/task of its process. */
 int proc_children_of(int task_dirfd, pid_t tid, pid_t *children, int max);
 /* Calls fn for every task of an open /proc/PID/task; stops when it returns < 0. */
 int proc_tasks(int task_dirfd, int (*fn)(pid_t tid, void *arg), void *arg);
 /* Whether two tasks have the same memory (kcmp(2)). */
 bool proc_same_memory(pid_t a, pid_t b);
-/* Likewise the same descriptor table, or the same working directory and umask: 1 or 0; -1: it can
- * not be told.  One that is just ending has none. */
+/* Likewise the same descriptor table, or the same working directory and umask: 1 or 0; -1: unknown.
+ * An exiting task has none. */
 enum shared { SHARED_FILES, SHARED_FOLDERS };
 int proc_shares(pid_t a, pid_t b, enum shared what);
 /* How many threads there are, by an open /proc/PID/task; 0: the process is gone. */
@@ -150,14 +149,14 @@ int proc_thread_count(int task_dirfd);
 /* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be
  * NULL): how many are resident and of no file. */
 long proc_vm_pages(int statm_fd, long *anonymous);
-/* The PID a pidfd stands for, in our namespace, or -1. */
+/* The PID of a pidfd, in our namespace, or -1. */
 pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
 /* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
 int proc_link(pid_t pid, const char *name, char *buf, size_t size);
-/* It is just ending, and may have closed already what it had open. */
+/* It is exiting, and may have closed its descriptors already. */
 bool proc_is_exiting(pid_t tid);
-/* By SIGKILL, whether or not it has come to its end already. */
+/* Whether it was killed by SIGKILL, even if it has not exited yet. */
 bool proc_is_killed(pid_t pid);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
@@ -194,7 +193,7 @@ struct mapping {
 int proc_mappings(pid_t pid, const char *file, int (*fn)(const struct mapping *mapping, void *arg),
 		  void *arg);
 
-/* The vDSO, or what belongs to it. */
+/* The vDSO, or a mapping that belongs to it. */
 bool mapping_is_special(const struct mapping *m);
 /* As mmap(2) has it. */
 int mapping_protection(const struct mapping *m);
@@ -203,28 +202,28 @@ int mapping_protection(const struct mapping *m);
 #define LIMITS 16
 int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
-/* A task as the scheduler sees it (/proc/PID/sched). */
+/* A task's scheduler statistics (/proc/PID/sched). */
 struct proc_sched {
-	uint64_t ran_ns; /* when it ran last, by the clock of the CPU it ran on    */
+	uint64_t ran_ns; /* when it last ran, by the clock of that CPU */
 	uint64_t switches, migrations;
 };
 
-/* -1: the kernel does not tell, or it has ended. */
+/* -1: not available, or it has exited. */
 int proc_sched(pid_t tid, struct proc_sched *sched);
 
-/* What is of interest in /proc/PID/status. */
+/* The relevant fields of /proc/PID/status. */
 #define STATUS_GROUPS 64
 struct proc_status {
-	int64_t locked_kb; /* -1: it has no memory any more                    */
+	int64_t locked_kb; /* -1: it has no memory any more */
 	pid_t inside;      /* in the innermost PID namespace                   */
-	/* The numbers of its group and session there, whoever leads them; 0: led from outside. */
+	/* Its process group and session there; 0: led from outside. */
 	pid_t group, session;
 	pid_t tracer;     /* a thread, in our namespace; 0: none              */
 	uint64_t caught;  /* signals it has handlers for, as in sigset_t      */
 	uint64_t ignored; /* likewise                                         */
 	uint32_t umask;
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
-	int group_count;         /* supplementary; those beyond are not known   */
+	int group_count;         /* supplementary; further ones are not known */
 	uint32_t groups[STATUS_GROUPS];
 	uint64_t caps[5]; /* inheritable, permitted, effective, bounding, ambient */
 	uint32_t no_new_privs, seccomp, seccomp_filters;
@@ -234,23 +233,23 @@ struct proc_status {
 int proc_status(pid_t tid, struct proc_status *status);
 /* "/proc/PID/NAME" opened, or -1 with errno. */
 int proc_open(pid_t pid, const char *name, int flags);
-/* What is mapped there (proc(5), map_files), or -1 with errno.  Needs CAP_CHECKPOINT_RESTORE or
- * CAP_SYS_ADMIN.  For writing only of who stands still, with all that share its memory (a template):
- * another could map something else meanwhile, which it may only read; and only if it was open for
- * writing there, too. */
+/* Opens what is mapped there (proc(5), map_files); -1 with errno. Needs CAP_CHECKPOINT_RESTORE or
+ * CAP_SYS_ADMIN. For writing only if the process, and all that share its memory, are stopped (a
+ * template): otherwise it could map something else meanwhile, which it may only read; and only if
+ * it was open for writing there, too. */
 int proc_open_mapped(pid_t pid, avc_remote start, avc_remote end, int flags);
-/* Whether that was open for writing, and not for reading alone: the link says so (fs/proc/base.c,
+/* Whether that was open for writing, not only for reading, according to the link (fs/proc/base.c,
  * proc_map_files_instantiate()). */
 bool proc_mapped_for_writing(pid_t pid, avc_remote start, avc_remote end);
 /* A duplicate of a descriptor of another process, or -1. */
 int proc_borrow_fd(int pidfd, int fd);
-/* The OOM killer takes those with a higher value first; best effort. */
+/* The OOM killer kills those with a higher value first; best effort. */
 void proc_set_oom_score_adj(pid_t pid, const char *value);
 int proc_oom_score_adj(pid_t pid);
 
 /* ---- proc_text.c -------------------------------------------------------------------- */
 
-/* What the texts say, for the functions above; -1 with EPROTO: not what was expected. */
+/* Parsers for the functions above; -1 with EPROTO: unexpected contents. */
 int proc_parse_stat(const char *text, struct proc_stat *stat);
 int proc_parse_statm(const char *text, long *pages, long *anonymous);
 int proc_parse_status(const char *text, struct proc_status *status);
@@ -260,7 +259,7 @@ int proc_parse_children(const char *text, pid_t *children, int max);
 int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *mapping, void *arg),
 			void *arg);
 
-/* A line of mountinfo, which the strings are in. */
+/* A line of mountinfo; the strings point into it. */
 struct proc_mount {
 	uint32_t major, minor;
 	char *point;
@@ -268,9 +267,9 @@ struct proc_mount {
 	char *details; /* of the file system's own; escaped                  */
 };
 
-/* False: it is no such line.  Changes it. */
+/* False: not such a line. Modifies it. */
 bool proc_parse_mount(char *line, struct proc_mount *mount);
-/* "\\040" and the like stand for blanks. */
+/* Replaces escapes such as "\\040". */
 void proc_unescape(char *text);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */
@@ -285,20 +284,19 @@ void proc_unescape(char *text);
 #define GUARD_INSTALL 102
 #define GUARD_REMOVE 103
 
-/* A guard page without a mapping of its own (madvise(2)); one of the process's own, and not just a
- * mark that nobody has written to an empty place (pagemap_written()). */
+/* A guard page without its own mapping (madvise(2)), not just the mark of an unwritten empty page
+ * (pagemap_written()). */
 bool page_is_guard(uint64_t entry);
 bool page_is_own(uint64_t entry);
-/* Calls fn for every stretch in which there are pages of no file, or guard pages; for all of it
- * if the kernel cannot tell (before Linux 6.7).  Stops when fn does not return 0.  0 or -1. */
+/* Calls fn for every range with anonymous pages or guard pages; for the whole if the kernel cannot
+ * tell (before Linux 6.7). Stops when fn does not return 0. 0 or -1. */
 int pagemap_walk(int pagemap, avc_remote start, avc_remote end,
 		 int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
 
 /* Whether the mapping there is watched so: see pagemap_written(). */
 bool pagemap_is_watched(int pagemap, avc_remote address);
-/* Which of them were written since they were asked for the last time, and asks anew: fn is told of
- * each stretch.  Of a stretch of mappings that are all watched so (userfaultfd(2), WP_ASYNC): EPERM,
- * it is not.  0, or -1 with errno. */
+/* Calls fn for every range written since the last such call, and protects it again. The mappings
+ * must all be watched (userfaultfd(2), WP_ASYNC), else EPERM. 0, or -1 with errno. */
 int pagemap_written(int pagemap, avc_remote start, avc_remote end,
 		    int (*fn)(avc_remote start, avc_remote end, void *arg), void *arg);
 
@@ -319,7 +317,7 @@ struct pageset {
 /* False: out of memory. */
 bool pageset_add(struct pageset *set, avc_remote start, avc_remote end);
 bool pageset_add_all(struct pageset *set, const struct pageset *more);
-/* Stretch by stretch; a cursor begins as { 0 }. */
+/* Iterates over ranges; a cursor begins as { 0 }. */
 struct page_cursor {
 	uint32_t chunk, bit;
 };
@@ -332,13 +330,12 @@ void pageset_free(struct pageset *set);
 
 /* ---- rt_priority.c -------------------------------------------------------------------- */
 
-/* The calling thread gets a CPU before others from here to the other; best effort.
- * May be nested. */
+/* Between the two, the calling thread gets a CPU before others; best effort. May be nested. */
 void rt_priority_begin(void);
 void rt_priority_end(void);
 /* Whether it is between the two. */
 bool rt_priority_is(void);
-/* Another thread is to have what the calling one has; best effort. */
+/* Gives another thread the calling one's priority; best effort. */
 void rt_priority_share(pid_t tid);
 
 #endif

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Descriptors for a process that is being made: one at a time, over a socket (unix(7), SCM_RIGHTS).
+ * Descriptors for a process being restored: one at a time, over a socket (unix(7), SCM_RIGHTS).
  */
 #include <stddef.h>
 #include <stdlib.h>

@@ -19,8 +19,8 @@
 #include "trace.h"
 
 #define LEFTOVERS_NS (100 * NS_PER_MS)
-/* On a busy machine it may take long until a killed process gets a CPU to end on.  Until then it
- * can take what is put back into a pipe: a read(2) that finds something does not look for signals. */
+/* On a busy machine a killed process may wait long for a CPU to exit. Until then it can consume
+ * what is put back into a pipe: a read(2) that finds data does not check for signals. */
 #define LEFTOVERS_ALIVE_NS (10 * NS_PER_S)
 #define LEFTOVERS_US 100
 #define LEFTOVERS_LONG_US 1000
@@ -61,9 +61,9 @@ static int find_ctl(pid_t init)
 #define PIPEFS_MAGIC_ 0x50495045 /* linux/magic.h */
 #define TMPFS_MAGIC_ 0x01021994
 
-/* What the container shows us is looked at before it is opened: by a duplicate of its own
- * descriptor, which gives us no more rights than it has, and which it cannot exchange for another
- * meanwhile.  Then it is opened anew, for O_NONBLOCK and flock(2) are of the open file. */
+/* What the container presents is checked before it is opened: through a duplicate of its own
+ * descriptor, which carries no more rights than it has, and which it cannot replace meanwhile. Then
+ * it is reopened, because O_NONBLOCK and flock(2) belong to the open file description. */
 static int reopen(int *theirs, int flags)
 {
 	char path[32];
@@ -82,8 +82,8 @@ static int reject(int *theirs)
 	return -1;
 }
 
-/* init's end of a pipe, or the other one; it must be the kernel's own and not a file with a name,
- * which the container may have been given to read only. */
+/* init's end of a pipe, or the other one; it must be an anonymous pipe and not a named file, which
+ * the container may be allowed only to read. */
 static int open_pipe_of(const struct init_channel *channel, int number, int flags)
 {
 	int theirs = proc_borrow_fd(channel->init_pidfd, number);
@@ -98,8 +98,8 @@ static int open_pipe_of(const struct init_channel *channel, int number, int flag
 	return reopen(&theirs, flags);
 }
 
-/* A memfd that cannot shrink under our mapping (SIGBUS), and not one of huge pages, of which there
- * may be none (SIGBUS).  Files of a tmpfs have seals, too, but never these. */
+/* A memfd that cannot shrink under our mapping (SIGBUS), and without huge pages, which may be
+ * exhausted (SIGBUS). Files of a tmpfs have seals, too, but never these. */
 static int open_ctl_of(const struct init_channel *channel, int number)
 {
 	int theirs = proc_borrow_fd(channel->init_pidfd, number), seals;
@@ -167,7 +167,7 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 	number = find_ctl(channel->init);
 	if (number < 0 || pidfd_ended(pidfd))
 		return 0;
-	/* The magic is written last: before that the page is not to be trusted. */
+	/* The magic is written last: before that the page is incomplete. */
 	theirs = proc_borrow_fd(pidfd, number);
 	if (theirs < 0)
 		return 0;
@@ -184,13 +184,13 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 	return -1;
 }
 
-/* Everything but the pidfd, which is the guard's. */
+/* Everything but the pidfd, which belongs to the guard. */
 void init_channel_close(struct init_channel *channel)
 {
 	if (channel->ctl)
 		munmap(channel->ctl, sizeof *channel->ctl);
 	channel->ctl = NULL;
-	close_fd(&channel->ctl_fd); /* lets the lock go */
+	close_fd(&channel->ctl_fd); /* releases the lock */
 	close_fd(&channel->report_fd);
 	close_fd(&channel->verdict_fd);
 	close_fd(&channel->numbers_fd);
@@ -252,7 +252,7 @@ int init_channel_verdict(const struct init_channel *channel, enum avc_verdict_ki
 {
 	const struct avc_verdict verdict = { .seq = channel->death, .kind = kind };
 
-	/* A reader that is gone raises SIGPIPE, which this thread has blocked. */
+	/* Without a reader this raises SIGPIPE, which this thread has blocked. */
 	if (write(channel->verdict_fd, &verdict, sizeof verdict) != sizeof verdict)
 		return fail_errno(err, channel->init, "tell init", "write", "init does not listen");
 	return 0;
@@ -276,7 +276,8 @@ void init_channel_kill_lost(const struct init_channel *channel,
 	pid_t children[CHILDREN_MAX];
 	bool any;
 
-	/* One that was just cloning, or was the parent of another, leaves that behind. */
+	/* A killed process leaves behind the child that it was just cloning, and its other
+	 * children. */
 	do {
 		const int count = proc_children(channel->init, children, CHILDREN_MAX);
 
@@ -289,19 +290,18 @@ void init_channel_kill_lost(const struct init_channel *channel,
 	} while (any);
 }
 
-/* What can still touch what the app shares with others: not yet on its way out, or one of its
- * threads is not. */
+/* Can still use what the app shares with others: it, or one of its threads, is not exiting yet. */
 static bool may_run(const struct proc_stat *stat)
 {
 	return (stat->state != 'Z' && stat->state != 'X') || stat->threads > 1;
 }
 
-/* A child of init's, if it is one still: 1 it runs, and has been sent SIGKILL; 0 it is a zombie; -1
- * it is none. */
+/* A child of init: 1 it runs, and has been sent SIGKILL; 0 it is a zombie; -1 it is no child of
+ * init. */
 static int kill_leftover(const struct init_channel *channel, pid_t pid)
 {
 	struct proc_stat stat;
-	/* First: then it stands for the process that is looked at, whoever has the number later. */
+	/* First: then it refers to the process that is checked, even if the PID is reused later. */
 	int pidfd = proc_pidfd_open(pid), result = -1;
 
 	if (proc_stat(pid, &stat) == 0 && stat.parent == channel->init)
@@ -320,7 +320,7 @@ int init_channel_kill_leftovers(struct init_channel *channel,
 	uint64_t alive_ns = start;
 	pid_t alive;
 
-	/* What a killed process leaves becomes init's child in its turn. */
+	/* The children of a killed process become init's in turn. */
 	for (;;) {
 		pid_t children[CHILDREN_MAX];
 		const int count = proc_children(channel->init, children, CHILDREN_MAX);
@@ -333,14 +333,14 @@ int init_channel_kill_leftovers(struct init_channel *channel,
 						 ? -1
 						 : kill_leftover(channel, children[i]);
 
-			/* Its number is not free before init has waited for it. */
+			/* Its PID is not free before init has reaped it. */
 			any |= runs >= 0;
 			if (runs > 0) {
 				alive = children[i];
 				alive_ns = now;
 			}
 		}
-		/* A zombie's number may be needed, and may be not: that shows soon enough. */
+		/* A zombie's PID may be needed or not: that shows later. */
 		if (!any || now - alive_ns > LEFTOVERS_NS)
 			return 0;
 		if (alive && now - start > LEFTOVERS_ALIVE_NS)

@@ -2,10 +2,9 @@
  *
  * The next PID of another PID namespace.
  *
- * /proc/sys/kernel/ns_last_pid acts on the namespace of the task that writes it, so
- * somebody has to be inside: avckpt-pid (lastpid/lastpid.c), for the length of one restore,
- * with nothing of ours.  It is started ahead of time, outside, for that takes longer than
- * what it does.
+ * /proc/sys/kernel/ns_last_pid acts on the namespace of the task that writes it, so a task has to
+ * be inside: avckpt-pid (lastpid/lastpid.c), for the duration of one restore, sharing nothing with
+ * us. It is started ahead of time, outside, because that takes longer than its work.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -25,12 +24,12 @@
 #include "syscall.h"
 #include "trace.h"
 
-/* Its program, as the Makefile has built it. */
+/* Its program, built by the Makefile. */
 __asm__(".pushsection .rodata\n"
 	"lastpid_program: .incbin \"avckpt-pid\"\n"
 	"lastpid_program_end:\n"
 	".popsection\n");
-/* Hidden, or aarch64's linker finds both by one entry of its table. */
+/* Hidden; otherwise aarch64's linker resolves both through one GOT entry. */
 #define HIDDEN __attribute__((visibility("hidden")))
 extern const uint8_t lastpid_program[] __asm__("lastpid_program") HIDDEN;
 extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end") HIDDEN;
@@ -39,7 +38,7 @@ extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end") HIDDEN
 #define MFD_EXEC 0x10U /* since Linux 6.3 */
 #endif
 #define STACK_BYTES 16384
-#define HIGH_FD 16 /* above those that it gets                                       */
+#define HIGH_FD 16 /* above those that it is given */
 #define ENGINE_SPINS 100
 #define SLICE_NS (20 * (long)NS_PER_MS)
 #define END_MS 1000
@@ -91,7 +90,7 @@ struct birth {
 	uint8_t stack[STACK_BYTES] __attribute__((aligned(16)));
 };
 
-/* In the new task, which has our memory until it executes its program, and we wait. */
+/* Runs in the new task, which shares our memory until it executes its program, while we wait. */
 #if defined(__SANITIZE_ADDRESS__)
 __attribute__((no_sanitize("address", "undefined")))
 #endif
@@ -116,7 +115,7 @@ become(void *arg)
 	return 1;
 }
 
-/* Nobody can write to it, not even through /proc/PID/exe.  -1 with errno. */
+/* Sealed: it cannot be written even through /proc/PID/exe. -1 with errno. */
 static int sealed_program(void)
 {
 	const size_t bytes = (size_t)(lastpid_program_end - lastpid_program);
@@ -131,7 +130,7 @@ static int sealed_program(void)
 	return fd;
 }
 
-/* Nobody can take it from under us. */
+/* It cannot be truncated under us. */
 static int shared_page(struct lastpid_page **page)
 {
 	int fd = memfd_create("avckpt-pid", MFD_CLOEXEC | MFD_ALLOW_SEALING);
@@ -184,7 +183,7 @@ static int give_birth(struct last_pid *helper, struct birth *birth, int init_pid
 		return fail_errno(err, 0, "restore", "socketpair", "no descriptors");
 	helper->socket = ends[0];
 	birth->fd[LASTPID_SOCKET] = ends[1];
-	/* No exit signal: nobody but us is to hear of it. */
+	/* No exit signal: its exit concerns only us. */
 	helper->task = clone(become, birth->stack + STACK_BYTES, CLONE_VM | CLONE_VFORK, birth);
 	if (helper->task < 0) {
 		helper->task = 0;
@@ -198,8 +197,8 @@ static int give_birth(struct last_pid *helper, struct birth *birth, int init_pid
 	return 0;
 }
 
-/* What is in the container's namespace does not outlive the one outside: it has asked to be
- * killed with it, unless it was taken over before it could. */
+/* The process inside does not outlive the one outside: it has set PR_SET_PDEATHSIG, unless it was
+ * taken over before it could. */
 static void kill_inside(const struct last_pid *helper)
 {
 	pid_t children[4];
@@ -209,7 +208,7 @@ static void kill_inside(const struct last_pid *helper)
 		int pidfd = proc_pidfd_open(children[i]);
 		struct proc_stat stat;
 
-		/* Still its child: that is whom the pidfd stands for. */
+		/* Still its child: the pidfd refers to it. */
 		if (pidfd >= 0 && proc_stat(children[i], &stat) == 0 && stat.parent == helper->task)
 			syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
 		close_fd(&pidfd);
@@ -219,12 +218,12 @@ static void kill_inside(const struct last_pid *helper)
 static void helper_end(struct last_pid *helper)
 {
 	struct pollfd ending = { .fd = helper->pidfd, .events = POLLIN };
-	/* One that serves and was not stopped has written nothing, and the slots may be gone. */
+	/* One that was serving and not stopped has written nothing, and the slots may be gone. */
 	const bool unused = helper->slot && !helper->page->stop;
 
 	if (helper->task && (unused || helper->pidfd < 0 || poll(&ending, 1, END_MS) != 1)) {
 		kill_inside(helper);
-		kill(helper->task, SIGKILL); /* our child, not reaped: the number is its own */
+		kill(helper->task, SIGKILL); /* our unreaped child: the PID is still its own */
 	}
 	if (helper->task)
 		while (waitpid(helper->task, NULL, __WALL | __WNOTHREAD) < 0 && errno == EINTR)
@@ -252,7 +251,7 @@ static struct last_pid *helper_new(int init_pidfd, struct avc_error *err)
 	result = give_birth(helper, birth, init_pidfd, err);
 	birth_free(birth);
 	if (result) {
-		close_fd(&helper->socket); /* it ends, if it is there */
+		close_fd(&helper->socket); /* it exits, if it is there */
 		helper_end(helper);
 		return NULL;
 	}
@@ -268,7 +267,7 @@ void last_pid_prepare(int init_pidfd)
 	struct avc_error later = { 0 };
 
 	if (!waiting)
-		waiting = helper_new(init_pidfd, &later); /* last_pid_start() tells why not */
+		waiting = helper_new(init_pidfd, &later); /* last_pid_start() reports why not */
 }
 
 void last_pid_forget(void)
@@ -313,7 +312,7 @@ static int send_slots(struct last_pid *helper, const struct last_pid_slot *slot,
 	return sendmsg(helper->socket, &head, MSG_NOSIGNAL) == (ssize_t)sizeof message ? 0 : -1;
 }
 
-/* It has to get a CPU when we do. */
+/* It needs a CPU as urgently as we do. */
 static void lend_priority(const struct last_pid *helper)
 {
 	struct sched_param own;
@@ -375,7 +374,7 @@ static void wake(uint32_t *word)
 	syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
-/* Until *word is what the helper is to make of it; false: not within `ns`, or it has ended. */
+/* Waits until the helper has set *word as wanted; false: not within `ns`, or it has exited. */
 static bool await_word(const struct last_pid *helper, uint32_t *word, uint32_t wanted, uint64_t ns)
 {
 	const uint64_t end = now_ns() + ns;
@@ -415,7 +414,7 @@ int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err)
 	return 0;
 }
 
-/* It may be asleep on the word of the slot that it serves.  Woken up it has nothing to write. */
+/* It may be asleep on the word of the slot that it serves. When woken it has nothing to write. */
 static void rouse(struct inj_slot *slot)
 {
 	slot->last_pid = 0;

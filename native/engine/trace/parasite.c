@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The parasite as the engine sees it (parasite/parasite.h says what it is), and code run
- * in a stopped task on it.
+ * The engine's side of the parasite (see parasite/parasite.h), and running its code in a stopped
+ * task.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -47,8 +47,7 @@ size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threa
 	return parasite->bytes;
 }
 
-/* Memory of ours, and of nobody else, until it is handed out: it can neither be taken away from
- * under us (SIGBUS) nor grow. */
+/* Private memory until we pass it on, which can neither be truncated under us (SIGBUS) nor grow. */
 static int make_memory(size_t bytes)
 {
 	int fd = memfd_create(PARASITE_NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING | MFD_NOEXEC_SEAL_);
@@ -61,8 +60,8 @@ static int make_memory(size_t bytes)
 	return fd;
 }
 
-/* Read-only: who has it like this cannot map it for writing; kernels before 6.7 let nobody map
- * by any other descriptor what is sealed for good. */
+/* Read-only: this descriptor cannot be mapped for writing; and kernels before 6.7 refuse shared
+ * mappings of a write-sealed memfd by any other descriptor. */
 static int open_read_only(int fd)
 {
 	char path[32];
@@ -71,7 +70,7 @@ static int open_read_only(int fd)
 	return open(path, O_RDONLY | O_CLOEXEC);
 }
 
-/* The code is the same in every process, and nobody can write it: one for all. */
+/* The code is the same in every process, and sealed: one memfd for all. */
 static pthread_once_t code_once = PTHREAD_ONCE_INIT;
 static int code_fd = -1;
 
@@ -182,8 +181,8 @@ void call_begin(struct inj_call *call, enum inj_after after)
 
 struct inj_syscall *call_append(struct inj_call *call, long nr, const uint64_t arg[6])
 {
-	/* The parasite is the app's to scribble on, and its other threads run while one of them is
-	 * asked: not even a number that was written just now is believed. */
+	/* The app can overwrite the parasite, and its other threads run while one is queried: not
+	 * even a value just written is trusted. */
 	const uint32_t count = __atomic_load_n(&call->count, __ATOMIC_RELAXED);
 	const uint32_t i = count < INJ_CALLS_MAX ? count : INJ_CALLS_MAX - 1;
 	struct inj_syscall *s = &call->call[i];
@@ -200,7 +199,7 @@ int parasite_will(struct process *process, long nr, const uint64_t arg[6])
 	const struct thread *thread = thread_find(process, process->pid);
 	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
 
-	/* Supervised, its filters would judge what it does without us. */
+	/* If supervised, its filters would apply to what it does without us. */
 	if (!thread || !thread->borrowed || i >= INJ_WILLS_MAX ||
 	    process->parasite.seccomp == SECCOMP_SUPERVISED)
 		return -1;
@@ -221,12 +220,11 @@ void parasite_will_done(struct process *process)
 		__atomic_store_n(&call->wills, i - 1, __ATOMIC_RELEASE);
 }
 
-/* A thread of the app has others waiting for it, and goes home after INJ_PARK_MS.
- * Templates and holders stay, and a template that waits for a CPU is no reason to
- * restore an older one.
+/* Other threads wait for a thread of the app, and it returns after INJ_PARK_MS. Templates and
+ * holders stay, and a template that waits for a CPU is no reason to restore an older one.
  *
- * A task that is killed never gets done: to be noticed at once, for its process
- * cannot be reaped before we have. */
+ * A task that is killed never completes: this must be noticed at once, because its process cannot
+ * be reaped before we have. */
 static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct avc_error *err)
 {
 	const struct timespec slice = { .tv_nsec = 500000 };
@@ -237,7 +235,7 @@ static int wait_word(struct inj_call *call, uint32_t *word, pid_t tid, struct av
 		struct stop stop;
 
 		heartbeat();
-		/* One that is supervised stops all the time. */
+		/* A supervised task stops at every call. */
 		if (!supervised)
 			syscall(SYS_futex, word, FUTEX_WAIT, 0, &slice, NULL, 0);
 		if (__atomic_load_n(word, __ATOMIC_ACQUIRE))
@@ -302,8 +300,8 @@ int parasite_run_to_pause(pid_t tid, struct inj_call *call, struct avc_error *er
 int parasite_halt(pid_t tid, struct inj_call *call, struct avc_error *err)
 {
 	if (wait_word(call, &call->done, tid, err)) {
-		/* Without a stop of its own it would go home and stay a tracee for ever;
-		 * now it stops as soon as it gets to run, and straggle() sends it home. */
+		/* Without a stop of its own it would return and stay a tracee forever; now it stops
+		 * as soon as it gets to run, and straggle() releases it. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		return -1;
 	}
@@ -332,7 +330,7 @@ int parasite_run(pid_t tid, struct inj_call *call, struct avc_error *err)
 	return parasite_start(tid, err) ? -1 : parasite_finish(tid, call, err);
 }
 
-/* It has made all its calls and not stopped: a limit of processes, or of memory. */
+/* It has made all its calls without a clone event: a limit on processes or memory. */
 static int clone_refused(pid_t tid, const struct inj_call *call, struct avc_error *err)
 {
 	int64_t result = 0;
@@ -370,8 +368,8 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 					    "not done in time");
 			return clone_refused(tid, call, err);
 		default:
-			/* SIGSTOP, SIGCONT and job control make stops of their own
-			 * (ptrace(2), PTRACE_EVENT_STOP). */
+			/* SIGSTOP, SIGCONT and job control cause stops of their own (ptrace(2),
+			 * PTRACE_EVENT_STOP). */
 			if (seccomp_go_on(tid, &stop))
 				return fail_errno(err, tid, "clone", "ptrace(CONT)", "it has gone");
 		}
@@ -412,12 +410,12 @@ int parasite_own(const struct parasite *parasite, pid_t tid)
 	return ptrace(PTRACE_SETOPTIONS, tid, NULL, options_of(parasite, true)) ? -1 : 0;
 }
 
-/* How the thread is going to be let run: it is borrowed next. */
+/* Decides how the thread will be resumed: it is borrowed next. */
 static int look_at_seccomp(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	struct parasite *parasite = &process->parasite;
 
-	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as a checkpoint has found */
+	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as found by a checkpoint */
 		thread->seccomp = SECCOMP_SUPERVISED;
 	if (seccomp_look(thread->tid, process->plain_filters, &thread->filters_known,
 			 &thread->seccomp))
@@ -448,7 +446,7 @@ int parasite_check(struct process *process, pid_t tid, struct avc_error *err)
 	return 0;
 }
 
-/* A holder has the memory of the program that it was made in. */
+/* A holder has the memory of the program in which it was made. */
 static bool has_memory_of_holder(const struct process *process)
 {
 	return process->holder && proc_same_memory(process->pid, process->holder);
@@ -460,13 +458,12 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
 		return -1;
 	if (!has_memory_of_holder(process) && parasite_check(process, thread->tid, err))
 		return -1;
-	/* Homes are places of the app's, never of a parasite that will be taken away. */
+	/* A thread must return into the app, never into a parasite that will be unmapped. */
 	if (parasite_is_old(process, arch_pc(&thread->regs)))
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "stop", "",
 			    "still on its way home from a guard that died");
-	/* The kernel forgets a restartable sequence as soon as the thread is
-	 * seen elsewhere: it has to go on where the kernel would send it.  There
-	 * are no system calls in one. */
+	/* The kernel forgets a restartable sequence as soon as the thread is outside of it: it has
+	 * to continue where the kernel would send it. There are no system calls in one. */
 	if (thread->call.nr < 0)
 		thread_fix_rseq(process->mem_fd, thread);
 	thread->vetted = true;
@@ -487,9 +484,9 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	home = thread->regs;
 	arch_resume(&home);
 	arch_home_set(&control->home, &home, thread->sigmask);
-	/* Registers first: if we die between the two, the thread enters the parasite with its
-	 * own mask, and blocks signals by itself (inj_enter()).  The other way round it would
-	 * be in the app with every signal blocked, for ever. */
+	/* Registers first: if we die between the two, the thread enters the parasite with its own
+	 * mask, and blocks signals by itself (inj_enter()). In the other order it would be in the
+	 * app with every signal blocked, forever. */
 	if (look_at_seccomp(process, thread, err) ||
 	    send_in(&process->parasite, thread->tid, false, &thread->regs, &control->runner, err))
 		return -1;
@@ -512,22 +509,22 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 
 	if (arch_regs_get(thread->tid, &now))
 		return fail_errno(err, thread->tid, "give back", "ptrace(GETREGS)", "it has gone");
-	/* Of a guard that did not get a CPU for so long (park_ms) it thinks that it has died: it
-	 * has gone home by itself, and its registers are newer than those that we know. */
+	/* If the guard gets no CPU for this long (park_ms), the thread takes it for dead: it has
+	 * returned by itself, and its registers are newer than ours. */
 	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
 		thread->borrowed = false;
 		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}
-	/* The mask before the registers, for the same reason.  But not while it has the stack of
-	 * the parasite, on which a handler would run if we died: it is sent home first, where it
-	 * would get with any mask. */
+	/* The mask before the registers, for the same reason. But not while it is on the parasite's
+	 * stack, where a handler would run if we died: it is sent to inj_go_home first, which it
+	 * would reach with any mask. */
 	arch_enter(&now, &thread->regs, homeward(thread), 0, 0);
 	if ((thread->borrowed_for && arch_regs_set(thread->tid, &now)) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
-	/* Strict mode is in force again when it is let go: nothing else comes in between. */
+	/* Strict mode is in force again when it is resumed: nothing happens in between. */
 	seccomp_let_be(thread->tid);
 	thread->borrowed = false;
 	return 0;

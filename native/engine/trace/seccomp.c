@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Seccomp filters stay in force over injected code.  Those of the container let pass what it does;
- * so do most that applications give themselves.  Where they do not, injected code is *supervised*:
- * its tracer stops it at the entry to every system call, and suspends the filters
- * (PTRACE_O_SUSPEND_SECCOMP) for that call alone, if it is one that injected code makes.  Nothing
- * that the application has written is asked for that.  At the entry the registers are the kernel's:
- * what the application does to the parasite, to its stack or its lists meanwhile, or puts in its
- * place, leads to calls that its own filter judges, or to some of those below.
+ * Seccomp filters stay in force over injected code. The container's allow what it calls; so do most
+ * that applications install. Where they do not, injected code is *supervised*: its tracer stops it
+ * at the entry to every system call, and suspends the filters (PTRACE_O_SUSPEND_SECCOMP) for that
+ * call alone, if it is one that injected code makes. This decision uses nothing that the
+ * application can write. At the entry the registers are fixed in the kernel: whatever the
+ * application does to the parasite, its stack or its lists, or maps in its place, leads to calls
+ * that its own filter checks, or to some of those below.
  *
  * A task without any filter can only be in strict mode.  That is suspended for the first
  * checkpoint, and supervised from then on.
@@ -30,15 +30,15 @@
 #define FILTERS_MAX 16
 #define SUPERVISED_MAX 64
 
-/* A system call, with the first argument where a filter is likely to look at it. */
+/* A system call, with the first argument where a filter is likely to check it. */
 struct kind {
 	long nr;
-	uint64_t arg; /* ANY: it differs                                       */
+	uint64_t arg; /* ANY: it varies */
 };
 
-/* What injected code calls. */
+/* The calls of injected code. */
 static const struct kind wanted[] = {
-	/* to get about */
+	/* control */
 	{ SYS_futex, ANY },
 	{ SYS_ppoll, ANY },
 	{ SYS_nanosleep, ANY },
@@ -57,7 +57,7 @@ static const struct kind wanted[] = {
 			     CLONE_SYSVSEM | CLONE_SETTLS },
 	{ SYS_setpgid, ANY },
 	{ SYS_setsid, ANY },
-	/* to ask */
+	/* queries */
 	{ SYS_prctl, PR_GET_TID_ADDRESS },
 	{ SYS_prctl, PR_GET_NAME },
 	{ SYS_prctl, PR_GET_DUMPABLE },
@@ -108,8 +108,8 @@ static const struct kind wanted[] = {
 	{ SYS_setsockopt, ANY },
 };
 
-/* And a process that is being put together: one with filters of its own is supervised then in any
- * case (sandbox.c). */
+/* And those of a process being restored: one with its own filters is then supervised in any case
+ * (sandbox.c). */
 static const struct kind wanted_to_restore[] = {
 	{ SYS_prctl, PR_SET_DUMPABLE },
 	{ SYS_prctl, PR_SET_KEEPCAPS },
@@ -157,8 +157,8 @@ struct program {
 	long count;
 };
 
-/* The classic BPF of seccomp(2), on arguments of which only the number, the architecture and, if
- * it is not ANY, the first one are known.  Whoever looks at anything else may say anything. */
+/* The classic BPF of seccomp(2), with only the number, the architecture and, if it is not ANY, the
+ * first argument known. A filter that reads anything else may return anything. */
 #define DEPENDS SECCOMP_RET_KILL_PROCESS
 
 static bool load(uint32_t at, long nr, uint64_t arg, uint32_t *value)
@@ -270,7 +270,7 @@ static uint32_t run(const struct program *p, long nr, uint64_t arg)
 	return DEPENDS;
 }
 
-/* Whether it keeps a call from being made, and how.  The worst of several filters counts. */
+/* Whether it prevents a call, and how. The most severe of several filters counts. */
 enum verdict { PASSES, REFUSES, BARS };
 
 static enum verdict verdict(const struct program *p, long nr, uint64_t arg)
@@ -286,7 +286,7 @@ static enum verdict verdict(const struct program *p, long nr, uint64_t arg)
 	}
 }
 
-/* What the container's own filters refuse, the app cannot have done either, so nobody needs it. */
+/* The app cannot have made a call that the container's own filters refuse, so it is not needed. */
 static bool bars(const struct program *p, bool containers)
 {
 	for (size_t i = 0; i < COUNT(wanted); i++) {
@@ -308,7 +308,7 @@ int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_w
 	struct program p;
 	uint32_t i;
 
-	/* Filters come, and never go. */
+	/* Filters are only ever added. */
 	if (*way == SECCOMP_SUPERVISED ||
 	    (*known && filter_get(tid, *known, NULL) < 0 && errno == ENOENT))
 		return 0;
@@ -349,7 +349,7 @@ int seccomp_supervise(pid_t tid, pid_t inside, long options)
 	int i = find(tid);
 
 	if (i < 0 && supervised.count == SUPERVISED_MAX) {
-		/* Those that ended without a word make room. */
+		/* Makes room by removing those that have exited unnoticed. */
 		for (uint32_t k = supervised.count; k-- > 0;)
 			if (!tracee_is_ours(supervised.task[k].tid))
 				supervised.task[k] = supervised.task[--supervised.count];
@@ -385,7 +385,7 @@ static bool is_among(const struct kind *kinds, size_t count, long nr, uint64_t a
 	return false;
 }
 
-/* Whether injected code makes such a call; `inside` is the process it is in, as that knows it. */
+/* Whether injected code makes such a call; `inside` is its process's own PID. */
 static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 {
 	const long nr = arch_syscall_nr(regs);
@@ -400,9 +400,9 @@ static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 		       arch_syscall_arg(regs, 1) == TIOCSCTTY;
 	case SYS_mmap:
 	case SYS_pkey_mprotect:
-	case SYS_mprotect: /* new code is for the porter to bring (infect.c) */
+	case SYS_mprotect: /* only the porter maps code (infect.c) */
 		return !inside || !(arch_syscall_arg(regs, 2) & PROT_EXEC);
-	case SYS_userfaultfd: /* in a table of its own, for the guard to take (tracker.c) */
+	case SYS_userfaultfd: /* in its own descriptor table, for the guard to take (tracker.c) */
 		return inside == SECCOMP_WATCHER;
 	case SYS_rt_sigqueueinfo:
 	case SYS_rt_tgsigqueueinfo:
@@ -419,7 +419,7 @@ void seccomp_at_call(pid_t tid, pid_t inside, long options)
 
 	if (tracee_enters_call(tid) && arch_regs_get(tid, &regs) == 0 && is_wanted(&regs, inside))
 		options |= PTRACE_O_SUSPEND_SECCOMP;
-	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* it was killed: no matter */
+	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* fails if it was killed */
 }
 
 long seccomp_go_on(pid_t tid, const struct stop *stop)

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Calls that a restored process makes while it is put together, as lists in its
- * slot of the parasite (struct inj_setup).  They are made up with the generation, when
- * the app runs again, so that a restore has nothing left to think about.
+ * Calls that a process makes while it is restored, as lists in its slot of the parasite (struct
+ * inj_setup). They are built with the generation, when the app runs again, so that a restore only
+ * has to execute them.
  */
 #include <string.h>
 
@@ -83,8 +83,8 @@ int setup_end(const struct setup *setup, pid_t pid, struct avc_error *err)
 	return 0;
 }
 
-/* Where the engine sees what the process calls `address`; the parasite is the app's to
- * scribble on, so nothing in there is believed. */
+/* Our address of what the process has at `address`; the app can overwrite the parasite, so its
+ * contents are not trusted. */
 static const struct inj_setup *local(const struct parasite *parasite, avc_remote address)
 {
 	if (address < parasite->base ||

@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A task that a restored process has forked, at rest in a parasite: it makes the system calls
- * that it is given, a list at a time, and gets descriptors over a socket.
+ * A task that a restored process has forked, stopped in a parasite: it makes the system calls that
+ * it is given, a batch at a time, and gets descriptors over a socket.
  *
- * It stops by itself at the end of a list, by a signal to itself that we take away.  To be woken
- * up by it and to stop it then would be two turns instead of one, and turns are most of what a
- * small process costs.  Who dies with us (PTRACE_O_EXITKILL) can be left to such a stop; a holder
- * or a thread of the app's could not.
+ * It stops by itself at the end of a batch, by a signal to itself that we suppress. A wake-up of
+ * the guard and then a stop would take two wake-ups instead of one, and wake-ups are most of the
+ * cost of a small process. This is only safe for tasks that die with us (PTRACE_O_EXITKILL), not
+ * for a holder or a thread of the app.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -23,8 +23,8 @@
 	8 /* syscall_batch_add() is used for so many in a row at most, syscall_batch_ask() for more */
 #define NOT_MADE INT64_MIN
 
-/* The list of calls is where files_restore.c has its own, which is not in use any more;
- * what they refer to is behind it. */
+/* The batch uses the memory of files_restore.c's list, which is no longer in use; its arguments
+ * follow it. */
 void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *parasite,
 			 uint32_t slot)
 {
@@ -55,14 +55,14 @@ void syscall_batch_soften(struct syscall_batch *batch, const char *problem)
 		batch->soft[batch->softs++] = (struct soft){ batch->listed - 1, problem };
 }
 
-/* Its own SIGSTOP has served: nobody is to be told of it again (tracee_wait). */
+/* Its own SIGSTOP has done its work: it must not be reported again (tracee_wait). */
 static int taken(pid_t pid)
 {
 	(void)waitpid(pid, NULL, __WALL | __WNOTHREAD | WNOHANG);
 	return 0;
 }
 
-/* At the end of its list; somebody else may have a signal for it, too. */
+/* At the end of its batch; it may have got a signal from another process, too. */
 static int await_end(const struct syscall_batch *batch, const struct inj_syscall *last,
 		     struct avc_error *err)
 {
@@ -85,7 +85,7 @@ static int await_end(const struct syscall_batch *batch, const struct inj_syscall
 			return fail(err, AVC_GONE, 0, batch->pid, "run injected code", "",
 				    "it has ended");
 		case STOP_DEADLINE:
-			/* Some security modules let nobody send signals (LSM, task_kill). */
+			/* Some security modules deny sending signals (LSM, task_kill). */
 			if (__atomic_load_n(&batch->call->done, __ATOMIC_ACQUIRE))
 				return parasite_finish(batch->pid, batch->call, err);
 			return fail(err, AVC_DEADLINE, 0, batch->pid, "run injected code", "",
@@ -187,7 +187,7 @@ int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err)
 	return result;
 }
 
-/* One of any number; those before it are made when there is no more room. */
+/* One of any number; earlier ones are flushed when there is no more room. */
 int syscall_batch_append_any(struct syscall_batch *batch, struct avc_error *err, long nr,
 			     const uint64_t arg[6])
 {
@@ -227,7 +227,7 @@ static int fetch(const struct syscall_batch *batch, int fd, struct avc_error *er
 	return ours;
 }
 
-/* What is between those that are kept. */
+/* Closes the gaps between those that are kept. */
 static int close_others(struct syscall_batch *batch, uint64_t first, const struct fd_table *table,
 			struct avc_error *err)
 {
@@ -243,7 +243,7 @@ static int close_others(struct syscall_batch *batch, uint64_t first, const struc
 	return syscall_batch_ask(batch, err, SYS_close_range, first, ~0u);
 }
 
-/* Descriptor 0 is a socket of which we have the other end. */
+/* Descriptor 0 is a socket whose other end is ours. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
 				  const struct fd_table *table, struct avc_error *err)
 {
@@ -299,10 +299,10 @@ int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_chan
 	return syscall_batch_flush(batch, err);
 }
 
-/* It comes to the lowest number that is free, by the socket that has number `socket` there. */
+/* It gets the lowest free number, over the socket that has number `socket` there. */
 static int hand_over(struct syscall_batch *batch, int socket, int fd, struct avc_error *err)
 {
-	/* What is not received yet waits in the socket. */
+	/* Descriptors not yet received wait in the socket. */
 	if (fd_send(batch->socket, fd) &&
 	    (errno != EAGAIN || syscall_batch_flush(batch, err) || fd_send(batch->socket, fd)))
 		return fail_errno(err, batch->pid, "restore", "sendmsg",
@@ -338,14 +338,14 @@ int syscall_batch_change_parasite(struct syscall_batch *batch, const struct proc
 	return 0;
 }
 
-/* In order; what is received comes to the lowest number that is free.  The last of the calls
- * are made with what comes next. */
+/* In order, because received descriptors get the lowest free number. The last calls are flushed
+ * with the next batch. */
 int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *table,
 			    struct avc_error *err)
 {
 	int socket = 0, lowest = 0;
 
-	/* Out of the way, between or behind those that are wanted. */
+	/* Moved to a number that is not wanted. */
 	for (uint32_t i = 0; i < table->count; i++)
 		socket += table->entry[i].fd == socket;
 	if (socket) {
@@ -362,7 +362,7 @@ int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *
 				return -1;
 			continue;
 		}
-		/* The lowest number that is free: not those before it, nor what is kept. */
+		/* The lowest free number: neither an earlier one nor a kept one. */
 		for (;; lowest++) {
 			while (at < table->count && table->entry[at].fd < lowest)
 				at++;

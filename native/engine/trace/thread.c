@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A thread of the app: stopped, waited for, let go.
+ * A thread of the app: stop, await, release.
  */
 #include <errno.h>
 #include <sched.h>
@@ -43,8 +43,8 @@ void threads_forget_unseen(struct process *process)
 	process->thread_count = kept;
 }
 
-/* 0: it is seized after all.  EPERM is also what an exiting task answers (kernel/ptrace.c, ptrace_attach); it
- * has no memory any more, or is a zombie. */
+/* 0: it is seized after all. EPERM is also the result for an exiting task (kernel/ptrace.c,
+ * ptrace_attach), which has no memory any more, or is a zombie. */
 static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 {
 	const int errnum = errno;
@@ -58,7 +58,7 @@ static int seize_failed(pid_t pid, pid_t tid, struct avc_error *err)
 			return fail(err, AVC_BUSY, errnum, pid, "stop", "ptrace(SEIZE)",
 				    "it is being traced by process %d", status.tracer);
 	}
-	/* Its tracer may have gone just now. */
+	/* Its tracer may have just exited. */
 	if (errnum == EPERM && ptrace(PTRACE_SEIZE, tid, NULL, (long)TRACE_OPTIONS_APP) == 0)
 		return 0;
 	errno = errnum;
@@ -75,8 +75,8 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 			return fail(err, AVC_GONE, ESRCH, thread->tid, "stop", "ptrace(SEIZE)",
 				    "it has ended");
 		errnum = errno;
-		/* One that a thread of ours has just brought forth is our tracee already,
-		 * though we may not have heard of it yet. */
+		/* A thread just created by a traced one is our tracee already, though it may not
+		 * have been reported yet. */
 		if (errnum == EPERM && tracee_is_ours(thread->tid)) {
 			thread->attached = true; /* and comes with its own stop */
 			thread->stopped = false;
@@ -93,7 +93,7 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 	return 0;
 }
 
-/* A process or thread that a thread of ours has brought forth meanwhile. */
+/* A process or thread created by a traced thread meanwhile. */
 static struct thread *adopt(struct process *process, pid_t tid, struct avc_error *err)
 {
 	struct thread *born = thread_find(process, tid);
@@ -107,7 +107,7 @@ static struct thread *adopt(struct process *process, pid_t tid, struct avc_error
 	return born;
 }
 
-/* Whether the call that it comes from has brought forth somebody that may be a tracee of ours
+/* Whether the call it returns from has created a task that may be our tracee
  * (tracee_release_strangers()). */
 static bool has_stranger(const struct process *process, const struct thread *thread)
 {
@@ -116,7 +116,7 @@ static bool has_stranger(const struct process *process, const struct thread *thr
 
 	if ((nr != SYS_clone && nr != SYS_clone3) || arch_syscall_result(&thread->regs) <= 0)
 		return false;
-	/* struct clone_args has them first. */
+	/* They come first in struct clone_args. */
 	if (nr == SYS_clone3 &&
 	    pread(process->mem_fd, &flags, sizeof flags, (off_t)flags) != sizeof flags)
 		return false;
@@ -126,12 +126,12 @@ static bool has_stranger(const struct process *process, const struct thread *thr
 int thread_await(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	pid_t child = 0;
-	/* It may be waiting for one that we do not know of (vfork(2)). */
+	/* It may be waiting for a child unknown to us (vfork(2)). */
 	const enum stop_kind kind = tracee_await_while(thread->tid, tracee_release_strangers,
 						       &child, err);
 
-	/* Whatever came of it: its new threads are found by the next walk, attached
-	 * already; new processes are not, which is how freeze_tree() tells them. */
+	/* In any case, its new threads are found by the next walk, already attached; new processes
+	 * are not, which is how freeze_tree() distinguishes them. */
 	if (child && !adopt(process, child, err))
 		return -1;
 	switch (kind) {
@@ -175,7 +175,7 @@ void thread_release(struct thread *thread)
 		thread->stopped = false;
 		return;
 	}
-	/* SIGKILL has taken it out of its stop: it has to be reaped. */
+	/* SIGKILL has ended its stop: it has to be reaped. */
 	thread->stopped = false;
 }
 
@@ -186,7 +186,7 @@ void thread_let_go(const struct process *process, struct thread *thread)
 	thread_release(thread);
 }
 
-/* True as long as it still has to be waited for. */
+/* True while it still has to be waited for. */
 static bool straggle(struct process *process, struct thread *thread)
 {
 	const pid_t tid = thread->tid;
@@ -194,8 +194,8 @@ static bool straggle(struct process *process, struct thread *thread)
 	struct stop stop = tracee_wait(tid, WNOHANG);
 	struct arch_regs now;
 
-	/* Registers can be read of what is stopped only.  If that is no news, somebody has
-	 * heard of it already, and it would stay so for ever. */
+	/* Registers can only be read of a stopped task. If no event is pending, the stop has been
+	 * consumed already, and it would stay stopped forever. */
 	if (stop.kind == STOP_NONE && arch_regs_get(tid, &now) == 0) {
 		stop = tracee_wait(tid, WNOHANG);
 		if (stop.kind == STOP_NONE)
@@ -204,7 +204,7 @@ static bool straggle(struct process *process, struct thread *thread)
 
 	switch (stop.kind) {
 	case STOP_NONE:
-		/* It may have found home by itself meanwhile, and would never stop again. */
+		/* It may have returned by itself meanwhile, and would never stop again. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		return true;
 	case STOP_DYING:
@@ -216,8 +216,8 @@ static bool straggle(struct process *process, struct thread *thread)
 		thread->borrowed = false;
 		return false;
 	case STOP_FORK:
-		/* A borrowed thread may have found home by itself, and what it starts
-		 * there is the app's: to kill one thread is to kill them all. */
+		/* A borrowed thread may have returned by itself, and what it creates then belongs
+		 * to the app: killing one thread kills them all. */
 		if (thread->borrowed && arch_regs_get(tid, &now) == 0 &&
 		    parasite_contains(&process->parasite, arch_pc(&now)))
 			tracee_kill(stop.message); /* our clone, too late */
@@ -225,7 +225,7 @@ static bool straggle(struct process *process, struct thread *thread)
 			adopt(process, stop.message, &ignored);
 		/* fall through */
 	case STOP_SYSCALL:
-		/* Not a place to change registers: let it come to a better one. */
+		/* Registers cannot be changed at this stop: let it reach another one. */
 		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		seccomp_go_on(tid, &stop);
 		return true;
@@ -233,8 +233,8 @@ static bool straggle(struct process *process, struct thread *thread)
 		break;
 	}
 	if (arch_regs_get(tid, &now) == 0) {
-		/* Not in the middle of its calls: it may still have to put something back
-		 * (MADV_DONTFORK), or to wait for what it brought forth for us, which the app would
+		/* Not in the middle of its calls: it may still have to restore something
+		 * (MADV_DONTFORK), or to reap a task that it created for us, which the app would
 		 * find. */
 		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now)) &&
 		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
@@ -287,9 +287,9 @@ void thread_fix_rseq(int mem_fd, struct thread *thread)
 /* Since Linux 6.4; the headers may be older. */
 #define GET_DISPATCH 0x4211 /* PTRACE_GET_SYSCALL_USER_DISPATCH_CONFIG */
 
-/* Asked before a thread runs anything of ours: while its selector says so, every system call that
- * is not made where it has them made is a SIGSYS (Documentation/admin-guide/
- * syscall-user-dispatch.rst), which is the app's end when all signals are blocked. */
+/* Checked before a thread runs injected code: depending on its selector, every system call from
+ * outside the allowed range raises SIGSYS (Documentation/admin-guide/ syscall-user-dispatch.rst),
+ * which kills the app when all signals are blocked. */
 int thread_check_dispatch(pid_t tid, struct avc_error *err)
 {
 	struct {
