@@ -297,7 +297,7 @@ def test_a_process_that_is_gone_is_no_reason_to_fail(run_dir: Path, process: sub
         (
             b'{"op": "deregister", "version": 1, "id": "%s"}' % ID.encode(),
             1,
-            "0 descriptor(s) wanted with the request, 1",
+            "0 descriptor(s) expected with the request, got 1",
         ),
         (b'{"op": "register", "version": 1, "id": "%s"}' % ID.encode(), 1, "'name' is None"),
     ],

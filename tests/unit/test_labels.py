@@ -38,14 +38,17 @@ def test_a_group_that_goes_back_together() -> None:
     ("labels", "says"),
     [
         ({"avckpt.group": None}, "label avckpt.group.recovery=together: there is no group; add avckpt.group=NAME"),
-        ({"avckpt.tcp": "keep"}, "label avckpt.tcp=keep: what was sent since the checkpoint would be received"),
-        ({"avckpt.tcp": "messages"}, "label avckpt.tcp=messages: what was sent since"),
+        ({"avckpt.tcp": "keep"}, "label avckpt.tcp=keep: a group that recovers together would receive"),
+        ({"avckpt.tcp": "messages"}, "label avckpt.tcp=messages: a group that recovers together would"),
         (
             {"avckpt.interval": "auto"},
             "label avckpt.interval=auto: a group that recovers together needs a fixed interval",
         ),
-        ({"avckpt.deadline": "50ms", "avckpt.deadline.late": "cold"}, "label avckpt.deadline.late=cold: nobody of a"),
-        ({"avckpt.scope": "nodes"}, "label avckpt.scope=nodes: nodes do not go back together"),
+        (
+            {"avckpt.deadline": "50ms", "avckpt.deadline.late": "cold"},
+            "label avckpt.deadline.late=cold: no member of a group that recovers together",
+        ),
+        ({"avckpt.scope": "nodes"}, "label avckpt.scope=nodes: nodes cannot recover together"),
     ],
 )
 def test_what_does_not_go_with_a_return_together(labels: dict[str, str | None], says: str) -> None:

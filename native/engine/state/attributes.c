@@ -1,14 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a thread is to the kernel: scheduling, I/O priority, credentials, prctl(2)
- * settings.
+ * The attributes of a thread: scheduling, I/O priority, credentials, prctl(2) settings.
  *
- * A restored process has what its template has, which is a fork of the main thread:
- * most of it is right by itself.  What is left is
+ * A restored process inherits from its template, which is a fork of the main thread: most
+ * attributes are right without further action.  The rest are
  *   - what fork(2) resets: parent-death signal, child subreaper;
- *   - threads that differ from the main thread: they set themselves up again, but for
- *     scheduling, which a process may be allowed to have and not to set: that is done
- *     from outside.
+ *   - threads that differ from the main thread: they set their attributes again themselves, except
+ *     for scheduling, which a process may have without the right to set it: the guard sets that.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -40,7 +38,7 @@ struct attributes {
 	} thread[]; /* those to be set from outside                            */
 };
 
-/* What the kernel writes where; the rest are results. */
+/* Where the kernel stores answers; the rest are results. */
 struct answers {
 	uint32_t uid[3], gid[3];
 	uint32_t caps[6];
@@ -111,7 +109,7 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	const struct answers *a = out;
 
 	_Static_assert(sizeof *a <= ATTRIBUTES_ASK_BYTES, "room for the answers");
-	memset(c, 0, sizeof *c); /* compared with memcmp() */
+	memset(c, 0, sizeof *c); /* compared by memcmp() */
 	memcpy(c->uid, a->uid, sizeof a->uid);
 	memcpy(c->gid, a->gid, sizeof a->gid);
 	memcpy(c->caps, a->caps, sizeof c->caps);
@@ -143,7 +141,7 @@ uint64_t attributes_read_filters(pid_t tid)
 		const long n = ptrace(PTRACE_SECCOMP_GET_FILTER, tid, i, program);
 
 		if (n <= 0)
-			return sum; /* that was the last one; or it has none */
+			return sum; /* that was the last one; or there is none */
 		for (long k = 0; k < n && k < FILTER_MAX; k++)
 			sum = (sum ^ program[k]) * UINT64_C(0x100000001b3);
 		sum = sum * 31 + (uint64_t)n;
@@ -187,20 +185,20 @@ static bool differ_in_securebits(const struct creds *from, const struct creds *t
 
 static bool raises_ambient(const struct creds *from, const struct creds *to)
 {
-	/* Another user has none. */
+	/* Another user has none of these capabilities. */
 	return to->ambient &&
 	       (to->ambient != from->ambient || memcmp(from->uid, to->uid, sizeof to->uid));
 }
 
-/* A thread that has fewer rights than the main thread, or other ones.  To go on with
- * more than it had would be wrong: these must succeed. */
+/* A thread that has fewer privileges than the main thread, or others.  It must not continue with
+ * more than it had: these calls must succeed. */
 static void lower(const struct creds *from, const struct creds *to, struct setup *setup)
 {
 	const bool uids = memcmp(from->uid, to->uid, sizeof to->uid) != 0;
 	const bool caps = uids || memcmp(from->caps, to->caps, sizeof to->caps) ||
 			  from->bounding != to->bounding || from->ambient != to->ambient ||
 			  differ_in_securebits(from, to) ||
-			  /* The file system's user takes capabilities along, too. */
+			  /* A change of the file-system user changes capabilities, too. */
 			  from->fsuid != to->fsuid;
 	uint32_t bits = from->securebits;
 
@@ -210,7 +208,7 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 	if (memcmp(from->gid, to->gid, sizeof to->gid))
 		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
 				 to->gid[2]);
-	/* Or the capabilities would go with the user. */
+	/* Otherwise the capabilities would be dropped with the user. */
 	if (uids && !(bits & SECBIT_KEEP_CAPS)) {
 		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS, 1);
 		bits |= SECBIT_KEEP_CAPS;
@@ -221,7 +219,7 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 	if ((bits ^ to->securebits) & SECBIT_KEEP_CAPS)
 		setup_add_thread(setup, "prctl(KEEPCAPS)", SYS_prctl, PR_SET_KEEPCAPS,
 				 (to->securebits & SECBIT_KEEP_CAPS) != 0);
-	/* Those that were effective have gone all the same, and are needed once more. */
+	/* The effective ones were cleared anyway, and are needed once more. */
 	if (caps)
 		add_capset(setup, caps_of(from, PERMITTED), caps_of(from, PERMITTED),
 			   caps_of(to, INHERITABLE));
@@ -229,7 +227,7 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 		setup_add_thread(setup, "setfsgid", SYS_setfsgid, to->fsgid);
 	if (from->fsuid != to->fsuid || to->fsuid != to->uid[1])
 		setup_add_thread(setup, "setfsuid", SYS_setfsuid, to->fsuid);
-	/* After what is inheritable, of which nothing may be out of bounds. */
+	/* After the inheritable set, which must stay within the bounding set. */
 	if (from->bounding != to->bounding)
 		setup_add_thread(setup, "prctl(CAPBSET_DROP)", INJ_CAPS_CHANGE, PR_CAPBSET_DROP,
 				 from->bounding & ~to->bounding);
@@ -249,7 +247,7 @@ static void lower(const struct creds *from, const struct creds *to, struct setup
 		setup_add_thread(setup, "prctl(NO_NEW_PRIVS)", SYS_prctl, PR_SET_NO_NEW_PRIVS, 1);
 }
 
-/* Each set of capabilities of `to` within what `from` may have? */
+/* Whether each capability set of `to` is within those of `from`. */
 static bool has_less(const struct creds *from, const struct creds *to)
 {
 	return !(caps_of(to, PERMITTED) & ~caps_of(from, PERMITTED)) &&
@@ -258,7 +256,7 @@ static bool has_less(const struct creds *from, const struct creds *to)
 		 ~(caps_of(from, INHERITABLE) | (caps_of(from, PERMITTED) & from->bounding)));
 }
 
-/* What a thread may do without takes a right to do without it. */
+/* Dropping from these sets takes a capability itself. */
 static bool may_be_lowered(const struct creds *from, const struct creds *to)
 {
 	const bool may = caps_of(from, PERMITTED) >> CAP_SETPCAP & 1;
@@ -267,8 +265,8 @@ static bool may_be_lowered(const struct creds *from, const struct creds *to)
 	       !(from->securebits & SECBIT_NO_CAP_AMBIENT_RAISE && raises_ambient(from, to));
 }
 
-/* What is locked in `from` is locked and as it is in `to`, too, and lower() has no need to change
- * it on the way: nobody may (prctl(2), PR_SET_SECUREBITS and PR_SET_KEEPCAPS). */
+/* What is locked in `from` is locked and equal in `to`, too, and lower() need not change it
+ * temporarily, which is impossible (prctl(2), PR_SET_SECUREBITS and PR_SET_KEEPCAPS). */
 static bool fits_locks(const struct creds *from, const struct creds *to)
 {
 	const uint32_t locks = from->securebits & LOCKS;
@@ -291,7 +289,7 @@ static bool may_take_ids(const uint32_t from[3], const uint32_t to[3])
 	       is_among(to[2], from, from[0]);
 }
 
-/* What lower() does of this must not be refused at a restore, when it is too late. */
+/* Calls of lower() must not be refused at a restore, when it is too late. */
 static bool may_become(const struct creds *from, const struct creds *to)
 {
 	const uint64_t may = caps_of(from, EFFECTIVE), later = caps_of(from, PERMITTED);
@@ -311,7 +309,7 @@ static int refuse(const struct process *process, pid_t inside, const char *has, 
 		    "%s %d has %s the main %s%s", which, inside, has, which, main);
 }
 
-/* A thread that is made by another one gets what it has not from that. */
+/* A new thread cannot gain what its creator lacks. */
 static int set_apart(const struct process *process, pid_t inside, const struct creds *from,
 		     const struct creds *to, struct setup *setup, struct avc_error *err)
 {
@@ -353,7 +351,7 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
 			    const struct thread *t, struct setup *setup, struct avc_error *err)
 {
-	/* One that is not the main process is made from that, as are its threads. */
+	/* Other processes are forked from the main one, and threads created by theirs. */
 	const struct creds *from = process->descendant ? process->forebear : &main_thread->creds;
 	const struct creds *to = &t->creds;
 
@@ -362,10 +360,10 @@ int attributes_setup_thread(const struct process *process, const struct thread *
 	if ((t != main_thread || process->descendant) &&
 	    set_apart(process, t->inside, from, to, setup, err))
 		return -1;
-	/* A process that is made gets its own with what else it has (process_attrs.c). */
+	/* A forked process gets its own in process_attrs.c. */
 	if (to->personality != main_thread->creds.personality)
 		setup_add_thread(setup, "personality", SYS_personality, to->personality);
-	/* After a change of users, which takes it away. */
+	/* After a change of users, which clears it. */
 	if (to->death_signal)
 		setup_add_thread(setup, "prctl(PDEATHSIG)", SYS_prctl, PR_SET_PDEATHSIG,
 				 to->death_signal);
@@ -386,7 +384,7 @@ int attributes_keep(struct image *image, struct avc_error *err)
 	image->attributes = kept;
 	if (!kept)
 		return fail_errno(err, 0, "keep template", "calloc", "out of memory");
-	/* It may die just now: what is restored must not stay the OOM killer's first choice. */
+	/* It may be dying: what is restored must not stay the OOM killer's first choice. */
 	if (proc_read(process->pid, "oom_score_adj", kept->oom_score_adj,
 		      sizeof kept->oom_score_adj) <= 0 &&
 	    !process->descendant) /* else it has its parent's */
@@ -433,8 +431,8 @@ static int put_back(pid_t tid, void *arg)
 	return 0;
 }
 
-/* By the kernel's rules they have what the one had that made them (sched(7), ioprio_set(2)): whom
- * that is right for, and that is nearly everybody, need not be looked for in /proc. */
+/* By the kernel's rules threads inherit these from their creator (sched(7), ioprio_set(2)): where
+ * that is right, as nearly always, the thread need not be looked up in /proc. */
 static bool has_all(const struct attributes *attributes, pid_t pid)
 {
 	struct scheduling is;
@@ -457,7 +455,7 @@ void attributes_put_back(const struct attributes *attributes, pid_t pid, struct 
 		return;
 	dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	if (dirfd < 0)
-		return; /* it has been killed again already */
+		return; /* it has already been killed again */
 	(void)proc_tasks(dirfd, put_back, &search);
 	close(dirfd);
 }

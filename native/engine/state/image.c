@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Which image is whose.
+ * Finding the image of a process.
  */
 #include "state.h"
 

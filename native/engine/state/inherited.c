@@ -1,8 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a fork has by itself, besides memory and descriptors.  A template that is brought up to date
- * instead of being forked anew has it as it was when it was forked: that must be what the process
- * has now.
+ * What a fork inherits besides memory and descriptors.  A template that is updated instead of being
+ * forked again has these as of its fork: they must equal what the process has now.
  */
 #include <fcntl.h>
 #include <signal.h>
@@ -24,7 +23,7 @@
 #define SECOND_LAYOUT_FIELD 45
 #define END_LAYOUT_FIELD 51
 
-/* Where the list stands, with room for what it asks for. */
+/* Memory of the list of calls, with room for its answers. */
 struct list {
 	struct inj_syscall call[INHERITED_SIGNALS + INHERITED_VALUES + 1];
 	uint64_t action[INHERITED_SIGNALS][4];
@@ -121,7 +120,7 @@ static int read_places(struct inherited *inherited, pid_t pid)
 		struct statx st;
 		uint64_t what[3];
 
-		/* Nobody is asked who may not answer: a file system of a program's, or of a network. */
+		/* Not on a file system that may not answer: FUSE or network. */
 		snprintf(path, sizeof path, "/proc/%d/%s", pid, places[i]);
 		if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT,
 			  STATX_INO | STATX_MNT_ID, &st))
@@ -152,7 +151,7 @@ int inherited_read(struct inherited *inherited, pid_t pid, struct avc_error *err
 void inherited_creds(struct inherited *inherited, const struct thread *thread)
 {
 	inherited->creds = thread->creds;
-	/* A fork has not got these; a restored process is told. */
+	/* These are not inherited by fork; a restored process sets them. */
 	inherited->creds.death_signal = inherited->creds.subreaper = 0;
 	inherited->creds.future_lock = 0;
 }

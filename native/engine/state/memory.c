@@ -2,21 +2,19 @@
  *
  * Memory that a clone does not carry as it is.
  *
- * - MADV_DONTFORK: missing in the clone.  Of a process that was found to have such areas they
- *   are looked up while it is stopped, are told MADV_DOFORK right before it is cloned, and
- *   MADV_DONTFORK right after that, by the process's own main thread, which does so also if the
- *   guard dies in between.  (Only those are left that the kernel keeps so: a device's, and on new
- *   kernels, seen on 7.3, huge pages.)
+ * - MADV_DONTFORK: missing in the clone.  In a process that was found to have such areas they are
+ *   looked up while it is stopped, set to MADV_DOFORK right before it is cloned, and to MADV_DONTFORK
+ *   right after that, by the process's own main thread, which does so even if the guard dies in
+ *   between. (Not possible for device memory, nor on new kernels, seen on 7.3, for huge pages.)
  * - MADV_WIPEONFORK: zeroes in the clone (memory_wiped.c).
- * - Shared memory that is nobody else's: is not copied by a clone.  Read while the app
- *   is stopped, up to a limit, and written back at a restore; once for all processes of
- *   the app.  With a name (shm_open(3), memfd_create(2)) it may be somebody else's as
- *   well, who would not go back with the app: then it is left alone, and that is told.
- * - Locked memory: a clone's is not.
+ * - Shared memory of the app alone: not copied by a clone.  Read while the app is stopped, up to a
+ *   limit, and written back at a restore; once for all processes of the app.  With a name
+ *   (shm_open(3), memfd_create(2)) other processes may have it as well, which would not be rolled
+ *   back with the app: then it is left alone, which is reported.
+ * - Locked memory: not locked in the clone.
  *
- * What areas there are of these kinds is known from the template before; whether
- * that was right is seen in the new template, when the app runs again.  If not, the
- * checkpoint is taken once more.
+ * The areas of these kinds are known from the previous template; whether they are still right is
+ * checked in the new template, when the app runs again.  If not, the checkpoint is taken once more.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -94,7 +92,7 @@ uint64_t mem_image_kinds(const struct mem_image *image)
 
 	for (uint32_t i = 0; i < image->kinds.count; i++) {
 		const uint32_t flags = image->kinds.area[i].flags;
-		/* Where a stack begins changes as it grows. */
+		/* The start of a stack changes as it grows. */
 		const uint64_t part[] = {
 			flags & MAPPING_GROWING ? 0 : image->kinds.area[i].start,
 			image->kinds.area[i].end,
@@ -109,7 +107,7 @@ uint64_t mem_image_kinds(const struct mem_image *image)
 
 /* ---- before and during a freeze ------------------------------------------------ */
 
-/* Where it is in the table, or is to be. */
+/* Its index in the table, or where to insert it. */
 static struct mem_key *find_key(const struct mem_seen *seen, const struct mem_key *key)
 {
 	uint64_t at = (key->inode * 31 + key->offset) * UINT64_C(0x9E3779B97F4A7C15) >> 32;
@@ -146,7 +144,7 @@ void mem_seen_free(struct mem_seen *seen)
 	*seen = (struct mem_seen){ 0 };
 }
 
-/* Whether an image is to have its contents: once for all processes, and no more than may be. */
+/* Whether an image gets its contents: once for all processes, and within the limit. */
 static int see(struct mem_seen *seen, struct area *a, uint64_t limit, struct avc_error *err)
 {
 	const struct mem_key key = { a->device, a->inode, a->offset, area_bytes(a) };
@@ -193,7 +191,7 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	*image = malloc(sizeof **image + bytes);
 	if (!*image)
 		return fail_errno(err, 0, "keep memory", "malloc", "out of memory");
-	/* All of it: page faults now, and not in the freeze. */
+	/* Touch all of it: page faults now, not in the freeze. */
 	memset(*image, 0, sizeof **image + bytes);
 	(*image)->whole = true;
 	(*image)->seen = seen;
@@ -204,9 +202,9 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	return 0;
 }
 
-/* By the file that is mapped there, which is looked at before it is opened: only a regular one is.
- * Its pages are not all mapped in any one process, and by /proc/PID/mem those that nobody has
- * written yet would come to be. */
+/* Reads through the mapped file, which is checked before it is opened: only a regular one is.  No
+ * single process may have all of its pages mapped, and reading through /proc/PID/mem would allocate
+ * those never written. */
 static bool copy_area(pid_t pid, struct area *a, uint8_t *to)
 {
 	const int path_fd = proc_open_mapped(pid, a->start, a->end, O_PATH);
@@ -243,7 +241,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 
 		if (!area_room(a))
 			continue;
-		/* Before it is read: what is written meanwhile was written since. */
+		/* Before it is read: what is written meanwhile counts as written since. */
 		if (a->as_file)
 			a->writes = others_writes(process->others, a);
 		image->whole &= budget_step() && copy_area(process->pid, a, to);
@@ -266,7 +264,8 @@ bool memory_needs_fork(const struct process *process)
 
 /* ---- mappings, from /proc ------------------------------------------------------------ */
 
-/* What drivers map, and huge pages.  Whether the kernel minds shows on our own vDSO, which is so. */
+/* Mappings of drivers, and huge pages.  Whether the kernel refuses shows on our own vDSO, which is
+ * one. */
 static bool minds_fixed(void)
 {
 	static int minds = -1;
@@ -344,7 +343,7 @@ int memory_look(struct process *process, struct avc_error *err)
 	return process->memory->dontfork ? look_for_dontfork(process, &look, err) : 0;
 }
 
-/* The list is where restores have theirs. */
+/* The list uses the memory of the restore's lists. */
 void memory_advise(const struct process *process, uint32_t slot, int advice, struct inj_call *call)
 {
 	const struct memory *memory = process->memory;
@@ -401,8 +400,8 @@ static int find_locked(const struct mapping *m, void *arg)
 	return 0;
 }
 
-/* Pages become locked as they are touched (MLOCK_ONFAULT): to bring them all in at once
- * would make a copy of all that memory before the process may run. */
+/* Pages become locked as they are touched (MLOCK_ONFAULT): faulting them all in at once would copy
+ * all that memory before the process may run. */
 static void lock_again(struct process *process, int64_t locked_kb, struct setup *setup)
 {
 	struct memory *memory = process->memory;
@@ -415,8 +414,8 @@ static void lock_again(struct process *process, int64_t locked_kb, struct setup 
 	     start - memory->locked_read_ns > memory->locked_cost_ns * SMAPS_SHARE)) {
 		struct marks found = { 0 };
 
-		/* Of one that has just died there is nothing to be seen any more; what
-		 * was known of it is right, as a rule. */
+		/* A process that has just died shows nothing any more; what was known is usually
+		 * right. */
 		if (proc_mappings(process->pid, "smaps", find_locked, &found) == 0 && found.count) {
 			memory->locked = found;
 			memory->locked_kb = locked_kb;
@@ -454,8 +453,9 @@ static void advise_again(const struct memory *memory, struct setup *setup)
 					->flags = INJ_MAY_FAIL;
 }
 
-/* After all that is mapped and advised.  What the kernel has sealed (CONFIG_MSEAL_SYSTEM_MAPPINGS)
- * is so in a fork; Podman's seccomp profile need not know mseal(2). */
+/* After everything is mapped and advised.  Mappings sealed by the kernel
+ * (CONFIG_MSEAL_SYSTEM_MAPPINGS) are inherited by fork; Podman's seccomp profile may lack
+ * mseal(2). */
 static void seal_again(const struct memory *memory, struct setup *setup)
 {
 	for (uint32_t i = 0; i < memory->kinds.count; i++)
@@ -511,7 +511,7 @@ void memory_note_left(const struct image *image, uint32_t images, struct avc_err
 		     (unsigned long long)left_bytes / 1024);
 }
 
-/* Whether it is what the image has, by the memory of a process. */
+/* Whether it equals the image, read from the memory of a process. */
 static bool is_equal(int mem_fd, const struct area *a, const uint8_t *image)
 {
 	uint8_t page[ARCH_PAGE_BYTES];
@@ -525,7 +525,7 @@ static bool is_equal(int mem_fd, const struct area *a, const uint8_t *image)
 	return true;
 }
 
-/* What was sealed at the checkpoint is what it was. */
+/* What was sealed at the checkpoint has not changed. */
 static int note_unless_equal(const struct area *a, int mem_fd, const uint8_t *from,
 			     struct avc_error *notes)
 {
@@ -536,7 +536,7 @@ static int note_unless_equal(const struct area *a, int mem_fd, const uint8_t *fr
 	return 0;
 }
 
-/* The template has it at the same place, and just as it was at the checkpoint. */
+/* The template has it at the same address, mapped as at the checkpoint. */
 static bool put_by_mapping(const struct area *a, int mem_fd, const uint8_t *from)
 {
 	return pwrite(mem_fd, from, a->kept, (off_t)a->start) == (ssize_t)a->kept;
@@ -597,7 +597,7 @@ static int put_back(const struct putting *putting, struct area *a, const uint8_t
 		return -1;
 	if (!put) {
 		put = put_by_file(a, putting->pid, from);
-		if (a->as_file) /* that was us */
+		if (a->as_file) /* that was our own write */
 			a->writes = others_writes(others, a);
 	}
 	return put ? 0 : note_unless_equal(a, putting->mem_fd, from, putting->notes);

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Which areas of a process a clone does not carry, as its template shows them.
+ * Finds the areas of a process that a clone does not carry, in its template.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -67,14 +67,14 @@ static bool is_of_parasite(const struct process *process, avc_remote at)
 	return false;
 }
 
-/* Only its descendants can have it, too. */
+/* Only its descendants can share it. */
 static bool is_shared(const struct mapping *m)
 {
 	return m->shared && (!strcmp(m->name, "/dev/zero (deleted)") ||
 			     !strcmp(m->name, "/anon_hugepage (deleted)"));
 }
 
-/* By its name the app may say that it is to stay as it is. */
+/* By its name the app can ask to leave it as it is. */
 static bool has_name(const struct mapping *m)
 {
 	const char *name = NULL;
@@ -86,7 +86,7 @@ static bool has_name(const struct mapping *m)
 	return m->shared && m->inode && name && strncmp(name, "avckpt-kept", 11) != 0;
 }
 
-/* Whoever has the file system can open it. */
+/* Any process that sees the file system can open it. */
 static bool is_as_file(const struct mapping *m)
 {
 	return has_name(m) && !strncmp(m->name, "/dev/shm/", 9);
@@ -104,7 +104,7 @@ static int hash_mapping(const struct mapping *m, void *arg)
 
 static uint32_t advice_of(const struct mapping *m)
 {
-	/* The kernel itself has marked those. */
+	/* These are marked by the kernel itself. */
 	if (m->flags & (MAPPING_DEVICE | MAPPING_DROPPABLE))
 		return 0;
 	return m->flags & (MAPPING_HUGE | MAPPING_SMALL | MAPPING_DONTDUMP | MAPPING_MERGEABLE);
@@ -127,7 +127,7 @@ void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags)
 }
 
 /* A file, or a device.  It is not opened to find out whether it can be: that breaks leases, and may
- * take its time. */
+ * block. */
 static bool has_path(const struct mapping *m)
 {
 	static const char *const others[] = { "/memfd:", "/secretmem", "/dmabuf:" };
@@ -138,9 +138,9 @@ static bool has_path(const struct mapping *m)
 	return m->name[0] == '/';
 }
 
-/* A restored process that does not have it from its parent would have to map it itself, of what
- * is behind it: not of a socket's ring (packet(7)), of memfd_secret(2), or for writing of a memfd
- * that is sealed. */
+/* A restored process that does not inherit it would have to map it from the file behind it:
+ * impossible for a socket's ring (packet(7)), memfd_secret(2), or a memfd sealed against writable
+ * mappings. */
 static bool is_only_here(pid_t template, const struct mapping *m)
 {
 	int fd, seals;
@@ -150,7 +150,7 @@ static bool is_only_here(pid_t template, const struct mapping *m)
 	fd = proc_open_mapped(template, m->start, m->end, O_RDONLY | O_NONBLOCK);
 	if (fd < 0)
 		return errno == ENXIO;
-	seals = fcntl(fd, F_GET_SEALS); /* -1: it knows none */
+	seals = fcntl(fd, F_GET_SEALS); /* -1: no seals */
 	close(fd);
 	return m->mode[1] == 'w' && seals > 0 && seals & (F_SEAL_WRITE | F_SEAL_FUTURE_WRITE);
 }
@@ -171,8 +171,8 @@ static int find_area(const struct mapping *m, void *arg)
 {
 	struct survey *survey = arg;
 	struct area area;
-	/* What the kernel may drop at any time (vDSO getrandom's state) may be
-	 * wiped as well, and is better so: nothing random comes twice. */
+	/* What the kernel may drop at any time (vDSO getrandom's state) may be wiped as well, and
+	 * should be: no random data is repeated. */
 	const bool wiped = (m->flags & (MAPPING_WIPEONFORK | MAPPING_DROPPABLE)) ==
 			   MAPPING_WIPEONFORK;
 
@@ -225,7 +225,7 @@ static bool is_known(const struct memory *memory, const struct area *wanted)
 	return false;
 }
 
-/* Of what is new, nobody knows yet whether others have it, too. */
+/* For new ones it is not known yet whether others have it, too. */
 static void look_for_others(const struct survey *survey)
 {
 	bool known = true;
@@ -237,7 +237,7 @@ static void look_for_others(const struct survey *survey)
 		    known ? 0 : survey->since);
 }
 
-/* By the mapping, by its file, or by a descriptor; not with rights that the application has not. */
+/* By the mapping, by its file, or by a descriptor; never with rights that the application lacks. */
 static enum area_way way_of(pid_t template, const struct area *a)
 {
 	if (a->wiped || a->way == WAY_MAPPING)
@@ -247,14 +247,14 @@ static enum area_way way_of(pid_t template, const struct area *a)
 	return area_find_descriptor(template, a) >= 0 ? WAY_FILE : WAY_NONE;
 }
 
-/* One that is too large does not keep small ones from being rolled back. */
+/* One that is too large does not prevent small ones from being rolled back. */
 static bool is_to_be_kept(struct survey *survey, struct area *a)
 {
 	if (a->wiped)
 		return true;
 	if (a->named && others_have(survey->process->others, a)) {
 		survey->others_bytes += area_bytes(a);
-		/* It is looked for again, if there is no memory to remember it in. */
+		/* If there is no memory to record it, it is searched again. */
 		(void)areas_add(&survey->foreign, a);
 		return false;
 	}
@@ -300,7 +300,7 @@ static bool same_areas(const struct areas *a, const struct areas *b)
 	return true;
 }
 
-/* Takes what was found for what is there from now on. */
+/* From now on, uses what was found. */
 static int remember(struct survey *survey, struct avc_error *err)
 {
 	struct memory *memory = survey->memory;
@@ -321,7 +321,7 @@ static int read_areas(struct survey *survey, const struct areas *copied, struct 
 
 	memory->advised.count = memory->kinds.count = 0;
 	memory->special = false;
-	/* What the process has been told since its template was forked, that does not know. */
+	/* Advice given to the process since its template was forked is missing in the template. */
 	if (proc_mappings(survey->recycled ? pid : survey->template, "smaps", find_area, survey))
 		return fail_errno(err, survey->template, "keep memory", "read(smaps)",
 				  "it was killed");
@@ -430,7 +430,7 @@ static int compare_unkept(const void *a, const void *b)
 	return (x->inode > y->inode) - (x->inode < y->inode);
 }
 
-/* The first one that several processes have, and one of them can write; NULL: none. */
+/* The first one that several processes have and at least one can write; NULL: none. */
 static const struct unkept *find_common(const struct unkept_list *list)
 {
 	const struct unkept *first = list->item;

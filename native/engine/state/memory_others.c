@@ -1,14 +1,14 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Shared memory with a name, or a descriptor, may be somebody else's as well, who would not go
+ * Other processes may also have shared memory with a name, or a descriptor, and would not be rolled
  * back with the application.
  *
  * Others are the processes outside of its PID namespace: those inside are the application, and
- * whoever was sent in to look after it.  Of a unit below a launcher, whose init is not the first
- * in there, they are all that are not below its init.  Who has mapped it or has it open for writing is looked
- * for now and then.  Who opens it by its name, writes and closes it within that time is told by
- * inotify(7), which tells of write(2) and not of what is written through a mapping; but not who
- * it was, so that what the application itself writes in this way is not taken back either.
+ * commands sent in to look after it.  For a unit below a launcher, whose init is not PID 1 there,
+ * they are all processes not below its init.  Processes that have mapped it or have it open for
+ * writing are searched periodically.  Those that open it by its name, write and close it in between
+ * are reported by inotify(7), which covers write(2) but not writes through a mapping; nor does it
+ * tell who it was, so what the application itself writes in this way is not rolled back either.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -25,12 +25,12 @@
 #include "memory.h"
 
 #define LOOK_NS (10 * NS_PER_S)
-#define LOOK_SHARE 50     /* of the time is spent on looks, at most               */
+#define LOOK_SHARE 50     /* at most this share of the time is spent on scans */
 #define DEVICES_MAX 16    /* file systems that the application has such memory of */
 #define OBJECTS_MAX 65536 /* of others, on these                                  */
 #define WATCHES_MAX 1024
 #define ANCESTORS_MAX 256
-#define READS_MAX 64 /* then so much was written that it is enough to know that */
+#define READS_MAX 64 /* more than that need not be counted */
 
 struct object {
 	uint64_t device, inode;
@@ -47,7 +47,7 @@ struct mem_others {
 	uint32_t devices, count, room;
 	uint64_t device[DEVICES_MAX];
 	struct object *object; /* in order                                        */
-	bool unknown;          /* there were too many: everything may be others'     */
+	bool unknown;          /* there were too many: everything may be shared with others */
 	int inotify;
 	uint32_t watches, watch_room, lost;
 	struct watch *watch;
@@ -115,7 +115,7 @@ static uint64_t device_of(const struct statx *st)
 	return (uint64_t)st->stx_dev_major << 32 | st->stx_dev_minor;
 }
 
-/* What /proc/PID/fd says, and no file server is asked. */
+/* From /proc/PID/fd, without asking a file server. */
 static bool look_at_descriptor(int fd_dir, const char *number, struct statx *st)
 {
 	struct stat link;
@@ -161,7 +161,7 @@ int area_find_descriptor(pid_t pid, const struct area *a)
 	return found;
 }
 
-/* Whether a process in the application's PID namespace is the application's. */
+/* Whether a process in the application's PID namespace belongs to the application. */
 static bool is_below(pid_t pid, pid_t init)
 {
 	struct proc_stat stat;
@@ -248,7 +248,7 @@ static void take_event(struct mem_others *others, const struct inotify_event *ev
 
 	if (event->mask & IN_Q_OVERFLOW)
 		others->lost++;
-	else if (watch && event->mask & IN_IGNORED) /* nobody finds it by name any more */
+	else if (watch && event->mask & IN_IGNORED) /* its name is gone */
 		*watch = others->watch[--others->watches];
 	else if (watch)
 		watch->writes++;

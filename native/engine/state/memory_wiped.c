@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Memory that is wiped in a clone (MADV_WIPEONFORK).  The application's flag must stay, for others
- * rely on it for their safety (random number generators); so what is in it is read while the
- * application is stopped, and written into the template, which gets the flag off, and the
- * restored process on again.
+ * Memory that is wiped in a clone (MADV_WIPEONFORK). The application's flag must stay, because
+ * programs rely on it for security (random number generators); so the contents are read while the
+ * application is stopped, and written into the template, where the flag is removed; the restored
+ * process sets it again.
  *
- * Programs reserve far more of it than they use: only what is there is read.
+ * Programs reserve far more of it than they use: only pages present are read.
  */
 #include <errno.h>
 #include <fcntl.h>

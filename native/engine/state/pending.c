@@ -20,9 +20,9 @@ struct pending {
 	uint32_t count;
 	bool too_many;
 	int deadly;  /* 0: none                                             */
-	bool caught; /* and there is a handler for it                       */
+	bool caught; /* and it has a handler */
 	struct {
-		int block; /* of the thread, -1: of the process                    */
+		int block; /* of the thread, -1: of the process */
 		siginfo_t info;
 	} signal[PENDING_MAX];
 	siginfo_t buffer[AT_ONCE];
@@ -37,7 +37,7 @@ static int read_queue(struct pending *pending, pid_t tid, int block, struct avc_
 {
 	struct __ptrace_peeksiginfo_args args = {
 		.flags = block < 0 ? PTRACE_PEEKSIGINFO_SHARED : 0,
-		/* Nearly always there is none: one is enough to find out. */
+		/* Nearly always there is none: asking for one is enough to find out. */
 		.nr = 1,
 	};
 
@@ -57,8 +57,8 @@ static int read_queue(struct pending *pending, pid_t tid, int block, struct avc_
 			pending->signal[pending->count].block = block;
 			pending->signal[pending->count++].info = pending->buffer[i];
 		}
-		/* Fewer than asked for need not be the last ones: a signal of our own, as of
-		 * the deadline's timer, ends the call, too (kernel/ptrace.c). */
+		/* Fewer than requested need not be all: a signal of our own, as of the deadline's
+		 * timer, ends the call, too (kernel/ptrace.c). */
 		args.off += (uint64_t)n;
 		args.nr = AT_ONCE;
 	}
@@ -69,9 +69,8 @@ static bool takes(const struct thread *t, int signal)
 	return t->block >= 0 && !(t->sigmask >> (signal - 1) & 1);
 }
 
-/* A thread that was just about to run a handler: its call is cut short by the signal,
- * so it has to get that, also one that any thread could take.  (One that is ignored
- * is queued only because we trace.) */
+/* A thread that was just about to run a handler: the signal interrupts its call, so this thread has
+ * to get it, even if any thread could. (An ignored one is queued only because we trace.) */
 static void assign(struct process *process, const struct proc_status *status)
 {
 	struct pending *pending = process->pending;
@@ -86,7 +85,7 @@ static void assign(struct process *process, const struct proc_status *status)
 		for (uint32_t i = 0; i < process->thread_count; i++) {
 			struct thread *t = &process->threads[i];
 
-			/* The kernel, too, likes to give the main thread such a one. */
+			/* The kernel, too, prefers the main thread for these. */
 			if (takes(t, signal) &&
 			    (pending->signal[k].block == t->block ||
 			     (pending->signal[k].block < 0 && (!found || t->block == 0))))
@@ -105,8 +104,8 @@ static bool ends_by_default(int signal)
 	       signal != SIGSTOP && signal != SIGTSTP && signal != SIGTTIN && signal != SIGTTOU;
 }
 
-/* A process that has got a deadly signal and was stopped by us before it could die of
- * it, or run its handler of a crash: every restore of such an image would die at once. */
+/* A process that has got a fatal signal and was stopped by us before it could die of it, or run its
+ * crash handler: every restore of such an image would die at once. */
 static int find_deadly(const struct process *process, const struct proc_status *status)
 {
 	const struct pending *pending = process->pending;
@@ -161,7 +160,7 @@ int pending_check(const struct process *process, struct avc_error *err)
 
 	if (!pending->deadly)
 		return 0;
-	/* Whoever handles it may go on after that. */
+	/* A program that handles it may continue afterwards. */
 	return pending->caught ? fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
 				      "it is about to handle signal %d", pending->deadly)
 			       : fail(err, AVC_GONE, 0, process->pid, "freeze", "",
@@ -180,7 +179,7 @@ bool pending_contains(const struct pending *pending, int signal, int timer)
 	return false;
 }
 
-/* A process that is stopped while it is being put together would never be ready. */
+/* A process that is stopped while it is being restored would never become ready. */
 static bool can_be_queued(const siginfo_t *info)
 {
 	return info->si_signo != SIGSTOP && info->si_signo != SIGKILL;

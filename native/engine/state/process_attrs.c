@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a process that is not the main one has besides memory and descriptors: signal
- * handlers, root and working directory, limits, groups, and what the kernel knows of its layout.
+ * The attributes of a process other than the main one, besides memory and descriptors: signal
+ * handlers, root and working directory, limits, groups, and its layout as known to the kernel.
  */
 #include <fcntl.h>
 #include <signal.h>
@@ -22,9 +22,9 @@
 #define PR_SET_MEMORY_MERGE 67 /* since Linux 6.4 */
 #define PR_GET_MEMORY_MERGE 68
 #endif
-#define KEYS 16 /* of memory, at most (pkeys(7)); the first one is everybody's    */
-/* membarrier(2).  Only since Linux 6.3 it says what is registered; but of the others each is
- * refused that is not, and the command that registers it is the double. */
+#define KEYS 16 /* of memory, at most (pkeys(7)); the first one is the default */
+/* membarrier(2).  Only since Linux 6.3 it reports what is registered; but an unregistered command
+ * is refused, and the command that registers it is its double. */
 #define BARRIERS_REGISTERED (1 << 9)
 #define BARRIER_GLOBAL (1 << 1)
 static const int barriers[] = { 1 << 3, 1 << 5, 1 << 7 };
@@ -42,9 +42,9 @@ struct process_attrs {
 	uint64_t state_permitted;       /* arch_cpu.h, ARCH_STATE_PERMITTED               */
 	int64_t no_huge_pages, merging; /* prctl(2), PR_GET_THP_DISABLE, PR_GET_MEMORY_MERGE */
 	int64_t barriers;               /* membarrier(2): commands that register it          */
-	uint32_t keys;                  /* pkey_alloc(2): by number; 0: the CPU has none     */
+	uint32_t keys;                  /* pkey_alloc(2): by number; 0: the CPU has none */
 	uint32_t umask;
-	int64_t dumped;            /* core(5), coredump_filter; -1: the kernel does not dump  */
+	int64_t dumped;            /* core(5), coredump_filter; -1: the kernel has no core dumps */
 	uint64_t mm[11];           /* of struct prctl_mm_map, but for brk                   */
 	uint64_t limit[LIMITS][2]; /* getrlimit(2)                                  */
 	uint32_t auxv_bytes;
@@ -129,8 +129,8 @@ static bool has_keys(void)
 	return has;
 }
 
-/* Nobody knows those of another process.  The template takes all that are free, and what it is not
- * given is taken.  It keeps them: it never runs, and no process is forked from it. */
+/* Those of another process cannot be read.  The template allocates all free ones, and those that it
+ * does not get are in use.  It keeps them: it never runs, and no process is forked from it. */
 static uint32_t keys_of(const struct inj_syscall given[KEYS - 1])
 {
 	uint32_t taken = (1u << KEYS) - 2;
@@ -145,7 +145,8 @@ static uint32_t keys_of(const struct inj_syscall given[KEYS - 1])
 
 static int64_t barriers_of(const struct inj_syscall *told, const struct inj_syscall *made)
 {
-	/* The kernel does not tell whether it registered for global barriers; to do so is cheap. */
+	/* The kernel does not tell whether it registered for global barriers; registering is
+	 * cheap. */
 	int64_t registered = BARRIER_GLOBAL << 1;
 
 	if (told->result >= 0)
@@ -197,10 +198,10 @@ int process_attrs_learn(struct image *image, struct avc_error *err)
 	attrs->merging = list[SIGNALS + 2].result;
 	attrs->barriers = barriers_of(&list[SIGNALS + 3], &list[SIGNALS + 4]);
 	attrs->keys = keys_of(keys);
-	/* These are no part of what its holder shares: it was asked itself, in the freeze. */
+	/* These are not shared with its holder: the process itself was queried, in the freeze. */
 	attrs->personality = main_thread->creds.personality;
 	attrs->state_permitted = main_thread->creds.state_permitted;
-	/* The template has limits of the time when the holder was made. */
+	/* The template has the limits of when the holder was created. */
 	if (read_mm(image->template, attrs) || read_status(image->template, attrs) ||
 	    (proc_limits(image->process->pid, attrs->limit) &&
 	     proc_limits(image->template, attrs->limit)))
@@ -217,7 +218,7 @@ void process_attrs_forget(struct image *image)
 
 /* ---- a restore ------------------------------------------------------------------------ */
 
-/* What the calls refer to, in the batch's memory. */
+/* Arguments of the calls, in the batch's memory. */
 struct arguments {
 	struct action action[SIGNALS];
 	struct { /* struct prctl_mm_map                                     */
@@ -234,7 +235,7 @@ static struct arguments *arguments_of(const struct syscall_batch *batch)
 	return (struct arguments *)batch->data;
 }
 
-/* Only what `ps` shows, and where its heap may grow. */
+/* Only affects what `ps` shows, and where its heap may grow. */
 static void put_mm(struct syscall_batch *batch, const struct process_attrs *attrs)
 {
 	struct arguments *arguments = arguments_of(batch);
@@ -259,18 +260,18 @@ void process_attrs_lift_limit(pid_t pid, int which, uint64_t least)
 	if (prlimit(pid, which, NULL, &now))
 		return;
 	lifted.rlim_cur = lifted.rlim_max = now.rlim_max > least ? now.rlim_max : least;
-	/* That there is nothing to lift is the rule. */
+	/* Usually there is nothing to lift. */
 	if ((lifted.rlim_cur == now.rlim_cur && lifted.rlim_max == now.rlim_max) ||
 	    prlimit(pid, which, &lifted, NULL) == 0)
 		return;
-	/* We may not; but up to there everybody may. */
+	/* Not permitted; but up to the hard limit it is. */
 	now.rlim_cur = now.rlim_max;
 	(void)prlimit(pid, which, &now, NULL);
 }
 
 void process_attrs_lift_limits(pid_t pid, const struct image *image, uint32_t files)
 {
-	/* Of descriptors there may not be any number (sysctl fs.nr_open). */
+	/* The descriptor limit is bounded (sysctl fs.nr_open). */
 	for (int i = 0; i < LIMITS; i++)
 		process_attrs_lift_limit(pid, i, i == RLIMIT_NOFILE ? files : RLIM_INFINITY);
 	process_attrs_lift_limit(pid, RLIMIT_NOFILE, image->attrs->limit[RLIMIT_NOFILE][1]);
@@ -295,7 +296,7 @@ static bool same_root(pid_t a, pid_t b)
 	       is.st_ino == other.st_ino;
 }
 
-/* Goes into a folder of the template's. */
+/* Changes to a directory of the template. */
 static int enter(struct syscall_batch *batch, pid_t template, const char *name,
 		 struct avc_error *err)
 {
@@ -314,7 +315,7 @@ static int enter(struct syscall_batch *batch, pid_t template, const char *name,
 	return 0;
 }
 
-/* It has its parent's, and the right to have another one only if that still has it. */
+/* It inherits its parent's, and may change it only if the parent still has that right. */
 static int put_folders(struct syscall_batch *batch, pid_t template, struct avc_error *err)
 {
 	struct arguments *arguments = arguments_of(batch);
@@ -390,7 +391,7 @@ int process_attrs_put(struct syscall_batch *batch, const struct image *image, st
 	put_dumped(batch, attrs->dumped);
 	if (attrs->state_permitted >> ARCH_STATE_NUMBER & 1)
 		syscall_batch_add(batch, ARCH_STATE_CALL, ARCH_STATE_ASK, ARCH_STATE_NUMBER);
-	/* Since Linux 6.18 what is answered has the flags in it, which are asked for apart. */
+	/* Since Linux 6.18 the answer includes flags, which are set by a separate argument. */
 	if (attrs->no_huge_pages >= 0)
 		syscall_batch_add(batch, SYS_prctl, PR_SET_THP_DISABLE,
 				  (uint64_t)attrs->no_huge_pages & 1,

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Restoring an app that has put itself under a seccomp filter, or into strict mode: what
- * a restored process calls to put itself together would be denied to it, or its end.  So
- * it stays traced and is supervised (seccomp.c) until all is ready; its own first call without us is
- * rt_sigreturn(2).  What it goes through then lies in the parasite, where the app has had all the
- * time to write what it likes: no more than what injected code may call comes of that.
+ * Restoring an app that has put itself under a seccomp filter, or into strict mode: the calls that
+ * restore a process would be denied, or kill it.  So it stays traced and is supervised (seccomp.c)
+ * until all is ready; its own first call without us is rt_sigreturn(2).  The code and lists that it
+ * executes until then are in the parasite, where the app could have written anything: it cannot
+ * make more calls than injected code may.
  */
 #include <errno.h>
 #include <sched.h>
@@ -59,7 +59,7 @@ static bool pump(struct sandbox *sandbox, bool *ended)
 		*ended = *ended || tid == sandbox->pid;
 		return true;
 	}
-	/* One that has a wrong number leaves again, and is not found later. */
+	/* A thread with a wrong TID exits again, and is not found later. */
 	if (status >> 16 == PTRACE_EVENT_CLONE &&
 	    ptrace(PTRACE_GETEVENTMSG, tid, NULL, &born) == 0 && sandbox->count < THREADS_MAX)
 		sandbox->tid[sandbox->count++] = (pid_t)born;
@@ -73,7 +73,7 @@ bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end)
 {
 	bool ended = false;
 
-	/* It stops so often that to sleep would be most of the time. */
+	/* It stops so often that sleeping would take most of the time. */
 	for (int looks = 0; __atomic_load_n(state, __ATOMIC_ACQUIRE) == INJ_IDLE;) {
 		if (ended || now_ns() > end)
 			return false;
@@ -111,7 +111,7 @@ static int thread_of(const struct parasite *parasite, uint32_t slot, pid_t tid)
 	return -1;
 }
 
-/* Lets it make the call that takes it home, and no step more. */
+/* Lets it make the call that returns it to the app, and not one step more. */
 static void bring_home(pid_t tid)
 {
 	for (int stops = 0; stops < 2;) {
@@ -126,7 +126,7 @@ static void bring_home(pid_t tid)
 	}
 }
 
-/* Each is stopped where it waits for `go`, and goes home from there. */
+/* Each is stopped where it waits for `go`, and returns from there. */
 void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32_t slot_number,
 		int stop_signal)
 {
@@ -142,7 +142,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
 		    seccomp_supervise(tid, sandbox->inside, SANDBOX_OPTIONS) ||
 		    tracee_await(tid, NULL, &ignored) != STOP_TRAP || arch_regs_get(tid, &now))
-			continue; /* it has left, or was killed */
+			continue; /* it has exited, or was killed */
 		seccomp_let_be(tid);
 		block = thread_of(parasite, slot_number, tid);
 		if (block < 0)
@@ -153,7 +153,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 				  frame);
 		else
 			arch_call(&regs, &now, parasite->base + INJ_END_OFFSET, arch_sp(&now), 0);
-		(void)arch_regs_set(tid, &regs); /* it was killed: no matter */
+		(void)arch_regs_set(tid, &regs); /* fails if it was killed */
 		if (frame && stop_signal)
 			bring_home(tid);
 	}
@@ -162,11 +162,11 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 	slot->running = slot->threads;
 	for (uint32_t i = 0; i < sandbox->count; i++) {
 		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);
-		/* The others know it as ended. */
+		/* The others regard it as exited. */
 		if (i == 0 && !parasite_thread(parasite, slot_number, 0)->frame)
 			proc_await_end(sandbox->pid);
 	}
-	/* Its parent may look at once. */
+	/* Its parent may check at once. */
 	for (uint64_t end = now_ns() + END_NS; stop_signal && now_ns() < end;) {
 		struct proc_stat stat;
 
@@ -174,7 +174,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 			break;
 		usleep(LOOK_US);
 	}
-	/* One that was killed meanwhile is a tracee still, until it was waited for. */
+	/* One that was killed meanwhile is still a tracee, until it is reaped. */
 	for (bool ended = false; pump(sandbox, &ended);)
 		;
 	free(sandbox);

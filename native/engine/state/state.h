@@ -1,12 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a process has, but for what it has open: asked while it is stopped, kept in an image, put
- * back.
+ * The state of a process except descriptors: read while it is stopped, kept in an image, restored.
  *
- *   image.c         which image is whose
+ *   image.c         finds the image of a process
  *   attributes.c    scheduling, credentials, prctl settings
  *   process_attrs.c what only a template can tell: signal handlers, limits, directories
- *   inherited.c     what a fork has of all that by itself
+ *   inherited.c     what of it a fork inherits
  *   pending.c       signals that have not been delivered
  *   timers.c        interval timers, POSIX timers
  *   memory*.c       memory that a clone does not carry as it is
@@ -17,20 +16,20 @@
 
 #include "trace.h"
 
-#define FILES_NAME 81 /* of a file, for people                                  */
+#define FILES_NAME 81 /* of a file, for messages */
 
 /* What is saved of one process. */
 struct image {
-	struct process *process; /* NULL: it had ended, and nobody had waited for it */
+	struct process *process; /* NULL: it was a zombie */
 	int parent;              /* the place of its parent's image, or ...         */
-	uint32_t host;           /* the same of the one that forks it in a restore  */
+	uint32_t host;           /* the same for the one that forks it in a restore */
 	pid_t inside;
-	/* Of its session and group, and of the group in the foreground of its terminal; inside, 0:
-	 * outside of the app, or none that could be seen. */
+	/* Its session and group, and the foreground group of its terminal; inside, 0: outside of
+	 * the app, or not visible. */
 	pid_t session, group, tty_group;
 	pid_t pid;             /* as of the freeze; then as restored last          */
 	int exit_signal;       /* struct proc_stat                                */
-	int status;            /* of one that had ended, as from wait(2)           */
+	int status;            /* of a zombie, as from wait(2) */
 	char name[16];         /* the same                                        */
 	struct proc_stat stat; /* as of the freeze                                */
 	pid_t template;
@@ -40,8 +39,8 @@ struct image {
 	uint64_t taken_ns;
 	struct arch_regs base; /* a user context of the template                */
 	long vm_pages;         /* of the process when it was taken                */
-	long anon_pages;       /* resident ones that are of no file                */
-	/* The OOM killer's: the app's own, and what it was told of the template (guard_memory.c) */
+	long anon_pages;       /* resident anonymous ones */
+	/* oom_score_adj: the app's own, and that of the template (guard_memory.c) */
 	int oom_own, oom_told;
 	bool oom_known;
 	bool sandboxed;   /* has seccomp filters of its own                   */
@@ -49,28 +48,28 @@ struct image {
 	int stop_signal;  /* stopped by that (job control), 0: it was not     */
 	int64_t dumpable; /* prctl(2), PR_GET_DUMPABLE                        */
 	struct attributes *attributes;
-	struct process_attrs *attrs;  /* of one that its parent is to fork               */
+	struct process_attrs *attrs;  /* of one to be forked by its parent */
 	struct mem_image *memory;     /* that is not in the template                     */
 	struct files *files;          /* descriptors                                     */
 	struct avc_error files_error; /* why they could not be read             */
-	struct files_mapped *mapped;  /* avckpt.files=strict; NULL: it was not             */
-	struct fd_table table;        /* at a restore: what it is to have open           */
-	struct avc_error notice;      /* what of it cannot be put back              */
-	struct inherited *inherited;  /* dirty.c: what its template was forked with; or NULL */
-	struct pageset *stale;        /* ... and where its memory is not the process's       */
-	uint64_t tracker;             /* ... as this one has noted it (struct tracker)        */
+	struct files_mapped *mapped;  /* avckpt.files=strict; NULL: it was not set */
+	struct fd_table table;        /* at a restore: what it must have open */
+	struct avc_error notice;      /* what of it cannot be restored */
+	struct inherited *inherited;  /* dirty.c: what its template inherited; or NULL */
+	struct pageset *stale;        /* ... and where its memory differs from the process's */
+	uint64_t tracker;             /* ... as recorded by this one (struct tracker) */
 	uint64_t forked_ns, copied;   /* when the template was; pages written to it since     */
 	uint64_t kinds;               /* mem_image_kinds(), then                              */
-	bool recycled;                /* it is an older one that was brought up to date       */
+	bool recycled;                /* an older one was updated for it */
 };
 #define PARENT_INIT (-1)
 
 /* ---- image.c ---------------------------------------------------------------------- */
 
-/* Among all images of a checkpoint; NULL: it has none. */
+/* Among all images of a checkpoint; NULL: none. */
 struct image *image_find(struct image *image, uint32_t images, const struct process *process);
 
-/* What a crash is known by. */
+/* Signals typical of crashes. */
 #define SIGNAL_BIT(signal) (UINT64_C(1) << ((signal)-1))
 #define FATAL_SIGNALS                                                                         \
 	(SIGNAL_BIT(SIGSEGV) | SIGNAL_BIT(SIGBUS) | SIGNAL_BIT(SIGFPE) | SIGNAL_BIT(SIGILL) | \
@@ -79,13 +78,13 @@ struct image *image_find(struct image *image, uint32_t images, const struct proc
 /* ---- pending.c ------------------------------------------------------------------ */
 
 struct pending *pending_new(void);
-/* While everything is stopped: those of all threads that are in the image.  Sets
- * thread.signalled.  AVC_GONE: who was killed meanwhile has none any more. */
+/* While everything is stopped: those of all threads that are in the image.  Sets thread.signalled.
+ * AVC_GONE: it was killed meanwhile. */
 int pending_read(struct process *process, struct avc_error *err) warn_unused;
-/* -1 if there is one that the process dies of as soon as it runs again, or reports its own
+/* -1 if there is one of which the process will die as soon as it runs again, or will report its own
  * crash. */
 int pending_check(const struct process *process, struct avc_error *err) warn_unused;
-/* Is there such a signal; of a POSIX timer, if timer >= 0? */
+/* Whether there is such a signal; of a POSIX timer, if timer >= 0. */
 bool pending_contains(const struct pending *pending, int signal, int timer);
 /* When the app runs again: one thread's, after setup_thread(); the process's. */
 void pending_setup_thread(const struct process *process, const struct thread *thread,
@@ -95,9 +94,9 @@ void pending_setup(const struct process *process, struct setup *setup);
 /* ---- timers.c -------------------------------------------------------------------- */
 
 struct timers *timers_new(void);
-/* What /proc/PID/timers says, which it changes. */
+/* Parses /proc/PID/timers, and modifies the text. */
 void timers_parse(struct timers *timers, char *text);
-/* While everything is stopped: what to call first in the list; when that was done. */
+/* While everything is stopped: adds the first calls to the list; takes their results. */
 void timers_ask(struct process *process, struct inj_call *call);
 void timers_answer(struct process *process, const struct inj_call *call, uint64_t took_ns);
 /* When the app runs again. */
@@ -108,36 +107,36 @@ void timers_setup(struct process *process, struct setup *setup);
 #define ATTRIBUTES_ASK_BYTES 376
 /* While it is stopped, from outside. */
 void attributes_read_scheduling(pid_t tid, struct scheduling *scheduling);
-/* Calls that ask a thread, and its answers; `out` (for it: `remote`) is where it is to
- * leave them.  Returns the first of the calls. */
+/* Calls that query a thread, and its answers; it stores them at `out` (its own address: `remote`).
+ * Returns the first of the calls. */
 const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_remote remote);
 void attributes_answer(const struct inj_syscall *first, const void *out, struct creds *creds);
 /* When the app runs again: each thread, after setup_thread(); the process. */
 int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
-/* Of a stopped thread: its seccomp filters, whatever they say. */
+/* A hash of a stopped thread's seccomp filters. */
 uint64_t attributes_read_filters(pid_t tid);
 int attributes_keep(struct image *image, struct avc_error *err) warn_unused;
-/* Before the restored threads go: what can be done from outside only. */
+/* Before the restored threads run: what can only be done from outside. */
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
 
 /* ---- process_attrs.c ------------------------------------------------------------------------ */
 
-/* After the app runs again: what only the template can tell. */
+/* After the app runs again: what only the template can report. */
 int process_attrs_learn(struct image *image, struct avc_error *err) warn_unused;
 void process_attrs_forget(struct image *image);
-/* All protection keys, before its memory refers to some and while the kernel must not choose one
- * (pkeys(7), of what can only be executed).  process_attrs_put() frees those that it did not have. */
+/* Allocates all protection keys, before its memory uses some and so that the kernel does not choose
+ * one (pkeys(7), for execute-only memory). process_attrs_put() frees those that it did not have. */
 int process_attrs_take_keys(struct syscall_batch *batch, struct avc_error *err) warn_unused;
 /* A restored process gets it, with the batch's next flush. */
 int process_attrs_put(struct syscall_batch *batch, const struct image *image,
 		      struct avc_error *err) warn_unused;
-/* Until then nothing is limited: it may have more than it may have now, and its parent may have
- * lowered its own limits since.  Its descriptors are below `files`. */
+/* Lifts all limits until then: it may have more than its limits allow, and its parent may have
+ * lowered its own since.  Its descriptors are below `files`. */
 void process_attrs_lift_limits(pid_t pid, const struct image *image, uint32_t files);
-/* One limit, to as much as there is, and to `least` at least; beyond the hard one that takes
- * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to there. */
+/* Lifts one limit to its maximum, at least `least`; beyond the hard limit that takes
+ * CAP_SYS_RESOURCE (setrlimit(2)), without which it is lifted up to that. */
 void process_attrs_lift_limit(pid_t pid, int which, uint64_t least);
 /* By the process itself, as the last: to set another user's takes CAP_SYS_RESOURCE (prlimit(2)). */
 void process_attrs_setup_limits(const struct image *image, struct setup *setup);
@@ -148,21 +147,21 @@ void process_attrs_setup_limits(const struct image *image, struct setup *setup);
 #define INHERITED_VALUES 10
 #define INHERITED_BREAK 0
 
-/* What a process has from the one that forked it, besides memory and descriptors: as it was then, or
- * as the other has it now.  Compared with memcmp(). */
+/* What a process inherits by fork, besides memory and descriptors: as of the fork, or as its parent
+ * has it now.  Compared by memcmp(). */
 struct inherited {
 	uint64_t action[INHERITED_SIGNALS][4]; /* rt_sigaction(2)                    */
 	int64_t value[INHERITED_VALUES];       /* prctl(2), membarrier(2), brk(2)    */
 	struct creds creds;
 	uint64_t limit[LIMITS][2];
-	uint64_t stat;   /* a hash of what /proc/PID/stat tells of its layout    */
+	uint64_t stat;   /* a hash of the layout in /proc/PID/stat */
 	uint64_t places; /* ... of its directories, namespaces and program       */
 	uint32_t umask;
 	uint32_t dumped; /* core(5), coredump_filter                            */
 };
 
-/* One more call for a list (INJ_LIST), which leaves its answers in that slot; these, once made;
- * what /proc says; and the thread's own attributes, as asked for with the rest. */
+/* Adds a call to a list (INJ_LIST), which leaves its answers in that slot; takes these, once made;
+ * reads /proc; and takes the thread's own attributes, queried with the rest. */
 void inherited_ask(const struct parasite *parasite, uint32_t slot, struct inj_call *call);
 void inherited_answer(const struct parasite *parasite, uint32_t slot, struct inherited *inherited,
 		      int64_t *dumpable);
@@ -172,22 +171,22 @@ bool inherited_equal(const struct inherited *a, const struct inherited *b);
 
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
-/* Keeps a new process, which is stopped, as a tracee, and lets it go on. */
+/* Keeps a new process, which is stopped, as a tracee, and resumes it. */
 struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err);
-/* Waits while *state is INJ_IDLE; false when it ended or was too late. */
+/* Waits while *state is INJ_IDLE; false when it exited or was too late. */
 bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
-/* The end of it: killed, or let go to where the threads of the slot were; stop_signal: where
- * they stop (job control), 0: go on. */
+/* Ends it: kills it, or releases its threads to where they were; stop_signal: they stop there (job
+ * control), 0: they continue. */
 void sandbox_end(struct sandbox *sandbox);
 void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32_t slot,
 		int stop_signal);
 
 /* ---- memory.c ------------------------------------------------------------------ */
 
-/* Shared memory that an image of the same checkpoint has: one is enough; and what all of them have
- * taken of what they may. */
+/* Shared memory that an image of the same checkpoint has, because one copy is enough; and the part
+ * of the limit that all have used. */
 #define WIPED_MAX (16u << 20)     /* bytes of MADV_WIPEONFORK memory                 */
-#define WIPED_RUNS_MAX (1u << 14) /* stretches of it, and guard pages within          */
+#define WIPED_RUNS_MAX (1u << 14) /* ranges of it, and guard pages within */
 struct mem_key {
 	uint64_t device, inode, offset, bytes;
 };
@@ -199,53 +198,54 @@ struct mem_seen {
 };
 void mem_seen_free(struct mem_seen *seen);
 
-/* memory_others.c: who else has shared memory of the application's; one for all its processes. */
+/* memory_others.c: other processes that have the application's shared memory; one for all its
+ * processes. */
 struct mem_others *mem_others_new(void);
 void mem_others_free(struct mem_others *others);
 
 struct memory *memory_new(void);
-void memory_forget(struct memory *memory); /* it is another program         */
+void memory_forget(struct memory *memory); /* it executes another program */
 void memory_free(struct memory *memory);
-/* Room for what is to be copied in the freeze. */
+/* Allocates memory for what is copied in the freeze. */
 int memory_prepare(const struct process *process, struct mem_image **image, struct mem_seen *seen,
 		   struct avc_error *err) warn_unused;
 void mem_image_free(struct mem_image *image);
-/* What only "smaps" tells of a mapping and a restore has to know, as of the checkpoint: enum
- * mapping_flag.  And whether it is so of any. */
+/* Flags of a mapping (enum mapping_flag) that only smaps shows and a restore needs, as of the
+ * checkpoint.  And whether any mapping has it. */
 uint32_t mem_image_marks(const struct mem_image *image, avc_remote address);
 bool mem_image_has(const struct mem_image *image, enum mapping_flag flag);
 /* Whether it has a vDSO. */
 bool mem_image_is_special(const struct mem_image *image);
-/* What its mappings are that /proc/PID/maps does not tell of; a number. */
+/* A hash of the properties of its mappings that /proc/PID/maps does not show. */
 uint64_t mem_image_kinds(const struct mem_image *image);
-/* While everything is stopped: copies, what is its own when it stands still, what is shared
- * when everybody does. */
+/* While everything is stopped: copies; private memory when the process is stopped, shared memory
+ * when all are. */
 void memory_copy_own(const struct process *process, struct mem_image *image);
 void memory_copy_shared(const struct process *process, struct mem_image *image);
-/* When it stands still: looks what a clone would not inherit (MADV_DONTFORK); whether there is any;
- * and what its main thread has to call right before the clone (MADV_DOFORK), and right after it
- * (MADV_DONTFORK).  Both before it begins. */
+/* While it is stopped: finds what a clone would not inherit (MADV_DONTFORK); whether there is any;
+ * and the calls of its main thread right before the clone (MADV_DOFORK), and right after it
+ * (MADV_DONTFORK). Both before it begins. */
 int memory_look(struct process *process, struct avc_error *err) warn_unused;
 bool memory_is_unforked(const struct memory *memory);
 void memory_advise(const struct process *process, uint32_t slot, int advice, struct inj_call *call);
-/* The template is smaller than the app: always fails, with AVC_RETRY if the next
- * attempt will be better. */
+/* The template is smaller than the app: always fails, with AVC_RETRY if the next attempt can
+ * succeed. */
 int memory_learn(struct process *process, long missing_pages, struct avc_error *err);
 /* When the app runs again.  Fails with AVC_RETRY if what had to be copied was not. */
-/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge
- * pages is small, and whoever writes to a shared one when it is empty is killed. */
+/* Why a process that has private mappings of hugetlbfs is not cloned: the pool of huge pages is
+ * small, and a process that writes to a shared one when it is empty is killed. */
 extern const char memory_private_huge_pages[];
 int memory_finish(struct image *image, int64_t locked_kb, struct setup *setup,
 		  struct avc_error *err) warn_unused;
-/* Whether only a fork carries what it has: advice, protection keys. */
+/* Whether only a fork preserves its properties: advice, protection keys. */
 bool memory_needs_fork(const struct process *process);
-/* When all of them are there: -1 if several processes have shared memory that is not rolled back
- * with them.  One that went back would wait for what another one had done. */
+/* When all exist: -1 if several processes have shared memory that is not rolled back with them.  One
+ * that goes back would wait for what another one has done already. */
 int memory_check_unkept(const struct image *image, uint32_t images,
 			struct avc_error *err) warn_unused;
-/* When all of a checkpoint are finished: what is more than may be kept. */
+/* When all of a checkpoint are finished: fails if that is more than may be kept. */
 void memory_note_left(const struct image *image, uint32_t images, struct avc_error *notice);
-/* At a restore, before anything runs; *notes: what cannot be written. */
+/* At a restore, before anything runs; *notes: what could not be written. */
 int memory_put_back(const struct image *image, pid_t pid, struct avc_error *notes,
 		    struct avc_error *err) warn_unused;
 

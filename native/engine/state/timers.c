@@ -3,11 +3,10 @@
  * Interval timers (setitimer(2), alarm(2)) and POSIX timers (timer_create(2)), none
  * of which a clone inherits.
  *
- * Which there are is read from /proc/PID/timers while everything is stopped; what
- * is left of them only the process itself can tell, in the same list of calls that
- * clones it.  At a restore they are made again with their own ids and set to what is
- * left now: a deadline stays where it was, a tick stays on its beat, and a timer that
- * counts CPU time goes on from where it was.
+ * They are listed in /proc/PID/timers while everything is stopped; only the process itself can
+ * report the remaining time, in the same list of calls that clones it.  At a restore they are
+ * recreated with their own ids and set to what is left now: a deadline stays where it was, ticks
+ * keep their phase, and a timer that counts CPU time continues from where it was.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -23,7 +22,7 @@
 #include "state.h"
 
 #define ITIMERS 3                  /* ITIMER_REAL, ITIMER_VIRTUAL, ITIMER_PROF */
-#define CLOCK (INJ_TIMERS_MAX - 1) /* where the time of the question goes */
+#define CLOCK (INJ_TIMERS_MAX - 1) /* where the time of the query is stored */
 #define POSIX_MAX (CLOCK - ITIMERS)
 
 struct posix_timer {
@@ -39,7 +38,7 @@ struct timers {
 	struct inj_timer setting[INJ_TIMERS_MAX];
 	bool valid[INJ_TIMERS_MAX];
 	uint64_t asked_ns; /* by the CLOCK_MONOTONIC of the process' time namespace */
-	uint64_t took_ns;  /* from the question until the pending signals were read */
+	uint64_t took_ns;  /* from the query until the pending signals were read */
 	char text[16384];
 };
 
@@ -124,7 +123,7 @@ void timers_answer(struct process *process, const struct inj_call *call, uint64_
 	timers->asked_ns = (uint64_t)asked.tv_sec * NS_PER_S + (uint64_t)asked.tv_nsec;
 }
 
-/* Of CPU time, which begins anew with the process. */
+/* On CPU time, which starts over with the process. */
 static bool counts_cpu(int32_t clock)
 {
 	return clock < 0 || clock == CLOCK_PROCESS_CPUTIME_ID || clock == CLOCK_THREAD_CPUTIME_ID;
@@ -135,7 +134,7 @@ static bool runs(const struct inj_timer *s)
 	return s->left[0] || s->left[1];
 }
 
-/* Expired between the two, and its signal is among the pending ones: once is enough. */
+/* It expired between the two, and its signal is among the pending ones: once is enough. */
 static bool has_just_expired(const struct process *process, const struct inj_timer *s,
 			     int64_t unit_ns, int signal, int id)
 {
@@ -144,8 +143,8 @@ static bool has_just_expired(const struct process *process, const struct inj_tim
 	       pending_contains(process->pending, signal, id);
 }
 
-/* ITIMER_REAL with its signal pending stands still until that is delivered, and
- * shows nothing left (kernel/time/itimer.c). */
+/* ITIMER_REAL with its signal pending is not running until that is delivered, and shows nothing
+ * left (kernel/time/itimer.c). */
 static bool ticks(const struct inj_timer *s)
 {
 	return s->interval[0] || s->interval[1];
@@ -182,7 +181,7 @@ static void add_posix(struct process *process, const struct posix_timer *t,
 		const struct thread *thread = thread_find(process, t->tid);
 
 		if (!thread || thread->block < 0)
-			return; /* the thread had ended: it could not fire any more */
+			return; /* the thread had exited: it could not fire any more */
 		event._sigev_un._tid = thread->inside;
 	}
 	setup_add(setup, INJ_AFTER, "timer_create", INJ_TIMER_CREATE, (uint64_t)(int64_t)t->clock,
@@ -206,7 +205,7 @@ void timers_setup(struct process *process, struct setup *setup)
 	const struct timers *timers = process->timers;
 	const struct posix_timer *sorted[POSIX_MAX];
 
-	/* Ascending, for a kernel on which ids can only be counted up to. */
+	/* Ascending, for kernels on which ids can only be reached by counting up. */
 	for (uint32_t i = 0; i < timers->count; i++)
 		sorted[i] = &timers->posix[i];
 	qsort(sorted, timers->count, sizeof *sorted, by_id);
