@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Looks at a table of descriptors (files.h).
+ * Reads a table of descriptors (files.h).
  *
- * A checkpoint looks twice: before the freeze at everything, names and all, while
- * the app runs; and during the freeze at what is of that instant, while the kernel
- * clones.  What was another one a moment before is looked at in full again.
+ * A checkpoint reads it twice: before the freeze everything, names included, while the app runs;
+ * and during the freeze the state of that instant, while the kernel clones.  A descriptor that has
+ * been replaced in between is read in full again.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -31,7 +31,7 @@ struct look {
 	pid_t pid, init;
 	int pidfd, fd_dir;
 	enum files_depth depth;
-	bool trusts; /* heirs are taken for what they were: files_check_heirs()  */
+	bool trusts; /* heirs are assumed unchanged: files_check_heirs() */
 	uint32_t ours;
 	struct stat init_stdio[3];
 	bool init_known[3];
@@ -52,7 +52,8 @@ struct files *files_new(uint32_t room)
 	return files;
 }
 
-/* One more has it, and frees it: a thread that was left behind may be the last (aside.c). */
+/* Takes a reference; the last holder frees it, which may be a thread that was left behind
+ * (aside.c). */
 static struct files *files_share(struct files *files)
 {
 	__atomic_fetch_add(&files->others, 1, __ATOMIC_RELAXED);
@@ -79,7 +80,7 @@ void files_free(struct files *files)
 	free(files);
 }
 
-/* Of the first so many, which are in order. */
+/* Among the first `count`, which are in order. */
 static struct file *find_among(const struct files *files, uint32_t count, int fd)
 {
 	uint32_t low = 0, high = count;
@@ -102,7 +103,7 @@ struct file *files_find(const struct files *files, int fd)
 	return find_among(files, files ? files->count : 0, fd);
 }
 
-/* The same file, socket, pipe...; of anonymous inodes only eventfds say who they are. */
+/* The same file, socket, pipe...; of anonymous inodes only eventfds have an id. */
 bool files_same_object(const struct file *a, const struct file *b)
 {
 	return a->kind == b->kind && a->dev == b->dev && a->ino == b->ino && a->rdev == b->rdev &&
@@ -161,7 +162,7 @@ static char *read_name(const struct look *look, int fd)
 	return budget_take((uint64_t)n) ? strdup(name) : NULL;
 }
 
-/* stdio that init has, too: then others read and write with the same offset. */
+/* stdio shared with init: other processes use the same offset. */
 static bool is_inits(const struct look *look, const struct file *f)
 {
 	for (int i = 0; i < 3; i++)
@@ -183,7 +184,7 @@ static void look_at_owner(int fd, struct file *f)
 	f->owner_signal = fcntl(fd, F_GETSIG);
 }
 
-/* Takes over what the look before the freeze has found out, if this is still the same. */
+/* Takes over what was read before the freeze, if this is still the same. */
 static struct file *take_known(const struct look *look, struct file *f)
 {
 	struct file *k = files_find(look->known, f->fd);
@@ -240,9 +241,9 @@ static struct file *take_known(const struct look *look, struct file *f)
 	return k;
 }
 
-/* A file server is asked nothing while the app stands still, or is dead: it may be the
- * app itself (FUSE), or not answer; and to close a duplicate is to ask (flush).  What
- * fdinfo says has to do. */
+/* No request goes to a file server while the app is stopped, or dead: it may be the app itself
+ * (FUSE), or not answer; closing a duplicate is such a request, too (flush). fdinfo has to
+ * suffice. */
 static bool look_at_remote(const struct look *look, int number, struct file *f)
 {
 	const struct file *k = look->known ? files_find(look->known, number) : NULL;
@@ -273,8 +274,8 @@ static bool look_at_remote(const struct look *look, int number, struct file *f)
 	return true;
 }
 
-/* A child has most of what it has open from its parent: then there is nothing to look at that
- * the look at the parent has not seen, but for what is the table's own. */
+/* A child shares most descriptors with its parent: then only what belongs to the table itself is
+ * left to read. */
 static bool is_parents(const struct look *look, const struct file *is)
 {
 	return syscall(SYS_kcmp, look->pid, look->files->parent_pid, KCMP_FILE, is->fd, is->fd) ==
@@ -334,7 +335,7 @@ static bool copy_frozen(const struct look *look, const struct file *is, struct f
 {
 	const struct file *k = files_find(look->known, is->fd);
 
-	/* Of locks and of what is watched there is more to know. */
+	/* For locks and watches there is more to read. */
 	if (!k || !is->known || k->remote || k->lock_count || is->lock_count || is->watch_count ||
 	    is->mark_count || k->kind != is->kind || k->id != is->id ||
 	    (is->kind == FILE_REGULAR && is->told_ino) ||
@@ -360,7 +361,7 @@ static bool is_channel(const struct file *f)
 					f->socket->domain == AF_UNIX && !f->socket->listening);
 }
 
-/* What an idle socket has become between the two looks must not be forgotten. */
+/* A change of an idle socket between the two reads must not be missed. */
 static bool is_outdated(int fd, const struct file_socket *s)
 {
 	int listens = 0;
@@ -440,7 +441,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		look_at_owner(fd, f);
 		if (f->kind == FILE_SOCKET)
 			file_look_at_socket(fd, f);
-		/* What was opened since is not made again. */
+		/* What was opened since is not recreated. */
 		if (f->socket && look->depth != FILES_NOW)
 			file_look_at_manner(fd, f->socket, look->init);
 	}
@@ -519,7 +520,7 @@ static int by_key(const void *a, const void *b)
 /* kcmp(2)'s order; -1: one of them has been closed since. */
 static long compare_held(const struct files_held *a, const struct files_held *b)
 {
-	/* A socket cannot be opened twice, its file (O_PATH) can. */
+	/* A socket cannot be opened twice, but its file (O_PATH) can. */
 	if (a->file->kind == FILE_SOCKET && !((a->file->flags | b->file->flags) & O_PATH))
 		return 0;
 	return syscall(SYS_kcmp, a->pid, b->pid, KCMP_FILE, a->file->fd, b->file->fd);
@@ -562,8 +563,8 @@ static int find_kind(struct files_held **kinds, uint32_t *count, const struct fi
 	return -1;
 }
 
-/* Only those of the same file can be of the same description, and kcmp(2) gives an order,
- * so that it takes few calls. */
+/* Only descriptors of the same file can share a description, and kcmp(2) gives an order, so that
+ * few calls are needed. */
 void files_group(struct files_held *held, uint32_t count)
 {
 	struct files_held **kinds = calloc(count + 1, sizeof *kinds);
@@ -638,8 +639,8 @@ static void check_shared(struct files *files, pid_t pid)
 	}
 }
 
-/* Has anybody in the app the other end?  Of several processes that is found out when it
- * matters, at a restore. */
+/* Whether the app has the other end.  With several processes that is found out at a restore, when
+ * it matters. */
 static bool may_be_ours(struct files *files, const struct file *f)
 {
 	if (!files->several)
@@ -657,7 +658,7 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->rights_lost = from->rights_lost;
 	f->senders_lost = from->senders_lost;
 	f->rights = from->rights;
-	/* What is put back once, one has (files_family.c). */
+	/* What is restored once is kept in one of them (files_family.c). */
 	if (!from->content_bytes || !from->ended)
 		return;
 	f->content = budget_has(from->content_bytes) && budget_take(from->content_bytes)
@@ -740,7 +741,7 @@ void files_missing_sort(struct files_missing *missing)
 		qsort(missing->file, missing->count, sizeof(void *), by_object);
 }
 
-/* A program may have opened thousands since, which are only to be closed. */
+/* A program may have opened thousands since, which only have to be closed. */
 static bool is_of_interest(const struct look *look, const char *name)
 {
 	const struct files_missing *missing = look->files->missing;
@@ -791,8 +792,7 @@ static int walk(struct look *look, uint32_t seen, struct avc_error *err)
 	}
 }
 
-/* Of those that were there before, to the places that they had: the heirs, or all others.  Whether
- * they all are. */
+/* Duplicates those that existed before: the heirs, or all others.  Whether all still exist. */
 static int look_at_known(struct look *look, bool heirs, bool *same, struct avc_error *err)
 {
 	struct files *files = look->files;
@@ -829,9 +829,9 @@ static int64_t size_of_table(const struct look *look)
 	return fstat(look->fd_dir, &st) ? -1 : st.st_size;
 }
 
-/* Heirs are by far the most, and take their time.  A process that has as many as it had, and
- * everything of its own just as it was, has them most likely, too, and that is looked at when it
- * runs again.  With as many as were there before there is no other one. */
+/* Heirs are by far the most numerous, and take time.  A process with the same number of
+ * descriptors, and with its own unchanged, most likely still has them, which is checked when it
+ * runs again.  With the same number, there is no new one. */
 static int walk_frozen(struct look *look, struct avc_error *err)
 {
 	const uint32_t count = look->known->count;
@@ -908,7 +908,7 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	return 0;
 }
 
-/* Those of the app itself, whose process will be another one with its number. */
+/* Those of the app itself, whose process will be a new one with the same PID. */
 static void find_own_pidfds(const struct process *process, struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++) {
@@ -943,7 +943,7 @@ static void find_owners(const struct process *process, struct files *files)
 	}
 }
 
-/* The look before the freeze, while whatever the app has open may be in use. */
+/* The read before the freeze, while the app may be using its descriptors. */
 struct survey {
 	struct aside aside;
 	struct files *files;
@@ -961,7 +961,7 @@ static void survey(struct aside *aside)
 	job->result = files_look(job->files, &job->owner, FILES_BEFORE, NULL, &job->error);
 }
 
-/* Heirs that it has once: what it has twice it can put in another's place, and back. */
+/* Only heirs that occur once: one that occurs twice could be moved and moved back unnoticed. */
 static void note_heirs(struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++)
@@ -972,7 +972,7 @@ static void note_heirs(struct files *files)
 				false;
 }
 
-/* Nothing of it is needed after the look. */
+/* Not needed afterwards. */
 static void forget_parent(struct files *files)
 {
 	files_free((struct files *)files->parent);
@@ -1050,8 +1050,8 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 	if (!image)
 		return fail_errno(err, process->pid, "look at descriptors", "calloc",
 				  "out of memory");
-	/* Touched now: a first touch costs a fault, then while the app is stopped.  (A compiler leaves
-	 * out memset(3) after calloc(3).) */
+	/* Touched now: otherwise the first touch would fault while the app is stopped. (A compiler
+	 * leaves out memset(3) after calloc(3).) */
 	explicit_bzero(image->file, image->room * sizeof *image->file);
 	image->with_tcp = process->tcp_moved;
 	process->files_image = image;
@@ -1084,8 +1084,8 @@ void files_capture(struct image *image, const struct image *parent, bool several
 	find_own_pidfds(process, files);
 }
 
-/* Nothing tells cheaply of flock(2): one that is there now, after the freeze, and was not
- * there before it may be of either side, and is left alone at a restore. */
+/* flock(2) cannot be observed cheaply: a lock that exists after the freeze, but not before, may be
+ * from either side of it, and is left alone at a restore. */
 void files_settle(struct image *image)
 {
 	files_land();

@@ -1,18 +1,18 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Descriptors: what the app had open at one instant, and how it becomes that again.
+ * Descriptors: what the app has open at one instant, and how it is restored.
  *
- *   files.c         looks at a table
+ *   files.c         reads a table
  *   files_info.c    what /proc/PID/fdinfo says
  *   files_state.c   what is behind a descriptor: offsets, counts, timers, bytes, locks
- *   files_messages.c what is in Unix sockets, and who may still send
- *   files_options.c options of sockets, and whether one can be made again
+ *   files_messages.c contents of Unix sockets, and which ends are shut down
+ *   files_options.c options of sockets, and whether one can be recreated
  *   files_unix.c    names of Unix sockets
- *   files_make.c    opens and makes again what is lost
+ *   files_make.c    reopens and recreates what is lost
  *   files_restore.c compares two tables and makes the one the other
- *   files_heirs.c   what a child has from its parent
- *   files_family.c  all tables of an app: what is between its processes
- *   files_calls.c   what the restored process has to do for that itself
+ *   files_heirs.c   what a child shares with its parent
+ *   files_family.c  all tables of an app: what its processes share
+ *   files_calls.c   what the restored process has to do itself
  *   files_watches.c inotify
  *   files_epoll.c   epoll
  *   files_pipes.c   sizes of pipes
@@ -22,8 +22,8 @@
  *   files_mapped.c  the same of files that are mapped
  *   files_written.c the same of files that are not open any more
  *
- * Looking is done on a duplicate (pidfd_getfd(2)) that lives for microseconds: while
- * it is there the app's close(2) closes nothing.
+ * Reading uses a duplicate (pidfd_getfd(2)) that lives for microseconds: while it exists, the app's
+ * close(2) does not release the file.
  */
 #ifndef AVCKPT_FILES_H
 #define AVCKPT_FILES_H
@@ -38,71 +38,71 @@
 
 /* ---- for the layers above ------------------------------------------------------- */
 
-/* Before a freeze: what can be known of the app's descriptors while it runs.  `parent`: a process
- * that was prepared just before, of which it may have a lot in common, or NULL. */
+/* Before a freeze: reads what can be read of the app's descriptors while it runs.  `parent`: a
+ * process that was prepared just before, with which it may share many, or NULL. */
 int files_prepare(struct process *process, const struct process *parent,
 		  struct avc_error *err) warn_unused;
-/* A pipe of our own, through which others are read; { -1, -1, 0 } at first. */
+/* Our own pipe, through which others are read; { -1, -1, 0 } at first. */
 struct scratch {
 	int in, out, bytes;
 };
 void scratch_close(struct scratch *scratch);
-/* During it: what is of this instant, or why it could not be read.  `parent`: an image of the same
- * freeze, of which it may have a lot in common, or NULL.  `several`: the app has other processes,
- * which may have the other ends of pipes. */
+/* During it: reads the state of this instant, or records why it could not be read.  `parent`: an
+ * image of the same freeze, with which it may share many, or NULL. `several`: the app has other
+ * processes, which may have the other ends of pipes. */
 void files_capture(struct image *image, const struct image *parent, bool several,
 		   struct scratch *scratch);
-/* What the freeze has left out, by the templates (files_heirs.c).  AVC_RETRY: what a process has
- * from its parent has changed meanwhile. */
+/* Checks what the freeze left out, in the templates (files_heirs.c).  AVC_RETRY: what a process
+ * shares with its parent has changed meanwhile. */
 int files_check_heirs(struct image *image, uint32_t images, struct avc_error *err) warn_unused;
 /* After it. */
 void files_settle(struct image *image);
 /* Of cameras, in the template (files_video.c). */
 void files_unmap_areas(const struct image *image);
-/* The same for all processes: what they share of open files, and who of them is named.
- * `before`: the checkpoint before, of so many. */
+/* The same for all processes: which open files they share, and which of them are referred to.
+ * `before`: the previous checkpoint's images. */
 void files_settle_family(struct image *image, uint32_t images, struct image *before,
 			 uint32_t befores);
 void files_forget(struct process *process);
 void files_free(struct files *files);
-/* Makes the tables of a dead app those of the images again: that of the main process, which
- * its templates hold, at once; of the others it says in image.table what is to be in them.
- * Lists what the restored processes have to do themselves.  What could not be put back is
- * told in *notes; -1 is for what must not go on. */
+/* Restores the tables of a dead app: that of the main process, which its templates hold, at once;
+ * for the others it fills in image.table.  Lists what the restored processes have to do themselves.
+ * What could not be restored is reported in *notes; -1 is for fatal errors. */
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err) warn_unused;
-/* A process that is to be restored opens its pidfds itself: as many descriptors as it takes, until
- * it puts its limit back after that. */
+/* A process that is being restored opens its pidfds itself: raises its descriptor limit for that,
+ * until it sets the limit again. */
 void files_lift_limit(const struct files *want, pid_t pid);
 /* A descriptor of that device, as stat(2) numbers it; -1: there is none. */
 int files_find_device(const struct files *files, uint32_t rdev);
 /* Whether a device or the kernel may write to the process's memory by one of them, unseen by its
  * page table: pages that were pinned before (files_pinned.c). */
 bool files_may_pin(const struct files *files);
-/* Whether the restored process could do it all. */
+/* Whether the restored process could do all of it. */
 void files_check_calls(const struct parasite *parasite, uint32_t slot, pid_t inside,
 		       struct avc_error *notes);
-/* -1 if a file was written since, with AVC_UNSUPPORTED and which.  `pid` is a process
- * that has the table as it is now, `holder` one that has the memory. */
+/* -1 if a file was written since, with AVC_UNSUPPORTED and its name.  `pid` is a process that has
+ * the table as it is now, `holder` one that has the memory. */
 int files_check_strict(const struct image *image, pid_t pid, int pidfd, pid_t init, pid_t holder,
 		       struct avc_error *err) warn_unused;
 
-/* Whether it looks like a database, as of files_prepare(): what others write matters, too. */
+/* Whether it looks like a database, as of files_prepare(): writes by other processes matter,
+ * too. */
 bool files_is_database(const struct process *process);
-/* Of such a one, whether memory may not go back to the image behind a file that was written and
- * is `st`.  True also if the image knows nothing of it. */
+/* For one that does, whether the image is invalidated by a write to the file `st`. True also if the
+ * image does not know the file. */
 bool files_is_older(const struct image *image, int fd, const struct stat *st);
-/* -1 if it belongs to its files, and those have gone on since, with AVC_UNSUPPORTED and which.
- * `pidfd` is that of a process that has the table as it is now; -1: nobody has it any more. */
+/* -1 if its memory belongs to its files, and those were written since, with AVC_UNSUPPORTED and the
+ * name.  `pidfd` is that of a process with the current table; -1: no process has it any more. */
 int files_check_auto(const struct image *image, int pidfd, pid_t init,
 		     struct avc_error *err) warn_unused;
 
-/* files_group.c: what others have sent to a dead app since the checkpoint, by datagrams and Unix
- * sockets.  `pidfd` is that of a process that has its table as it is now. */
+/* files_group.c: discards what others have sent to a dead app since the checkpoint, by datagrams
+ * and Unix sockets.  `pidfd` is that of a process that has its table as it is now. */
 void files_forget_others(const struct image *image, int pidfd, const struct avc_config *config);
 
-/* files_mapped.c: what is in files that are mapped for writing.  Before a freeze; NULL:
- * out of memory. */
+/* files_mapped.c: contents of files that are mapped for writing.  Before a freeze; NULL: out of
+ * memory. */
 struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes);
 /* While everything is stopped; NULL: nothing. */
 void files_mapped_copy(struct files_mapped *mapped);
@@ -114,13 +114,13 @@ struct files_written *files_written_new(void);
 void files_written_free(struct files_written *written);
 /* From now on; *notice if it cannot be. */
 void files_written_watch(struct files_written *written, pid_t pid, struct avc_error *notice);
-/* Whether a file was written since the last time this was asked, and which; inherited ones in
- * `files` (may be NULL) do not count, nor what `counts` (may be NULL: all do) says no to. */
+/* Whether a file was written since the last call, and which; inherited ones in `files` (may be
+ * NULL) do not count, nor what `counts` (may be NULL: all do) says no to. */
 typedef bool files_counts(int fd, const struct stat *st, const void *arg);
 bool files_written_since(struct files_written *written, const struct files *files,
 			 files_counts *counts, const void *arg, char name[FILES_NAME]);
 
-/* ---- what its own files give each other --------------------------------------------- */
+/* ---- shared by its own files --------------------------------------------- */
 
 enum file_kind {
 	FILE_OTHER,
@@ -141,14 +141,14 @@ enum file_kind {
 struct file_lock {
 	enum { LOCK_FLOCK_, LOCK_POSIX_, LOCK_OFD_ } kind;
 	bool exclusive;
-	int64_t start, end; /* last byte; -1: to the end of the file             */
+	int64_t start, end; /* last byte; -1: to the end of the file */
 };
 
 struct file_watch { /* of an epoll set                                         */
 	int fd;
 	uint32_t events;
 	uint64_t data;
-	uint64_t dev, ino; /* of what is watched, as the kernel has them          */
+	uint64_t dev, ino; /* of what is watched, as encoded by the kernel */
 	uint32_t at;       /* of those with this number, in the kernel's order     */
 	/* The number of what is watched, which may be closed, or another file's, if another
 	 * descriptor is of the same description; -1: of none that is known          */
@@ -158,7 +158,7 @@ struct file_watch { /* of an epoll set                                         *
 struct file_mark { /* of inotify                                               */
 	int wd;
 	uint32_t mask;
-	uint64_t dev, ino; /* as the kernel has them                           */
+	uint64_t dev, ino; /* as encoded by the kernel */
 	uint32_t handle_bytes;
 	int handle_type;
 	uint8_t handle[128]; /* open_by_handle_at(2)                           */
@@ -167,7 +167,7 @@ struct file_mark { /* of inotify                                               *
 /* A camera with buffers, of V4L2.                                              */
 struct file_video {
 	uint32_t type, memory, count; /* 0: it has none                           */
-	uint64_t held; /* those that the program has, by index; the others are the driver's */
+	uint64_t held; /* those held by the program, by index; the driver has the others */
 };
 
 /* Where a camera's buffers are mapped.                                        */
@@ -178,13 +178,13 @@ struct file_area {
 };
 
 struct file_socket {
-	uint32_t others; /* tables that have it, too                                  */
+	uint32_t others; /* other tables that have it */
 	int domain, type, protocol;
 	bool listening, connected;
 	bool idle;    /* has never been connected, and does not listen                    */
-	int backlog;  /* -1: not asked yet                                         */
+	int backlog;  /* -1: not read yet */
 	uint8_t shut; /* of a pair's end: SHUT_IN, SHUT_OUT                          */
-	/* Of those that can be made again: file_socket_is_alone()                 */
+	/* For those that can be recreated: file_socket_is_alone() */
 	uint32_t uid, gid;
 	struct file_option *option; /* files_options.c, allocated               */
 	size_t option_bytes;
@@ -195,7 +195,7 @@ struct file_socket {
 	struct sockaddr_storage local, remote;
 };
 
-/* Of a process, as the checkpoint found it, in our own user namespace. */
+/* Of a process, as of the checkpoint, in our own user namespace. */
 #define RIGHTS_GROUPS STATUS_GROUPS
 struct file_rights {
 	bool known;
@@ -209,18 +209,18 @@ struct file {
 	int fd;
 	enum file_kind kind;
 	uint64_t dev, ino, rdev;
-	uint64_t id; /* of an eventfd, 0: the kernel does not say                   */
+	uint64_t id; /* of an eventfd, 0: unknown */
 	uint32_t mode;
 	int flags; /* F_GETFL                                                       */
 	bool cloexec;
 	int ours;     /* our duplicate, for as long as a look takes; 0: none            */
 	bool outside; /* its open file description is also init's                  */
 	int shared;   /* lowest fd with the same open file description             */
-	/* The first one, of all processes, that has it; NULL: only this process      */
+	/* The first one, of all processes, that shares it; NULL: only this process */
 	const struct file *family;
 	bool known; /* the same object as in `known` of files_look(); at a restore
 		       * the name and what does not change is left to that   */
-	char *name; /* as readlink(2) says, allocated                            */
+	char *name; /* as from readlink(2), allocated */
 	/* F_GETOWN_EX: in our namespace, and in its own (0: not the app's); F_GETSIG */
 	int owner_type, owner, owner_inside, owner_signal;
 	int64_t offset; /* -1: it has none                                          */
@@ -229,7 +229,7 @@ struct file {
 	/* eventfd */
 	uint64_t count;
 	bool semaphore;
-	/* timerfd: when it is to go off next, by its own clock; 0: never          */
+	/* timerfd: when it expires next, by its own clock; 0: never */
 	int clock, settime_flags;
 	uint64_t ticks, deadline_ns, interval_ns;
 	uint64_t mask; /* signalfd                                                  */
@@ -239,37 +239,37 @@ struct file {
 	struct file_watch *watch; /* epoll, allocated                              */
 	uint32_t mark_count;
 	struct file_mark *mark; /* inotify, allocated                              */
-	bool unread;            /* there are events in it                          */
-	/* As fdinfo says it                                                      */
+	bool unread;            /* it has unread events */
+	/* As in fdinfo */
 	int told_flags;
 	uint64_t told_ino;
 	int64_t told_offset;
 	struct file_lock *lock; /* allocated                                     */
 	uint32_t lock_count;
 	int pipe_bytes;             /* F_GETPIPE_SZ; -1: it does not answer              */
-	bool remote;                /* a network file system: no questions while frozen       */
+	bool remote;                /* a network file system: no requests while frozen */
 	bool lock_unsure;           /* flock(2) may have been called just around the freeze   */
 	struct file_socket *socket; /* allocated                                   */
 	uint64_t tcp_written, tcp_taken; /* bytes, by the app                      */
-	uint64_t tcp_unread;             /* that have come, and were not taken yet */
+	uint64_t tcp_unread;             /* received, and not read yet */
 	bool tcp_counted;                /* these three are exact                  */
 	int tcp_state; /* 0: no connection over a network                           */
-	/* In the middle of a message, as far as can be told (files_stream.c)      */
+	/* In the middle of a message, as far as known (files_stream.c) */
 	bool tcp_coming, tcp_going;
 	/* What can be read from it, when its other end is the app's own as well   */
 	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
-	bool content_lost; /* there was something that cannot be put back          */
-	bool ended;        /* nobody has its other end: what is in it is the last        */
+	bool content_lost; /* it had contents that cannot be restored */
+	bool ended;        /* its other end is closed: its contents are final */
 	uint8_t shut;      /* at a restore, of a socket of now: SHUT_IN, SHUT_OUT      */
 	bool rights_lost;  /* descriptors in flight (SCM_RIGHTS)                     */
-	bool senders_lost; /* who had sent it (SCM_CREDENTIALS) is seen by who reads it  */
-	uint64_t rights;   /* what these are, as far as it can be told; 0: none        */
+	bool senders_lost; /* readers see the sender (SCM_CREDENTIALS) */
+	uint64_t rights;   /* a hash of these, as far as known; 0: none */
 	struct file_video video;
 	/* The same open file description in `parent` of files_look(); NULL: not known to be.
 	 * Afterwards only in the images of a freeze, where all are at the same time. */
 	const struct file *inherited;
-	bool heir; /* of a look before a freeze: it was that                        */
+	bool heir; /* of a read before a freeze: it was one */
 };
 
 /* What is not where it was. */
@@ -282,23 +282,23 @@ struct files_missing {
 struct files {
 	uint32_t others; /* who have it, too                                          */
 	uint32_t count, room;
-	const struct file **ends; /* pipes and sockets by inode, when it is asked for: allocated */
+	const struct file **ends; /* pipes and sockets by inode, built on demand: allocated */
 	uint32_t end_count;
-	bool trusted;           /* its heirs were not looked at in the freeze               */
+	bool trusted;           /* its heirs were not read in the freeze */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */
 	struct file *file;      /* by fd, ascending                                     */
 	struct file_area *area; /* allocated                                       */
 	uint32_t areas;
-	/* A table that has just been looked at in the same way.  What this one has in common
-	 * with it, as children have with their parents, is not looked at again. */
+	/* A table that has just been read in the same way.  What this one shares with it, as
+	 * children do with their parents, is not read again. */
 	const struct files *parent;
 	pid_t parent_pid;
 	struct scratch *scratch; /* during a freeze                                 */
 	struct process *process; /* likewise                                       */
 	struct file_rights rights;
-	/* At a restore: of what is not in `known`, only what may be one of these is looked at. */
+	/* At a restore: of what is not in `known`, only what may be one of these is read. */
 	const struct files_missing *missing;
 };
 
@@ -306,8 +306,8 @@ struct files_work;
 struct tcp_info;
 
 enum files_depth {
-	FILES_BEFORE, /* everything about what stays the same; the app runs         */
-	FILES_FROZEN, /* what is of this instant; the rest from `known`             */
+	FILES_BEFORE, /* everything that does not change; the app runs */
+	FILES_FROZEN, /* the state of this instant; the rest from `known` */
 	FILES_NOW     /* at a restore: what may have changed since `known`          */
 };
 
@@ -322,7 +322,7 @@ struct files_owner {
 /* `files->parent` may be set. */
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err) warn_unused;
-/* Puts them in order. */
+/* Sorts them. */
 void files_missing_sort(struct files_missing *missing);
 struct file *files_find(const struct files *files, int fd);
 bool files_same_object(const struct file *a, const struct file *b);
@@ -331,12 +331,12 @@ bool files_same_object(const struct file *a, const struct file *b);
 struct files_held {
 	struct file *file;
 	const struct file *before; /* the same in the checkpoint before, or NULL       */
-	pid_t pid;                 /* who has it                                       */
+	pid_t pid;                 /* the process that has it */
 	uint32_t number;
 	struct file *first;
 };
 void files_group(struct files_held *held, uint32_t count);
-/* Since the look at it. */
+/* Since it was read. */
 bool files_is_closed(const struct files_held *held);
 
 /* files_info.c */
@@ -350,11 +350,11 @@ uint64_t file_count(int fd);
 
 /* files_messages.c */
 #define CONTENT_MAX (1 << 20)
-/* What is in a Unix socket, so many bytes. */
+/* Reads the contents of a Unix socket, of so many bytes. */
 void file_keep_messages(struct process *process, int fd, struct file *file, uint32_t bytes);
-/* Whether that is all just as it was.  At a restore. */
+/* Whether that is unchanged.  At a restore. */
 bool file_has_messages(int fd, const struct file *want);
-/* Closes descriptors that came with what was looked at: not in a freeze. */
+/* Closes descriptors that came with peeked messages: not in a freeze. */
 void files_land(void);
 /* As shutdown(2) has left it, of one of ours whose process is dead. */
 #define SHUT_IN 1
@@ -362,7 +362,7 @@ void files_land(void);
 uint8_t file_shut(int fd);
 
 /* files_state.c */
-/* So often a count is read at most, to bring it down to what it was. */
+/* How often a count is read at most, to lower it to what it was. */
 #define FILE_COUNT_READS 1000
 void file_look_at_socket(int fd, struct file *file);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
@@ -370,7 +370,7 @@ void files_find_peers(struct files *files, pid_t pid);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(struct files *files, const struct file *file);
 void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);
-/* Whether anybody has POSIX or OFD locks on it; and on what file system it is. */
+/* Whether it has POSIX or OFD locks; and its file system. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
 /* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
@@ -381,18 +381,18 @@ bool file_tcp_moved(const struct file *want, const struct file *now);
 const char *file_reset_tcp(int fd);
 
 /* files_options.c */
-/* One more has it; NULL: there is none. */
+/* Takes a reference; may be NULL. */
 struct file_socket *file_socket_share(struct file_socket *socket);
 void file_socket_free(struct file_socket *socket);
-/* Whether it can be made again: it needs nobody at the other end. */
+/* Whether it can be recreated: it needs no peer. */
 bool file_socket_is_alone(const struct file_socket *socket);
-/* What only matters if it has to be made again: options, user, the file of its name. */
+/* What only matters if it has to be recreated: options, user, the file of its name. */
 void file_look_at_manner(int fd, struct file_socket *socket, pid_t init);
 /* Whether one that was idle has got a name or a connection since. */
 bool file_socket_was_used(int fd, const struct file_socket *socket);
 /* Whether getsockname(2) says the same of `fd`. */
 bool file_socket_has_name(int fd, const struct file_socket *socket);
-/* Those that are not so yet.  Returns NULL or what failed. */
+/* Sets those that differ.  Returns NULL or what failed. */
 const char *file_put_options(int fd, const struct file_socket *socket);
 
 /* files_unix.c */
@@ -401,27 +401,27 @@ bool file_unix_is_alone(const struct file_socket *socket);
 void file_look_at_node(int fd, struct file_socket *socket, pid_t init);
 /* Whether that file was deleted since. */
 bool file_unix_is_deleted(int fd, const struct file_socket *socket);
-/* `template` looks names up as the app did.  0, or -1 and *why; *why may be set on success
- * as well: what is not as it was. */
+/* `template` resolves names as the app did. 0, or -1 and *why; *why may be set on success as well:
+ * what differs. */
 int file_bind_unix(int fd, const struct file_socket *socket, pid_t template, pid_t init,
 		   const char **why) warn_unused;
-/* When all have their names: sockets for datagrams that were made again, or are connected
- * to one that was. */
+/* When all have their names: connects datagram sockets that were recreated, or were connected to
+ * one. */
 void files_connect_again(struct files_work *work);
 
 /* files_stream.c */
-/* Whether bytes are just coming in; whether some that were to go out did not fit. */
+/* Whether bytes are arriving; whether some to be sent did not fit. */
 bool file_is_coming(int fd);
 bool file_was_coming(const struct tcp_info *info, int unread);
 bool file_is_going(int fd);
-/* Looks at epoll sets for who waits to write on. */
+/* Finds in epoll sets which sockets are waited on for writing. */
 void files_find_going(struct files *files);
-/* avckpt.tcp=messages: a connection that a restore leaves between two messages goes on,
- * one that can be brought there is, any other is reset.  Returns NULL or what failed. */
+/* avckpt.tcp=messages: a connection that a restore leaves between two messages is kept, one that
+ * can be brought there is, any other is reset.  Returns NULL or what failed. */
 const char *file_put_stream(int fd, const struct file *want, const struct file *now);
 
 /* files_pipes.c */
-/* Of those that are not inherited from a parent, and not init's, too. */
+/* Of those that are not inherited from a parent, nor shared with init. */
 void files_measure_pipes(struct files *files, int pidfd);
 
 /* files_watches.c */
@@ -431,11 +431,11 @@ const char *file_put_marks(int fd, const struct file *want, const struct file *n
 
 /* files_video.c */
 bool file_is_video(const struct file *file);
-/* Only who streams has buffers: not who has the same camera open beside him.  -1: it does not
+/* Only the descriptor that streams has buffers, not others of the same camera. -1: it does not
  * answer before the guard's deadline. */
 int file_look_at_video(int fd, struct file_video *video) warn_unused;
-/* May wait until the camera has filled what was given back to it since.  Returns NULL or
- * what failed. */
+/* May wait until the camera has filled buffers that were queued since.  Returns NULL or what
+ * failed. */
 const char *file_put_video(int fd, const struct file_video *want);
 void files_find_areas(struct files *files, pid_t pid);
 
@@ -447,13 +447,13 @@ struct file_rights_own {
 	uint32_t groups[RIGHTS_GROUPS];
 };
 void file_rights_read(struct file_rights *rights, pid_t pid);
-/* The calling thread opens files as that process would, until it gives that back; nothing else may
- * be done in between.  -1: it cannot, and nothing has changed. */
+/* The calling thread opens files as that process would, until it switches back; nothing else may be
+ * done in between. -1: it cannot, and nothing has changed. */
 int file_rights_take(const struct file_rights *rights, struct file_rights_own *own) warn_unused;
 void file_rights_give_back(const struct file_rights_own *own);
 
 /* files_make.c */
-/* Of a pseudoterminal, the side that programs run on. */
+/* The slave side of a pseudoterminal. */
 bool file_is_pts(const struct file *file);
 /* The file that it was, by its path: an O_PATH descriptor, or -1.  With our own rights if `rights` is
  * NULL. */
@@ -461,13 +461,13 @@ int file_open_path(const struct file *want, pid_t init, const struct file_rights
 /* The file that it was, by its path or because it is still mapped: an O_PATH descriptor; or -1, with
  * errno: ESTALE if another one has its name. */
 int file_find(const struct file *want, pid_t template, pid_t init);
-/* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why
- * may be set on success as well: what is not as it was. */
+/* A descriptor of ours for what is not in the table any more, or -1 with *why.  *why may be set on
+ * success as well: what differs. */
 int file_make(const struct file *want, pid_t template, pid_t init, const struct file_rights *rights,
 	      const char **why);
 /* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
 int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
-/* A socket or pipe that reads as closed by the other side, after what was in it. */
+/* A socket or pipe that reads as closed by the peer, after its contents. */
 int file_make_dead(const struct file *want, pid_t template);
 
 /* files_restore.c and files_calls.c */
@@ -486,10 +486,10 @@ struct files_work {
 	int *claimed_by;         /* of now: leader (index in want) of the group that has it */
 	int *source;             /* of want, by group leader: index in now, or -1          */
 	bool *closed;            /* of now: by us                                          */
-	bool *lost;              /* of want: has to be put in place                        */
-	bool *kept;              /* of want: the process that forks it has just this       */
+	bool *lost;              /* of want: has to be restored */
+	bool *kept;              /* of want: inherited from the process that forks it */
 	struct files_work *host; /* of which process that is; NULL: none            */
-	uint32_t listed;         /* calls for the template that were not made yet          */
+	uint32_t listed;         /* calls for the template, not made yet */
 	uint32_t problems;
 	struct avc_error *notes;
 };
@@ -503,7 +503,7 @@ int files_work_table(const struct files_work *work, struct fd_table *table,
 void files_work_end(struct files_work *work);
 /* A duplicate of what is at this place of the table now. */
 int files_borrow_placed(const struct files_work *work, const struct file *w);
-/* Makes the calls that were listed. */
+/* Makes the listed calls. */
 int files_work_flush(struct files_work *work, struct avc_error *err) warn_unused;
 void files_note(struct files_work *work, const struct file *f, const char *problem);
 
@@ -515,13 +515,13 @@ const struct file *files_now_of(const struct files_work *work, uint32_t i);
 void files_list_calls(struct files_work *work);
 
 /* files_epoll.c */
-/* After a freeze: finds out what is watched under a number that is not its own any more. */
+/* After a freeze: finds out what is watched under a number that no longer belongs to it. */
 void files_find_closed(struct files *files, pid_t pid);
 /* What the set `now` (may be NULL) watches just as `watch` says, or NULL. */
 const struct file_watch *files_find_watch(const struct file *now, const struct file_watch *watch);
 /* Whether there are calls of files_list_epoll() that take a number beyond the last. */
 bool files_watch_closed(const struct files *files);
-/* Sets that cannot be made what they were are made again. */
+/* Sets that cannot be restored in place are recreated. */
 int files_give_up_sets(struct files_work *work, struct avc_error *err) warn_unused;
 void files_list_epoll(const struct files_work *work, struct setup *setup, const struct file *w,
 		      const struct file *n);

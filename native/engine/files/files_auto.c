@@ -1,15 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.files=auto: what the program's files say of its memory.
+ * avckpt.files=auto: whether the program's files allow its memory to go back.
  *
- * A log, or any other output, is only ever written on; that it has lines of which a restored program
- * does not know harms nobody.  A database knows what is in its files and where, and memory that goes
- * back behind them writes old pages over new ones.  Such a file is opened to be read as well, or is
- * locked, and it is written elsewhere than at its end.  And a file that has been deleted since
- * belonged to work that is done.
+ * A log, or any other output, is only appended to; lines unknown to a restored program do no harm.
+ * A database has the layout of its files in memory, and memory that goes back behind them
+ * overwrites new pages with old ones.  Such a file is also open for reading, or is locked, and it
+ * is written elsewhere than at its end.  And a file that has been deleted since belonged to work
+ * that is done.
  *
- * Beside such a file, what is not open counts as well (files_written.c): each session of PostgreSQL's
- * is a process of its own that writes to its log and ends.
+ * Beside such a file, what is not open counts as well (files_written.c): each PostgreSQL session is
+ * a separate process that writes to its log and exits.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -22,15 +22,15 @@
 /* Timestamps of most kernels advance by a tick (files_strict.c). */
 #define TICK_NS (10 * NS_PER_MS)
 
-/* A page that is mapped and dirty can be written again without a sign, until the kernel has written
- * it out (vm.dirty_expire_centisecs, and the flusher's own interval). */
+/* A page that is mapped and dirty can be written again unnoticed, until the kernel has written it
+ * out (vm.dirty_expire_centisecs, and the flusher's own interval). */
 #define DIRTY_NS (35 * NS_PER_S)
 
-/* What a program shows of itself to others, and does not read back (/tmp/hsperfdata_USER of Java,
+/* Data that a program publishes, and does not read back (/tmp/hsperfdata_USER of Java,
  * queries.active of Prometheus), is mapped and small. */
 #define STATUS_BYTES 65536
 
-/* Of no disk; and what is shared memory is looked after elsewhere. */
+/* Not on a disk; shared memory is handled elsewhere. */
 static bool is_data(const struct file *f)
 {
 	static const char *const elsewhere[] = { "/memfd:", "/dev/", "/proc/", "/sys/" };
@@ -63,7 +63,7 @@ static bool is_mapped(pid_t pid, const struct file *w)
 	return proc_mappings(pid, "maps", is_mapping_of, &key) != 0;
 }
 
-/* `offset`: where it stands now; -1: it was closed since. */
+/* `offset`: the current one; -1: it was closed since. */
 static bool is_in_the_way(const struct image *image, const struct file *w, const struct stat *st,
 			  int64_t offset)
 {
@@ -77,14 +77,14 @@ static bool is_in_the_way(const struct image *image, const struct file *w, const
 	if (!changed)
 		return w->bytes > STATUS_BYTES && modified + DIRTY_NS > image->files->taken_ns &&
 		       is_mapped(image->template, w);
-	/* Written on, from its end to its end; one that has not grown was written over. */
+	/* Appended to, from end to end; one that has not grown was overwritten. */
 	if (w->offset == w->bytes && offset == st->st_size && offset > w->offset)
 		return false;
 	return w->bytes > STATUS_BYTES || st->st_size > STATUS_BYTES ||
 	       !is_mapped(image->template, w);
 }
 
-/* It, or what stands for it by now, as it is in the table; -1: it is not there. */
+/* Its current descriptor, or its replacement's, in the table; -1: none. */
 static int borrow(const struct file *w, int pidfd, struct stat *st)
 {
 	int fd = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, w->fd);
@@ -109,10 +109,10 @@ static int check(const struct image *image, const struct file *w, int pidfd, pid
 		missing = errno;
 		if (fd < 0 || fstat(fd, &st)) {
 			close_fd(&fd);
-			/* A log that was rotated goes on under another name. */
+			/* A rotated log continues under another name. */
 			if (w->flags & O_APPEND || (missing == ESTALE && !readable))
 				return 0;
-			/* A file that was read is replaced whole (rename(2)). */
+			/* A file that was read is replaced as a whole (rename(2)). */
 			if (missing == ESTALE && (w->flags & O_ACCMODE) == O_RDONLY)
 				return 0;
 			return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
@@ -148,7 +148,7 @@ bool files_is_older(const struct image *image, int fd, const struct stat *st)
 {
 	struct statx born;
 
-	/* One that was made since is of no concern. */
+	/* One that was created since does not matter. */
 	if (!statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC, STATX_BTIME, &born) &&
 	    born.stx_mask & STATX_BTIME &&
 	    (uint64_t)born.stx_btime.tv_sec * NS_PER_S + born.stx_btime.tv_nsec >

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the restored process has to do itself for its descriptors to be as they were
- * (files.h), as a list of calls in its slot: epoll and signalfd are bound to the process
- * that registers, owners and POSIX locks are its number.
+ * What the restored process has to do itself to restore its descriptors (files.h), as a list of
+ * calls in its slot: epoll and signalfd are bound to the process that registers, owners and POSIX
+ * locks to its PID.
  */
 #include <fcntl.h>
 #include <string.h>
@@ -36,8 +36,8 @@ static bool has_lock(const struct file *f, const struct file_lock *lock)
 	return false;
 }
 
-/* POSIX locks belong to the table, so they outlive the app; but whoever closes any descriptor of the
- * file loses them, and we may have.  And they are said to be of the process that took them. */
+/* POSIX locks belong to the table, so they outlive the app; but closing any descriptor of the file
+ * drops them, and we may have.  And the process that took them is recorded as their owner. */
 static void list_locks(struct setup *setup, const struct file *w, const struct file *n)
 {
 	for (uint32_t i = 0; n && i < n->lock_count; i++)
@@ -48,7 +48,7 @@ static void list_locks(struct setup *setup, const struct file *w, const struct f
 			list_lock(setup, w, &w->lock[i], w->lock[i].exclusive ? F_WRLCK : F_RDLCK);
 }
 
-/* A thread can be an owner, so all of them have to be there. */
+/* A thread can be an owner, so all of them have to exist. */
 static void list_owner(struct setup *setup, const struct file *w)
 {
 	struct f_owner_ex owner = { .type = (int)w->owner_type, .pid = w->owner_inside };
@@ -64,7 +64,7 @@ static void list_owner(struct setup *setup, const struct file *w)
 		->flags = INJ_MAY_FAIL;
 }
 
-/* What was open is a dead process's. */
+/* What was open refers to a dead process. */
 static void list_pidfd(struct setup *setup, const struct file *w)
 {
 	setup_add(setup, INJ_OWNERS, "pidfd_open", INJ_PIDFD_OPEN, (uint64_t)w->fd,
@@ -104,8 +104,8 @@ static void list_limit(const struct files_work *work, struct setup *setup)
 			->flags = INJ_MAY_FAIL;
 }
 
-/* Made again, and bound (files_make.c).  Whoever connects is told who listens (unix(7),
- * SO_PEERCRED), so the process must have its own user by then. */
+/* Recreated and bound (files_make.c).  Clients see who called listen(2) (unix(7), SO_PEERCRED), so
+ * the process must have its own credentials by then. */
 static void list_listen(const struct files_work *work, struct setup *setup, const struct file *w,
 			const struct file *n)
 {
@@ -118,8 +118,8 @@ static void list_listen(const struct files_work *work, struct setup *setup, cons
 			->flags = INJ_MAY_FAIL;
 }
 
-/* The template has let go of it (files_video.c).  A mapping that fails in its place would leave
- * nothing there (mmap(2), MAP_FIXED), so it is made elsewhere first. */
+/* The template has unmapped it (files_video.c).  A mapping that fails there would leave a hole
+ * (mmap(2), MAP_FIXED), so it is made elsewhere first. */
 static void list_area(struct setup *setup, const struct file_area *area)
 {
 	struct inj_setup *map, *move;
@@ -156,7 +156,7 @@ void files_list_calls(struct files_work *work)
 			list_pidfd(setup, &work->want->file[i]);
 	if (!work->process->descendant && needs_numbers(work->want))
 		list_limit(work, setup);
-	/* Numbers are taken for moments, and who closes a file loses its locks. */
+	/* Numbers are used temporarily, and closing a file drops its locks. */
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->want->file[i].kind == FILE_EPOLL &&
 		    files_leader(work->want, &work->want->file[i]) == i)

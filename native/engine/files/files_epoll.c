@@ -2,10 +2,10 @@
  *
  * What an epoll set watches (files.h).
  *
- * The kernel names it by a number and an open file description, and goes on to watch that
- * when the number is closed, as long as anybody has the description by another number
- * (epoll(7), Questions and answers).  The number may be another file's by then, which can be
- * watched as well.  Only kcmp(2) tells what such an entry is of.
+ * The kernel identifies an entry by a number and an open file description, and keeps watching that
+ * when the number is closed, as long as any process has the description open (epoll(7), Questions
+ * and answers).  The number may belong to another file by then, which can be watched as well.  Only
+ * kcmp(2) shows what such an entry refers to.
  */
 #include <fcntl.h>
 #include <linux/kcmp.h>
@@ -17,18 +17,18 @@
 
 #include "files.h"
 
-/* Of anonymous inodes nothing but kcmp(2) tells one from another, which takes the kernel the longer
- * the more a set watches.  So in a large one it is only asked where there is something odd. */
+/* Only kcmp(2) distinguishes anonymous inodes, and the kernel takes longer the more a set watches.
+ * So in a large one it is only called where something is inconsistent. */
 #define ANONYMOUS_ASKED 128
 
 static bool is_of(const struct file_watch *watch, const struct file *f)
 {
-	/* linux/kdev_t.h: as the kernel has them.  Before Linux 4.14 it does not say. */
+	/* linux/kdev_t.h: as the kernel has them.  Not reported before Linux 4.14. */
 	return !watch->ino || (f->ino == watch->ino &&
 			       ((uint64_t)major(f->dev) << 20 | minor(f->dev)) == watch->dev);
 }
 
-/* On an overlay stat(2) says another number. */
+/* On an overlay stat(2) returns another number. */
 static bool has_name(const struct file *f)
 {
 	return f->kind == FILE_FIFO || f->kind == FILE_DEVICE;
@@ -130,8 +130,8 @@ const struct file_watch *files_find_watch(const struct file *now, const struct f
 
 /* ---- what the restored process has to do ------------------------------------------- */
 
-/* Has to be registered again?  An edge that came since the checkpoint is gone, and a
- * signalfd is bound to the process that registered it. */
+/* Whether it has to be registered again: an edge since the checkpoint is gone, and a signalfd is
+ * bound to the process that registered it. */
 static bool renew(const struct files_work *work, const struct file *n,
 		  const struct file_watch *watch)
 {
@@ -168,7 +168,7 @@ static void list_watch(struct setup *setup, enum inj_stage stage, const struct f
 		->flags = INJ_MAY_FAIL;
 }
 
-/* What is watched gets its old number for that moment. */
+/* The watched file temporarily gets its old number. */
 static void list_closed_watch(const struct files_work *work, struct setup *setup,
 			      enum inj_stage stage, const struct file *set,
 			      const struct file_watch *watch)
@@ -185,7 +185,7 @@ static void list_closed_watch(const struct files_work *work, struct setup *setup
 	list_close(setup, stage, holds ? aside : watch->fd);
 }
 
-/* What it watches since has been forgotten (files_restore.c). */
+/* What it watches since the checkpoint has been removed (files_restore.c). */
 void files_list_epoll(const struct files_work *work, struct setup *setup, const struct file *w,
 		      const struct file *n)
 {
@@ -206,8 +206,8 @@ void files_list_epoll(const struct files_work *work, struct setup *setup, const 
 
 /* ---- sets that are made again ------------------------------------------------------- */
 
-/* What it has watched since was to be forgotten.  What is still in it is watched under a number
- * that is closed, and cannot be reached any more (or again in another way than it was). */
+/* What it watches since the checkpoint was removed.  What is still in it is watched under a closed
+ * number, and cannot be reached any more (or is registered differently again). */
 static bool is_spoilt(const struct files_work *work, const struct file *w, const struct file *n)
 {
 	struct file is = { .fd = n->fd, .kind = FILE_EPOLL };

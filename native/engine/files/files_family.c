@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The tables of descriptors of all processes of an app (files.h), and what is between
- * them: a pipe or socket pair whose ends different processes have is made again once, for
- * all of them, and what was in it is put back once.
+ * The descriptor tables of all processes of an app (files.h), and what they share: a pipe or socket
+ * pair with ends in different processes is recreated once, for all of them, and its contents are
+ * restored once.
  */
 #include <fcntl.h>
 #include <stdio.h>
@@ -42,8 +42,8 @@ static uint32_t list_held(struct files_held *held, const struct image *image,
 	return count;
 }
 
-/* What has been closed since the freeze (a worker does that when its parent has died) cannot
- * be compared any more; as a rule it was shared in the checkpoint before. */
+/* What has been closed since the freeze (a worker does that when its parent has died) cannot be
+ * compared any more; usually it was shared in the previous checkpoint. */
 static void group_closed(struct files_held *held, uint32_t count)
 {
 	for (uint32_t i = 0; i < count; i++) {
@@ -79,7 +79,7 @@ static void name_others(const struct image *image, uint32_t images, struct files
 	}
 }
 
-/* What the freeze has found to be of the parent's descriptions.  Parents come first. */
+/* What the freeze found to share the parent's descriptions.  Parents come first. */
 static void join_parents(const struct image *image, uint32_t index)
 {
 	const int parent = image[index].parent < 0 ? 0 : image[index].parent;
@@ -98,8 +98,8 @@ static void join_parents(const struct image *image, uint32_t index)
 	}
 }
 
-/* By the templates, which have the tables as the processes have them.  What a process has
- * put in a place since is found to be shared with nobody. */
+/* In the templates, which share the processes' tables.  A descriptor that was replaced since is
+ * found to be unshared. */
 void files_settle_family(struct image *image, uint32_t images, struct image *before,
 			 uint32_t befores)
 {
@@ -137,7 +137,7 @@ struct spot {
 	uint32_t table, k;
 };
 
-/* In order, for there are as many as processes times what each has open. */
+/* Sorted, because there are as many as processes times descriptors. */
 struct spots {
 	struct spot *spot;
 	uint32_t count;
@@ -284,13 +284,13 @@ static int reopen(int fd, int flags)
 	int opened;
 
 	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
-	/* With O_NONBLOCK, or it would wait for somebody at the other end. */
+	/* With O_NONBLOCK, or it would wait for a process at the other end. */
 	opened = open(path, (flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
 	close(fd);
 	return opened;
 }
 
-/* Whoever has the other end, and whether it came of what is still there. */
+/* Finds who has the other end, and whether it comes from one that still exists. */
 static const struct file *find_other(const struct tables *tables, const struct file *w,
 				     bool *made_already)
 {
@@ -308,8 +308,7 @@ static const struct file *find_other(const struct tables *tables, const struct f
 	return NULL;
 }
 
-/* To everybody who has had it.  An end that is still there belongs to a pair that is none
- * any more. */
+/* To every process that had it.  An end that still exists belongs to a broken pair. */
 static void give_end(const struct tables *tables, const struct file *w, int end)
 {
 	EACH_SPOT(at, &tables->ends, w->ino)
@@ -329,7 +328,7 @@ static void give_end(const struct tables *tables, const struct file *w, int end)
 	close(end);
 }
 
-/* What another process has still, or again, this one has as well. */
+/* What another process still has, or has again, is shared with this one. */
 static void join_family(const struct tables *tables, struct files_work *work)
 {
 	for (uint32_t k = 0; k < work->want->count; k++) {
@@ -383,7 +382,7 @@ static void join(const struct tables *tables)
 	}
 }
 
-/* Once, however many have an end that can be read. */
+/* Once, however many processes have a readable end. */
 static bool is_first(const struct tables *tables, const struct file *w)
 {
 	EACH_SPOT(at, &tables->ends, w->ino)
@@ -404,7 +403,7 @@ static const struct file *content_of(const struct tables *tables, const struct f
 	return w;
 }
 
-/* Whoever had the other end of this pipe had ended already, and left it what is in it. */
+/* The process with the other end of this pipe had already exited, leaving its contents. */
 static bool has_ended(const struct tables *tables, const struct file *w)
 {
 	EACH_SPOT(at, &tables->ends, other_key(w))
@@ -452,7 +451,7 @@ static uint8_t shut_of(const struct file *f, const struct file *other)
 			 (others & SHUT_IN ? SHUT_OUT : 0));
 }
 
-/* As it is now; -1: nobody has it any more. */
+/* As it is now; -1: no process has it any more. */
 static int shut_now(const struct tables *tables, const struct file *w)
 {
 	EACH_SPOT(at, &tables->ends, w->ino)
@@ -465,7 +464,7 @@ static int shut_now(const struct tables *tables, const struct file *w)
 	return -1;
 }
 
-/* Whether there is something to put back that cannot come by way of `other` to `w` any more. */
+/* Whether there are contents to restore that can no longer be sent through `other` to `w`. */
 static bool is_blocked(const struct tables *tables, const struct file *w, int is, int others)
 {
 	const struct file *content = content_of(tables, w);
@@ -481,8 +480,8 @@ static bool is_blocked(const struct tables *tables, const struct file *w, int is
 	return blocked;
 }
 
-/* Nothing opens again what shutdown(2) has shut: such a pair is made again, and shut after what was
- * in it has been put back. */
+/* shutdown(2) cannot be undone: such a pair is recreated, and shut down after its contents have
+ * been restored. */
 static void renew_pair(const struct tables *tables, const struct file *w, const struct file *other)
 {
 	const int is = shut_now(tables, w), others = shut_now(tables, other);
@@ -547,7 +546,7 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 		return fail_errno(err, 0, "restore descriptors", "calloc", "out of memory");
 	for (uint32_t i = 0; i < images; i++) {
 		const struct process *process = image[i].process;
-		/* Of one that has ended before, nobody has the table. */
+		/* The table of one that had exited before is gone. */
 		const bool held = process && process->descendant;
 
 		if (!process)

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Heirs: descriptors that a child has from its parent, under the same number.  There may be as many
- * as processes times what the first of them has open.  So a freeze takes those that a child has
- * once for what they were a moment before (files.c, walk_frozen()), and it is found out afterwards,
- * by the templates, whether that was right.  A child that has put another file in the place of one
- * has it back from nowhere, but by exchanging two of them twice within that time.
+ * Heirs: descriptors that a child shares with its parent, under the same number.  There may be as
+ * many as processes times the descriptors of the first.  So a freeze assumes that those that occur
+ * once in a child are unchanged (files.c, walk_frozen()), which is checked afterwards, in the
+ * templates.  A child that has replaced one cannot get it back unnoticed, except by exchanging two
+ * of them twice within that time.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -31,7 +31,7 @@ static int check(struct image *image, const struct image *parent, struct avc_err
 	return 0;
 }
 
-/* Whether they are closed by execve(2) is the table's own.  The template has the same table. */
+/* O_CLOEXEC belongs to the table.  The template has the same table. */
 static int ask_flags(struct image *image, struct avc_error *err)
 {
 	const struct parasite *parasite = &image->process->parasite;

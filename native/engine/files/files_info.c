@@ -16,7 +16,7 @@ struct rooms {
 	uint32_t locks, watches, marks;
 };
 
-/* As make_room(), of what a checkpoint may have. */
+/* As make_room(), within the checkpoint's budget. */
 static bool take_room(void *array, uint32_t count, uint32_t *room, size_t bytes)
 {
 	return count < *room ||
@@ -156,7 +156,7 @@ static void take_line(struct file *file, const char *key, const char *value, str
 		add_mark(file, value, &room->marks);
 }
 
-/* The kernel has an order of its own; there may be tens of thousands to be compared. */
+/* The kernel uses its own order; there may be tens of thousands to compare. */
 static int by_number(const void *a, const void *b)
 {
 	const struct file_watch *x = a, *y = b;

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Opens and makes again what is not in the table any more (files.h).  A file is only
- * opened if it is the very one: the app is given nothing that it did not have.
+ * Reopens and recreates what is not in the table any more (files.h).  A file is only opened if it
+ * is the same one: the app gets nothing that it did not have.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -43,13 +43,13 @@ static int open_as(int fd, const struct file *want)
 
 	if (want->flags & O_PATH)
 		return fcntl(fd, F_DUPFD_CLOEXEC, 3);
-	/* Nobody may be there to open a fifo's other side. */
+	/* There may be no process at the other end of a fifo. */
 	if (want->kind == FILE_FIFO || want->kind == FILE_DEVICE)
 		flags |= O_NONBLOCK;
 	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
 	opened = open(path, flags | O_NOCTTY | O_CLOEXEC);
 	if (opened < 0 && errno == ENXIO && want->kind == FILE_FIFO) {
-		/* To write, with no reader: there must be one for this moment. */
+		/* For writing, without a reader: there must be one temporarily. */
 		const int reader = open(path, O_RDONLY | O_NONBLOCK | O_CLOEXEC);
 
 		opened = open(path, flags | O_CLOEXEC);
@@ -130,8 +130,7 @@ bool file_is_pts(const struct file *f)
 	       major(f->rdev) < UNIX98_PTY_SLAVE_MAJOR + UNIX98_PTY_MAJOR_COUNT;
 }
 
-/* Whether whoever opens it has something of his own: not so with /dev/null and its like, nor
- * with terminals, but with /dev/ptmx. */
+/* Whether it has state per open: not /dev/null and its like, nor terminals, but /dev/ptmx. */
 static bool is_another_instance(const struct file *want)
 {
 	if (want->kind != FILE_DEVICE || want->flags & O_PATH || file_is_pts(want))
@@ -188,7 +187,7 @@ static int socket_of(pid_t template, int domain, int type, int protocol)
 	return fd;
 }
 
-/* What the other side had sent before it was gone. */
+/* What the peer had sent before it closed. */
 static void leave_content(int fd, int other_fd, const struct file *want)
 {
 	if (want->ended && want->content)
@@ -231,10 +230,10 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 {
 	const int yes = 1;
 
-	/* Connections that it had accepted have its port, still. */
+	/* Connections that it had accepted still have its port. */
 	if (s->type == SOCK_STREAM)
 		setsockopt(fd, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
-	/* One without a port must not get any. */
+	/* One without a port must not get one. */
 	if ((file_socket_has_name(fd, s) ||
 	     bind(fd, (const struct sockaddr *)&s->local, s->local_bytes) == 0) &&
 	    (!s->listening || listen(fd, s->backlog) == 0) &&
@@ -246,9 +245,9 @@ static int bind_socket(int fd, const struct file_socket *s, const char **why)
 	return -1;
 }
 
-/* Those that need nobody at the other end.  That a Unix socket listens is left to the
- * restored process, which its clients take for the server (unix(7), SO_PEERCRED); that it is
- * connected, to when all have their names (files_restore.c). */
+/* Those that need no peer.  For a Unix socket, listen(2) is left to the restored process, which
+ * clients see as the server (unix(7), SO_PEERCRED), and connect(2) until all have their names
+ * (files_restore.c). */
 static int make_socket(const struct file *want, pid_t template, pid_t init, const char **why)
 {
 	const struct file_socket *s = want->socket;
@@ -256,7 +255,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 	int fd;
 
 	if (!s || !file_socket_is_alone(s)) {
-		/* A connection that was closed is nothing to tell. */
+		/* A closed connection need not be reported. */
 		if (s && s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6)
 			*why = not_again;
 		return file_make_dead(want, template);
@@ -264,7 +263,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 	fd = socket_of(template, s->domain, s->type, s->protocol);
 	if (fd < 0)
 		return file_make_dead(want, template);
-	/* Only one user's share a port (socket(7), SO_REUSEPORT). */
+	/* Only sockets of one user can share a port (socket(7), SO_REUSEPORT). */
 	if (fchown(fd, s->uid, s->gid))
 		*why = "it does not belong to its user any more";
 	file_put_options(fd, s);
@@ -278,7 +277,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 	return fd;
 }
 
-/* init has the same stdio as the app was started with. */
+/* init has the stdio that the app was started with. */
 static int take_from_init(const struct file *want, pid_t init)
 {
 	int pidfd = proc_pidfd_open(init), fd = -1;
@@ -293,7 +292,7 @@ static int take_from_init(const struct file *want, pid_t init)
 	return fd;
 }
 
-/* Since Linux 6.9 the inode tells one process from another that has got its number. */
+/* Since Linux 6.9 the inode distinguishes a process from another that has reused its PID. */
 static int make_pidfd(const struct file *want, pid_t init)
 {
 	struct stat own = { 0 };

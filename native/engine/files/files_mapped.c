@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.files=strict, for files that are mapped for writing: what was in them.
+ * avckpt.files=strict, for files that are mapped for writing: their contents.
  *
  * A write through a mapping changes the file's time when a page gets dirty, not again
  * before the kernel has written it out, and on a tmpfs never.  So the contents are
@@ -31,7 +31,7 @@ struct files_mapped {
 	struct mapped_area area[MAPPED_MAX];
 };
 
-/* Not on a disk: what others are told through it cannot be taken back anyhow. */
+/* Not on a disk: what it tells others cannot be taken back anyway. */
 static bool is_data(const struct mapping *m)
 {
 	return m->shared && m->mode[1] == 'w' && m->inode && strncmp(m->name, "/dev/", 5) &&
@@ -63,7 +63,7 @@ static int take_area(const struct mapping *m, void *arg)
 	};
 	if (a->fd < 0)
 		return 0;
-	/* A file server is asked nothing while the app stands still: it may be the app. */
+	/* No request goes to a file server while the app is stopped: it may be the app. */
 	a->content = file_is_remote(a->fd) ? NULL : malloc(bytes);
 	/* Page faults and disk reads now, not in the freeze. */
 	if (!a->content || read_whole(a->fd, a->content, bytes, (off_t)a->offset) < 0) {
@@ -84,7 +84,7 @@ struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
 		.bytes_left = limit_bytes,
 	};
 
-	/* What cannot be had counts as written at a restore. */
+	/* What cannot be read counts as written at a restore. */
 	if (look.mapped)
 		(void)proc_mappings(pid, "maps", take_area, &look);
 	return look.mapped;
@@ -163,7 +163,7 @@ int files_mapped_check(const struct image *image, pid_t holder, struct avc_error
 	if (!image->mapped)
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
 			    "avckpt.files=strict: was set after the checkpoint");
-	/* The template has what was mapped then, the holder what was mapped at last. */
+	/* The template has what was mapped then, the holder what was mapped last. */
 	if (check_process(image->template, &check) || check_process(holder, &check))
 		return -1;
 	for (uint32_t i = 0; i < check.mapped->count; i++)

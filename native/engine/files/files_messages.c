@@ -1,9 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What is in Unix sockets, looked at without taking it out: bytes or messages, and that there are
- * descriptors on their way with them (SCM_RIGHTS).  Those come with each look, for there is no other
- * way to know what they are.  To close one may be to ask a file server, so that waits for the end of
- * the freeze, and is done aside.
+ * Peeks at the contents of Unix sockets: bytes or messages, and descriptors in flight with them
+ * (SCM_RIGHTS). Each peek receives these, because there is no other way to identify them.  Closing
+ * one may block on a file server, so that waits for the end of the freeze, and is done aside.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -18,12 +17,12 @@
 
 #include "files.h"
 
-#define MESSAGE_MAX (256 << 10) /* as large as the buffer of a socket, by default */
+#define MESSAGE_MAX (256 << 10) /* the default size of a socket's buffer */
 #define LANDED_MAX 1024
 #define LAND_NS NS_PER_S
 #define RIGHTS_UNKNOWN UINT64_MAX
 #define SCM_PIDFD_ 4 /* linux/socket.h, since Linux 6.5                              */
-/* What a message may bring along: 253 descriptors, and some more that the socket asks for. */
+/* Ancillary data of a message: 253 descriptors, and more that socket options request. */
 #define CONTROL_BYTES 2048
 
 /* ---- descriptors that came along ----------------------------------------------------------------- */
@@ -71,7 +70,7 @@ void files_land(void)
 		free(job);
 }
 
-/* In a freeze nobody is asked. */
+/* Not in a freeze: it may block. */
 static uint64_t mark_of(int fd)
 {
 	struct statx st = { 0 };
@@ -118,7 +117,7 @@ static int option(int fd, int name)
 	return getsockopt(fd, SOL_SOCKET, name, &value, &bytes) ? -1 : value;
 }
 
-/* Nothing is taken out.  Bytes, or -1; a message is cut, and its whole length the answer. */
+/* Only peeks.  Bytes, or -1; a message is truncated, but its full length is returned. */
 static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 {
 	uint8_t control[CONTROL_BYTES] __attribute__((aligned(8)));
@@ -135,7 +134,7 @@ static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 		return n;
 	if (lands)
 		hear_control(&head, file);
-	/* There is no room for them: so it is said that there are some. */
+	/* No room for them: truncation shows that there are some. */
 	if (head.msg_flags & MSG_CTRUNC && (lands || option(fd, SO_PASSCRED) <= 0)) {
 		file->rights_lost = true;
 		file->rights = RIGHTS_UNKNOWN;
@@ -143,8 +142,8 @@ static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 	return n;
 }
 
-/* The kernel moves on with every look, if it is told where to begin.  Messages are kept with their
- * lengths before them; what descriptors come with is a piece of a stream. */
+/* The kernel advances with every peek, once an offset is set.  Messages are kept with their lengths
+ * before them; in a stream, data with descriptors is a separate piece. */
 static void look_through(int fd, struct file *file)
 {
 	const bool stream = file->socket->type == SOCK_STREAM;
@@ -159,7 +158,8 @@ static void look_through(int fd, struct file *file)
 		if (more)
 			file->content = more;
 		n = more ? peek(fd, file, more + used + length, MESSAGE_MAX) : MESSAGE_MAX + 1;
-		/* An empty datagram cannot be looked past; for others it is the end. */
+		/* The peek offset cannot move past an empty datagram; on other sockets it is the
+		 * end. */
 		file->content_lost |=
 			n > MESSAGE_MAX ||
 			(n > 0 && (used + (size_t)n > CONTENT_MAX || !budget_has((uint64_t)n))) ||
@@ -187,7 +187,7 @@ static void trim(struct file *file)
 	}
 }
 
-/* It is an option of the app's own socket, which gets its value back also if we die. */
+/* It is an option of the app's socket, which is reset even if we die. */
 static void look_again(struct process *process, int fd, struct file *file)
 {
 	const int first = 0, before = option(fd, SO_PEEK_OFF);
@@ -224,7 +224,7 @@ void file_keep_messages(struct process *process, int fd, struct file *file, uint
 	file->content_bytes = n > 0 ? (uint32_t)n : 0;
 	if (n == bytes)
 		return;
-	/* A descriptor in flight ends what is seen. */
+	/* A peek ends at a descriptor in flight. */
 	file->rights = 0;
 	look_again(process, fd, file);
 	file->content_lost |= file->content_bytes != bytes;
@@ -250,7 +250,7 @@ bool file_has_messages(int fd, const struct file *want)
 
 /* ---- ends that are shut ---------------------------------------------------------------------------- */
 
-/* The kernel looks whether it may be sent before it looks at what. */
+/* The kernel checks whether sending is possible before it reads the message. */
 static bool is_out_shut(int fd)
 {
 	return send(fd, (const void *)1, 1, MSG_DONTWAIT | MSG_NOSIGNAL) < 0 && errno == EPIPE;

@@ -1,8 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a socket that can be made again is to be like: its options, user, name (files.h).  An
- * option that a new socket has anyway is not set, so that nothing is asked of the kernel that
- * the app had not asked for.
+ * The options, user and name of a socket that can be recreated (files.h).  An option with its
+ * default value is not set, so that the kernel is not asked for more than the app had asked for.
  */
 #include <linux/can/isotp.h>
 #include <linux/can/raw.h>
@@ -23,8 +22,8 @@
 #define SO_BUF_LOCK_ 72
 #define SO_PASSPIDFD_ 76
 
-/* In the order in which they are set.  A kernel or a kind of socket that does not know one
- * says so when it is read. */
+/* In the order in which they are set.  A kernel or a kind of socket that lacks one reports it when
+ * it is read. */
 static const struct {
 	int level, name;
 	int forced; /* sets it beyond the limits for users, to twice the value: socket(7) */
@@ -149,7 +148,7 @@ static bool read_option(int fd, uint32_t which, struct file_option *option)
 	return true;
 }
 
-/* They stand one behind the other. */
+/* They are stored consecutively. */
 static size_t size_of(const struct file_option *option)
 {
 	return (sizeof *option + option->bytes + 3) & ~(size_t)3;
@@ -274,7 +273,7 @@ bool file_socket_was_used(int fd, const struct file_socket *s)
 	return !file_socket_has_name(fd, s) || !getpeername(fd, (struct sockaddr *)&remote, &bytes);
 }
 
-/* socketpair(2): whoever is connected by name has one end with a name. */
+/* socketpair(2): a connection by name has one end with a name. */
 static bool is_of_pair(const struct file_socket *s)
 {
 	return s->domain == AF_UNIX && s->connected && s->local_bytes == sizeof(sa_family_t) &&

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Through what is open, others may write to the process's memory without its page table: pages that
- * were pinned before, for a device or for the kernel.
+ * Through open descriptors, a device or the kernel may write to the process's memory bypassing its
+ * page table: pages that were pinned before.
  */
 #include <fcntl.h>
 #include <sys/sysmacros.h>

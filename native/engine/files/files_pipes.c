@@ -2,10 +2,10 @@
  *
  * The sizes of pipes (files.h).
  *
- * To ask for one takes the pipe's lock, and whoever waits in splice(2) for what is to go into a pipe
- * holds that for as long as nothing comes.  No thread of the app does so while it stands still,
- * but somebody outside of it may.  So the question is put aside, and a pipe that does not answer
- * is left alone: whatever else is done with it takes the same lock.
+ * F_GETPIPE_SZ takes the pipe's lock, and a thread that waits in splice(2) for data to put into a
+ * pipe holds it for as long as none arrives.  No thread of the app does so while it is stopped, but
+ * one outside of it may.  So the call is made aside, and a pipe that does not answer is left alone:
+ * any other operation takes the same lock.
  */
 #include <fcntl.h>
 #include <stdlib.h>
@@ -42,7 +42,7 @@ static void drop(struct aside *aside)
 	free(job);
 }
 
-/* All that have been gathered; whoever does not answer keeps -1. */
+/* All that have been collected; one that does not answer keeps -1. */
 static void ask_gathered(struct inquiry *job)
 {
 	if (!aside_run(&job->aside, ANSWER_NS))

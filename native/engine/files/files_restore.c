@@ -1,16 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Makes the table of descriptors the checkpoint's again (files.h).
+ * Restores the descriptor table of the checkpoint (files.h).
  *
- * The dead app's table lives on in its template and its holder.  The engine gets or makes
- * what is missing, and the template, by injected calls, takes it over a socket and puts it
- * in its place: nobody else runs with this table meanwhile.  What depends on the process
- * (epoll and signalfd, owners, POSIX locks) is left to the restored process itself, as a
- * list of calls in its slot.
+ * The dead app's table lives on in its template and its holder.  The engine gets or recreates what
+ * is missing, and the template, by injected calls, receives it over a socket and moves it to its
+ * number: no other task with this table runs meanwhile.  What depends on the process (epoll and
+ * signalfd, owners, POSIX locks) is left to the restored process itself, as a list of calls in its
+ * slot.
  *
- * Only the main process gets this table.  The others are forked by their parents and get
- * theirs anew, out of what is gathered here (files_work_table()): of the old one, which the
- * holder has, only that is closed which is new, until they are all there.
+ * Only the main process gets this table.  The others are forked by their parents and get new
+ * tables, from what is collected here (files_work_table()): in the old one, which the holder has,
+ * only new descriptors are closed, until all processes exist.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -60,7 +60,7 @@ uint32_t files_leader(const struct files *files, const struct file *f)
 
 /* ---- what stays, and where the rest comes from ---------------------------------- */
 
-/* By number: whoever comes first claims the open file description. */
+/* By number: the first one claims the open file description. */
 static void find_staying(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -80,7 +80,7 @@ static void find_staying(struct files_work *work)
 	}
 }
 
-/* A pair of which an end was closed is no pair any more: both are made again. */
+/* A pair with a closed end is broken: both ends are recreated. */
 static void break_pairs(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -113,7 +113,7 @@ static bool has_the_last(const struct file *w)
 	return w->kind == FILE_SOCKET && w->ended && w->content;
 }
 
-/* Nobody can send again what was read since from a socket that has no other end. */
+/* What was read since from a socket without a peer cannot be sent again. */
 static bool was_read(int fd, const struct file *w)
 {
 	int bytes = 0;
@@ -126,7 +126,7 @@ static bool has_node(const struct file *w)
 	return w->socket && w->socket->node;
 }
 
-/* Nobody finds a Unix socket any more whose file was deleted since: made again, it has one. */
+/* A Unix socket whose file was deleted since cannot be reached: a recreated one has a file. */
 static bool is_deleted(int fd, const struct file *w)
 {
 	return file_unix_is_deleted(fd, w->socket);
@@ -137,8 +137,8 @@ static bool was_idle(const struct file *w)
 	return w->socket && w->socket->idle;
 }
 
-/* A restored caller of bind(2) or connect(2) makes the call again, and the kernel refuses the
- * second one (EINVAL, EISCONN). */
+/* A restored process repeats its bind(2) or connect(2), and the kernel refuses the second one
+ * (EINVAL, EISCONN). */
 static bool was_used(int fd, const struct file *w)
 {
 	return file_socket_was_used(fd, w->socket);
@@ -149,7 +149,7 @@ static bool is_semaphore(const struct file *w)
 	return w->kind == FILE_EVENTFD && w->semaphore;
 }
 
-/* Each read(2) takes one of it. */
+/* Each read(2) decrements it by one. */
 static bool counts_too_much(int fd, const struct file *w)
 {
 	const uint64_t count = file_count(fd);
@@ -157,7 +157,7 @@ static bool counts_too_much(int fd, const struct file *w)
 	return count > w->count && count - w->count > FILE_COUNT_READS;
 }
 
-/* It is there still, and of no use: another one is made. */
+/* It still exists, but is useless: a new one is made. */
 static void give_up_useless(struct files_work *work)
 {
 	static const struct {
@@ -187,7 +187,7 @@ static void give_up_useless(struct files_work *work)
 	}
 }
 
-/* Of a process of the app's, it is of a dead one. */
+/* For a process of the app, it refers to a dead one. */
 static void give_up_pidfds(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -285,8 +285,8 @@ static void share_port(const struct files_work *work, const struct file *w)
 	}
 }
 
-/* What is in the table somewhere, as long as it is: one descriptor of ours for every open
- * file description that has to be put in place. */
+/* While it is still somewhere in the table: takes one descriptor of ours for every open file
+ * description that has to be restored. */
 static void gather(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -305,7 +305,7 @@ static void gather(struct files_work *work)
 	}
 }
 
-/* The rest, when what the app has opened since is closed, and its ports are free. */
+/* The rest, after what the app has opened since is closed, and its ports are free. */
 static void make_lost(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++)
@@ -327,8 +327,8 @@ static void make_lost(struct files_work *work)
 	}
 }
 
-/* Whether the calls that were listed have to be made at once: locks of what is to be closed
- * would be in the way of others. */
+/* Whether the listed calls have to be made at once: locks of what is to be closed would block
+ * others. */
 static bool is_urgent(const struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++)
@@ -339,7 +339,7 @@ static bool is_urgent(const struct files_work *work)
 
 /* ---- in the table ------------------------------------------------------------------ */
 
-/* Behind the calls for the restored process (files_calls.c): one letter, then a list. */
+/* After the calls for the restored process (files_calls.c): one message header, then a list. */
 static struct fd_letter *letter_of(const struct files_work *work)
 {
 	return (struct fd_letter *)(parasite_files(&work->process->parasite, work->image->slot) +
@@ -361,7 +361,7 @@ static struct inj_call *call_of(const struct files_work *work)
 		       : &parasite_slot(&work->process->parasite, work->image->slot)->template_call;
 }
 
-/* What was listed becomes the task's next call. */
+/* The list becomes the task's next calls. */
 static void close_list(struct files_work *work)
 {
 	if (work->listed)
@@ -370,7 +370,7 @@ static void close_list(struct files_work *work)
 	work->listed = 0;
 }
 
-/* What came of the calls that were made last. */
+/* The results of the last calls. */
 static void note_refused(struct files_work *work, uint32_t count)
 {
 	for (uint32_t i = 0; i < count; i++) {
@@ -413,7 +413,7 @@ static int inject(struct files_work *work, struct avc_error *err, long nr, uint6
 	return 0;
 }
 
-/* Has somebody watched by this epoll set what is not watched by it in the checkpoint? */
+/* Whether this epoll set watches what it did not watch at the checkpoint. */
 static bool is_watched_since(const struct files_work *work, const struct file *want,
 			     const struct file_watch *watch)
 {
@@ -422,11 +422,11 @@ static bool is_watched_since(const struct files_work *work, const struct file *w
 	return !files_find_watch(want, watch) || !w || work->lost[files_index(work->want, w)];
 }
 
-/* A set watches a number and an open file description, and lets go of them when nobody has
- * the description open any more (epoll(7), Questions and answers): a process outside of the
- * app may have it still, and of a table that is made anew the old one stays for a while.  Under
- * the same number something else is watched then as well.  Only in the table where the two
- * belong together can they be forgotten. */
+/* A set watches a number and an open file description, and drops them when no process has the
+ * description open any more (epoll(7), Questions and answers): a process outside of the app may
+ * still have it, and where a table is rebuilt the old one stays for a while.  Under the same number
+ * another file may then be watched as well.  Only in the table where the two belong together can
+ * the entry be removed. */
 static int forget_watches(struct files_work *work, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -444,7 +444,7 @@ static int forget_watches(struct files_work *work, struct avc_error *err)
 	return 0;
 }
 
-/* POSIX locks are the table's (fcntl(2)), and the one that is made anew has to get them. */
+/* POSIX locks belong to the table (fcntl(2)), and the rebuilt one has to get them. */
 static int unlock_all(struct files_work *work, struct avc_error *err)
 {
 	struct flock *all = (struct flock *)letter_of(work);
@@ -472,8 +472,8 @@ static int close_range_of(struct files_work *work, uint64_t first, uint64_t last
 	return first > last ? 0 : inject(work, err, SYS_close_range, first, last, 0);
 }
 
-/* Whatever is not the checkpoint's, in ranges: a program may have opened thousands since, and nobody
- * has looked at them. */
+/* Whatever the checkpoint does not have, in ranges: a program may have opened thousands since,
+ * which are not read. */
 static int close_new(struct files_work *work, struct avc_error *err)
 {
 	const struct files *now = work->now;
@@ -495,8 +495,8 @@ static int close_new(struct files_work *work, struct avc_error *err)
 	return close_range_of(work, next, UINT32_MAX, err);
 }
 
-/* Cheaper set than looked at; and by the template, for which a filter of system calls
- * that the app has made for itself is suspended. */
+/* Cheaper to set than to check; and by the template, for which the app's own seccomp filter is
+ * suspended. */
 static int set_cloexec(struct files_work *work, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -509,7 +509,7 @@ static int set_cloexec(struct files_work *work, struct avc_error *err)
 	return 0;
 }
 
-/* Which numbers are taken, so that it is known which one the kernel gives next. */
+/* Which numbers are in use, to predict the one that the kernel assigns next. */
 struct numbers {
 	uint8_t *taken;
 	int room;
@@ -532,7 +532,7 @@ static avc_remote lay_out_letter(const struct files_work *work)
 	return remote;
 }
 
-/* One letter for all: recvmsg(2) leaves the header as it was, for it is just as long. */
+/* One message header for all: recvmsg(2) leaves it unchanged, because the lengths are equal. */
 static int receive(struct files_work *work, struct numbers *numbers, int ours, int theirs,
 		   struct avc_error *err)
 {
@@ -546,7 +546,7 @@ static int receive(struct files_work *work, struct numbers *numbers, int ours, i
 		if (!work->lost[i] || from < 0)
 			continue;
 		to = lowest_free(numbers, NULL);
-		/* What is not received yet waits in the socket, which has room for some hundred. */
+		/* Descriptors not yet received wait in the socket, which holds some hundred. */
 		if (fd_send(ours, from) &&
 		    (errno != EAGAIN || files_work_flush(work, err) || fd_send(ours, from))) {
 			files_note(work, w, "it could not be handed over");
@@ -592,8 +592,8 @@ static int put_lost(struct files_work *work, struct avc_error *err)
 			numbers.taken[work->now->file[i].fd] = 1;
 	if (files_work_flush(work, err))
 		goto out;
-	/* To hand descriptors over takes some more, and there may be one with a number that was
-	 * allowed once. */
+	/* Passing descriptors takes some more, and one may have a number above the current
+	 * limit. */
 	if (prlimit(work->table, RLIMIT_NOFILE, NULL, &limit) == 0 &&
 	    limit.rlim_cur < (rlim_t)numbers.room)
 		process_attrs_lift_limit(work->table, RLIMIT_NOFILE, (uint64_t)numbers.room);
@@ -733,9 +733,9 @@ static int look_once(struct files_work *work, const struct files_missing *missin
 	return 0;
 }
 
-/* First at those numbers alone at which there was something, for all others are closed whatever they
- * are.  But what is missing may be at any of them now; and where somebody waits to send a
- * message may be known to an epoll set that is new. */
+/* First only the numbers in use at the checkpoint, because all others are closed anyway.  But what
+ * is missing may be at any of them now; and an epoll set that is new may show where a thread waits
+ * to send a message. */
 static int look(struct files_work *work, struct avc_error *err)
 {
 	struct files_missing missing = { 0 };
@@ -833,7 +833,7 @@ static bool host_has(const struct files_work *host, int h)
 	       host->local[files_leader(host->want, &host->want->file[h])] >= 0;
 }
 
-/* One that the host has lost it gets from the first of its children that has it still. */
+/* One that the host has lost it gets from the first of its children that still has it. */
 static void give_to_host(struct files_work *work, uint32_t i)
 {
 	const struct file *w = &work->want->file[i];
@@ -845,7 +845,7 @@ static void give_to_host(struct files_work *work, uint32_t i)
 		fcntl(local, F_DUPFD_CLOEXEC, 0);
 }
 
-/* All other processes have a table that is made anew. */
+/* All other processes get a rebuilt table. */
 static int gather_anew(struct files_work *work, struct avc_error *err)
 {
 	if (unlock_all(work, err) || files_work_flush(work, err))
@@ -885,8 +885,8 @@ int files_work_place(struct files_work *work, struct avc_error *err)
 	return 0;
 }
 
-/* What was made again is what the generation has from now on: the next restore finds it,
- * also where other processes share it. */
+/* What was recreated belongs to the generation from now on: the next restore finds it, also where
+ * other processes share it. */
 static void remember_made(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -897,7 +897,7 @@ static void remember_made(struct files_work *work)
 		if (work->kept[i] && w->kind == FILE_SOCKET)
 			w->ino = files_find(work->host->want, w->fd)->ino;
 
-		/* And not what stands for it, because its name was taken. */
+		/* But not a substitute for one whose name was taken. */
 		if (fd >= 0 && !files_now_of(work, i) && w->socket &&
 		    file_socket_is_alone(w->socket) && file_socket_has_name(fd, w->socket) &&
 		    fstat(fd, &st) == 0)
@@ -924,7 +924,7 @@ int files_work_table(const struct files_work *work, struct fd_table *table, stru
 		const int local = work->local[files_leader(work->want, w)];
 
 		if (local < 0 && !work->kept[i])
-			continue; /* told already */
+			continue; /* reported already */
 		table->entry[table->count].fd = w->fd;
 		table->entry[table->count].cloexec = w->cloexec;
 		table->entry[table->count].changed =

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Files are opened for an application as it could open them itself: by its user, its groups and
- * its capabilities.  It had them open once, but that may be no reason any more: the mode has been
- * changed since, or another file has the number of an inode that is gone.
+ * Files are opened for an application as it could open them itself: with its user, groups and
+ * capabilities.  That it had them open once is not enough: the mode may have been changed since, or
+ * another file may have reused the inode number.
  */
 #include <grp.h>
 #include <linux/capability.h>
@@ -30,7 +30,7 @@ void file_rights_read(struct file_rights *rights, pid_t pid)
 	rights->known = true;
 	rights->user = status.uid[3];
 	rights->group = status.gid[3];
-	/* In a user namespace of its own they are good for nothing outside. */
+	/* In a user namespace of its own they mean nothing outside. */
 	rights->caps = same_users(pid) ? status.caps[2] : 0;
 	rights->group_count = status.group_count;
 	memcpy(rights->groups, status.groups, sizeof rights->groups);
@@ -57,7 +57,7 @@ static void set_user(uint32_t user, uint32_t group)
 
 static bool is_user(uint32_t user, uint32_t group)
 {
-	/* -1 changes nothing, and both answer what there was. */
+	/* -1 changes nothing, and both return the previous value. */
 	return (uint32_t)syscall(SYS_setfsuid, -1) == user &&
 	       (uint32_t)syscall(SYS_setfsgid, -1) == group;
 }
@@ -79,7 +79,7 @@ int file_rights_take(const struct file_rights *rights, struct file_rights_own *o
 	return 0;
 }
 
-/* The real user is still our own, and so are the permitted capabilities: all of this is allowed. */
+/* The real user and the permitted capabilities are still our own: all of this is allowed. */
 void file_rights_give_back(const struct file_rights_own *own)
 {
 	set_user(own->user, own->group);

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What is behind a descriptor, besides the file: offsets, flags, counts, timers,
- * unread bytes, locks (files.h).
+ * The state of a descriptor besides the file itself: offsets, flags, counts, timers, unread bytes,
+ * locks (files.h).
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -55,7 +55,7 @@ static bool is_idle(int fd, const struct file_socket *s)
 	    s->type == SOCK_RAW || s->listening || s->connected || poll(&state, 1, 0) < 0 ||
 	    state.revents & POLLRDHUP)
 		return false;
-	/* A stream hangs up when it has no connection, but not while it gets one (tcp_poll()). */
+	/* A stream without a connection reports HUP, but not while connecting (tcp_poll()). */
 	return s->type == SOCK_DGRAM || state.revents & POLLHUP;
 }
 
@@ -131,8 +131,8 @@ void file_look_at_tcp(int fd, struct file *file, const struct file_socket *s)
 	}
 	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes))
 		return;
-	/* The other side goes on: what comes, or is acknowledged, between two of these calls
-	 * would be in one figure and not in the other. */
+	/* The peer keeps running: what arrives, or is acknowledged, between two of these calls
+	 * would be in only one of the figures. */
 	for (int try = 0; try < TCP_TRIES; try++) {
 		before = info;
 		if (ioctl(fd, SIOCINQ, &unread))
@@ -160,8 +160,8 @@ struct diag_request {
 	struct unix_diag_req ask;
 };
 
-/* Asks sock_diag(7) for the other end of a Unix socket, and how many may wait for one that
- * listens (unix_diag_rqlen).  `ino` 0: of all. */
+/* Asks sock_diag(7) for the peer of a Unix socket, and for the backlog of one that listens
+ * (unix_diag_rqlen).  `ino` 0: for all. */
 static bool ask_diag(int diag, uint64_t ino)
 {
 	const struct diag_request request = {
@@ -268,7 +268,7 @@ static void hear_all(int diag, struct file **asked, uint32_t count, bool one)
 	}
 }
 
-/* The kernel looks for one socket as long as for all (net/unix/diag.c). */
+/* The kernel takes as long to find one socket as to list all (net/unix/diag.c). */
 #define ASKED_EACH 4
 
 void files_find_peers(struct files *files, pid_t pid)
@@ -378,7 +378,7 @@ void scratch_close(struct scratch *scratch)
 	close_fd(&scratch->out);
 }
 
-/* Reads without taking anything out: tee(2) shares the pages with a pipe of ours. */
+/* Reads without consuming: tee(2) shares the pages with a pipe of ours. */
 static void keep_pipe(int fd, struct file *file, uint32_t bytes, struct scratch *scratch)
 {
 	uint32_t got = 0;
@@ -388,7 +388,7 @@ static void keep_pipe(int fd, struct file *file, uint32_t bytes, struct scratch 
 		file->content_lost = true;
 		return;
 	}
-	/* It always begins at the front: once is all. */
+	/* It always begins at the front, so only one call is useful. */
 	if (tee(fd, scratch->out, bytes, SPLICE_F_NONBLOCK) == (ssize_t)bytes)
 		while (got < bytes && (n = read(scratch->in, file->content + got, bytes - got)) > 0)
 			got += (uint32_t)n;
@@ -421,7 +421,7 @@ void file_keep_content(struct process *process, int fd, struct file *file, struc
 	keep_pipe(fd, file, (uint32_t)bytes, scratch);
 }
 
-/* A description of our own of the same pipe, so that its O_NONBLOCK is ours. */
+/* Our own open file description of the same pipe, for an O_NONBLOCK of our own. */
 static int reopen(int fd, int flags)
 {
 	char path[32];
@@ -430,7 +430,7 @@ static int reopen(int fd, int flags)
 	return open(path, flags | O_NONBLOCK | O_CLOEXEC);
 }
 
-/* False if there is no end of it: somebody outside of the application goes on writing. */
+/* False if it does not become empty: a process outside of the application keeps writing. */
 static bool drain(int fd, const struct file *want)
 {
 	char buf[65536];
@@ -454,7 +454,7 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 	uint32_t put = 0;
 	bool emptied;
 
-	/* As it is, its senders are known, too, and what came with it. */
+	/* Unchanged, it still has its senders and descriptors. */
 	if (!pipe && file_has_messages(fd, want))
 		return NULL;
 	emptied = in >= 0 && out >= 0 && drain(in, want);
@@ -501,11 +501,11 @@ static const char *put_count(int fd, const struct file *want, const struct file 
 
 	if (now && now->count == want->count)
 		return NULL;
-	count = file_count(fd); /* another process that has it may have put it back */
+	count = file_count(fd); /* another process that has it may have restored it */
 	if (count == want->count)
 		return NULL;
-	/* Without ever waiting, whatever its flags are.  A semaphore's goes down by one; one that is
-	 * far too high has been given up for a new one (files_restore.c). */
+	/* Never blocks, whatever its flags are.  A semaphore is decremented by one; one that is far
+	 * too high has been replaced (files_restore.c). */
 	for (int i = 0; count > want->count && i < FILE_COUNT_READS; i++) {
 		if (preadv2(fd, &io, 1, -1, RWF_NOWAIT) != sizeof value)
 			return "its count could not be put back";
@@ -520,7 +520,7 @@ static const char *put_count(int fd, const struct file *want, const struct file 
 	return NULL;
 }
 
-/* Beyond the instants at which it would have gone off: how often that was; 0: never again. */
+/* Skips the instants at which it would have expired; returns their number; 0: never again. */
 static uint64_t next_of(const struct file *want, uint64_t now_of_clock, uint64_t *ticks)
 {
 	const uint64_t late = now_of_clock - want->deadline_ns;
@@ -531,14 +531,14 @@ static uint64_t next_of(const struct file *want, uint64_t now_of_clock, uint64_t
 	return want->interval_ns ? now_of_clock + want->interval_ns - late % want->interval_ns : 0;
 }
 
-/* One that goes off and is not read stands still until then, and does not say since when. */
+/* One that has expired and is not read is not rearmed until then, and does not show since when. */
 static bool stands_still(const struct file *want)
 {
 	return want->ticks && want->interval_ns && !want->deadline_ns;
 }
 
-/* At the instants it would have gone off; what was not read yet can be read.  An older kernel does
- * not let itself be told how often it has, and takes the instant before the next. */
+/* Expires when it would have; unread expiries can be read.  An older kernel cannot set their
+ * number, and gets the instant before the next. */
 static const char *put_timer(int fd, const struct file *want)
 {
 	const uint64_t set_ticks_of = want->ticks && !stands_still(want) ? want->ticks : 0;
@@ -570,7 +570,7 @@ bool file_is_locked(int fd)
 
 bool file_is_remote(int fd)
 {
-	/* linux/magic.h; the server would be asked for locks, or for a program's answer */
+	/* linux/magic.h; requests for locks would go to the server, or to a program */
 	static const uint32_t remote[] = { 0x6969,     0x65735546, 0xfe534d42, 0xff534d42,
 					   0x517b,     0x01021997, 0x00c36400, 0x5346414f,
 					   0x01161970, 0x7461636f, 0x73757245 };
@@ -594,7 +594,7 @@ static const char *put_flocks(int fd, const struct file *want, const struct file
 	for (uint32_t i = 0; now && i < now->lock_count; i++)
 		if (now->lock[i].kind == LOCK_FLOCK_)
 			is = now->lock[i].exclusive ? LOCK_EX : LOCK_SH;
-	/* To do what is so already is nothing; but a server might be asked. */
+	/* Repeating a lock changes nothing; but it might be a request to a server. */
 	if (want->lock_unsure || (want->remote && was == is))
 		return NULL;
 	return flock(fd, (was ? was : LOCK_UN) | LOCK_NB) && was ? "its lock is somebody else's now"
@@ -652,7 +652,7 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 
 	if (want->flags & O_PATH)
 		return NULL;
-	/* FASYNC is only taken away here: whoever sets it is whom it is for. */
+	/* FASYNC is only cleared here: the process that sets it becomes the owner. */
 	if ((!now || (now->flags ^ want->flags) & (STATUS_FLAGS | FASYNC)) && !want->outside) {
 		const int keep = ~(STATUS_FLAGS | (want->flags & FASYNC ? 0 : FASYNC));
 
@@ -662,7 +662,7 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 	switch (want->kind) {
 	case FILE_REGULAR:
 	case FILE_DIRECTORY:
-		/* Appended to: where the next byte goes is not ours to say. */
+		/* Appended to: the offset does not matter. */
 		if (want->offset >= 0 && !want->outside && !(want->flags & O_APPEND && now) &&
 		    (rewind || !now) && (!now || now->offset != want->offset) &&
 		    lseek(fd, want->offset, SEEK_SET) < 0)
@@ -683,7 +683,7 @@ const char *file_put_state(int fd, const struct file *want, const struct file *n
 		problem = problem ? problem : other;
 		break;
 	case FILE_DEVICE:
-		/* One that was opened anew has lost more, and that is told. */
+		/* One that was reopened has lost more, which is reported. */
 		if (now && file_is_video(want)) {
 			other = file_put_video(fd, &want->video);
 			problem = problem ? problem : other;
@@ -715,7 +715,7 @@ const char *file_reset_tcp(int fd)
 
 	if (connect(fd, &nobody, sizeof nobody))
 		return "its connection could not be reset";
-	shutdown(fd, SHUT_RDWR); /* says ENOTCONN, and does it (net/ipv4/af_inet.c) */
+	shutdown(fd, SHUT_RDWR); /* returns ENOTCONN, but works (net/ipv4/af_inet.c) */
 	getsockopt(fd, SOL_SOCKET, SO_ERROR, &error, &bytes);
 	return NULL;
 }

@@ -1,11 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.tcp=messages: streams of messages, and where in them a connection stands.
+ * avckpt.tcp=messages: streams of messages, and the position of a connection in them.
  *
- * The kernel does not know where a message begins.  But a stream of messages has
- * pauses, and between the bytes of one message there are none to speak of.  So a
- * connection that has been silent for a moment, with nothing left unread and
- * nothing that waits to be written, stands between two messages.
+ * The kernel does not know where a message begins.  But a stream of messages has pauses, and the
+ * bytes of one message arrive without notable ones.  So a connection that has been silent for a
+ * moment, with nothing unread and nothing waiting to be written, is between two messages.
  */
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -16,15 +15,15 @@
 
 #include "files.h"
 
-/* A sender may be kept from a CPU in the middle of a message.  Longer would be safer,
- * and too long for a stream of 100 messages a second. */
+/* A sender may lose its CPU in the middle of a message.  Longer would be safer, but too long for a
+ * stream of 100 messages a second. */
 #define SILENCE_NS (8 * NS_PER_MS)
 /* tcpi_last_data_recv counts in ticks of the kernel's clock (HZ is 250 at least). */
 #define TICK_NS (4 * NS_PER_MS)
-/* So long is the end of a message waited for, while nobody reads. */
+/* How long to wait for the end of a message, while no thread reads. */
 #define DRAIN_NS (100 * NS_PER_MS)
 
-/* For how long nothing has come in, at least. */
+/* For how long at least nothing has arrived. */
 static uint64_t silent_ns(const struct tcp_info *info)
 {
 	const uint64_t silent = info->tcpi_last_data_recv * NS_PER_MS;
@@ -63,8 +62,8 @@ bool file_is_going(int fd)
 	return poll(&writable, 1, 0) == 0;
 }
 
-/* A writer that has written part of a message asks to be told when there is room for more.
- * Edge-triggered sets ask for that all the time. */
+/* A writer that has written part of a message waits for room to write more.  Edge-triggered sets
+ * always wait for that. */
 void files_find_going(struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++) {
@@ -80,7 +79,7 @@ void files_find_going(struct files *files)
 	}
 }
 
-/* Reads away what is left of a message.  False if it does not end. */
+/* Discards the rest of a message.  False if it does not end. */
 static bool drain(int fd)
 {
 	const uint64_t begun = now_ns();
@@ -90,7 +89,7 @@ static bool drain(int fd)
 
 	while ((now = now_ns()) - begun < DRAIN_NS) {
 		struct pollfd readable = { .fd = fd, .events = POLLIN };
-		/* TCP throws away what it is told to truncate, without a copy: tcp(7). */
+		/* TCP discards data read with MSG_TRUNC, without a copy: tcp(7). */
 		const ssize_t n = recv(fd, NULL, 1 << 30, MSG_TRUNC | MSG_DONTWAIT);
 
 		if (n > 0) {
@@ -98,7 +97,7 @@ static bool drain(int fd)
 			continue;
 		}
 		if (n == 0)
-			return true; /* closed by the other side, which the app will see */
+			return true; /* closed by the peer, which the app will see */
 		if (now - last >= SILENCE_NS)
 			return true;
 		poll(&readable, 1, (int)((SILENCE_NS - (now - last)) / NS_PER_MS) + 1);
@@ -111,7 +110,7 @@ const char *file_put_stream(int fd, const struct file *want, const struct file *
 	const bool in = want->tcp_taken != now->tcp_taken;
 	const bool out = want->tcp_written != now->tcp_written;
 
-	/* The half that the app has, or the other side has, is of another message now. */
+	/* The half message that either side has would be continued by another message. */
 	if ((in && want->tcp_coming) || (out && (want->tcp_going || now->tcp_going)))
 		return file_reset_tcp(fd);
 	if (in && now->tcp_coming && !drain(fd))

@@ -1,8 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Names of Unix sockets (files.h).  A name that is a path is a file, too: that of a socket
- * made again is where the old one was, with its mode and owner, and getsockname(2) says
- * what it said.
+ * Names of Unix sockets (files.h).  A path name is also a file: that of a recreated socket is where
+ * the old one was, with its mode and owner, and getsockname(2) returns the same.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -44,7 +43,7 @@ static bool is_path(const struct sockaddr_storage *address, socklen_t bytes)
 	return is_named(bytes) && ((const struct sockaddr_un *)address)->sun_path[0];
 }
 
-/* unix(7): whatever it is connected to has a name, or is the other end of a socketpair(2). */
+/* unix(7): its peer has a name, or is the other end of a socketpair(2). */
 bool file_unix_is_alone(const struct file_socket *s)
 {
 	if (s->type != SOCK_DGRAM)
@@ -127,7 +126,7 @@ void file_look_at_node(int fd, struct file_socket *s, pid_t init)
 	close_fd(&root);
 	if (!node.folder_ino)
 		return;
-	/* A path is rarely as long as it may be. */
+	/* A path is rarely of maximum length. */
 	s->node = malloc(offsetof(struct file_node, path) + strlen(node.path) + 1);
 	if (s->node)
 		memcpy(s->node, &node, offsetof(struct file_node, path) + strlen(node.path) + 1);
@@ -145,8 +144,8 @@ bool file_unix_is_deleted(int fd, const struct file_socket *s)
 
 /* ---- calls that look a name up ---------------------------------------------------- */
 
-/* Where the process looks names up: its root and folder, as of the checkpoint.  If it has
- * changed them after bind(2): the container's root, and the folder that its file tells. */
+/* Where the process resolves names: its root and working directory, as of the checkpoint.  If it
+ * has changed them after bind(2): the container's root, and the directory of its file. */
 struct errand {
 	bool connects; /* or binds                                                 */
 	int fd;
@@ -167,7 +166,7 @@ static int call(const struct errand *errand)
 
 	if (!errand->connects)
 		return bind(errand->fd, address, errand->bytes);
-	/* To whatever is behind that name now. */
+	/* To the current socket of that name. */
 	if (file_rights_take(errand->rights, &own)) {
 		errno = EPERM;
 		return -1;
@@ -179,14 +178,14 @@ static int call(const struct errand *errand)
 	return result;
 }
 
-/* A thread of its own, for it does not come back: root and folder are a thread's, once
- * they are not shared. */
+/* A separate thread, which does not return to normal: root and working directory belong to a thread
+ * once they are unshared. */
 static void *errand_main(void *arg)
 {
 	struct errand *errand = arg;
 
 	errand->errnum = unshare(CLONE_FS) ? errno : ENOENT;
-	umask(0777); /* the file is nobody's until it has its mode and owner */
+	umask(0777); /* no access to the file until it has its mode and owner */
 	for (int i = 0; i < 2 && errand->errnum == ENOENT; i++)
 		errand->errnum = fchdir(errand->root[i]) || chroot(".") ||
 						 fchdir(errand->folder[i]) || call(errand)
@@ -195,7 +194,7 @@ static void *errand_main(void *arg)
 	return NULL;
 }
 
-/* A relative name and what became of it: what is in front is where the app was. */
+/* Compares a relative name with the file's path: the rest is where the app was. */
 static int open_old_folder(const struct errand *errand, int root)
 {
 	const char *name = ((const struct sockaddr_un *)errand->address)->sun_path;
@@ -208,7 +207,7 @@ static int open_old_folder(const struct errand *errand, int root)
 	front = strlen(errand->node->path) - bytes;
 	if (strncmp(errand->node->path + front, name, bytes))
 		return -1;
-	/* Up to and with the slash: the folder of what comes after it. */
+	/* Up to and including the slash: the directory of the rest. */
 	snprintf(path, sizeof path, "%.*s", (int)front, errand->node->path);
 	return path[front - 1] == '/' ? open_folder(root, path) : -1;
 }
@@ -241,8 +240,8 @@ static int call_there(struct errand *errand, pid_t template, pid_t init)
 
 /* ---- making again ------------------------------------------------------------------- */
 
-/* Whether nobody is behind this file any more.  A socket of another kind may ask without
- * being let in, and one for datagrams is not noticed (connect(2), ECONNREFUSED). */
+/* Whether this socket file is stale.  A socket of another type can try without being accepted, and
+ * a datagram one is not noticed (connect(2), ECONNREFUSED). */
 static bool is_dead(int file)
 {
 	struct sockaddr_un address = { .sun_family = AF_UNIX };
@@ -280,7 +279,7 @@ static bool is_there(int folder, const char *name, int file)
 	       st.st_dev == is.st_dev && st.st_ino == is.st_ino;
 }
 
-/* bind(2) has made it where the name leads to now; and the app may have renamed it. */
+/* bind(2) has created it where the name resolves to now; and the app may have renamed it. */
 static bool move(int file, int root, int folder, const char *name)
 {
 	char path[PATH_MAX];
@@ -324,7 +323,7 @@ static bool is_folder(int fd, const struct file_node *node)
 	       st.st_ino == node->folder_ino;
 }
 
-/* Made with the engine's rights, so only where it was: in the very folder. */
+/* Created with the engine's rights, so only where it was: in the same directory. */
 static int bind_path(struct errand *errand, const struct file_node *node, pid_t template,
 		     pid_t init, const char **why)
 {
@@ -378,7 +377,7 @@ static const char *connect_unix(const struct files_work *work, int fd, const str
 		       : NULL;
 }
 
-/* Whether the name that it is connected to is that of a socket made again. */
+/* Whether it is connected to the name of a recreated socket. */
 static bool is_peer_new(const struct files_work *work, const struct file_socket *s)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
@@ -392,8 +391,8 @@ static bool is_peer_new(const struct files_work *work, const struct file_socket 
 	return false;
 }
 
-/* When all have their names: Unix sockets for datagrams that were made again, or are
- * connected to one that was. */
+/* When all have their names: connects Unix datagram sockets that were recreated, or were connected
+ * to one. */
 void files_connect_again(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {

@@ -1,14 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Cameras (V4L2).  Of the buffers that a program has mapped, some are the driver's, to be
- * filled (VIDIOC_QBUF), and the others the program's (VIDIOC_DQBUF).  The driver does not go
- * back to a checkpoint: a buffer that died in the program's hands would never be filled
- * again, and one that the program holds by its memory, but has given back since, would be
- * refused (EINVAL).
+ * Cameras (V4L2).  Of the buffers that a program has mapped, some are the driver's, to be filled
+ * (VIDIOC_QBUF), and the others the program's (VIDIOC_DQBUF). The driver is not rolled back: a
+ * buffer that the dead program held would never be filled again, and one that the restored program
+ * holds, but has queued since, would be refused (EINVAL).
  *
- * As long as one of its buffers is mapped anywhere a camera is in use, also when it was closed,
- * and whoever opens it anew is told so (EBUSY).  So templates do not keep them mapped, and the
- * restored process maps them again.
+ * While any process has one of its buffers mapped, a camera is in use, even if it was closed, and
+ * opening it again fails (EBUSY). So templates do not keep them mapped, and the restored process
+ * maps them again.
  *
  * Which are whose: linux/videodev2.h, V4L2_BUF_FLAG_QUEUED and V4L2_BUF_FLAG_DONE;
  * drivers/media/common/videobuf2/videobuf2-v4l2.c.
@@ -28,10 +27,10 @@
 
 #define VIDEO4LINUX_MAJOR 81 /* Documentation/admin-guide/devices.txt */
 
-/* As long as a slow camera (five pictures a second) takes to fill its buffers; init waits 2 s. */
+/* The time that a slow camera (five frames a second) takes to fill its buffers; init waits 2 s. */
 #define TAKE_NS (1500 * NS_PER_MS)
 
-#define BUFFERS_MAX 64 /* as many as can be told apart; drivers have 32, most of them        */
+#define BUFFERS_MAX 64 /* as many as fit the mask; most drivers have 32 */
 
 static const uint32_t types[] = { V4L2_BUF_TYPE_VIDEO_CAPTURE, V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE };
 
@@ -40,7 +39,7 @@ struct buffer {
 	struct v4l2_plane plane[VIDEO_MAX_PLANES];
 };
 
-/* The ticks of the guard's deadline interrupt it. */
+/* The guard's deadline timer interrupts it. */
 static int tell(int fd, unsigned long request, void *argument)
 {
 	int result;
@@ -68,8 +67,8 @@ bool file_is_video(const struct file *f)
 	       !(f->flags & O_PATH);
 }
 
-/* Anybody may ask (VIDIOC_QUERYBUF); but to others than whose they are no command is allowed,
- * and that is said before there is no such buffer. */
+/* Any descriptor may query (VIDIOC_QUERYBUF); but only the owner may issue commands, which is
+ * checked before the buffer's index. */
 static bool is_anothers(int fd, uint32_t type)
 {
 	struct buffer b;
@@ -124,7 +123,7 @@ static const char *give(int fd, uint32_t type, uint64_t buffers)
 	return problem;
 }
 
-/* Whether there is a picture.  Where the driver is just busy when a tick comes, poll(2) answers
+/* Whether there is a frame.  If the driver is busy when the timer interrupts, poll(2) returns
  * POLLERR (vb2_fop_poll()), as it does where there will never be one. */
 static bool wait_filled(int fd, uint64_t end_ns)
 {
@@ -140,7 +139,7 @@ static bool wait_filled(int fd, uint64_t end_ns)
 	return false;
 }
 
-/* They come in the order in which they are filled: others that come are given back. */
+/* They are dequeued in the order in which they are filled: unwanted ones are queued again. */
 static const char *take(int fd, uint32_t type, uint64_t buffers)
 {
 	const uint64_t end_ns = now_ns() + TAKE_NS;
@@ -170,7 +169,7 @@ const char *file_put_video(int fd, const struct file_video *want)
 	if (now.type != want->type || now.count != want->count)
 		return "its buffers are others now";
 	problem = give(fd, want->type, now.held & ~want->held);
-	/* It had been stopped (VIDIOC_STREAMOFF), which leaves the driver with none. */
+	/* It had been stopped (VIDIOC_STREAMOFF), which takes all buffers from the driver. */
 	type = (int)want->type;
 	if (now.held != want->held && now.held == (UINT64_C(2) << (now.count - 1)) - 1 &&
 	    tell(fd, VIDIOC_STREAMON, &type))
@@ -214,8 +213,8 @@ void files_find_areas(struct files *files, pid_t pid)
 		}
 }
 
-/* Something else is mapped in their place: nothing must come to be there, and where a camera is
- * lost for good, old pictures are black instead of deadly. */
+/* Other memory is mapped in their place, so that the addresses stay in use, and if a camera is lost
+ * for good, old frames are black instead of causing SIGBUS. */
 void files_unmap_areas(const struct image *image)
 {
 	const struct parasite *parasite = &image->process->parasite;

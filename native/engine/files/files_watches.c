@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Watches of inotify(7) put back under their own numbers (files.h).
+ * Restores watches of inotify(7) under their own numbers (files.h).
  *
  * A watch is on an inode.  fdinfo names that by file system and handle, and the container
  * has the file system mounted somewhere: from any place on it a handle can be opened.
@@ -26,7 +26,7 @@
 
 /* ---- where it is ---------------------------------------------------------------- */
 
-/* A server is asked nothing while the app is dead (files.c). */
+/* No request goes to a server while the app is dead (files.c). */
 static bool is_served(const char *type)
 {
 	static const char *const served[] = { "fuse", "nfs", "cifs", "smb", "9p", "ceph", "afs" };
@@ -37,7 +37,7 @@ static bool is_served(const char *type)
 	return false;
 }
 
-/* Not just O_PATH, for open_by_handle_at(2); but to open a device does things. */
+/* Not just O_PATH, for open_by_handle_at(2); but opening a device has side effects. */
 static int open_anchor(int at)
 {
 	char own[40];
@@ -140,7 +140,7 @@ struct overlay_handle {
 	uint8_t real[];
 };
 
-/* The file below has a path, and its end, how much of it ever, is that in the overlay. */
+/* The lower file has a path, and some tail of it is the path in the overlay. */
 static int open_overlaid(const struct file_system *fs, const struct file_mark *mark, pid_t init)
 {
 	const struct overlay_handle *handle = (const struct overlay_handle *)mark->handle;
@@ -203,7 +203,7 @@ static const struct file_mark *find_mark(const struct file *f, const struct file
 /* More than the longest queue (fs.inotify.max_queued_events) holds. */
 #define READS_MAX 1024
 
-/* Reads what is in it, event by event, as long as there is one and it is without a name. */
+/* Reads events one by one, as long as they are without a name. */
 static void take_events(int fd, int bytes)
 {
 	struct inotify_event event;
@@ -215,8 +215,8 @@ static void take_events(int fd, int bytes)
 			return;
 }
 
-/* Those that were added since.  That is an event, IN_IGNORED, which the app would not
- * understand; if nothing else is in the queue, it can be taken out again. */
+/* Removes those that were added since.  That causes an event, IN_IGNORED, which the app would not
+ * understand; if the queue has no other events, it can be read here. */
 static void remove_new(int fd, const struct file *want, const struct file *now)
 {
 	uint32_t kept = 0;
@@ -232,13 +232,13 @@ static void remove_new(int fd, const struct file *want, const struct file *now)
 			removed++;
 	if (!before)
 		take_events(fd, removed * (int)sizeof(struct inotify_event));
-	/* Nothing in it is of a watch that is known, or was in it then. */
+	/* No event in it is of a known watch, or was in it at the checkpoint. */
 	while (before && !kept && !want->unread && ++reads < READS_MAX &&
 	       ioctl(fd, FIONREAD, &before) == 0 && before && read(fd, buf, sizeof buf) > 0)
 		;
 }
 
-/* Those that are missing, or have another mask. */
+/* Adds those that are missing, or have another mask. */
 static uint32_t add_missing(int fd, const struct file *want, const struct file *now, pid_t init)
 {
 	struct file_system fs = { .anchor = -1 };
@@ -273,8 +273,8 @@ static uint32_t add_missing(int fd, const struct file *want, const struct file *
 #define EVENTS_MAX (1 << 16) /* four times fs.inotify.max_queued_events               */
 #define EVENTS_EACH 256
 
-/* Two of the same, one after the other, would be one.  Of what nobody has opened by a name, the kernel
- * tells nothing.  What is in the queue then, in bytes; true: it is full. */
+/* Two equal events in a row would be merged.  The kernel reports no events for files not opened by
+ * a name.  Returns the bytes in the queue; true: it is full. */
 static bool fill(int fd, const char *path, int *bytes)
 {
 	const int file = open(path, O_RDWR | O_CLOEXEC);
@@ -295,8 +295,8 @@ static bool fill(int fd, const char *path, int *bytes)
 	return *bytes && *bytes == before;
 }
 
-/* Nobody can put an event back.  But there is one that says that some were lost (inotify(7),
- * IN_Q_OVERFLOW), the last that the kernel puts into a full queue: those before it are read away. */
+/* Events cannot be requeued.  But one reports that some were lost (inotify(7), IN_Q_OVERFLOW), the
+ * last that the kernel puts into a full queue: those before it are read and discarded. */
 static const char *put_overflow(int fd)
 {
 	const int file = memfd_create("avckpt", MFD_CLOEXEC), event = sizeof(struct inotify_event);
@@ -307,7 +307,7 @@ static const char *put_overflow(int fd)
 	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", file);
 	wd = file < 0 ? -1 : inotify_add_watch(fd, path, IN_MODIFY | IN_ACCESS);
 	full = wd >= 0 && fill(fd, path, &bytes);
-	/* There must be no room for the event that tells of this. */
+	/* There must be no room for the event caused by this. */
 	if (wd >= 0)
 		inotify_rm_watch(fd, wd);
 	if (!full)
@@ -344,7 +344,7 @@ const char *file_put_marks(int fd, const struct file *want, const struct file *n
 	failed = add_missing(fd, want, now, init);
 	if (want->unread && !ioctl(fd, FIONREAD, &bytes) && !bytes)
 		problem = put_overflow(fd);
-	/* As ever, a number is not given again soon. */
+	/* So that a number is not reused soon, as usual. */
 	ioctl(fd, SET_NEXT_WD, highest(now, highest(want, 0)) + 1);
 	return problem ? problem : failed ? "not all of what it watched is there any more" : NULL;
 }

@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.files=strict, and auto beside a database, for files that are opened, written and
- * closed between two looks at the table, also by a child or by a program that was executed
- * since: fanotify(7) tells of everything written in the container's mount namespace.
+ * avckpt.files=strict, and auto beside a database, for files that are opened, written and closed
+ * between two looks at the table, also by a child or by a program that was executed since:
+ * fanotify(7) reports everything written in the container's mount namespace.
  *
- * The kernel queues an event within the write(2) that it is about, so after a death the
- * queue has all of them.  Nobody waits for us, and the queue ends with our process.
+ * The kernel queues an event within the write(2) that causes it, so after a death the queue has all
+ * of them.  No process waits for us, and the queue vanishes with our process.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -31,7 +31,7 @@ struct files_written *files_written_new(void)
 
 	if (!written)
 		return NULL;
-	/* What is reported comes as an open file: a fifo must not make us wait. */
+	/* Events come with an open file: a fifo must not block us. */
 	written->fd = fanotify_init(FAN_CLASS_NOTIF | FAN_CLOEXEC | FAN_NONBLOCK,
 				    O_RDONLY | O_CLOEXEC | O_LARGEFILE | O_NONBLOCK);
 	written->errnum = written->fd < 0 ? errno : 0;
@@ -53,8 +53,8 @@ static bool starts_with_one_of(const char *text, const char *const *words)
 	return false;
 }
 
-/* Where no data are, where to open a file has effects (devices), or may wait for a
- * server (it may be the app itself). */
+/* Without data, or where opening a file has side effects (devices) or may wait for a server (which
+ * may be the app itself). */
 static bool is_worth_it(const char *point, const char *options, const char *type)
 {
 	static const char *const places[] = { "/dev", "/proc", "/sys", NULL };
@@ -115,7 +115,7 @@ void files_written_watch(struct files_written *written, pid_t pid, struct avc_er
 		return; /* it has ended */
 	while (getline(&line, &size, info) > 0)
 		mounts = hash_line(mounts, line);
-	/* What is mounted anew is marked before the checkpoint after it. */
+	/* New mounts are marked before the next checkpoint. */
 	if (mounts != written->mounts) {
 		written->mounts = mounts;
 		written->errnum = is_our_mount_namespace(pid) ? ENOTSUP : 0;
