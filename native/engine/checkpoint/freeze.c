@@ -1,10 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * One checkpoint.  Every thread of every process that is known is stopped; then, and only
- * then, the processes are cloned: the main one by its main thread, the others by their
- * holders, which share their memory (infect.c).  While the kernel does that, everything is
- * read that is of this instant.  Then everything goes on.  What can wait, waits until then
- * (generation.c).
+ * One checkpoint.  Every thread of every known process is stopped; then, and only then, the
+ * processes are cloned: the main one by its main thread, the others by their holders, which share
+ * their memory (infect.c).  While the kernel does that, the state of this instant is read.  Then
+ * everything is released.  What can wait is done afterwards (generation.c).
  */
 #include <errno.h>
 #include <stdlib.h>
@@ -16,7 +15,7 @@
 
 /* ---- who there is ------------------------------------------------------------------------- */
 
-/* One that was found while everything was stopped has nothing of ours yet. */
+/* One that was found while everything was stopped is not infected yet. */
 static int prepare_stopped(struct tree *tree, struct process *process, struct avc_error *err)
 {
 	if (process->pid != process->leader)
@@ -27,8 +26,7 @@ static int prepare_stopped(struct tree *tree, struct process *process, struct av
 	return process->files_image ? 0 : files_prepare(process, NULL, err);
 }
 
-/* Of the leader of a session or group, as the app knows it; 0: it is none of the app's,
- * or gone. */
+/* The PID of the leader of a session or group, inside; 0: not of the app, or gone. */
 static pid_t number_inside(const struct tree *tree, pid_t pid)
 {
 	for (uint32_t i = 0; i < tree->count; i++)
@@ -38,7 +36,7 @@ static pid_t number_inside(const struct tree *tree, pid_t pid)
 	return 0;
 }
 
-/* Of a group whose leader is outside of the app, too, if it is to be seen. */
+/* The same for a group whose leader is outside of the app, too, if visible. */
 static pid_t group_inside(const struct tree *tree, pid_t group)
 {
 	const pid_t inside = group > 0 ? number_inside(tree, group) : 0;
@@ -53,8 +51,8 @@ static bool is_there(pid_t pid)
 	return proc_stat(pid, &stat) == 0;
 }
 
-/* A leader that is not of the app: it is gone, and the number is nobody else's as long as there is
- * somebody in its session; or it is somebody of outside (`podman exec`), whom nobody can join. */
+/* A leader that is not of the app: either it is gone, and the PID is not reused while its session
+ * has members; or it is outside (`podman exec`), and its session cannot be joined. */
 static pid_t session_of_other(const struct tree_entry *entry, const struct proc_status *status,
 			      struct image *image)
 {
@@ -68,8 +66,8 @@ static pid_t session_of_other(const struct tree_entry *entry, const struct proc_
 	return 0;
 }
 
-/* Now, while all stand still: right after, it may be in another group, or who leads its
- * group may be gone. */
+/* Now, while all are stopped: right after, it may be in another group, or the group's leader may be
+ * gone. */
 static void keep_place(const struct tree *tree, const struct tree_entry *entry,
 		       const struct image *main, struct image *image)
 {
@@ -83,7 +81,7 @@ static void keep_place(const struct tree *tree, const struct tree_entry *entry,
 	group = number_inside(tree, stat->group);
 	if (!group && image != main && stat->group == of_main->group)
 		group = main->group;
-	/* The kernel knows its numbers inside, whoever had them. */
+	/* The kernel knows the numbers inside, whichever process had them. */
 	if (!group || (!session && stat->session != of_main->session))
 		(void)proc_status(entry->pid, &status);
 	if (!session && stat->session != of_main->session)
@@ -94,7 +92,7 @@ static void keep_place(const struct tree *tree, const struct tree_entry *entry,
 	image->exit_signal = stat->exit_signal;
 }
 
-/* Those that were found are the images, in the same order. */
+/* The processes found become the images, in the same order. */
 static int make_images(const struct tree *tree, struct generation *generation,
 		       struct avc_error *err)
 {
@@ -137,7 +135,7 @@ static int make_images(const struct tree *tree, struct generation *generation,
 
 static int find_others(struct tree *tree, struct generation *generation, struct avc_error *err)
 {
-	/* Whoever waits for a child to execute a program (vfork(2)) could not be stopped. */
+	/* A process that waits for a child to execute a program (vfork(2)) could not be stopped. */
 	for (uint32_t i = 1; i < tree->count; i++)
 		if (tree->entry[i].process && !tree->entry[i].process->infected &&
 		    tree_shares_memory(tree, i))
@@ -183,14 +181,14 @@ static int keep_all(struct generation *generation, struct mem_seen *seen, struct
 	return 0;
 }
 
-/* The tables do not change while the kernel clones: nobody runs. */
+/* The tables do not change while the kernel clones: no task runs. */
 static void capture_files(struct generation *generation)
 {
 	struct scratch scratch = { -1, -1, 0 };
 
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct image *image = &generation->image[i];
-		/* An orphan has most in common with the main process, if with anybody. */
+		/* An orphan shares most with the main process, if at all. */
 		const struct image *parent =
 			i ? &generation->image[image->parent < 0 ? 0 : image->parent] : NULL;
 
@@ -200,8 +198,8 @@ static void capture_files(struct generation *generation)
 	scratch_close(&scratch);
 }
 
-/* Whoever is killed has no descriptors any more, which looks like a table with nothing in it.
- * Of those that are still at what they were asked it will be seen then. */
+/* A killed process has no descriptors any more, which looks like an empty table.  Those still
+ * answering queries are checked then. */
 static int see_alive(const struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->count; i++) {
@@ -226,8 +224,8 @@ static bool has_all_holders(const struct tree *tree)
 	return true;
 }
 
-/* What a process above it adopts would be a child that it never had; it itself sees to that
- * (process_hold_stopped()). */
+/* An ancestor that adopts orphans would get a child that it never had; the process itself prevents
+ * that (process_hold_stopped()). */
 static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *err)
 {
 	for (int k = tree->entry[i].parent; k >= 0; k = tree->entry[k].parent) {
@@ -262,15 +260,15 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 	return result;
 }
 
-/* Their main threads make the holders, and have to be at rest for that, as well as those of
- * the processes above them. */
+/* Their main threads clone the holders, and have to be idle for that, as well as those of the
+ * processes above them. */
 static int clone_missing(struct freeze *freeze, struct avc_error *err)
 {
 	struct tree *tree = freeze->tree;
 	struct process *main = tree_main(tree);
 
-	/* First who waits in its parasite for us: how long the main process takes is not known
-	 * yet. */
+	/* First the threads that wait for us in their parasites: how long the main process takes is
+	 * not known yet. */
 	if (freeze_hear_all(tree, err) ||
 	    (main->cloning &&
 	     (freeze_await_clone(main, &freeze->generation->image[0].template, err) ||
@@ -333,8 +331,7 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 	return has_all_holders(freeze->tree) ? 0 : clone_missing(freeze, err);
 }
 
-/* Also what was begun before something failed: *template is set as soon as the main process is
- * cloned. */
+/* Also what was begun before a failure: *template is set as soon as the main process is cloned. */
 static int hear_and_await(struct freeze *freeze, int result, struct avc_error *err)
 {
 	struct process *main = tree_main(freeze->tree);
@@ -351,7 +348,8 @@ static int hear_and_await(struct freeze *freeze, int result, struct avc_error *e
 	return result;
 }
 
-/* Others may take their time to stand still, and who waits in its parasite goes home before that. */
+/* Other members may take long to stop, and a thread that waits in its parasite would return before
+ * that. */
 static int rest_all(struct freeze *freeze, struct avc_error *err)
 {
 	struct process *main = tree_main(freeze->tree);
@@ -382,7 +380,7 @@ static int meet_others(struct freeze *freeze, int result, struct avc_error *err)
 	return freeze->meet(freeze->arg, !result, result ? &failed : err) ? -1 : result;
 }
 
-/* The main thread first: it would have to share the CPUs with everybody else. */
+/* The main thread first: otherwise it would have to share the CPUs with all others. */
 static void let_go(struct freeze *freeze)
 {
 	struct process *main = tree_main(freeze->tree);
@@ -411,8 +409,7 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
 	start = now_ns();
 	result = stop_and_begin(freeze, err);
-	/* The deadline is for getting things stopped; the clone of a big process takes its
-	 * time. */
+	/* The deadline is for stopping; the clone of a big process may take longer. */
 	tracee_deadline_set(freeze->timer, CLONE_NS);
 	if (!result)
 		result = read_and_clone(freeze, err);

@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the files of a freeze give each other.
+ * Shared by the files of a freeze.
  *
  *   freeze.c        one checkpoint
- *   freeze_stop.c   stops everybody, and lets everybody go
+ *   freeze_stop.c   stops and releases all processes
  *   freeze_clone.c  reads and clones
  */
 #ifndef AVCKPT_FREEZE_H
@@ -13,32 +13,32 @@
 
 /* ---- freeze_stop.c ------------------------------------------------------------------------ */
 
-/* Those that have something of ours; another child may have to execute a program before its
- * parent can be stopped (vfork(2)). */
+/* Those that are infected; another child may have to execute a program before its parent can be
+ * stopped (vfork(2)). */
 int freeze_stop_known(struct tree *tree, struct avc_error *err) warn_unused;
-/* Until a look at the whole tree finds nobody who is not stopped: processes create
- * processes while we look. */
+/* Until a walk of the whole tree finds no process that is not stopped: processes create processes
+ * meanwhile. */
 int freeze_stop_others(struct tree *tree, struct avc_error *err) warn_unused;
 
 /* ---- freeze_clone.c ----------------------------------------------------------------------- */
 
-/* As soon as everybody stands still who is known to be there: their clones begin, as far as
- * they do not take long, and they answer meanwhile what they are asked.  Whoever is found after
- * that is stopped, too, and has had nothing to do with the memory of the others.  (One that shares
- * it is not protected: find_others().)  One that has no holder yet waits for the others. */
+/* As soon as all known processes are stopped: starts their clones, as far as they are short, while
+ * they answer queries.  A process that is found later is stopped, too, and cannot have changed the
+ * memory of the others. (One that shares it is not protected: find_others().) One that has no
+ * holder yet waits for the others. */
 int freeze_begin_known(struct freeze *freeze, struct avc_error *err) warn_unused;
-/* Those that have been found since.  Without a holder they are only read and asked. */
+/* Those found since.  Without a holder they are only read and queried. */
 int freeze_begin_others(struct freeze *freeze, struct avc_error *err) warn_unused;
 /* The main process is cloned by its own main thread, any other by its holder, which shares its
- * memory and descriptors: nobody finds children that he has not made. */
+ * memory and descriptors: no process finds children that it has not created. */
 int freeze_start_clone(struct process *process, uint32_t slot, struct avc_error *err) warn_unused;
 int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err) warn_unused;
-/* The main thread that has cloned has a few steps to go before it can be let go. */
+/* After cloning, the main thread has a few more steps before it can be released. */
 int freeze_rest_main(const struct process *main, struct thread *main_thread, struct avc_error *err);
 /* The answers of all others, also of those that were asked before one failed. */
 int freeze_hear_all(struct tree *tree, struct avc_error *err) warn_unused;
-/* Clones that nobody waits for any more: of a process that was killed meanwhile, and all of
- * them when the checkpoint failed. */
+/* Abandoned clones: of a process that was killed meanwhile, and all of them when the checkpoint
+ * failed. */
 void freeze_drop_clones(struct tree *tree);
 
 #endif

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Reading and cloning: what begins with a process as soon as it stands still, and goes on
- * while the others are looked for, and what is waited for at the end.
+ * Reading and cloning: begins with a process as soon as it is stopped, continues while others are
+ * searched, and is completed at the end.
  *
- * What is to be read in a process' own memory is read before its clone begins: the kernel
- * lets nobody in while it clones (mmap_lock).
+ * A process's own memory is read before its clone begins: the kernel blocks access while it clones
+ * (mmap_lock).
  */
 #include <errno.h>
 #include <sched.h>
@@ -17,19 +17,19 @@
 
 #include "freeze.h"
 
-/* Holders have real-time priority, and who is still to be found needs a CPU to get to its
- * stop: so much may come before that. */
+/* Holders have real-time priority, and processes not found yet need a CPU to reach their stops:
+ * clones up to this size may run before that. */
 #define CLONES_AHEAD_NS (5 * NS_PER_MS)
 #define CLONE_PROCESS_NS 100000
 #define CLONE_PAGE_NS 90
 #define CLONES_MAX_NS NS_PER_S
-/* Times as long as that, they may take. */
+/* The factor by which they may exceed that. */
 #define PATIENCE 4
 
 /* ---- what is read ----------------------------------------------------------------------- */
 
-/* In a handler, on an alternate stack that it has given up for as long (sigaltstack(2),
- * SS_AUTODISARM), or was when it was asked last.  Any other cannot be changed by who is on it. */
+/* In a handler, on an alternate stack that is disarmed meanwhile (sigaltstack(2), SS_AUTODISARM),
+ * or was at the last query.  Any other cannot be changed while in use. */
 static bool may_be_disarmed(const struct thread *t)
 {
 	return t->disarmed || (t->altstack[1] & SS_AUTODISARM_ &&
@@ -55,8 +55,8 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 		if (!arch_is_native(&t->regs))
 			return fail(err, AVC_UNSUPPORTED, 0, t->tid, "freeze", "",
 				    "it is a 32-bit program");
-		/* A thread that somebody who died sent into a parasite finds its way out
-		 * in microseconds: such an image would be of the parasite. */
+		/* A thread that a dead guard sent into a parasite leaves it in microseconds: such
+		 * an image would be of the parasite. */
 		if (parasite_contains(&process->parasite, arch_pc(&t->regs)))
 			return fail(err, AVC_DEADLINE, 0, t->tid, "freeze", "",
 				    "a thread is in the parasite");
@@ -79,13 +79,13 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 	return 0;
 }
 
-/* ECHILD, if it has none: the one question that needs no look at each thread. */
+/* ECHILD if it has none: the only query that needs no walk of all threads. */
 static const struct inj_syscall *ask_for_children(struct inj_call *call)
 {
 	return call_add(call, SYS_waitid, P_ALL, 0, 0, WEXITED | WNOHANG | WNOWAIT | __WALL);
 }
 
-/* Nobody has looked below one that had none at the last checkpoint. */
+/* A process that had none at the last checkpoint was not searched. */
 static int hear_of_children(struct process *process, struct avc_error *err)
 {
 	const bool was_childless = process->childless;
@@ -97,8 +97,8 @@ static int hear_of_children(struct process *process, struct avc_error *err)
 		       : 0;
 }
 
-/* Those of guards that died, and of the process that forked this one.  Its clone is smaller by
- * what they take. */
+/* Those of dead guards, and of the process that forked this one.  Its clone is smaller by their
+ * size. */
 static void drop_old_parasites(struct process *process, struct inj_call *call)
 {
 	if (!process->checkpoints)
@@ -142,7 +142,7 @@ static int await_own_clone(struct process *process, pid_t *template, struct avc_
 		thread_runs_on(thread, err);
 		return -1;
 	}
-	/* After the timers were asked: one that has expired just now is found here. */
+	/* After the timers were queried: one that has just expired is found here. */
 	if (pending_read(process, err))
 		return -1;
 	timers_answer(process, call, now_ns() - process->asked_ns);
@@ -173,11 +173,11 @@ static int start_holders_clone(struct process *process, struct avc_error *err)
 	if (parasite_send(&process->parasite, process->holder, &process->holder_base, call, err) ||
 	    parasite_start(process->holder, err))
 		return -1;
-	process->lost = true; /* until we have heard of the clone */
+	process->lost = true; /* until the clone has been reported */
 	return 0;
 }
 
-/* After its main thread was asked, which tells of everything else. */
+/* After the query of its main thread, which reports everything else. */
 static void note_future_lock(struct process *process)
 {
 	const struct inj_call *call = &process->parasite.control->holder;
@@ -197,9 +197,9 @@ static int await_holders_clone(struct process *process, pid_t *template, struct 
 	return 0;
 }
 
-/* Nobody but the process itself may change its memory for a moment: a holder would be killed with
- * us in the middle of it, and leave it so.  Its main thread waits in the parasite until that is
- * over, and then puts it back, with us or without. */
+/* Only the process itself may change its memory temporarily: a holder would be killed with us in
+ * the middle of it.  Its main thread waits in the parasite until that is over, and then restores
+ * it, with or without us. */
 static int clone_unforked(struct process *process, uint32_t slot, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
@@ -264,8 +264,8 @@ int freeze_await_clone(struct process *process, pid_t *template, struct avc_erro
 
 /* ---- questions --------------------------------------------------------------------------- */
 
-/* Timers only the process itself can tell of.  And young processes change what they are
- * all the time: a name, a user.  All are asked at the same time. */
+/* Timers can only be read by the process itself.  And young processes often change attributes: a
+ * name, a user.  All are queried at the same time. */
 static int ask_begin(struct process *process, uint32_t slot, uint64_t takes_ns,
 		     struct avc_error *err)
 {
@@ -273,8 +273,8 @@ static int ask_begin(struct process *process, uint32_t slot, uint64_t takes_ns,
 	struct thread *thread = thread_find(process, process->pid);
 
 	call_begin(call, INJ_AFTER_HOME);
-	/* It is heard only when the main process is cloned, and the holders take the CPUs from us
-	 * meanwhile; if it went home before, the image would be of two instants. */
+	/* It is awaited only when the main process is cloned, and the holders take the CPUs from us
+	 * meanwhile; if it returned before, the image would be of two instants. */
 	call->park_ms += (uint32_t)(PATIENCE *
 				    (takes_ns < CLONES_MAX_NS ? takes_ns : CLONES_MAX_NS) /
 				    NS_PER_MS);
@@ -340,9 +340,8 @@ int freeze_hear_all(struct tree *tree, struct avc_error *err)
 	return result;
 }
 
-/* It stands still: its clone begins, if it has a holder for that, and it answers meanwhile what
- * it is asked, which changes nothing of its memory.  The main process is asked by the calls that
- * clone it. */
+/* It is stopped: its clone begins, if it has a holder, while it answers queries, which does not
+ * change its memory.  The main process is queried by the calls that clone it. */
 static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, struct avc_error *err)
 {
 	struct thread *thread = thread_find(process, process->pid);
@@ -363,7 +362,7 @@ static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, stru
 		       : 0;
 }
 
-/* What it has just brought forth was taken for a thread of its own; a look tells. */
+/* A task that it has just created was mistaken for its thread; check. */
 static bool has_strangers(const struct process *process)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++)
@@ -372,7 +371,7 @@ static bool has_strangers(const struct process *process)
 	return false;
 }
 
-/* About, of a process that has so many pages of its own. */
+/* An estimate, for a process with this many pages of its own. */
 static uint64_t clone_time_ns(long anon_pages)
 {
 	return CLONE_PROCESS_NS + (uint64_t)anon_pages * CLONE_PAGE_NS;
@@ -394,7 +393,7 @@ static uint64_t clones_time_ns(const struct tree *tree)
 	return takes_ns;
 }
 
-/* One that can be cloned at once, and of which it is known what that takes. */
+/* One that can be cloned at once, and whose clone time is known. */
 static bool is_ready(const struct process *process)
 {
 	return process->stage == FREEZE_STOPPED && !has_strangers(process) &&

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Stopping: every thread of every process, until there is nobody left who could create
- * another one; and letting go.
+ * Stops every thread of every process, until none is left that could create another one; and
+ * releases them.
  */
 #include <errno.h>
 #include <sys/syscall.h>
@@ -38,8 +38,7 @@ int freeze_stop_known(struct tree *tree, struct avc_error *err)
 
 int freeze_stop_others(struct tree *tree, struct avc_error *err)
 {
-	/* It had no other one at the last checkpoint; whether that is still so, the clone
-	 * will tell. */
+	/* It had no other one at the last checkpoint; the clone shows whether that is still so. */
 	if (tree->count <= 1 && tree_main(tree)->childless)
 		return 0;
 	for (int looks = 0; looks < LOOKS; looks++) {

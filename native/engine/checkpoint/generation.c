@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A template once the app runs again: made to lie still, and prepared so that a
- * restore finds everything ready in its slot of the parasite.
+ * Finishes a template once the app runs again: it is parked, and prepared so that a restore finds
+ * everything ready in its slot of the parasite.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -16,7 +16,7 @@
 
 #include "checkpoint.h"
 
-/* In template_call.out: what the template had got by fork(2). */
+/* In template_call.out: what the template inherited by fork(2). */
 #define TEMPLATE_NAME 16
 #define TEMPLATE_ALTSTACK 32
 #define TEMPLATE_ATTRIBUTES 64
@@ -47,7 +47,7 @@ int generation_new(struct generation *generation, struct process *main, uint32_t
 	return 0;
 }
 
-/* A fork of the main thread has what that had at that instant, but for what fork(2) resets. */
+/* A fork of the main thread has its attributes of that instant, except for what fork(2) resets. */
 static int hear_template(struct process *process, struct thread *cloned,
 			 const struct inj_call *call, const struct inj_syscall *attributes,
 			 struct avc_error *err)
@@ -64,7 +64,7 @@ static int hear_template(struct process *process, struct thread *cloned,
 	return thread_ask_others(process, cloned, &was, err);
 }
 
-/* For the day when it is brought up to date instead of another one being forked. */
+/* For a later update instead of another fork. */
 static int keep_inherited(struct image *image, struct avc_error *err)
 {
 	const struct thread *cloned = thread_find(image->process, image->process->pid);
@@ -100,7 +100,7 @@ static int quieten(struct image *image, struct avc_error *err)
 	memset(call->out, 0, sizeof call->out);
 	memcpy(call->out, "avckpt-tmpl", 12);
 	call_begin(call, INJ_AFTER_PARK);
-	/* Out of the app's session or process group, or the number stays taken. */
+	/* Leaves the app's session or process group; otherwise the number stays taken. */
 	if (process->descendant || image->stat.session == process->leader)
 		call_add(call, SYS_setsid);
 	else
@@ -116,8 +116,8 @@ static int quieten(struct image *image, struct avc_error *err)
 					    parasite_remote(&process->parasite,
 							    call->out + TEMPLATE_ATTRIBUTES));
 	}
-	/* Or the kernel would write to its memory each time it runs, and to what is made of
-	 * that.  A holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
+	/* Otherwise the kernel would write to its memory each time it runs, and to its clones'. A
+	 * holder's clone is not registered (kernel/rseq.c, CLONE_VM). */
 	if (cloned && cloned->rseq)
 		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
 				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature);
@@ -135,8 +135,7 @@ static int quieten(struct image *image, struct avc_error *err)
 	return process->tracker ? keep_inherited(image, err) : 0;
 }
 
-/* A main thread that has ended while others go on: it is there again until they are,
- * and ends again. */
+/* A main thread that has exited while others run: it exists until they do, and exits again. */
 static void fill_ended(const struct image *image)
 {
 	const struct process *process = image->process;
@@ -187,8 +186,8 @@ static int fill_slot(struct image *image, struct avc_error *err)
 		block = parasite_thread(parasite, image->slot, b);
 		frame = parasite_frame(parasite, image->slot, b);
 
-		/* The borrowed thread's was seen to when it was borrowed; its own
-		 * memory has been run on since. */
+		/* The borrowed thread's was handled when it was borrowed; its memory has changed
+		 * since. */
 		if (t.tid != process->pid)
 			thread_fix_rseq(mem_fd, &t);
 		rewind_original(&t, &t.regs);
@@ -213,7 +212,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 			.affinity_bytes = t.affinity_bytes,
 		};
 		memcpy(block->affinity, t.affinity, sizeof block->affinity);
-		/* Of the one that was cloned, as it was then. */
+		/* Of the thread that was cloned, as of then. */
 		memcpy(block->name,
 		       !process->descendant && !image->recycled && t.tid == process->pid
 			       ? (char *)slot->template_call.out + TEMPLATE_NAME
@@ -241,7 +240,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	timers_setup(process, &setup);
 	if (process->descendant)
 		process_attrs_setup_limits(image, &setup);
-	/* A change of users takes it from the whole process, whichever thread it is. */
+	/* A change of users clears it for the whole process, whichever thread makes it. */
 	if (image->dumpable == 0 || image->dumpable == 1)
 		setup_add(&setup, INJ_AFTER, "", SYS_prctl, PR_SET_DUMPABLE,
 			  (uint64_t)image->dumpable)
@@ -250,8 +249,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 		image->notice = setup.notice;
 	slot->threads = image->threads;
 	slot->pid = process->inside;
-	/* Nothing but the app's own group, or one whose leader is visible, can be
-	 * put back. */
+	/* Only the app's own group, or one whose leader is visible, can be restored. */
 	slot->group = !process->descendant && image->group > 0 ? image->group : process->inside;
 	slot->session_leader = stat->session == process->leader;
 	slot->placed = process->descendant;
@@ -267,7 +265,7 @@ static int begin_template(struct image *image, struct avc_error *err)
 {
 	if (image->recycled)
 		return 0;
-	/* The holder rests again. */
+	/* The holder is parked again. */
 	if (image->process->descendant && tracee_settle(image->process->holder, err))
 		return -1;
 	image->pidfd = proc_pidfd_open(image->template);
@@ -277,8 +275,8 @@ static int begin_template(struct image *image, struct avc_error *err)
 	return quieten(image, err);
 }
 
-/* What only a process that makes another one its child has to know.  This one may have
- * ended meanwhile: a shell's children live for milliseconds. */
+/* What the process that will fork this one has to know.  It may have exited meanwhile: a shell's
+ * children live for milliseconds. */
 static int finish(struct image *image, struct avc_error *err)
 {
 	struct process *process = image->process;
@@ -314,7 +312,7 @@ int generation_finish(struct generation *generation, struct avc_error *err)
 			image->process->forebear = &main_thread->creds;
 		if (begin_template(image, &failed) == 0 && finish(image, &failed) == 0)
 			continue;
-		/* What was not as it was known is known now: of all of them. */
+		/* What was outdated is known now, for all of them. */
 		if (failed.code != AVC_RETRY) {
 			*err = failed;
 			return -1;
@@ -406,7 +404,7 @@ void generation_drop(struct generation *generation)
 	for (uint32_t i = 0; i < generation->images; i++)
 		image_drop(&generation->image[i]);
 	if (spare_is_unknown(generation))
-		tracee_end_now(); /* the kernel has made one by now, or makes none */
+		tracee_end_now(); /* the kernel has made one by now, or never will */
 	restore_plan_free(generation->plan);
 	free(generation->image);
 	*generation = (struct generation){ 0 };

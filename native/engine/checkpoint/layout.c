@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Whether two processes have the same mappings, and what it takes.  A mapping that is watched
- * (tracker.c) and what is mapped beside it later are two to the kernel, and one in a process that is
- * not watched.
+ * Whether two processes have the same mappings, and the calls that make them equal.  A watched
+ * mapping (tracker.c) and a later adjacent one are separate to the kernel, but merged in a process
+ * that is not watched.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -87,7 +87,7 @@ bool layout_equal(char *a, char *b)
 	struct mappings first = { 0 }, second = { 0 };
 	bool equal;
 
-	/* Of two that are watched in the same way, as a rule. */
+	/* Usually both are watched in the same way. */
 	if (!strcmp(a, b))
 		return true;
 	equal = parse(a, &first) && parse(b, &second) && first.count == second.count;

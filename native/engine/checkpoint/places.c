@@ -1,13 +1,13 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Where a restored process is to be forked, so that it comes to stand where it stood.
+ * Where to fork a restored process, so that it is in its session again.
  *
  * A process is in the session of the one that forked it, for good, unless it begins its own
- * (setsid(2)).  So one that is in another session than its parent was either there before that
- * one began its own, or comes of somebody who is gone.  For the former, the parent has a *keeper*
- * before it begins its session: a task that shares its memory, stays in the old session, and makes
- * children of it there (CLONE_PARENT).  For the latter, a keeper has the number of the leader that
- * is gone for a while, and begins the session anew.
+ * (setsid(2)).  So one that is in another session than its parent was either forked before the
+ * parent began its own, or descends from a process that is gone.  For the former, the parent gets a
+ * *keeper* before it begins its session: a task that shares its memory, stays in the old session,
+ * and clones children of the parent there (CLONE_PARENT). For the latter, a keeper temporarily
+ * takes the PID of the leader that is gone, and begins the session again.
  */
 #include <signal.h>
 #include <stdlib.h>
@@ -47,7 +47,7 @@ static int refuse(const struct image *image, struct avc_error *err)
 		image->inside, image->session);
 }
 
-/* Of an orphan anybody can be the parent for a moment. */
+/* Any process can temporarily be the parent of an orphan. */
 static int place_orphan(const struct generation *generation, uint32_t i, struct place *place,
 			struct avc_error *err)
 {
@@ -73,7 +73,7 @@ static int place_child(const struct generation *generation, uint32_t i, struct p
 
 	if (born == PLACE_ANY || born == generation->image[parent].session)
 		return 0;
-	/* It has its exit signal from the keeper. */
+	/* It inherits its exit signal from the keeper. */
 	if (image->exit_signal != SIGCHLD)
 		return refuse(image, err);
 	if (parent && leads(&generation->image[parent]) &&
@@ -81,7 +81,7 @@ static int place_child(const struct generation *generation, uint32_t i, struct p
 		place[parent].before = born;
 		return 0;
 	}
-	/* There can be one with that number, and it is the child of one. */
+	/* There can only be one process with that PID, and it has one parent. */
 	other = kept(place, generation, born);
 	if (born <= 0 || leader_of(generation, born) >= 0 || (other && other->host != parent))
 		return refuse(image, err);
@@ -89,8 +89,8 @@ static int place_child(const struct generation *generation, uint32_t i, struct p
 	return 0;
 }
 
-/* Orphans of a session whose leader is gone: by the keeper that there has to be in any case, or by
- * one of the main process's. */
+/* Orphans of a session whose leader is gone: by the keeper that is needed in any case, or by one of
+ * the main process. */
 static void place_renewed(const struct generation *generation, uint32_t i, struct place *place)
 {
 	const pid_t born = place[i].born;

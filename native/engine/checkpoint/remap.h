@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the memory of one process differs in from another's: found out by remap_plan.c, done by
+ * How the memory of one process differs from another's: found by remap_plan.c, applied by
  * restore/remap.c.
  */
 #ifndef AVCKPT_REMAP_H
@@ -12,7 +12,7 @@
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 
-/* A stretch that is in one mapping of both at most. */
+/* A range within at most one mapping of each. */
 struct piece {
 	avc_remote start, end;
 	const struct mapping *is, *want; /* NULL: nothing is mapped             */
@@ -24,8 +24,8 @@ enum page {
 	PAGE_COPY,
 	PAGE_DROP,
 	PAGE_GUARD,    /* becomes a guard page                                   */
-	PAGE_OPEN,     /* is one, and is to be empty                             */
-	PAGE_OPEN_COPY /* is one, and is to be copied                           */
+	PAGE_OPEN,     /* is one, and must be empty */
+	PAGE_OPEN_COPY /* is one, and must be copied */
 };
 
 struct run {

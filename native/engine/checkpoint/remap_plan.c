@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the memory of a process differs in from that of the one that is to fork it.
+ * How the memory of a process differs from that of the one that will fork it.
  *
- * Where both have the same mapped at the same place it stays, and with it the pages that
- * they share: of equal page frames (pagemap, Documentation/admin-guide/mm/pagemap.rst)
- * there is nothing to do.  Everything else is unmapped, mapped, and copied (restore/remap.c).  What
- * that is is found out by the templates of both, before there is a process that it is for.
+ * Where both have the same mapping at the same address it stays, and with it the pages that they
+ * share: those with equal page frames (pagemap, Documentation/admin-guide/mm/pagemap.rst).
+ * Everything else is unmapped, mapped, and copied (restore/remap.c).  The difference is found in
+ * the templates of both, before the process exists.
  */
 #include <stdlib.h>
 #include <string.h>
@@ -35,7 +35,7 @@ static bool same_backing(const struct mapping *a, const struct mapping *b)
 		(a->offset - a->start == b->offset - b->start && !strcmp(a->name, b->name)));
 }
 
-/* What stays where it is whatever happens; where our parasite is nothing else is touched. */
+/* What stays in any case; the range of our parasite is not touched. */
 static bool is_fixed(const struct remap *r, const struct mapping *m, avc_remote address)
 {
 	return mapping_is_special(m) || parasite_contains(&r->process->parasite, address);
@@ -55,7 +55,7 @@ static avc_remote boundary(const struct mappings *maps, uint32_t next, avc_remot
 	return maps->map[next].start > address ? maps->map[next].start : maps->map[next].end;
 }
 
-/* Both lists side by side. */
+/* Merges both lists. */
 static int cut(struct remap *r, struct avc_error *err)
 {
 	const struct mappings *is_maps = &r->is->maps, *want_maps = &r->want->maps;
@@ -103,7 +103,7 @@ const struct mapping *mappings_find(const struct mappings *maps, const char *nam
 
 /* ---- pages -------------------------------------------------------------------------- */
 
-/* Of a private mapping.  What is of a file is there by itself. */
+/* Of a private mapping.  Pages of a file need no copy. */
 static enum page compare(uint64_t want, uint64_t is)
 {
 	if (page_is_guard(want))
@@ -189,7 +189,7 @@ failed:
 	return NULL;
 }
 
-/* mseal(2): nobody takes it away or protects it otherwise, not in a fork either. */
+/* mseal(2): it cannot be unmapped or protected differently, not even in a fork. */
 static bool is_stuck(const struct piece *piece)
 {
 	return piece->is && piece->is->flags & MAPPING_SEALED &&

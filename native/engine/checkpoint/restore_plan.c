@@ -1,31 +1,30 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the processes of a generation have in memory of those that will fork them
- * (restore_tree.c): who forks whom, and a plan for each (remap.c).
+ * How the processes of a generation are made from those that will fork them (restore_tree.c): which
+ * forks which, and a memory plan for each (remap.c).
  *
- * To compare big processes takes longer than to fork them: 50 ns a page, for the kernel
- * looks at each.  Templates do not change, so that it can be done as soon as they are there,
- * while nobody waits for it.  What that may cost is limited; what is left is done when it
- * is needed.
+ * Comparing big processes takes longer than forking them: 50 ns a page, because the kernel walks
+ * each.  Templates do not change, so it can be done as soon as they exist, while nothing waits for
+ * it.  Its cost is limited; the rest is done when it is needed.
  */
 #include <stdlib.h>
 
 #include "checkpoint.h"
 
-/* Fewer pages are compared in no time. */
+/* Fewer pages are compared at once. */
 #define WORTH_PAGES 1024
-/* About what it takes to compare a page. */
+/* The approximate time to compare a page. */
 #define PAGE_NS 60
 
 /* Of one image. */
 struct plan_entry {
-	struct snapshot *snapshot; /* NULL: nobody has asked yet                      */
+	struct snapshot *snapshot; /* NULL: not needed yet */
 	struct remap *plan;        /* the same                                        */
 };
 
 struct restore_plan {
 	uint64_t left_ns; /* to be spent ahead                                        */
-	uint32_t next;    /* to be looked at ahead                                    */
+	uint32_t next;    /* next one to be planned ahead */
 	uint32_t entries;
 	struct place *place;       /* by image                                        */
 	struct plan_entry entry[]; /* by image                                       */
@@ -75,7 +74,7 @@ static struct snapshot *snapshot_of(struct generation *generation, uint32_t inde
 	return *snapshot;
 }
 
-/* What nobody is to be compared with any more needs no room. */
+/* Frees what is no longer needed for a comparison. */
 static void rest(const struct generation *generation, uint32_t index)
 {
 	struct restore_plan *all = generation->plan;
@@ -118,7 +117,7 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 		const struct image *host = &generation->image[place[i].memory];
 		struct snapshot *want, *is;
 
-		/* Few have anything of the kind. */
+		/* Few have any. */
 		if (!image->process ||
 		    (!mem_image_has(image->memory, MAPPING_ONLY_HERE) &&
 		     !mem_image_has(host->memory, MAPPING_SEALED) &&
@@ -142,7 +141,7 @@ bool restore_plan_next(struct generation *generation)
 	while (all->next < all->entries) {
 		const uint32_t i = all->next++;
 		const uint64_t pages = (uint64_t)generation->image[i].anon_pages;
-		struct avc_error later = { 0 }; /* the restore will say it */
+		struct avc_error later = { 0 }; /* the restore will report it */
 
 		if (pages < WORTH_PAGES || pages * PAGE_NS > all->left_ns)
 			continue;

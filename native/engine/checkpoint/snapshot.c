@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a template has in memory: its mappings, and of the private ones the frames of the
- * pages that are its own.  Templates do not run, so that it can be read at any time.
+ * The memory of a template: its mappings, and for private ones the frames of its own pages.
+ * Templates do not run, so it can be read at any time.
  *
- * A page that two templates share stays shared, and one that they do not share stays so,
+ * A page that two templates share stays shared, and one that they do not share stays unshared,
  * whatever the kernel does with its frame meanwhile.
  */
 #include <fcntl.h>
@@ -13,7 +13,8 @@
 #include "checkpoint.h"
 
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
-/* Runtimes reserve terabytes of which they use little: beyond that, what is empty is not read. */
+/* Runtimes reserve terabytes of which they use little: beyond this size, empty ranges are not
+ * read. */
 #define SPARSE_BYTES (UINT64_C(4) << 30)
 static int add_mapping(const struct mapping *m, void *arg)
 {
@@ -108,7 +109,7 @@ static int read_sparse(avc_remote start, avc_remote end, void *arg)
 	return read_extent(sparse->snapshot, sparse->pages, start, end);
 }
 
-/* Of a private mapping of the snapshot's. */
+/* Of a private mapping of the snapshot. */
 const struct pages *snapshot_pages(struct snapshot *snapshot, const struct mapping *m,
 				   struct avc_error *err)
 {

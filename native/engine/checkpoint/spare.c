@@ -1,9 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A fork of a template, made while the app runs.  What a restore takes longest for is the
- * kernel's copying of page tables.  With a spare they are copied already: the process that
- * takes the app's place is made with the spare's memory (clone(2), CLONE_VM), and has it for
- * itself when the spare has ended.  The template keeps its own, for the next time.
+ * A fork of a template, made while the app runs.  The longest part of a restore is the kernel's
+ * copying of page tables.  With a spare they are already copied: the process that takes the app's
+ * place is cloned with the spare's memory (clone(2), CLONE_VM), and owns it alone when the spare
+ * has exited.  The template keeps its own, for the next time.
  */
 #include <errno.h>
 #include <sched.h>
@@ -24,8 +24,8 @@ static uint32_t policy_of(const struct scheduling *s)
 	return policy;
 }
 
-/* What is made in advance must not keep the app from running: not on a CPU that it has
- * chosen (each thread chooses again, set_up() in parasite.c), and not at its priority. */
+/* What is made in advance must not hinder the app: not on a CPU that it has chosen (each thread
+ * sets its affinity again, set_up() in parasite.c), and not at its priority. */
 static bool step_aside(pid_t template, struct scheduling *was)
 {
 	const struct sched_param none = { 0 };
@@ -79,8 +79,8 @@ static int end_fork(struct generation *generation, struct avc_error *err)
 		return -1;
 	}
 	if (!tracee_is_ours(spare->pid)) {
-		/* The template was killed before it could tell, or init_channel_kill_lost() did not
-		 * know of the spare. */
+		/* The template was killed before it could report the spare, or
+		 * init_channel_kill_lost() did not know it. */
 		spare->pid = 0;
 		generation->image[0].process->lost = true;
 	}
@@ -119,7 +119,7 @@ int spare_make(struct generation *generation, struct avc_error *err)
 	if (make(generation, step_aside(generation->image[0].template, &spare->scheduling), err) ==
 	    0)
 		return 0;
-	/* A frozen cgroup, or others have the CPUs; spare_await() goes on with it. */
+	/* A frozen cgroup, or busy CPUs; spare_await() continues. */
 	return err->code == AVC_DEADLINE && spare->work ? 0 : -1;
 }
 

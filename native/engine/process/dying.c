@@ -1,30 +1,30 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * A process that is already dying: one of its threads is in its own handler of a fatal signal,
- * making a report, closing what it has open.  An image of that would die at every restore.
+ * writing a report, closing descriptors.  Such an image would die at every restore.
  *
- * Where a thread is in a handler, the kernel's signal frame lies above its stack pointer, and
- * says what the thread had blocked before and (SA_SIGINFO) which signal it was.  Frames of handlers that
- * have ended lie about as well: programs that live by faults (virtual machines, garbage
- * collectors) leave many.  So a frame counts only
+ * Where a thread is in a handler, the kernel's signal frame lies above its stack pointer, and says
+ * what the thread had blocked before and (SA_SIGINFO) which signal it was.  Frames of handlers that
+ * have returned remain as well: programs that rely on faults (virtual machines, garbage collectors)
+ * leave many.  So a frame counts only
  *   - on the alternate stack, if the thread is there now;
- *   - if the thread has more signals blocked than before, as it has in a handler;
- *   - if the signal was caught before and is not now: a handler that is to run once only.
+ *   - if the thread has more signals blocked than before, as in a handler;
+ *   - if the signal was caught before and is not now: a handler that runs only once.
  * One without any of these signs (SA_NODEFER, nothing blocked, no stack of its own, installed
- * for good) is not recognized.
+ * permanently) is not recognized.
  */
 #include <signal.h>
 #include <unistd.h>
 
 #include "process.h"
 
-/* Of a stack, from its pointer upwards: more than handlers use; and of an alternate one, where
- * the first frame is. */
+/* How much of a stack is searched, from its pointer upwards: more than handlers use; and of an
+ * alternate one, where the first frame is. */
 #define LOOK_BYTES (256 * 1024)
 #define LOOK_TOP_BYTES (32 * 1024)
 #define CHUNK_BYTES (16 * 1024)
-/* There are programs that live in their handlers: of calls that a filter traps (SIGSYS) and of
- * breakpoints, or by the third sign. */
+/* Some programs run permanently in their handlers: of calls trapped by a filter (SIGSYS) and of
+ * breakpoints, or with the third sign. */
 #define PATIENCE_NS (10 * NS_PER_S)
 
 void dying_note_caught(struct process *process)
@@ -62,8 +62,8 @@ static bool is_single(uint64_t set)
 	return set && !(set & (set - 1));
 }
 
-/* The fatal signal in whose handler the thread is by this frame, 0: none; *surely: and will not
- * come back from it. */
+/* The fatal signal in whose handler the thread is according to this frame, 0: none; *surely: it
+ * will not return from it. */
 static int handled(const struct process *process, const struct thread *t,
 		   const struct arch_signal_frame *frame, bool *surely)
 {
@@ -81,7 +81,7 @@ static int handled(const struct process *process, const struct thread *t,
 			  !(bit & (SIGNAL_BIT(SIGSYS) | SIGNAL_BIT(SIGTRAP)));
 		return alternate || (more && nested) || bit & process->uncaught ? frame->signal : 0;
 	}
-	/* Without SA_SIGINFO the kernel does not write there which one it is. */
+	/* Without SA_SIGINFO the kernel does not store the signal there. */
 	if (!nested || more & bit)
 		return 0;
 	*surely = is_single(more) && !(more & (SIGNAL_BIT(SIGSYS) | SIGNAL_BIT(SIGTRAP)));
@@ -94,7 +94,7 @@ static int handled(const struct process *process, const struct thread *t,
 static int look(const struct process *process, const struct thread *t, avc_remote from,
 		avc_remote end, bool *surely)
 {
-	/* Frames across the edge of a chunk are seen in the next one. */
+	/* Frames across the end of a chunk are found in the next one. */
 	static uint8_t chunk[CHUNK_BYTES + ARCH_SIGNAL_FRAME_BYTES] __attribute__((aligned(16)));
 
 	for (avc_remote at = from & ~UINT64_C(15); at < end; at += CHUNK_BYTES) {
@@ -114,7 +114,7 @@ static int look(const struct process *process, const struct thread *t, avc_remot
 	return 0;
 }
 
-/* Thread-local storage lies above the stack that a library has made; beyond is another one's. */
+/* Thread-local storage is above the stack in a library's allocation; beyond it is other memory. */
 static avc_remote stack_end(const struct thread *t)
 {
 	const avc_remote sp = arch_sp(&t->regs), tls = arch_tls(&t->regs);
@@ -134,7 +134,7 @@ static int find(const struct process *process, const struct thread *t, bool *sur
 	return signal;
 }
 
-/* Threads stand still most of the time. */
+/* Threads are mostly blocked. */
 static bool was_looked_at(const struct thread *t)
 {
 	return t->looked_at.pc == arch_pc(&t->regs) && t->looked_at.sp == arch_sp(&t->regs) &&
@@ -168,7 +168,7 @@ int dying_check(struct process *process, struct thread *t, struct avc_error *err
 		process->alive = true;
 		return 0;
 	}
-	/* A fault that is mended takes no time: the next attempt is all right. */
+	/* A fault that the handler repairs takes no time: the next attempt will succeed. */
 	return fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
 		    "it is in its own handler of signal %d", signal);
 }

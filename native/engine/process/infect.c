@@ -1,17 +1,17 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Parasite and holder are brought into the live app through its main thread; the
- * other threads run on meanwhile.
+ * Injects parasite and holder into the live app through its main thread; the other threads keep
+ * running.
  *
  * The parasite is memory that the guard makes (parasite.c), so that what the app does to its own
- * mapping of it is the app's affair alone.  To get it in, the main thread clones a *porter*, a task
- * with the same memory, from a stub in the zero padding behind some executable mapping, the vDSO's
- * as a rule.  The porter takes leave of the app's descriptors, so that no number is taken for a
- * moment that the app could miss; in a table of its own it is sent the memory over a socket, maps
- * it, and ends.  It makes one system call at a time, of which every register is set from outside.
+ * mapping affects only the app.  To inject it, the main thread clones a *porter*, a task with the
+ * same memory, from a stub in the zero padding behind an executable mapping, usually the vDSO. The
+ * porter unshares the app's descriptor table, so that it never uses a number there; in its own
+ * table it receives the memory over a socket, maps it, and exits.  It makes one system call at a
+ * time, with every register set by the guard.
  *
- * The stub ends by loading the thread's own registers, so it gets home without us, and a porter
- * that we cannot tell what to do ends by itself.
+ * The stub ends by loading the thread's own registers, so the thread returns without us, and a
+ * porter without a guard exits by itself.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -39,10 +39,9 @@
 #define PADS_START UINT64_C(0x200000000000)
 #define PADS (UINT64_C(1) << 19)
 #define PARASITE_DISTANCE (UINT64_C(64) << 20)
-#define PARASITE_SHARE 16 /* of what may be mapped, the parasite is a 16th at most */
+#define PARASITE_SHARE 16 /* the parasite may be at most a 16th of what may still be mapped */
 
-/* True if the last bytes of the mapping are a stub that a guard which died could not
- * take away. */
+/* True if the last bytes of the mapping are a stub that a dead guard has left. */
 static bool has_stub(int mem_fd, avc_remote end)
 {
 	uint8_t bytes[CAVE_BYTES];
@@ -71,7 +70,7 @@ static bool is_place_of_pads(avc_remote base)
 	       base % PARASITE_DISTANCE == 0;
 }
 
-/* The mapping of a guard that died before it wrote anything is told by its place. */
+/* The mapping of a guard that died before it wrote anything is recognized by its address. */
 static void note_old_parasite(struct process *process, avc_remote base, avc_remote end)
 {
 	uint64_t magic;
@@ -89,11 +88,11 @@ static void note_old_parasite(struct process *process, avc_remote base, avc_remo
 
 struct survey {
 	struct process *process;
-	avc_remote pc, cave, start, end; /* start, end: of the parasite that is gone through */
+	avc_remote pc, cave, start, end; /* start, end: of the parasite being scanned */
 	bool in_stub;
 };
 
-/* Of a parasite that is there, or was being brought in (bring_parasite). */
+/* Of an existing parasite, or one that was being injected (bring_parasite). */
 static bool is_of_parasite(const struct mapping *m)
 {
 	return !strcmp(m->name, "/memfd:" PARASITE_NAME " (deleted)") ||
@@ -106,7 +105,7 @@ static int survey_mapping(const struct mapping *m, void *arg)
 	struct process *process = survey->process;
 	const bool code = m->mode[2] == 'x' && !m->shared;
 
-	/* In pieces, one right behind the other. */
+	/* In adjacent pieces. */
 	if (is_of_parasite(m)) {
 		if (m->start != survey->end || is_place_of_pads(m->start)) {
 			note_old_parasite(process, survey->start, survey->end);
@@ -166,8 +165,8 @@ static int step(pid_t tid, struct stop *stop, struct avc_error *err)
 	return 0;
 }
 
-/* From stop to stop, to the exit from a call `nr` that will not be made again.  1: on the way it
- * has brought forth *child. */
+/* From stop to stop, to the exit from a call `nr` that will not be restarted. 1: on the way it has
+ * created *child. */
 static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_error *err)
 {
 	struct stop stop = { .kind = STOP_OTHER };
@@ -191,9 +190,10 @@ static int step_over(pid_t tid, long nr, long *result, pid_t *child, struct avc_
 	}
 }
 
-/* The task that brings the parasite.  For the main process it is a child of init's.  Any child of
- * another process its own threads could wait for (__WALL), even before the stub does: there it is a
- * thread, which nobody waits for, and which ends by itself, for whoever kills it kills them all. */
+/* The task that injects the parasite.  For the main process it is a child of init.  A child of
+ * another process could be reaped by that process's own threads (__WALL), even before the stub
+ * does: there it is a thread, which needs no wait, and which exits by itself, because killing it
+ * would kill the process. */
 struct porter {
 	pid_t tid; /* 0: there is none                                     */
 	bool is_thread;
@@ -206,7 +206,7 @@ static int open_pidfd(pid_t tid, bool is_thread)
 	return (int)syscall(SYS_pidfd_open, tid, is_thread ? PIDFD_THREAD_ : 0);
 }
 
-/* A thread has descriptors of its own, which only a pidfd of its own gives (since Linux 6.9). */
+/* A thread has its own descriptor table, reachable only through its own pidfd (since Linux 6.9). */
 static bool can_be_thread(void)
 {
 	int pidfd = open_pidfd((pid_t)syscall(SYS_gettid), true);
@@ -216,7 +216,7 @@ static bool can_be_thread(void)
 	return can;
 }
 
-/* The main thread makes it, and stays in the event's stop. */
+/* The main thread clones it, and stays in the event's stop. */
 static int make_porter(struct process *process, struct thread *thread, struct porter *porter,
 		       struct avc_error *err)
 {
@@ -232,9 +232,9 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	long refused;
 	int born;
 
-	/* If we die before its signals are blocked, it may not make a porter, which would take the
-	 * app's signals on its stack: it makes a call that is refused (a mask of 0 bytes) and goes
-	 * home.  But never is it in the app with every signal blocked. */
+	/* If we die before its signals are blocked, it must not clone a porter, which would handle
+	 * the app's signals on its stack: it makes a call that fails (a mask of 0 bytes) and
+	 * returns.  But it is never in the app with every signal blocked. */
 	arch_stub_call(&homeward, &thread->regs, porter->cave, false, SYS_rt_sigprocmask, nothing);
 	arch_stub_call(&regs, &thread->regs, porter->cave, false, SYS_clone, arg);
 	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
@@ -247,7 +247,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	born = step_over(thread->tid, SYS_clone, &refused, &porter->tid, err);
 	if (born < 0) {
 		process->lost = true;
-		thread->stopped = false; /* it runs: in the stub, which must stay, and home */
+		thread->stopped = false; /* it runs: in the stub, which must stay, and back */
 		return -1;
 	}
 	if (!born) {
@@ -263,12 +263,12 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	if (ptrace(PTRACE_SETOPTIONS, porter->tid, NULL, options) ||
 	    seccomp_supervise(porter->tid, 0, options))
 		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
-	/* The main thread waits for it, and each of its calls is two turns.  Best effort. */
+	/* The main thread waits for it, and each of its calls takes two wake-ups.  Best effort. */
 	(void)sched_setscheduler(porter->tid, SCHED_FIFO, &first);
 	return 0;
 }
 
-/* False: it is still on its way out, through the stub. */
+/* False: it is still exiting, through the stub. */
 static bool kill_porter(struct process *process, const struct porter *porter)
 {
 	const uint64_t arg[6] = { 0 };
@@ -293,7 +293,8 @@ static bool kill_porter(struct process *process, const struct porter *porter)
 	return false;
 }
 
-/* The porter is gone: the main thread out of the stub's calls, to where it can be sent home. */
+/* The porter is gone: leads the main thread out of the stub's calls, to where it can be
+ * released. */
 static int leave_stub(struct thread *thread, struct avc_error *err)
 {
 	long result;
@@ -332,16 +333,16 @@ static int porter_must(const struct porter *porter, const char *name, const char
 	return 0;
 }
 
-/* A child has its parent's parasite mapped, and at a restore is there together with it for
- * a moment: each has a place of its own, in a part of the address space that programs
- * do not use by themselves.  The kernel takes another place if this one is taken. */
+/* A child has its parent's parasite mapped, and at a restore briefly has both: each has its own
+ * address, in a part of the address space that programs do not use otherwise.  The kernel chooses
+ * another one if this is taken. */
 static uint64_t where_to_map(const struct process *process)
 {
 	return PADS_START + process->nonce % PADS * PARASITE_DISTANCE;
 }
 
-/* RLIMIT_AS counts the parasite, too: what the app could still map before it has to be able to map
- * with it, as far as one can tell.  So only where the parasite is next to nothing of that. */
+/* RLIMIT_AS counts the parasite, too, but must not make the app's own mappings fail.  So only where
+ * the parasite is a small part of what is left. */
 static int check_room(const struct process *process, size_t bytes, struct avc_error *err)
 {
 	const long pages = proc_vm_pages(process->statm_fd, NULL);
@@ -358,8 +359,8 @@ static int check_room(const struct process *process, size_t bytes, struct avc_er
 		    bytes / 1024);
 }
 
-/* The other end of a socket of the porter's, whose own one is descriptor 0: the first of a table
- * that it shares with nobody. */
+/* The other end of the porter's socket, whose own is descriptor 0: the first of an unshared
+ * table. */
 static int open_channel(const struct porter *porter, avc_remote scratch, struct avc_error *err)
 {
 	const uint64_t leave[6] = { 0, ~0u, CLOSE_RANGE_UNSHARE };
@@ -383,8 +384,8 @@ static int open_channel(const struct porter *porter, avc_remote scratch, struct 
 	return channel;
 }
 
-/* One part of the parasite; it comes as descriptor 1.  If somebody has changed the letter
- * meanwhile, it comes not at all, or is not there to be mapped. */
+/* One part of the parasite; it arrives as descriptor 1. If the app changes the message header
+ * meanwhile, it does not arrive, or cannot be mapped. */
 static int bring(const struct process *process, const struct porter *porter, int channel, int fd,
 		 const uint64_t map[6], struct avc_error *err)
 {
@@ -412,8 +413,8 @@ static int bring(const struct process *process, const struct porter *porter, int
 		       : 0;
 }
 
-/* All of the place first: what comes into it then takes no other mapping's.  Its first page holds
- * the letters until the code comes there. */
+/* Reserves the whole range first, so that the parts replace no other mapping.  Its first page holds
+ * the message headers until the code is mapped there. */
 static int bring_parasite(struct process *process, const struct porter *porter,
 			  struct avc_error *err)
 {
@@ -471,7 +472,7 @@ static int make_parasite(struct process *process, struct thread *thread, avc_rem
 	return result;
 }
 
-/* The main thread, stopped, with everything read that borrowing it needs. */
+/* The main thread, stopped, with all that borrowing it needs read. */
 static struct thread *stop_main(struct process *process, struct avc_error *err)
 {
 	struct thread *t = thread_find(process, process->pid);
@@ -542,7 +543,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	result = make_parasite(process, thread, cave,
 			       parasite_layout(&process->parasite, slots, threads_max),
 			       &stub_is_free, err);
-	/* Nobody is in the stub any more: leave no trace. */
+	/* No thread is in the stub any more: erase it. */
 	if (stub_is_free && thread->stopped &&
 	    (!thread->borrowed || thread_give_back(thread, err) == 0)) {
 		if (pwrite(process->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
@@ -555,8 +556,8 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	return result;
 }
 
-/* Of a process that is not the main one, while all of it stands still: the holder, or `slots` of a
- * parasite.  Another thread may be waiting for children, of any kind (__WALL). */
+/* For a process other than the main one, while all of it is stopped: injects the holder, or a
+ * parasite with `slots`. Another thread may be waiting for children of any kind (__WALL). */
 static int do_stopped(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		      struct avc_error *err)
 {
@@ -611,7 +612,7 @@ int process_infect_stopped(struct process *process, uint32_t slots, struct avc_e
 	return infect_thread(process, thread, slots, err);
 }
 
-/* ESRCH is of one that is ending: exec(2) has memory, but not this. */
+/* ESRCH means that it is exiting: after exec(2) there is memory, but not this. */
 bool process_has_executed(const struct process *process)
 {
 	uint64_t nonce = 0;
@@ -624,20 +625,19 @@ bool process_has_executed(const struct process *process)
 	return n == sizeof nonce ? nonce != process->nonce : errno == EFAULT;
 }
 
-/* What makes a new task the holder: it lies still, is known as such, and has none of
- * the app's numbers. */
+/* Turns a new task into the holder: stopped, named, and outside of the app's process groups. */
 static int make_holder(struct process *process, pid_t holder, const struct arch_regs *base,
 		       struct avc_error *err)
 {
 	struct inj_call *own = &process->parasite.control->holder;
 	const struct sched_param first = { .sched_priority = 1 };
 
-	/* It clones while all of the app stands still.  Best effort; not for its clones. */
+	/* It clones while the whole app is stopped.  Best effort; not for its clones. */
 	if (process->descendant)
 		(void)sched_setscheduler(holder, SCHED_FIFO | SCHED_RESET_ON_FORK, &first);
 	memcpy(own->out, "avckpt-hold", 12);
 	call_begin(own, INJ_AFTER_PARK);
-	/* Out of the app's session and process group, which a process of the app may lead: their
+	/* Leaves the app's session and process group, which a process of the app may lead: their
 	 * numbers would stay taken. */
 	call_add(own, SYS_setsid);
 	call_add(own, SYS_prctl, PR_SET_NAME, parasite_remote(&process->parasite, own->out));
@@ -662,7 +662,7 @@ int process_adopt_no_more(struct process *process, struct avc_error *err)
 		return -1;
 	process->paused = true;
 	if (parasite_run_to_pause(thread->tid, call, err)) {
-		thread->stopped = false; /* on its way through the parasite, and home */
+		thread->stopped = false; /* on its way through the parasite, and back */
 		process->paused = false;
 		return -1;
 	}
@@ -726,7 +726,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	if (!result)
 		result = tracee_settle(thread->tid, err);
 	else if (err->code == AVC_DEADLINE && thread->borrowed)
-		thread->stopped = false; /* on its way through the parasite, and home */
+		thread->stopped = false; /* on its way through the parasite, and back */
 	if (!result)
 		result = thread_give_back(thread, err);
 	thread_release(thread);
@@ -734,7 +734,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	rt_priority_end();
 	if (!holder)
 		return -1;
-	/* It must never run on by itself: it has the app's memory for a stack. */
+	/* It must never run by itself: its stack is the app's memory. */
 	tracee_deadline_set(timer, NS_PER_S);
 	if (tracee_await(holder, NULL, err) != STOP_TRAP)
 		result = -1;
@@ -747,7 +747,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 	return keep_holder(process, holder, result, err);
 }
 
-/* The stopped task in between makes the holder, which is in its first stop then. */
+/* The stopped intermediate task clones the holder, which is then in its first stop. */
 static int clone_holder(struct process *process, pid_t between, pid_t *holder,
 			struct avc_error *err)
 {
@@ -766,14 +766,13 @@ static int clone_holder(struct process *process, pid_t between, pid_t *holder,
 	return 0;
 }
 
-/* The holder of a process that is not the main one must not be a child of anybody in the
- * app: wait(2) would find it.  So a task in between makes it, and ends, whereupon it is
- * init's; and the one in between is waited for by its parent, which does so in any case
- * before it goes home, whether we are still there or not.  It has no exit signal, so that
- * nobody is told.
+/* The holder of a process other than the main one must not be a child of any process of the app:
+ * wait(2) would find it.  So an intermediate task clones it, and exits, whereupon it is init's
+ * child; the intermediate task is reaped by its parent, which does so in any case before it
+ * returns, whether we are alive or not.  It has no exit signal, so that the app does not notice.
  *
- * This holder also makes the templates.  They have its signal handlers and working
- * directory, which are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
+ * This holder also clones the templates.  They get its signal handlers and working directory, which
+ * are therefore shared with the app (CLONE_SIGHAND, CLONE_FS). */
 int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;

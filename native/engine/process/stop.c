@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A process is stopped: every thread of it, until there is nobody left who could create another
- * one; and let go.
+ * Stops every thread of a process, until none is left that could create another one; and releases
+ * them.
  */
 #include "process.h"
 
@@ -27,7 +27,7 @@ static int stop_task(pid_t tid, void *arg)
 	t->seen = true;
 	walk->fresh++;
 	if (t->attached)
-		return 0; /* born of a thread of ours: comes with its own stop */
+		return 0; /* created by a traced thread: has its own stop pending */
 	if (thread_stop(process, t, &gone)) {
 		if (gone.code == AVC_GONE && tid != process->pid)
 			return 0; /* it ended meanwhile */
@@ -38,7 +38,7 @@ static int stop_task(pid_t tid, void *arg)
 	return 0;
 }
 
-/* Those that are known; what fails is seen when it is waited for. */
+/* The known ones; failures show when they are waited for. */
 void process_interrupt(struct process *process)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++) {
@@ -50,7 +50,7 @@ void process_interrupt(struct process *process)
 	}
 }
 
-/* Then nobody is left who could create another one. */
+/* Then no thread is left that could create another one. */
 static bool everybody_stopped(const struct process *process)
 {
 	int stopped = 0;
@@ -69,7 +69,7 @@ void process_stop_begin(struct process *process)
 	process->stage = FREEZE_RUNS;
 }
 
-/* Until all are stopped, for threads create threads meanwhile: then a walk finds them. */
+/* Until all are stopped, because threads create threads meanwhile: a walk finds them. */
 int process_stop_all(struct process *process, struct avc_error *err)
 {
 	for (;;) {

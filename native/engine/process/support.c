@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What cannot be protected, found while the app runs; and whether this is a
- * good moment.
+ * Checks for what cannot be protected, while the app runs; and whether this is a quiescent moment.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -86,7 +85,7 @@ static int check_mappings(struct process *process, struct avc_error *err)
 	return reason ? fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "", "%s", reason) : 0;
 }
 
-/* Of one that is just ending they are gone, or EACCES is the answer. */
+/* For an exiting process they are gone, or the result is EACCES. */
 static int not_seen(pid_t pid, struct avc_error *err)
 {
 	const int errnum = errno;
@@ -97,7 +96,7 @@ static int not_seen(pid_t pid, struct avc_error *err)
 	return fail_errno(err, pid, "check", "stat(ns)", "its namespaces cannot be seen");
 }
 
-/* Its children are made by their parents, which have to have what their children have. */
+/* Children are forked by their parents, which must have the same namespaces. */
 static int check_descendant(const struct process *process, struct avc_error *err)
 {
 	static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "user", "cgroup", "pid" };
@@ -125,8 +124,8 @@ static int check_descendant(const struct process *process, struct avc_error *err
 	return 0;
 }
 
-/* A thread's second stack would not know of what it was made to do in the parasite, and return
- * to the wrong place: so before that.  A program has it from its start, or not at all. */
+/* The shadow stack would not match the calls made in the parasite, and the thread would fault on
+ * return: so before injection.  A program has it from its start, or not at all. */
 static int check_shadow_stack(struct process *process, struct avc_error *err)
 {
 	struct proc_status status;
@@ -161,14 +160,14 @@ static int check_namespaces(struct process *process, struct avc_error *err)
 		snprintf(path, sizeof path, "/proc/%d/%s", process->pid, kinds[i].own);
 		if (readlink(path, own, sizeof own - 1) < 0)
 			continue; /* the kernel has none of these; or it has ended */
-		/* Of a namespace in which there was no process yet nothing is told. */
+		/* A namespace that has no process yet is not shown. */
 		snprintf(path, sizeof path, "/proc/%d/%s", process->pid, kinds[i].of_children);
 		if (readlink(path, theirs, sizeof theirs - 1) < 0) {
 			char other[64];
 
 			if (errno != ENOENT)
 				continue;
-			/* Nor of any of one that is just ending (kernel/exit.c,
+			/* Nor is any of an exiting process (kernel/exit.c,
 			 * exit_task_namespaces()). */
 			snprintf(path, sizeof path, "/proc/%d/ns/uts", process->pid);
 			if (readlink(path, other, sizeof other) < 0)
@@ -192,8 +191,8 @@ int support_check(struct process *process, struct avc_error *err)
 	return process->descendant ? check_descendant(process, err) : 0;
 }
 
-/* By way of the process: a second entry for each thread in the kernel's memory of
- * /proc would make its end longer (see thread_ask()). */
+/* Through the process: a second dentry for each thread in /proc would make its exit slower (see
+ * thread_ask()). */
 static int is_awake(pid_t tid, void *arg)
 {
 	const pid_t pid = *(const pid_t *)arg;
@@ -215,7 +214,7 @@ static bool unread_bytes(const struct process *process)
 		if (fd < 0)
 			continue; /* closed since */
 		if (ioctl(fd, FIONREAD, &bytes))
-			bytes = 0; /* not one that bytes come from */
+			bytes = 0; /* not one with bytes to read */
 		if (process->tcp_messages && file_is_coming(fd))
 			bytes = 1;
 		close(fd);

@@ -1,17 +1,17 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Which pages of a process are written: asynchronous write protection (userfaultfd(2),
+ * Tracks which pages of a process are written: asynchronous write protection (userfaultfd(2),
  * UFFD_FEATURE_WP_ASYNC, Linux 6.7).  The kernel itself resolves the fault of the first write to a
- * page; PAGEMAP_SCAN tells of those and protects them again in the same walk.
+ * page; PAGEMAP_SCAN reports those and protects them again in the same walk.
  *
- * The descriptor has to be made by a task with the process's memory.  The holder makes one for that,
- * which leaves the application's descriptor table first, so that no number in it is taken; the guard
- * takes it from there, and the task ends.  When the guard dies, the last reference goes, and the
- * kernel takes every mark off.
+ * The descriptor has to be created by a task with the process's memory.  The holder clones one for
+ * that, which unshares the application's descriptor table first, so that it uses no number in it;
+ * the guard takes the descriptor from it, and the task exits.  When the guard dies, the last
+ * reference goes, and the kernel removes every mark.
  *
- * Protection of what is empty takes page tables, and programs reserve terabytes.  So only *parts* are
- * protected, of 2 MB each, which is what one page table is for: where the process, or a template of
- * it, has or had a page of its own.
+ * Protecting empty memory takes page tables, and programs reserve terabytes.  So only *parts* are
+ * protected, of 2 MB each, which is the range of one page table: where the process, or a template
+ * of it, has or had a page of its own.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -75,7 +75,7 @@ static bool is_userfaultfd(int fd)
 	       !strcmp(name, "anon_inode:[userfaultfd]");
 }
 
-/* Number 0 of a table that it shares with nobody. */
+/* Number 0 of an unshared table. */
 static int open_in(struct process *process, pid_t child, const struct arch_regs *base,
 		   struct avc_error *err)
 {
@@ -88,7 +88,7 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 	made = call_add(call, SYS_userfaultfd, O_CLOEXEC | UFFD_USER_MODE_ONLY);
 	if (parasite_send(&process->parasite, child, base, call, err))
 		return -1;
-	/* Containers' filters know nothing of this call. */
+	/* Containers' filters do not allow this call. */
 	if (seccomp_supervise(child, SECCOMP_WATCHER, (long)TRACE_OPTIONS_OURS))
 		return fail(err, AVC_DEADLINE, 0, child, "watch memory", "", "too many at once");
 	if (parasite_run(child, call, err))
@@ -189,10 +189,10 @@ static bool is_private(const struct mapping *m)
 	return !m->shared && m->start < ARCH_USER_END && !mapping_is_special(m);
 }
 
-/* A mapping that mremap(2) moves is not watched any more, nor is all of the one that it becomes a part
- * of there.  Marks of the time before stay in the page table, also of what is written then: they are
- * taken off, so that all of it counts as written.  What is watched is left as it is: it may cease to
- * be at any moment, and that has to be seen. */
+/* A mapping that mremap(2) moves is no longer watched, nor is the whole mapping that it becomes a
+ * part of there.  Old marks stay in the page table, even of pages that are written then: they are
+ * removed, so that all of it counts as written.  What is watched is left alone: it may cease to be
+ * at any moment, and that has to be noticed. */
 static bool register_area(struct tracker *tracker, avc_remote start, avc_remote end)
 {
 	struct uffdio_register area = { .range = { start, end - start },
@@ -220,8 +220,7 @@ static int watch_mapping(const struct mapping *m, void *arg)
 	return add_area(watch->tracker, m->start, m->end) ? 0 : -1;
 }
 
-/* What the kernel may drop at any time is not watched, and is not in a template either
- * (memory_areas.c). */
+/* Droppable memory is not watched, and is not in a template either (memory_areas.c). */
 static int check_refused(const struct mapping *m, void *arg)
 {
 	const struct watch *watch = arg;
@@ -268,7 +267,7 @@ static uint32_t find_part(const struct tracker *tracker, avc_remote address)
 	return low;
 }
 
-/* None of it is in a part yet; those beside it become one with it. */
+/* None of it is in a part yet; adjacent ones are merged. */
 static int add_part(avc_remote start, avc_remote end, void *arg)
 {
 	struct tracker *tracker = arg;
@@ -297,7 +296,7 @@ static int add_part(avc_remote start, avc_remote end, void *arg)
 	return 0;
 }
 
-/* Calls fn for what of an area is in parts, or is not. */
+/* Calls fn for the ranges of an area that are in parts, or are not. */
 static int each(struct tracker *tracker, const struct stretch *area, bool in_parts,
 		int (*fn)(struct tracker *tracker, avc_remote start, avc_remote end, int pagemap),
 		int pagemap)

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The processes of an app: its main process and everything below it, and what has
- * become init's because its parent is gone.
+ * The processes of an app: its main process and everything below it, and orphans that have become
+ * init's children.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -39,7 +39,7 @@ static int add_entry(struct tree *tree, pid_t pid, int parent, struct avc_error 
 			    "it has more than %d processes", PROCESSES_MAX);
 	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->entry[i].pid == pid)
-			return 0; /* its parent has just gone: seen twice */
+			return 0; /* its parent has just exited: seen twice */
 	tree->entry[tree->count++] = (struct tree_entry){ .pid = pid, .parent = parent };
 	return 0;
 }
@@ -68,8 +68,8 @@ bool tree_has_parasite(const struct tree *tree, avc_remote pc)
 	return false;
 }
 
-/* A clone of ours: of a holder that is at it, or one of which we never heard.  What a thread of
- * the app's has brought forth beside itself (CLONE_PARENT) may be a tracee, too.  1 or 0. */
+/* A clone of ours: of a holder that is cloning, or one that was never reported.  A sibling that a
+ * thread of the app has created (CLONE_PARENT) may be a tracee, too. 1 or 0. */
 static int is_clone(const struct tree *tree, pid_t pid, struct avc_error *err)
 {
 	avc_remote pc;
@@ -86,7 +86,7 @@ static int is_clone(const struct tree *tree, pid_t pid, struct avc_error *err)
 	return 1;
 }
 
-/* A child of init's that is no process of the app's. */
+/* A child of init that does not belong to the app. */
 static int is_none(const struct tree *tree, pid_t pid, struct avc_error *err)
 {
 	return pid == tree_main(tree)->leader || tree->is_ours(pid, tree->arg)
@@ -94,7 +94,7 @@ static int is_none(const struct tree *tree, pid_t pid, struct avc_error *err)
 		       : is_clone(tree, pid, err);
 }
 
-/* A child hangs on the thread that forked it. */
+/* A child is listed under the thread that forked it. */
 static int look_at_task(pid_t tid, void *arg)
 {
 	const struct looking *look = arg;
@@ -114,7 +114,7 @@ static int look_at_task(pid_t tid, void *arg)
 	return 0;
 }
 
-/* Of one that has ended there is nothing to be seen. */
+/* A process that has exited shows nothing. */
 static int look_below(struct tree *tree, int task_dirfd, int parent, struct avc_error *err)
 {
 	struct looking look = { tree, task_dirfd, parent, err };
@@ -133,7 +133,7 @@ static int look_below_init(struct tree *tree, struct avc_error *err)
 	return result;
 }
 
-/* Ended, and not waited for; a main thread that has gone before its threads is not. */
+/* A zombie; not a main thread that has exited before its threads. */
 static bool is_zombie(const struct proc_stat *stat)
 {
 	return (stat->state == 'Z' || stat->state == 'X') && stat->threads < 2;
@@ -180,8 +180,8 @@ static struct process *find_process(const struct tree *tree, pid_t pid, uint64_t
 	return NULL;
 }
 
-/* A thread of ours that forked while it was being stopped has brought it forth as our
- * tracee, and it was taken for one more thread (trace/thread.c, adopt()). */
+/* A thread that forked while it was being stopped created it as our tracee, and it was mistaken for
+ * another thread (trace/thread.c, adopt()). */
 static void forget_thread(struct process *process, pid_t tid)
 {
 	struct thread *t = thread_find(process, tid);
@@ -218,7 +218,7 @@ static struct process *add_process(struct tree *tree, pid_t pid, uint64_t start,
 	return process;
 }
 
-/* What is kept open of one that is known takes less to look at. */
+/* For a known one, open descriptors make this cheaper. */
 static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 {
 	for (uint32_t i = 0; i < tree->processes; i++)
@@ -228,8 +228,8 @@ static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 	return proc_stat(pid, stat);
 }
 
-/* clone(2): what one of them opens, or where it goes, is the other's, too; those that are
- * restored have tables and directories of their own. */
+/* clone(2): the two share what they open, or where they go; restored ones have separate tables and
+ * directories. */
 static int check_sharing(const struct tree *tree, const struct tree_entry *entry,
 			 struct avc_error *err)
 {
@@ -261,7 +261,7 @@ int tree_look(struct tree *tree, struct avc_error *err)
 		struct proc_stat stat;
 
 		if (i && look_at(tree, entry->pid, &stat)) {
-			entry->pid = 0; /* it was waited for just now */
+			entry->pid = 0; /* it has just been reaped */
 			continue;
 		}
 		if (i)
@@ -288,8 +288,8 @@ int tree_look(struct tree *tree, struct avc_error *err)
 				}
 			}
 		}
-		/* Thread by thread only when the last checkpoint did not find that it
-		 * has none: then the next one will find that it has. */
+		/* Thread by thread only if the last checkpoint did not find that it has no child: a
+		 * new one is found by the next checkpoint. */
 		if (!entry->process->childless &&
 		    look_below(tree, entry->process->task_dirfd, (int)i, err))
 			return -1;
@@ -297,8 +297,8 @@ int tree_look(struct tree *tree, struct avc_error *err)
 	return 0;
 }
 
-/* Who could not be asked is just ending, and nobody knows of it yet: what is found here also
- * holds for the one that is restored in its place (guard_death.c, hold_all()). */
+/* One that could not be queried is exiting, which is not known yet: the result also applies to the
+ * one that is restored in its place (guard_death.c, hold_all()). */
 static bool may_be_reaper(struct process *process)
 {
 	const struct thread *thread = process ? thread_find(process, process->pid) : NULL;
@@ -337,7 +337,7 @@ void tree_sweep(struct tree *tree)
 	for (uint32_t i = 0; i < tree->processes; i++) {
 		struct process *process = tree->process[i];
 
-		/* One of which a thread is still ours has to be waited for. */
+		/* One with a thread that is still our tracee has to be waited for. */
 		if (process->descendant && !process->pid && !process->images &&
 		    !process->thread_count && !process->lost)
 			process_free(process);
