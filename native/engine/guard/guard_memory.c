@@ -1,19 +1,19 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Whom the OOM killer takes.
+ * The OOM killer's choice of victim.
  *
- * It takes the process with the most points: its resident pages, and as many thousandths of what
- * may be used as its oom_score_adj says (mm/oom_kill.c, oom_badness()).
+ * It kills the process with the most points: its resident pages, plus its oom_score_adj in
+ * thousandths of the limit (mm/oom_kill.c, oom_badness()).
  *
  * - Older generations go first, the oldest before all others: 1000, or a little less.
  * - The newest one is there for an application that leaks until it is killed.  Without a limit it
- *   has the value of the application, which has more points, for it has grown since.
+ *   has the value of the application, which has more points, because it has grown since.
  * - With a limit it has as many points as the application has when that fills the limit by
- *   itself, all but a twentieth.  So the kernel takes the application that has leaked so much,
- *   and the template where the application would have room without it: it never dies of what
- *   its template holds.
+ *   itself, all but a twentieth.  So the kernel kills an application that has leaked so much,
+ *   and the template where the application would have room without it: it never dies because of
+ *   its template.
  *
- * Nobody gets less than the application's own value, which would take CAP_SYS_RESOURCE.
+ * No template gets less than the application's own value, which would take CAP_SYS_RESOURCE.
  */
 #include <fcntl.h>
 #include <stdio.h>
@@ -23,7 +23,7 @@
 #define FIRST 1000
 #define OWN_MAX (FIRST - 1)
 #define STEP 2
-/* Of the limit, in percent: an app that has so much is killed; of one that has so much no
+/* In percent of the limit: an app that uses this much is killed; of one that uses this much no
  * checkpoint is taken. */
 #define KILLED 95
 #define FULL 90
@@ -46,7 +46,7 @@ static void tell(struct image *image, int value)
 	proc_set_oom_score_adj(image->template, text);
 }
 
-/* The points of whichever process of the app has grown until all of them fill the limit. */
+/* The points of the process that has grown until all processes of the app fill the limit. */
 static long points_wanted(const struct generation *generation, long limit)
 {
 	long least = generation->image[0].anon_pages, others = 0;

@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Hears that the app sends: a perf event of the kernel's tracepoint sock:sock_send_length on each
- * of its threads (perf_event_open(2)), which is enabled only while a checkpoint is wanted.
- * Nothing is in the app; threads that are made later inherit the event.
+ * Detects that the app sends: a perf event of the kernel's tracepoint sock:sock_send_length on each
+ * of its threads (perf_event_open(2)), which is enabled only while a checkpoint is wanted.  The app
+ * is not modified; threads that are created later inherit the event.
  *
- * A ring buffer could not be had for an event that is inherited (perf_mmap()), and what was sent
- * is of no interest: the event sends us SIGIO (O_ASYNC), which is blocked, so that one at most is
- * pending, and read by signalfd(2).
+ * An inherited event cannot have a ring buffer (perf_mmap()), and the data sent does not matter:
+ * the event sends us SIGIO (O_ASYNC), which is blocked, so that at most one is pending, and read by
+ * signalfd(2).
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -23,10 +23,10 @@
 #include "guard.h"
 
 #define TRACEPOINT "events/sock/sock_send_length/id"
-#define EVENTS_MAX 512 /* a descriptor each: beyond that, quiescence has to do              */
+#define EVENTS_MAX 512 /* a descriptor each: beyond that, only quiescence is used */
 
-/* The tracepoint's number; -1: this kernel has none, or does not tell us.  The file system is
- * mounted nowhere. */
+/* The tracepoint's number; -1: this kernel has none, or denies access.  The file system is not
+ * attached to any mount point. */
 static int tracepoint(void)
 {
 	const int fs = (int)syscall(SYS_fsopen, "tracefs", FSOPEN_CLOEXEC);
@@ -56,7 +56,7 @@ static void close_all(struct output *output)
 	output->armed = false;
 }
 
-/* From here on there is only the app's quiescence to go by. */
+/* From here on only the app's quiescence is used. */
 static void go_deaf(struct output *output)
 {
 	close_all(output);
@@ -134,7 +134,7 @@ static int follow_thread(pid_t tid, void *arg)
 	return 0;
 }
 
-/* Until a look finds nobody new: a thread that was made by one without the event has none. */
+/* Until a walk finds no new thread: one created by a thread without the event has none. */
 static int follow(struct output *output, const struct process *process)
 {
 	struct follow look = { .output = output, .process = process, .found = true };

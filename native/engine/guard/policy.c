@@ -2,11 +2,10 @@
  *
  * What the guard decides (policy.h).
  *
- * A bug that is in the state and not in the moment comes back with every restore, and
- * with every checkpoint taken after one.  So for restore_window_ns after a restore the
- * process is on probation: checkpoints of it are of the same lineage as the generation
- * it came from, carry that one's crashes, and take the place of their own kind, so that
- * what is older is still there to go back to.
+ * A bug that is in the state and not in the moment comes back with every restore, and with every
+ * checkpoint taken after one.  So for restore_window_ns after a restore the process is on
+ * probation: checkpoints of it are of the same lineage as the generation it came from, inherit its
+ * crash count, and replace only that lineage, so that older generations stay.
  */
 #include <signal.h>
 #include <sys/wait.h>
@@ -16,14 +15,14 @@
 #define MISSES_UNTIL_UNPROTECTED 3
 #define MS UINT64_C(1000000)
 #define FIRST_NS (500 * MS)
-#define PROOF_NS (1000 * MS) /* so long an app lives that got somewhere                      */
+#define PROOF_NS (1000 * MS) /* an app that lives this long has made progress */
 #define AGAIN_NS (50 * MS)
 #define AVERAGE_OF 8
 #define LOOK_NS (20 * MS)
 #define LOOK_LONG_NS (200 * MS)
-/* What a checkpoint makes an app that does nothing use: calls that are made again. */
+/* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
-/* After a restore: whoever dies before that has come across what is wrong in the image. */
+/* After a restore: an app that dies within this time has met the bug in the image. */
 #define AT_ONCE_NS UINT64_C(1000000000)
 
 static bool on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
@@ -39,7 +38,7 @@ static int newest_vouched(const struct policy *policy)
 	return -1;
 }
 
-/* Which waits to be vouched for, unless it is that one. */
+/* Waits to be vouched for, unless it is that one. */
 static int newest_seen(const struct policy *policy)
 {
 	for (uint32_t i = policy->count; i-- > 0;)
@@ -62,7 +61,7 @@ uint64_t policy_due(const struct avc_config *config, uint64_t now)
 	return config->interval_ns ? now + config->interval_ns : POLICY_NEVER;
 }
 
-/* Never later than it was to be, unless there are to be none. */
+/* Never later than planned, unless there are to be none. */
 uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now)
 {
 	const uint64_t next = policy_due(config, now);
@@ -101,7 +100,7 @@ uint32_t policy_replaced(const struct policy *policy, const struct avc_config *c
 			if (policy->held[i].lineage == policy->lineage && (int)i != vouched &&
 			    (int)i != seen)
 				return i;
-	/* Often taken, they would all be of the last moments: the newest makes way until it is
+	/* If taken often, they would all be of the last moments: the newest is replaced until it is
 	 * as far from the one before it as if they were taken seldom. */
 	if (policy_is_automatic(config) && policy->count > 1) {
 		const uint32_t i = policy->count - 1;
@@ -117,15 +116,15 @@ void policy_hold(struct policy *policy, struct policy_generation fresh)
 {
 	policy->held[policy->count++] = fresh;
 	policy->misses = 0;
-	/* Only a health check can say that a process does not hang; and one that has just been
-	 * restored has not got far because a checkpoint came at once. */
+	/* Only a health check can show that a process does not hang; and an immediate checkpoint of
+	 * one that was just restored shows no progress. */
 	if (!policy->vouching && fresh.proves)
 		policy->proved = true;
 }
 
-/* A child process may be gone at the next look: the generations there are stay good for a
- * while.  As long as somebody traces it there is no new one: a debugger, or a crash reporter
- * (breakpad, gdb) that the app has started, whose report a death may follow. */
+/* A child process may be gone at the next attempt: existing generations stay valid for a while.
+ * While another process traces it there is no new one: a debugger, or a crash reporter (breakpad,
+ * gdb) that the app has started, and whose report may be followed by a death. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
 {
 	if (code == AVC_BUSY)
@@ -153,7 +152,7 @@ static uint64_t average(uint64_t before, uint64_t now)
 	return before - before / AVERAGE_OF + now / AVERAGE_OF;
 }
 
-/* The first one brings the parasite in: the second says more. */
+/* The first one injects the parasite: the second says more. */
 static void learn(struct policy_pace *pace, struct policy_cost cost)
 {
 	if (++pace->samples <= 2) {
@@ -186,7 +185,7 @@ void policy_pay(struct policy_pace *pace, const struct avc_config *config, struc
 	if (pace->spent_ns < now)
 		pace->spent_ns = now;
 	pace->spent_ns += pace->interval_ns;
-	/* On command they come as often as somebody wants. */
+	/* On command they come as often as requested. */
 	if (pace->spent_ns > now + 2 * pace->interval_ns)
 		pace->spent_ns = now + 2 * pace->interval_ns;
 }
@@ -220,7 +219,7 @@ bool policy_wants(const struct policy_pace *pace, const struct avc_config *confi
 		return now >= policy_ready(pace, config);
 	if (now < pace->spent_ns || activity.cpu_ns <= NOISE_NS)
 		return false;
-	/* What is at stake should be more than what it costs to save it. */
+	/* What is at stake should exceed the cost of saving it. */
 	return activity.sends || activity.cpu_ns >= pace->cost.cpu_ns ||
 	       now - pace->taken_ns >= config->interval_ns;
 }
@@ -245,7 +244,7 @@ void policy_drop(struct policy *policy, uint32_t i)
 		policy->held[i] = policy->held[i + 1];
 }
 
-/* The oldest, but not what a roll back of a hung process would need. */
+/* The oldest, but not what a rollback of a hung process would need. */
 uint32_t policy_dispensable(const struct policy *policy)
 {
 	const int vouched = newest_vouched(policy), seen = newest_seen(policy);
@@ -269,15 +268,15 @@ bool policy_refill(struct policy *policy, const struct avc_config *config)
 	return short_before && !policy->count && config->interval_ns;
 }
 
-/* Who gave generations up because memory is short goes on without them. */
+/* A container that lost generations because memory is short continues without them. */
 void policy_resize(struct policy *policy, uint32_t was, uint32_t keep)
 {
 	if (policy->room == was || policy->room > keep)
 		policy->room = keep;
 }
 
-/* A check that has just passed may have looked at something that a hung app left a moment
- * ago: what was taken since the last one waits for the next. */
+/* A check that has just passed may have seen what a now hung app left a moment ago: what was taken
+ * since the previous one waits for the next. */
 void policy_vouch(struct policy *policy)
 {
 	policy->vouching = true;
@@ -315,8 +314,8 @@ struct policy_verdict policy_judge(const struct avc_config *config, int status, 
 	return (struct policy_verdict){ false, AVC_REASON_POLICY };
 }
 
-/* What it came from is suspect.  A hang takes its time to be noticed, so that a hung process
- * is on probation until it was healthy once. */
+/* What it came from is suspect.  A hang is detected late, so a hung process is on probation until
+ * it was healthy once. */
 static void count_crash(struct policy *policy, const struct avc_config *config, bool hung,
 			uint64_t now)
 {
@@ -332,9 +331,9 @@ static void count_crash(struct policy *policy, const struct avc_config *config, 
 	}
 }
 
-/* Of what somebody else may have done to it, nothing follows for the image.  Nobody can tell who has
- * sent a signal that a program dies of by its own faults as a rule; but who got as far as the next
- * checkpoint did not die of the image. */
+/* A death possibly caused from outside says nothing about the image.  The sender of a signal that
+ * programs usually cause themselves is unknown; but a process that reached the next checkpoint did
+ * not die of the image. */
 static bool is_its_own(const struct policy *policy, int status)
 {
 	if (WIFEXITED(status))
@@ -353,7 +352,7 @@ static bool is_its_own(const struct policy *policy, int status)
 	}
 }
 
-/* The same death as after the restore before this one, and again at once. */
+/* The same death as after the previous restore, and again at once. */
 static void count_at_once(struct policy *policy, const struct avc_config *config, int status,
 			  uint64_t now)
 {
@@ -372,7 +371,7 @@ static void count_at_once(struct policy *policy, const struct avc_config *config
 		policy->held[i].looping |= policy->held[i].lineage == policy->lineage;
 }
 
-/* Where there is something older to go back to, half of the restores are enough. */
+/* If there is an older one, half of the restores are enough. */
 static bool is_trusted(const struct policy *policy, const struct avc_config *config, uint32_t i,
 		       bool used_up)
 {
@@ -392,7 +391,7 @@ struct policy_fallback policy_crashed(struct policy *policy, const struct avc_co
 	count_crash(policy, config, hung, now);
 	if (!hung)
 		count_at_once(policy, config, status, now);
-	/* Checkpoints may have been taken for as long as nobody noticed the hang. */
+	/* Checkpoints may have been taken while the hang was not yet detected. */
 	if (hung && policy->count) {
 		const int vouched = newest_vouched(policy);
 

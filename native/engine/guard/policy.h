@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What the guard decides: which deaths are undone, which generation is gone back to and which
- * one makes way, when to give up, when the next checkpoint is due (docs/policy.md).
+ * What the guard decides: which deaths are undone, which generation is restored and which one is
+ * replaced, when to give up, when the next checkpoint is due (docs/policy.md).
  *
- * Nothing here acts.  No function makes a system call, reads a clock or has state of its own:
- * each reads its arguments and changes the `struct policy` that it is given, if anything.
- * So all of it is tested without an application (tests/unit/test_guard_policy.py).
- * Times are nanoseconds of CLOCK_MONOTONIC.
+ * Pure functions: none makes a system call, reads a clock or has state of its own: each reads its
+ * arguments and changes at most the `struct policy` that it is given.  So all of it is tested
+ * without an application (tests/unit/test_guard_policy.py).  Times are nanoseconds of
+ * CLOCK_MONOTONIC.
  */
 #ifndef AVCKPT_POLICY_H
 #define AVCKPT_POLICY_H
@@ -18,7 +18,7 @@
 
 #define POLICY_NEVER UINT64_MAX
 
-/* What is known of a generation that is held. */
+/* What is known about a generation that is held. */
 struct policy_generation {
 	uint64_t number;
 	uint64_t taken_ns;
@@ -26,44 +26,44 @@ struct policy_generation {
 	 * restored from, and as suspect.  Any other one begins a lineage. */
 	uint32_t lineage;
 	uint32_t crashes; /* of its lineage, soon after a restore             */
-	uint32_t lost;    /* restores from it that came to nothing            */
+	uint32_t lost;    /* restores from it that failed */
 	bool looping;     /* restores from its lineage led to the same death at once, twice */
 	bool seen;        /* held when the app was healthy; again so: vouched */
 	bool vouched;     /* the app was healthy well after it was taken      */
-	bool proves;      /* that its process got somewhere since a restore   */
+	bool proves;      /* its process has made progress since a restore */
 };
 
-/* All zero but `room` at the start. */
+/* All zero except `room` at the start. */
 struct policy {
 	struct policy_generation held[AVC_KEEP_MAX]; /* oldest first        */
 	uint32_t count;
 	uint32_t room;     /* generations that may be held now                */
-	uint32_t lineages; /* that there have been                            */
-	uint32_t misses;   /* in a row, for want of a child process's support */
+	uint32_t lineages; /* that have existed */
+	uint32_t misses;   /* in a row, because of a child process */
 	uint32_t restores; /* after a crash, not on command                   */
 	uint64_t restored_at[AVC_RESTORES_MAX]; /* the last of these        */
 	bool vouching;                          /* a health check says when the app is healthy */
-	/* Of the process that runs now. */
+	/* The process that runs now. */
 	uint32_t lineage;
 	uint64_t restored_from; /* generation, 0: never restored              */
 	uint64_t restored_ns;   /* after a crash; 0: not, or long ago         */
-	bool proved;            /* got somewhere since it was restored        */
-	/* The last death that came at once, and was the program's own. */
+	bool proved;            /* has made progress since it was restored */
+	/* The last immediate death that was the program's own. */
 	int at_once_status;
 	uint32_t at_once_lineage;
 };
 
 /* ---- checkpoints ------------------------------------------------------------- */
 
-/* The first one: the app is to get somewhere before. */
+/* The first one: the app should make progress before. */
 uint64_t policy_first_due(const struct avc_config *config, uint64_t now);
 /* An interval from now; POLICY_NEVER: on command only. */
 uint64_t policy_due(const struct avc_config *config, uint64_t now);
 /* The one that was due at `due`, by a new configuration. */
 uint64_t policy_due_again(const struct avc_config *config, uint64_t due, uint64_t now);
 
-/* The record of a generation that was just taken.  Then policy_replaced() says what makes way
- * while there is no room, and policy_hold() takes it in. */
+/* The record of a generation that was just taken.  Then policy_replaced() says what to replace
+ * while there is no room, and policy_hold() adds it. */
 struct policy_generation policy_new_generation(struct policy *policy,
 					       const struct avc_config *config, uint64_t number,
 					       uint64_t now);
@@ -71,25 +71,25 @@ uint32_t policy_replaced(const struct policy *policy, const struct avc_config *c
 			 uint64_t now);
 void policy_hold(struct policy *policy, struct policy_generation fresh);
 
-/* A checkpoint has failed because of the main process, or of another one.  True: nothing that
- * is held is any good, the app is unprotected.  False: it is tried again when it is due. */
+/* A checkpoint has failed because of the main process, or of another one.  True: no generation is
+ * valid, the app is unprotected.  False: it is retried when it is due. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
 
 /* What one checkpoint costs. */
 struct policy_cost {
-	uint64_t held_ns; /* the app, by its freeze and by the faults that follow it */
-	uint64_t cpu_ns;  /* us and our templates                            */
+	uint64_t held_ns; /* the app was stopped by its freeze, and by the page faults after it */
+	uint64_t cpu_ns;  /* by us and our templates */
 };
 
-/* How often there may be one.  All zero at the start. */
+/* How often there may be a checkpoint.  All zero at the start. */
 struct policy_pace {
 	struct policy_cost cost; /* on average                                      */
 	uint32_t samples;
 	uint32_t failures;    /* in a row                                        */
 	uint64_t interval_ns; /* between two, by the budgets                     */
-	uint64_t taken_ns;    /* when the app went on after the last one         */
+	uint64_t taken_ns;    /* when the app resumed after the last one */
 	uint64_t spent_ns;    /* until then the budgets are used up              */
 };
 
@@ -97,41 +97,41 @@ struct policy_pace {
 struct policy_activity {
 	uint64_t cpu_ns;
 	bool sent;  /* just now                                        */
-	bool sends; /* it is one that does                             */
+	bool sends; /* it sends regularly */
 };
 
 bool policy_is_automatic(const struct avc_config *config);
-/* What it is at present, automatic or not. */
+/* The current interval, automatic or not. */
 uint64_t policy_interval(const struct policy_pace *pace, const struct avc_config *config);
-/* One was taken, and cost that. */
+/* One was taken, at that cost. */
 void policy_pay(struct policy_pace *pace, const struct avc_config *config, struct policy_cost cost,
 		uint64_t now);
 /* Nothing was taken; when to try again. */
 uint64_t policy_try_again(struct policy_pace *pace, const struct avc_config *config, uint64_t now);
-/* One more than the budgets allow on average may come right after output: from when on. */
+/* One more than the budgets allow on average may come right after output: the earliest time. */
 uint64_t policy_ready(const struct policy_pace *pace, const struct avc_config *config);
 /* Whether one is due. */
 bool policy_wants(const struct policy_pace *pace, const struct avc_config *config,
 		  struct policy_activity activity, uint64_t now);
-/* It is not: when to look again. */
+/* It is not: when to check again. */
 uint64_t policy_look_again(const struct policy_pace *pace, uint64_t now);
 
 /* ---- what is held ------------------------------------------------------------ */
 
 /* held[i] is gone, whatever the reason. */
 void policy_drop(struct policy *policy, uint32_t i);
-/* Which one goes next, if one must.  There is one at least. */
+/* Which one to drop next.  There is at least one. */
 uint32_t policy_dispensable(const struct policy *policy);
-/* Memory is short: no more are held than there are now, but for one. */
+/* Memory is short: from now on holds one fewer than now. */
 void policy_shrink(struct policy *policy);
-/* It is not short any more.  True: there is none, so a checkpoint is due at once. */
+/* Memory is available again.  True: none is held, so a checkpoint is due at once. */
 bool policy_refill(struct policy *policy, const struct avc_config *config);
-/* `keep` is another one than it `was`. */
+/* `keep` has changed from `was`. */
 void policy_resize(struct policy *policy, uint32_t was, uint32_t keep);
 
 /* A health check has passed. */
 void policy_vouch(struct policy *policy);
-/* There will be none. */
+/* There will be no more health checks. */
 void policy_unvouch(struct policy *policy);
 
 /* ---- deaths ------------------------------------------------------------------- */
@@ -141,27 +141,26 @@ struct policy_verdict {
 	enum avc_reason reason;
 };
 
-/* Of an end with this status (waitpid(2)).  `asked`: why we have killed it ourselves; NONE: we
- * have not. */
+/* The reason for an exit with this status (waitpid(2)).  `asked`: why we have killed it ourselves;
+ * NONE: we have not. */
 struct policy_verdict policy_judge(const struct avc_config *config, int status, bool stop_asked,
 				   enum avc_reason asked);
 
-/* How many of the oldest are left: of those after `healthy`, the app may have hung already;
- * what is restored from those between the two keeps crashing.  The newest of `trusted` is to
- * be restored; 0: it is over. */
+/* How many of the oldest are left: after `healthy`, the app may have hung already; those between
+ * the two keep crashing.  The newest of `trusted` is to be restored; 0: give up. */
 struct policy_fallback {
 	uint32_t healthy, trusted;
 	bool looping; /* the newest is not trusted for that: the same death at once, twice  */
 };
 
-/* The process that ran is gone, with that status (waitpid(2)), and nobody wanted that. */
+/* The process that ran has died, with that status (waitpid(2)), unrequested. */
 struct policy_fallback policy_crashed(struct policy *policy, const struct avc_config *config,
 				      int status, bool hung, uint64_t now);
 
 /* held[i] runs again.  `crashed`: not on command. */
 void policy_restored(struct policy *policy, uint32_t i, bool crashed, uint64_t now);
 
-/* Restores after a crash, as far as they count now. */
+/* The number of restores after a crash that count now. */
 uint32_t policy_restores_within(const struct policy *policy, const struct avc_config *config,
 				uint64_t now);
 

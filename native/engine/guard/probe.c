@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Can this machine do it?  Tried on a child of our own, not deduced from version
- * numbers.
+ * Whether this machine supports it: tried on our own child, not deduced from version numbers.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -52,8 +51,8 @@ int guard_probe(struct avc_error *err)
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "probe", "",
 			    "the kernel's pages have %ld bytes: avckpt needs pages of %d",
 			    sysconf(_SC_PAGESIZE), ARCH_PAGE_BYTES);
-	/* Owned by the kernel: opening it for writing needs root, writing it a
-	 * capability.  Writing back what is there changes nothing. */
+	/* Opening it for writing needs root, writing it a capability.  Writing the same value back
+	 * changes nothing. */
 	fd = open("/proc/sys/kernel/ns_last_pid", O_WRONLY | O_CLOEXEC);
 	if (fd < 0)
 		return errno == ENOENT
@@ -68,8 +67,8 @@ int guard_probe(struct avc_error *err)
 		ready[0] = ready[1] = -1;
 	child = fork();
 	if (child == 0) {
-		/* Like a process of somebody else's: a child of one's own may be
-		 * traced without CAP_SYS_PTRACE, unless it is not dumpable. */
+		/* Like another user's process: one's own child may be traced without
+		 * CAP_SYS_PTRACE, unless it is not dumpable. */
 		prctl(PR_SET_DUMPABLE, 0);
 		close(ready[1]);
 		for (;;)

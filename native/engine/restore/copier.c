@@ -1,12 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Copies memory from templates into new processes on a second CPU, while the guard goes
- * on with everything else that they need, and on both when nothing else is left to do.
+ * Copies memory from templates into new processes on a second CPU, while the guard does everything
+ * else that they need, and on both when nothing else is left to do.
  *
- * Read from /proc/PID/mem, and not by process_vm_readv(2): that pins pages, and a page
- * that is shared is copied for whoever is to have it pinned (mm/gup.c,
- * gup_must_unshare()).  Written by process_vm_writev(2): /proc/PID/mem copies each page
- * once more on its way, and a page that is written to is its writer's own anyway.
+ * Reads from /proc/PID/mem, not by process_vm_readv(2): that pins pages, and pinning a shared page
+ * copies it (mm/gup.c, gup_must_unshare()).  Writes by process_vm_writev(2): /proc/PID/mem copies
+ * each page once more, and a written page is unshared anyway.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -18,13 +17,13 @@
 #include "restore.h"
 
 #define BUFFER_BYTES (256u << 10)
-/* What one of the two takes at a time. */
+/* The chunk that a thread takes at a time. */
 #define CHUNK_BYTES (UINT64_C(2) << 20)
 /* Less than this is copied before a thread has been started. */
 #define WORTH_BYTES (UINT64_C(1) << 20)
 
 struct chunk {
-	uint32_t from; /* of the copier's sources                             */
+	uint32_t from; /* index of its source */
 	avc_remote start, end;
 };
 
@@ -62,7 +61,7 @@ struct copier *copier_new(struct avc_error *err)
 	return copier;
 }
 
-/* The kernel gives no reason when it comes to a page that it cannot get at after others. */
+/* The kernel reports no error when it fails at a page after others. */
 static bool is_all(ssize_t done, size_t bytes)
 {
 	if (done >= 0 && (size_t)done < bytes)
@@ -70,8 +69,8 @@ static bool is_all(ssize_t done, size_t bytes)
 	return done == (ssize_t)bytes;
 }
 
-/* What its owner may not read or write only its tracer may, by /proc/PID/mem
- * (fs/proc/base.c, proc_mem_foll_force()); a kernel can be without the other
+/* Only a tracer may access memory that its owner may not read or write, by /proc/PID/mem
+ * (fs/proc/base.c, proc_mem_foll_force()); a kernel may lack the other
  * (CONFIG_CROSS_MEMORY_ATTACH). */
 static bool put(const struct source *source, uint8_t *buffer, size_t bytes, avc_remote at,
 		bool plain)
@@ -100,7 +99,7 @@ static int copy(const struct source *source, uint8_t *buffer, avc_remote start, 
 	return 0;
 }
 
-/* With the lock held, which is let go while it copies. */
+/* With the lock held, which is released while it copies. */
 static void take_chunk(struct copier *copier, uint8_t *buffer)
 {
 	const struct chunk chunk = copier->chunk[copier->next++];
@@ -240,7 +239,7 @@ void copier_free(struct copier *copier)
 	if (!copier)
 		return;
 	pthread_mutex_lock(&copier->lock);
-	copier->next = copier->chunks; /* what is not begun is not wanted any more */
+	copier->next = copier->chunks; /* cancels what is not begun */
 	copier->stop = true;
 	pthread_cond_broadcast(&copier->changed);
 	pthread_mutex_unlock(&copier->lock);

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The memory of a process that its restored parent has forked: it is the parent's, and
- * is made that of the template, by the plan that checkpoint/remap_plan.c has made.
+ * The memory of a process that its restored parent has forked: turned from the parent's into that
+ * of the template, by the plan of checkpoint/remap_plan.c.
  */
 #include <fcntl.h>
 #include <string.h>
@@ -33,8 +33,8 @@ static int unmap(const struct remap *r, struct syscall_batch *batch, struct avc_
 	return 0;
 }
 
-/* Of a program that was executed anew the vDSO is somewhere else.  By way of a place that
- * neither has anything at: behind the parasite. */
+/* After execve(2) the vDSO is at another address.  Moved by way of a range that is unused in both:
+ * behind the parasite. */
 static int move_special(const struct remap *r, struct syscall_batch *batch, struct avc_error *err)
 {
 	static const char *const names[] = { "[vvar]", "[vvar_vclock]", "[vdso]" };
@@ -69,8 +69,8 @@ static int move_special(const struct remap *r, struct syscall_batch *batch, stru
 	return 0;
 }
 
-/* By a descriptor for more, what is shared could be made writable that never was; and of a file
- * in an overlay a copy would be made. */
+/* A descriptor with more rights would allow making shared memory writable that never was; and a
+ * file in an overlay would be copied up. */
 static int open_mapped(pid_t template, const struct mapping *m)
 {
 	const int fd = m->shared ? proc_open_mapped(template, m->start, m->end, O_RDWR) : -1;
@@ -78,7 +78,7 @@ static int open_mapped(pid_t template, const struct mapping *m)
 	return fd >= 0 ? fd : proc_open_mapped(template, m->start, m->end, O_RDONLY);
 }
 
-/* Libraries are mapped in several pieces, one after the other: opened once. */
+/* Libraries are mapped in several consecutive pieces: opened once. */
 static int give_file(const struct remap *r, struct syscall_batch *batch, const struct mapping *m,
 		     const struct mapping **given, struct avc_error *err)
 {
@@ -106,7 +106,7 @@ static bool is_sysv(const struct mapping *m)
 	return m->shared && !strncmp(m->name, "/SYSV", 5);
 }
 
-/* All of a segment, and not a part that is protected otherwise. */
+/* A whole segment, not a part with other protection. */
 static bool is_whole(pid_t template, const struct piece *piece)
 {
 	const struct mapping *m = piece->want;
@@ -120,8 +120,9 @@ static bool is_whole(pid_t template, const struct piece *piece)
 	       ((uint64_t)st.st_size + PAGE - 1) / PAGE == (m->end - m->start) / PAGE;
 }
 
-/* In the place of what has been mapped, or shmdt(2) would not know it.  Who may not attach it any
- * more keeps that.  Its inode has the number of the segment (ipc/shm.c, newseg()). */
+/* In place of the mapping; otherwise shmdt(2) would not recognize it.  A process that may not
+ * attach it any more keeps the mapping.  Its inode number is the segment's id (ipc/shm.c,
+ * newseg()). */
 static int attach(const struct remap *r, struct syscall_batch *batch, const struct piece *piece,
 		  struct avc_error *err)
 {
@@ -179,12 +180,12 @@ static int protect_piece(struct syscall_batch *batch, const struct piece *piece,
 	const uint64_t mode = (uint64_t)mapping_protection(want), bytes = piece->end - piece->start;
 	const uint32_t key = mapping_key(want);
 
-	/* Without keys, pkey_mprotect(2) may not know key 0 either. */
+	/* Without protection keys, pkey_mprotect(2) may reject key 0, too. */
 	if (!key && (!piece->is || !mapping_key(piece->is)))
 		return syscall_batch_ask(batch, err, SYS_mprotect, piece->start, bytes, mode);
-	/* What can only be executed has a key that the kernel took (pkeys(7)).  Where this process
-	 * has inherited such a key the first call sets it, and the second is refused; where it has
-	 * not, no key is free to be taken (process_attrs_take_keys), and the second call sets it. */
+	/* Execute-only memory has a key that the kernel allocated (pkeys(7)).  If this process has
+	 * inherited such a key, the first call sets it, and the second fails; if not, no key is
+	 * free (process_attrs_take_keys), and the second call sets it. */
 	if (mode == PROT_EXEC &&
 	    syscall_batch_ask(batch, err, SYS_mprotect, piece->start, bytes, mode))
 		return -1;
@@ -195,7 +196,7 @@ static int protect_piece(struct syscall_batch *batch, const struct piece *piece,
 	return 0;
 }
 
-/* What it maps has to be there before it is filled; all else can wait for the next calls. */
+/* Its mappings have to exist before they are filled; all else can wait for the next calls. */
 static int map_new(const struct remap *r, struct syscall_batch *batch, struct avc_error *err)
 {
 	const struct mapping *given = NULL;
@@ -250,7 +251,7 @@ static int fill(const struct remap *r, struct syscall_batch *batch, struct copie
 						run->end - run->start, (uint64_t)advice))
 			return -1;
 	}
-	/* Nothing can be written where a guard page still is. */
+	/* Guard pages cannot be written to. */
 	if (opened && syscall_batch_flush(batch, err))
 		return -1;
 	for (uint32_t i = 0; i < r->runs; i++) {

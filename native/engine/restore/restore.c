@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A template becomes the app again: it forks a process with the app's own PID, or its spare
- * gives its memory to one (spare.c), which puts itself together (parasite.c, inj_restore) and waits
- * until everything is there; then all its threads go at once.  The new process is not traced.
+ * A template becomes the app again: it forks a process with the app's own PID, or its spare gives
+ * its memory to one (spare.c), which restores itself (parasite.c, inj_restore) and waits until
+ * everything is ready; then all its threads are released at once.  The new process is not traced.
  */
 #include <errno.h>
 #include <linux/futex.h>
@@ -44,7 +44,7 @@ static bool wait_word(uint32_t *word, uint32_t value, uint64_t end)
 	return true;
 }
 
-/* Until the new process has put itself together, or has failed to. */
+/* Until the new process has restored itself, or has failed. */
 static bool await_state(struct inj_slot *slot, struct sandbox *sandbox)
 {
 	const uint64_t end = now_ns() + READY_NS;
@@ -69,7 +69,7 @@ static void reset(const struct parasite *parasite, uint32_t slot_number)
 	slot->blocks = parasite_remote(parasite, parasite_thread(parasite, slot_number, 0));
 }
 
-/* A stopped process is sent to inj_restore() and let go. */
+/* Sets a stopped process to inj_restore() and detaches. */
 static int send_off(const struct image *image, pid_t child, struct sandbox **sandbox,
 		    struct avc_error *err)
 {
@@ -80,7 +80,7 @@ static int send_off(const struct image *image, pid_t child, struct sandbox **san
 	arch_call(&regs, &image->base, parasite->base + INJ_RESTORE_OFFSET,
 		  parasite_remote(parasite, parasite_stack(parasite, image->slot, 0)),
 		  parasite_remote(parasite, parasite_slot(parasite, image->slot)));
-	/* A holder, of which the template is a clone, has that of the time when it was made. */
+	/* The template is a clone of a holder, whose attribute dates from its creation. */
 	if (!image->headless)
 		arch_tls_set(&regs, parasite_thread(parasite, image->slot, 0)->tls);
 	if ((image->sandboxed || image->stop_signal) && arch_regs_set(child, &regs) == 0) {
@@ -98,7 +98,7 @@ static int send_off(const struct image *image, pid_t child, struct sandbox **san
 	return 0;
 }
 
-/* One fork of the template, or what is to have the memory of its spare.  If it is to have
+/* One fork of the template, or the process that takes over its spare's memory.  If it is to have
  * children, it stays stopped. */
 static int fork_template(struct restore *restore, bool again, struct avc_error *err)
 {
@@ -137,7 +137,7 @@ static int fork_template(struct restore *restore, bool again, struct avc_error *
 	if (!restore->tree && send_off(image, child, &restore->sandbox, err))
 		return -1;
 	restore->pid = child;
-	/* The template can come to rest meanwhile. */
+	/* The template can park meanwhile. */
 	return tracee_settle(from, err);
 }
 
@@ -158,8 +158,8 @@ static int describe_failure(const struct parasite *parasite, const struct inj_sl
 		    "thread %d could not be put back", slot->error_tid);
 }
 
-/* Forks until the number that comes out is the app's; in a PID namespace that is
- * shared somebody else may fork in between. */
+/* Forks until the PID is the app's; in a shared PID namespace other processes may fork in
+ * between. */
 static int rebuild(struct restore *restore, struct avc_error *err)
 {
 	const struct image *image = &restore->generation->image[0];
@@ -227,7 +227,7 @@ int restore_await(const struct image *image, pid_t pid, struct sandbox *sandbox,
 	return slot->state == INJ_READY ? 0 : describe_failure(parasite, slot, err);
 }
 
-/* What was allowed to fail, and did: to be told. */
+/* What was allowed to fail, and did: to be reported. */
 static void note_failed(const struct parasite *parasite, uint32_t slot, pid_t pid,
 			struct avc_error *notice)
 {
@@ -245,7 +245,7 @@ static void let_go(struct inj_slot *slot, enum inj_go stage)
 	syscall(SYS_futex, &slot->go, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
-/* As the others knew it: its main thread has ended, it is stopped. */
+/* As other processes saw it: its main thread has exited, it is stopped. */
 void restore_go(const struct image *image, struct sandbox *sandbox)
 {
 	const struct parasite *parasite = &image->process->parasite;
@@ -266,7 +266,7 @@ void restore_note(const struct image *image, pid_t pid, struct avc_error *notes)
 
 /* ---- all of it --------------------------------------------------------------------- */
 
-/* It serves all processes that ask for numbers: those that are no zombies. */
+/* It serves all processes that request PIDs: those that are not zombies. */
 static struct last_pid *start_helper(const struct generation *generation,
 				     const struct init_channel *channel, struct avc_error *err)
 {
@@ -290,7 +290,7 @@ static struct last_pid *start_helper(const struct generation *generation,
 	return helper;
 }
 
-/* To fork takes so long that the number would be somebody else's in the end. */
+/* The fork takes so long that another process could take the PID. */
 static int make_spare_first(struct restore *restore, struct avc_error *err)
 {
 	struct generation *generation = restore->generation;
@@ -304,7 +304,7 @@ static int make_spare_first(struct restore *restore, struct avc_error *err)
 	return result;
 }
 
-/* Of a group that is not its own and not init's: one of its processes leads it, or somebody who is
+/* In a group that is neither its own nor init's: led by one of its processes, or by one that is
  * gone. */
 static bool is_in_another_group(const struct restore *restore)
 {
@@ -315,7 +315,7 @@ static bool is_in_another_group(const struct restore *restore)
 	       proc_stat(restore->channel->init, &init) == 0 && init.group != main->stat.group;
 }
 
-/* Until everything is there; nothing of the app's has run then. */
+/* Until everything is ready; nothing of the app has run yet. */
 static int make(struct restore *restore, struct avc_error *err)
 {
 	struct generation *generation = restore->generation;
@@ -341,7 +341,7 @@ static int make(struct restore *restore, struct avc_error *err)
 	return 0;
 }
 
-/* The numbers it holds must be free before another generation is tried. */
+/* The PIDs it holds must be free before another generation is tried. */
 static void take_back(struct restore *restore)
 {
 	/* It waits for `go`. */
@@ -371,7 +371,7 @@ static void go(struct restore *restore)
 		proc_await_end(restore->pid);
 	}
 	restore_go(main, restore->sandbox);
-	spare_drop(generation); /* it has the memory of what runs now */
+	spare_drop(generation); /* it shares memory with what runs now */
 	for (uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 
@@ -387,7 +387,7 @@ static void go(struct restore *restore)
 struct last_pid *restore_ahead(const struct generation *generation,
 			       const struct init_channel *channel)
 {
-	struct avc_error later = { 0 }; /* told when it is needed */
+	struct avc_error later = { 0 }; /* reported when it is needed */
 
 	return start_helper(generation, channel, &later);
 }
@@ -421,7 +421,7 @@ int restore_app(struct restore *restore, struct avc_error *err)
 		take_back(restore);
 	else
 		go(restore);
-	/* The app runs: it need not wait for two processes to end. */
+	/* The app runs: it need not wait for two processes to exit. */
 	last_pid_end(restore->helper);
 	restore_tree_free(restore->tree);
 	close_fd(&restore->pidfd);

@@ -4,7 +4,7 @@
  *
  *   restore.c       the main process
  *   restore_tree.c  a restored process makes its children
- *   restore_fork.c  ... each under its number, in its session
+ *   restore_fork.c  ... each under its PID, in its session
  *   remap.c         ... and their memory
  *   copier.c        ... which a second thread helps to copy
  */
@@ -15,22 +15,22 @@
 
 /* ---- restore.c ------------------------------------------------------------------ */
 
-/* What takes less than a millisecond or so to fork gets the number that it is to have sooner or
- * later, also where others fork all the time.  What has more pages is copied first (spare.c). */
+/* A process that takes less than about a millisecond to fork gets its PID sooner or later, even
+ * where others fork all the time.  One with more pages is copied first (spare.c). */
 #define COPIED_PAGES 16384
 
-/* An app is made anew from a generation. */
+/* Restores an app from a generation. */
 struct restore {
 	struct generation *generation;
 	struct init_channel *channel;
 	const struct avc_config *config;
 	timer_t timer;
 	uint64_t died_ns;
-	/* Called when everything is there, before anything runs: it sends the verdict. */
+	/* Called when everything is ready, before anything runs: sends the verdict. */
 	int (*ready)(void *arg, struct avc_error *err);
 	void *arg;
 	struct last_pid *helper; /* of restore_ahead(); NULL: it is started now; is ended    */
-	/* What came of it: the new main process, what it took, what is not as it was. */
+	/* The result: the new main process, the times, what could not be restored. */
 	pid_t pid;
 	uint64_t restore_ns, fork_ns, threads_ns;
 	struct avc_error notes;
@@ -40,17 +40,17 @@ struct restore {
 	struct restore_tree *tree; /* NULL: there is one process                       */
 };
 
-/* What can be begun before it is clear whether the generation is restored: a process enters the
- * container's PID namespace, while the dead application is cleared away.  NULL: restore_app() tries
- * again.  last_pid_end() ends it. */
+/* Started before it is clear whether the generation is restored: the helper enters the container's
+ * PID namespace, while the dead application is cleaned up.  NULL: restore_app() tries again.
+ * last_pid_end() ends it. */
 struct last_pid *restore_ahead(const struct generation *generation,
 			       const struct init_channel *channel);
 int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 
-/* Lets a stopped process that is what its template is put itself together; waits until
- * it has; tells what of it failed; lets it go. */
+/* For a stopped process that equals its template: has it restore itself; waits until it has;
+ * reports what failed; releases it. */
 int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
 		  struct sandbox **sandbox, struct avc_error *err) warn_unused;
 int restore_await(const struct image *image, pid_t pid, struct sandbox *sandbox,
@@ -60,17 +60,17 @@ void restore_go(const struct image *image, struct sandbox *sandbox);
 
 /* ---- restore_tree.c ------------------------------------------------------------------------- */
 
-/* All processes of a generation, of which the main one is there; each is stopped. */
+/* All processes of a generation, of which the main one exists; each is stopped. */
 struct restore_tree;
 struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err);
-/* The main process (a stopped tracee) brings forth the others. */
+/* The main process (a stopped tracee) forks the others. */
 int restore_tree_make(struct restore_tree *tree, struct avc_error *err) warn_unused;
-/* They put themselves together, but for the main one. */
+/* They restore themselves, except the main one. */
 int restore_tree_start(struct restore_tree *tree, struct avc_error *err) warn_unused;
 void restore_tree_go(struct restore_tree *tree);
 void restore_tree_kill(struct restore_tree *tree);
 void restore_tree_free(struct restore_tree *tree);
-/* PID of an image's process, when all of it is there. */
+/* PID of an image's process, when all exist. */
 pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t index);
 
 /* ---- remap.c ------------------------------------------------------------------------ */
@@ -93,7 +93,7 @@ int copier_open(struct copier *copier, pid_t template, pid_t pid,
 /* One stretch of memory.  `plain`: the mapping may be read and written. */
 int copier_add(struct copier *copier, avc_remote from, avc_remote to, bool plain,
 	       struct avc_error *err) warn_unused;
-/* Lends a hand; false when nothing is left, and then it can be finished. */
+/* Helps to copy; false when nothing is left, and then it can be finished. */
 bool copier_help(struct copier *copier);
 int copier_finish(struct copier *copier, struct avc_error *err) warn_unused;
 void copier_free(struct copier *copier);

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A restored process forks another one: under its number, and in its session (places.c).
+ * A restored process forks another one: under its PID, and in its session (places.c).
  */
 #include <errno.h>
 #include <signal.h>
@@ -14,15 +14,15 @@
 #define TRIES 64
 #define TRY_AGAIN_US 200
 
-/* What is to come into being, and what for. */
+/* A process to be forked, and its parents. */
 struct birth {
 	struct restore_tree *restored;
-	struct forked *host; /* whose child it will be, unless it is an orphan         */
+	struct forked *host; /* its parent, unless it is an orphan */
 	struct forked *by;   /* that one, or a keeper of it                          */
 	pid_t number;
 	int exit_signal;
 	bool orphan;
-	/* What is done while it takes its time; NULL: nothing. */
+	/* What to do meanwhile; NULL: nothing. */
 	void (*meanwhile)(void *arg);
 	void *arg;
 };
@@ -51,27 +51,27 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 	return 0;
 }
 
-/* A child of the host's that came to nothing, or was only in between. */
+/* Removes a child of the host that failed, or was only intermediate. */
 static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *err)
 {
 	const pid_t inside = proc_inside(child);
 
 	tracee_kill(child);
 	if (inside <= 0)
-		return 0; /* nobody had to wait for it */
+		return 0; /* it needs no wait(2) */
 	syscall_batch_add(host, SYS_wait4, (uint64_t)inside, 0, __WALL);
 	syscall_batch_soften(host, NULL);
 	return syscall_batch_flush(host, err);
 }
 
-/* A child, with the number if nobody else has taken it.  `copy`: a child of the host's that is as it
- * came out of fork(2), and gives its memory to this one; 0: there is none. */
+/* A child, with the wanted PID unless another process has taken it.  `copy`: a child of the host,
+ * fresh from fork(2), which gives its memory to this one; 0: none. */
 static int fork_once(const struct birth *birth, pid_t copy, pid_t *child, struct avc_error *err)
 {
 	struct restore_tree *restored = birth->restored;
 	struct syscall_batch *by = &birth->by->batch;
 	struct inj_call *runner = &by->parasite->control->runner;
-	/* Siblings' numbers often follow each other; to ask takes two wake-ups. */
+	/* Siblings' PIDs are often consecutive; a request takes two wake-ups. */
 	const bool follows = !birth->orphan && restored->last_number &&
 			     restored->last_number + 1 == birth->number;
 	const bool sibling = copy || (birth->by != birth->host && !birth->orphan);
@@ -79,7 +79,7 @@ static int fork_once(const struct birth *birth, pid_t copy, pid_t *child, struct
 	int result;
 
 	restored->last_number = 0;
-	/* An orphan's parent has ended: so does one that is there for that. */
+	/* An orphan's parent has exited: so does an intermediate one. */
 	if (birth->orphan && clone_task(by, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
 		return -1;
 	if (copy)
@@ -94,7 +94,8 @@ static int fork_once(const struct birth *birth, pid_t copy, pid_t *child, struct
 	return result ? -1 : 0;
 }
 
-/* A parent that was killed after it had made the child, and before it told us, left it behind. */
+/* A parent that was killed after it had forked the child, and before it was reported, left it
+ * behind. */
 static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc_error *err)
 {
 	pid_t children[CHILDREN_MAX];
@@ -106,10 +107,10 @@ static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc
 	return 0;
 }
 
-/* Until it has the number.  The kernel gives it one at the end of the fork (kernel/fork.c,
- * copy_process()), when everything is copied: what is big may never get it where others fork all
- * the time.  So the first that has another one is kept as a copy.  To give its memory away takes
- * no time. */
+/* Until it has the PID. The kernel assigns it at the end of the fork (kernel/fork.c,
+ * copy_process()), when everything is copied: a big process may never get it where others fork all
+ * the time.  So the first with another PID is kept as a copy.  Handing over its memory takes no
+ * time. */
 static int give_birth(const struct birth *birth, pid_t *child, struct avc_error *err)
 {
 	struct restore_tree *restored = birth->restored;
@@ -144,7 +145,7 @@ static int give_birth(const struct birth *birth, pid_t *child, struct avc_error 
 			return -1;
 		if (made)
 			continue;
-		/* One of them was killed, or is one too many where processes are limited. */
+		/* One of them was killed, or exceeds a limit on processes. */
 		if ((copy && take_back(host, copy, err)) ||
 		    take_back_untold(host, birth->number, err))
 			return -1;
@@ -191,7 +192,7 @@ int restore_fork_keeper(struct restore_tree *restored, uint32_t index, pid_t ses
 	struct syscall_batch *batch = &restored->forked[index].batch;
 	pid_t pid = 0;
 
-	/* Out of the way of those that are still to come. */
+	/* Moved away from PIDs still needed. */
 	restored->last_number = 0;
 	if (last_pid_set(restored->restore->helper, highest_number(restored->generation), err))
 		return -1;
@@ -203,7 +204,7 @@ int restore_fork_keeper(struct restore_tree *restored, uint32_t index, pid_t ses
 	return add_keeper(restored, index, session, pid, err) ? 0 : -1;
 }
 
-/* With the number of a leader that is gone. */
+/* With the PID of a leader that is gone. */
 static struct keeper *renew(struct restore_tree *restored, uint32_t host, pid_t number, bool group,
 			    struct avc_error *err)
 {
@@ -230,7 +231,7 @@ int restore_fork_group(struct restore_tree *restored, uint32_t index, pid_t grou
 	return renew(restored, index, group, true, err) ? 0 : -1;
 }
 
-/* Who makes it: its host, if that is in the session, or a keeper. */
+/* The process that forks it: its host, if that is in the session, or a keeper. */
 static struct forked *maker_of(struct restore_tree *restored, const struct place *place,
 			       struct avc_error *err)
 {

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The kernel has no call that gives a process another parent, and a fork of a template is
- * init's child.  So only the main process is forked from its template; the others are
- * forked by their own restored parents, under their own numbers, and then made what their
- * templates are (become()): memory (remap.c), descriptors, signal handlers, credentials.  All of
- * them are tracees that rest in a parasite until everything is there.
+ * The kernel has no call that gives a process another parent, and a fork of a template is init's
+ * child.  So only the main process is forked from its template; the others are forked by their own
+ * restored parents, under their own PIDs, and then made into what their templates are (become()):
+ * memory (remap.c), descriptors, signal handlers, credentials.  All of them are tracees that are
+ * parked in a parasite until everything is ready.
  */
 #include <errno.h>
 #include <poll.h>
@@ -21,7 +21,7 @@
 
 #define STEP_NS (5 * NS_PER_S)
 #define FILES_SPARE 64
-/* So many children have fd_channel of their own. */
+/* The number of children with their own fd_channel. */
 #define FEW 2
 
 struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err)
@@ -48,8 +48,8 @@ struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error 
 	return restored;
 }
 
-/* What is done while a process forks, which takes its time if it is big: how the child
- * will differ from it is found out, and its last child is made what it is to be. */
+/* Done while a process forks, which takes long if it is big: finds out how the child will differ
+ * from it, and completes its last child. */
 struct chores {
 	struct restore_tree *restored;
 	uint32_t child; /* 0: one that will be a zombie                          */
@@ -59,7 +59,7 @@ struct chores {
 	bool done;
 };
 
-/* Ended, and not waited for: it ends again, and nobody waits for it. */
+/* A zombie: it exits again, and is not waited for. */
 static int make_zombie(struct forked *forked, const struct image *image, struct avc_error *err)
 {
 	const int signal = WIFSIGNALED(image->status) ? WTERMSIG(image->status) : 0;
@@ -74,7 +74,7 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 	syscall_batch_add(batch, SYS_prctl, PR_SET_NAME, remote + 32);
 	if (signal) {
 		syscall_batch_add(batch, SYS_rt_sigaction, (uint64_t)signal, remote, 0, 8);
-		syscall_batch_soften(batch, NULL); /* nobody may change that of SIGKILL */
+		syscall_batch_soften(batch, NULL); /* SIGKILL's action cannot be changed */
 		if (syscall_batch_flush(batch, err))
 			return -1;
 		prlimit(batch->pid, RLIMIT_CORE, &none, NULL);
@@ -91,7 +91,7 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
 			return -1;
 	}
-	/* Of SIGKILL it dies where it is. */
+	/* SIGKILL kills it where it is. */
 	if (signal != SIGKILL && seccomp_go_on(batch->pid, NULL))
 		return fail_errno(err, batch->pid, "restore", "ptrace(CONT)", "it was killed");
 	for (;;) {
@@ -107,8 +107,8 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 	}
 }
 
-/* Session and group before it has children of its own.  What it has from its parent is
- * right as a rule. */
+/* Session and group before it has children of its own.  Those inherited from its parent are usually
+ * right. */
 static int place(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
 	const struct image *image = &restored->generation->image[index];
@@ -133,7 +133,7 @@ static int place(struct restore_tree *restored, uint32_t index, struct avc_error
 	return 0;
 }
 
-/* The leader of a session gets its terminal before it has children, who inherit it. */
+/* The leader of a session gets its terminal before it has children, which inherit it. */
 static void take_terminal(struct syscall_batch *batch, const struct image *image)
 {
 	const int fd = files_find_device(image->files, image->stat.tty);
@@ -144,7 +144,7 @@ static void take_terminal(struct syscall_batch *batch, const struct image *image
 	syscall_batch_soften(batch, "the session that it leads has lost its terminal");
 }
 
-/* Whoever was in the foreground is there again; asked for by anybody in the session. */
+/* Restores the foreground group; any process in the session can do it. */
 static int put_foreground(struct syscall_batch *batch, const struct image *image,
 			  struct avc_error *err)
 {
@@ -170,7 +170,7 @@ static int try_group(struct syscall_batch *batch, pid_t group, bool hard, struct
 	return batch->list[0].result ? 1 : 0;
 }
 
-/* When all are there: into groups that others lead, or have led. */
+/* When all exist: joins groups that others lead, or have led. */
 static int join_group(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
 	const struct image *image = &restored->generation->image[index];
@@ -223,7 +223,7 @@ static void do_chores(void *arg)
 	struct restore_tree *restored = chores->restored;
 
 	if (chores->done)
-		return; /* the number was not the right one */
+		return; /* the PID was not the right one */
 	chores->done = true;
 	if (chores->child && !restore_plan_of(restored->generation, chores->child, &chores->error))
 		chores->result = -1;
@@ -231,7 +231,7 @@ static void do_chores(void *arg)
 		chores->result = become(restored, chores->last, &chores->error);
 }
 
-/* How long all of it takes depends on how much there is: deadlines are for each step. */
+/* The total time depends on the size: deadlines are per step. */
 static void go_on(struct restore_tree *restored)
 {
 	tracee_deadline_set(restored->restore->timer, STEP_NS);
@@ -245,7 +245,7 @@ static int finish_copies(struct restore_tree *restored, struct avc_error *err)
 	return copier_finish(restored->copier, err);
 }
 
-/* What it has open is below that, with some for those that are only on their way. */
+/* Its descriptors are below that, with room for temporary ones. */
 static uint32_t files_of(const struct image *image)
 {
 	const struct fd_table *table = &image->table;
@@ -253,7 +253,7 @@ static uint32_t files_of(const struct image *image)
 	return (table->count ? (uint32_t)table->entry[table->count - 1].fd : 0) + FILES_SPARE;
 }
 
-/* `last` is the one that was forked last and is not yet what it is to be; 0: none. */
+/* `last` is the one forked last, which is not complete yet; 0: none. */
 static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *last,
 		    struct avc_error *err)
 {
@@ -263,7 +263,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *las
 	struct chores chores = { .restored = restored };
 
 	go_on(restored);
-	/* It has to be itself before it has children. */
+	/* It has to be complete before it has children. */
 	if (host && host == *last) {
 		if (become(restored, *last, err))
 			return -1;
@@ -297,7 +297,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *las
 	return place(restored, index, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
 }
 
-/* When nobody is to join a group that they lead any more. */
+/* When no process will join a group that they lead any more. */
 static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < restored->generation->images; i++) {
@@ -314,7 +314,7 @@ static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 	return 0;
 }
 
-/* Those that have ended again have told their parents, who know it already. */
+/* Discards the signals of zombies that exited again: their parents have had these already. */
 static int flush_signals(struct restore_tree *restored, struct syscall_batch *batch,
 			 struct avc_error *err)
 {
@@ -355,7 +355,7 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 		syscall_batch_add(batch, SYS_setsid);
 	else
 		syscall_batch_add(batch, SYS_setpgid, 0, (uint64_t)slot->group);
-	/* One of its own processes may have led the group, or somebody who is gone. */
+	/* The group may have been led by one of its own processes, or by one that is gone. */
 	if (!slot->session_leader)
 		syscall_batch_soften(batch, NULL);
 	take_terminal(batch, image);
@@ -366,7 +366,7 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 	return 0;
 }
 
-/* Processes, when all are there. */
+/* The processes, when all exist. */
 static int join_up(struct restore_tree *restored, struct avc_error *err)
 {
 	const struct generation *generation = restored->generation;
@@ -390,7 +390,7 @@ static int join_up(struct restore_tree *restored, struct avc_error *err)
 	return 0;
 }
 
-/* An orphan may come after the one that forks it, though parents come before their children. */
+/* An orphan may come before the one that forks it, although parents come before their children. */
 static int make_all(struct restore_tree *restored, uint32_t *last, struct avc_error *err)
 {
 	const struct generation *generation = restored->generation;
@@ -458,8 +458,7 @@ static int await_one(struct restore_tree *restored, uint32_t index, struct avc_e
 	return memory_put_back(image, forked->pid, notes, err);
 }
 
-/* It asks nothing of us while it puts itself together: no numbers for threads, no
- * permission for calls. */
+/* It needs nothing from us while it restores itself: no TIDs, no permission for calls. */
 static bool is_on_its_own(const struct image *image)
 {
 	return image->threads == 1 && !image->sandboxed && !image->stop_signal;
@@ -483,7 +482,7 @@ int restore_tree_start(struct restore_tree *restored, struct avc_error *err)
 
 void restore_tree_go(struct restore_tree *restored)
 {
-	/* First those that are stopped: their parents know it. */
+	/* First those stopped by job control: their parents know it. */
 	for (int stopped = 1; stopped >= 0; stopped--)
 		for (uint32_t i = 1; i < restored->generation->images; i++) {
 			const struct image *image = &restored->generation->image[i];
