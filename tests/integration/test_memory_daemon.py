@@ -17,7 +17,9 @@ from testkit.host_pressure import make_group, remove_group
 from testkit.local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
 from testkit.procfs import children_of
 
-HOARD = ROOT / "tests/victims/build/hoard"
+VICTIMS = ROOT / "tests/victims/build"
+HOARD = VICTIMS / "hoard"
+MB = 1 << 20
 pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
     pytest.mark.shared_machine("the guard is given a time to see a new limit"),
@@ -74,3 +76,45 @@ def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_pa
     wait_until(lambda: 300 < int(Path(f"/proc/{newest}/oom_score_adj").read_text()) < 1000, 5, "its guard knows of it")
     assert local.row(web)["generations"] == 1
     limit.write_text("-1" if first else "max")
+
+
+@pytest.mark.parametrize("rate", [50, 200])
+def test_who_shares_memory_with_others_keeps_its_newest_generation(
+    local: LocalSidecar, group: Path, tmp_path: Path, rate: int
+) -> None:
+    """A group above the container's, or the host, is full before the container is: templates are no first victims."""
+    subprocess.run(["make", "-s", "-C", str(VICTIMS.parent)], check=True)
+    knob = "memory.limit_in_bytes" if (group / "memory.limit_in_bytes").exists() else "memory.max"
+    if knob == "memory.max":
+        (group / "memory.high").write_text("max")
+        (group / "cgroup.subtree_control").write_text("+memory")
+    (group / knob).write_text(str(300 * MB))
+    inner = [group / name for name in ("container", "neighbour")]
+    with Board(tmp_path / "neighbour") as others, Board(tmp_path / "board") as board:
+        for each in inner:
+            each.mkdir()
+        (inner[0] / knob).write_text(str(256 * MB))
+
+        def enter() -> None:
+            (inner[1] / "cgroup.procs").write_text(str(os.getpid()))
+
+        neighbour = subprocess.Popen([str(HOARD), "90", "--board", str(others.path)], preexec_fn=enter)
+        leak = f"echo 0 > {inner[0]}/cgroup.procs && exec {VICTIMS}/leak {rate} 40 --board {board.path}"
+        web = local.container("web", ["sh", "-c", leak])
+        try:
+            wait_until(lambda: board.see().ready and others.see().ready, 10, "both are ready")
+            (inner[0] / "cgroup.procs").write_text(str(web.init_pid))
+            assert web.hook("prestart", {"avckpt.enable": "true", "avckpt.interval": "500ms"}) == ""
+            local.wait_for(web, app_pid_inside=2, generations=2)
+            os.kill(web.app_pid, signal.SIGUSR1)
+            wait_until(lambda: local.row(web, "-a").get("restores", 0), 30, "it is restored")
+            beats = board.see().beats
+            wait_until(lambda: board.see().beats > beats, 10, "it goes on")
+            assert neighbour.poll() is None
+        finally:
+            neighbour.kill()
+            neighbour.wait()
+            web.close()
+            local.containers.remove(web)
+            for each in inner:
+                remove_group(each)

@@ -22,6 +22,8 @@ OWN_MOUNTS = Path("/run/avckpt-cgroup")
 """In the sidecar's own file system."""
 UNLIMITED_BYTES = 1 << 62
 """Version 1 writes "no limit" as a number near 2**63."""
+OUTSIDE = 0.05
+"""Of a group's limit: so much less must be left outside.  A pod has hardly more memory than its only container."""
 
 
 def see_whole_tree() -> None:
@@ -87,11 +89,7 @@ class Groups:
 
     def memory_limit_bytes(self) -> int | None:
         """The hard limit; None: there is none (or the group is gone)."""
-        if self.memory is None:
-            return None
-        text = _read(self.memory / ("memory.max" if self.memory_version == 2 else "memory.limit_in_bytes"))
-        limit = int(text) if text.isdecimal() else UNLIMITED_BYTES
-        return limit if limit < UNLIMITED_BYTES else None
+        return None if self.memory is None else _limit_bytes(self.memory, self.memory_version)
 
     def memory_and_swap_bytes(self) -> int | None:
         """The limit at which the OOM killer acts: the hard limit, plus allowed swap; None: no limit."""
@@ -106,15 +104,29 @@ class Groups:
 
     def memory_used_bytes(self) -> int | None:
         """What counts against the limit and cannot simply be reclaimed: usage less clean file pages."""
-        if self.memory is None:
+        return None if self.memory is None else _used_bytes(self.memory, self.memory_version)
+
+    def first_to_run_out_bytes(self) -> int | None:
+        """`memory_and_swap_bytes()`; None, too, if a group above, or the host, has less room left than this one.
+
+        The OOM killer comes where memory runs out first, and counts in thousandths of what there is *there*.
+        """
+        limit, used = self.memory_and_swap_bytes(), self.memory_used_bytes()
+        if limit is None or used is None:
             return None
-        text = _read(self.memory / ("memory.current" if self.memory_version == 2 else "memory.usage_in_bytes"))
-        if not text.isdecimal():
-            return None
-        prefix = "" if self.memory_version == 2 else "total_"
-        stat = dict(line.split(" ", 1) for line in _read(self.memory / "memory.stat").splitlines() if " " in line)
-        cache = sum(int(stat.get(prefix + key, 0)) for key in ("inactive_file", "active_file"))
-        return max(int(text) - cache, 0)
+        return None if self._room_outside_bytes() < limit - used - OUTSIDE * limit else limit
+
+    def _room_outside_bytes(self) -> int:
+        """The least that is left in a group above, or on the host."""
+        fields = _host_memory()
+        room = [fields["MemAvailable"] + fields["SwapFree"]]
+        for folder in self.memory.parents if self.memory else ():
+            if not (folder / "cgroup.procs").exists():
+                break
+            limit, used = _limit_bytes(folder, self.memory_version), _used_bytes(folder, self.memory_version)
+            if limit is not None and used is not None:
+                room.append(limit - used)
+        return min(room)
 
     def is_frozen(self) -> bool:
         """Whether it is paused (podman pause)."""
@@ -193,8 +205,28 @@ def _mounts(owner: str) -> list[Mount]:
 
 
 def _host_swap_bytes() -> int:
-    fields = dict(line.split(":", 1) for line in _lines(Path("/proc/meminfo")))
-    return int(fields["SwapTotal"].split()[0]) * 1024
+    return _host_memory()["SwapTotal"]
+
+
+def _host_memory() -> dict[str, int]:
+    fields = (line.split(":", 1) for line in _lines(Path("/proc/meminfo")))
+    return {name: int(value.split()[0]) * 1024 for name, value in fields}
+
+
+def _limit_bytes(folder: Path, version: int) -> int | None:
+    text = _read(folder / ("memory.max" if version == 2 else "memory.limit_in_bytes"))
+    limit = int(text) if text.isdecimal() else UNLIMITED_BYTES
+    return limit if limit < UNLIMITED_BYTES else None
+
+
+def _used_bytes(folder: Path, version: int) -> int | None:
+    text = _read(folder / ("memory.current" if version == 2 else "memory.usage_in_bytes"))
+    if not text.isdecimal():
+        return None
+    prefix = "" if version == 2 else "total_"
+    stat = dict(line.split(" ", 1) for line in _read(folder / "memory.stat").splitlines() if " " in line)
+    cache = sum(int(stat.get(prefix + key, 0)) for key in ("inactive_file", "active_file"))
+    return max(int(text) - cache, 0)
 
 
 def _lines(path: Path) -> list[str]:
