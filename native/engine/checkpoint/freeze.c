@@ -236,7 +236,7 @@ static int make_holder_missing(struct tree *tree, uint32_t i, struct avc_error *
 			continue;
 		if (!above->paused && !above->descendant && thread_ask(above, thread, err))
 			return -1; /* the others were asked just now */
-		if (thread->creds.subreaper && process_adopt_no_more(above, err))
+		if (thread->creds.subreaper && process_pause_adoption(above, err))
 			return -1;
 	}
 	return process_hold_stopped(tree->entry[i].process, tree->init, err);
@@ -253,7 +253,7 @@ static int make_holders_missing(struct tree *tree, struct avc_error *err)
 			result = make_holder_missing(tree, i, err);
 	for (uint32_t i = 0; i < tree->count; i++)
 		if (tree->entry[i].process &&
-		    process_adopt_again(tree->entry[i].process, &failed) && !result) {
+		    process_resume_adoption(tree->entry[i].process, &failed) && !result) {
 			*err = failed;
 			result = -1;
 		}
@@ -269,10 +269,10 @@ static int clone_missing(struct freeze *freeze, struct avc_error *err)
 
 	/* First the threads that wait for us in their parasites: how long the main process takes is
 	 * not known yet. */
-	if (freeze_hear_all(tree, err) ||
+	if (freeze_await_answers(tree, err) ||
 	    (main->cloning &&
 	     (freeze_await_clone(main, &freeze->generation->image[0].template, err) ||
-	      freeze_rest_main(main, thread_find(main, main->pid), err))) ||
+	      freeze_park_main(main, thread_find(main, main->pid), err))) ||
 	    make_holders_missing(tree, err))
 		return -1;
 	for (uint32_t i = 1; i < tree->count; i++) {
@@ -322,7 +322,7 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err) ||
 	    keep_all(generation, &freeze->seen, err))
 		return -1;
-	/* While main threads are in their parasites: see parasite_will(). */
+	/* While main threads are in their parasites: see parasite_set_undo(). */
 	capture_files(generation);
 	if (dirty_capture(freeze->dirty, generation, err))
 		return -1;
@@ -340,7 +340,7 @@ static int hear_and_await(struct freeze *freeze, int result, struct avc_error *e
 	if (main->cloning && freeze_await_clone(main, &freeze->generation->image[0].template,
 						result ? &failed : err))
 		result = -1;
-	if (freeze_hear_all(freeze->tree, result ? &failed : err))
+	if (freeze_await_answers(freeze->tree, result ? &failed : err))
 		result = -1;
 	if (!result)
 		result = await_clones(freeze->generation, err);
@@ -361,7 +361,7 @@ static int rest_all(struct freeze *freeze, struct avc_error *err)
 			struct thread *thread = &process->threads[k];
 			const bool is_main = process == main && thread->tid == main->pid;
 
-			if (thread->borrowed && (is_main ? freeze_rest_main(main, thread, err)
+			if (thread->borrowed && (is_main ? freeze_park_main(main, thread, err)
 							 : thread_give_back(thread, err)))
 				return -1;
 		}
@@ -391,7 +391,7 @@ static void let_go(struct freeze *freeze)
 		/* A frozen cgroup, at this very moment. */
 		tracee_deadline_set(freeze->timer, NS_PER_S);
 		if (freeze->generation->image[0].template && main_thread->borrowed)
-			(void)freeze_rest_main(main, main_thread,
+			(void)freeze_park_main(main, main_thread,
 					       &ignored); /* or it is killed just now */
 		thread_let_go(main, main_thread);
 	}

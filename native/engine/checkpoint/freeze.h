@@ -34,9 +34,9 @@ int freeze_begin_others(struct freeze *freeze, struct avc_error *err) warn_unuse
 int freeze_start_clone(struct process *process, uint32_t slot, struct avc_error *err) warn_unused;
 int freeze_await_clone(struct process *process, pid_t *template, struct avc_error *err) warn_unused;
 /* After cloning, the main thread has a few more steps before it can be released. */
-int freeze_rest_main(const struct process *main, struct thread *main_thread, struct avc_error *err);
+int freeze_park_main(const struct process *main, struct thread *main_thread, struct avc_error *err);
 /* The answers of all others, also of those that were asked before one failed. */
-int freeze_hear_all(struct tree *tree, struct avc_error *err) warn_unused;
+int freeze_await_answers(struct tree *tree, struct avc_error *err) warn_unused;
 /* Abandoned clones: of a process that was killed meanwhile, and all of them when the checkpoint
  * failed. */
 void freeze_drop_clones(struct tree *tree);

@@ -149,7 +149,7 @@ static int await_own_clone(struct process *process, pid_t *template, struct avc_
 	return hear_of_children(process, err);
 }
 
-int freeze_rest_main(const struct process *main, struct thread *main_thread, struct avc_error *err)
+int freeze_park_main(const struct process *main, struct thread *main_thread, struct avc_error *err)
 {
 	const int result = memory_is_unforked(main->memory)
 				   ? parasite_run(main_thread->tid, &main->parasite.control->runner,
@@ -322,7 +322,7 @@ static int ask_end(struct process *process, struct avc_error *err)
 											       : 0;
 }
 
-int freeze_hear_all(struct tree *tree, struct avc_error *err)
+int freeze_await_answers(struct tree *tree, struct avc_error *err)
 {
 	int (*const step[])(struct process *, struct avc_error *) = { ask_halt, ask_end };
 	int result = 0;
@@ -350,7 +350,7 @@ static int begin(struct process *process, uint32_t slot, uint64_t takes_ns, stru
 		return fail(err, process->descendant ? AVC_UNSUPPORTED : AVC_DEADLINE, 0,
 			    process->pid, "freeze", "", "its main thread has ended");
 	process->stage = FREEZE_BEGUN;
-	if (read_all(process, slot, err) || memory_look(process, err))
+	if (read_all(process, slot, err) || memory_find_unforked(process, err))
 		return -1;
 	if (!process->descendant && !process->recycling)
 		return freeze_start_clone(process, slot, err);

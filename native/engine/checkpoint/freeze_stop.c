@@ -44,7 +44,7 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 	for (int looks = 0; looks < LOOKS; looks++) {
 		bool all = true;
 
-		if (tree_look(tree, err))
+		if (tree_scan(tree, err))
 			return -1;
 		for (uint32_t i = 1; i < tree->count; i++) {
 			struct process *t = tree->entry[i].process;

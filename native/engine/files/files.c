@@ -443,12 +443,12 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 			file_look_at_socket(fd, f);
 		/* What was opened since is not recreated. */
 		if (f->socket && look->depth != FILES_NOW)
-			file_look_at_manner(fd, f->socket, look->init);
+			file_look_at_options(fd, f->socket, look->init);
 	}
 	if (look->depth == FILES_FROZEN && known && f->socket && is_outdated(fd, f->socket)) {
 		f->known = false; /* for its heirs (look_at_inherited())         */
 		file_look_at_socket(fd, f);
-		file_look_at_manner(fd, f->socket, look->init);
+		file_look_at_options(fd, f->socket, look->init);
 	}
 	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
 	    !(f->flags & O_PATH))

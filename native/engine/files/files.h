@@ -387,7 +387,7 @@ void file_socket_free(struct file_socket *socket);
 /* Whether it can be recreated: it needs no peer. */
 bool file_socket_is_alone(const struct file_socket *socket);
 /* What only matters if it has to be recreated: options, user, the file of its name. */
-void file_look_at_manner(int fd, struct file_socket *socket, pid_t init);
+void file_look_at_options(int fd, struct file_socket *socket, pid_t init);
 /* Whether one that was idle has got a name or a connection since. */
 bool file_socket_was_used(int fd, const struct file_socket *socket);
 /* Whether getsockname(2) says the same of `fd`. */

@@ -192,9 +192,9 @@ static void look_again(struct process *process, int fd, struct file *file)
 {
 	const int first = 0, before = option(fd, SO_PEEK_OFF);
 
-	if (parasite_will(process, SYS_setsockopt,
-			  ARGUMENTS((uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
-				    (uint64_t)(int64_t)before, sizeof before))) {
+	if (parasite_set_undo(process, SYS_setsockopt,
+			      ARGUMENTS((uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
+					(uint64_t)(int64_t)before, sizeof before))) {
 		file->content_lost = true;
 		return;
 	}
@@ -203,7 +203,7 @@ static void look_again(struct process *process, int fd, struct file *file)
 	else
 		look_through(fd, file);
 	setsockopt(fd, SOL_SOCKET, SO_PEEK_OFF, &before, sizeof before);
-	parasite_will_done(process);
+	parasite_clear_undo(process);
 	trim(file);
 }
 

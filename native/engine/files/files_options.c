@@ -280,7 +280,7 @@ static bool is_of_pair(const struct file_socket *s)
 	       s->remote_bytes == sizeof(sa_family_t);
 }
 
-void file_look_at_manner(int fd, struct file_socket *s, pid_t init)
+void file_look_at_options(int fd, struct file_socket *s, pid_t init)
 {
 	struct stat st;
 

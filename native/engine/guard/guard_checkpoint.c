@@ -122,7 +122,7 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_e
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
 
 	if (process_follow(process, err) || support_check(process, err) ||
-	    process_take_stock(process, err))
+	    process_list_threads(process, err))
 		return -1;
 	if (process->infected && (process->thread_count > process->parasite.threads_max ||
 				  guard->config.keep >= process->parasite.slots))
@@ -138,7 +138,7 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_e
 		if (infect(guard, process, err))
 			return -1;
 	}
-	if (process_acquaint(process, guard->timer, deadline, err))
+	if (process_query_new_threads(process, guard->timer, deadline, err))
 		return -1;
 	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
 	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
@@ -194,7 +194,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
 	(void)guard_let_executed_go(guard, true);
-	if (tree_look(tree, err) || check_vfork(tree, err))
+	if (tree_scan(tree, err) || check_vfork(tree, err))
 		return -1;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
@@ -219,7 +219,7 @@ void guard_tell_unstoppable(struct avc_guard *guard, const struct avc_error *err
 {
 	struct avc_error why = { 0 };
 
-	if (guard->main.pid && !tree_look(&guard->tree, &why))
+	if (guard->main.pid && !tree_scan(&guard->tree, &why))
 		(void)check_vfork(&guard->tree, &why);
 	if (policy_missed(&guard->policy, why.code, false))
 		guard_unprotect(guard, 0, &why);

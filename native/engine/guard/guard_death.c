@@ -155,7 +155,7 @@ static void keep_remains(struct avc_guard *guard)
 		process_unhold_soon(&guard->main);
 		return;
 	}
-	guard->remains.pid = process_give_holder(&guard->main, &guard->remains.pidfd);
+	guard->remains.pid = process_detach_holder(&guard->main, &guard->remains.pidfd);
 	guard->remains.until_ns = now_ns() + guard->config.remains_ns;
 	/* Memory that nobody runs in goes before anybody's. */
 	proc_set_oom_score_adj(guard->remains.pid, "1000");

@@ -284,7 +284,7 @@ static bool kill_porter(struct process *process, const struct porter *porter)
 		while (seccomp_go_on(porter->tid, &stop) == 0 && stop.kind != STOP_EXIT &&
 		       stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
 			stop = tracee_wait(porter->tid, 0);
-	seccomp_let_be(porter->tid);
+	seccomp_end_supervision(porter->tid);
 	if (!porter->is_thread || stop.kind == STOP_EXIT)
 		return true;
 	left = thread_add(process, porter->tid, &ignored);
@@ -647,7 +647,7 @@ static int make_holder(struct process *process, pid_t holder, const struct arch_
 		       : 0;
 }
 
-int process_adopt_no_more(struct process *process, struct avc_error *err)
+int process_pause_adoption(struct process *process, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	struct thread *thread = thread_find(process, process->pid);
@@ -669,7 +669,7 @@ int process_adopt_no_more(struct process *process, struct avc_error *err)
 	return 0;
 }
 
-int process_adopt_again(struct process *process, struct avc_error *err)
+int process_resume_adoption(struct process *process, struct avc_error *err)
 {
 	struct thread *thread = thread_find(process, process->pid);
 
@@ -838,7 +838,7 @@ void process_unhold(struct process *process)
 	forget_holder(process);
 }
 
-pid_t process_give_holder(struct process *process, int *pidfd)
+pid_t process_detach_holder(struct process *process, int *pidfd)
 {
 	const pid_t holder = process->holder;
 
@@ -850,7 +850,7 @@ pid_t process_give_holder(struct process *process, int *pidfd)
 void process_unhold_soon(struct process *process)
 {
 	int pidfd;
-	const pid_t holder = process_give_holder(process, &pidfd);
+	const pid_t holder = process_detach_holder(process, &pidfd);
 
 	if (holder)
 		tracee_end(holder, pidfd);

@@ -287,7 +287,7 @@ static int count_task(pid_t tid, void *arg)
 	return 0;
 }
 
-int process_take_stock(struct process *process, struct avc_error *err)
+int process_list_threads(struct process *process, struct avc_error *err)
 {
 	struct walk walk = { .process = process, .err = err };
 
@@ -380,8 +380,8 @@ static int check_spaces(const struct process *process, const struct thread *t,
 	return result;
 }
 
-int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
-		     struct avc_error *err)
+int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
+			      struct avc_error *err)
 {
 	uint32_t again = 0;
 

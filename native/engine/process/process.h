@@ -81,10 +81,10 @@ int thread_ask(struct process *process, struct thread *thread, struct avc_error 
 int thread_ask_others(struct process *process, const struct thread *thread, const struct creds *was,
 		      struct avc_error *err) warn_unused;
 /* The threads there are now; those that ended are forgotten. */
-int process_take_stock(struct process *process, struct avc_error *err) warn_unused;
+int process_list_threads(struct process *process, struct avc_error *err) warn_unused;
 /* Gets known every thread that is not yet, one at a time, before a freeze. */
-int process_acquaint(struct process *process, timer_t timer, uint64_t deadline_ns,
-		     struct avc_error *err) warn_unused;
+int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
+			      struct avc_error *err) warn_unused;
 
 /* ---- dying.c ------------------------------------------------------------------- */
 
@@ -119,8 +119,8 @@ int process_infect_stopped(struct process *process, uint32_t slots,
 int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err) warn_unused;
 /* A stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) does not for a while: they
  * are init's.  If we die meanwhile it does again all by itself. */
-int process_adopt_no_more(struct process *process, struct avc_error *err) warn_unused;
-int process_adopt_again(struct process *process, struct avc_error *err) warn_unused;
+int process_pause_adoption(struct process *process, struct avc_error *err) warn_unused;
+int process_resume_adoption(struct process *process, struct avc_error *err) warn_unused;
 /* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until what it
  * has open is closed and its memory gone. */
 int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
@@ -128,7 +128,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 void process_unhold(struct process *process);
 void process_unhold_soon(struct process *process);
 /* The holder is the caller's from here on, with its pidfd (-1: there was none). */
-pid_t process_give_holder(struct process *process, int *pidfd);
+pid_t process_detach_holder(struct process *process, int *pidfd);
 
 /* ---- tracker.c -------------------------------------------------------------------- */
 
@@ -184,7 +184,7 @@ bool process_is_quiescent(const struct process *process);
 /* Of one whose main process is this.  -1: out of memory. */
 int tree_init(struct tree *tree, struct process *main) warn_unused;
 /* Looks who there is; new ones are opened. */
-int tree_look(struct tree *tree, struct avc_error *err) warn_unused;
+int tree_scan(struct tree *tree, struct avc_error *err) warn_unused;
 /* Whether entry[i] or a process above it adopts orphans, or could not be asked whether it does. */
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether entry[i] has its parent's memory, and not its own: after vfork(2) until it has

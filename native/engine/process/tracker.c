@@ -118,7 +118,7 @@ static int open_uffd(struct process *process, struct avc_error *err)
 		fd = open_in(process, child, &base, err);
 	if (child) {
 		tracee_kill(child);
-		seccomp_let_be(child);
+		seccomp_end_supervision(child);
 	}
 	if (fd >= 0 && ioctl(fd, UFFDIO_API, &api)) {
 		fail_errno(err, process->pid, "watch memory", "ioctl(UFFDIO_API)",

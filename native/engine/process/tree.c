@@ -248,7 +248,7 @@ static int check_sharing(const struct tree *tree, const struct tree_entry *entry
 		    "process %d shares its %s with its parent", proc_inside(entry->pid), what);
 }
 
-int tree_look(struct tree *tree, struct avc_error *err)
+int tree_scan(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
 	if (add_entry(tree, tree_main(tree)->leader, PARENT_INIT, err))

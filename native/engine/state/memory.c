@@ -243,7 +243,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 			continue;
 		/* Before it is read: what is written meanwhile counts as written since. */
 		if (a->as_file)
-			a->writes = others_writes(process->others, a);
+			a->writes = mem_others_writes(process->others, a);
 		image->whole &= budget_step() && copy_area(process->pid, a, to);
 		to += area_room(a);
 	}
@@ -336,7 +336,7 @@ static int look_for_dontfork(struct process *process, struct dontfork *look, str
 	return 0;
 }
 
-int memory_look(struct process *process, struct avc_error *err)
+int memory_find_unforked(struct process *process, struct avc_error *err)
 {
 	struct dontfork look = { 0 };
 
@@ -583,7 +583,7 @@ static int put_back(const struct putting *putting, struct area *a, const uint8_t
 	const bool opened = a->way == WAY_PROTECT;
 	bool put = false;
 
-	if (a->as_file && others_writes(others, a) != a->writes) {
+	if (a->as_file && mem_others_writes(others, a) != a->writes) {
 		fail(putting->notes, AVC_UNSUPPORTED, 0, putting->pid, "restore", "",
 		     "%zu kB of shared memory have been written as files since, and are not rolled back",
 		     area_bytes(a) / 1024);
@@ -598,7 +598,7 @@ static int put_back(const struct putting *putting, struct area *a, const uint8_t
 	if (!put) {
 		put = put_by_file(a, putting->pid, from);
 		if (a->as_file) /* that was our own write */
-			a->writes = others_writes(others, a);
+			a->writes = mem_others_writes(others, a);
 	}
 	return put ? 0 : note_unless_equal(a, putting->mem_fd, from, putting->notes);
 }

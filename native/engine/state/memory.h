@@ -137,12 +137,12 @@ void wiped_free(struct wiped *wiped);
 
 /* Marks the areas that processes outside of the app's PID namespace have, too, by a scan not older
  * than `since`. */
-void others_look(struct mem_others *others, const struct process *process,
-		 const struct areas *areas, uint64_t since);
-bool others_have(const struct mem_others *others, const struct area *area);
+void mem_others_scan(struct mem_others *others, const struct process *process,
+		     const struct areas *areas, uint64_t since);
+bool mem_others_have(const struct mem_others *others, const struct area *area);
 /* Watches it for writes as to a file from now on. */
-void others_watch(struct mem_others *others, pid_t template, const struct area *area);
+void mem_others_watch(struct mem_others *others, pid_t template, const struct area *area);
 /* Counts these; the same number: none since. */
-uint32_t others_writes(struct mem_others *others, const struct area *area);
+uint32_t mem_others_writes(struct mem_others *others, const struct area *area);
 
 #endif

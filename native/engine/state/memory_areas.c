@@ -233,8 +233,8 @@ static void look_for_others(const struct survey *survey)
 	for (uint32_t i = 0; known && i < survey->areas.count; i++)
 		known = !survey->areas.area[i].named ||
 			is_known(survey->memory, &survey->areas.area[i]);
-	others_look(survey->process->others, survey->process, &survey->areas,
-		    known ? 0 : survey->since);
+	mem_others_scan(survey->process->others, survey->process, &survey->areas,
+			known ? 0 : survey->since);
 }
 
 /* By the mapping, by its file, or by a descriptor; never with rights that the application lacks. */
@@ -252,7 +252,7 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 {
 	if (a->wiped)
 		return true;
-	if (a->named && others_have(survey->process->others, a)) {
+	if (a->named && mem_others_have(survey->process->others, a)) {
 		survey->others_bytes += area_bytes(a);
 		/* If there is no memory to record it, it is searched again. */
 		(void)areas_add(&survey->foreign, a);
@@ -267,7 +267,7 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 	}
 	survey->shared_bytes += area_bytes(a);
 	if (a->as_file)
-		others_watch(survey->process->others, survey->template, a);
+		mem_others_watch(survey->process->others, survey->template, a);
 	return true;
 }
 

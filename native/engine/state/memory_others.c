@@ -201,8 +201,8 @@ static void look(struct mem_others *others, const struct process *process)
 	others->cost_ns = now_ns() - others->looked_ns;
 }
 
-void others_look(struct mem_others *others, const struct process *process,
-		 const struct areas *areas, uint64_t since)
+void mem_others_scan(struct mem_others *others, const struct process *process,
+		     const struct areas *areas, uint64_t since)
 {
 	bool any = false,
 	     fresh = now_ns() - others->looked_ns < LOOK_NS + others->cost_ns * LOOK_SHARE;
@@ -223,7 +223,7 @@ void others_look(struct mem_others *others, const struct process *process,
 		look(others, process);
 }
 
-bool others_have(const struct mem_others *others, const struct area *a)
+bool mem_others_have(const struct mem_others *others, const struct area *a)
 {
 	const struct object wanted = { a->device, a->inode };
 
@@ -273,7 +273,7 @@ static void take_events(struct mem_others *others)
 		others->lost++;
 }
 
-void others_watch(struct mem_others *others, pid_t template, const struct area *a)
+void mem_others_watch(struct mem_others *others, pid_t template, const struct area *a)
 {
 	const struct object object = { a->device, a->inode };
 	char path[96];
@@ -294,7 +294,7 @@ void others_watch(struct mem_others *others, pid_t template, const struct area *
 		others->watch[others->watches++] = (struct watch){ number, object, 0 };
 }
 
-uint32_t others_writes(struct mem_others *others, const struct area *a)
+uint32_t mem_others_writes(struct mem_others *others, const struct area *a)
 {
 	const struct object object = { a->device, a->inode };
 

@@ -143,7 +143,7 @@ void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32
 		    seccomp_supervise(tid, sandbox->inside, SANDBOX_OPTIONS) ||
 		    tracee_await(tid, NULL, &ignored) != STOP_TRAP || arch_regs_get(tid, &now))
 			continue; /* it has exited, or was killed */
-		seccomp_let_be(tid);
+		seccomp_end_supervision(tid);
 		block = thread_of(parasite, slot_number, tid);
 		if (block < 0)
 			continue;

@@ -225,7 +225,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image);
 /* While it is stopped: finds what a clone would not inherit (MADV_DONTFORK); whether there is any;
  * and the calls of its main thread right before the clone (MADV_DOFORK), and right after it
  * (MADV_DONTFORK). Both before it begins. */
-int memory_look(struct process *process, struct avc_error *err) warn_unused;
+int memory_find_unforked(struct process *process, struct avc_error *err) warn_unused;
 bool memory_is_unforked(const struct memory *memory);
 void memory_advise(const struct process *process, uint32_t slot, int advice, struct inj_call *call);
 /* The template is smaller than the app: always fails, with AVC_RETRY if the next attempt can

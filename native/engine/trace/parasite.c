@@ -193,7 +193,7 @@ struct inj_syscall *call_append(struct inj_call *call, long nr, const uint64_t a
 	return s;
 }
 
-int parasite_will(struct process *process, long nr, const uint64_t arg[6])
+int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6])
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	const struct thread *thread = thread_find(process, process->pid);
@@ -211,7 +211,7 @@ int parasite_will(struct process *process, long nr, const uint64_t arg[6])
 	return 0;
 }
 
-void parasite_will_done(struct process *process)
+void parasite_clear_undo(struct process *process)
 {
 	struct inj_call *call = &process->parasite.control->runner;
 	const uint32_t i = __atomic_load_n(&call->wills, __ATOMIC_RELAXED);
@@ -264,7 +264,7 @@ static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
 	struct arch_regs regs;
 
 	if (parasite->seccomp != SECCOMP_SUPERVISED)
-		seccomp_let_be(tid);
+		seccomp_end_supervision(tid);
 	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours)))
 		return fail(err, AVC_UNSUPPORTED, 0, tid, "run injected code", "",
 			    "it has too many processes under seccomp filters of its own");
@@ -417,7 +417,7 @@ static int look_at_seccomp(struct process *process, struct thread *thread, struc
 
 	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as found by a checkpoint */
 		thread->seccomp = SECCOMP_SUPERVISED;
-	if (seccomp_look(thread->tid, process->plain_filters, &thread->filters_known,
+	if (seccomp_read(thread->tid, process->plain_filters, &thread->filters_known,
 			 &thread->seccomp))
 		return fail_errno(err, thread->tid, "run injected code",
 				  "ptrace(SECCOMP_GET_FILTER)", "its filters cannot be read");
@@ -525,7 +525,7 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
 	/* Strict mode is in force again when it is resumed: nothing happens in between. */
-	seccomp_let_be(thread->tid);
+	seccomp_end_supervision(thread->tid);
 	thread->borrowed = false;
 	return 0;
 }

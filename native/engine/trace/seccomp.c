@@ -303,7 +303,7 @@ static long filter_get(pid_t tid, uint32_t index, void *insn)
 	return ptrace(PTRACE_SECCOMP_GET_FILTER, tid, (long)index, insn);
 }
 
-int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_way *way)
+int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_way *way)
 {
 	struct program p;
 	uint32_t i;
@@ -364,7 +364,7 @@ int seccomp_supervise(pid_t tid, pid_t inside, long options)
 	return 0;
 }
 
-void seccomp_let_be(pid_t tid)
+void seccomp_end_supervision(pid_t tid)
 {
 	const int i = find(tid);
 

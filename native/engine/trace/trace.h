@@ -226,7 +226,7 @@ struct process {
 	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
 	const struct creds *forebear; /* what a process that is made from the main one has */
 	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
-	bool paused; /* between process_adopt_no_more() and process_adopt_again()         */
+	bool paused; /* between process_pause_adoption() and process_resume_adoption()         */
 	struct tracker *tracker; /* process/tracker.c; NULL: nobody watches its memory         */
 	bool recycling;          /* in this freeze a template is brought up to date          */
 	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
@@ -362,13 +362,13 @@ void rewind_prepare(struct thread *thread);
 
 /* Looks at a stopped thread's filters, of which the first `containers` are the container's; *known:
  * how many there were the last time.  Who is supervised stays so.  0, or -1 with errno. */
-int seccomp_look(pid_t tid, uint32_t containers, uint32_t *known,
+int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known,
 		 enum seccomp_way *way) warn_unused;
-/* From now on, until seccomp_let_be(): `options` are those it has else, `inside` the number of its
- * process as that knows it. */
+/* From now on, until seccomp_end_supervision(): `options` are its other ones, `inside` the PID of
+ * its process as that knows it. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
 #define SECCOMP_WATCHER (-1) /* for `inside`: the one that opens a userfaultfd       */
-void seccomp_let_be(pid_t tid);
+void seccomp_end_supervision(pid_t tid);
 bool seccomp_is_supervised(pid_t tid);
 /* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
 void seccomp_at_call(pid_t tid, pid_t inside, long options);
@@ -425,9 +425,9 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
 /* While the main thread is in its parasite: a call that it makes before it goes home if we are not
  * there any more, with the address of arg[3] as its fourth argument.  For what we are about to
  * change in what is the app's; that must not be changed if this fails.  The last one has been
- * undone: parasite_will_done(). */
-int parasite_will(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
-void parasite_will_done(struct process *process);
+ * undone: parasite_clear_undo(). */
+int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
+void parasite_clear_undo(struct process *process);
 /* exec puts another program in its place, at any moment, and the parasite is gone: whether it
  * is there, in a stopped thread.  If not, the process is not infected any more. */
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
