@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`avckpt bundle`: one archive with what is known of a container, for whoever has to find out why it crashed."""
+"""`avckpt bundle`: one archive with all that is known about a container, to find out why it crashed."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def _pretty(data: object) -> str:
 
 
 def _plain(container: Json) -> str:
-    """Its name as a part of a file's."""
+    """Its name, usable in a file name."""
     return "".join(each if each.isalnum() or each in "-_." else "_" for each in called(container))
 
 

@@ -31,15 +31,15 @@ START_IT = (
 class Client:
     """The sidecar whose run-time directory is `run_dir`.
 
-    Every method raises SidecarUnreachable when nobody answers, Denied when we
-    may not ask, and the sidecar's own error as the exception that it was there.
+    Every method raises SidecarUnreachable without an answer, Denied without
+    permission, and the sidecar's own error as the original exception.
     """
 
     def __init__(self, run_dir: Path) -> None:
         self._path = run_dir / "api.sock"
 
     def info(self) -> Json:
-        """Who the sidecar is."""
+        """Version and state of the sidecar."""
         return self._request("GET", "/v1/info")
 
     def containers(self, *, ended: bool = False, memory: bool = True) -> list[Json]:
@@ -51,7 +51,8 @@ class Client:
         return cast("list[Json]", answer["containers"])
 
     def inspect(self, name: str) -> Json:
-        """All that is known of a container; returns {"container": ..., "settings": ..., "generations": ..., ...}."""
+        """All that is known about a container; returns {"container": ..., "settings": ..., "generations":
+        ..., ...}."""
         return self._request("GET", f"/v1/containers/{quote(name, safe='')}")
 
     def command(self, name: str, command: Command, generation: int = 0) -> Json:
@@ -104,7 +105,7 @@ class Client:
 
     @contextlib.contextmanager
     def _connected(self) -> Iterator[_UnixConnection]:
-        """A connection; what goes wrong with it in the body becomes our errors."""
+        """A connection; its errors in the body are converted to ours."""
         connection = _UnixConnection(self._path)
         try:
             yield connection

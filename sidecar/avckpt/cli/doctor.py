@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Can this machine keep containers alive, and if not, what is to be done?
+"""Whether this machine can keep containers alive, and if not, what to do.
 
 `gather()` looks, and `judge()` makes up its mind from what was seen alone, so
 that every verdict can be tested without a machine that deserves it.

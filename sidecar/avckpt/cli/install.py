@@ -105,7 +105,7 @@ class _File:
             to.symlink_to(self.content.decode())
 
     def is_at(self, place: Path) -> bool:
-        """Whether that is what stands there."""
+        """Whether the installed file equals it."""
         try:
             if place.is_symlink():
                 return not self.mode and os.readlink(place).encode() == self.content

@@ -9,8 +9,8 @@ The program has our standard descriptors and, if we had it, the foreground of
 our terminal.  ^Z stops the program, and us with our group, as a job; the shell
 that continues us has the program continued.
 
-When `avckpt run` itself is killed with SIGKILL, init and program go on as
-orphans, unprotected.
+When `avckpt run` itself is killed with SIGKILL, init and program are killed,
+too.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ class Job:
 
 
 def say(text: str) -> None:
-    """One message of ours.  That nobody reads it must not end the program."""
+    """Writes one message. A closed reader must not end the program."""
     try:
         os.write(2, f"avckpt: {text}\n".encode())
     except OSError:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an application died of, and where."""
+"""Crash reports: what an application died of, and where."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hears of fatal signals on this machine, with the registers of the threads that die.
+"""Receives fatal signals on this machine, with the registers of the threads that die.
 
 Two of the kernel's tracepoints as perf events (perf_event_open(2)), on every CPU:
 
@@ -8,8 +8,8 @@ Two of the kernel's tracepoints as perf events (perf_event_open(2)), on every CP
   process follow, each with a SIGKILL.
 - `signal:signal_generate` of signals that end a process: who sent it, and the thread's name.
 
-The events belong to CPUs, not to processes: no switch between processes takes longer, and nothing
-happens until somebody dies.  The rings are read when a death is told of, or one is half full.
+The events belong to CPUs, not to processes: no context switch takes longer, and nothing happens
+until a process dies.  The rings are read when a death is reported, or one is half full.
 """
 
 from __future__ import annotations

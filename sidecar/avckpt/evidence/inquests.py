@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Follows each death: what the kernel told, what the memory says, what came of it, and then one event of all that."""
+"""Follows each death: collects what the kernel reported, the memory shows, and the outcome, and makes one
+event of it."""
 
 from __future__ import annotations
 

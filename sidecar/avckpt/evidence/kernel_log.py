@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the kernel's log says of a crash: the address of a fault, which nobody else tells.
+"""The kernel's log of a crash: the address of a fault, which has no other source.
 
 x86 writes a line for each unhandled fault (arch/x86/mm/fault.c, kernel/traps.c), ten in five seconds
 at most, unless `debug.exception-trace` is 0.

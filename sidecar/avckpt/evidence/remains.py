@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a dead application has left: a stopped task of the guard's that still has its memory.
+"""The remains of a dead application: a stopped task of the guard that still has its memory.
 
-All of it is the application's word and may be anything; what is read is bounded.  Reading may wait
-for as long as a file system that is mapped does not answer: not for the daemon's own thread.
+None of it is trusted; what is read is bounded.  Reading may block while a mapped file system does
+not answer: not for the daemon's own thread.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A page about a sidecar, for a browser: files, and some paths of the API behind a token.
 
-The API's socket is for root only, and whoever reaches it can roll containers back.  A
-browser runs the code of strangers beside ours, so this server
+The API's socket is for root only, and gives the right to roll containers back.  A browser runs
+foreign code beside ours, so this server
 
 - passes on what PASSED names and nothing else, and commands only if it was started so;
 - wants the token in the header Authorization, which no other site's page can set for us

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a Compose file may say and hardly mean: of a service, and of services together."""
+"""Warnings about a Compose file: what is valid, but probably unintended."""
 
 from __future__ import annotations
 

@@ -27,14 +27,14 @@ from avckpt_hooks.shared.labels import LabelError, merge, parse_policy
 from avckpt.errors import AvckptError
 
 STUCK_S = 5.0
-"""So long may podman-compose do nothing but wait for containers to run that nobody starts."""
+"""How long podman-compose may do nothing but wait for containers to run."""
 UNHEALTHY_S = 300.0
 """The same where it waits for one to become healthy."""
 LOOK_EVERY_S = 0.2
 QUERY_TIMEOUT_S = 60.0
 
 Say = Callable[[str], None]
-"""Takes a line for the person who waits."""
+"""Receives a line for the waiting user."""
 
 _HEALTHY = "--condition=healthy"
 _WAITS = {"--condition=running": "running", _HEALTHY: "healthy"}
@@ -195,7 +195,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 class _Words:
-    """What podman-compose prints, without what tells nobody anything.
+    """The relevant output of podman-compose.
 
     That is names and ids of what was made or removed, that something was not there to be removed, and of a
     traceback all but its last line.
