@@ -36,7 +36,7 @@ from typing import Any
 from avckpt.engine import Engine
 from avckpt.errors import AvckptError
 from avckpt.events.vocabulary import Kind
-from avckpt.guard import Event, GuardConfig
+from avckpt.guard import Event, GuardConfig, Images
 from avckpt.supervision.pressure import templates_of
 from rich.console import Console
 
@@ -119,8 +119,9 @@ class Held:
 class Protected:
     """The server below avckpt-init; with `way.kind` "avckpt" also an engine that takes checkpoints of it."""
 
-    def __init__(self, way: Way, folder: Path, before: Sequence[str] = ()) -> None:
+    def __init__(self, way: Way, folder: Path, before: Sequence[str] = (), *, images: Images = Images.FORK) -> None:
         self.way = way
+        self.images = images
         self.port = free_port()
         self.board = Board(folder / f"server-{self.port}")
         self.events: list[Event] = []
@@ -146,6 +147,7 @@ class Protected:
                 restore_max=5,
                 restore_window_s=60.0,
                 quiesce_s=QUIESCE_S,
+                images=self.images,
             )
             pidfd = os.pidfd_open(self.init_pid)
             try:
@@ -260,7 +262,7 @@ def hold(way: Way, folder: Path, before: Sequence[str] = ()) -> Held:
                 continue
             with contextlib.suppress(OSError):
                 held = [figures(pid) for pid in templates_of(server.init_pid)]
-                app = figures(_app(server))
+                app = figures(server_pid(server))
                 pages = sum(each["Pss"] for each in held) + app["Pss"] - app["Rss"]
                 if pages / 1024 > highest:
                     highest = pages / 1024
@@ -270,7 +272,8 @@ def hold(way: Way, folder: Path, before: Sequence[str] = ()) -> Held:
     return Held(way.interval_s, way.rate_mb_s, way.mb, way.keep, round(highest, 2), round(tables, 2))
 
 
-def _app(server: Protected) -> int:
+def server_pid(server: Protected) -> int:
+    """The server itself."""
     for child in children_of(server.init_pid):
         with contextlib.suppress(OSError):
             if Path(f"/proc/{child}/comm").read_text().strip() == "server":

@@ -6,7 +6,7 @@
 A program with so much memory (tests/victims/dirt.c) writes pages at random, so many MB a second (a page counts as
 4 kB, whatever is written in it).  Before each checkpoint bench/fork.c, with as much memory and one thread, times
 one plain fork(), so that noise falls on both alike.  After them it is killed some times, 0.1 s after a
-checkpoint.  Writes bench/results/dirty.json.
+checkpoint and at once.  Writes bench/results/dirty.json.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from testkit.harness import ROOT
 RESULTS = ROOT / "bench" / "results" / "dirty.json"
 THREAD_MS = 0.03
 PAUSE_S = 0.1
+AGAIN = 8
 WARM_UP = 6
 PATIENCE_S = 60.0
 
@@ -80,6 +81,8 @@ class Result:
     freeze_ms: float
     freeze_p99_ms: float
     restore_ms: float
+    restore_at_once_ms: float
+    """Killed right after a checkpoint."""
     limit_ms: float
     images: dict[str, int]
     """How many were made how."""
@@ -95,10 +98,13 @@ def checkpoint(guard: GuardProcess) -> tuple[float, str]:
     raise BenchFailed(f"no checkpoint: {event}")
 
 
-def restore_ms(guard: GuardProcess, victim: Victim) -> float:
-    """From the death's report until the last thread runs again."""
-    checkpoint(guard)
-    time.sleep(PAUSE_S)
+def restore_ms(guard: GuardProcess, victim: Victim, pause_s: float) -> float:
+    """From the death's report until the last thread runs again; killed so long after a checkpoint."""
+    # The first ones after a restore are forks.
+    for _ in range(AGAIN):
+        time.sleep(PAUSE_S)
+        checkpoint(guard)
+    time.sleep(pause_s)
     since = guard.mark()
     kill_main(victim)
     event = guard.wait("restored", since=since, timeout_s=PATIENCE_S)
@@ -122,7 +128,8 @@ def measure(case: Case, images: Images, options: argparse.Namespace, folder: Pat
                 forks.append(fork_ms)
                 freezes.append(freeze_ms)
                 made[how] += 1
-        restores = [restore_ms(guard, victim) for _ in range(options.restores)]
+        restores = [restore_ms(guard, victim, PAUSE_S) for _ in range(options.restores)]
+        at_once = [restore_ms(guard, victim, 0.0) for _ in range(options.restores)]
         victim.check()
     fork_ms = statistics.median(forks) if forker else forks_ms(case.command, folder)[0]
     freezes.sort()
@@ -135,6 +142,7 @@ def measure(case: Case, images: Images, options: argparse.Namespace, folder: Pat
         round(statistics.median(freezes), 2),
         round(freezes[len(freezes) * 99 // 100], 2),
         round(statistics.median(restores), 2) if restores else 0.0,
+        round(statistics.median(at_once), 2) if at_once else 0.0,
         round(case.part * fork_ms + (case.threads * THREAD_MS if case.part < 1 else 0.0), 2),
         dict(made),
     )
@@ -142,13 +150,13 @@ def measure(case: Case, images: Images, options: argparse.Namespace, folder: Pat
 
 def show(results: list[Result]) -> None:
     """A table; what does not hold is marked."""
-    table = Table(*("MB", "threads", "MB/s", "fork", "freeze", "p99", "its limit", "restore", "how"))
+    table = Table(*("MB", "threads", "MB/s", "fork", "freeze", "p99", "its limit", "restore", "at once", "how"))
     for r in results:
         table.add_row(
             f"{r.processes} x {r.mb}" if r.processes > 1 else str(r.mb),
             *(str(value) for value in (r.threads, r.mb_per_s, r.fork_ms)),
             f"{'' if r.freeze_ms <= r.limit_ms else '! '}{r.freeze_ms}",
-            *(str(value) for value in (r.freeze_p99_ms, r.limit_ms, r.restore_ms)),
+            *(str(value) for value in (r.freeze_p99_ms, r.limit_ms, r.restore_ms, r.restore_at_once_ms)),
             ", ".join(f"{count} {how}" for how, count in r.images.items()),
         )
     console.print(table)

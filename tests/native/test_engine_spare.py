@@ -182,7 +182,7 @@ def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:
 def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
     """It must not take much of a CPU."""
     command = f"idle {MEGABYTES} 1"
-    forks = config(0.06, images=Images.FORK)
+    forks = config(0.03, images=Images.FORK)
     with Victim(command, tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
         for _ in range(20):
             guard.wait("checkpoint", since=guard.mark())

@@ -435,8 +435,13 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	while (!poll_until(guard->fds, n,
 			   earlier(due, earlier(now_ns() + AVC_HEARTBEAT_NS,
 						guard_exec_check_due(guard)))) &&
-	       now_ns() < due && !guard_let_executed_go(guard, false))
-		;
+	       !guard_let_executed_go(guard, false)) {
+		if (now_ns() < due)
+			continue;
+		if (straggling || !guard_pace_dozes(guard))
+			break;
+		due = work_due(guard);
+	}
 }
 
 /* Nobody is to believe that there are checkpoints when there are none. */

@@ -189,12 +189,14 @@ void guard_pace_begin(struct avc_guard *guard);
 void guard_pace_end(struct avc_guard *guard);
 /* After guard_pace_begin(): that was one, or none.  They say when to look again. */
 void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event);
-void guard_pace_missed(struct avc_guard *guard);
+void guard_pace_missed(struct avc_guard *guard, uint64_t held_ns);
 void guard_pace_restored(struct avc_guard *guard);
 /* Looks whether the app has sent. */
 void guard_pace_listen(struct avc_guard *guard);
 /* It is time to look: whether a checkpoint is due now. */
 bool guard_pace_wants(struct avc_guard *guard);
+/* It is time to look, and nothing else: whether the next look is all that there is to wait for. */
+bool guard_pace_dozes(struct avc_guard *guard);
 /* Tells of a checkpoint, or soon; of those that were not told yet; when that is due. */
 void guard_tell_taken(struct avc_guard *guard, struct avc_event *event);
 void guard_tell_untold(struct avc_guard *guard);

@@ -579,7 +579,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard->unprotected = false;
 		return;
 	}
-	guard_pace_missed(guard);
+	guard_pace_missed(guard, event.freeze_ns);
 	if (error.code == AVC_GONE)
 		guard->dying_until_ns = now_ns() + DYING_NS;
 	/* Of a dying app init's report tells; this is for one that is only away. */

@@ -93,12 +93,24 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 	begin_rest(guard);
 }
 
-void guard_pace_missed(struct avc_guard *guard)
+/* It has held the app up all the same: within the budget, and no later than the next one is to be
+ * at an interval that does not change. */
+static uint64_t paid_for(const struct avc_guard *guard, uint64_t held_ns)
+{
+	const uint64_t pause = held_ns * 1000000 / guard->config.budget_freeze_ppm,
+		       longest = guard->config.interval_ns;
+
+	return now_ns() + (pause < longest ? pause : longest);
+}
+
+void guard_pace_missed(struct avc_guard *guard, uint64_t held_ns)
 {
 	if (!policy_is_automatic(&guard->config))
 		return;
 	guard_pace_end(guard);
 	guard->next_ns = policy_try_again(&guard->pace, &guard->config, now_ns());
+	if (guard->next_ns < paid_for(guard, held_ns))
+		guard->next_ns = paid_for(guard, held_ns);
 }
 
 void guard_pace_restored(struct avc_guard *guard)
@@ -131,6 +143,19 @@ static bool wants(const struct avc_guard *guard, uint64_t now)
 
 	return used < guard->pace_app_cpu_ns || /* one of them has ended */
 	       policy_wants(&guard->pace, &guard->config, activity, now);
+}
+
+/* Nearly all looks at an app that does nothing find nothing: no more than that is to be done for
+ * them. */
+bool guard_pace_dozes(struct avc_guard *guard)
+{
+	const uint64_t now = now_ns();
+
+	if (!policy_is_automatic(&guard->config) || !guard->attached || !guard->output.armed ||
+	    now < guard->next_ns || wants(guard, now))
+		return false;
+	guard->next_ns = policy_look_again(&guard->pace, now);
+	return true;
 }
 
 bool guard_pace_wants(struct avc_guard *guard)
