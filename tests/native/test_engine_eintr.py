@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import os
 import time
 from pathlib import Path
@@ -12,7 +12,6 @@ import pytest
 
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import SLOWNESS
-from testkit.procfs import threads
 
 pytestmark = pytest.mark.shared_machine("timeouts of blocked calls are compared with the clock")
 
@@ -90,22 +89,25 @@ def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.1, 1.0])
-def test_the_wait_before_the_first_stop_counts(interval_s: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["", "woken elsewhere"])
+def test_the_wait_before_the_first_stop_counts(elsewhere: bool, interval_s: float, tmp_path: Path) -> None:
     """How long a call had been waiting before it was stopped is known: it takes what it would have taken.
 
-    Not always: see docs/limits.md.  So the best third, of threads that are not woken on another
-    CPU than they slept on; of calls that were begun again, one in twelve would be as punctual.
+    All of them on a machine at rest; one in four may have to wait for a guard that gets no CPU.
     """
     seconds, n = 0.25, 12
     late = []
-    with Victim(f"eintr epoll_wait {seconds} --quiet", tmp_path) as victim, contextlib.ExitStack() as stack:
-        for tid in threads(victim.app):
-            os.sched_setaffinity(tid, {0})
-        guard = stack.enter_context(GuardProcess(config(interval_s), [victim.pid]))
+    command = f"eintr epoll_wait {seconds} --quiet"
+    with Victim(command, tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
+        cpus = itertools.cycle(os.sched_getaffinity(victim.app))
+        os.sched_setaffinity(victim.app, {next(cpus)})
         guard.wait("checkpoint")
         for _ in range(n):
             victim.board.set_counter(LONGEST, 0)
+            if elsewhere:  # where it sleeps it may not wake
+                victim.wait_beats(1)
+                os.sched_setaffinity(victim.app, {next(cpus)})
             guard.wait("checkpoint", since=guard.mark())
             victim.wait_beats(1)  # the call that was stopped ends
             late.append(victim.see().counter[LONGEST] / 1e9 - seconds)
-    assert sorted(late)[n // 3] < 0.02 * SLOWNESS, late
+    assert sorted(late)[n * 3 // 4] < 0.04 * SLOWNESS, late

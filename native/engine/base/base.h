@@ -14,6 +14,7 @@
  *   aside.c         calls that may block forever
  *   proc.c          /proc
  *   proc_text.c     parsers of its files
+ *   cpu_clock.c     the scheduler's per-CPU clocks
  *   pagemap.c       which pages of a process are present
  *   pageset.c       sets of them
  *   rt_priority.c   a CPU at once while an app waits for us
@@ -97,6 +98,14 @@ void aside_step(void);
 /* Whether the main thread no longer waits for this thread. */
 bool aside_is_left_behind(void);
 
+/* ---- cpu_clock.c ------------------------------------------------------------ */
+
+/* Converts a time by the scheduler's clock of that CPU to CLOCK_MONOTONIC. The result may be late, but
+ * never early. 0: unknown, for instance because the CPU is too busy. Main thread only. */
+uint64_t cpu_clock_when(uint32_t cpu, uint64_t ran_ns);
+/* A thousandth less: the scheduler's clocks are not adjusted as CLOCK_MONOTONIC is. */
+uint64_t cpu_clock_least(uint64_t ns);
+
 /* ---- config.c -------------------------------------------------------------- */
 
 int config_check(const struct avc_config *config, struct avc_error *err) warn_unused;
@@ -111,6 +120,7 @@ struct proc_stat {
 	uint64_t faults; /* minor faults, of all its threads */
 	uint64_t start;  /* clock ticks after boot                            */
 	int exit_signal; /* sent to its parent when it exits, 0: none */
+	uint32_t cpu;    /* the one it runs on, or ran on last */
 	int exit_status; /* of a zombie, as from wait(2) */
 	char name[16];
 };
@@ -204,8 +214,11 @@ int proc_limits(pid_t pid, uint64_t limit[LIMITS][2]);
 
 /* A task's scheduler statistics (/proc/PID/sched). */
 struct proc_sched {
-	uint64_t ran_ns; /* when it last ran, by the clock of that CPU */
-	uint64_t switches, migrations;
+	/* When it last ran, or a little later, by the clock of its current CPU (cpu_clock.c). Since
+	 * Linux 6.12 a sleeping task may be moved to another CPU with a time by the old CPU's clock;
+	 * the kernel updates its load average when it arrives there, so the later of the two counts. */
+	uint64_t ran_ns;
+	uint64_t sleeps, migrations;
 };
 
 /* -1: not available, or it has exited. */

@@ -31,10 +31,10 @@ int proc_parse_stat(const char *text, struct proc_stat *stat)
 	if (!name || !last || !p || p < name ||
 	    sscanf(p + 1,
 		   " %c %d %d %d %d %d %u %llu %*u %*u %*u %*u %*u %*d %*d %*d %*d %d %*d %llu"
-		   " %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %d",
+		   " %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %*s %d %u",
 		   &stat->state, &stat->parent, &stat->group, &stat->session, &tty,
 		   &stat->tty_group, &stat->flags, &faults, &stat->threads, &start,
-		   &stat->exit_signal) != 11)
+		   &stat->exit_signal, &stat->cpu) != 12)
 		return not_understood();
 	stat->tty = (uint32_t)tty;
 	stat->faults = faults;
@@ -59,19 +59,23 @@ int proc_parse_sched(const char *text, struct proc_sched *sched)
 {
 	/* The name comes first, unescaped, line feeds included: too short to contain both a line
 	 * feed and a key. */
-	const char *rest = strstr(text, "\n------"), *ran, *switches, *migrations;
-	unsigned long long ms, ns;
+	const char *rest = strstr(text, "\n------"), *ran, *sleeps, *migrations, *counted;
+	unsigned long long ms, ns, counted_ns;
 
 	if (!rest)
 		return not_understood();
 	ran = strstr(rest, "\nse.exec_start");
-	switches = strstr(rest, "\nnr_switches");
+	sleeps = strstr(rest, "\nnr_voluntary_switches");
 	migrations = strstr(rest, "\nse.nr_migrations");
-	if (!ran || !switches || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
-	    sscanf(switches, " %*s : %lu", &sched->switches) != 1 ||
+	if (!ran || !sleeps || !migrations || sscanf(ran, " %*s : %llu.%6llu", &ms, &ns) != 2 ||
+	    sscanf(sleeps, " %*s : %lu", &sched->sleeps) != 1 ||
 	    sscanf(migrations, " %*s : %lu", &sched->migrations) != 1)
 		return not_understood();
 	sched->ran_ns = ms * NS_PER_MS + ns;
+	counted = strstr(rest, "\nse.avg.last_update_time");
+	if (counted && sscanf(counted, " %*s : %llu", &counted_ns) == 1 &&
+	    counted_ns > sched->ran_ns)
+		sched->ran_ns = counted_ns;
 	return 0;
 }
 

@@ -3,32 +3,25 @@
  * Calls whose time is up.  A call that a checkpoint has interrupted was made again just
  * as it was (rewind.c), and would take its whole timeout once more.
  */
-#include <stdio.h>
-
 #include "process.h"
 
 #define END_DEADLINE_NS (20 * NS_PER_MS)
 #define LOOKS_MAX 64 /* of some 50 us, before a checkpoint */
 
-/* How often a thread has been given a CPU; 0: the kernel does not count. */
-static uint64_t runs_of(pid_t tid)
+/* How often a thread has gone to sleep; 0: unknown. */
+static uint64_t sleeps_of(pid_t tid)
 {
-	char buf[96];
-	unsigned long long on_cpu, waited, runs;
+	struct proc_sched sched;
 
-	return proc_read(tid, "schedstat", buf, sizeof buf) > 0 &&
-			       sscanf(buf, "%llu %llu %llu", &on_cpu, &waited, &runs) == 3
-		       ? runs
-		       : 0;
+	return proc_sched(tid, &sched) == 0 ? sched.sleeps : 0;
 }
 
-/* The thread is back in its call by now, or about to be: that takes it one more run.  If it
- * has run more often when the time is up, it has been woken, and is in another call as a
- * rule, which is not to be disturbed.  If it is still in the same one, the next checkpoint
- * ends that. */
+/* The thread is asleep in its call again by now, or about to be. If it has gone to sleep more often
+ * when the time is up, it was woken and is usually in another call, which must not be disturbed. If
+ * it is still in the same one, the next checkpoint ends that. Preemptions do not count. */
 static bool is_waiting(struct thread *thread)
 {
-	return runs_of(thread->tid) - thread->rewound.runs <= 1;
+	return sleeps_of(thread->tid) - thread->rewound.sleeps <= 1;
 }
 
 /* To be stopped is all it takes (rewind_call()). */
@@ -67,9 +60,10 @@ void waits_end(struct process *process, timer_t timer)
 
 		if (!r->mark || r->due_ns == UINT64_MAX || t->attached)
 			continue;
-		if (!r->runs_known) {
-			r->runs = runs_of(t->tid);
-			r->runs_known = true;
+		rewind_date(t);
+		if (!r->sleeps_known) {
+			r->sleeps = sleeps_of(t->tid);
+			r->sleeps_known = true;
 			r->waiting = true;
 		}
 		if (!r->waiting)

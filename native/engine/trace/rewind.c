@@ -40,6 +40,7 @@
 
 #define ERESTARTNOHAND 514 /* include/linux/errno.h */
 #define ERESTART_RESTARTBLOCK 516
+#define DATE_LOOKS 5 /* at the clock of a CPU that has no time to say what it says */
 #define FDS_PER_WORD 64
 #define FD_WORDS_MAX 16384 /* of an fd_set: a million descriptors */
 
@@ -299,32 +300,61 @@ static bool is_about_to_rewind(const struct thread *thread)
 	return thread->rewound.mark && arch_result_mark(&thread->regs) == thread->rewound.mark;
 }
 
-/* The kernel does not tell how much of its timeout an interrupted call had left.  It tells
- * when a thread ran last: for one that slept in the call, that was when the call began. */
+/* The kernel does not show how much of its timeout an interrupted call had left. It shows when a
+ * thread last ran: for a thread that slept in the call, that is when the call began. A thread takes
+ * longer to exit once its /proc files were opened (proc_flush_pid()), so only those that may need
+ * it are looked at. */
 void rewind_prepare(struct thread *thread)
 {
 	struct sleeper *s = &thread->sleeper;
-	struct proc_stat stat;
+	struct proc_stat before, after = { 0 };
 
-	s->known = (has_timeout(thread->call.nr) || arch_may_continue(thread->call.nr) ||
-		    !thread->stopped_ns) &&
-		   proc_sched(thread->tid, &s->sched) == 0 && proc_stat(thread->tid, &stat) == 0 &&
-		   stat.state == 'S';
+	s->known = (s->timed || has_timeout(thread->call.nr) ||
+		    arch_may_continue(thread->call.nr) || !thread->stopped_ns) &&
+		   proc_stat(thread->tid, &before) == 0 &&
+		   proc_sched(thread->tid, &s->sched) == 0 && proc_stat(thread->tid, &after) == 0 &&
+		   before.cpu == after.cpu && after.state == 'S';
+	s->cpu = after.cpu;
 }
 
-/* For how long a thread that has just stopped was in its call, at least; 0: nobody knows.  It
- * was, if it has run only once since, to stop, and on the same CPU, for the clocks of different
- * ones differ.  They are not those that people set their clocks by, either: a thousandth less
- * is sure not to be too much. */
-static uint64_t waited_ns(struct thread *thread)
+/* Whether a thread that has just stopped slept in its call until then: if it has gone to sleep only
+ * once since, which was to stop. It may have been preempted on the way. */
+static bool has_slept(const struct thread *thread, struct proc_sched *now)
+{
+	return thread->sleeper.known && proc_sched(thread->tid, now) == 0 &&
+	       now->sleeps == thread->sleeper.sched.sleeps + 1;
+}
+
+/* Subtracts the time that the call has taken so far. If the thread woke on another CPU than it slept
+ * on, rewind_date() does that later, while nothing is stopped. */
+static void count_sleep(struct thread *thread)
 {
 	const struct sleeper *s = &thread->sleeper;
+	struct rewound *r = &thread->rewound;
 	struct proc_sched now;
 
-	if (!s->known || proc_sched(thread->tid, &now) || now.switches != s->sched.switches + 1 ||
-	    now.migrations != s->sched.migrations || now.ran_ns < s->sched.ran_ns)
-		return 0;
-	return (now.ran_ns - s->sched.ran_ns) / 1000 * 999;
+	if (!has_slept(thread, &now))
+		return;
+	if (now.migrations != s->sched.migrations) {
+		r->cpu = s->cpu;
+		r->ran_ns = s->sched.ran_ns;
+	} else if (now.ran_ns > s->sched.ran_ns) {
+		r->due_ns -= cpu_clock_least(now.ran_ns - s->sched.ran_ns);
+	}
+}
+
+void rewind_date(struct thread *thread)
+{
+	struct rewound *r = &thread->rewound;
+	uint64_t began_ns;
+
+	if (!r->ran_ns)
+		return;
+	began_ns = cpu_clock_when(r->cpu, r->ran_ns);
+	if (began_ns && began_ns < r->since_ns)
+		r->due_ns -= r->since_ns - began_ns;
+	if (began_ns || ++r->looks == DATE_LOOKS)
+		r->ran_ns = 0;
 }
 
 /* recvmmsg(2) that was interrupted when it had some of its messages answers how many, and
@@ -357,18 +387,23 @@ static void begin_watch(const struct process *process, struct thread *thread, ui
 	thread->rewound = (struct rewound){ .mark = (uint32_t)now | 1,
 					    .answer = answer,
 					    .due_ns = UINT64_MAX };
-	if (limit_ns)
-		thread->rewound.due_ns = now + limit_ns - waited_ns(thread);
+	if (!limit_ns)
+		return;
+	thread->sleeper.timed = true;
+	thread->rewound.since_ns = now;
+	thread->rewound.due_ns = now + limit_ns;
+	count_sleep(thread);
 }
 
 void rewind_call(struct process *process, struct thread *thread)
 {
 	struct arch_regs *regs = &thread->regs;
 	struct rewound *r = &thread->rewound;
+	struct proc_sched sched;
 	const uint64_t now = now_ns();
 
 	thread->stopped_ns = now;
-	if (arch_may_continue(arch_syscall_nr(regs)) && waited_ns(thread))
+	if (arch_may_continue(arch_syscall_nr(regs)) && has_slept(thread, &sched))
 		arch_note_slept(regs);
 	note_call(process, thread);
 	if (arch_syscall_nr(regs) < 0 || is_about_to_rewind(thread))
@@ -388,7 +423,7 @@ void rewind_call(struct process *process, struct thread *thread)
 	} else if (arch_syscall_result(regs) != -ERESTARTNOHAND || !is_rewound(thread)) {
 		return;
 	} /* else stopped again before it has run: as it was left */
-	r->runs_known = false;
+	r->sleeps_known = false;
 	if (now >= r->due_ns)
 		answer_late(thread);
 	else if (r->due_ns < process->due_ns)

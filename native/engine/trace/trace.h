@@ -40,14 +40,19 @@ struct call {
 struct rewound {
 	uint32_t mark; /* of that call; 0: none                            */
 	int answer;    /* when its time is up                              */
-	uint64_t due_ns;
-	uint64_t runs;            /* how often the thread had run when it was waiting again */
-	bool runs_known, waiting; /* waits.c                                        */
+	uint64_t since_ns, due_ns;
+	/* It began at this time by the clock of that CPU (cpu_clock.c), not yet converted;
+	 * 0: nothing to convert. */
+	uint64_t ran_ns;
+	uint32_t cpu, looks;
+	uint64_t sleeps; /* of the thread, once it waited again (waits.c) */
+	bool sleeps_known, waiting;
 };
 
 /* A thread that slept, as far as one can tell from outside, just before it was stopped. */
 struct sleeper {
-	bool known;
+	bool known, timed; /* timed: a call of it with a timeout was rewound before */
+	uint32_t cpu;
 	struct proc_sched sched;
 };
 
@@ -357,6 +362,8 @@ void rewind_original(const struct thread *thread, struct arch_regs *regs);
 /* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
  * it sleeps. */
 void rewind_prepare(struct thread *thread);
+/* Once the thread runs again: finds out when its rewound call began, if that is still unknown. */
+void rewind_date(struct thread *thread);
 
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
