@@ -55,6 +55,7 @@ def main() -> int:
             "checkpoints": sum(row["checkpoints"] for row in rows),
             "missed": sum(row["missed"] for row in rows),
             "tokens": int(_said(members[0])[-2].split()[0]) if not wrong else 0,
+            "connections_lost": sum(int(_said(each)[-2].split()[2]) for each in members) if not wrong else 0,
             "freeze_median_ms": round(statistics.median(freezes) * 1000, 2),
             "freeze_p99_ms": round(sorted(freezes)[len(freezes) * 99 // 100] * 1000, 2),
             "restore_median_ms": round(statistics.median(died) * 1000, 1) if died else 0,

@@ -489,11 +489,12 @@ int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config
 
 int avc_meeting_new(uint32_t members, struct avc_error *err)
 {
-	const struct avc_meeting meeting = { .members = members };
 	int fd = memfd_create("avckpt-meeting", MFD_CLOEXEC | MFD_ALLOW_SEALING);
 
 	*err = (struct avc_error){ 0 };
-	if (fd >= 0 && pwrite(fd, &meeting, sizeof meeting, 0) == sizeof meeting &&
+	if (fd >= 0 && ftruncate(fd, sizeof(struct avc_meeting)) == 0 &&
+	    pwrite(fd, &members, sizeof members, offsetof(struct avc_meeting, members)) ==
+		    sizeof members &&
 	    fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW) == 0)
 		return fd;
 	fail_errno(err, 0, "meet", "memfd_create", "no memory to share");

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A member of a ring that passes numbered tokens over TCP at full rate.
+"""A member of a ring that passes numbered tokens over TCP, or Unix sockets, at full rate.
 
-    python ring.py INDEX MEMBERS PORT
+    python ring.py INDEX MEMBERS PORT|FOLDER
 
 Member 0 makes the tokens 1, 2, 3, ... and stops for a moment when WINDOW of them are under way; the
 others pass them on.  Each keeps a ledger, the number of the last token that it got and gave; nothing
@@ -23,9 +23,22 @@ WINDOW = 2000
 TOKEN = 8
 ROOM = 65536
 
-index, members, port = map(int, sys.argv[1:])
+index, members = map(int, sys.argv[1:3])
 got = gave = lost = 0
-listening = socket.create_server(("127.0.0.1", port + index), backlog=8)
+
+
+def address(of: int) -> str | tuple[str, int]:
+    return ("127.0.0.1", int(sys.argv[3]) + of) if sys.argv[3].isdigit() else f"{sys.argv[3]}/{of}"
+
+
+def new_socket() -> socket.socket:
+    return socket.socket(socket.AF_INET if sys.argv[3].isdigit() else socket.AF_UNIX)
+
+
+listening = new_socket()
+listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+listening.bind(address(index))
+listening.listen(8)
 listening.setblocking(False)
 before: socket.socket | None = None
 after: socket.socket | None = None
@@ -80,9 +93,15 @@ def drop_before() -> None:
 def connect() -> None:
     global after, connected
     connected = time.monotonic()
-    with contextlib.suppress(OSError):
-        after = socket.create_connection(("127.0.0.1", port + (index + 1) % members), timeout=0.2)
-        after.setblocking(False)
+    caller = new_socket()
+    caller.settimeout(0.2)
+    try:
+        caller.connect(address((index + 1) % members))
+    except OSError:
+        caller.close()
+        return
+    caller.setblocking(False)
+    after = caller
 
 
 def greet(data: bytes) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -46,13 +47,13 @@ def free_ports(count: int) -> int:
     raise AssertionError("no free ports")
 
 
-@pytest.fixture
-def ring(local: LocalSidecar) -> list[Container]:
+@pytest.fixture(params=["tcp"])
+def ring(local: LocalSidecar, tmp_path: Path, request: pytest.FixtureRequest) -> list[Container]:
     """Members that pass numbered tokens at full rate (testkit/programs/ring.py), in a line of all."""
-    port = str(free_ports(MEMBERS))
+    where = str(free_ports(MEMBERS)) if request.param == "tcp" else str(tmp_path)
     program = [sys.executable, "-u", str(ROOT / "testkit/programs/ring.py")]
     members = [
-        local.protected(f"member{index}", [*program, str(index), str(MEMBERS), port], TOGETHER)
+        local.protected(f"member{index}", [*program, str(index), str(MEMBERS), where], TOGETHER)
         for index in range(MEMBERS)
     ]
     wait_for_line(local, members)
@@ -102,6 +103,12 @@ def tokens(member: Container) -> int:
     return next((int(words[0]) for words in reversed(lines) if len(words) == 3 and words[0].isdigit()), 0)
 
 
+def lost_connections(member: Container) -> int:
+    """As it has said last."""
+    lines = [line.split() for line in said(member)[:-1]]
+    return next(int(words[2]) for words in reversed(lines) if len(words) == 3 and words[2].isdigit())
+
+
 def check_ledgers(ring: list[Container]) -> None:
     """They agree, and go on to."""
     wrong = [line for member in ring for line in said(member) if "WRONG" in line or "Traceback" in line]
@@ -114,6 +121,7 @@ def told(local: LocalSidecar, kind: str) -> list[dict[str, Any]]:
     return [event for event in Client(local.run_dir).history() if event["kind"] == kind]
 
 
+@pytest.mark.parametrize("ring", ["tcp", "unix"], indirect=True)
 def test_ledgers_agree_after_any_death(local: LocalSidecar, ring: list[Container]) -> None:
     for death in range(1, 6):
         victim = ring[death % MEMBERS]
@@ -121,6 +129,7 @@ def test_ledgers_agree_after_any_death(local: LocalSidecar, ring: list[Container
         wait_for_restores(local, ring, death)
         wait_for_line(local, ring, row(local, victim)["line"])
     check_ledgers(ring)
+    assert [lost_connections(member) for member in ring] == [0] * MEMBERS
     restored = told(local, "restored")
     assert len(restored) == 5 * MEMBERS
     for death in range(5):
@@ -177,3 +186,99 @@ def test_without_a_line_nobody_is_killed(local: LocalSidecar) -> None:
     os.kill(members[0].app_pid, signal.SIGKILL)
     assert members[0].status() == 128 + signal.SIGKILL
     assert (members[1].app_pid, row(local, members[1])["restores"]) == (survivor, 0)
+
+
+# What both do after the line, when there is a file that is not rolled back.
+SENDER = """
+import os, socket, sys, time
+to = socket.create_connection(("127.0.0.1", int(sys.argv[1])))
+to.sendall(b"0123456789" * 50)
+print("SENT", flush=True)
+while not os.path.exists(sys.argv[2]):
+    time.sleep(0.01)
+for _ in range(100):
+    to.sendall(b"later")
+    time.sleep(0.005)
+print("ENDED", to.recv(1), flush=True)
+time.sleep(1000)
+"""
+RECEIVER = """
+import os, socket, sys, time
+end, _ = socket.create_server(("127.0.0.1", int(sys.argv[1]))).accept()
+while not os.path.exists(sys.argv[2]):
+    time.sleep(0.01)
+got = b""
+while len(got) < 1000 and (data := end.recv(4096)):
+    got += data
+print("GOT", got == b"0123456789" * 50 + b"later" * 100, flush=True)
+end.sendall(b"!")
+time.sleep(1000)
+"""
+RARELY = {**TOGETHER, "avckpt.interval": "1h"}
+
+
+def pair(local: LocalSidecar, programs: list[str], go: Path) -> list[Container]:
+    """The one that listens first, connected to the other, and a line of both: after that there is the file `go`."""
+    arguments = [str(free_ports(1)), str(go)]
+    members = [local.protected("server", [sys.executable, "-uc", programs[0], *arguments], RARELY)]
+    members.append(
+        local.protected(
+            "client", ["sh", "-c", 'sleep 1; exec "$@"', "sh", sys.executable, "-uc", programs[1], *arguments], RARELY
+        )
+    )
+    wait_until(lambda: "SENT" in said(members[1]), 10, "it has sent")
+    wait_until(lambda: local.avckpt("checkpoint", "client", check=False).status == 0, 20, "a line")
+    wait_for_line(local, members)
+    go.touch()
+    return members
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_what_was_on_its_way_is_so_again(local: LocalSidecar, tmp_path: Path, victim: int) -> None:
+    """It was not read yet at the line, and has been since; and what was sent later never was."""
+    members = pair(local, [RECEIVER, SENDER], tmp_path / "go")
+    time.sleep(0.2)
+    before = said(members[1]).count("ENDED b'!'")
+    os.kill(members[victim].app_pid, signal.SIGKILL)
+    wait_for_restores(local, members, 1)
+    wait_until(lambda: said(members[1]).count("ENDED b'!'") > before, 20, "it was answered")
+    assert set(said(members[0])) == {"GOT True"}
+
+
+CANNOT = {
+    "full": "to.setblocking(False)\ntry:\n    while to.send(b'x' * 65536): pass\nexcept OSError: pass",
+    "urgent": "to.send(b'x', socket.MSG_OOB)",
+}
+
+
+@pytest.mark.parametrize("state", ["full", "urgent"])
+def test_a_connection_that_cannot_go_on_is_reset_and_told(local: LocalSidecar, tmp_path: Path, state: str) -> None:
+    server = """
+import os, socket, sys, time
+end, _ = socket.create_server(("127.0.0.1", int(sys.argv[1]))).accept()
+while not os.path.exists(sys.argv[2]):
+    time.sleep(0.01)
+while end.recv(65536):
+    pass
+"""
+    client = f"""
+import os, socket, sys, time
+to = socket.create_connection(("127.0.0.1", int(sys.argv[1])))
+{CANNOT[state]}
+print("SENT")
+while not os.path.exists(sys.argv[2]):
+    time.sleep(0.01)
+to.setblocking(True)
+try:
+    while True:
+        to.send(b"y")
+        time.sleep(0.01)
+except OSError as error:
+    print("RESET", error)
+time.sleep(1000)
+"""
+    members = pair(local, [server, client], tmp_path / "go")
+    time.sleep(0.5)
+    os.kill(members[1].app_pid, signal.SIGKILL)
+    wait_until(lambda: any(line.startswith("RESET") for line in said(members[1])), 20, f"{said(members[1])}")
+    assert any("connections have ended" in json.dumps(event) for event in told(local, "restored"))

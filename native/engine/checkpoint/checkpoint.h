@@ -101,6 +101,7 @@ struct generation {
 	char written[FILES_NAME];  /* avckpt.files: what was written since; "": none */
 	struct spare spare;        /* of the main process                              */
 	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                   */
+	struct group_ends *ends;   /* of connections in its group; NULL: none           */
 };
 
 /* ---- freeze.c ------------------------------------------------------------------ */
@@ -113,9 +114,9 @@ struct freeze {
 	timer_t timer;
 	uint64_t deadline_ns;
 	struct mem_seen seen; /* the shared memory that is prepared for already   */
-	/* Of one that is part of a line: called when everything has been read and cloned, or
-	 * (not `whole`) could not be, and before anything is let go.  NULL: it is not. */
-	int (*meet)(void *arg, bool whole, struct avc_error *err);
+	/* Of one that is part of a line: called when everything has been read and cloned, or (NULL)
+	 * could not be, and before anything is let go.  NULL: it is not. */
+	int (*meet)(void *arg, struct generation *whole, struct avc_error *err);
 	void *arg;
 	/* What it took. */
 	uint64_t freeze_ns, stop_ns, clone_ns;

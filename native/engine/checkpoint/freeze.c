@@ -377,7 +377,9 @@ static int meet_others(struct freeze *freeze, int result, struct avc_error *err)
 		return result;
 	if (!result)
 		result = rest_all(freeze, err);
-	return freeze->meet(freeze->arg, !result, result ? &failed : err) ? -1 : result;
+	return freeze->meet(freeze->arg, result ? NULL : freeze->generation, result ? &failed : err)
+		       ? -1
+		       : result;
 }
 
 /* The main thread first: otherwise it would have to share the CPUs with all others. */

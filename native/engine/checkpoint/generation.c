@@ -406,6 +406,7 @@ void generation_drop(struct generation *generation)
 	if (spare_is_unknown(generation))
 		tracee_end_now(); /* the kernel has made one by now, or never will */
 	restore_plan_free(generation->plan);
+	files_ends_free(generation->ends);
 	free(generation->image);
 	*generation = (struct generation){ 0 };
 }

@@ -97,9 +97,21 @@ bool files_is_older(const struct image *image, int fd, const struct stat *st);
 int files_check_auto(const struct image *image, int pidfd, pid_t init,
 		     struct avc_error *err) warn_unused;
 
-/* files_group.c: discards what others have sent to a dead app since the checkpoint, by datagrams
- * and Unix sockets.  `pidfd` is that of a process that has its table as it is now. */
-void files_forget_others(const struct image *image, int pidfd, const struct avc_config *config);
+/* files_group.c: connections between apps that are rolled back together.  At a line: lists the ends
+ * of a stopped app (NULL: there are none, or no memory); keeps what is in flight, when all members
+ * are stopped. */
+struct avc_board;
+struct group_ends *files_ends_new(const struct image *image, uint32_t images,
+				  struct avc_board *board);
+void files_ends_keep(struct group_ends *ends, struct avc_board *board);
+void files_ends_free(struct group_ends *ends);
+/* At a rollback, when all members are dead: discards what others have sent since, and publishes the
+ * ends that can be kept; when all members have done that, puts back in flight what was.  Returns how
+ * many connections had to be closed. */
+void files_ends_show(struct group_ends *ends, struct image *image, uint32_t images,
+		     const struct avc_config *config, struct avc_board *board);
+uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
+			 const struct avc_config *config, struct avc_board *board);
 
 /* files_mapped.c: contents of files that are mapped for writing.  Before a freeze; NULL: out of
  * memory. */
@@ -191,6 +203,7 @@ struct file_socket {
 	struct file_node *node; /* files_unix.c, allocated, NULL: none or not known */
 	uint64_t peer;          /* inode of the other end of a Unix socket, 0: not known    */
 	bool asked;             /* for that                                               */
+	uint64_t partner;       /* the same of one that was connected by a name             */
 	socklen_t local_bytes, remote_bytes;
 	struct sockaddr_storage local, remote;
 };
@@ -256,6 +269,7 @@ struct file {
 	int tcp_state; /* 0: no connection over a network                           */
 	/* In the middle of a message, as far as known (files_stream.c) */
 	bool tcp_coming, tcp_going;
+	bool goes_on; /* at a restore: its other end was rolled back, too (files_group.c) */
 	/* What can be read from it, when its other end is the app's own as well   */
 	uint8_t *content; /* of messages: each with its length in front, uint32_t  */
 	uint32_t content_bytes;
@@ -367,6 +381,9 @@ uint8_t file_shut(int fd);
 void file_look_at_socket(int fd, struct file *file);
 void file_look_at_tcp(int fd, struct file *file, const struct file_socket *socket);
 void files_find_peers(struct files *files, pid_t pid);
+/* The same of Unix sockets that were connected by a name. */
+void files_find_partners(struct files *files, pid_t pid);
+bool file_has_name(const struct file_socket *socket);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(struct files *files, const struct file *file);
 void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);

@@ -3,20 +3,57 @@
  * A dead app that goes back together with others (avckpt.group.recovery=together): what they
  * have sent to each other since is taken away, and nobody runs who could send more.
  *
- * TCP connections on which something moved are reset, at both ends, before anything of them
- * is looked at for the restore: after the other end's reset there may still be something to
- * read.  Nothing counts the bytes of a Unix connection or the datagrams.
+ * A connection both of whose ends go back goes on.  The kernel's sockets are those of now: both
+ * ends are read to where the other one has written, and then what was on its way at the line is
+ * sent once more, by the socket of the one that had sent it.  What that was is kept by the end that
+ * it was for: while all stand still, it waits there to be read.  Where that cannot be done, and of
+ * all other connections on which something moved, TCP is reset at both ends, before anything of it is
+ * looked at for the restore: after the other end's reset there may still be something to read.
+ *
+ * Which two ends belong together, the guards find out on a board that they share (avckpt/guard.h).
  */
+#include <arpa/inet.h>
 #include <fcntl.h>
+#include <linux/sockios.h>
+#include <linux/tcp.h>
 #include <netinet/in.h>
 #include <poll.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "avckpt/guard.h"
 #include "files.h"
 
 #define EMPTY_NS (100 * NS_PER_MS) /* of one socket; others may go on to send to it        */
+#define COMES_NS (2 * NS_PER_MS)   /* of all, while everything stands still              */
+#define MEND_NS (500 * NS_PER_MS)  /* of all, when everything is dead                     */
+#define LOOK_US 20
+#define ENDS_MAX 1024
+#define SYN_BYTES 1 /* which who has connected has had acknowledged as well           */
+#define PROTOCOL_UNIX UINT32_C(256)
+
+/* One end of a connection. */
+struct group_end {
+	uint64_t ino;
+	struct avc_end_name own, other;
+	bool kept; /* what was on its way to it is known                           */
+	uint8_t *content;
+	uint32_t bytes;
+	const struct file *file; /* of any of the images that have it                     */
+	int fd;                  /* of ours; -1: none                                       */
+	int shown;               /* where on the board; -1: not there                       */
+	uint64_t surplus;        /* bytes that are still to be read away                     */
+	uint32_t sent;
+};
+
+struct group_ends {
+	uint32_t count;
+	struct group_end end[ENDS_MAX];
+};
 
 static void empty(int fd)
 {
@@ -46,12 +83,6 @@ static void turn_away(int fd)
 	}
 }
 
-/* Both ends of one without a name are the app's own (socketpair(2)). */
-static bool has_name(const struct file_socket *s)
-{
-	return s->local_bytes > sizeof(sa_family_t) || s->remote_bytes > sizeof(sa_family_t);
-}
-
 /* What was on its way at the checkpoint and has come since counts, too. */
 static bool has_moved(int fd, const struct file *then)
 {
@@ -71,9 +102,9 @@ static void forget(int fd, const struct file *then, const struct avc_config *con
 	if (s->listening) {
 		turn_away(fd);
 	} else if (s->type == SOCK_DGRAM) {
-		if (s->domain != AF_UNIX || has_name(s))
+		if (s->domain != AF_UNIX || file_has_name(s))
 			empty(fd);
-	} else if (s->domain == AF_UNIX && s->connected && has_name(s)) {
+	} else if (s->domain == AF_UNIX && s->connected && file_has_name(s)) {
 		shutdown(fd, SHUT_RDWR);
 		empty(fd);
 	} else if (s->protocol == IPPROTO_TCP && (s->connected || then->tcp_state) &&
@@ -83,22 +114,494 @@ static void forget(int fd, const struct file *then, const struct avc_config *con
 	}
 }
 
-void files_forget_others(const struct image *image, int pidfd, const struct avc_config *config)
+/* ---- ends ----------------------------------------------------------------------------------- */
+
+static bool is_tcp(const struct group_end *end)
 {
-	const struct files *files = image->files;
+	return end->own.protocol == IPPROTO_TCP;
+}
 
-	for (uint32_t i = 0; files && i < files->count; i++) {
-		const struct file *f = &files->file[i];
-		struct stat st;
-		int fd;
+static bool is_stream(const struct file *f)
+{
+	return f->socket->type == SOCK_STREAM;
+}
 
-		if (f->kind != FILE_SOCKET || !f->socket || f->outside ||
-		    files_leader(files, f) != i)
-			continue;
-		fd = proc_borrow_fd(pidfd, f->fd);
-		/* Or it was closed since. */
-		if (fd >= 0 && fstat(fd, &st) == 0 && st.st_ino == f->ino)
-			forget(fd, f, config);
-		close_fd(&fd);
+static bool may_go_on(const struct file *f)
+{
+	const struct file_socket *s = f->kind == FILE_SOCKET ? f->socket : NULL;
+
+	if (!s || f->outside || !s->connected || f->flags & O_PATH)
+		return false;
+	if (s->domain == AF_UNIX)
+		return (s->type == SOCK_STREAM || s->type == SOCK_SEQPACKET) && s->partner;
+	return s->protocol == IPPROTO_TCP && s->type == SOCK_STREAM;
+}
+
+static int option(int fd, int level, int name)
+{
+	int value = 0;
+	socklen_t bytes = sizeof value;
+
+	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
+}
+
+/* Nothing of it is shut down or broken, and nothing is read from it out of turn. */
+static bool is_whole(int fd)
+{
+	struct pollfd state = { .fd = fd, .events = POLLRDHUP | POLLPRI };
+
+	return poll(&state, 1, 0) == 0 && option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0;
+}
+
+/* IPv4 as IPv6 has it, for one end may call it so. */
+static bool name_address(struct avc_end_name *name, const struct sockaddr_storage *address,
+			 uint64_t network)
+{
+	const struct sockaddr_in *v4 = (const struct sockaddr_in *)address;
+	const struct sockaddr_in6 *v6 = (const struct sockaddr_in6 *)address;
+
+	name->protocol = IPPROTO_TCP;
+	if (address->ss_family == AF_INET) {
+		name->address[10] = name->address[11] = 0xff;
+		memcpy(name->address + 12, &v4->sin_addr, sizeof v4->sin_addr);
+		name->port = v4->sin_port;
+	} else if (address->ss_family == AF_INET6) {
+		memcpy(name->address, &v6->sin6_addr, sizeof name->address);
+		name->port = v6->sin6_port;
+	} else {
+		return false;
 	}
+	v6 = &(const struct sockaddr_in6){ 0 };
+	if (!memcmp(name->address, &in6addr_loopback, sizeof in6addr_loopback) ||
+	    (!memcmp(name->address, "\0\0\0\0\0\0\0\0\0\0\xff\xff\x7f", 13)))
+		name->where = network;
+	return true;
+}
+
+static bool name_tcp(int fd, struct group_end *end)
+{
+	struct sockaddr_storage own = { 0 }, other = { 0 };
+	socklen_t own_bytes = sizeof own, other_bytes = sizeof other;
+	uint64_t network = 0;
+	socklen_t bytes = sizeof network;
+
+	return getsockopt(fd, SOL_SOCKET, SO_NETNS_COOKIE, &network, &bytes) == 0 &&
+	       getsockname(fd, (struct sockaddr *)&own, &own_bytes) == 0 &&
+	       getpeername(fd, (struct sockaddr *)&other, &other_bytes) == 0 &&
+	       name_address(&end->own, &own, network) && name_address(&end->other, &other, network);
+}
+
+static bool name_unix(const struct file *f, struct group_end *end)
+{
+	end->own = (struct avc_end_name){ .where = f->ino, .protocol = PROTOCOL_UNIX };
+	end->other = (struct avc_end_name){ .where = f->socket->partner,
+					    .protocol = PROTOCOL_UNIX };
+	return true;
+}
+
+/* Bytes, as the application has written them and as they have come; false: it is not known. */
+static bool count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
+{
+	struct tcp_info info = { 0 };
+	socklen_t bytes = sizeof info;
+	char layer[16];
+	socklen_t layer_bytes = sizeof layer;
+	int waiting = 0, going = 0;
+	uint64_t sent;
+
+	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) ||
+	    bytes < offsetof(struct tcp_info, tcpi_dsack_dups) || info.tcpi_state != 1 ||
+	    ioctl(fd, SIOCINQ, &waiting) || ioctl(fd, SIOCOUTQ, &going) ||
+	    (getsockopt(fd, IPPROTO_TCP, TCP_ULP, layer, &layer_bytes) == 0 && layer_bytes))
+		return false;
+	sent = info.tcpi_bytes_sent - info.tcpi_bytes_retrans + info.tcpi_notsent_bytes;
+	*written = info.tcpi_bytes_acked + (uint64_t)going;
+	*received = info.tcpi_bytes_received;
+	*unread = (uint64_t)waiting;
+	if (*written == sent + SYN_BYTES)
+		*written = sent;
+	return *written == sent;
+}
+
+static void show(struct group_end *end, struct avc_board *board, uint64_t written)
+{
+	const uint32_t at = __atomic_add_fetch(&board->ends, 1, __ATOMIC_ACQ_REL) - 1;
+
+	if (at >= AVC_BOARD_ENDS)
+		return;
+	board->end[at] = (struct avc_end){ end->own, end->other, written, 0, 0 };
+	end->shown = (int)at;
+}
+
+/* NULL: there is none, or more than one. */
+static const struct avc_end *find_other(const struct group_end *end, const struct avc_board *board)
+{
+	const uint32_t all = __atomic_load_n(&board->ends, __ATOMIC_ACQUIRE);
+	const struct avc_end *found = NULL;
+
+	for (uint32_t i = 0; i < all && i < AVC_BOARD_ENDS; i++) {
+		const struct avc_end *other = &board->end[i];
+
+		if ((int)i == end->shown || memcmp(&other->own, &end->other, sizeof end->own) ||
+		    memcmp(&other->other, &end->own, sizeof end->own))
+			continue;
+		if (found)
+			return NULL;
+		found = other;
+	}
+	return found;
+}
+
+static struct group_end *find_end(struct group_ends *ends, uint64_t ino)
+{
+	for (uint32_t i = 0; ends && i < ends->count; i++)
+		if (ends->end[i].ino == ino)
+			return &ends->end[i];
+	return NULL;
+}
+
+static void drop_end(struct group_end *end)
+{
+	close_fd(&end->fd);
+	end->shown = -1;
+}
+
+/* ---- a line ------------------------------------------------------------------------------------ */
+
+static void add_end(struct group_ends *ends, const struct file *f, int pidfd,
+		    struct avc_board *board)
+{
+	struct group_end *end = &ends->end[ends->count];
+	uint64_t written = 0, ignored;
+
+	if (ends->count == ENDS_MAX || find_end(ends, f->ino))
+		return;
+	*end = (struct group_end){ .ino = f->ino, .file = f, .shown = -1 };
+	end->fd = proc_borrow_fd(pidfd, f->fd);
+	if (end->fd >= 0 && is_whole(end->fd) &&
+	    (f->socket->domain == AF_UNIX
+		     ? name_unix(f, end)
+		     : name_tcp(end->fd, end) &&
+			       count_tcp(end->fd, &written, &ignored, &ignored))) {
+		show(end, board, written);
+		ends->count++;
+	} else {
+		drop_end(end);
+	}
+}
+
+struct group_ends *files_ends_new(const struct image *image, uint32_t images,
+				  struct avc_board *board)
+{
+	struct group_ends *ends = NULL;
+
+	for (uint32_t i = 0; i < images; i++) {
+		struct files *files = image[i].files;
+		bool any = false;
+
+		if (!files || !image[i].process)
+			continue;
+		files_find_partners(files, image[i].process->pid);
+		for (uint32_t k = 0; k < files->count; k++)
+			any |= may_go_on(&files->file[k]);
+		if (any && !ends)
+			ends = calloc(1, sizeof *ends);
+		for (uint32_t k = 0; any && ends && k < files->count; k++)
+			if (may_go_on(&files->file[k]))
+				add_end(ends, &files->file[k], image[i].process->pidfd, board);
+	}
+	return ends;
+}
+
+/* Who has sent may wait for an acknowledgement before it sends the rest (Nagle). */
+static void acknowledge(int fd)
+{
+	const int yes = 1;
+
+	setsockopt(fd, IPPROTO_TCP, TCP_QUICKACK, &yes, sizeof yes);
+}
+
+/* Whether everything has come that was written. */
+static bool has_come(const struct group_end *end, uint64_t written, uint64_t *unread,
+		     uint64_t until)
+{
+	uint64_t ignored, received;
+
+	while (count_tcp(end->fd, &ignored, &received, unread)) {
+		if (received == written)
+			return true;
+		if (now_ns() > until)
+			break;
+		acknowledge(end->fd);
+		usleep(LOOK_US);
+	}
+	return false;
+}
+
+/* Of messages, only one: to look at others takes an option of the socket. */
+static bool keep_bytes(struct group_end *end, uint64_t bytes)
+{
+	struct iovec io;
+	struct msghdr head = { .msg_iov = &io, .msg_iovlen = 1 };
+	ssize_t n;
+
+	if (!bytes)
+		return true;
+	if (bytes > CONTENT_MAX || !budget_has(bytes) || !budget_take(bytes))
+		return false;
+	end->content = malloc(bytes);
+	if (!end->content)
+		return false;
+	io = (struct iovec){ end->content, bytes };
+	n = recvmsg(end->fd, &head, MSG_PEEK | MSG_DONTWAIT);
+	end->bytes = (uint32_t)bytes;
+	/* It came with descriptors, or says who has sent it. */
+	return n == (ssize_t)bytes && !(head.msg_flags & (MSG_CTRUNC | MSG_TRUNC));
+}
+
+void files_ends_keep(struct group_ends *ends, struct avc_board *board)
+{
+	const uint64_t until = now_ns() + COMES_NS;
+
+	for (uint32_t i = 0; ends && i < ends->count; i++) {
+		struct group_end *end = &ends->end[i];
+		const struct avc_end *other = end->shown < 0 ? NULL : find_other(end, board);
+		uint64_t unread = 0;
+		int waiting = 0;
+
+		if (other && is_tcp(end)) {
+			end->kept = has_come(end, other->written, &unread, until) &&
+				    keep_bytes(end, unread);
+		} else if (other && ioctl(end->fd, SIOCINQ, &waiting) == 0) {
+			struct pollfd some = { .fd = end->fd, .events = POLLIN };
+
+			/* An empty message is one, too. */
+			end->kept = (waiting || poll(&some, 1, 0) == 0) &&
+				    keep_bytes(end, (uint64_t)waiting);
+		}
+		drop_end(end);
+	}
+}
+
+void files_ends_free(struct group_ends *ends)
+{
+	for (uint32_t i = 0; ends && i < ends->count; i++) {
+		close_fd(&ends->end[i].fd);
+		free(ends->end[i].content);
+	}
+	free(ends);
+}
+
+/* ---- a return ------------------------------------------------------------------------------------ */
+
+/* A process that has its table as it is now, when it is dead; -1: there is none. */
+static int table_of(const struct image *image)
+{
+	if (!image->process || !image->files)
+		return -1;
+	if (!image->process->descendant)
+		return image->pidfd;
+	return image->process->holder ? image->process->holder_pidfd : -1;
+}
+
+/* What is behind that descriptor now, if it still is the same; -1: it is not. */
+static int borrow(int pidfd, const struct file *f)
+{
+	struct stat st;
+	int fd = proc_borrow_fd(pidfd, f->fd);
+
+	if (fd >= 0 && (fstat(fd, &st) || st.st_ino != f->ino))
+		close_fd(&fd);
+	return fd;
+}
+
+static bool put_on_board(const struct group_end *end, struct avc_board *board)
+{
+	struct avc_end *shown = &board->end[end->shown];
+	const uint32_t next = __atomic_add_fetch(&board->bytes, end->bytes, __ATOMIC_ACQ_REL);
+
+	if (next > AVC_BOARD_BYTES || next < end->bytes)
+		return false;
+	shown->at = next - end->bytes;
+	shown->bytes = end->bytes;
+	if (end->bytes)
+		memcpy(board->content + shown->at, end->content, end->bytes);
+	return true;
+}
+
+/* False: it cannot go on. */
+static bool try_show(struct group_end *end, struct avc_board *board)
+{
+	uint64_t written = 0, ignored;
+
+	if (!end->kept || end->bytes > CONTENT_MAX || !is_whole(end->fd) ||
+	    (is_tcp(end) && !count_tcp(end->fd, &written, &ignored, &ignored)))
+		return false;
+	if (!is_tcp(end))
+		empty(end->fd);
+	show(end, board, written);
+	if (end->shown < 0 || put_on_board(end, board))
+		return end->shown >= 0;
+	memset(&board->end[end->shown], 0, sizeof *board->end);
+	return false;
+}
+
+void files_ends_show(struct group_ends *ends, struct image *image, uint32_t images,
+		     const struct avc_config *config, struct avc_board *board)
+{
+	for (uint32_t i = 0; ends && i < ends->count; i++)
+		drop_end(&ends->end[i]);
+	for (uint32_t i = 0; i < images; i++) {
+		struct files *files = image[i].files;
+		const int pidfd = table_of(&image[i]);
+
+		for (uint32_t k = 0; pidfd >= 0 && k < files->count; k++) {
+			struct file *f = &files->file[k];
+			struct group_end *end;
+			int fd;
+
+			f->goes_on = false;
+			if (f->kind != FILE_SOCKET || !f->socket || f->outside ||
+			    files_leader(files, f) != k)
+				continue;
+			end = find_end(ends, f->ino);
+			if (end && end->fd >= 0)
+				continue;
+			fd = borrow(pidfd, f);
+			if (fd < 0)
+				continue;
+			if (end) {
+				end->fd = fd;
+				end->file = f;
+				if (!try_show(end, board))
+					end->shown = -1;
+			} else {
+				forget(fd, f, config);
+				close(fd);
+			}
+		}
+	}
+}
+
+/* APART: the other end does not go on with it. */
+enum mend_state { APART, MENDING, MENDED, TORN };
+
+static enum mend_state mend(struct group_end *end, const struct avc_end *other,
+			    const struct avc_board *board)
+{
+	const uint32_t bytes = other->bytes;
+	ssize_t n;
+
+	if (end->surplus) {
+		/* TCP throws away what it is told to truncate: tcp(7). */
+		n = recv(end->fd, NULL, end->surplus < 1 << 30 ? end->surplus : 1 << 30,
+			 MSG_TRUNC | MSG_DONTWAIT);
+		if (n > 0)
+			end->surplus -= (uint64_t)n;
+		else if (n == 0)
+			return TORN;
+		else
+			acknowledge(end->fd);
+	}
+	if (end->sent < bytes) {
+		n = send(end->fd, board->content + other->at + end->sent, bytes - end->sent,
+			 MSG_DONTWAIT | MSG_NOSIGNAL);
+		if (n > 0)
+			end->sent += (uint32_t)n;
+		else if (!is_stream(end->file))
+			return TORN;
+	}
+	return end->surplus || end->sent < bytes ? MENDING : MENDED;
+}
+
+/* What is on the board is somebody else's, and so it is looked at once. */
+static bool begin_mend(struct group_end *end, struct avc_end *copy, const struct avc_board *board)
+{
+	const struct avc_end *other = end->shown < 0 ? NULL : find_other(end, board);
+	uint64_t ignored, received = 0, unread = 0;
+
+	if (!other)
+		return false;
+	*copy = *other;
+	end->sent = 0;
+	end->surplus = 0;
+	if (copy->bytes > CONTENT_MAX || copy->at > AVC_BOARD_BYTES - copy->bytes)
+		return false;
+	if (!is_tcp(end))
+		return true;
+	/* As far as the other one had written before anything of this is sent, and no further. */
+	if (!count_tcp(end->fd, &ignored, &received, &unread) || copy->written + unread < received)
+		return false;
+	end->surplus = copy->written + unread - received;
+	return true;
+}
+
+static void let_go_on(struct image *image, uint32_t images, uint64_t ino)
+{
+	for (uint32_t i = 0; i < images; i++)
+		for (uint32_t k = 0; image[i].files && k < image[i].files->count; k++)
+			if (image[i].files->file[k].kind == FILE_SOCKET &&
+			    image[i].files->file[k].ino == ino)
+				image[i].files->file[k].goes_on = true;
+}
+
+/* Both ends of a connection may be ours, so all go on together. */
+static void mend_all(struct group_ends *ends, struct avc_end *others, enum mend_state *states,
+		     const struct avc_board *board)
+{
+	const uint64_t until = now_ns() + MEND_NS;
+	bool more = true;
+
+	while (more && now_ns() < until) {
+		bool waits = true;
+
+		more = false;
+		for (uint32_t i = 0; i < ends->count; i++) {
+			const uint64_t surplus = ends->end[i].surplus;
+			const uint32_t sent = ends->end[i].sent;
+
+			if (states[i] != MENDING)
+				continue;
+			states[i] = mend(&ends->end[i], &others[i], board);
+			more |= states[i] == MENDING;
+			waits &= surplus == ends->end[i].surplus && sent == ends->end[i].sent;
+		}
+		(void)budget_step();
+		if (more && waits)
+			usleep(LOOK_US);
+	}
+}
+
+uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
+			 const struct avc_config *config, struct avc_board *board)
+{
+	struct avc_end *others = ends ? calloc(ends->count + 1, sizeof *others) : NULL;
+	enum mend_state *states = ends ? calloc(ends->count + 1, sizeof *states) : NULL;
+	uint32_t ended = 0;
+
+	for (uint32_t i = 0; others && states && i < ends->count; i++)
+		states[i] = ends->end[i].fd >= 0 && begin_mend(&ends->end[i], &others[i], board)
+				    ? MENDING
+				    : APART;
+	if (others && states)
+		mend_all(ends, others, states, board);
+	for (uint32_t i = 0; ends && i < ends->count; i++) {
+		struct group_end *end = &ends->end[i];
+		const enum mend_state state = others && states ? states[i] : APART;
+
+		if (end->fd < 0)
+			continue;
+		if (state == MENDED) {
+			let_go_on(image, images, end->ino);
+		} else if (state != APART && is_tcp(end)) {
+			ended += file_reset_tcp(end->fd) == NULL;
+		} else {
+			forget(end->fd, end->file, config);
+			ended += !is_whole(end->fd);
+		}
+		drop_end(end);
+	}
+	free(others);
+	free(states);
+	return ended;
 }

@@ -178,6 +178,11 @@ static bool ask_diag(int diag, uint64_t ino)
 	return send(diag, &request, sizeof request, 0) == sizeof request;
 }
 
+bool file_has_name(const struct file_socket *s)
+{
+	return s->local_bytes > sizeof(sa_family_t) || s->remote_bytes > sizeof(sa_family_t);
+}
+
 /* What one message of the answer says. */
 static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
 {
@@ -193,7 +198,7 @@ static void hear_diag(const struct nlmsghdr *head, struct file_socket *s)
 			break;
 		if (attribute->nla_type == UNIX_DIAG_PEER) {
 			memcpy(&peer, attribute + 1, sizeof peer);
-			s->peer = peer;
+			*(file_has_name(s) ? &s->partner : &s->peer) = peer;
 		}
 		if (attribute->nla_type == UNIX_DIAG_SHUTDOWN)
 			memcpy(&s->shut, attribute + 1, sizeof s->shut);
@@ -225,8 +230,15 @@ static int diag_open(pid_t pid)
 static bool maybe_pair(const struct file *f)
 {
 	return f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
-	       f->socket->connected && f->socket->local_bytes <= sizeof(sa_family_t) &&
-	       f->socket->remote_bytes <= sizeof(sa_family_t);
+	       f->socket->connected && !file_has_name(f->socket);
+}
+
+/* Connected by a name.  There is no other end before it is accepted. */
+static bool wants_partner(const struct file *f)
+{
+	return f->kind == FILE_SOCKET && f->socket && f->socket->domain == AF_UNIX &&
+	       f->socket->type != SOCK_DGRAM && f->socket->connected && file_has_name(f->socket) &&
+	       !f->socket->partner;
 }
 
 static int by_inode(const void *a, const void *b)
@@ -271,23 +283,15 @@ static void hear_all(int diag, struct file **asked, uint32_t count, bool one)
 /* The kernel takes as long to find one socket as to list all (net/unix/diag.c). */
 #define ASKED_EACH 4
 
-void files_find_peers(struct files *files, pid_t pid)
+static void find_ends(struct files *files, pid_t pid, bool (*wants)(const struct file *))
 {
 	struct file **asked = calloc(files->count + 1, sizeof *asked);
 	uint32_t count = 0;
 	int diag;
 
-	for (uint32_t i = 0; asked && i < files->count; i++) {
-		struct file *f = &files->file[i];
-
-		if (f->kind != FILE_SOCKET || !f->socket || f->socket->asked ||
-		    !(maybe_pair(f) || f->socket->backlog < 0))
-			continue;
-		f->socket->asked = true;
-		if (f->socket->listening)
-			f->socket->backlog = SOMAXCONN;
-		asked[count++] = f;
-	}
+	for (uint32_t i = 0; asked && i < files->count; i++)
+		if (wants(&files->file[i]))
+			asked[count++] = &files->file[i];
 	diag = count ? diag_open(pid) : -1;
 	if (diag >= 0) {
 		qsort(asked, count, sizeof(void *), by_inode);
@@ -299,6 +303,28 @@ void files_find_peers(struct files *files, pid_t pid)
 	}
 	close_fd(&diag);
 	free(asked);
+}
+
+static bool wants_peer(const struct file *f)
+{
+	struct file_socket *s = f->kind == FILE_SOCKET ? f->socket : NULL;
+
+	if (!s || s->asked || !(maybe_pair(f) || s->backlog < 0))
+		return false;
+	s->asked = true;
+	if (s->listening)
+		s->backlog = SOMAXCONN;
+	return true;
+}
+
+void files_find_peers(struct files *files, pid_t pid)
+{
+	find_ends(files, pid, wants_peer);
+}
+
+void files_find_partners(struct files *files, pid_t pid)
+{
+	find_ends(files, pid, wants_partner);
 }
 
 /* ---- bytes in pipes and socket pairs ------------------------------------------ */

@@ -47,7 +47,8 @@ struct group_death {
 	struct avc_report report;
 	enum avc_reason reason;
 	uint64_t ticket, until_ns;
-	uint32_t had; /* generations when it died                         */
+	uint32_t had;   /* generations when it died                         */
+	uint32_t ended; /* connections that could not go back with it       */
 };
 
 struct avc_guard {
@@ -241,7 +242,7 @@ void guard_forget(struct avc_guard *guard, uint64_t generation);
 void guard_abandon(struct avc_guard *guard, uint64_t ticket);
 /* Of a checkpoint: it is ready; it stands still (freeze.meet). */
 int guard_meet_ready(struct avc_guard *guard, struct avc_error *err) warn_unused;
-int guard_meet_frozen(void *guard, bool whole, struct avc_error *err) warn_unused;
+int guard_meet_frozen(void *guard, struct generation *whole, struct avc_error *err) warn_unused;
 /* Of a restore: everything is there. */
 int guard_meet_restored(struct avc_guard *guard, struct avc_error *err) warn_unused;
 /* There is no meeting, or it is one to which it can still come. */

@@ -218,6 +218,10 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		budget_begin(say_working, &guard->channel);
+		if (together && guard->dead.ended)
+			fail(&restore.notes, AVC_UNSUPPORTED, 0, guard->main.inside,
+			     "restore descriptors", "", "%u of its connections have ended",
+			     guard->dead.ended);
 
 		/* What was written since the newest was written since all others, also
 		 * where that cannot be seen any more. */

@@ -8,10 +8,12 @@
  * all of them.
  *
  *   a line     0 ready        the app still runs; what takes its time is done
- *              1 frozen       everything is read and cloned: now all are let go
+ *              1 still        everything is read and cloned: nobody sends any more
+ *              2 frozen       so is what is on its way between them: now all are let go
  *   a return   0 able         the app still runs, if it does: it could go back
  *              1 dead         nothing runs any more that could send
- *              2 restored     everything is there: now all run
+ *              2 shown        what is to be on its way, and nothing else is, but for TCP's
+ *              3 restored     everything is there: now all run
  */
 #include <limits.h>
 #include <linux/futex.h>
@@ -32,8 +34,14 @@
 #define RESTORED_NS (3 * NS_PER_S) /* init is told meanwhile; INJ_GO_S is longer          */
 #define WAITS_NS (5 * NS_PER_S)    /* for the daemon to say what is gone back to           */
 
-enum line_step { LINE_READY = 0, LINE_FROZEN = 1, LINE_STEPS };
-enum recall_step { RECALL_ABLE = 0, RECALL_DEAD = 1, RECALL_RESTORED = 2, RECALL_STEPS };
+enum line_step { LINE_READY = 0, LINE_STILL = 1, LINE_FROZEN = 2, LINE_STEPS };
+enum recall_step {
+	RECALL_ABLE = 0,
+	RECALL_DEAD = 1,
+	RECALL_SHOWN = 2,
+	RECALL_RESTORED = 3,
+	RECALL_STEPS
+};
 
 /* ---- a meeting ---------------------------------------------------------------- */
 
@@ -177,9 +185,10 @@ int guard_meet_ready(struct avc_guard *guard, struct avc_error *err)
 }
 
 /* Nothing of the app is in the parasite any more: if this process dies, all of it goes on. */
-int guard_meet_frozen(void *arg, bool whole, struct avc_error *err)
+int guard_meet_frozen(void *arg, struct generation *whole, struct avc_error *err)
 {
 	struct avc_guard *guard = arg;
+	struct avc_board *board = &guard->meeting->board;
 	uint64_t ms = __atomic_load_n(&guard->meeting->clone_ms, __ATOMIC_RELAXED);
 
 	if (!whole) {
@@ -187,8 +196,12 @@ int guard_meet_frozen(void *arg, bool whole, struct avc_error *err)
 		return fail_broken(guard, err);
 	}
 	ms = ms < NS_PER_S / NS_PER_MS ? ms : NS_PER_S / NS_PER_MS;
-	return meet(guard, LINE_FROZEN, guard->config.freeze_deadline_ns + CLONES * ms * NS_PER_MS,
-		    err);
+	whole->ends = files_ends_new(whole->image, whole->images, board);
+	if (meet(guard, LINE_STILL, guard->config.freeze_deadline_ns + CLONES * ms * NS_PER_MS,
+		 err))
+		return -1;
+	files_ends_keep(whole->ends, board);
+	return meet(guard, LINE_FROZEN, guard->config.freeze_deadline_ns, err);
 }
 
 void guard_forget(struct avc_guard *guard, uint64_t generation)
@@ -226,18 +239,16 @@ static void end_dead(struct avc_guard *guard, enum avc_reason reason, const stru
 }
 
 /* All are dead. */
-static void forget_others(const struct generation *generation, const struct avc_config *config)
+static int meet_shown(struct avc_guard *guard, struct avc_error *err)
 {
-	for (uint32_t i = 0; i < generation->images; i++) {
-		const struct image *image = &generation->image[i];
+	struct generation *to = &guard->generations[guard->count - 1];
+	struct avc_board *board = &guard->meeting->board;
 
-		if (!image->process)
-			continue;
-		if (!image->process->descendant)
-			files_forget_others(image, image->pidfd, config);
-		else if (image->process->holder)
-			files_forget_others(image, image->process->holder_pidfd, config);
-	}
+	files_ends_show(to->ends, to->image, to->images, &guard->config, board);
+	if (meet(guard, RECALL_SHOWN, DEAD_NS, err))
+		return -1;
+	guard->dead.ended = files_ends_mend(to->ends, to->image, to->images, &guard->config, board);
+	return 0;
 }
 
 /* The app is dead, and all others are to be. */
@@ -251,9 +262,9 @@ static void go_back(struct avc_guard *guard)
 	if (guard_find_generation(guard, guard->recall) >= 0 &&
 	    meet(guard, RECALL_DEAD, DEAD_NS, &error) == 0) {
 		guard_drop_newer(guard, guard->recall);
-		forget_others(&guard->generations[guard->count - 1], &guard->config);
 		guard->restore_ticket = guard->dead.ticket;
-		back = guard_bring_back(guard, &guard->dead.report, guard->dead.reason,
+		back = meet_shown(guard, &error) == 0 &&
+		       guard_bring_back(guard, &guard->dead.report, guard->dead.reason,
 					guard->dead.had, &error);
 	}
 	guard_leave_meeting(guard);

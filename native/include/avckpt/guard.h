@@ -58,13 +58,34 @@ struct avc_request {
  * changes only by compare and exchange, so that all members see the same. So none waits longer than
  * that for one that has died, and what a compromised guard writes here affects only its own
  * group. */
-enum { AVC_MEETING_STEPS = 3 };
+enum { AVC_MEETING_STEPS = 4, AVC_BOARD_ENDS = 4096, AVC_BOARD_BYTES = 32 << 20 };
+
+/* One end of a connection: address and port of TCP, inode of a Unix socket. */
+struct avc_end_name {
+	uint64_t where; /* inode; or network namespace of a loopback address                    */
+	uint8_t address[16];
+	uint32_t port, protocol;
+};
+
+struct avc_end {
+	struct avc_end_name own, other;
+	uint64_t written;   /* TCP: bytes that the application has written to it           */
+	uint32_t at, bytes; /* in avc_board.content: what is to be in flight to this end    */
+};
+
+/* Where guards find out which ends belong together.  Readers bound what they find here. */
+struct avc_board {
+	uint32_t ends, bytes; /* allocated; may be more than there are                     */
+	struct avc_end end[AVC_BOARD_ENDS];
+	uint8_t content[AVC_BOARD_BYTES];
+};
 
 struct avc_meeting {
 	uint32_t members; /* how many are expected                            */
 	uint32_t state;
 	uint32_t arrived[AVC_MEETING_STEPS];
 	uint32_t clone_ms; /* what the slowest of them expects its clone to take */
+	struct avc_board board;
 };
 
 #define AVC_MEETING_BROKEN UINT32_C(99)
