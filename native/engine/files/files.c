@@ -361,13 +361,20 @@ static bool is_channel(const struct file *f)
 					f->socket->domain == AF_UNIX && !f->socket->listening);
 }
 
+/* Neither idle nor connected: it was just being connected when it was read. */
+static bool was_connecting(const struct file_socket *s)
+{
+	return !s->connected && !s->listening && s->type != SOCK_DGRAM && s->local_bytes &&
+	       (s->domain == AF_UNIX || s->domain == AF_INET || s->domain == AF_INET6);
+}
+
 /* A change of an idle socket between the two reads must not be missed. */
 static bool is_outdated(int fd, const struct file_socket *s)
 {
 	int listens = 0;
 	socklen_t bytes = sizeof listens;
 
-	return s->idle &&
+	return (s->idle || was_connecting(s)) &&
 	       (file_socket_was_used(fd, s) ||
 		(!getsockopt(fd, SOL_SOCKET, SO_ACCEPTCONN, &listens, &bytes) && listens));
 }

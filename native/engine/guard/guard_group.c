@@ -9,10 +9,11 @@
  *
  *   a line     0 ready        the app still runs; what takes its time is done
  *              1 still        everything is read and cloned: nobody sends any more
- *              2 frozen       so is what is on its way between them: now all are let go
+ *              2 frozen       what is in flight between them is copied, too: now all are let go
  *   a return   0 able         the app still runs, if it does: it could go back
  *              1 dead         nothing runs any more that could send
- *              2 shown        what is to be on its way, and nothing else is, but for TCP's
+ *              2 shown        its ends of connections are published: now they are made what
+ *                             they were (files_group.c)
  *              3 restored     everything is there: now all run
  */
 #include <limits.h>
@@ -198,8 +199,11 @@ int guard_meet_frozen(void *arg, struct generation *whole, struct avc_error *err
 	ms = ms < NS_PER_S / NS_PER_MS ? ms : NS_PER_S / NS_PER_MS;
 	whole->ends = files_ends_new(whole->image, whole->images, board);
 	if (meet(guard, LINE_STILL, guard->config.freeze_deadline_ns + CLONES * ms * NS_PER_MS,
-		 err))
+		 err)) {
+		files_ends_free(whole->ends); /* before the app can close them */
+		whole->ends = NULL;
 		return -1;
+	}
 	files_ends_keep(whole->ends, board);
 	return meet(guard, LINE_FROZEN, guard->config.freeze_deadline_ns, err);
 }
