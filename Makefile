@@ -43,13 +43,15 @@ setup-images: ## the part of setup that makes Podman work and builds the images
 	@scripts/setup-podman.sh
 	@scripts/setup-sidecar.sh
 
-demo: setup ## kill a protected container's application twice and watch it go on
-	@$(VENV)/python -m scripts.demo
-
-test: setup ## every test (T=expression selects, TESTS=folder narrows)
+setup-tests: # what tests need beyond setup
 	@scripts/setup-system.sh view
 	@scripts/setup-trees.sh
 	@scripts/setup-docker.sh
+
+demo: setup ## kill a protected container's application twice and watch it go on
+	@$(VENV)/python -m scripts.demo
+
+test: setup setup-tests ## every test (T=expression selects, TESTS=folder narrows)
 	@$(VENV)/python -m pytest $(TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") $(if $(JUNIT),--junit-xml="$(JUNIT)")
 
 .PHONY: build-aarch64
@@ -82,11 +84,14 @@ test-kernels: ## the engine's tests on other kernels, in emulated machines (KERN
 	@scripts/setup-machine.sh $(KERNELS)
 	@for kernel in $(KERNELS); do scripts/test-machine.sh $$kernel $(KERNEL_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") || exit; done
 
-# What scripts/test-machine.sh runs in the root of a machine.
-machine-build: setup-build
+# All that tests run and would compile themselves, before several runs of pytest do it at once.
+build-tests: setup-build
 	@$(MAKE) -s -C native
 	@$(MAKE) -s -C native SANITIZE=1
+	@$(MAKE) -s -C native STORES=1
 	@$(MAKE) -s -C tests/victims
+	@$(MAKE) -s -C tests/victims STATIC=1 build-static/intruder
+	@$(MAKE) -s -C tests/fuzz SEEDS=1
 
 lint: setup-build ## ruff, mypy --strict, layers of the engine, shellcheck, clang-format; a missing tool is a failure
 	@scripts/setup-system.sh lint
@@ -152,5 +157,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help deb wheel test-packages setup setup-build setup-images demo test sweep test-programs test-trees test-kernels machine-build test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
+.PHONY: help deb wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
 .DEFAULT_GOAL := help

@@ -50,7 +50,7 @@ install_checkout() {
 	# shellcheck disable=SC2016 # the words are for that shell
 	unshare --mount bash -c '
 		for name in proc sys dev; do mount --rbind "/$name" "$1/$name" || exit; done
-		exec chroot "$1" make -C /opt/avckpt machine-build' - "$WORLD"
+		exec chroot "$1" make -C /opt/avckpt build-tests' - "$WORLD"
 }
 
 make_disk() {

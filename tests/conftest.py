@@ -27,7 +27,12 @@ def pytest_configure(config: pytest.Config) -> None:
     make starts programs with posix_spawn(3), whose child, in glibc, ignores the
     two signals that libc keeps for itself (32 and 33), and what is ignored stays
     so over execve(2): every program under test would inherit it from `make test`.
+    A shell ignores SIGINT and SIGQUIT in what it starts with `&`.
     """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGQUIT) == signal.SIG_IGN:
+        signal.signal(signal.SIGQUIT, signal.SIG_DFL)
     for number in (32, 33):
         reset_if_ignored(number)
 
@@ -46,11 +51,12 @@ def reset_if_ignored(number: int) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whatever takes the fixture `podman` is marked so; who excuses a failure says why.  Raises UsageError."""
+    """Whatever takes the fixture `podman` is marked so; a mark that asks for a favour says why.  Raises UsageError."""
     for item in items:
-        excuse = item.get_closest_marker("shared_machine")
-        if excuse is not None and not (len(excuse.args) == 1 and str(excuse.args[0]).strip()):
-            raise pytest.UsageError(f'{item.nodeid}: write @pytest.mark.shared_machine("why it may fail there")')
+        for name in ("shared_machine", "alone"):
+            mark = item.get_closest_marker(name)
+            if mark is not None and not (len(mark.args) == 1 and str(mark.args[0]).strip()):
+                raise pytest.UsageError(f'{item.nodeid}: write @pytest.mark.{name}("why")')
         if "podman" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.podman)
 

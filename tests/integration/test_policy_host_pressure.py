@@ -19,6 +19,7 @@ from testkit.protected import start_hoard, write_hoard
 VICTIMS = ROOT / "tests/victims/build"
 pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
+    pytest.mark.alone("the host becomes short of memory, and every sidecar on it gives generations up"),
     pytest.mark.shared_machine("how short of memory the host is depends on what else runs there"),
 ]
 

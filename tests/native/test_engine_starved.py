@@ -19,7 +19,10 @@ from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import wait_until
 from testkit.procfs import children_of
 
-pytestmark = pytest.mark.shared_machine("it takes CPU away itself, and what is left for the guard must suffice")
+pytestmark = [
+    pytest.mark.alone("it takes a CPU away from everybody else"),
+    pytest.mark.shared_machine("it takes CPU away itself, and what is left for the guard must suffice"),
+]
 
 ENOUGH = 6
 """Threads that were sent into the parasite and did not get there in time."""
