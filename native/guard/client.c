@@ -424,15 +424,18 @@ static bool is_runnable(pid_t pid)
 
 void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
 {
-	uint64_t beats, silent_ns;
+	uint64_t beats, rests_ns, silent_ns;
 
 	pthread_mutex_lock(&guard->engine->lock);
+	rests_ns = __atomic_load_n(&guard->heartbeat->rests_until_ns, __ATOMIC_RELAXED);
 	beats = __atomic_load_n(&guard->heartbeat->beats, __ATOMIC_RELAXED);
 	if (beats != guard->beats) {
 		guard->beats = beats;
 		guard->beats_ns = now_ns();
 	}
 	silent_ns = now_ns() - guard->beats_ns;
+	if (rests_ns > guard->beats_ns)
+		silent_ns = now_ns() > rests_ns ? now_ns() - rests_ns : 0;
 	if (guard->pid && !guard->stopping && silent_ns > patience_ns &&
 	    (!is_runnable(guard->pid) || silent_ns > STARVED_FACTOR * patience_ns)) {
 		guard->hung = true;

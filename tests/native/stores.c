@@ -16,7 +16,7 @@
 #include <unistd.h>
 
 #define AREAS_MAX 256
-#define HEARTBEAT_BYTES 8 /* struct avc_heartbeat, which only the daemon reads        */
+#define HEARTBEAT_BYTES 16 /* struct avc_heartbeat, which only the daemon reads        */
 
 static struct {
 	uintptr_t start, end;

@@ -64,6 +64,8 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 int heartbeat_open(int fd) warn_unused;
 /* A sign of progress: the daemon kills a guard that has been silent for seconds. */
 void heartbeat(void);
+/* It sleeps until then, CLOCK_MONOTONIC; 0: it is awake again. */
+void heartbeat_rest(uint64_t until_ns);
 
 /* ---- budget.c --------------------------------------------------------------- */
 

@@ -30,3 +30,9 @@ void heartbeat(void)
 	if (shared) /* a probe has none */
 		__atomic_fetch_add(&shared->beats, 1, __ATOMIC_RELAXED);
 }
+
+void heartbeat_rest(uint64_t until_ns)
+{
+	if (shared)
+		__atomic_store_n(&shared->rests_until_ns, until_ns, __ATOMIC_RELAXED);
+}

@@ -380,7 +380,7 @@ static uint64_t work_due(struct avc_guard *guard)
 		due = earlier(due, guard->remains.until_ns);
 	if (guard->dead.waits)
 		due = earlier(due, now_ns() + DEAD_LOOK_NS);
-	return earlier(due, tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : tracee_ending_due());
+	return earlier(due, tracee_any_ending() ? tracee_ending_due() : guard->ahead_ns);
 }
 
 /* Whether there was any. */
@@ -388,8 +388,11 @@ static bool poll_until(struct pollfd *fds, nfds_t n, uint64_t until)
 {
 	const uint64_t now = now_ns();
 	const struct timespec timeout = timespec_of(until > now ? until - now : 0);
-	const bool any = ppoll(fds, n, &timeout, NULL) != 0;
+	bool any;
 
+	heartbeat_rest(until);
+	any = ppoll(fds, n, &timeout, NULL) != 0;
+	heartbeat_rest(0);
 	heartbeat();
 	return any;
 }
@@ -398,6 +401,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	uint64_t due = work_due(guard);
 	nfds_t n = 0;
+	int ending;
 
 	watch(guard, &n, guard->socket);
 	if (n && guard->outbox_count)
@@ -416,6 +420,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		if (process->descendant)
 			watch(guard, &n, process->pidfd);
 		watch(guard, &n, process->holder_pidfd);
+		watch(guard, &n, process->exec_sign.fd);
 	}
 	for (uint32_t i = 0; i < guard->count; i++) {
 		if (guard->generations[i].spare.pid)
@@ -423,8 +428,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		for (uint32_t k = 0; k < guard->generations[i].images; k++)
 			watch(guard, &n, guard->generations[i].image[k].pidfd);
 	}
-	for (uint32_t i = 0; tracee_ending_pidfd(i) >= 0; i++)
-		watch(guard, &n, tracee_ending_pidfd(i));
+	for (uint32_t i = 0; tracee_ending_late(i, &ending); i++)
+		watch(guard, &n, ending);
 	if (straggling) {
 		const uint64_t now = now_ns();
 		const bool fresh = now - guard->stragglers_since_ns < NS_PER_S;
@@ -442,6 +447,9 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 			break;
 		due = work_due(guard);
 	}
+	for (nfds_t i = 0; i < n; i++)
+		if (guard->fds[i].revents)
+			guard_hear_exec(guard, guard->fds[i].fd);
 }
 
 /* Nobody is to believe that there are checkpoints when there are none. */
@@ -529,7 +537,7 @@ static void guard_main(struct avc_guard *guard)
 		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
 			guard_tell_untold(guard);
-		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
+		if (now_ns() >= guard->ahead_ns && !tracee_any_ending())
 			guard_work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;

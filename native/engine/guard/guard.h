@@ -146,6 +146,8 @@ void guard_tend_tree(struct avc_guard *guard);
 /* Gives up what was brought into processes that have executed another program since;
  * `all`: whether or not it is time to look.  When it is: CLOCK_MONOTONIC, UINT64_MAX: never. */
 bool guard_let_executed_go(struct avc_guard *guard, bool all);
+/* There is news of this descriptor: that process is looked at next. */
+void guard_hear_exec(struct avc_guard *guard, int fd);
 uint64_t guard_exec_check_due(const struct avc_guard *guard);
 /* Tracees of ours that nobody knows of. */
 void guard_kill_lost(struct avc_guard *guard);

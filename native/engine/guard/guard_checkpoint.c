@@ -306,19 +306,6 @@ static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 		guard->ahead_ns = UINT64_MAX; /* there is no memory for it */
 }
 
-/* Of those before the newest; there is one at most. */
-static bool drop_old_spare(struct avc_guard *guard)
-{
-	bool any = false;
-
-	for (uint32_t i = 0; i + 1 < guard->count; i++) {
-		any |= guard->generations[i].spare.pid != 0;
-		spare_drop(&guard->generations[i]);
-	}
-	tracee_end_now();
-	return any;
-}
-
 /* Where checkpoints are copies, there is none to be made after each of them, but after a restore, say:
  * it may take its share of the time since the last one. */
 static bool may_make_spare(const struct avc_guard *guard, const struct generation *newest)
@@ -362,8 +349,8 @@ static void work_ahead(struct avc_guard *guard)
 		return;
 	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
-	if (stand_in_catch_up(&guard->dirty, newest, guard->timer) || drop_old_spare(guard))
-		; /* which has to end first */
+	if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
+		; /* its predecessor has to end first */
 	else if (wants_spare(guard, newest))
 		make_spare(guard, newest);
 	else
@@ -522,7 +509,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 		guard->cramped |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);
 	}
-	if (tracee_ending_pidfd(0) < 0)
+	if (!tracee_any_ending())
 		return false;
 	guard_wait_ended();
 	usleep(INIT_REAPS_US);

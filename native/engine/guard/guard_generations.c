@@ -213,7 +213,8 @@ static bool found_executed(struct process *process, uint64_t now)
 		pause = EXEC_CHECK_NS;
 	if (pause > EXEC_CHECK_LONG_NS)
 		pause = EXEC_CHECK_LONG_NS;
-	process->exec_check_ns = now + pause;
+	/* First: an exec after this look is told. */
+	process->exec_check_ns = process_listen_for_exec(process) ? UINT64_MAX : now + pause;
 	return process_has_executed(process);
 }
 
@@ -236,7 +237,7 @@ static void lose_program(struct avc_guard *guard)
 }
 
 /* One that executes another program closes what it has marked for that (O_CLOEXEC), and
- * somebody may be waiting for just that.  The kernel does not tell, so it is looked at: often
+ * somebody may be waiting for just that.  Where the kernel does not tell, it is looked at: often
  * at first, for most do it at once if they do it at all.  Returns whether there was one. */
 bool guard_let_executed_go(struct avc_guard *guard, bool all)
 {
@@ -256,6 +257,18 @@ bool guard_let_executed_go(struct avc_guard *guard, bool all)
 			lose_program(guard);
 	}
 	return any;
+}
+
+void guard_hear_exec(struct avc_guard *guard, int fd)
+{
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct process *process = guard->tree.process[i];
+
+		if (process->exec_sign.fd != fd)
+			continue;
+		process_listen_no_more(process); /* it says so once */
+		process->exec_check_ns = 0;
+	}
 }
 
 uint64_t guard_exec_check_due(const struct avc_guard *guard)
@@ -357,6 +370,9 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 	const struct policy_generation record =
 		policy_new_generation(&guard->policy, &guard->config, fresh->number, now);
 
+	/* Only the newest has one. */
+	for (uint32_t i = 0; i < guard->count; i++)
+		spare_drop(&guard->generations[i]);
 	while (guard->count >= guard->policy.room) {
 		const uint32_t i = policy_replaced(&guard->policy, &guard->config, now);
 

@@ -612,19 +612,6 @@ int process_infect_stopped(struct process *process, uint32_t slots, struct avc_e
 	return infect_thread(process, thread, slots, err);
 }
 
-/* ESRCH means that it is exiting: after exec(2) there is memory, but not this. */
-bool process_has_executed(const struct process *process)
-{
-	uint64_t nonce = 0;
-	struct iovec here = { &nonce, sizeof nonce };
-	struct iovec there = { (void *)(process->parasite.base + INJ_CODE_BYTES +
-					offsetof(struct inj_control, nonce)),
-			       sizeof nonce };
-	const ssize_t n = process_vm_readv(process->pid, &here, 1, &there, 1, 0);
-
-	return n == sizeof nonce ? nonce != process->nonce : errno == EFAULT;
-}
-
 /* Turns a new task into the holder: stopped, named, and outside of the app's process groups. */
 static int make_holder(struct process *process, pid_t holder, const struct arch_regs *base,
 		       struct avc_error *err)

@@ -32,6 +32,7 @@ void process_init(struct process *process)
 				     .stat_fd = -1,
 				     .statm_fd = -1,
 				     .holder_pidfd = -1,
+				     .exec_sign.fd = -1,
 				     .due_ns = UINT64_MAX };
 }
 
@@ -125,6 +126,7 @@ void process_close(struct process *process)
 	close_fd(&process->timers_fd);
 	close_fd(&process->stat_fd);
 	close_fd(&process->statm_fd);
+	process_listen_no_more(process);
 	process->pid = 0;
 	process->leader = 0;
 	process->infected = false;

@@ -5,6 +5,7 @@
  *   process.c        one of them: looked at, asked, stopped
  *   stop.c          ... stopped, let go
  *   infect.c        parasite and holder brought into it
+ *   executed.c      ... which are gone when it executes another program
  *   tracker.c       which of its pages are written
  *   support.c       what cannot be protected; quiescence
  *   waits.c         calls that are to be ended
@@ -130,6 +131,16 @@ void process_unhold_soon(struct process *process);
 /* The holder is the caller's from here on, with its pidfd (-1: there was none). */
 pid_t process_detach_holder(struct process *process, int *pidfd);
 
+/* ---- executed.c ---------------------------------------------------------------------- */
+
+/* Whether the (running, infected) process has another program: what was brought into it
+ * is gone. */
+bool process_has_executed(const struct process *process);
+/* From now on process->exec_sign.fd has news (poll(2)) when it may have: it has, or its main thread
+ * has ended.  false: the kernel does not tell. */
+bool process_listen_for_exec(struct process *process);
+void process_listen_no_more(struct process *process);
+
 /* ---- tracker.c -------------------------------------------------------------------- */
 
 /* Sets that are added to. */
@@ -173,9 +184,6 @@ void tracker_remove(struct tracker *tracker, const struct pageset *set);
 /* Looks at a running app for what cannot be protected.  0, or -1 with
  * AVC_UNSUPPORTED and the reason in words. */
 int support_check(struct process *process, struct avc_error *err) warn_unused;
-/* Whether the (running, infected) process has another program: what was brought into it
- * is gone. */
-bool process_has_executed(const struct process *process);
 /* True if this looks like a moment at which nobody is in the middle of anything. */
 bool process_is_quiescent(const struct process *process);
 

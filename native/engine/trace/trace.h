@@ -234,8 +234,12 @@ struct process {
 	bool paused; /* between process_pause_adoption() and process_resume_adoption()         */
 	struct tracker *tracker; /* process/tracker.c; NULL: nobody watches its memory         */
 	bool recycling;          /* in this freeze a template is brought up to date          */
-	uint64_t held_ns, exec_check_ns; /* since when, and when to look again whether it has
-					  * executed another program                       */
+	/* Says that it may have executed another program (executed.c); fd -1: nothing does.  */
+	struct exec_sign {
+		int fd;
+		void *page;
+	} exec_sign;
+	uint64_t held_ns, exec_check_ns; /* since when, and when to look whether it has     */
 };
 
 /* ---- tracee.c ---------------------------------------------------------------- */
@@ -314,8 +318,9 @@ uint64_t tracee_ending_due(void);
 /* Kills them now. */
 void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
-/* Of the i-th of them, to be watched; -1: there are no more. */
-int tracee_ending_pidfd(uint32_t i);
+bool tracee_any_ending(void);
+/* *pidfd: of the i-th of them, to be watched; -1: not yet.  false: there are no more. */
+bool tracee_ending_late(uint32_t i, int *pidfd);
 /* Whether STOP_SYSCALL is of one that enters a system call, and not of one that leaves it. */
 bool tracee_enters_call(pid_t tid);
 /* Is this thread the one that traces it? */

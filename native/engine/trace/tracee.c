@@ -363,7 +363,8 @@ static __thread struct {
 	struct {
 		pid_t pid;
 		int pidfd;
-		uint64_t kill_ns; /* 0: it was killed                                */
+		bool killed;
+		uint64_t due_ns; /* to be killed                                     */
 	} task[ENDING_MAX];
 	uint32_t count;
 } ending;
@@ -377,16 +378,17 @@ void tracee_end(pid_t pid, int pidfd)
 		return;
 	}
 	ending.task[ending.count].pid = pid;
-	ending.task[ending.count].kill_ns = now_ns() + END_AFTER_NS;
+	ending.task[ending.count].killed = false;
+	ending.task[ending.count].due_ns = now_ns() + END_AFTER_NS;
 	ending.task[ending.count++].pidfd = pidfd;
 }
 
 static void end_until(uint64_t now)
 {
 	for (uint32_t i = 0; i < ending.count; i++)
-		if (ending.task[i].kill_ns && ending.task[i].kill_ns <= now) {
+		if (!ending.task[i].killed && ending.task[i].due_ns <= now) {
 			syscall(SYS_pidfd_send_signal, ending.task[i].pidfd, SIGKILL, NULL, 0);
-			ending.task[i].kill_ns = 0;
+			ending.task[i].killed = true;
 		}
 }
 
@@ -419,8 +421,8 @@ uint64_t tracee_ending_due(void)
 	uint64_t due = UINT64_MAX;
 
 	for (uint32_t i = 0; i < ending.count; i++)
-		if (ending.task[i].kill_ns && ending.task[i].kill_ns < due)
-			due = ending.task[i].kill_ns;
+		if (!ending.task[i].killed && ending.task[i].due_ns < due)
+			due = ending.task[i].due_ns;
 	return due;
 }
 
@@ -432,7 +434,17 @@ bool tracee_is_ending(pid_t pid)
 	return false;
 }
 
-int tracee_ending_pidfd(uint32_t i)
+bool tracee_any_ending(void)
 {
-	return i < ending.count ? ending.task[i].pidfd : -1;
+	return ending.count != 0;
+}
+
+bool tracee_ending_late(uint32_t i, int *pidfd)
+{
+	*pidfd = -1;
+	if (i >= ending.count)
+		return false;
+	if (ending.task[i].killed)
+		*pidfd = ending.task[i].pidfd;
+	return true;
 }

@@ -90,12 +90,14 @@ struct avc_meeting {
 
 #define AVC_MEETING_BROKEN UINT32_C(99)
 
-/* Shared memory of the two.  The guard counts up at least once in AVC_HEARTBEAT_NS while it
- * has nothing to do, and wherever it gets on with something long. */
+/* Shared memory of the two.  The guard counts up wherever it gets on with something long, and
+ * says until when it sleeps when it has nothing to do: AVC_HEARTBEAT_NS at most.  It is silent
+ * since it counted up last, or was to wake up, whichever is later. */
 struct avc_heartbeat {
 	uint64_t beats;
+	uint64_t rests_until_ns; /* CLOCK_MONOTONIC; 0: it does not sleep            */
 };
 
-#define AVC_HEARTBEAT_NS UINT64_C(1000000000)
+#define AVC_HEARTBEAT_NS UINT64_C(3000000000)
 
 #endif

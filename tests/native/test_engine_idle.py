@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a guard does while nothing happens: it sleeps, and is woken by what concerns it."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
+from testkit.harness import app_pid, wait_until
+from testkit.init_peer import Init
+
+SLEEPS_S = 6.0
+"""Two of the guard's longest sleeps (AVC_HEARTBEAT_NS)."""
+WAKES = 6
+"""In that time: it says that it lives, and has a moment to finish its last checkpoint."""
+
+EXECUTES = """
+import os, sys
+held = os.open(sys.argv[1], os.O_WRONLY)  # O_CLOEXEC, as all of Python's
+os.read(0, 1)
+os.execv("/bin/sleep", ["sleep", "1000"])
+"""
+
+
+def wake_ups(pid: int) -> int:
+    """How often it has gone to sleep."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.split("\nvoluntary_ctxt_switches:")[1].split()[0])
+
+
+def has_open(pid: int, path: Path) -> bool:
+    """Whether a process has that file open."""
+    return any(Path(link).resolve() == path for link in Path(f"/proc/{pid}/fd").iterdir())
+
+
+def test_it_sleeps(tmp_path: Path) -> None:
+    """Between checkpoints; also one of several processes."""
+    for command in ("idle 1 2 --beat-us 1000", "tree 3"):
+        with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            time.sleep(1)  # its spare
+            before = wake_ups(guard.pid)
+            time.sleep(SLEEPS_S)
+            assert wake_ups(guard.pid) - before <= WAKES, command
+
+
+def exec_until_closed_s(fifo: Path) -> float:
+    """Of a program that has run for a while: how long after its exec(2) nobody has that open any more."""
+    os.mkfifo(fifo)
+    ours = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    command = [sys.executable, "-S", "-c", EXECUTES, str(fifo)]
+    with Init(command, pid1=True, stdin=subprocess.PIPE) as init, GuardProcess(config(), [init.pid]) as guard:
+        wait_until(lambda: has_open(app_pid(init.pid), fifo), PATIENCE_S, "it has it open")
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        time.sleep(1.7)  # looks around would be 200 ms apart by now
+        began = time.monotonic()
+        assert init.popen.stdin is not None
+        init.popen.stdin.write(b"x")
+        init.popen.stdin.flush()
+        assert select.select([ours], [], [], PATIENCE_S)[0], "somebody has it open"
+        took = time.monotonic() - began
+        assert guard.wait("dropped")["reason"] == "executed"
+    os.close(ours)
+    return took
+
+
+@pytest.mark.shared_machine("a guard that is told of an exec may have to wait for a CPU")
+def test_an_exec_is_heard(tmp_path: Path) -> None:
+    """What is marked O_CLOEXEC is closed at once, however long the program has run, and not after a look around."""
+    took = sorted(exec_until_closed_s(tmp_path / f"held-{number}") for number in range(5))
+    assert took[1] < 0.03, took
