@@ -434,6 +434,9 @@ void avc_guard_check(struct avc_guard *guard, uint64_t patience_ns)
 		guard->beats_ns = now_ns();
 	}
 	silent_ns = now_ns() - guard->beats_ns;
+	/* It cannot claim to sleep for longer than it may. */
+	if (rests_ns > guard->beats_ns + AVC_HEARTBEAT_NS)
+		rests_ns = guard->beats_ns + AVC_HEARTBEAT_NS;
 	if (rests_ns > guard->beats_ns)
 		silent_ns = now_ns() > rests_ns ? now_ns() - rests_ns : 0;
 	if (guard->pid && !guard->stopping && silent_ns > patience_ns &&
