@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * The guard: one process per container, whose main thread waits, decides and reports.
- * That thread makes every ptrace call: a process can only be traced by one.
+ * It makes every ptrace call: a process can only be traced by one thread.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -16,17 +16,17 @@
 
 #include "guard.h"
 
-#define LOOK_AGAIN_NS (20 * NS_PER_MS)   /* for init to set itself up        */
+#define LOOK_AGAIN_NS (20 * NS_PER_MS)   /* whether init is ready            */
 #define LOOK_SELDOM_NS (250 * NS_PER_MS) /* after LOOK_OFTEN_NS of that      */
 #define LOOK_OFTEN_NS (5 * NS_PER_S)
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
 #define LAST_WORDS_MS 1000
-#define REQUEST_FDS 2                 /* that come with one, at most                             */
-#define DEAD_LOOK_NS (50 * NS_PER_MS) /* at one that waits for its group: init is told */
-#define GUARD_UNTOLD 3 /* exit status: nobody of our build has told it what to do      */
+#define REQUEST_FDS 2                 /* sent with one, at most                                  */
+#define DEAD_LOOK_NS (50 * NS_PER_MS) /* while it waits for its group: init is notified */
+#define GUARD_UNTOLD 3 /* exit status: no valid start message from the same build      */
 
-/* ---- telling ---------------------------------------------------------------- */
+/* ---- events ----------------------------------------------------------------- */
 
 struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind kind)
 {
@@ -41,8 +41,8 @@ struct avc_event guard_event(const struct avc_guard *guard, enum avc_event_kind 
 	};
 }
 
-/* A daemon that does not listen must not hold the guard up: what it has no room for stays
- * here, and of more than that the oldest are lost. */
+/* A daemon that does not read must not block the guard: events that the socket has no room for
+ * wait here, and when this is full, the oldest are lost. */
 static void send_outbox(struct avc_guard *guard)
 {
 	uint32_t sent = 0;
@@ -123,7 +123,7 @@ static void roll_back(struct avc_guard *guard, const struct avc_request *request
 		return;
 	}
 	budget_begin(NULL, NULL);
-	/* An app that hangs is better started anew than left as it is. */
+	/* A hung app is killed in any case: a fresh start is better than the hang. */
 	if (reason == AVC_REASON_COMMAND &&
 	    guard_check_files(guard, &guard->generations[i], guard->main.pid, guard->main.pidfd,
 			      &error)) {
@@ -133,7 +133,7 @@ static void roll_back(struct avc_guard *guard, const struct avc_request *request
 	guard->restore_asked = reason;
 	guard->restore_ticket = ticket;
 	guard->restore_generation = request->generation;
-	/* init reports the death; the rest is as after any other. */
+	/* init reports the death, which is then handled like any other. */
 	process_kill(&guard->main);
 }
 
@@ -203,7 +203,7 @@ static void obey(struct avc_guard *guard, const struct avc_request *request)
 	}
 }
 
-/* Who gave the command has said by now that it failed: it must not happen all the same. */
+/* The client has reported a failure by then: a late command must not take effect. */
 static void obey_in_time(struct avc_guard *guard, const struct avc_request *request)
 {
 	if (request->until_ns && now_ns() > request->until_ns)
@@ -214,7 +214,7 @@ static void obey_in_time(struct avc_guard *guard, const struct avc_request *requ
 
 /* ---- the daemon ------------------------------------------------------------------- */
 
-/* As recvmsg(2); *count: of the descriptors that came with it, no more than there is room for. */
+/* Like recvmsg(2); *count: received descriptors, no more than there is room for. */
 static ssize_t receive(int socket, struct avc_request *request, int flags, int fds[REQUEST_FDS],
 		       size_t *count)
 {
@@ -238,7 +238,7 @@ static ssize_t receive(int socket, struct avc_request *request, int flags, int f
 	return n;
 }
 
-/* 1: there is one; 0: none now; -1: there will be no more.  *fd: what came with it, or -1. */
+/* 1: received; 0: none now; -1: there will be no more.  *fd: the descriptor sent with it, or -1. */
 static int next_request(struct avc_guard *guard, struct avc_request *request, int *fd)
 {
 	int fds[REQUEST_FDS];
@@ -247,7 +247,7 @@ static int next_request(struct avc_guard *guard, struct avc_request *request, in
 
 	*fd = count ? fds[0] : -1;
 	if (count > 1)
-		close_fd(&fds[1]); /* nobody sends two */
+		close_fd(&fds[1]); /* only the first message has two */
 	if (n < 0)
 		return errno == EAGAIN || errno == EINTR ? 0 : -1;
 	return n == sizeof *request && request->magic == AVC_GUARD_MAGIC ? 1 : -1;
@@ -293,7 +293,7 @@ static void carry_out(struct avc_guard *guard)
 
 /* ---- the cycle -------------------------------------------------------------------- */
 
-/* Until init has set itself up: the hook runs before the container does. */
+/* Retried until init is ready: the hook runs before the container does. */
 static void attach(struct avc_guard *guard)
 {
 	struct avc_error error = { 0 };
@@ -327,7 +327,7 @@ static void watch(struct avc_guard *guard, nfds_t *n, int fd)
 		struct pollfd *more = realloc(guard->fds, 2 * (*n + 32) * sizeof *more);
 
 		if (!more)
-			return; /* its news will be seen with the next */
+			return; /* it is checked with the next event all the same */
 		guard->fds = more;
 		guard->fds_room = 2 * (*n + 32);
 	}
@@ -351,8 +351,8 @@ static bool any_lost(const struct avc_guard *guard)
 	return false;
 }
 
-/* Calls of the app's that a checkpoint has interrupted.  When the first of those that are
- * left is to be ended. */
+/* Calls of the app that a checkpoint has interrupted: ends those whose time is up.  Returns when
+ * the next one is due. */
 static uint64_t end_waits(struct avc_guard *guard)
 {
 	uint64_t due = UINT64_MAX;
@@ -370,7 +370,7 @@ static uint64_t earlier(uint64_t a, uint64_t b)
 	return a < b ? a : b;
 }
 
-/* When there is something to do, whether anything is heard or not. */
+/* When there is work even if no descriptor becomes ready. */
 static uint64_t work_due(struct avc_guard *guard)
 {
 	uint64_t due = earlier(guard->next_ns, end_waits(guard));
@@ -383,7 +383,7 @@ static uint64_t work_due(struct avc_guard *guard)
 	return earlier(due, tracee_any_ending() ? tracee_ending_due() : guard->ahead_ns);
 }
 
-/* Whether there was any. */
+/* Whether a descriptor became ready. */
 static bool poll_until(struct pollfd *fds, nfds_t n, uint64_t until)
 {
 	const uint64_t now = now_ns();
@@ -416,7 +416,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
-		/* How the main process ended init tells. */
+		/* init reports the end of the main process. */
 		if (process->descendant)
 			watch(guard, &n, process->pidfd);
 		watch(guard, &n, process->holder_pidfd);
@@ -436,7 +436,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 
 		due = earlier(due, now + (fresh ? STRAGGLER_NS : STRAGGLER_LONG_NS));
 	}
-	/* Most of an idle guard's time: to beat, and to look whether a program was executed. */
+	/* An idle guard only wakes to beat, and to check whether a program was executed. */
 	while (!poll_until(guard->fds, n,
 			   earlier(due, earlier(now_ns() + AVC_HEARTBEAT_NS,
 						guard_exec_check_due(guard)))) &&
@@ -452,7 +452,7 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 			guard_hear_exec(guard, guard->fds[i].fd);
 }
 
-/* Nobody is to believe that there are checkpoints when there are none. */
+/* Without this, users would believe that checkpoints are taken. */
 static void tell_straggling(struct avc_guard *guard)
 {
 	const uint64_t now = now_ns();
@@ -481,11 +481,11 @@ static void let_go(struct avc_guard *guard)
 	guard_release_remains(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
-	/* The end of this process detaches what is left. */
+	/* When this process exits, the kernel detaches the rest. */
 	tracee_end_now();
 	while ((guard_tend_stragglers(guard) || tracee_reap_ending()) && now_ns() < end)
 		usleep(200);
-	dirty_free(&guard->dirty); /* it knows processes of the tree */
+	dirty_free(&guard->dirty); /* before the tree: it refers to its processes */
 	tree_free(&guard->tree);
 	process_close(&guard->main);
 	parasite_close(&guard->main.parasite);
@@ -511,7 +511,7 @@ static void guard_main(struct avc_guard *guard)
 		if (!straggling && !dying && !tracee_expects_strangers())
 			guard->stragglers_since_ns = now_ns();
 		if (!straggling)
-			guard->told_stragglers_ns = now_ns(); /* there are none */
+			guard->told_stragglers_ns = now_ns(); /* reported after a second of them */
 		if (any_lost(guard))
 			guard_kill_lost(guard);
 		if (dying)
@@ -558,9 +558,9 @@ static void guard_main(struct avc_guard *guard)
 	}
 }
 
-/* ---- its beginning and end --------------------------------------------------------- */
+/* ---- start and end ----------------------------------------------------------------- */
 
-/* The first message; *init_pidfd and *heartbeat_fd come with it. */
+/* The first message; *init_pidfd and *heartbeat_fd are sent with it. */
 static int receive_start(int socket, struct avc_request *request, int *init_pidfd,
 			 int *heartbeat_fd)
 {
@@ -607,7 +607,7 @@ static void guard_free(struct avc_guard *guard)
 	free(guard);
 }
 
-/* What is left to be told, as far as somebody listens. */
+/* Unsent events, as long as the daemon reads. */
 static void send_last_words(struct avc_guard *guard)
 {
 	struct pollfd daemon = { .fd = guard->socket, .events = POLLOUT };

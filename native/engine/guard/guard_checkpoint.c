@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * When a checkpoint is taken, and what is said when none can be.
+ * When and how a checkpoint is taken, and what is reported when none can be.
  */
 #include <errno.h>
 #include <string.h>
@@ -10,18 +10,18 @@
 #include "guard.h"
 
 #define SPARE_NS (NS_PER_S / 2)
-#define READ_NS (2 * NS_PER_S) /* of what it has, while it stands still                        */
-#define INIT_REAPS_US 3000     /* what we have reaped is a zombie of init's until then           */
+#define READ_NS (2 * NS_PER_S) /* to read its state while it is stopped                        */
+#define INIT_REAPS_US 3000     /* processes that we have reaped are zombies of init until then   */
 #define QUIESCE_STEP_MS 1
 #define TAKE_TRIES 4
 #define VFORK_NS (2 * NS_PER_S)
-/* Parts of an interval, of a CPU's time, that are spent on what may come, at most. */
+/* Work ahead takes at most one of so many parts of an interval's CPU time. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
 
 /* ---- checkpoint --------------------------------------------------------------- */
 
-/* The app as it cannot be protected: says so once, and gives everything up. */
+/* The app cannot be protected as it is: reports that once, and drops everything. */
 void guard_unprotect(struct avc_guard *guard, uint64_t ticket, const struct avc_error *error)
 {
 	guard_drop_all(guard);
@@ -52,7 +52,7 @@ int guard_find_app(struct avc_guard *guard, struct avc_error *err)
 static void wait_quiescent(struct avc_guard *guard, bool *found)
 {
 	const uint64_t end = now_ns() + guard->config.quiesce_ns;
-	/* Then there is something else to do. */
+	/* A death ends the wait. */
 	struct pollfd death = { .fd = guard->channel.report_fd, .events = POLLIN };
 
 	*found = false;
@@ -76,7 +76,7 @@ static void touch_slot(const struct parasite *parasite, uint32_t slot, uint32_t 
 	}
 }
 
-/* Templates of another parasite are of another program, or too small. */
+/* With another parasite, templates are of another program, or their slots too small. */
 static void drop_images(struct avc_guard *guard, const struct process *process)
 {
 	for (uint32_t i = guard->count; i-- > 0;)
@@ -84,7 +84,7 @@ static void drop_images(struct avc_guard *guard, const struct process *process)
 			guard_drop_generation(guard, i);
 }
 
-/* Nobody of ours forks while another guard in the same PID namespace chooses numbers. */
+/* We do not fork while another guard in the same PID namespace chooses PIDs. */
 static int lock_numbers(const struct avc_guard *guard, struct avc_error *err)
 {
 	if (last_pid_lock(guard->channel.numbers_fd, false))
@@ -141,7 +141,7 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_e
 	if (process_query_new_threads(process, guard->timer, deadline, err))
 		return -1;
 	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
-	/* Under one that adopts orphans it can be made only when that one is stopped, too. */
+	/* Below a process that adopts orphans, only when that one is stopped, too. */
 	if (!process->holder && !process->adopts && hold(guard, process, err))
 		return -1;
 	return 0;
@@ -163,7 +163,7 @@ static int renew_holders(struct avc_guard *guard, struct avc_error *err)
 }
 
 /* A parent that waits for its child to execute a program or end (vfork(2)) cannot be stopped, and
- * every checkpoint would be missed.  Few take that long. */
+ * every checkpoint would be missed.  Few children take longer than VFORK_NS. */
 static int check_vfork(const struct tree *tree, struct avc_error *err)
 {
 	const uint64_t tick_ns = NS_PER_S / (uint64_t)sysconf(_SC_CLK_TCK);
@@ -206,7 +206,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		process->tcp_moved = guard->main.tcp_moved;
 		if (prepare_process(guard, i, &failed) == 0)
 			continue;
-		/* One that is ending is seen to by the freeze. */
+		/* The freeze handles one that is ending. */
 		if (i == 0 || failed.code != AVC_GONE) {
 			*err = failed;
 			return -1;
@@ -228,14 +228,14 @@ void guard_tell_unstoppable(struct avc_guard *guard, const struct avc_error *err
 				 why.code == AVC_UNSUPPORTED ? &why : error);
 }
 
-/* What is known of the descriptors while the app runs makes the freeze shorter. */
+/* Descriptors that are read while the app runs make the freeze shorter. */
 static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
 
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
-		/* An orphan has most in common with the main process, if with anybody. */
+		/* An orphan shares most with the main process, if at all. */
 		const int parent = tree->entry[i].parent < 0 ? 0 : tree->entry[i].parent;
 		struct avc_error failed = { 0 };
 
@@ -249,12 +249,12 @@ static int prepare_files(struct avc_guard *guard, struct avc_error *err)
 	return 0;
 }
 
-/* A checkpoint that came to nothing: holders that were cloning are not to be relied on for
- * another one.  But if it was because the app died, they have what its processes had open. */
+/* After a failed checkpoint: holders that were cloning must not be used for another one.  But if it
+ * failed because the app died, they still have its open files. */
 static void abandon(struct avc_guard *guard, struct generation *fresh)
 {
 	generation_drop(fresh);
-	tracee_end_now(); /* they have the tables of processes that are in no generation yet */
+	tracee_end_now(); /* its templates have open files of processes in no generation yet */
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		guard->tree.process[i]->doubtful |= guard->tree.process[i]->descendant &&
 						    guard->tree.process[i]->lost;
@@ -271,7 +271,7 @@ static bool is_database(const struct avc_guard *guard)
 	return false;
 }
 
-/* avckpt.files=strict, or auto and a database: from here on, nothing is written that is not seen. */
+/* avckpt.files=strict, or auto and a database: from here on, all writes to files are detected. */
 static void watch_files(struct avc_guard *guard, struct image *main)
 {
 	const bool strict = guard->config.files == AVC_FILES_STRICT;
@@ -291,7 +291,7 @@ static void watch_files(struct avc_guard *guard, struct image *main)
 		main->mapped = files_mapped_prepare(process->pid, process->shm_bytes);
 }
 
-/* What a restore can be spared of it is found out when nothing else is to be done. */
+/* Work that a restore would have to do is done ahead, when the guard is idle. */
 static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 {
 	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
@@ -303,11 +303,11 @@ static void begin_ahead(struct avc_guard *guard, struct generation *fresh)
 	if (fresh->images > 1 &&
 	    restore_plan_begin(fresh, interval_ns ? interval_ns / INHERIT_SHARE : UINT64_MAX,
 			       &later))
-		guard->ahead_ns = UINT64_MAX; /* there is no memory for it */
+		guard->ahead_ns = UINT64_MAX; /* out of memory */
 }
 
-/* Where checkpoints are copies, there is none to be made after each of them, but after a restore, say:
- * it may take its share of the time since the last one. */
+/* Where checkpoints are copies, a spare is not made after each of them but, for example, after a
+ * restore: it may take its share of the time since the last one. */
 static bool may_make_spare(const struct avc_guard *guard, const struct generation *newest)
 {
 	const uint64_t interval_ns = policy_interval(&guard->pace, &guard->config);
@@ -331,7 +331,7 @@ static void make_spare(struct avc_guard *guard, struct generation *newest)
 		return;
 	guard->spare_ns = now_ns();
 	tracee_deadline_set(guard->timer, SPARE_NS);
-	/* A template that was killed is seen to by guard_reap_dead(), as soon as that shows. */
+	/* guard_reap_dead() handles a template that was killed. */
 	if (spare_make(newest, &error) && error.code != AVC_GONE &&
 	    !pidfd_ended(newest->image[0].pidfd))
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_KILLED, 0);
@@ -350,7 +350,7 @@ static void work_ahead(struct avc_guard *guard)
 	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
 	if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
-		; /* its predecessor has to end first */
+		; /* to be continued before anything else */
 	else if (wants_spare(guard, newest))
 		make_spare(guard, newest);
 	else
@@ -390,7 +390,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 		if (guard->tree.entry[i].process)
 			waits_prepare(guard->tree.entry[i].process);
 	budget_deadline(READ_NS);
-	/* What is written between here and the freeze counts as written after it. */
+	/* Writes between here and the freeze count as later than it. */
 	guard_note_written(guard);
 	return 0;
 }
@@ -497,8 +497,8 @@ static int take_once(struct avc_guard *guard, struct avc_event *event, struct av
 	return result;
 }
 
-/* A limit of processes, or of memory, leaves no room for a template: spares have to go, and
- * those that were to go a little later. */
+/* A limit on processes or memory leaves no room for a template: drops spares and idle templates,
+ * and waits for processes that are ending. */
 static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 {
 	if (err->code != AVC_LIMIT)
@@ -569,7 +569,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	guard_pace_missed(guard, event.freeze_ns);
 	if (error.code == AVC_GONE)
 		guard->dying_until_ns = now_ns() + DYING_NS;
-	/* Of a dying app init's report tells; this is for one that is only away. */
+	/* If the app has died, init's report follows: only a command needs an answer. */
 	if (error.code == AVC_GONE && guard->main.pid && pidfd_ended(guard->main.pidfd)) {
 		if (ticket)
 			guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
@@ -580,7 +580,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	event.kind = AVC_EVENT_MISSED;
-	event.generations = guard->count; /* another parasite may have cost them all */
+	event.generations = guard->count; /* with a new parasite, all may have been dropped */
 	event.ticket = ticket;
 	event.error = error;
 	guard_emit(guard, &event);

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What a guard is told to do, at its start and while it runs.
+ * A guard's settings, at its start and while it runs.
  */
 #include "guard.h"
 
@@ -12,13 +12,13 @@ void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 	if (!guard->config.freeze_deadline_ns)
 		guard->config.freeze_deadline_ns = FREEZE_DEADLINE_NS;
 	guard->main.shm_bytes = config->shm_bytes;
-	/* A generation whose bytes were not counted has none: its connections all moved. */
+	/* In generations taken without byte counts, all connections count as moved. */
 	guard->main.tcp_messages = config->tcp == AVC_TCP_MESSAGES;
 	guard->main.tcp_moved = config->tcp == AVC_TCP_RESET_MOVED ||
 				config->tcp == AVC_TCP_MESSAGES || config->together;
 }
 
-/* A death that comes next is judged by the new settings. */
+/* The next death is already judged by the new settings. */
 void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	const uint32_t keep = guard->config.keep;

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What follows a death: a restore, or init being told to end.
+ * What follows a death: a restore, or the end of init.
  */
 #include <errno.h>
 #include <signal.h>
@@ -20,7 +20,7 @@ static bool is_late(const struct avc_guard *guard)
 	return guard->late_ns && now_ns() > guard->late_ns;
 }
 
-/* Or does not: the app has not run an instruction yet. */
+/* Last chance to refuse: the app has not run an instruction yet. */
 static int say_restored(void *arg, struct avc_error *err)
 {
 	struct avc_guard *guard = arg;
@@ -49,11 +49,11 @@ void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enu
 	guard_drop_all(guard);
 	process_unhold(&guard->main);
 	process_close(&guard->main);
-	/* Init ends now, and why is what was told last. */
+	/* init ends now, and the reason should remain the last event. */
 	guard->next_ns = POLICY_NEVER;
 }
 
-/* Processes that were started since leave nothing open: a port, a lock, the end of a pipe. */
+/* Nothing that processes started since had open may stay so: a port, a lock, the end of a pipe. */
 static void release_new(struct avc_guard *guard, const struct generation *generation)
 {
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
@@ -62,8 +62,8 @@ static void release_new(struct avc_guard *guard, const struct generation *genera
 			guard_release(guard, guard->tree.process[i]);
 }
 
-/* The processes are those of the generation now; of what the others had before they died nothing
- * is open any more (generation_close_tables()). */
+/* From now on the processes are those of the generation; nothing that the dead ones had open is
+ * open any more (generation_close_tables()). */
 static void adopt_family(struct avc_guard *guard, const struct generation *generation)
 {
 	struct tree *tree = &guard->tree;
@@ -79,8 +79,8 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 
 		if (!process)
 			continue;
-		/* One that has died again already is seen to by the next checkpoint; of the main
-		 * one the next report tells. */
+		/* The next checkpoint notices one that has died again already; init reports the
+		 * main process. */
 		process->infected = proc_stat(image->pid, &stat) == 0 &&
 				    process_open(process, image->pid, image->inside, &gone) == 0;
 		if (process->infected)
@@ -90,7 +90,7 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 	guard->main.childless = generation->images == 1;
 }
 
-/* Of a restore that is nobody's fault. */
+/* A restore without a crash of this app. */
 static bool is_command(enum avc_reason reason)
 {
 	return reason == AVC_REASON_COMMAND || reason == AVC_REASON_GROUP;
@@ -105,7 +105,7 @@ static void note_restore(struct avc_guard *guard, enum avc_reason reason)
 	policy_restored(&guard->policy, guard->count - 1, !is_command(reason), now);
 }
 
-/* `error`: of a newer generation that would not. */
+/* `error`: of a newer generation that could not be restored. */
 static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 			  const struct restore *restore, const struct avc_error *error)
 {
@@ -128,7 +128,7 @@ static void tell_restored(struct avc_guard *guard, struct avc_event *event,
 	guard_emit(guard, event);
 }
 
-/* Of whatever takes its time. */
+/* During long work. */
 static void say_working(void *channel)
 {
 	init_channel_working(channel);
@@ -148,7 +148,7 @@ void guard_tend_remains(struct avc_guard *guard)
 		guard_release_remains(guard);
 }
 
-/* The holder has the dead app's memory; what was open is the restored one's. */
+/* The holder still has the dead app's memory; its open files belong to the restored one. */
 static void keep_remains(struct avc_guard *guard)
 {
 	if (!guard->config.remains_ns || !guard->main.holder) {
@@ -157,7 +157,7 @@ static void keep_remains(struct avc_guard *guard)
 	}
 	guard->remains.pid = process_detach_holder(&guard->main, &guard->remains.pidfd);
 	guard->remains.until_ns = now_ns() + guard->config.remains_ns;
-	/* Memory that nobody runs in goes before anybody's. */
+	/* Memory of a dead process goes before that of any running one. */
 	proc_set_oom_score_adj(guard->remains.pid, "1000");
 }
 
@@ -198,8 +198,8 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	event.attempt = policy_restores_within(&guard->policy, &guard->config, now_ns()) +
 			(reason != AVC_REASON_GROUP);
 	if (together)
-		ready_helper(guard); /* it may be another one than the newest of then */
-	/* Of a group: an older one is of another line. */
+		ready_helper(guard); /* the newest may have changed since the death */
+	/* In a group only this one: an older one belongs to another line. */
 	while (guard->count && (guard->meeting || !together)) {
 		struct generation *generation = &guard->generations[guard->count - 1];
 		const struct image *image = &generation->image[0];
@@ -223,28 +223,28 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			     "restore descriptors", "", "%u of its connections have ended",
 			     guard->dead.ended);
 
-		/* What was written since the newest was written since all others, also
-		 * where that cannot be seen any more. */
+		/* Written since the newest means written since all others, also where that cannot
+		 * be seen any more. */
 		if (guard_check_files(guard, generation, image->template, image->pidfd, &failed)) {
 			*error = failed;
 			guard_drop_all(guard);
 			break;
 		}
 		release_new(guard, generation);
-		/* Nor do templates of one that was lost by this death: theirs are the same
-		 * tables.  And they count where processes are limited, as a spare does. */
+		/* Nor may templates lost by this death keep anything open.  And where processes are
+		 * limited, they count, as spares do. */
 		if (ending)
 			guard_wait_ended();
 		init_channel_working(&guard->channel);
 		(void)last_pid_lock(guard->channel.numbers_fd, true);
-		guard->helper = NULL; /* it is the restore's now, which ends it */
+		guard->helper = NULL; /* restore_app() ends it */
 		stand_in_begin(&guard->dirty, generation, guard->timer);
 		back = restore_app(&restore, &failed) == 0;
 		last_pid_unlock(guard->channel.numbers_fd);
 		whole = stand_in_finish(&guard->dirty, generation, guard->timer);
 		if (back) {
 			adopt_family(guard, generation);
-			generation->spare.tried = false; /* that one is used up */
+			generation->spare.tried = false; /* the spare is used up */
 			note_restore(guard, reason);
 			tell_restored(guard, &event, &restore, error);
 			guard_rank_generations(guard);
@@ -254,13 +254,13 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		if (!guard_may_meet(guard)) {
-			/* Another one could not be restored, and this one could. */
+			/* Another member could not be restored; this one could. */
 			*error = failed;
 			guard_kill_lost(guard);
 			break;
 		}
-		/* Perhaps because the spare was killed when it was needed, or was one
-		 * process too many.  The template is as good as before. */
+		/* Perhaps because the spare was killed when it was needed, or was one process too
+		 * many.  The template is still good. */
 		if (whole && generation->spare.pid && !again) {
 			spare_drop(generation);
 			generation->spare.unwanted = failed.errnum == EAGAIN;
@@ -281,7 +281,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 	return back;
 }
 
-/* Of the processes that are not the main one only the holder keeps what they have open. */
+/* Only holders keep open what the other processes have open. */
 void guard_hold_all(struct avc_guard *guard)
 {
 	if (!last_pid_lock(guard->channel.numbers_fd, false))
@@ -290,7 +290,7 @@ void guard_hold_all(struct avc_guard *guard)
 		struct process *process = guard->tree.process[i];
 		struct avc_error ignored = { 0 };
 
-		/* The next checkpoint tries again, and tells. */
+		/* The next checkpoint tries again, and reports the error. */
 		if (process->pid && !process->adopts &&
 		    process_hold(process, guard->timer, guard->config.freeze_deadline_ns, &ignored))
 			guard->dying_until_ns = now_ns() + DYING_NS;
@@ -298,8 +298,8 @@ void guard_hold_all(struct avc_guard *guard)
 	last_pid_unlock(guard->channel.numbers_fd);
 }
 
-/* Killed in the middle of a checkpoint: init cannot wait for a process before we have waited
- * for those of its threads that are our tracees. */
+/* If the app is killed during a checkpoint, init cannot reap a process before we have reaped those
+ * of its threads that are our tracees. */
 static void reap_tracees(void *arg)
 {
 	struct avc_guard *guard = arg;
@@ -308,8 +308,8 @@ static void reap_tracees(void *arg)
 	guard_reap_unknown(guard);
 }
 
-/* The OOM killer kills whoever has the memory of the one that it has chosen: the holder, too.
- * Before that one is gone there is no room for what is restored. */
+/* The OOM killer also kills processes that share its victim's memory: the holder, too.  Until that
+ * is gone, there is no room for the restored app. */
 static void await_killed_holder(struct avc_guard *guard)
 {
 	const struct process *main = &guard->main;
@@ -392,7 +392,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	}
 out:
 	if (!guard->dead.waits)
-		drop_helper(guard); /* there was nothing to be restored, after all */
+		drop_helper(guard); /* if there was nothing to restore, after all */
 	guard->foreseen = 0;
 	rt_priority_end();
 	guard_leave_meeting(guard);

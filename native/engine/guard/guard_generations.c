@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Which generations are held, and what has become of those that were.
+ * Which generations are held, and what ends them.
  */
 #include <poll.h>
 #include <string.h>
@@ -18,7 +18,7 @@
 
 void guard_drop_generation(struct avc_guard *guard, uint32_t i)
 {
-	/* Disarmed first: a death in between is then final at once. */
+	/* Disarmed first: init then takes a death in between as final. */
 	if (guard->count == 1 && guard->channel.ctl)
 		init_channel_arm(&guard->channel, false);
 	guard->main.lost |= spare_is_unknown(&guard->generations[i]);
@@ -63,7 +63,7 @@ uint32_t guard_free_slot(const struct avc_guard *guard)
 	}
 }
 
-/* Given up before its time; the event is to be emitted. */
+/* Dropped early; the caller emits the event. */
 static struct avc_event lost_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason)
 {
 	const struct policy_generation lost = guard->policy.held[i];
@@ -128,7 +128,7 @@ void guard_wait_ended(void)
 		usleep(ENDED_STEP_US);
 }
 
-/* Of those that were late (spare_make), whichever has been made by now. */
+/* Collects late spares (spare_make) that have been made by now. */
 void guard_await_spares(struct avc_guard *guard)
 {
 	for (uint32_t i = 0; i < guard->count; i++) {
@@ -137,7 +137,7 @@ void guard_await_spares(struct avc_guard *guard)
 		if (!guard->generations[i].spare.work)
 			continue;
 		tracee_deadline_set(guard->timer, LATE_SPARE_NS);
-		/* Or it is still on its way; who was killed is seen to by guard_reap_dead(). */
+		/* AVC_DEADLINE: still under way; guard_reap_dead() handles one that was killed. */
 		if (spare_await(&guard->generations[i], &late))
 			guard->main.lost |= late.code != AVC_DEADLINE;
 		tracee_deadline_clear(guard->timer);
@@ -171,8 +171,8 @@ bool guard_knows_tracee(pid_t tid, const void *arg)
 	return is_known(tid, guard) || tree_has_parasite(&guard->tree, tracee_pc(tid));
 }
 
-/* What is not in a parasite is the app's (CLONE_PARENT, CLONE_PTRACE), or ends by itself
- * (infect.c); it is let go. */
+/* One that is not in a parasite belongs to the app (CLONE_PARENT, CLONE_PTRACE), or ends by itself
+ * (infect.c); it is released. */
 static bool is_not_lost(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
@@ -213,32 +213,32 @@ static bool found_executed(struct process *process, uint64_t now)
 		pause = EXEC_CHECK_NS;
 	if (pause > EXEC_CHECK_LONG_NS)
 		pause = EXEC_CHECK_LONG_NS;
-	/* First: an exec after this look is told. */
+	/* First, so that no exec between the two is missed. */
 	process->exec_check_ns = process_listen_for_exec(process) ? UINT64_MAX : now + pause;
 	return process_has_executed(process);
 }
 
-/* What may be left in it by another program. */
+/* Whether it has something of ours that has to go after an exec. */
 static bool has_ours(const struct process *process)
 {
 	return process->descendant ? process->pid && process->infected : process->holder != 0;
 }
 
-/* All that there is of the app is of a program that the main process does not run any more. */
+/* The main process runs another program: everything saved is of the old one. */
 static void lose_program(struct avc_guard *guard)
 {
 	while (guard->count)
 		guard_lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
 	dirty_drop_idle(&guard->dirty);
 	tracker_end(&guard->main);
-	tracee_end_now(); /* they have the table that exec(2) has left */
+	tracee_end_now(); /* they have the descriptors from before execve(2) */
 	process_unhold(&guard->main);
-	guard->main.infected = false; /* what was mapped there went with its memory */
+	guard->main.infected = false; /* the parasite went with its memory */
 }
 
-/* One that executes another program closes what it has marked for that (O_CLOEXEC), and
- * somebody may be waiting for just that.  Where the kernel does not tell, it is looked at: often
- * at first, for most do it at once if they do it at all.  Returns whether there was one. */
+/* A process that executes another program closes its O_CLOEXEC descriptors, and another process may
+ * be waiting for just that.  Where the kernel does not report it, we poll: often at first, because
+ * most do it at once if at all. */
 bool guard_let_executed_go(struct avc_guard *guard, bool all)
 {
 	const uint64_t now = now_ns();
@@ -266,7 +266,7 @@ void guard_hear_exec(struct avc_guard *guard, int fd)
 
 		if (process->exec_sign.fd != fd)
 			continue;
-		process_listen_no_more(process); /* it says so once */
+		process_listen_no_more(process); /* it reports only one */
 		process->exec_check_ns = 0;
 	}
 }
@@ -284,9 +284,9 @@ uint64_t guard_exec_check_due(const struct avc_guard *guard)
 	return due;
 }
 
-/* When the main process goes, the others go with it, and all of it comes back with what
- * the holders have.  Some end by themselves, as soon as it has closed what it has open:
- * before its own end can be seen.  So that is looked for last. */
+/* When the main process ends, the others do, too, and all are restored with what the holders have.
+ * Some end by themselves as soon as it has closed its descriptors: before its own end can be seen.
+ * So its end is checked last. */
 void guard_let_ended_go(struct avc_guard *guard)
 {
 	const struct process *main = &guard->main;
@@ -309,11 +309,11 @@ void guard_tend_tree(struct avc_guard *guard)
 	guard_let_ended_go(guard);
 }
 
-/* An app that is killed while its threads are being stopped may leave a thread that
- * was just being made: attached to us, unheard of, and in the way of its leader's end. */
+/* An app that is killed while its threads are being stopped may leave a thread that was just being
+ * created: our tracee, unknown to us, and its leader cannot be reaped before it. */
 void guard_reap_unknown(const struct avc_guard *guard)
 {
-	/* The first that is known hides the others. */
+	/* A known one that has ended would hide the others. */
 	(void)tracee_reap_ending();
 	while (tracee_reap_unknown(is_known, guard))
 		;
@@ -337,8 +337,8 @@ void guard_reap_dead(struct avc_guard *guard)
 	};
 	uint32_t count = 0;
 
-	/* With its PID namespace everything dies, and init last, once we have
-	 * reaped what is ours: then it is no news.  A death does not wait. */
+	/* When the PID namespace ends, everything dies, init last, once we have reaped our tracees:
+	 * then lost generations are not reported.  A death of the app is handled at once. */
 	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
 		(void)tracee_reap_ending();
 		for (uint32_t i = 0; i < guard->count; i++)
@@ -370,7 +370,7 @@ void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 	const struct policy_generation record =
 		policy_new_generation(&guard->policy, &guard->config, fresh->number, now);
 
-	/* Only the newest has one. */
+	/* Only the newest has a spare. */
 	for (uint32_t i = 0; i < guard->count; i++)
 		spare_drop(&guard->generations[i]);
 	while (guard->count >= guard->policy.room) {
@@ -398,7 +398,7 @@ enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung)
 
 /* ---- avckpt.files=auto and strict ---------------------------------------------- */
 
-/* Older than the generation, and open in none of its processes. */
+/* File is older than the generation, and open in none of its processes. */
 static bool is_old(int fd, const struct stat *st, const void *arg)
 {
 	const struct generation *generation = arg;
@@ -409,8 +409,8 @@ static bool is_old(int fd, const struct stat *st, const void *arg)
 	return true;
 }
 
-/* Before the next generation is taken, and before one is restored: no generation is
- * good any more after a file was written. */
+/* Before the next generation is taken, and before one is restored: a write to a file makes all
+ * generations invalid. */
 void guard_note_written(struct avc_guard *guard)
 {
 	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
@@ -426,7 +426,7 @@ void guard_note_written(struct avc_guard *guard)
 		memcpy(guard->generations[i].written, name, sizeof name);
 }
 
-/* All of them, also those that have ended before: what they had written belongs to the others. */
+/* All processes, also those that have ended: what they have written belongs to the others. */
 static int check_auto(const struct avc_guard *guard, const struct generation *generation, int pidfd,
 		      struct avc_error *err)
 {
@@ -444,8 +444,8 @@ static int check_auto(const struct avc_guard *guard, const struct generation *ge
 	return 0;
 }
 
-/* Whether memory may go back although files do not.  A process that has the table of
- * descriptors as it is now. */
+/* Whether memory may go back although files do not.  `pid`, `pidfd`: a process that has the current
+ * descriptors. */
 int guard_check_files(struct avc_guard *guard, const struct generation *generation, pid_t pid,
 		      int pidfd, struct avc_error *err)
 {
@@ -464,7 +464,7 @@ int guard_check_files(struct avc_guard *guard, const struct generation *generati
 		const struct image *image = &generation->image[i];
 		const struct process *process = image->process;
 
-		/* What one that has ended before has written, guard_note_written() knows. */
+		/* guard_note_written() has seen the writes of one that has ended before. */
 		if (!process || (process->descendant && !process->holder))
 			continue;
 		if (files_check_strict(image, process->descendant ? process->holder : pid,

@@ -1,20 +1,20 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.group.recovery=together: what guards of one group do in the same instant.
+ * avckpt.group.recovery=together: what the guards of a group do in the same instant.
  *
- * The daemon has them meet (struct avc_meeting) for one line, or for one return to a line.
- * From there on they go by what they share alone: the daemon is not waited for while anything
- * stands still.  Every wait is bounded, and whoever waits for too long breaks the meeting for
- * all of them.
+ * The daemon starts a meeting (struct avc_meeting) for one line, or for one return to a line.
+ * From then on they depend only on the memory that they share: none waits for the daemon while an
+ * app is stopped.  Every wait is bounded, and a guard that waits too long breaks the meeting for
+ * all.
  *
- *   a line     0 ready        the app still runs; what takes its time is done
- *              1 still        everything is read and cloned: nobody sends any more
- *              2 frozen       what is in flight between them is copied, too: now all are let go
- *   a return   0 able         the app still runs, if it does: it could go back
- *              1 dead         nothing runs any more that could send
- *              2 shown        its ends of connections are published: now they are made what
- *                             they were (files_group.c)
- *              3 restored     everything is there: now all run
+ *   a line     0 ready        the app still runs; slow preparations are done
+ *              1 still        everything is read and cloned: no member sends any more
+ *              2 frozen       data in flight between them is copied, too: all are released
+ *   a return   0 able         the app may still run; it could go back
+ *              1 dead         nothing that could send runs any more
+ *              2 shown        its ends of connections are published: now they are restored
+ *                             (files_group.c)
+ *              3 restored     everything is restored: now all run
  */
 #include <limits.h>
 #include <linux/futex.h>
@@ -27,13 +27,13 @@
 #include "guard.h"
 
 #define MEMBERS_MAX 1024
-#define SLICE_NS (2 * NS_PER_MS) /* between looks whether the app has died               */
+#define SLICE_NS (2 * NS_PER_MS) /* between checks whether the app has died              */
 #define READY_NS (1 * NS_PER_S)  /* the app runs                                         */
-#define CLONES 4                 /* so many times as long as the slowest clone may take  */
-#define FIRST_CLONE_MS 250       /* nobody knows yet how long it takes                   */
+#define CLONES 4                 /* wait for so many times the slowest expected clone    */
+#define FIRST_CLONE_MS 250       /* assumed before the first one was measured            */
 #define DEAD_NS (3 * NS_PER_S)
-#define RESTORED_NS (3 * NS_PER_S) /* init is told meanwhile; INJ_GO_S is longer          */
-#define WAITS_NS (5 * NS_PER_S)    /* for the daemon to say what is gone back to           */
+#define RESTORED_NS (3 * NS_PER_S) /* init is notified meanwhile; INJ_GO_S is longer      */
+#define WAITS_NS (5 * NS_PER_S)    /* for the daemon to choose a line                      */
 
 enum line_step { LINE_READY = 0, LINE_STILL = 1, LINE_FROZEN = 2, LINE_STEPS };
 enum recall_step {
@@ -80,7 +80,7 @@ static void wake_all(struct avc_meeting *meeting)
 	syscall(SYS_futex, &meeting->state, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
 }
 
-/* Only from the step for which it is gathered: nobody is told two things. */
+/* Only from the current step, so that all members see the same outcome. */
 static bool move(struct avc_meeting *meeting, uint32_t from, uint32_t to)
 {
 	if (!__atomic_compare_exchange_n(&meeting->state, &from, to, false, __ATOMIC_ACQ_REL,
@@ -95,7 +95,7 @@ static uint32_t state_of(const struct avc_meeting *meeting)
 	return __atomic_load_n(&meeting->state, __ATOMIC_ACQUIRE);
 }
 
-/* If all have arrived at the step that is gathered for, it is too late for that. */
+/* Has no effect if all have arrived at this step already. */
 static void break_at(struct avc_guard *guard, uint32_t step)
 {
 	(void)move(guard->meeting, step, AVC_MEETING_BROKEN);
@@ -117,7 +117,7 @@ bool guard_may_meet(const struct avc_guard *guard)
 	return !guard->meeting || state_of(guard->meeting) == guard->step;
 }
 
-/* Whether there is something that does not wait: the app has died, or init. */
+/* Whether something urgent has happened: the app has died, or init. */
 static bool is_called_away(const struct avc_guard *guard)
 {
 	struct pollfd news[] = {
@@ -185,7 +185,7 @@ int guard_meet_ready(struct avc_guard *guard, struct avc_error *err)
 	return meet(guard, LINE_READY, READY_NS, err);
 }
 
-/* Nothing of the app is in the parasite any more: if this process dies, all of it goes on. */
+/* No thread of the app is in the parasite any more: if this process dies, all of them continue. */
 int guard_meet_frozen(void *arg, struct generation *whole, struct avc_error *err)
 {
 	struct avc_guard *guard = arg;
@@ -255,14 +255,14 @@ static int meet_shown(struct avc_guard *guard, struct avc_error *err)
 	return 0;
 }
 
-/* The app is dead, and all others are to be. */
+/* This app is dead; waits until all others are. */
 static void go_back(struct avc_guard *guard)
 {
 	struct avc_error error = { 0 };
 	bool back = false;
 
 	rt_priority_begin();
-	guard->dead.waits = true; /* init is told that we are at work */
+	guard->dead.waits = true; /* so that meet() notifies init of progress */
 	if (guard_find_generation(guard, guard->recall) >= 0 &&
 	    meet(guard, RECALL_DEAD, DEAD_NS, &error) == 0) {
 		guard_drop_newer(guard, guard->recall);
@@ -300,7 +300,7 @@ void guard_go_back(struct avc_guard *guard, const struct avc_report *report, enu
 		wait_for_group(guard, &none);
 }
 
-/* One that lives could be killed for nothing. */
+/* Checked first: otherwise a running app might be killed in vain. */
 static int check_able(struct avc_guard *guard, struct avc_error *err)
 {
 	const int i = guard_find_generation(guard, guard->recall);

@@ -6,14 +6,13 @@
  * thousandths of the limit (mm/oom_kill.c, oom_badness()).
  *
  * - Older generations go first, the oldest before all others: 1000, or a little less.
- * - The newest one is there for an application that leaks until it is killed.  Without a limit it
+ * - The newest one must survive an application that leaks until it is killed.  Without a limit it
  *   has the value of the application, which has more points, because it has grown since.
- * - With a limit it has as many points as the application has when that fills the limit by
- *   itself, all but a twentieth.  So the kernel kills an application that has leaked so much,
- *   and the template where the application would have room without it: it never dies because of
- *   its template.
+ * - With a limit it has as many points as the application has when it alone fills 95 % of the
+ *   limit.  So the kernel kills an application that has leaked that much, and the template where
+ *   the application would have room without it: it never dies because of its template.
  *
- * No template gets less than the application's own value, which would take CAP_SYS_RESOURCE.
+ * No template gets less than the application's own value: that would take CAP_SYS_RESOURCE.
  */
 #include <fcntl.h>
 #include <stdio.h>
@@ -23,8 +22,7 @@
 #define FIRST 1000
 #define OWN_MAX (FIRST - 1)
 #define STEP 2
-/* In percent of the limit: an app that uses this much is killed; of one that uses this much no
- * checkpoint is taken. */
+/* In percent of the limit: above KILLED the app is killed; above FULL no checkpoint is taken. */
 #define KILLED 95
 #define FULL 90
 
@@ -46,7 +44,7 @@ static void tell(struct image *image, int value)
 	proc_set_oom_score_adj(image->template, text);
 }
 
-/* The points of the process that has grown until all processes of the app fill the limit. */
+/* The points of the smallest process, if it alone grew until all processes fill the limit. */
 static long points_wanted(const struct generation *generation, long limit)
 {
 	long least = generation->image[0].anon_pages, others = 0;
@@ -80,7 +78,7 @@ static void rank_newest(struct generation *newest, long limit)
 	}
 }
 
-/* A newer one is larger, if the app grows. */
+/* A newer one is larger if the app grows: its value makes up for that. */
 static void rank_older(struct generation *older, uint32_t k, long oldest_pages, long limit)
 {
 	const long grown = older->image[0].anon_pages - oldest_pages;

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * avckpt.interval=auto: what checkpoints cost, what the app does between them, and when that
- * calls for another one (policy_wants()).
+ * avckpt.interval=auto: measures what checkpoints cost and what the app does between them, and when
+ * to take the next one (policy_wants()).
  */
 #include <time.h>
 
@@ -9,7 +9,7 @@
 
 #define FAULT_NS 1000 /* the first write to a page after a clone of it             */
 #define TOLD_NS NS_PER_S
-#define SENDS_NS (10 * NS_PER_S) /* so long one that has sent is one that sends             */
+#define SENDS_NS (10 * NS_PER_S) /* an app that has sent counts as a sender for so long      */
 
 static uint64_t own_cpu_ns(void)
 {
@@ -44,7 +44,7 @@ static uint64_t app_faults(const struct avc_guard *guard)
 	return sum;
 }
 
-/* What it does from here on is not in the newest generation. */
+/* The app's work from here on is not in the newest generation. */
 static void begin_rest(struct avc_guard *guard)
 {
 	guard->sent = false;
@@ -64,8 +64,8 @@ void guard_pace_end(struct avc_guard *guard)
 		guard->pace_cpu_ns += own_cpu_ns() - guard->pace_began_ns;
 }
 
-/* Writes to pages that have not been written since the clone; faults of other kinds look the
- * same, so no more than what the checkpoint itself has cost the app once more. */
+/* Cost of first writes to pages after the clone; other faults look the same, so it counts for no
+ * more than the freeze itself. */
 static uint64_t faults_ns(struct avc_guard *guard, uint64_t freeze_ns)
 {
 	const uint64_t faults = app_faults(guard), before = guard->pace_faults;
@@ -85,7 +85,7 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 	if (!policy_is_automatic(&guard->config))
 		return;
 	guard_pace_end(guard);
-	/* The template is made and, when it makes way, unmade. */
+	/* Making the template, and freeing it later. */
 	cost.cpu_ns = guard->pace_cpu_ns + 2 * event->clone_ns;
 	cost.held_ns = event->freeze_ns + faults_ns(guard, event->freeze_ns);
 	guard->pace_cpu_ns = 0;
@@ -93,8 +93,8 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 	begin_rest(guard);
 }
 
-/* It has held the app up all the same: within the budget, and no later than the next one is to be
- * at an interval that does not change. */
+/* A failed checkpoint has stopped the app, too: the pause after it keeps to the budget, but is no
+ * longer than a fixed interval would be. */
 static uint64_t paid_for(const struct avc_guard *guard, uint64_t held_ns)
 {
 	const uint64_t pause = held_ns * 1000000 / guard->config.budget_freeze_ppm,
@@ -145,8 +145,7 @@ static bool wants(const struct avc_guard *guard, uint64_t now)
 	       policy_wants(&guard->pace, &guard->config, activity, now);
 }
 
-/* Nearly all looks at an app that does nothing find nothing: no more than that is to be done for
- * them. */
+/* Nearly all looks at an idle app find nothing, so they skip the rest of the guard's cycle. */
 bool guard_pace_dozes(struct avc_guard *guard)
 {
 	const uint64_t now = now_ns();
@@ -162,7 +161,7 @@ bool guard_pace_wants(struct avc_guard *guard)
 {
 	const uint64_t now = now_ns();
 
-	/* What others write counts where files are strict, too. */
+	/* With strict files, writes by other processes count, too. */
 	if (!policy_is_automatic(&guard->config) || !guard->count ||
 	    guard->config.files == AVC_FILES_STRICT || wants(guard, now)) {
 		output_disarm(&guard->output);
@@ -175,9 +174,9 @@ bool guard_pace_wants(struct avc_guard *guard)
 	return false;
 }
 
-/* ---- telling ------------------------------------------------------------------- */
+/* ---- events -------------------------------------------------------------------- */
 
-/* Fifty a second are no news; how often and at what price is, once a second. */
+/* Fifty events a second would be noise: once a second, one reports how many and at what cost. */
 void guard_tell_taken(struct avc_guard *guard, struct avc_event *event)
 {
 	struct avc_event *told = &guard->untold;
