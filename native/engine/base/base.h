@@ -64,7 +64,7 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 int heartbeat_open(int fd) warn_unused;
 /* A sign of progress: the daemon kills a guard that has been silent for seconds. */
 void heartbeat(void);
-/* It sleeps until then, CLOCK_MONOTONIC; 0: it is awake again. */
+/* The guard sleeps until then, CLOCK_MONOTONIC; 0: it is awake again. */
 void heartbeat_rest(uint64_t until_ns);
 
 /* ---- budget.c --------------------------------------------------------------- */
@@ -102,8 +102,8 @@ bool aside_is_left_behind(void);
 
 /* ---- cpu_clock.c ------------------------------------------------------------ */
 
-/* Converts a time by the scheduler's clock of that CPU to CLOCK_MONOTONIC. The result may be late, but
- * never early. 0: unknown, for instance because the CPU is too busy. Main thread only. */
+/* Converts a time by the scheduler's clock of that CPU to CLOCK_MONOTONIC. The result may be late,
+ * but never early. 0: unknown, for instance because the CPU is too busy. Main thread only. */
 uint64_t cpu_clock_when(uint32_t cpu, uint64_t ran_ns);
 /* A thousandth less: the scheduler's clocks are not adjusted as CLOCK_MONOTONIC is. */
 uint64_t cpu_clock_least(uint64_t ns);
@@ -339,7 +339,7 @@ struct page_cursor {
 bool pageset_next(const struct pageset *set, struct page_cursor *at, avc_remote *start,
 		  avc_remote *end);
 uint64_t pageset_count(const struct pageset *set);
-/* Moves so many of the last ones, or a few more. */
+/* Moves this many of the last ones, or a few more. */
 bool pageset_take(struct pageset *from, uint64_t pages, struct pageset *to);
 void pageset_free(struct pageset *set);
 

@@ -1,16 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A checkpoint that costs what was written, and not what there is.
+ * A checkpoint whose cost depends on what was written, not on the size of the process.
  *
- * A template is forked once.  When its generation gives way it is not killed but kept, and brought up
- * to date for a later one: what was written since (tracker.c) is copied, in rounds while the
- * application runs, and the last, small one with it stopped.  Even that is only read then, and
- * written to the template when the application runs again.
+ * A template is forked once.  When its generation is replaced, it is not killed but kept, and
+ * brought up to date for a later one: pages written since (tracker.c) are copied, in rounds while
+ * the application runs, and in a last, small one with it stopped.  Even those are only read then,
+ * and written to the template when the application runs again.
  *
- * What may differ between the process and a template is the template's *stale set*.  Every scan adds
- * to the sets of all templates, and only a copy takes away, so that an attempt that comes to nothing
- * costs nothing.  What else a fork inherits must be what it was (inherited.c, layout.c); if not, the
- * checkpoint is taken by a fork.
+ * The pages that may differ between the process and a template are the template's *stale set*.
+ * Every scan adds to the sets of all templates, and only a copy removes pages, so that a failed
+ * attempt loses nothing.  All else that a fork inherits must be unchanged (inherited.c, layout.c);
+ * if not, the checkpoint is taken by a fork.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -25,22 +25,22 @@
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 #define ROUNDS 6
 #define SCAN_TRIES 3
-#define FEW_PAGES 48     /* a round that finds no more is the last          */
+#define FEW_PAGES 48     /* a round that leaves no more is the last         */
 #define READ_PAGE_NS 700 /* in a freeze                                     */
 #define AGE_NS (60 * NS_PER_S)
-#define STALE_SHARE 2 /* of its pages of its own: more than a half is for a fork to bring */
+#define STALE_SHARE 2 /* if more than half of its own pages are stale, a fork is better   */
 #define COPIES_SHARE 2
 #define SMALL_PAGES 1024
-#define SLACK_PAGES 64 /* written until the freeze, of one process of many */
-#define FORK_NS 100000 /* a fork of nothing */
+#define SLACK_PAGES 64 /* written until the freeze, by one process of many */
+#define FORK_NS 100000 /* without any pages */
 #define FORK_PAGE_NS 90
 #define REST_LEAST 4u /* checkpoints */
 #define FAILURES_MAX 4
-#define CONFIDENCE 8 /* attempts in a row that came to something: it is as if none had failed */
+#define CONFIDENCE 8 /* after so many successes in a row, failures are forgotten */
 
 /* ---- while the application runs -------------------------------------------------------------- */
 
-/* All of it is watched that is mapped now. */
+/* Everything that is mapped now. */
 static bool watch_mappings(struct dirty *dirty, struct process *process)
 {
 	struct avc_error refused = { 0 };
@@ -49,8 +49,8 @@ static bool watch_mappings(struct dirty *dirty, struct process *process)
 	       !tracker_watch(process, dirty->layout, &refused);
 }
 
-/* As of when it was watched.  A template in which that was not possible is neither the one nor the
- * other. */
+/* As read by watch_mappings().  If that fails, the template may have some of the mappings, and is
+ * dropped. */
 static bool follow_layout(struct dirty *dirty, const struct attempt *attempt)
 {
 	struct template_calls calls = template_calls_begin(&attempt->process->parasite,
@@ -66,7 +66,7 @@ static bool follow_layout(struct dirty *dirty, const struct attempt *attempt)
 	return !result;
 }
 
-/* What was mapped just now is not watched yet. */
+/* Repeated, because new mappings are not watched yet. */
 static bool scan(struct dirty *dirty, const struct attempt *attempt, pid_t template, uint64_t *left)
 {
 	struct process *process = attempt->process;
@@ -81,7 +81,7 @@ static bool scan(struct dirty *dirty, const struct attempt *attempt, pid_t templ
 	return false;
 }
 
-/* Until a round finds little, or no less than the one before.  What is left. */
+/* Until a round leaves little, or hardly less than the one before.  *left: how much. */
 static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint64_t *left)
 {
 	const struct process *process = attempt->process;
@@ -105,7 +105,7 @@ static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint
 	return true;
 }
 
-/* ---- whether --------------------------------------------------------------------------------- */
+/* ---- decisions ------------------------------------------------------------------------------- */
 
 /* By RDMA and the like (mm_struct.pinned_vm). */
 static bool has_pinned(pid_t pid)
@@ -128,7 +128,7 @@ static bool has_own_filter(const struct process *process)
 	       status.seccomp_filters > process->plain_filters;
 }
 
-/* A fork of it takes no longer than the questions that a copy needs. */
+/* A fork of it takes no longer than the queries that a copy needs. */
 static bool is_small(const struct process *process)
 {
 	long pages = 0;
@@ -155,8 +155,8 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 	return AVC_FORK_NONE;
 }
 
-/* An attempt that comes to nothing costs more than a fork: after each one in a row, twice as many
- * checkpoints are forked before the next. */
+/* A failed attempt costs more than a fork: after each one in a row, twice as many checkpoints are
+ * forked before the next attempt. */
 static void give_up(struct dirty *dirty, enum avc_fork_reason reason)
 {
 	dirty->reason = dirty->rest_reason = reason;
@@ -175,7 +175,7 @@ static bool rests(struct dirty *dirty, const struct avc_config *config)
 	return true;
 }
 
-/* It is watched, all of it. */
+/* Has all of its memory watched, or returns why not. */
 static enum avc_fork_reason watch(struct dirty *dirty, struct process *process, timer_t timer)
 {
 	struct avc_error refused = { 0 };
@@ -241,7 +241,7 @@ void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 	if (!dirty->reason && !follow_layout(dirty, attempt))
 		give_up(dirty, AVC_FORK_LAYOUT);
 	if (dirty->reason) {
-		/* What is written before the fork is not written since. */
+		/* Clears the record: writes before the fork are in the fork. */
 		if (tracker_scan(process->tracker, 0, &left))
 			tracker_end(process);
 		return;
@@ -250,11 +250,11 @@ void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 		give_up(dirty, dirty->reason ? dirty->reason : AVC_FORK_LAYOUT);
 		return;
 	}
-	/* Room for what is written until the freeze. */
 	if (config->images == AVC_IMAGES_AUTO && left * READ_PAGE_NS > dirty->fork_ns)
 		give_up(dirty, AVC_FORK_WRITES);
 	else
 		process->recycling = true;
+	/* With room for what is written until the freeze. */
 	dirty->wanted = (4 * left + slack) * PAGE;
 }
 
@@ -268,7 +268,7 @@ static int fork_instead(struct dirty *dirty, const struct process *process, cons
 	return fail(err, AVC_RETRY, 0, process->pid, "freeze", "", "%s", what);
 }
 
-/* Once more, if something was mapped since. */
+/* Twice, if something was mapped since. */
 static bool scan_stopped(struct dirty *dirty, struct process *process)
 {
 	char *before = dirty->layout;
@@ -288,7 +288,7 @@ static bool scan_stopped(struct dirty *dirty, struct process *process)
 			!tracker_scan(process->tracker, 0, &pages));
 }
 
-/* Limits of one that is not the main process are not its template's (process_attrs_learn()). */
+/* Only the template of the main process has the limits of its process (process_attrs_learn()). */
 static int read_inherited(struct inherited *inherited, const struct process *process,
 			  struct avc_error *err)
 {
@@ -422,7 +422,7 @@ void dirty_recycle_one(struct dirty *dirty, struct image *image)
 	if (!image->stale || !image->inherited || !image->template || !tracker || tracker->over ||
 	    tracker->number != image->tracker)
 		return;
-	dirty_drop_idle_one(dirty); /* one that could not be used is older */
+	dirty_drop_idle_one(dirty); /* one that was not used is older */
 	*idle = (struct idle_template){
 		.pid = image->template,
 		.pidfd = image->pidfd,
@@ -438,12 +438,13 @@ void dirty_recycle_one(struct dirty *dirty, struct image *image)
 	image->pidfd = -1;
 	image->inherited = NULL;
 	image->stale = NULL;
-	/* The first to go when memory is short. */
+	/* The first victim when memory is short. */
 	snprintf(score, sizeof score, "%d", IDLE_OOM_SCORE);
 	proc_set_oom_score_adj(idle->pid, score);
 }
 
-/* Of what was written between the scan before a fork and the fork, only the next scan tells. */
+/* Not after a fork: pages written between the scan before it and the fork are found only by the
+ * next scan. */
 void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t number)
 {
 	struct tracker *tracker = image->process->tracker;
@@ -457,7 +458,7 @@ void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t 
 		return;
 	idle->near = number;
 	idle->catching_up = true;
-	/* Room now, and not when it is needed. */
+	/* Allocated now, not when it is needed. */
 	(void)copy_make_room(dirty, 2 * pageset_count(&idle->differs) * PAGE);
 }
 

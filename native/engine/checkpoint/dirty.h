@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Between the files that bring an idle template up to date:
+ * Shared by the files that bring an idle template up to date:
  *
  *   dirty_tree.c      all processes
- *   dirty.c           one of them: whether, when, and what was written
- *   dirty_copy.c      copies it
- *   stand_in.c        gives a restore another one's memory
- *   dirty_template.c  calls that the template makes for it: its mappings become the process's
+ *   dirty.c           one of them: whether, when, and which pages
+ *   dirty_copy.c      copies them
+ *   dirty_template.c  calls made by the template, so that its mappings become the process's
+ *   stand_in.c        replaces a template whose memory a restore takes
  */
 #ifndef AVCKPT_DIRTY_H
 #define AVCKPT_DIRTY_H
@@ -25,7 +25,7 @@ struct attempt {
 	timer_t timer;
 };
 
-/* As those in checkpoint.h, of one process. */
+/* Like those in checkpoint.h, for one process. */
 void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt);
 int dirty_capture_one(struct dirty *dirty, const struct image *image,
 		      struct avc_error *err) warn_unused;
@@ -35,7 +35,7 @@ int dirty_check_one(struct dirty *dirty, const struct image *image,
 void dirty_follow_one(struct dirty *dirty, struct image *image);
 void dirty_recycle_one(struct dirty *dirty, struct image *image);
 void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t number);
-/* All that is known of it; it lives on. */
+/* Forgets the idle template, which keeps running. */
 void dirty_leave_idle_one(struct dirty *dirty);
 void dirty_drop_idle_one(struct dirty *dirty);
 void dirty_free_one(struct dirty *dirty);
@@ -54,14 +54,14 @@ struct template_calls template_calls_begin(const struct parasite *parasite,
 					   struct idle_template *idle, uint32_t slot);
 int template_call(struct template_calls *calls, const struct inj_syscall *call,
 		  struct avc_error *err) warn_unused;
-/* Those that were not made yet.  AVC_RETRY: one was refused. */
+/* Makes the calls not made yet.  AVC_RETRY: one failed. */
 int template_calls_end(struct template_calls *calls, struct avc_error *err) warn_unused;
 
-/* Its mappings become those of `layout`, which is /proc/PID/maps of the process.  AVC_RETRY: they
- * cannot. */
+/* Changes its mappings to those of `layout`, which is /proc/PID/maps of the process.  AVC_RETRY:
+ * not possible. */
 int template_follow_layout(struct template_calls *calls, char *layout,
 			   struct avc_error *err) warn_unused;
-/* And its heap ends there, to the byte: mappings tell of its pages only. */
+/* Sets the end of its heap, to the byte: mappings show only pages. */
 int template_set_break(struct template_calls *calls, int64_t end,
 		       struct avc_error *err) warn_unused;
 
@@ -70,13 +70,13 @@ int template_set_break(struct template_calls *calls, int64_t end,
 #define COPY_BATCH_PAGES 1024 /* copied at a time                                */
 
 bool copy_make_room(struct dirty *dirty, size_t bytes);
-/* What is stale and can be, while the application runs. */
+/* While the application runs: copies stale pages, as far as possible. */
 void copy_stale(struct dirty *dirty, const struct process *process);
-/* Of what another template of the process has there, which cannot be stopped: as the next one. */
+/* Reads these pages of another template of the process; false as for copy_read(). */
 bool copy_read_template(struct dirty *dirty, pid_t template, const struct pageset *pages);
-/* While it is stopped: reads what is stale; false: it is too much, or cannot be read. */
+/* While it is stopped: reads stale pages; false: too many, or not readable. */
 bool copy_read(struct dirty *dirty, const struct process *process);
-/* When it runs again: what was read is written to the template. */
+/* When it runs again: writes to the template what was read. */
 int copy_write(struct dirty *dirty, struct template_calls *calls,
 	       struct avc_error *err) warn_unused;
 

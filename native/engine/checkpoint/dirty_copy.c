@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Pages of a process copied to an idle template of it: at once while the application runs; with it
- * stopped they are only read.
+ * Copies pages of a process to an idle template of it: at once while the application runs; while it
+ * is stopped they are only read.
  */
 #include <fcntl.h>
 #include <stdlib.h>
@@ -22,10 +22,10 @@ enum run_kind { RUN_DATA, RUN_EMPTY, RUN_GUARD };
 struct run {
 	avc_remote start, end;
 	enum run_kind kind;
-	size_t at; /* of its contents                                           */
+	size_t at; /* offset of its contents in dirty.data                      */
 };
 
-/* ---- what there is to copy ------------------------------------------------------------------ */
+/* ---- runs ------------------------------------------------------------------------------------ */
 
 static enum run_kind kind_of(uint64_t entry)
 {
@@ -42,7 +42,7 @@ static bool add_run(struct dirty *dirty, avc_remote start, avc_remote end, enum 
 	return true;
 }
 
-/* A stretch of a chunk, as the process has it. */
+/* Splits part of a chunk into runs of the same kind. */
 static bool sort_stretch(struct dirty *dirty, int pagemap, avc_remote start, avc_remote end)
 {
 	uint64_t entry[PAGESET_PAGES];
@@ -73,12 +73,12 @@ bool copy_make_room(struct dirty *dirty, size_t bytes)
 	dirty->data = more;
 	dirty->data_bytes = more ? bytes : 0;
 	if (more)
-		memset(more, 0, bytes); /* page faults now, and not in a freeze */
+		memset(more, 0, bytes); /* page faults now, not in a freeze */
 	return more != NULL;
 }
 
-/* process_vm_readv(2) or its counterpart for some of the runs, all of which have contents; `mem` is
- * for those that the process itself could not read or write. */
+/* process_vm_readv(2) or process_vm_writev(2), for the runs that have contents; `mem` is for those
+ * that the process itself could not read or write. */
 typedef ssize_t transfer(pid_t pid, const struct iovec *here, unsigned long heres,
 			 const struct iovec *there, unsigned long theres, unsigned long flags);
 
@@ -124,7 +124,7 @@ static bool move(const struct dirty *dirty, pid_t pid, int mem, bool reading)
 
 /* ---- while the application runs -------------------------------------------------------------- */
 
-/* What cannot be copied yet stays in the set; what is empty does in any case. */
+/* Pages that cannot be copied yet stay in the set; empty ones always do. */
 static void copy_batch(struct dirty *dirty, const struct process *process, int mem)
 {
 	struct idle_template *idle = &dirty->idle;
@@ -169,7 +169,7 @@ void copy_stale(struct dirty *dirty, const struct process *process)
 
 /* ---- in the freeze, and after it --------------------------------------------------------------- */
 
-/* What there is to be read, as far as there is room for it. */
+/* false: there is not enough room for all contents, or there are too many. */
 static bool sort(struct dirty *dirty, int pagemap, const struct pageset *pages)
 {
 	struct page_cursor at = { 0 };
@@ -212,7 +212,7 @@ static int advise(struct template_calls *calls, avc_remote start, avc_remote end
 		err);
 }
 
-/* Of one run, what the template has there that the process has not. */
+/* Removes what the template has in one run and the process has not. */
 static int prepare_run(struct template_calls *calls, const struct run *run, int pagemap,
 		       struct avc_error *err)
 {

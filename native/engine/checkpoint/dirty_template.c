@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What an idle template has to do itself to become what the process is: its mappings.  What of them
- * is new is empty; what stands in it is copied, for it counts as written (tracker.c).
+ * Only an idle template itself can change its mappings to those of the process.  New ones are
+ * empty; their contents are copied, because they count as written (tracker.c).
  */
 #include <errno.h>
 #include <stdlib.h>
@@ -11,7 +11,7 @@
 #include "dirty.h"
 
 #define LISTED_MAX (INJ_FILES_BYTES / 2 / sizeof(struct inj_syscall))
-#define LAYOUT_TRIES 3 /* a heap that has grown is protected in the second                */
+#define LAYOUT_TRIES 3 /* a heap grows in the first, and is protected in the second       */
 
 struct template_calls template_calls_begin(const struct parasite *parasite,
 					   struct idle_template *idle, uint32_t slot)
@@ -70,7 +70,7 @@ int template_call(struct template_calls *calls, const struct inj_syscall *call,
 
 /* ---- mappings -------------------------------------------------------------------------------- */
 
-/* times(2) writes to the lowest page of the stack, so that the kernel makes it grow. */
+/* times(2) writes to the lowest page of the stack, so that the kernel grows it. */
 static struct inj_syscall call_of(const struct layout_step *step)
 {
 	const uint64_t start = step->start, bytes = step->end - start;
@@ -100,13 +100,13 @@ static struct inj_syscall call_of(const struct layout_step *step)
 static int take_steps(struct template_calls *calls, const struct layout_steps *steps,
 		      struct avc_error *err)
 {
-	/* What stood in memory that is given back is noted nowhere. */
+	/* Contents of memory that is unmapped are in no set. */
 	calls->idle->near = 0;
 	for (uint32_t i = 0; i < steps->count; i++) {
 		const struct layout_step *step = &steps->step[i];
 		const struct inj_syscall call = call_of(step);
 
-		/* Not to the byte: a page's end. */
+		/* Unknown: these only reach the end of a page. */
 		if (step->kind == LAYOUT_SHRINK || step->kind == LAYOUT_GROW)
 			calls->idle->inherited->value[INHERITED_BREAK] = 0;
 		if (template_call(calls, &call, err))

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Checkpoints by copies of all processes of an app.  Each of them is copied or forked by itself: one
- * may write too much, another one be new.
+ * Checkpoints by copies of all processes of an app.  Whether to copy or fork is decided for each:
+ * one may write too much, another be new.
  */
 #include <stdlib.h>
 
@@ -35,7 +35,7 @@ void dirty_forget(struct dirty_tree *tree, const struct process *process)
 			drop(tree, i);
 }
 
-/* It has ended, or been restored, which is another one. */
+/* Processes that have ended, or been restored, which makes them new ones. */
 static void forget_ended(struct dirty_tree *tree)
 {
 	for (uint32_t i = tree->count; i-- > 0;) {
@@ -47,7 +47,7 @@ static void forget_ended(struct dirty_tree *tree)
 	}
 }
 
-/* The process is not freed as long as something is known of it here. */
+/* process->images keeps the process from being freed. */
 static struct dirty *get(struct dirty_tree *tree, struct process *process)
 {
 	struct dirty *dirty = dirty_find(tree, process);
@@ -68,7 +68,7 @@ static struct dirty *get(struct dirty_tree *tree, struct process *process)
 	return tree->of[tree->count++] = dirty;
 }
 
-/* Rounds need much room, one process at a time. */
+/* Rounds need a large buffer, one process at a time: they share one. */
 static void swap_batch(struct dirty_tree *tree, struct dirty *dirty)
 {
 	uint8_t *data = tree->batch;
@@ -82,7 +82,7 @@ static void swap_batch(struct dirty_tree *tree, struct dirty *dirty)
 
 /* ---- one checkpoint ------------------------------------------------------------------------------ */
 
-/* The first reason that there is, the main process's if it has one. */
+/* The first reason found; the main process comes first. */
 static void sum_up(struct dirty_tree *tree, const struct dirty *dirty)
 {
 	if (!tree->reason)

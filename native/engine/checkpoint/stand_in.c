@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * A restore without a fork, also right after a checkpoint: the template gives its memory away
- * (clone(2), CLONE_VM), as a spare does, and the idle one, which is nearly the same, takes its place.
- * What they differ in is read before that, and written when the app runs again.
+ * (clone(2), CLONE_VM), as a spare does, and the idle template, which is nearly the same, replaces
+ * it.  Pages that differ are read before that, and written when the app runs again.
  */
 #include <signal.h>
 #include <stdlib.h>
@@ -15,7 +15,7 @@
 #define PAGES_MAX 16384
 #define READ_PAGE_NS 700
 
-/* Nor is it worth it if to read what they differ in takes longer than a fork. */
+/* It is not worth it if reading the pages that differ takes longer than a fork. */
 static bool is_near(const struct dirty *dirty, const struct generation *generation)
 {
 	const struct idle_template *idle = &dirty->idle;
@@ -35,7 +35,7 @@ bool stand_in_is_there(const struct dirty_tree *dirty, const struct generation *
 	return one && is_near(one, generation);
 }
 
-/* Has the mappings of the other one, and what was read of it can be written. */
+/* Gives the idle template the mappings of the other one, from which these pages are read. */
 static bool approach(struct dirty *dirty, struct template_calls *calls, const struct image *image,
 		     const struct pageset *pages)
 {
@@ -68,7 +68,7 @@ bool stand_in_catch_up(struct dirty_tree *tree, const struct generation *generat
 	tracee_deadline_clear(timer);
 	pageset_free(&pages);
 	pageset_free(&same);
-	/* The mappings are those of the generation, whatever was done for that. */
+	/* approach() may have cleared it; the mappings are the generation's now. */
 	dirty->idle.near = generation->number;
 	if (!caught)
 		dirty_drop_idle_one(dirty);
@@ -113,7 +113,7 @@ void stand_in_begin(struct dirty_tree *tree, struct generation *generation, time
 		return;
 	}
 	exchange(dirty, generation);
-	/* Others are made of it, too, and compared with it. */
+	/* Other processes are forked from it, and compared with it. */
 	if (generation->images > 1)
 		(void)stand_in_finish(tree, generation, timer);
 }
@@ -133,12 +133,12 @@ bool stand_in_finish(struct dirty_tree *tree, struct generation *generation, tim
 	whole = copy_write(dirty, &calls, &why) == 0;
 	tracee_deadline_clear(timer);
 	dirty->standing_in = false;
-	/* It is the generation's only now. */
+	/* Only now does it belong to the generation. */
 	free(image->inherited);
 	image->inherited = dirty->idle.inherited;
 	dirty->idle.inherited = NULL;
 	dirty_leave_idle_one(dirty);
-	/* Of what the other one had: it is no snapshot of this one. */
+	/* The plan is for the other template's memory. */
 	restore_plan_free(generation->plan);
 	generation->plan = NULL;
 	return whole;

@@ -1,16 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * A dead app that goes back together with others (avckpt.group.recovery=together): what they
- * have sent to each other since is taken away, and nobody runs who could send more.
+ * A dead app that goes back together with others (avckpt.group.recovery=together): discards what
+ * they have sent to each other since, while none runs that could send more.
  *
- * A connection both of whose ends go back goes on.  The kernel's sockets are those of now: both
- * ends are read to where the other one has written, and then what was on its way at the line is
- * sent once more, by the socket of the one that had sent it.  What that was is kept by the end that
- * it was for: while all stand still, it waits there to be read.  Where that cannot be done, and of
- * all other connections on which something moved, TCP is reset at both ends, before anything of it is
- * looked at for the restore: after the other end's reset there may still be something to read.
+ * A connection is kept if both of its ends go back.  The kernel's sockets are the current ones:
+ * both ends are read up to what the other one has written, and then the data in flight at the line
+ * is sent again, by the socket that had sent it.  The receiving end has a copy of that data: it was
+ * in its queue while all were stopped.  Where that cannot be done, and on all other connections on
+ * which data moved, TCP is reset at both ends, before the restore reads their state: after the
+ * other end's reset there may still be unread data.
  *
- * Which two ends belong together, the guards find out on a board that they share (avckpt/guard.h).
+ * Guards match the ends of a connection on a board that they share (avckpt/guard.h).
  */
 #include <arpa/inet.h>
 #include <fcntl.h>
@@ -28,25 +28,25 @@
 #include "avckpt/guard.h"
 #include "files.h"
 
-#define EMPTY_NS (100 * NS_PER_MS) /* of one socket; others may go on to send to it        */
-#define COMES_NS (2 * NS_PER_MS)   /* of all, while everything stands still              */
+#define EMPTY_NS (100 * NS_PER_MS) /* of one socket; outsiders may keep sending to it      */
+#define COMES_NS (2 * NS_PER_MS)   /* of all, while everything is stopped                */
 #define MEND_NS (500 * NS_PER_MS)  /* of all, when everything is dead                     */
 #define LOOK_US 20
 #define ENDS_MAX 1024
-#define SYN_BYTES 1 /* which who has connected has had acknowledged as well           */
+#define SYN_BYTES 1 /* the connecting end counts its SYN as acknowledged              */
 #define PROTOCOL_UNIX UINT32_C(256)
 
 /* One end of a connection. */
 struct group_end {
 	uint64_t ino;
 	struct avc_end_name own, other;
-	bool kept; /* what was on its way to it is known                           */
+	bool kept; /* data in flight to it was copied                              */
 	uint8_t *content;
 	uint32_t bytes;
-	const struct file *file; /* of any of the images that have it                     */
-	int fd;                  /* of ours; -1: none                                       */
-	int shown;               /* where on the board; -1: not there                       */
-	uint64_t surplus;        /* bytes that are still to be read away                     */
+	const struct file *file; /* of any image that has it                              */
+	int fd;                  /* ours; -1: none                                          */
+	int shown;               /* index on the board; -1: not there                       */
+	uint64_t surplus;        /* bytes still to be discarded                              */
 	uint32_t sent;
 };
 
@@ -64,8 +64,8 @@ static void empty(int fd)
 		(void)budget_step();
 }
 
-/* What has been said on a connection that nobody has accepted yet may not be true any more.  That
- * it does not wait now is put back with all other flags. */
+/* Data on a connection that is not accepted yet may be invalid now.  The restore resets O_NONBLOCK
+ * with all other flags. */
 static void turn_away(int fd)
 {
 	const struct linger reset = { .l_onoff = 1 };
@@ -83,7 +83,7 @@ static void turn_away(int fd)
 	}
 }
 
-/* What was on its way at the checkpoint and has come since counts, too. */
+/* Data in flight at the checkpoint that has arrived since counts, too. */
 static bool has_moved(int fd, const struct file *then)
 {
 	struct file now = { 0 };
@@ -109,7 +109,7 @@ static void forget(int fd, const struct file *then, const struct avc_config *con
 		empty(fd);
 	} else if (s->protocol == IPPROTO_TCP && (s->connected || then->tcp_state) &&
 		   (config->tcp == AVC_TCP_RESET || has_moved(fd, then))) {
-		/* Which takes away what there is to be read, also of one that is closed. */
+		/* This discards unread data, also if the connection is closed. */
 		(void)file_reset_tcp(fd);
 	}
 }
@@ -145,7 +145,7 @@ static int option(int fd, int level, int name)
 	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
 }
 
-/* Nothing of it is shut down or broken, and nothing is read from it out of turn. */
+/* Not shut down or broken, and without urgent data or SO_PEEK_OFF. */
 static bool is_whole(int fd)
 {
 	struct pollfd state = { .fd = fd, .events = POLLRDHUP | POLLPRI };
@@ -153,7 +153,7 @@ static bool is_whole(int fd)
 	return poll(&state, 1, 0) == 0 && option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0;
 }
 
-/* IPv4 as IPv6 has it, for one end may call it so. */
+/* IPv4 as mapped to IPv6, because one end may use that. */
 static bool name_address(struct avc_end_name *name, const struct sockaddr_storage *address,
 			 uint64_t network)
 {
@@ -199,7 +199,7 @@ static bool name_unix(const struct file *f, struct group_end *end)
 	return true;
 }
 
-/* Bytes, as the application has written them and as they have come; false: it is not known. */
+/* Bytes written by the application, received, and received but unread; false: unknown. */
 static bool count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
 {
 	struct tcp_info info = { 0 };
@@ -313,7 +313,7 @@ struct group_ends *files_ends_new(const struct image *image, uint32_t images,
 	return ends;
 }
 
-/* Who has sent may wait for an acknowledgement before it sends the rest (Nagle). */
+/* The sender may wait for an acknowledgement before it sends the rest (Nagle). */
 static void acknowledge(int fd)
 {
 	const int yes = 1;
@@ -321,7 +321,7 @@ static void acknowledge(int fd)
 	setsockopt(fd, IPPROTO_TCP, TCP_QUICKACK, &yes, sizeof yes);
 }
 
-/* Whether everything has come that was written. */
+/* Whether everything written has arrived; waits for it until `until`. */
 static bool has_come(const struct group_end *end, uint64_t written, uint64_t *unread,
 		     uint64_t until)
 {
@@ -338,7 +338,7 @@ static bool has_come(const struct group_end *end, uint64_t written, uint64_t *un
 	return false;
 }
 
-/* Of messages, only one: to look at others takes an option of the socket. */
+/* At most one message: peeking at more takes an option of the socket (SO_PEEK_OFF). */
 static bool keep_bytes(struct group_end *end, uint64_t bytes)
 {
 	struct iovec io;
@@ -355,7 +355,7 @@ static bool keep_bytes(struct group_end *end, uint64_t bytes)
 	io = (struct iovec){ end->content, bytes };
 	n = recvmsg(end->fd, &head, MSG_PEEK | MSG_DONTWAIT);
 	end->bytes = (uint32_t)bytes;
-	/* It came with descriptors, or says who has sent it. */
+	/* MSG_CTRUNC: it has descriptors or credentials with it. */
 	return n == (ssize_t)bytes && !(head.msg_flags & (MSG_CTRUNC | MSG_TRUNC));
 }
 
@@ -375,7 +375,7 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 		} else if (other && ioctl(end->fd, SIOCINQ, &waiting) == 0) {
 			struct pollfd some = { .fd = end->fd, .events = POLLIN };
 
-			/* An empty message is one, too. */
+			/* An empty message counts as one, too. */
 			end->kept = (waiting || poll(&some, 1, 0) == 0) &&
 				    keep_bytes(end, (uint64_t)waiting);
 		}
@@ -394,7 +394,7 @@ void files_ends_free(struct group_ends *ends)
 
 /* ---- a return ------------------------------------------------------------------------------------ */
 
-/* A process that has its table as it is now, when it is dead; -1: there is none. */
+/* A process that has the current descriptors of a dead one; -1: there is none. */
 static int table_of(const struct image *image)
 {
 	if (!image->process || !image->files)
@@ -404,7 +404,7 @@ static int table_of(const struct image *image)
 	return image->process->holder ? image->process->holder_pidfd : -1;
 }
 
-/* What is behind that descriptor now, if it still is the same; -1: it is not. */
+/* A copy of that descriptor, if it still refers to the same file; -1: it does not. */
 static int borrow(int pidfd, const struct file *f)
 {
 	struct stat st;
@@ -429,7 +429,7 @@ static bool put_on_board(const struct group_end *end, struct avc_board *board)
 	return true;
 }
 
-/* False: it cannot go on. */
+/* False: it cannot be kept. */
 static bool try_show(struct group_end *end, struct avc_board *board)
 {
 	uint64_t written = 0, ignored;
@@ -483,7 +483,7 @@ void files_ends_show(struct group_ends *ends, struct image *image, uint32_t imag
 	}
 }
 
-/* APART: the other end does not go on with it. */
+/* APART: it is not kept, or has no matching end.  TORN: it failed half-way. */
 enum mend_state { APART, MENDING, MENDED, TORN };
 
 static enum mend_state mend(struct group_end *end, const struct avc_end *other,
@@ -493,7 +493,7 @@ static enum mend_state mend(struct group_end *end, const struct avc_end *other,
 	ssize_t n;
 
 	if (end->surplus) {
-		/* TCP throws away what it is told to truncate: tcp(7). */
+		/* With MSG_TRUNC, TCP discards the data: tcp(7). */
 		n = recv(end->fd, NULL, end->surplus < 1 << 30 ? end->surplus : 1 << 30,
 			 MSG_TRUNC | MSG_DONTWAIT);
 		if (n > 0)
@@ -514,7 +514,7 @@ static enum mend_state mend(struct group_end *end, const struct avc_end *other,
 	return end->surplus || end->sent < bytes ? MENDING : MENDED;
 }
 
-/* What is on the board is somebody else's, and so it is looked at once. */
+/* Other guards can change the board at any time, so it is read only once. */
 static bool begin_mend(struct group_end *end, struct avc_end *copy, const struct avc_board *board)
 {
 	const struct avc_end *other = end->shown < 0 ? NULL : find_other(end, board);
@@ -529,7 +529,7 @@ static bool begin_mend(struct group_end *end, struct avc_end *copy, const struct
 		return false;
 	if (!is_tcp(end))
 		return true;
-	/* As far as the other one had written before anything of this is sent, and no further. */
+	/* Up to what the other end had written before any of this is sent, and no further. */
 	if (!count_tcp(end->fd, &ignored, &received, &unread) || copy->written + unread < received)
 		return false;
 	end->surplus = copy->written + unread - received;
@@ -545,7 +545,7 @@ static void let_go_on(struct image *image, uint32_t images, uint64_t ino)
 				image[i].files->file[k].goes_on = true;
 }
 
-/* Both ends of a connection may be ours, so all go on together. */
+/* Both ends of a connection may be ours, so all take turns. */
 static void mend_all(struct group_ends *ends, struct avc_end *others, enum mend_state *states,
 		     const struct avc_board *board)
 {
