@@ -2,9 +2,10 @@
  *
  * Whether a process has executed another program, execve(2).
  *
- * A perf event of the main thread says so at once: the kernel takes it away in an exec of whichever
- * thread, and when that thread ends (attr.remove_on_exec, since Linux 5.13).  It counts nothing and
- * is never switched on.  poll(2) knows it only with a ring buffer, whose one page nobody reads.
+ * A perf event of the main thread reports that at once: the kernel removes it when any thread calls
+ * execve(2), and when the main thread ends (attr.remove_on_exec, since Linux 5.13).  It counts
+ * nothing and is never enabled.  poll(2) reports this only with a ring buffer, whose only page is
+ * never read.
  */
 #include <errno.h>
 #include <linux/perf_event.h>
@@ -14,7 +15,7 @@
 
 #include "process.h"
 
-/* ESRCH means that it is exiting: after exec(2) there is memory, but not this. */
+/* ESRCH: it is exiting.  EFAULT: after execve(2) it has memory, but not the parasite. */
 bool process_has_executed(const struct process *process)
 {
 	uint64_t nonce = 0;

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The app's main process and its threads: stopped, asked, let go.
+ * A process of the app and its threads: opened, listed, queried.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -58,8 +58,8 @@ void process_free_room(struct process *process)
 	process->timers = NULL;
 }
 
-/* A descriptor for its table of descriptors: the main thread has none any more when it
- * has ended, and the others have pidfds of their own since Linux 6.9. */
+/* pidfd_getfd(2) needs a thread that still has descriptors: a main thread that has ended has none,
+ * and other threads have pidfds since Linux 6.9. */
 static int follow(struct process *process, struct avc_error *err)
 {
 	const pid_t pid = proc_live_thread(process->leader);
@@ -69,7 +69,7 @@ static int follow(struct process *process, struct avc_error *err)
 	close_fd(&process->pidfd);
 	close_fd(&process->statm_fd);
 	process->pid = pid;
-	/* Its number is nobody else's as long as there are others. */
+	/* Its PID is not reused while other threads exist. */
 	if (pid != process->leader && process->leader_pidfd < 0)
 		process->leader_pidfd = proc_pidfd_open(process->leader);
 	process->statm_fd = proc_open(pid, "statm", O_RDONLY);
@@ -130,11 +130,11 @@ void process_close(struct process *process)
 	process->pid = 0;
 	process->leader = 0;
 	process->infected = false;
-	/* To close it takes the kernel some 10 ms for each GB as long as that memory is there, and a
-	 * restore does not wait for that. */
+	/* Closed later: while the memory exists, that takes some 10 ms for each GB, for which a
+	 * restore must not wait. */
 	if (process->tracker)
 		process->tracker->over = true;
-	/* Stragglers stay: a tracee that nobody waits for is a zombie for ever. */
+	/* Stragglers stay: a tracee that is not reaped remains a zombie forever. */
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		process->threads[i].seen = false;
 		process->threads[i].known = false;
@@ -172,7 +172,7 @@ int thread_read(struct thread *thread, struct avc_error *err)
 	if (syscall(SYS_get_robust_list, thread->tid, &thread->robust_list, &thread->robust_bytes))
 		return fail_errno(err, thread->tid, "read state", "get_robust_list",
 				  "it has ended");
-	/* As the kernel has it: bytes that were written, 0 on failure. */
+	/* affinity_bytes: as returned by the kernel, 0 on failure. */
 	attributes_read_scheduling(thread->tid, &thread->scheduling);
 	thread->affinity_bytes = 0;
 	affinity = syscall(SYS_sched_getaffinity, thread->tid, sizeof thread->affinity,
@@ -191,9 +191,8 @@ void thread_ask_add(const struct process *process, bool with_locks, struct inj_c
 	memset(call->out, 0, sizeof call->out);
 	tid_address = call_add(call, SYS_prctl, PR_GET_TID_ADDRESS, out);
 	altstack = call_add(call, SYS_sigaltstack, 0, out + 8);
-	/* Not from /proc: whatever is looked at there is remembered, and makes the
-	 * thread's end, for which a restore waits, several microseconds longer
-	 * (fs/proc/base.c, proc_flush_pid()). */
+	/* Not from /proc: reading there leaves cached entries, which prolong the thread's end, for
+	 * which a restore waits, by several microseconds (fs/proc/base.c, proc_flush_pid()). */
 	inside = call_add(call, SYS_gettid);
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32);
 	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK) : NULL;
@@ -258,7 +257,7 @@ int thread_ask_others(struct process *process, const struct thread *thread, cons
 {
 	struct creds is = thread->creds;
 
-	is.future_lock = was->future_lock; /* of the process's memory, no matter of threads */
+	is.future_lock = was->future_lock; /* of the process's memory, not of threads */
 	if (process->thread_count == 1 || !memcmp(was, &is, sizeof is))
 		return 0;
 	for (uint32_t i = 0; i < process->thread_count; i++)
@@ -305,8 +304,7 @@ int process_list_threads(struct process *process, struct avc_error *err)
 	return err->code ? -1 : 0;
 }
 
-/* In the order of their numbers they can be made again with the fewest writes to
- * ns_last_pid. */
+/* In the order of their TIDs they can be created again with the fewest writes to ns_last_pid. */
 static int by_inside(const void *a, const void *b)
 {
 	const struct thread *x = a, *y = b;
@@ -314,8 +312,7 @@ static int by_inside(const void *a, const void *b)
 	return (x->inside > y->inside) - (x->inside < y->inside);
 }
 
-/* A process that one of them has just brought forth stands among them, too, until the next
- * look (adopt()). */
+/* Until the next look, the list may contain a process that a thread has just created (adopt()). */
 static bool is_thread(const struct process *process, pid_t tid)
 {
 	char number[16];
@@ -324,7 +321,7 @@ static bool is_thread(const struct process *process, pid_t tid)
 	return faccessat(process->task_dirfd, number, F_OK, 0) == 0;
 }
 
-/* unshare(2): those that are restored have the main thread's.  It is stopped. */
+/* unshare(2): restored threads share the main thread's.  `t` is stopped. */
 static int check_unshared(const struct process *process, const struct thread *t,
 			  struct avc_error *err)
 {
@@ -334,7 +331,7 @@ static int check_unshared(const struct process *process, const struct thread *t,
 		what = "a descriptor table of its own (CLONE_FILES)";
 	else if (proc_shares(process->pid, t->tid, SHARED_FOLDERS) == 0)
 		what = "a working directory of its own (CLONE_FS)";
-	/* A main thread that is just ending has none. */
+	/* A main thread that is just ending has neither. */
 	if (!what || proc_is_exiting(process->pid) || proc_is_exiting(t->tid))
 		return 0;
 	if (!is_thread(process, t->tid))
@@ -343,7 +340,7 @@ static int check_unshared(const struct process *process, const struct thread *t,
 		    proc_inside(t->tid), what);
 }
 
-/* 0: the kernel does not tell (it does since Linux 6.11), or the task is ending. */
+/* 0: the kernel does not support it (it does since Linux 6.11), or the task is ending. */
 static uint64_t space_of(int pidfd, unsigned int kind)
 {
 	struct stat st = { 0 };
@@ -355,7 +352,7 @@ static uint64_t space_of(int pidfd, unsigned int kind)
 	return st.st_ino;
 }
 
-/* Those that it can have without a working directory of its own.  Not from /proc: see
+/* Namespaces that a thread can have without a working directory of its own.  Not from /proc: see
  * thread_ask_add(). */
 static int check_spaces(const struct process *process, const struct thread *t,
 			struct avc_error *err)
@@ -387,7 +384,7 @@ int process_query_new_threads(struct process *process, timer_t timer, uint64_t d
 {
 	uint32_t again = 0;
 
-	/* All of them first: there is one way home in the parasite, and it may still need it. */
+	/* All of them first: the parasite's way back is for one thread, and may be in use. */
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (process->threads[i].attached)
 			return fail(err, AVC_DEADLINE, 0, process->threads[i].tid, "stop", "",
@@ -415,7 +412,7 @@ int process_query_new_threads(struct process *process, timer_t timer, uint64_t d
 			*err = gone;
 			return -1;
 		}
-		t->seen |= t->known; /* or it is no thread */
+		t->seen |= t->known; /* otherwise it is no thread */
 	}
 	threads_forget_unseen(process);
 	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);

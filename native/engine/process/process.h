@@ -2,13 +2,13 @@
  *
  * Live processes of the app.
  *
- *   process.c        one of them: looked at, asked, stopped
- *   stop.c          ... stopped, let go
- *   infect.c        parasite and holder brought into it
+ *   process.c       one of them: opened, its threads queried
+ *   stop.c          ... stopped, released
+ *   infect.c        injects parasite and holder
  *   executed.c      ... which are gone when it executes another program
  *   tracker.c       which of its pages are written
  *   support.c       what cannot be protected; quiescence
- *   waits.c         calls that are to be ended
+ *   waits.c         ends calls whose timeout has expired
  *   dying.c         in its own handler of a fatal signal
  *   tree.c          all of them
  */
@@ -19,12 +19,12 @@
 
 #define PROCESSES_MAX 512 /* of one app                                     */
 
-/* One process of the app, as it was found. */
+/* One process of the app, as found by tree_scan(). */
 struct tree_entry {
 	pid_t pid;
 	int parent;  /* index, PARENT_INIT; the main process is 0           */
 	bool ended;  /* a zombie                                         */
-	bool ending; /* neither a process any more nor a zombie yet      */
+	bool ending; /* exiting, but no zombie yet                       */
 	struct proc_stat stat;
 	struct process *process;
 };
@@ -33,13 +33,13 @@ struct tree_entry {
 struct tree {
 	pid_t init;
 	uint32_t slots;           /* of a parasite                                        */
-	struct tree_entry *entry; /* who was found; parents before children            */
+	struct tree_entry *entry; /* those found; parents before children              */
 	uint32_t count;
-	/* The main one first, which stays whatever becomes of it; of the others those that have
-	 * ended as long as there are images of them. */
+	/* The main one first, which always stays; others also after their end, as long as there are
+	 * images of them. */
 	struct process **process;
 	uint32_t processes;
-	/* Is this child of init one of our own? */
+	/* Whether this child of init is one of our own. */
 	bool (*is_ours)(pid_t pid, const void *arg);
 	const void *arg;
 };
@@ -54,55 +54,55 @@ static inline struct process *tree_main(const struct tree *tree)
 /* ---- process.c ----------------------------------------------------------------- */
 
 void process_init(struct process *process);
-/* Room for threads and all else that a process has; false: out of memory. */
+/* Memory for threads and all else that a process has; false: out of memory. */
 bool process_make_room(struct process *process);
 void process_free_room(struct process *process);
 int process_open(struct process *process, pid_t pid, pid_t inside,
 		 struct avc_error *err) warn_unused;
-/* Before anything else is done with it: the main thread may have ended, and others go
- * on (pthread_exit(3)). */
+/* Before anything else is done with it: the main thread may have ended while others continue
+ * (pthread_exit(3)). */
 int process_follow(struct process *process, struct avc_error *err) warn_unused;
-/* All of it, whichever of its threads have ended meanwhile. */
+/* Kills all its threads, even if some have ended meanwhile. */
 void process_kill(const struct process *process);
-/* Forgets the process (the parasite stays mapped here: templates live in it). */
+/* Forgets the process (our view of the parasite stays mapped: templates use it). */
 void process_close(struct process *process);
-/* What ptrace can read of a stopped thread: mask, robust list, rseq. */
+/* What can be read of a stopped thread from outside: mask, robust list, rseq, scheduling. */
 int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
-/* What only a thread itself can tell (clear_child_tid, sigaltstack, credentials): added to
- * calls that it makes anyway, and what came of it.  `with_locks`: of its process, what is to
- * be locked in memory; there is a mapping more while that is found out. */
+/* What only a thread itself can query (clear_child_tid, sigaltstack, credentials): added to calls
+ * that it makes anyway, and their results.  `with_locks`: also what its process locks in future
+ * (mlockall(2)), for which it temporarily has one more mapping. */
 void thread_ask_add(const struct process *process, bool with_locks, struct inj_call *call,
 		    struct questions *questions);
 int thread_ask_answer(struct thread *thread, const struct inj_call *call,
 		      const struct questions *questions, struct avc_error *err) warn_unused;
-/* Asks a stopped thread just that; if it is the main thread, thread_ask_others(). */
+/* Has a stopped thread make only those; if it is the main thread, thread_ask_others(). */
 int thread_ask(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
-/* The main thread was asked, and had other credentials before: a change may be one of all
- * threads (nptl(7), setuid(3)), so these are to be asked again, too (AVC_RETRY). */
+/* If the main thread's credentials have changed since `was`: all threads may have changed theirs
+ * (nptl(7), setuid(3)), so they have to be queried again, too (AVC_RETRY). */
 int thread_ask_others(struct process *process, const struct thread *thread, const struct creds *was,
 		      struct avc_error *err) warn_unused;
-/* The threads there are now; those that ended are forgotten. */
+/* Lists the threads there are now; those that ended are forgotten. */
 int process_list_threads(struct process *process, struct avc_error *err) warn_unused;
-/* Gets known every thread that is not yet, one at a time, before a freeze. */
+/* Queries every thread that is not known yet, one at a time, before a freeze. */
 int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
 			      struct avc_error *err) warn_unused;
 
 /* ---- dying.c ------------------------------------------------------------------- */
 
-/* Before a freeze: of which fatal signals it has handlers. */
+/* Before a freeze: notes for which fatal signals it has handlers. */
 void dying_note_caught(struct process *process);
 /* In a freeze: before its threads are checked, and when none was in a handler. */
 void dying_begin(struct process *process);
 void dying_end(struct process *process);
-/* Of a stopped thread that was read: AVC_RETRY, it is in the handler of a fatal signal. */
+/* For a stopped thread that was read: AVC_RETRY, it is in the handler of a fatal signal. */
 int dying_check(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 
 /* ---- stop.c --------------------------------------------------------------------- */
 
-/* Every thread of one process is stopped; all go on. */
+/* Stops every thread of one process; process_let_go() releases them. */
 int process_stop(struct process *process, struct avc_error *err) warn_unused;
-/* The same in parts, for several at a time: what is known of the last time is forgotten; those
- * threads are interrupted that are known; all are waited for, and the others found. */
+/* The same in parts, for several at a time: forgets the state of the last freeze; interrupts known
+ * threads; waits for all, and finds the others. */
 void process_stop_begin(struct process *process);
 void process_interrupt(struct process *process);
 int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
@@ -110,47 +110,47 @@ void process_let_go(struct process *process);
 
 /* ---- infect.c ----------------------------------------------------------------- */
 
-/* Brings the parasite into the app, through its main thread.  The other threads run. */
+/* Injects the parasite by the main thread.  The other threads keep running. */
 int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		   struct avc_error *err) warn_unused;
 /* The same while everything is stopped. */
 int process_infect_stopped(struct process *process, uint32_t slots,
 			   struct avc_error *err) warn_unused;
-/* The holder of one that is not the main process, by its stopped main thread. */
+/* Makes the holder of one that is not the main process, by its stopped main thread. */
 int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err) warn_unused;
-/* A stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) does not for a while: they
- * are init's.  If we die meanwhile it does again all by itself. */
+/* Makes a stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) leave them to init.  If we
+ * die meanwhile, it resumes by itself. */
 int process_pause_adoption(struct process *process, struct avc_error *err) warn_unused;
 int process_resume_adoption(struct process *process, struct avc_error *err) warn_unused;
-/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until what it
- * has open is closed and its memory gone. */
+/* Makes the holder; process_unhold() drops it.  process_unhold_soon() does not wait until its
+ * descriptors are closed and its memory is freed. */
 int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		 struct avc_error *err) warn_unused;
 void process_unhold(struct process *process);
 void process_unhold_soon(struct process *process);
-/* The holder is the caller's from here on, with its pidfd (-1: there was none). */
+/* From then on the holder belongs to the caller, with its pidfd (-1: there was none). */
 pid_t process_detach_holder(struct process *process, int *pidfd);
 
 /* ---- executed.c ---------------------------------------------------------------------- */
 
-/* Whether the (running, infected) process has another program: what was brought into it
- * is gone. */
+/* Whether the (running, infected) process has executed another program: parasite and holder are of
+ * the old one. */
 bool process_has_executed(const struct process *process);
-/* From now on process->exec_sign.fd has news (poll(2)) when it may have: it has, or its main thread
- * has ended.  false: the kernel does not tell. */
+/* From now on process->exec_sign.fd becomes ready (poll(2)) when it has, or when its main thread
+ * has ended.  false: the kernel does not support this. */
 bool process_listen_for_exec(struct process *process);
 void process_listen_no_more(struct process *process);
 
 /* ---- tracker.c -------------------------------------------------------------------- */
 
-/* Sets that are added to. */
+/* Sets that scans add to. */
 #define TRACKER_SETS (AVC_KEEP_MAX + 3)
 
-/* Whose private memory is watched: the kernel notes which pages are written, in the process's page
- * table and by no fault that anybody waits for.  With the last descriptor, which is ours, all of it
- * goes from the process. */
+/* Watches a process's private memory: the kernel records which pages are written, in the process's
+ * page table, without a fault that has to be handled.  When our descriptor, the last one, is
+ * closed, nothing of it remains in the process. */
 struct tracker {
-	uint64_t number; /* none has the same: what was known by another one is not known */
+	uint64_t number; /* unique: results of another tracker do not count               */
 	int uffd, pagemap;
 	uint32_t areas, area_room; /* the mappings that are watched, in order             */
 	struct stretch {
@@ -161,21 +161,21 @@ struct tracker {
 	struct pageset found;
 	struct pageset *set[TRACKER_SETS];
 	uint32_t sets;
-	bool over;   /* the process is another one                              */
-	bool broken; /* there was no memory to note something in                */
+	bool over;   /* its process has ended                                   */
+	bool broken; /* incomplete: out of memory                               */
 };
 
 /* By a task with the memory of the holder.  AVC_UNSUPPORTED: the kernel cannot do it. */
 int tracker_begin(struct process *process, timer_t timer, struct avc_error *err) warn_unused;
 void tracker_end(struct process *process);
-/* All of its mappings that are private, by /proc/PID/maps of just now.  AVC_UNSUPPORTED: there are
- * some that cannot be watched. */
+/* Watches all its private mappings, as listed in `layout`, a fresh /proc/PID/maps.
+ * AVC_UNSUPPORTED: some cannot be watched. */
 int tracker_watch(struct process *process, char *layout, struct avc_error *err) warn_unused;
-/* What was written since the last time is added to all sets; `template`: a process of which pages
- * count as written where it has any and the other has not been known to, 0: none.  *pages: how many.
- * -1: not all of it is watched any more. */
+/* Adds pages written since the last scan to all sets; `template`: its own pages also count as
+ * written where the process was not known to have any, 0: none.  *pages: how many.  -1: not all of
+ * it is watched any more. */
 int tracker_scan(struct tracker *tracker, pid_t template, uint64_t *pages) warn_unused;
-/* From now on, or no more. */
+/* Scans add to this set from now on, or no more. */
 bool tracker_add(struct tracker *tracker, struct pageset *set);
 void tracker_remove(struct tracker *tracker, const struct pageset *set);
 
@@ -184,35 +184,33 @@ void tracker_remove(struct tracker *tracker, const struct pageset *set);
 /* Looks at a running app for what cannot be protected.  0, or -1 with
  * AVC_UNSUPPORTED and the reason in words. */
 int support_check(struct process *process, struct avc_error *err) warn_unused;
-/* True if this looks like a moment at which nobody is in the middle of anything. */
+/* True if no thread seems to be in the middle of work. */
 bool process_is_quiescent(const struct process *process);
 
 /* ---- tree.c --------------------------------------------------------------------- */
 
-/* Of one whose main process is this.  -1: out of memory. */
+/* Of an app with this main process.  -1: out of memory. */
 int tree_init(struct tree *tree, struct process *main) warn_unused;
-/* Looks who there is; new ones are opened. */
+/* Finds all processes; opens new ones. */
 int tree_scan(struct tree *tree, struct avc_error *err) warn_unused;
-/* Whether entry[i] or a process above it adopts orphans, or could not be asked whether it does. */
+/* Whether entry[i] or an ancestor adopts orphans, or could not be queried for that. */
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
-/* Whether entry[i] has its parent's memory, and not its own: after vfork(2) until it has
- * executed a program. */
-/* Whether that is in one of their parasites: then it is none of the app's that is there. */
+/* Whether this is in one of their parasites: then the task there is not the app's. */
 bool tree_has_parasite(const struct tree *tree, avc_remote pc);
+/* Whether entry[i] shares its parent's memory: after vfork(2) until it has executed a program. */
 bool tree_shares_memory(const struct tree *tree, uint32_t i);
 /* Frees those that have ended and of which there is no image. */
 void tree_sweep(struct tree *tree);
-/* It is gone, or another program: what it had open must not stay open by us. */
+/* It has ended, or executed another program: we must not keep its descriptors open. */
 void tree_let_go(struct process *process);
 /* Of all but the main process, which is the caller's. */
 void tree_free(struct tree *tree);
 
 /* ---- waits.c ---------------------------------------------------------------------- */
 
-/* Before a freeze: looks at those that may be waiting. */
+/* Before a freeze: rewind_prepare() for its threads. */
 void waits_prepare(struct process *process);
-/* Ends the calls that were rewound and whose time is up; the next one's is at
- * process->due_ns (UINT64_MAX: none). */
+/* Ends rewound calls whose time is up; the next is due at process->due_ns (UINT64_MAX: none). */
 void waits_end(struct process *process, timer_t timer);
 
 #endif

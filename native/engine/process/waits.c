@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Calls whose time is up.  A call that a checkpoint has interrupted was made again just
- * as it was (rewind.c), and would take its whole timeout once more.
+ * Ends calls whose time is up.  A call that a checkpoint has interrupted is repeated
+ * unchanged (rewind.c), and would take its whole timeout once more.
  */
 #include "process.h"
 
 #define END_DEADLINE_NS (20 * NS_PER_MS)
-#define LOOKS_MAX 64 /* of some 50 us, before a checkpoint */
+#define LOOKS_MAX 64 /* some 50 us each, before a checkpoint */
 
 /* How often a thread has gone to sleep; 0: unknown. */
 static uint64_t sleeps_of(pid_t tid)
@@ -24,7 +24,7 @@ static bool is_waiting(struct thread *thread)
 	return sleeps_of(thread->tid) - thread->rewound.sleeps <= 1;
 }
 
-/* To be stopped is all it takes (rewind_call()). */
+/* Stopping the thread is enough (rewind_call()). */
 static void end(struct process *process, struct thread *thread, timer_t timer)
 {
 	struct avc_error gone = { 0 };

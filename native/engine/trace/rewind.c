@@ -3,29 +3,29 @@
  * Interrupted system calls.
  *
  * A ptrace stop wakes a blocked call.  Most calls then return one of the kernel's
- * restart codes, and the kernel makes them again by itself when the thread goes
- * on.  Some (signal(7), "Interruption of system calls") return plain EINTR, which
- * the app would see although no signal came.  Those are turned into -ERESTARTNOHAND
- * while the thread is stopped: if a signal with a handler *is* pending, the kernel
- * makes EINTR of it again, as it should; if none is, the call is made again.
+ * restart codes, and the kernel restarts them by itself when the thread continues.
+ * Some (signal(7), "Interruption of system calls") return plain EINTR, which the app
+ * would see although no signal came.  We change those to -ERESTARTNOHAND while the
+ * thread is stopped: if a signal with a handler *is* pending, the kernel changes that
+ * back to EINTR, as it should; if none is, it restarts the call.
  *
- * A call that is made again begins its timeout again.  No argument is shortened for
- * that: the app may keep its arguments in registers from one call to the next, and
- * would find the shorter one there.  The call is made again just as it was, and the
- * guard ends it when its time is up: it stops the thread and answers what the kernel
- * would have answered (rewind_end_due()).
+ * A restarted call begins its timeout again.  We shorten no argument for that: the app
+ * may keep its arguments in registers from one call to the next, and would find the
+ * shorter one there.  The call is repeated unchanged, and the guard ends it when its
+ * time is up (waits.c): it stops the thread and sets the result that the kernel would
+ * have returned (answer_late()).
  *
- * For that, a call that was rewound has to be told from the next one with the same
- * arguments.  It is marked where the app cannot see it: the kernel takes the number of
- * a call from the lower half of a register whose upper half it only keeps
- * (arch_call_mark()), and which the result of the call overwrites.
+ * For that, a rewound call has to be told from a later one with the same arguments.  It
+ * is marked where the app cannot see it: the kernel takes the number of a call from the
+ * lower half of a register whose upper half it only preserves (arch_call_mark()), and
+ * which the result of the call overwrites.
  *
- * When the guard dies:
- *   - before the result is changed, the call answers the EINTR that the kernel gave it.
- *     The kernel leaves no other way: it wakes the call before it stops the thread, and
- *     lets the thread go on by itself as soon as there is no tracer;
+ * If the guard dies:
+ *   - before the result is changed, the call returns the EINTR that the kernel gave it.
+ *     That cannot be avoided: the kernel wakes the call before it stops the thread, and
+ *     lets the thread continue as soon as there is no tracer;
  *   - after that, the call begins its timeout once more, and ends late.
- * Nothing of the app's has changed in either case.
+ * The app's state is unchanged in either case.
  */
 #include <errno.h>
 #include <string.h>
@@ -40,11 +40,11 @@
 
 #define ERESTARTNOHAND 514 /* include/linux/errno.h */
 #define ERESTART_RESTARTBLOCK 516
-#define DATE_LOOKS 5 /* at the clock of a CPU that has no time to say what it says */
+#define DATE_LOOKS 5 /* attempts to read the clock of a busy CPU */
 #define FDS_PER_WORD 64
 #define FD_WORDS_MAX 16384 /* of an fd_set: a million descriptors */
 
-/* Newer CPUs are without these. */
+/* Newer architectures lack these. */
 #ifndef SYS_epoll_wait
 #define SYS_epoll_wait (-2)
 #define SYS_select (-2)
@@ -53,13 +53,13 @@
 
 enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND };
 
-/* Calls that answer EINTR to a stop, have done nothing when they do, and may be
- * made again.  Never close(2). */
+/* Calls that return EINTR after a stop, have had no effect when they do, and may be repeated.
+ * Never close(2). */
 static const struct rewindable {
 	long nr;
 	enum timeout timeout;
 	unsigned int argument;
-	int answer; /* when its time is up */
+	int answer; /* its result when its time is up */
 } rewindable[] = {
 	{ SYS_epoll_wait, MILLISECONDS, 3, 0 },
 	{ SYS_epoll_pwait, MILLISECONDS, 3, 0 },
@@ -69,9 +69,8 @@ static const struct rewindable {
 	{ SYS_rt_sigtimedwait, TIMESPEC, 2, -EAGAIN },
 	{ SYS_io_getevents, TIMESPEC, 4, 0 },
 	{ SYS_io_pgetevents, TIMESPEC, 4, 0 },
-	/* If they cannot write what is left of the timeout (fs/select.c,
-	 * poll_select_finish()): it is in read-only memory, or the program has the
-	 * personality STICKY_TIMEOUTS. */
+	/* Only when they cannot write the remaining timeout (fs/select.c, poll_select_finish()): it
+	 * is in read-only memory, or the program has the personality STICKY_TIMEOUTS. */
 	{ SYS_ppoll, TIMESPEC, 2, 0 },
 	{ SYS_pselect6, TIMESPEC, 4, 0 },
 	{ SYS_select, TIMEVAL, 4, 0 },
@@ -99,13 +98,13 @@ static const struct rewindable {
 
 /* ---- how long a call may take --------------------------------------------------------- */
 
-/* In ns; 0: for ever. */
+/* In ns; 0: forever. */
 static uint64_t time_in_memory(const struct process *process, avc_remote pointer, uint64_t unit_ns)
 {
 	int64_t time[2];
 
 	if (!pointer || pread(process->mem_fd, time, sizeof time, (off_t)pointer) != sizeof time ||
-	    time[0] < 0 || time[1] < 0 || time[0] > INT32_MAX) /* as good as for ever */
+	    time[0] < 0 || time[1] < 0 || time[0] > INT32_MAX) /* as good as forever */
 		return 0;
 	return (uint64_t)time[0] * NS_PER_S + (uint64_t)time[1] * unit_ns;
 }
@@ -174,7 +173,7 @@ static bool has_timeout(long nr)
 	return false;
 }
 
-/* False: the call is none of those.  *limit_ns: 0, it may take for ever. */
+/* False: the call is none of those.  *limit_ns: 0 if it may take forever. */
 static bool look_up(const struct process *process, const struct arch_regs *regs, uint64_t *limit_ns,
 		    int *answer)
 {
@@ -191,7 +190,7 @@ static bool look_up(const struct process *process, const struct arch_regs *regs,
 
 /* ---- the end of a call's time --------------------------------------------------------- */
 
-/* select(2) tells with its sets that nothing is ready. */
+/* select(2) clears its sets when its time is up. */
 static void clear_sets(const struct thread *thread)
 {
 	static const uint64_t zero[FD_WORDS_MAX];
@@ -215,9 +214,9 @@ static void answer_late(struct thread *thread)
 	const long nr = arch_syscall_nr(&thread->regs);
 	uint64_t mask;
 
-	/* epoll_pwait(2) and others: a signal that comes now is too late for the mask that
-	 * was in force for as long as the call.  What is read here is the thread's own, and
-	 * written back it is in force again (kernel/ptrace.c). */
+	/* epoll_pwait(2) and others set a signal mask for the duration of the call, which must not
+	 * apply to a signal that arrives now.  What we read here is the thread's own mask, and
+	 * writing it back restores it (kernel/ptrace.c). */
 	if (ptrace(PTRACE_GETSIGMASK, thread->tid, sizeof mask, &mask) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof mask, &mask))
 		return;
@@ -231,11 +230,10 @@ static void answer_late(struct thread *thread)
 
 /* ---- which call it is ------------------------------------------------------------------ */
 
-/* restart_syscall(2) is what the kernel makes of nanosleep, clock_nanosleep, poll
- * and futex when it takes them up again.  In another process it means nothing, so
- * there the call itself has to be made again, and its number is no longer in the
- * registers.  Normally we have seen it before.  If not (a guard that came later),
- * the code in front of the system call or the arguments tell. */
+/* The kernel restarts nanosleep, clock_nanosleep, poll and futex as restart_syscall(2).  In another
+ * process that means nothing, so there the original call has to be repeated, whose number is no
+ * longer in the registers.  Normally we have seen it before.  If not (a guard started later), it is
+ * guessed from the code before the system call, or from the arguments. */
 static long guess_call(const struct process *process, const struct arch_regs *regs, avc_remote pc)
 {
 	const uint64_t a = arch_syscall_arg(regs, 0), b = arch_syscall_arg(regs, 1),
@@ -258,8 +256,8 @@ static long guess_call(const struct process *process, const struct arch_regs *re
 	return SYS_poll;          /* descriptors, how many, timeout */
 }
 
-/* Let go a moment ago, and stopped again before it was back in its call: the kernel
- * has sent it back to the instruction, with the number of restart_syscall(2). */
+/* Released a moment ago, and stopped again before it was back in its call: the kernel has moved it
+ * back to the instruction, with the number of restart_syscall(2). */
 static bool is_about_to_restart(const struct process *process, const struct arch_regs *regs)
 {
 	uint8_t code[ARCH_SYSCALL_BYTES];
@@ -294,7 +292,7 @@ static bool is_rewound(const struct thread *thread)
 	return thread->rewound.mark && thread->rewound.mark == arch_call_mark(&thread->regs);
 }
 
-/* See is_about_to_restart(); of a call that was rewound. */
+/* Like is_about_to_restart(), for a rewound call. */
 static bool is_about_to_rewind(const struct thread *thread)
 {
 	return thread->rewound.mark && arch_result_mark(&thread->regs) == thread->rewound.mark;
@@ -325,8 +323,8 @@ static bool has_slept(const struct thread *thread, struct proc_sched *now)
 	       now->sleeps == thread->sleeper.sched.sleeps + 1;
 }
 
-/* Subtracts the time that the call has taken so far. If the thread woke on another CPU than it slept
- * on, rewind_date() does that later, while nothing is stopped. */
+/* Subtracts the time that the call has taken so far. If the thread woke on another CPU than it
+ * slept on, rewind_date() does that later, while nothing is stopped. */
 static void count_sleep(struct thread *thread)
 {
 	const struct sleeper *s = &thread->sleeper;
@@ -357,9 +355,9 @@ void rewind_date(struct thread *thread)
 		r->ran_ns = 0;
 }
 
-/* recvmmsg(2) that was interrupted when it had some of its messages answers how many, and
- * leaves what interrupted it to the socket's next call (net/socket.c, do_recvmmsg()): which
- * would fail with one of the kernel's own codes.  To ask for an error takes it away. */
+/* If recvmmsg(2) is interrupted after some messages, it returns their number, and leaves the error
+ * to the socket's next call (net/socket.c, do_recvmmsg()), which would fail with one of the
+ * kernel's internal codes.  Reading SO_ERROR clears it. */
 static void forget_error(const struct process *process, const struct arch_regs *regs)
 {
 	const long got = arch_syscall_result(regs);
@@ -375,7 +373,7 @@ static void forget_error(const struct process *process, const struct arch_regs *
 	close(fd);
 }
 
-/* A call that answers EINTR to a stop is from now on watched. */
+/* Marks a call that returned EINTR after a stop, and computes when its time is up. */
 static void begin_watch(const struct process *process, struct thread *thread, uint64_t now)
 {
 	uint64_t limit_ns;
@@ -413,8 +411,8 @@ void rewind_call(struct process *process, struct thread *thread)
 	if (arch_syscall_result(regs) == -EINTR) {
 		if (!is_rewound(thread))
 			begin_watch(process, thread, now);
-		/* The result first: a guard that dies before the mark is set leaves a wait
-		 * that is too long, not one that fails. */
+		/* The result first: if the guard dies before the mark is set, the wait is too long,
+		 * but does not fail. */
 		if (!r->mark || arch_result_set(thread->tid, -ERESTARTNOHAND))
 			return; /* another call, or it was killed */
 		arch_result_note(regs, -ERESTARTNOHAND);
@@ -422,7 +420,7 @@ void rewind_call(struct process *process, struct thread *thread)
 			return;
 	} else if (arch_syscall_result(regs) != -ERESTARTNOHAND || !is_rewound(thread)) {
 		return;
-	} /* else stopped again before it has run: as it was left */
+	} /* else stopped again before it ran: nothing to change */
 	r->sleeps_known = false;
 	if (now >= r->due_ns)
 		answer_late(thread);
@@ -430,9 +428,8 @@ void rewind_call(struct process *process, struct thread *thread)
 		process->due_ns = r->due_ns;
 }
 
-/* ppoll, pselect and select write what is left of their timeout to the app's memory
- * when they are interrupted, and are made again with that: what they do not count
- * is the time they were stopped. */
+/* When ppoll, pselect and select are interrupted, they write the remaining timeout to the app's
+ * memory, and are restarted with it: only the duration of the stop is missing. */
 void rewind_count_stop(const struct process *process, const struct thread *thread)
 {
 	const struct arch_regs *regs = &thread->regs;
@@ -445,7 +442,7 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 	    arch_syscall_result(regs) != -ERESTARTNOHAND)
 		return;
 	if (is_rewound(thread))
-		return; /* it could not write that */
+		return; /* it could not write the timeout */
 	pointer = arch_syscall_arg(regs, nr == SYS_ppoll ? 2 : 4);
 	if (!pointer || pread(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left ||
 	    left[0] > INT32_MAX)
@@ -455,7 +452,7 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 	left[0] = ns > 0 ? ns / (int64_t)NS_PER_S : 0;
 	left[1] = ns > 0 ? ns % (int64_t)NS_PER_S / unit_ns : 0;
 	if (pwrite(process->mem_fd, left, sizeof left, (off_t)pointer) != sizeof left)
-		return; /* a little late, then */
+		return; /* then it ends a little late */
 }
 
 void rewind_original(const struct thread *thread, struct arch_regs *regs)
@@ -464,13 +461,13 @@ void rewind_original(const struct thread *thread, struct arch_regs *regs)
 		arch_result_note(regs, (int32_t)arch_syscall_result(regs));
 	if (arch_syscall_nr(regs) == SYS_restart_syscall)
 		arch_syscall_nr_set(regs, thread->call.nr);
-	/* See is_about_to_restart(): otherwise it stands where note_call() found it. */
+	/* See is_about_to_restart(). */
 	if (arch_syscall_result(regs) == SYS_restart_syscall &&
 	    thread->call.pc == arch_pc(regs) + ARCH_SYSCALL_BYTES)
 		arch_result_note(regs, thread->call.nr);
-	/* Its signal is sent again (pending.c), and cuts the call short as it would
-	 * have done.  (Whether -ERESTARTSYS becomes EINTR is for sigaction's flags to
-	 * say: those calls are made again.) */
+	/* Its signal is sent again (pending.c), and interrupts the call as it would have done.
+	 * (Whether -ERESTARTSYS becomes EINTR depends on sigaction's flags: those calls are
+	 * restarted.) */
 	if (thread->signalled && arch_syscall_nr(regs) >= 0 &&
 	    (arch_syscall_result(regs) == -ERESTARTNOHAND ||
 	     arch_syscall_result(regs) == -ERESTART_RESTARTBLOCK))

@@ -1,14 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Stopped tasks: ptrace(2), threads of the app, and code of ours run in them.
+ * Stopped tasks: ptrace(2), threads of the app, and our code run in them.
  *
  *   tracee.c        seize, stop, wait, release
- *   thread.c        a thread of the app: stopped, let go
+ *   thread.c        a thread of the app: stopped, released
  *   rewind.c        interrupted system calls
  *   parasite.c      the parasite as the engine sees it, code run in a process
+ *   seccomp.c       ... despite the app's seccomp filters
  *   setup.c         lists of calls that a restored process makes
- *   syscall_batch.c a process that is being made
- *   fd_channel.c    ... and gets descriptors
+ *   syscall_batch.c calls of a process that is being created
+ *   fd_channel.c    ... and descriptors for it
  *   last_pid.c      the next PID of another PID namespace
  *   init_channel.c  to avckpt-init: control page, reports, verdicts
  */
@@ -29,7 +30,7 @@
 #define PTRACE_GET_RSEQ 0x420f
 #define SS_AUTODISARM_ (1u << 31) /* linux/signal.h, which does not go with signal.h */
 
-/* The call a thread was in when it was stopped last. */
+/* The call that a thread was in when it was last stopped. */
 struct call {
 	long nr;
 	avc_remote pc, sp;
@@ -39,7 +40,7 @@ struct call {
 /* What is remembered of a call that was rewound (rewind.c). */
 struct rewound {
 	uint32_t mark; /* of that call; 0: none                            */
-	int answer;    /* when its time is up                              */
+	int answer;    /* its result when its time is up                   */
 	uint64_t since_ns, due_ns;
 	/* It began at this time by the clock of that CPU (cpu_clock.c), not yet converted;
 	 * 0: nothing to convert. */
@@ -85,7 +86,7 @@ struct creds {
 	int32_t future_lock; /* mlockall(2), of the main thread only            */
 };
 
-/* What a thread is asked (process.c); NULL: not that. */
+/* Queries to a thread (process.c); NULL: not made. */
 struct questions {
 	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
 };
@@ -93,8 +94,8 @@ struct questions {
 /* How injected code gets along with the app's seccomp filters (seccomp.c). */
 enum seccomp_way {
 	SECCOMP_NONE,      /* there are none                                       */
-	SECCOMP_IN_FORCE,  /* they let pass what it calls                          */
-	SECCOMP_SUPERVISED /* they do not                                          */
+	SECCOMP_IN_FORCE,  /* they allow its calls                                 */
+	SECCOMP_SUPERVISED /* they do not: seccomp_supervise()                     */
 };
 
 struct thread {
@@ -104,27 +105,27 @@ struct thread {
 	int stop_signal; /* the process is stopped by job control           */
 	int block;       /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
-	const struct parasite *borrowed_for; /* NULL: not yet a parasite (infect.c)         */
-	uint32_t filters_known;              /* of seccomp, when they were looked at last       */
+	const struct parasite *borrowed_for; /* NULL: before there is one (infect.c)        */
+	uint32_t filters_known;              /* of seccomp, at the last check                   */
 	enum seccomp_way seccomp;
-	bool vetted;           /* thread_vet() has been at this stop                      */
-	struct arch_regs regs; /* as of the stop, EINTR already mended          */
+	bool vetted;           /* thread_vet() has checked it at this stop                */
+	struct arch_regs regs; /* as of the stop, EINTR already replaced        */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
 	uint64_t rseq;
 	uint32_t rseq_bytes, rseq_signature;
 	uint64_t affinity[INJ_CPU_WORDS];
 	uint32_t affinity_bytes;
-	/* Asked of the thread itself, or slow to read; kept between checkpoints
-	 * as long as it looks like the same thread. */
+	/* Queried from the thread itself, or slow to read; kept between checkpoints as long as it
+	 * looks like the same thread. */
 	bool known;
 	uint32_t asked; /* checkpoints since                                */
-	bool young;     /* was asked once only: it may just be setting itself up    */
+	bool young;     /* queried only once: it may just be initializing           */
 	pid_t inside;
 	uint64_t known_tls;
 	uint64_t clear_tid;
 	uint64_t altstack[3]; /* sp, flags, size                                */
-	bool disarmed;        /* has none as long as it is in a handler on it   */
+	bool disarmed;        /* it is in a handler on it (SS_AUTODISARM)       */
 	char name[16];
 	struct creds creds;
 	struct scheduling scheduling; /* at this freeze                         */
@@ -136,20 +137,20 @@ struct thread {
 		avc_remote pc, sp;
 		uint64_t sigmask;
 	} looked_at;    /* when it was in no handler (dying.c)                     */
-	bool signalled; /* was just about to run a handler                  */
+	bool signalled; /* was about to run a handler                       */
 };
 
 struct parasite {
 	avc_remote base; /* 0: none                                          */
 	enum seccomp_way seccomp;
-	pid_t inside; /* the process it was brought into, as that knows it     */
+	pid_t inside; /* the infected process, in its own namespace            */
 	size_t bytes;
 	uint8_t *map; /* our view of the same pages                       */
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
-	/* The guard's own memory, not the app's: the code, sealed, so that nobody can write it; and
-	 * the rest, which the app can write as well. */
+	/* Memory of the guard, not of the app: the code, sealed against writing; and the rest,
+	 * which the app can write as well. */
 	int code_fd, data_fd;
 };
 #define PARASITE_NAME "avckpt-parasite"
@@ -162,16 +163,16 @@ struct parasite {
 /* How far a freeze has come with a process. */
 enum freeze_stage {
 	FREEZE_RUNS,    /* or not all of its threads are known to be stopped        */
-	FREEZE_STOPPED, /* all of it                                            */
-	FREEZE_BEGUN    /* and it is being read, cloned and asked                     */
+	FREEZE_STOPPED, /* all its threads are stopped                          */
+	FREEZE_BEGUN    /* and it is being read, cloned and queried                   */
 };
 
 /* A live process of the app. */
 struct process {
-	/* The thread that stands for the process to /proc and ptrace(2): the main thread,
-	 * or, when that has ended, any other (process_follow).  0: none           */
+	/* The thread by which /proc and ptrace(2) reach the process: the main thread, or, when that
+	 * has ended, any other (process_follow).  0: none                         */
 	pid_t pid;
-	pid_t leader; /* the process's own number                            */
+	pid_t leader; /* the process's own PID                               */
 	pid_t inside; /* the same in its own namespace                       */
 	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd;
 	int leader_pidfd; /* when pidfd is of another thread: of the process    */
@@ -181,25 +182,25 @@ struct process {
 	int holder_pidfd;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
-	uint64_t due_ns; /* when the first of its calls is to be ended (waits.c)   */
+	uint64_t due_ns; /* when the first of its calls has to be ended (waits.c)  */
 	uint64_t nonce;
-	/* Parasites that a guard which died left behind; they go with the second
-	 * checkpoint, when no thread can be in them any more. */
+	/* Parasites left behind by dead guards; unmapped by the second checkpoint, when no thread
+	 * can be in them any more. */
 	struct {
 		avc_remote base;
 		size_t bytes;
 	} old_parasite[OLD_PARASITES_MAX];
 	uint32_t old_parasites, checkpoints;
-	/* A thread died while it may have been cloning: there may be a tracee that
-	 * nobody knows (init_channel_kill_lost). */
+	/* A thread died while it may have been cloning: there may be a tracee that is on no list
+	 * (init_channel_kill_lost). */
 	bool lost;
 	bool childless;                     /* it had no child process at the last checkpoint   */
-	const struct inj_syscall *children; /* the question whether it has, in a freeze */
-	struct questions questions;         /* and what else it is asked               */
+	const struct inj_syscall *children; /* the query whether it has, in a freeze   */
+	struct questions questions;         /* and the other queries                   */
 	uint64_t asked_ns;
 	bool asked;
 	uint32_t blocks;     /* of the slot, that its threads take up in this freeze     */
-	long surveyed_pages; /* size when its mappings were looked at last      */
+	long surveyed_pages; /* size when its mappings were last read           */
 	int sockets[SOCKETS_MAX];
 	uint32_t socket_count;
 	struct pending *pending;
@@ -211,12 +212,12 @@ struct process {
 	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
-	bool heirs_vary;   /* what it has from its parent changed in a freeze        */
-	bool tcp_moved;    /* bytes of connections are to be counted           */
-	bool tcp_messages; /* quiescent is only who is between two messages    */
+	bool heirs_vary;   /* inherited files changed in a freeze                    */
+	bool tcp_moved;    /* bytes of connections are counted                 */
+	bool tcp_messages; /* quiescent only between two messages              */
 	/* Of a process that is not the main one (tree.c). */
 	bool descendant;
-	uint64_t start;               /* when it began; tells it from one with its number */
+	uint64_t start;               /* start time; tells it from one with the same PID  */
 	uint32_t images;              /* generations that have one of it                  */
 	struct arch_regs holder_base; /* a user context of the holder, which clones       */
 	enum freeze_stage stage;      /* in this freeze                                    */
@@ -225,21 +226,21 @@ struct process {
 	long clone_pages;             /* its size when that began                         */
 	long anon_pages;              /* of its last template; 0: none yet                */
 	uint64_t caught;              /* fatal signals that it has had handlers for        */
-	uint64_t uncaught;            /* and has not any more                              */
+	uint64_t uncaught;            /* and has no longer                                 */
 	uint64_t dying_ns;            /* since when it has been in one                     */
-	bool alive;                   /* that was too long ago: it lives there             */
-	bool doubtful;                /* it was cloning when a checkpoint came to nothing */
-	const struct creds *forebear; /* what a process that is made from the main one has */
-	bool adopts;                  /* it or one above it adopts orphans, or may do so    */
+	bool alive;                   /* for too long: it goes on running in the handler   */
+	bool doubtful;                /* it was cloning when a checkpoint failed          */
+	const struct creds *forebear; /* of a process forked from the main one             */
+	bool adopts;                  /* it or an ancestor adopts orphans, or may do so     */
 	bool paused; /* between process_pause_adoption() and process_resume_adoption()         */
-	struct tracker *tracker; /* process/tracker.c; NULL: nobody watches its memory         */
+	struct tracker *tracker; /* process/tracker.c; NULL: its memory is not watched         */
 	bool recycling;          /* in this freeze a template is brought up to date          */
-	/* Says that it may have executed another program (executed.c); fd -1: nothing does.  */
+	/* Readable when it may have executed another program (executed.c); fd -1: not used. */
 	struct exec_sign {
 		int fd;
 		void *page;
 	} exec_sign;
-	uint64_t held_ns, exec_check_ns; /* since when, and when to look whether it has     */
+	uint64_t held_ns, exec_check_ns; /* since when it has a holder; next check for that */
 };
 
 /* ---- tracee.c ---------------------------------------------------------------- */
@@ -259,7 +260,7 @@ enum stop_kind {
 	STOP_EXIT,     /* gone; reaped                                           */
 	STOP_DYING,    /* killed, to be reaped later (threads_tend_stragglers())              */
 	STOP_DEADLINE, /* did not stop in time                                   */
-	STOP_NONE,     /* WNOHANG: nothing new                                   */
+	STOP_NONE,     /* WNOHANG: no stop                                       */
 	STOP_OTHER
 };
 
@@ -272,46 +273,45 @@ struct stop {
 /* From now on a wait also ends (as at the deadline) when *word is not 0; NULL: no more. */
 void tracee_watch(const uint32_t *word);
 /* Waits for the next stop of one tracee of this thread; options: 0 or WNOHANG.  A STOP_SIGNAL is
- * told of again until it is made to go on: so the application gets its signal also if we die. */
+ * reported again until the tracee continues: so the application gets its signal even if we die. */
 struct stop tracee_wait(pid_t tid, int options);
-/* For a running tracee that was interrupted (or is new): waits until it is in a
- * plain trap stop (STOP_TRAP); signals that come in between are delivered.  A new
- * tracee that it brings forth goes to *child (NULL: not expected).  Anything but
- * STOP_TRAP is an error. */
+/* For a running tracee that was interrupted (or is new): waits until it is in a plain trap stop
+ * (STOP_TRAP); signals in between are delivered.  A task that it creates is returned in *child
+ * (NULL: not expected).  Anything but STOP_TRAP is an error. */
 enum stop_kind tracee_await(pid_t tid, pid_t *child, struct avc_error *err) warn_unused;
 /* The same; tick() is called now and then, as long as there is a deadline. */
 enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 				  struct avc_error *err) warn_unused;
-/* The signal by which the one awaited last is stopped (job control); 0: it is not. */
+/* The job control signal by which the tracee awaited last is stopped; 0: it is not. */
 int tracee_group_signal(void);
-/* From a stop of another kind to a plain trap stop, on the kernel's way back to
- * the app, where it sees to interrupted calls and signals. */
+/* From a stop of another kind to a plain trap stop, on the way back to user mode, where the kernel
+ * handles interrupted calls and signals. */
 int tracee_settle(pid_t tid, struct avc_error *err) warn_unused;
-/* The same of a task of ours of which it is not known whether it runs. */
+/* The same for a task of ours that may be running. */
 int tracee_halt(pid_t tid, struct avc_error *err) warn_unused;
-/* Where a tracee is, as soon as it is stopped; 0: it is not, after some milliseconds, or ended. */
+/* The program counter of a tracee once it is stopped; 0: it did not stop for some milliseconds, or
+ * has ended. */
 avc_remote tracee_pc(pid_t tid);
-/* Tracees of which we are not told: clone(2) with CLONE_PTRACE attaches a child to its parent's
- * tracer, if there is one by then; but whether to tell it is decided at the call's beginning
- * (kernel/fork.c, kernel_clone()).  One that is not known() is let go as soon as it has stopped. */
+/* Tracees that are not reported to us: clone(2) with CLONE_PTRACE attaches a child to its parent's
+ * tracer, if there is one by then; but whether to report it is decided at the start of the call
+ * (kernel/fork.c, kernel_clone()).  One that is not known() is released once it has stopped. */
 void tracee_know(bool (*known)(pid_t tid, const void *arg), const void *arg);
 void tracee_release_strangers(void);
-/* One may come; for a second it is to be looked for. */
+/* One may appear: it is looked for during a second. */
 void tracee_expect_strangers(void);
 bool tracee_expects_strangers(void);
-/* Reaps a dead tracee of this thread that is not known(): true if there was one.  One
- * that a thread has brought forth when it was killed is a tracee nobody heard of. */
+/* Reaps a dead tracee of this thread that is not known(): true if there was one.  A task that a
+ * thread was creating when it was killed is our tracee without having been reported. */
 bool tracee_reap_unknown(bool (*known)(pid_t tid, const void *arg), const void *arg);
-/* To a tracee (a process).  Its number is nobody else's as long as we have not waited for its
- * end, and it is ours no more after that. */
+/* To a tracee (a process), unless we have reaped it: until then its PID is not reused. */
 void tracee_signal(pid_t pid, int signal);
 /* Kills (SIGKILL) and reaps a tracee that is no thread of a live app. */
 void tracee_kill(pid_t pid);
 /* The same some milliseconds later, and without waiting for its end: the kernel takes some 10 ms
  * for each GB that it has mapped, and longer if it gets no CPU.  Takes `pidfd`.  Until
- * tracee_reap_ending() has killed and reaped it, it is_ending(): the task, of this thread.  That
- * returns how many are left, and tracee_ending_due() when to call it again if there is no news of
- * theirs: CLOCK_MONOTONIC, UINT64_MAX: never. */
+ * tracee_reap_ending() has killed and reaped it, tracee_is_ending().  tracee_reap_ending() returns
+ * how many are left, and tracee_ending_due() when to call it again if no pidfd becomes ready:
+ * CLOCK_MONOTONIC, UINT64_MAX: never. */
 void tracee_end(pid_t pid, int pidfd);
 uint32_t tracee_reap_ending(void);
 uint64_t tracee_ending_due(void);
@@ -319,13 +319,13 @@ uint64_t tracee_ending_due(void);
 void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
 bool tracee_any_ending(void);
-/* *pidfd: of the i-th of them, to be watched; -1: not yet.  false: there are no more. */
+/* *pidfd: of the i-th of them, to be polled; -1: not killed yet.  false: there are no more. */
 bool tracee_ending_late(uint32_t i, int *pidfd);
-/* Whether STOP_SYSCALL is of one that enters a system call, and not of one that leaves it. */
+/* Whether a STOP_SYSCALL is at the entry of the call, not at its exit. */
 bool tracee_enters_call(pid_t tid);
-/* Is this thread the one that traces it? */
+/* Whether it is a tracee of this thread. */
 bool tracee_is_ours(pid_t tid);
-/* Holders, and processes that are being made: never to run on without us. */
+/* Holders, and processes that are being created: they must not outlive us. */
 #define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | TRACE_OPTIONS_APP)
 #define TRACE_OPTIONS_APP \
 	(PTRACE_O_TRACEFORK | PTRACE_O_TRACECLONE | PTRACE_O_TRACEVFORK | PTRACE_O_TRACESYSGOOD)
@@ -336,61 +336,59 @@ bool tracee_is_ours(pid_t tid);
 struct thread *thread_find(struct process *process, pid_t tid);
 struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *err);
 void threads_forget_unseen(struct process *process);
-/* Attaches and interrupts; thread_await() then waits for the stop, reads the
- * registers and mends the interrupted call. */
+/* Attaches and interrupts; thread_await() then waits for the stop, reads the registers and handles
+ * the interrupted call (rewind_call()). */
 int thread_stop(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
 int thread_await(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
-/* After injected code in it has failed: what did not come back in time is still on its way. */
+/* After injected code in it has failed: notes if it may still be running. */
 void thread_runs_on(struct thread *thread, const struct avc_error *err);
-/* Lets it go on as if nothing had been.  A thread that could not be stopped stays
- * attached: a straggler. */
+/* Releases it without a trace.  A thread that could not be stopped stays attached: a straggler. */
 void thread_release(struct thread *thread);
-/* The same after a freeze: what that has taken is no time of a call that it was waiting in. */
+/* The same after a freeze: its duration does not count as part of a call's timeout. */
 void thread_let_go(const struct process *process, struct thread *thread);
-/* Looks after stragglers without waiting; returns how many are left. */
+/* Releases stragglers that have stopped; does not wait.  Returns how many are left. */
 uint32_t threads_tend_stragglers(struct process *process);
-/* Where a thread inside a restartable sequence has to go on (rseq(2)). */
+/* Moves a thread inside a restartable sequence to its abort handler (rseq(2)). */
 void thread_fix_rseq(int mem_fd, struct thread *thread);
-/* Of a stopped thread: whether it can be made to run something of ours. */
+/* Whether a stopped thread can run injected code. */
 int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 
 /* ---- rewind.c --------------------------------------------------------------------- */
 
-/* A thread that just stopped: remembers which call it is in.  If that was only interrupted
- * by us, the thread is set to make it again, or, when the call's time is up, to answer that. */
+/* A thread that just stopped: notes which call it is in.  If only we have interrupted that, sets
+ * the thread to repeat it, or to return its timeout's result when its time is up. */
 void rewind_call(struct process *process, struct thread *thread);
-/* Just before it goes on: takes off what the stop has added to a wait. */
+/* Just before it continues: subtracts the duration of the stop from a remaining timeout. */
 void rewind_count_stop(const struct process *process, const struct thread *thread);
-/* Registers as the app had them, before rewind_call() marked the call or the kernel made
- * restart_syscall(2) of it. */
+/* Registers as the app had them, before rewind_call() marked the call or the kernel replaced it by
+ * restart_syscall(2). */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
-/* Shortly before a thread is stopped that may be in such a call, as far as one knows: since when
- * it sleeps. */
+/* Shortly before a thread is stopped: if it may be in such a call, notes since when it sleeps. */
 void rewind_prepare(struct thread *thread);
 /* Once the thread runs again: finds out when its rewound call began, if that is still unknown. */
 void rewind_date(struct thread *thread);
 
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
-/* Looks at a stopped thread's filters, of which the first `containers` are the container's; *known:
- * how many there were the last time.  Who is supervised stays so.  0, or -1 with errno. */
+/* Reads a stopped thread's filters, of which the first `containers` are the container's; *known:
+ * how many there were the last time.  A supervised thread stays so.  0, or -1 with errno. */
 int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known,
 		 enum seccomp_way *way) warn_unused;
-/* From now on, until seccomp_end_supervision(): `options` are its other ones, `inside` the PID of
- * its process as that knows it. */
+/* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
+ * the PID of its process in its own namespace. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
 #define SECCOMP_WATCHER (-1) /* for `inside`: the one that opens a userfaultfd       */
 void seccomp_end_supervision(pid_t tid);
 bool seccomp_is_supervised(pid_t tid);
 /* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
 void seccomp_at_call(pid_t tid, pid_t inside, long options);
-/* ptrace(PTRACE_CONT) for whoever runs injected code: from `stop`, with its signal if it is one;
- * NULL: it was told of before. */
+/* ptrace(PTRACE_CONT) for tasks that run injected code: from `stop`, with its signal if it is one;
+ * NULL: that stop was handled before. */
 long seccomp_go_on(pid_t tid, const struct stop *stop);
 
 /* ---- parasite.c ------------------------------------------------------------------- */
 
-/* Makes the memory for a layout, with code and control filled in; it is in no process yet. */
+/* Makes the memory for a layout, with code and control filled in; no process has mapped it yet. */
 int parasite_make(struct parasite *parasite, uint64_t nonce, struct avc_error *err) warn_unused;
 size_t parasite_layout(struct parasite *parasite, uint32_t slots, uint32_t threads_max);
 void parasite_close(struct parasite *parasite);
@@ -405,7 +403,7 @@ void *parasite_stack(const struct parasite *parasite, uint32_t slot, uint32_t i)
 uint8_t *parasite_setup(const struct parasite *parasite, uint32_t slot); /* INJ_SETUP_BYTES */
 uint8_t *parasite_files(const struct parasite *parasite, uint32_t slot); /* INJ_FILES_BYTES */
 
-/* Of a system call; those that are not given are 0. */
+/* Of a system call; missing ones are 0. */
 #define ARGUMENTS(...) ((const uint64_t[6]){ __VA_ARGS__ })
 /* Prepares a list of calls; returns the next call to fill in. */
 void call_begin(struct inj_call *call, enum inj_after after);
@@ -424,8 +422,8 @@ int parasite_run_on(pid_t tid, struct inj_call *call, struct avc_error *err) war
  * not let it, fails with AVC_LIMIT, and it is in a plain trap stop. */
 int parasite_run_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 		       struct avc_error *err) warn_unused;
-/* The same in parts, for several at a time.  parasite_halt() waits until it is done and
- * interrupts it; its stop is still to come, for which parasite_finish() waits, too. */
+/* The same in parts, for several at a time.  parasite_halt() waits until the calls are made and
+ * interrupts it; parasite_finish() also waits for its stop. */
 int parasite_start(pid_t tid, struct avc_error *err) warn_unused;
 int parasite_halt(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
 int parasite_finish(pid_t tid, struct inj_call *call, struct avc_error *err) warn_unused;
@@ -434,22 +432,22 @@ int parasite_await_clone(pid_t tid, const struct inj_call *call, pid_t *child,
 /* The same; `meanwhile` is called once while the kernel clones. */
 int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*meanwhile)(void *arg),
 			     void *arg, pid_t *child, struct avc_error *err) warn_unused;
-/* While the main thread is in its parasite: a call that it makes before it goes home if we are not
- * there any more, with the address of arg[3] as its fourth argument.  For what we are about to
- * change in what is the app's; that must not be changed if this fails.  The last one has been
- * undone: parasite_clear_undo(). */
+/* While the main thread is in its parasite: a call that it makes before it returns if we have died,
+ * with the address of arg[3] as its fourth argument.  Undoes a change of the app's state that we
+ * are about to make, and must not make if this fails.  When the last change has been undone:
+ * parasite_clear_undo(). */
 int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
 void parasite_clear_undo(struct process *process);
-/* exec puts another program in its place, at any moment, and the parasite is gone: whether it
- * is there, in a stopped thread.  If not, the process is not infected any more. */
+/* execve(2) can replace the program at any moment, and the parasite with it: checks, in a stopped
+ * thread, that it is there.  If not, the process is not infected any more. */
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
-/* In what a guard that died left behind? */
+/* Whether this is in a parasite left behind by a dead guard. */
 bool parasite_is_old(const struct process *process, avc_remote address);
-/* Options for a task of ours, which is stopped, with the memory of the parasite's process. */
+/* Options for a stopped task of ours, which has the memory of the parasite's process. */
 int parasite_own(const struct parasite *parasite, pid_t tid) warn_unused;
-/* May this stopped thread be borrowed?  What of that is to be read in its memory. */
+/* May this stopped thread be borrowed?  As far as that is to be read in its memory. */
 int thread_vet(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
-/* The same as parasite_run* for a stopped thread of the app, which gets home by itself if we die:
+/* The same as parasite_run* for a stopped thread of the app, which returns by itself if we die:
  * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
 int thread_borrow(struct process *process, struct thread *thread,
 		  struct avc_error *err) warn_unused;
@@ -468,13 +466,13 @@ struct setup {
 	uint64_t *tail[INJ_STAGES]; /* where the next one's address goes        */
 	uint64_t *thread_tail;
 	bool full;
-	struct avc_error notice; /* what cannot be put back, the first of it */
+	struct avc_error notice; /* the first thing that cannot be restored  */
 	struct inj_setup spare;  /* written to when there is no room         */
 };
 
 void setup_begin(struct setup *setup, const struct parasite *parasite, uint32_t slot);
-/* One more call for a stage or (after setup_thread()) for a thread; `name` is for
- * messages.  To be filled in further: call.arg[5], store, flags. */
+/* One more call for a stage or (after setup_thread()) for a thread; `name` is for messages.  The
+ * caller may also set call.arg[5], store, flags. */
 struct inj_setup *setup_append(struct setup *setup, enum inj_stage stage, const char *name, long nr,
 			       const uint64_t arg[6]);
 #define setup_add(setup, stage, name, nr, ...) \
@@ -508,7 +506,7 @@ struct fd_letter {
 void fd_letter_write(struct fd_letter *letter, avc_remote remote);
 /* One descriptor over a socket (unix(7), SCM_RIGHTS). */
 int fd_send(int socket, int fd);
-/* A table that is made anew: what is to be in it. */
+/* The descriptors that a new process is to have. */
 struct fd_table {
 	uint32_t count;
 	struct {
@@ -523,7 +521,7 @@ void fd_table_free(struct fd_table *table);
 
 #define BATCH_SOFTS 64
 
-/* A task that a restored process has forked, and that is made what a template is. */
+/* A task that a restored process has forked, and that becomes a copy of a template. */
 struct syscall_batch {
 	pid_t pid;
 	const struct parasite *parasite; /* the one it runs in                              */
@@ -531,13 +529,13 @@ struct syscall_batch {
 	struct arch_regs base;
 	struct inj_syscall *list; /* in the parasite: calls not made yet                  */
 	uint32_t listed, list_max;
-	uint8_t *data; /* in the parasite: for what the calls refer to             */
+	uint8_t *data; /* in the parasite: data that the calls point to            */
 	struct soft {
 		uint32_t index;
 		const char *problem;
 	} soft[BATCH_SOFTS]; /* of the calls, those that may fail                  */
 	uint32_t softs;
-	pid_t inside; /* for notes: what did fail                            */
+	pid_t inside; /* for notes: soft failures                            */
 	struct avc_error *notes;
 	int socket; /* ours, through which it gets descriptors; -1     */
 };
@@ -546,7 +544,7 @@ struct syscall_batch {
 void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *parasite,
 			 uint32_t slot);
 /* One more call.  All of them are made by syscall_batch_flush(), which leaves the results in
- * batch->list and tells the first that failed. */
+ * batch->list and reports the first that failed. */
 void syscall_batch_append(struct syscall_batch *batch, long nr, const uint64_t arg[6]);
 #define syscall_batch_add(batch, nr, ...) syscall_batch_append(batch, nr, ARGUMENTS(__VA_ARGS__))
 /* The same, for any number: those before it are made when there is no more room. */
@@ -563,14 +561,13 @@ struct fd_channel {
 	int ours, theirs;
 };
 
-/* Closes what it has from its parent, but for what it keeps of that; from here on it can be given
- * descriptors, each to be number 1 until that is closed: by the channel that it has from its
- * parent, if any, or its own. */
+/* Closes inherited descriptors, except those that it keeps; from then on it can be given
+ * descriptors, each as number 1 until it is closed: by an inherited channel, if any, or its own. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
 				  const struct fd_table *table, struct avc_error *err) warn_unused;
 #define FD_KEPT_MIN 2 /* 0 and 1 are for the channel                               */
-/* Of the main process, for its children, who have it from the fork: to make one takes longer than
- * all that comes by it.  None where there is no number left for it. */
+/* Of the main process, inherited by its children: making one takes longer than all transfers
+ * through it.  None where there is no descriptor number left for it. */
 int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
 				   struct avc_error *err) warn_unused;
 int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
@@ -590,27 +587,27 @@ struct last_pid_slot {
 	const struct parasite *parasite;
 	uint32_t number;
 };
-/* In a PID namespace with several guards one at a time forks, or chooses numbers: what another one
- * makes meanwhile, a template or a spare, would take them.  A restore is urgent: it looks more
- * often.  The lock is of the namespace, and so anybody's in there: false if it was not to be had in
- * time.  fd < 0: there is no need. */
+/* In a PID namespace with several guards, one at a time forks, or chooses PIDs: a template or spare
+ * that another one makes meanwhile would take them.  A restore is urgent: it tries more often.  Any
+ * process in the namespace can take the lock: false if it was not free in time.  fd < 0: not
+ * needed. */
 int last_pid_lock_open(pid_t init);
 bool last_pid_lock(int fd, bool urgent);
 void last_pid_unlock(int fd);
 /* Starts the helper of the next restore, which waits for it; best effort. */
 void last_pid_prepare(int init_pidfd);
 void last_pid_forget(void);
-/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as the process that
- * is restored in the first slot asks, or in that of last_pid_serve().  last_pid_set() is the
+/* Has it write to ns_last_pid in init's PID namespace until last_pid_stop(): as requested by the
+ * process restored in the first slot, or in that of last_pid_serve().  last_pid_set() is the
  * engine's own request. */
 struct last_pid *last_pid_start(int init_pidfd, const struct last_pid_slot *slot, uint32_t count,
 				struct avc_error *err);
 /* It lives for a minute, and may have failed. */
 bool last_pid_is_there(const struct last_pid *helper);
 int last_pid_set(struct last_pid *helper, pid_t value, struct avc_error *err) warn_unused;
-/* From now on those of another one of the slots. */
+/* From now on serves requests of another slot. */
 void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
-/* Nothing is written any more: the namespace's numbers go on from where they were. */
+/* Nothing is written any more: the namespace's PIDs continue from where they were. */
 void last_pid_stop(struct last_pid *helper);
 /* Stops it, and waits until its processes are gone; NULL: nothing to do. */
 void last_pid_end(struct last_pid *helper);
@@ -622,8 +619,8 @@ struct init_channel {
 	int numbers_fd; /* last_pid_lock(), where others restore in its PID namespace, too */
 	pid_t init, init_inside;
 	struct avc_ctl *ctl;
-	uint32_t death;      /* of which init waits to hear: struct avc_report, seq  */
-	uint64_t working_ns; /* when that was, or it was told that it takes longer   */
+	uint32_t death;      /* about which init awaits a verdict: struct avc_report, seq */
+	uint64_t working_ns; /* when that was, or init was last told that it takes longer */
 };
 
 void init_channel_init(struct init_channel *channel);
@@ -635,12 +632,12 @@ void init_channel_close(struct init_channel *channel);
 /* The app's main process in our namespace, 0 if it is not there (yet). */
 pid_t init_channel_app(const struct init_channel *channel);
 void init_channel_arm(struct init_channel *channel, bool armed);
-/* Whether a child of init's is the one that listens to the keys of a terminal. */
+/* Whether a child of init is the one that reads the keys of a terminal. */
 bool init_channel_listens(const struct init_channel *channel, pid_t pid);
 bool init_channel_stop_asked(const struct init_channel *channel);
 int init_channel_report(struct init_channel *channel, struct avc_report *report);
-/* Of the last death.  init waits for only so long, and anew from each init_channel_working() on,
- * which may be called as often as there is progress. */
+/* For the last death.  init waits for a limited time, which starts anew with each
+ * init_channel_working(); that may be called whenever there is progress. */
 int init_channel_verdict(const struct init_channel *channel, enum avc_verdict_kind kind,
 			 struct avc_error *err);
 void init_channel_working(struct init_channel *channel);

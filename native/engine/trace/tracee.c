@@ -1,9 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * ptrace(2), the parts every other file needs.
+ * ptrace(2), the parts that every other file needs.
  *
- * Waiting: a guard waits for its own tracees only (__WNOTHREAD), so guards in
- * one process do not steal each other's news.  The rest of that process must not
+ * A guard waits only for tracees of its own thread (__WNOTHREAD).  The rest of its process must not
  * call waitpid(-1).
  */
 #include <errno.h>
@@ -69,8 +68,8 @@ void tracee_watch(const uint32_t *word)
 	watched = word;
 }
 
-/* Ticks before the deadline, to look whether what we wait for is dying, and after
- * it: a tick that comes just before the thread has entered wait(2) is lost. */
+/* Ticks before the deadline, to check whether the tracee is dying, and after it: a tick just before
+ * the thread enters wait(2) is lost. */
 void tracee_deadline_set(timer_t timer, uint64_t ns)
 {
 	struct itimerspec t = { .it_interval.tv_nsec = TICK_NS, .it_value.tv_nsec = TICK_NS };
@@ -95,8 +94,8 @@ bool tracee_deadline_passed(void)
 	return deadline_ns && now_ns() >= deadline_ns;
 }
 
-/* A killed leader is not reported as long as there are threads of it that were not
- * waited for, and those are waited for one after the other: by us. */
+/* A killed leader is not reported until all its other threads have been reaped, which only we can
+ * do, one after the other. */
 static bool is_dying(pid_t tid)
 {
 	struct proc_stat stat;
@@ -104,10 +103,9 @@ static bool is_dying(pid_t tid)
 	return proc_stat(tid, &stat) || stat.state == 'Z' || stat.state == 'X';
 }
 
-/* As waitpid(2), but a thread that is about to receive a signal stays as it is.  Who waits for such
- * a stop takes the signal out of it (kernel/exit.c, wait_task_stopped()); if we then died before
- * we let the thread go on with it, the application would never have been sent that signal.  From
- * one that was only looked at, it gets it whatever becomes of us. */
+/* Like waitpid(2), but leaves a thread that is about to receive a signal as it is.  Waiting for
+ * such a stop takes the signal out of it (kernel/exit.c, wait_task_stopped()); if we then died
+ * before passing it on, the application would never get it.  With WNOWAIT it does. */
 static pid_t wait_keeping_signal(pid_t tid, int *status, int options)
 {
 	siginfo_t info = { 0 };
@@ -125,7 +123,7 @@ static pid_t wait_keeping_signal(pid_t tid, int *status, int options)
 	return waitpid(tid, status, options);
 }
 
-/* tick() is called now and then, as long as there is a deadline. */
+/* tick() is called at intervals while there is a deadline. */
 static struct stop wait_ticking(pid_t tid, int options, void (*tick)(void))
 {
 	struct stop stop = { .kind = STOP_OTHER };
@@ -199,8 +197,8 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 			group_signal = 0;
 			return STOP_TRAP;
 		case STOP_GROUP:
-			/* Stopped by job control, and stays so when it is let go: what it is
-			 * made to do meanwhile is no concern of its parent's. */
+			/* Stopped by job control, and stays so when it is released: its parent does
+			 * not notice what it does meanwhile. */
 			group_signal = stop.signal;
 			return STOP_TRAP;
 		case STOP_FORK:
@@ -221,8 +219,8 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 			     "it did not stop in time: it is paused, or waits in the kernel for a device");
 			return stop.kind;
 		}
-		/* Any stop takes a pending interrupt away (kernel/signal.c, ptrace_stop):
-		 * without a new one it would just run on. */
+		/* Any stop clears a pending interrupt (kernel/signal.c, ptrace_stop): without a new
+		 * one it would just keep running. */
 		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) || seccomp_go_on(tid, &stop)) {
 			fail_errno(err, tid, "stop", "ptrace(CONT)", "it has gone");
 			return STOP_OTHER;
@@ -241,7 +239,7 @@ int tracee_halt(pid_t tid, struct avc_error *err)
 {
 	if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
 		return fail_errno(err, tid, "stop", "ptrace(INTERRUPT)", "it has gone");
-	(void)seccomp_go_on(tid, NULL); /* refused if it runs */
+	(void)seccomp_go_on(tid, NULL); /* fails if it runs */
 	return tracee_await(tid, NULL, err) == STOP_TRAP ? 0 : -1;
 }
 
@@ -270,7 +268,7 @@ avc_remote tracee_pc(pid_t tid)
 	const uint64_t end = now_ns() + PC_NS;
 	struct arch_regs regs;
 
-	/* Only of what is stopped. */
+	/* Fails until it is stopped. */
 	while (arch_regs_get(tid, &regs)) {
 		if (now_ns() > end || is_dying(tid))
 			return 0;
@@ -279,7 +277,7 @@ avc_remote tracee_pc(pid_t tid)
 	return arch_pc(&regs);
 }
 
-/* ---- those that nobody knows of ----------------------------------------------------- */
+/* ---- unknown tracees ---------------------------------------------------------------- */
 
 static struct {
 	bool (*known)(pid_t tid, const void *arg);
@@ -351,12 +349,12 @@ void tracee_kill(pid_t pid)
 	}
 }
 
-/* ---- those that are just ending ------------------------------------------------------ */
+/* ---- ending tracees ------------------------------------------------------------------ */
 
-/* Those beyond that are waited for. */
+/* If there are more, we wait for their end. */
 #define ENDING_MAX 64
-/* The app has just been held up, and goes first: an end keeps a CPU from it for as long as the
- * kernel does not look up from the page tables. */
+/* The app has just been stopped, and goes first: freeing memory keeps a CPU from it for as long as
+ * the kernel does not reschedule. */
 #define END_AFTER_NS (10 * NS_PER_MS)
 
 static __thread struct {
@@ -364,7 +362,7 @@ static __thread struct {
 		pid_t pid;
 		int pidfd;
 		bool killed;
-		uint64_t due_ns; /* to be killed                                     */
+		uint64_t due_ns; /* when to kill it                                  */
 	} task[ENDING_MAX];
 	uint32_t count;
 } ending;
@@ -406,7 +404,7 @@ uint32_t tracee_reap_ending(void)
 		int status;
 		const pid_t r = waitpid(ending.task[i].pid, &status,
 					__WALL | __WNOTHREAD | WNOHANG);
-		/* Other stops are on its way to its end. */
+		/* It may stop before it ends. */
 		if (r == 0 || (r > 0 && WIFSTOPPED(status)))
 			ending.task[left++] = ending.task[i];
 		else

@@ -70,10 +70,10 @@ struct avc_end_name {
 struct avc_end {
 	struct avc_end_name own, other;
 	uint64_t written;   /* TCP: bytes that the application has written to it           */
-	uint32_t at, bytes; /* in avc_board.content: what is to be in flight to this end    */
+	uint32_t at, bytes; /* in avc_board.content: data in flight to this end             */
 };
 
-/* Where guards find out which ends belong together.  Readers bound what they find here. */
+/* Where guards match the ends of connections.  Readers check the bounds of what they find here. */
 struct avc_board {
 	uint32_t ends, bytes; /* allocated; may be more than there are                     */
 	struct avc_end end[AVC_BOARD_ENDS];
@@ -84,15 +84,15 @@ struct avc_meeting {
 	uint32_t members; /* how many are expected                            */
 	uint32_t state;
 	uint32_t arrived[AVC_MEETING_STEPS];
-	uint32_t clone_ms; /* what the slowest of them expects its clone to take */
+	uint32_t clone_ms; /* expected duration of the slowest member's clone    */
 	struct avc_board board;
 };
 
 #define AVC_MEETING_BROKEN UINT32_C(99)
 
-/* Shared memory of the two.  The guard counts up wherever it gets on with something long, and
- * says until when it sleeps when it has nothing to do: AVC_HEARTBEAT_NS at most.  It is silent
- * since it counted up last, or was to wake up, whichever is later. */
+/* Memory shared by daemon and guard.  The guard counts up as long work progresses; before it sleeps
+ * it stores until when: AVC_HEARTBEAT_NS at most.  It counts as silent since its last beat, or
+ * since it should have woken up, whichever is later. */
 struct avc_heartbeat {
 	uint64_t beats;
 	uint64_t rests_until_ns; /* CLOCK_MONOTONIC; 0: it does not sleep            */
