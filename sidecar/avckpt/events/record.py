@@ -32,7 +32,7 @@ NUMBERS_BELOW = 1 << 64
 
 
 def said(description: str, default: Any = None, values: tuple[Reason, ...] = ()) -> Any:
-    """A field of EventRecord with its meaning, and its values where these are fewer than its type has."""
+    """A field of EventRecord with its meaning, and its values where its type allows more."""
     return field(default=default, metadata={"description": description, "values": values})
 
 
@@ -42,13 +42,13 @@ class EventRecord:
 
     kind: Kind = field(metadata={"description": "what happened", "values": ()})
     container: str = said(
-        "name of the container, or its short id where it has none; empty: it is the sidecar's event", ""
+        "name of the container, or its short id where it has none; empty: an event of the sidecar", ""
     )
     id: str = said("its id, 64 hex digits", "")
     group: str = said("its `avckpt.group`, empty: none", "")
     at: float = said("time of day, seconds since 1970", 0.0)
     monotonic_s: float = said("the same instant on CLOCK_MONOTONIC, for differences", 0.0)
-    seq: int = said("number in the history, growing; 0: routine (every checkpoint), told once and not kept", 0)
+    seq: int = said("number in the history, increasing; 0: routine (every checkpoint), reported but not stored", 0)
     reason: Reason | None = said(  # noqa: RUF009
         "why the application died: `signal`, `exit`, `unhealthy`, `manual` or `group` (it went back with others); "
         "why a generation was dropped: `crashed`, `unhealthy`, `memory`, `killed` (its template) or `executed` "
@@ -56,9 +56,9 @@ class EventRecord:
         values=tuple(dict.fromkeys((*CAUSES, *DROPPED_WORDS))),
     )
     outcome: Reason | None = said(  # noqa: RUF009
-        "what followed: `restored`, or why not: `clean_exit`, `stopped` (meant), `policy` (avckpt.restore.on), "
-        "`limit` (avckpt.restore.max), `loop` (the same death at once, twice), `late` (avckpt.deadline), `failed`, "
-        "`empty` (no generation held)",
+        "what followed: `restored`, or why not: `clean_exit`, `stopped` (on request), `policy` (avckpt.restore.on), "
+        "`limit` (avckpt.restore.max), `loop` (the same death right after a restore, twice), "
+        "`late` (avckpt.deadline), `failed`, `empty` (no generation held)",
         values=OUTCOMES,
     )
     wait_status: int | None = said("of the death, as from waitpid(2)")
@@ -66,27 +66,27 @@ class EventRecord:
     line: int | None = said("the line of its group (avckpt.group.recovery) that this generation is part of")
     generations: int | None = said("generations held now")
     age_s: float | None = said("age of the restored generation when the application died, or of the dropped one")
-    lost_s: float | None = said("what the application lost: age_s and restore_s together")
-    freeze_s: float | None = said("how long the application stood still for this generation's checkpoint")
-    checkpoints: int | None = said("checkpoints taken since the last that was told, this one included")
+    lost_s: float | None = said("time that the application lost: age_s and restore_s together")
+    freeze_s: float | None = said("how long the application was stopped for this generation's checkpoint")
+    checkpoints: int | None = said("checkpoints taken since the last event of this kind, this one included")
     freeze_max_s: float | None = said("the longest freeze of these")
-    interval_s: float | None = said("time between checkpoints, at present")
-    restore_s: float | None = said("death to the last thread running again")
+    interval_s: float | None = said("current time between checkpoints")
+    restore_s: float | None = said("from the death until the last thread runs again")
     threads: int | None = said("threads of the checkpoint or restore")
     attempt: int | None = said(
-        "restores within the time of avckpt.restore.max, this one included; of a dropped generation: its crashes"
+        "restores within the period of avckpt.restore.max, this one included; of a dropped generation: its crashes"
     )
-    restores: int | None = said("restores since the sidecar protects this run of the container")
-    left: int | None = said("restores that avckpt.restore.max leaves for its time")
-    quiescent: bool | None = said("whether the checkpoint was taken at a quiet moment")
-    images: str | None = said("how the checkpoint got the memory: fork or dirty")
+    restores: int | None = said("restores since the sidecar began to protect this run of the container")
+    left: int | None = said("restores left within the period of avckpt.restore.max")
+    quiescent: bool | None = said("whether the application was quiescent at the checkpoint")
+    images: str | None = said("how the checkpoint saved memory: fork, or dirty (by copies)")
     fork_reason: str | None = said("why it was forked, where avckpt.images is not fork")
     app_pid: int | None = said("the application's main process, in the sidecar's PID namespace")
     app_pid_inside: int | None = said("the same in the container's")
-    detail: str = said("one clause for a person, where the rest does not say it", "")
-    core: str | None = said("path of a core file; none: there is none, and `detail` says why")
+    detail: str = said("a clause for users, where the other fields do not say it", "")
+    core: str | None = said("path of the core file; missing: none was written, and `detail` says why")
     core_bytes: int | None = said("its size, compressed")
-    detected_s: float | None = said("fatal signal to avckpt-init knowing of the death; not known of exits")
+    detected_s: float | None = said("from the fatal signal until avckpt-init noticed the death; unknown for exits")
     recovered_s: float | None = said("detected_s and restore_s together")
     crash: Crash | None = said("what it died of, and where")  # noqa: RUF009
     error: AvckptError | None = said("what went wrong, as in the API's errors")  # noqa: RUF009
@@ -146,7 +146,7 @@ _TYPES: dict[str, type] = {cls.__name__: cls for cls in (Kind, Reason, AvckptErr
 
 def field_types() -> dict[str, type]:
     """Types of the fields of EventRecord by name, without the None."""
-    # Read as text: to evaluate `int | None` takes Python 3.10.
+    # Read as text: evaluating `int | None` takes Python 3.10.
     return {each.name: _TYPES[str(each.type).partition(" ")[0]] for each in fields(EventRecord)}
 
 
@@ -308,7 +308,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.MISSED: lambda record: f"checkpoint missed: {record.error}{_nothing_held(record)}",
     Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
     Kind.GUARD_LOST: lambda record: f"runs unprotected: {record.error}",
-    # Whether this is bad is known only from what follows.
+    # Only the following event says whether the application was lost.
     Kind.DIED: _died,
     Kind.WAITS: lambda record: f"waits for its group to go back with it{_why(record)}",
     Kind.RESTORED: _restored,
