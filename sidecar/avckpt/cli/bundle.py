@@ -43,7 +43,7 @@ doctor.json       what avckpt doctor says of the machine
 config.yaml       defaults for all containers, where there are any
 versions.txt      kernel, Podman, runtime
 core.zst          with --core: its newest core file (zstd -d, gdb)
-missing.txt       what could not be had, and why, if anything
+missing.txt       what could not be collected, and why, if anything
 """
 INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCount", "Mounts")
 """What of `podman inspect` is taken: nothing that could hold a secret, as environment and command can."""
@@ -55,17 +55,15 @@ INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCou
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Where to put it; default avckpt-NAME-TIME.tar.gz here.",
+    help="Output file; default avckpt-NAME-TIME.tar.gz here.",
 )
-@click.option(
-    "--core", is_flag=True, help="With its newest core file (avckpt.core): all that it knew, secrets included."
-)
+@click.option("--core", is_flag=True, help="With its newest core file (avckpt.core): all its memory, secrets included.")
 def bundle(name: str, output: Path | None, core: bool) -> None:
-    """Collect all that is known of container NAME in one archive.
+    """Collect everything known about container NAME in one archive.
 
     Events, state, labels, logs, metrics, versions and what "avckpt doctor" says; no
-    environment and no command lines.  Look through it before you send it on: logs
-    hold what the container wrote.
+    environment and no command lines.  Look through it before you pass it on: logs
+    contain what the container wrote.
     """
     from avckpt_hooks.shared import protocol
 

@@ -94,7 +94,7 @@ root_option = click.option(
     "--root",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     default="/",
-    help="Where the host's file system is; for use in a container.",
+    help="Root of the host's file system; for use in a container.",
 )
 
 
@@ -106,13 +106,13 @@ root_option = click.option(
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="With --sidecar: load the image from this file (podman save).",
 )
-@click.option("--base", default="", metavar="IMAGE", help="With --sidecar: the Debian or Ubuntu it is built from.")
-@click.option("--quadlet", is_flag=True, help="Also put a systemd unit for the sidecar's container in place.")
+@click.option("--base", default="", metavar="IMAGE", help="With --sidecar: the Debian or Ubuntu image to build from.")
+@click.option("--quadlet", is_flag=True, help="Also install a systemd unit for the sidecar's container.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON list of what was done.")
 def install(*, root: Path, sidecar: bool, archive: Path | None, base: str, quadlet: bool, as_json: bool) -> None:
     """Put hooks and avckpt-init in place on this host.
 
-    With --sidecar all is done that protection needs: the sidecar's image is
+    With --sidecar, all that protection needs is set up: the sidecar's image is
     built from this installation (which needs no checkout) or loaded, and its
     container is started, or replaced if it is of another build.
     """
@@ -157,7 +157,7 @@ def uninstall(root: Path, as_json: bool) -> None:
     "--watchdog",
     is_flag=True,
     default="container" in os.environ,  # podman-run(1)
-    help="Kill a daemon that hangs, and start another; so it does in a container.",
+    help="Kill a daemon that hangs, and start another; always on in the sidecar's container.",
 )
 def sidecar(verbose: bool, config: Path, watchdog: bool) -> None:
     """Run the sidecar's daemon in the foreground (in its container, or as a service)."""
@@ -192,7 +192,7 @@ def _serve(config: Path, beat_fd: int) -> int:
 
 
 @main.command()
-@click.option("-a", "--all", "ended", is_flag=True, help="Also the last few that have ended.")
+@click.option("-a", "--all", "ended", is_flag=True, help="Also the last few ended ones.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON list instead of a table.")
 def ps(ended: bool, as_json: bool) -> None:
     """List protected containers: state, generations, last freeze, restores."""
@@ -235,12 +235,12 @@ def checkpoint(name: str, as_json: bool) -> None:
 
 @main.command()
 @click.argument("name", shell_complete=complete_container)
-@click.option("-g", "--generation", type=click.IntRange(1), help="This one, as avckpt inspect lists them.")
+@click.option("-g", "--generation", type=click.IntRange(1), help="Its number, as listed by avckpt inspect.")
 @click.option("--json", "as_json", is_flag=True, help="The answer as JSON.")
 def restore(name: str, generation: int | None, as_json: bool) -> None:
     """Roll the running container NAME back to its newest checkpoint.
 
-    With --generation to an older one; those that were taken after it are given up.
+    With --generation, back to an older one; newer ones are dropped.
     """
     from avckpt.guard import Command
 
@@ -260,8 +260,8 @@ def restore(name: str, generation: int | None, as_json: bool) -> None:
 def reload(as_json: bool) -> None:
     """Have the sidecar read /etc/avckpt/config.yaml again.
 
-    It holds for containers that run, too; what it changes is told.  If anything
-    in it is wrong, it is refused and the old one stays in force.
+    It applies to running containers, too; changes are reported.  If anything in it
+    is wrong, it is refused and the old one stays in force.
     """
     answer = _client().reload()
     if as_json:
@@ -279,7 +279,7 @@ def reload(as_json: bool) -> None:
 @main.command()
 @click.option("--json", "as_json", is_flag=True, help="A JSON list instead of text.")
 def doctor(as_json: bool) -> None:
-    """Check kernel, Podman, hooks and privileges, and say what to do.
+    """Check kernel, Podman, hooks and privileges, and suggest what to do.
 
     Ends with 1 when something is missing.
     """
@@ -301,8 +301,8 @@ def doctor(as_json: bool) -> None:
     context_settings={"allow_interspersed_args": False},
     options_metavar="[--label avckpt.KEY=VALUE ...] [-v] --",
 )
-@click.option("-l", "--label", "labels", multiple=True, metavar="avckpt.KEY=VALUE", help="As of a container.")
-@click.option("-v", "--verbose", is_flag=True, help="Say more than deaths and restores.")
+@click.option("-l", "--label", "labels", multiple=True, metavar="avckpt.KEY=VALUE", help="As for a container.")
+@click.option("-v", "--verbose", is_flag=True, help="Report more than deaths and restores.")
 @click.argument("argv", nargs=-1, required=True, type=click.UNPROCESSED, metavar="PROGRAM [ARGS...]")
 def run(labels: tuple[str, ...], verbose: bool, argv: tuple[str, ...]) -> None:
     """Protect a plain program: no Podman, no sidecar.

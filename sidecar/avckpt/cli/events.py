@@ -71,19 +71,19 @@ def complete_container(ctx: click.Context, param: click.Parameter, incomplete: s
 
 @click.command()
 @click.argument("name", required=False, shell_complete=complete_container)
-@click.option("-f", "--follow", is_flag=True, help="Go on with those to come, also over a restart of the sidecar.")
-@click.option("--since", type=Instant(), help="Only from then on: 10m (ago), or 2026-05-17T08:30.")
+@click.option("-f", "--follow", is_flag=True, help="Keep printing new events, also over a restart of the sidecar.")
+@click.option("--since", type=Instant(), help="Only events since then: 10m (ago), or 2026-05-17T08:30.")
 @click.option("-a", "--all", "routine", is_flag=True, help="With --follow: also every single checkpoint.")
 @click.option(
-    "-k", "--kind", "kinds", multiple=True, type=click.Choice([kind.value for kind in Kind]), help="Only these."
+    "-k", "--kind", "kinds", multiple=True, type=click.Choice([kind.value for kind in Kind]), help="Only this kind."
 )
 @click.option("--json", "as_json", is_flag=True, help="JSON lines, one for each event.")
 def events(
     name: str | None, follow: bool, since: float | None, routine: bool, kinds: tuple[str, ...], as_json: bool
 ) -> None:
-    """Tell what happened: crashes, restores, what is unprotected and why.
+    """Show what happened: crashes, restores, what is unprotected and why.
 
-    With NAME (a name, an id or the beginning of one) only of that container.
+    With NAME (a name, an id or the beginning of one) only for that container.
     The sidecar keeps the last 1000 events, also over its own restart.
     """
     if routine and not follow:

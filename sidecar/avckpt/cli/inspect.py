@@ -22,7 +22,7 @@ CRASHES_SHOWN = 5
 @click.argument("name", shell_complete=complete_container)
 @click.option("--json", "as_json", is_flag=True, help="The answer as JSON.")
 def inspect(name: str, as_json: bool) -> None:
-    """Tell all that is known of container NAME: state, generations, settings, last crashes."""
+    """Show everything known about container NAME: state, generations, settings, last crashes."""
     from avckpt_hooks.shared import protocol
 
     from avckpt.cli.client import Client

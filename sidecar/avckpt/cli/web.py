@@ -18,18 +18,18 @@ TOKEN_LEAST = 16
 
 @click.command()
 @click.option("--listen", metavar="ADDRESS", default="127.0.0.1", show_default=True, help="Where to listen.")
-@click.option("--port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free.")
+@click.option("--port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any free port.")
 @click.option("--name", "names", multiple=True, help="Also answer under this host name.")
 @click.option(
     "--token-file",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="A file of its owner's alone that holds the token; else a new one each time.",
+    help="File with the token, readable only by its owner; default: a new token each time.",
 )
 @click.option("--control", is_flag=True, help="Let the page take checkpoints and roll containers back.")
 def web(listen: str, port: int, names: tuple[str, ...], token_file: Path | None, control: bool) -> None:
     """Serve a page about all protected containers, for a browser.
 
-    It prints the page's URL, with a token; whoever has the URL may look.  It is read-only
+    It prints the page's URL, with a token; anyone who has the URL may read.  It is read-only
     unless started with --control, needs no other host, and ends on Ctrl-C.
 
     A dashboard, or Prometheus, may read /metrics and the paths below /v1/ with the

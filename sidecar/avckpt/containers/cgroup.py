@@ -23,7 +23,7 @@ OWN_MOUNTS = Path("/run/avckpt-cgroup")
 UNLIMITED_BYTES = 1 << 62
 """Version 1 writes "no limit" as a number near 2**63."""
 OUTSIDE = 0.05
-"""Of a group's limit: so much less must be left outside.  A pod has hardly more memory than its only container."""
+"""Less must be left outside by this part of the limit.  A pod has hardly more memory than its only container."""
 
 
 def see_whole_tree() -> None:
@@ -109,7 +109,7 @@ class Groups:
     def first_to_run_out_bytes(self) -> int | None:
         """`memory_and_swap_bytes()`; None, too, if a group above, or the host, has less room left than this one.
 
-        The OOM killer comes where memory runs out first, and counts in thousandths of what there is *there*.
+        The OOM killer acts where memory runs out first, and counts in thousandths of the memory *there*.
         """
         limit, used = self.memory_and_swap_bytes(), self.memory_used_bytes()
         if limit is None or used is None:
@@ -117,7 +117,7 @@ class Groups:
         return None if self._room_outside_bytes() < limit - used - OUTSIDE * limit else limit
 
     def _room_outside_bytes(self) -> int:
-        """The least that is left in a group above, or on the host."""
+        """The smallest amount left in a group above, or on the host."""
         fields = _host_memory()
         room = [fields["MemAvailable"] + fields["SwapFree"]]
         for folder in self.memory.parents if self.memory else ():

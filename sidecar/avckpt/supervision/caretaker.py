@@ -150,8 +150,8 @@ class Caretaker(Generic[W]):
         return care.allowance.advise(used, limit, held, container.generations, now_s())
 
     def _tell_limit(self, care: _Care[W]) -> None:
-        """Its guard ranks what it holds by it.  It may be another one each time: `podman update --memory`, or
-        somebody else runs out of memory first."""
+        """Its guard ranks generations by it.  It can change at any time: by `podman update --memory`, or when
+        memory runs out elsewhere first."""
         container, guard = care.ward.container, care.ward.guard
         limit = care.groups.first_to_run_out_bytes() or 0
         if guard is None or limit == container.config.memory_limit_bytes:

@@ -23,26 +23,26 @@ files_option = click.option(
     *("-f", "--file", "files"),
     multiple=True,
     type=click.Path(path_type=Path),
-    help="Compose file; default vehicle.yaml, or what podman-compose takes.",
+    help="Compose file; default vehicle.yaml, or those that podman-compose reads.",
 )
-project_option = click.option("-p", "--project-name", "project", default="", help="As of podman-compose.")
+project_option = click.option("-p", "--project-name", "project", default="", help="As for podman-compose.")
 profiles_option = click.option("--profile", "profiles", multiple=True, help="Also the services of this profile.")
 env_file_option = click.option(
     "--env-file",
     type=click.Path(exists=True, dir_okay=False, resolve_path=True, path_type=Path),
-    help="As of podman-compose; default .env.",
+    help="As for podman-compose; default .env.",
 )
 
 
 @click.command()
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE...]")
-@click.option("--config", "is_config", is_flag=True, help="Of the sidecar; without FILE: /etc/avckpt/config.yaml.")
+@click.option("--config", "is_config", is_flag=True, help="The sidecar's; default /etc/avckpt/config.yaml.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON object instead of text.")
 def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
     """Check every avckpt.* label and annotation of Compose files, or of Kubernetes' YAML.
 
     Without FILE, those of COMPOSE_FILE, or vehicle.yaml of this folder, or all
-    that podman-compose takes: compose.yaml, compose.override.yaml and so on.
+    that podman-compose reads: compose.yaml, compose.override.yaml and so on.
     Several files are one manifest, later ones over earlier ones.  Prints "FILE:LINE: service NAME:
     what is wrong" and ends with 1 if anything is wrong, with 0 if there are only
     warnings or nothing.
@@ -72,8 +72,8 @@ def up(
 ) -> None:
     """Bring up the services of Compose files and wait until they are protected.
 
-    Checks the files as "avckpt check" does, sees to hooks and sidecar, then lets
-    podman-compose do it.  Ends with 5 if a container that asks for protection
+    Checks the files as "avckpt check" does, prepares hooks and sidecar, then runs
+    podman-compose.  Ends with 5 if a container that asks for protection
     has none after --wait seconds.
     """
     from avckpt_hooks.shared import protocol
@@ -113,7 +113,7 @@ def up(
 @profiles_option
 @env_file_option
 @click.option("-v", "--volumes", is_flag=True, help="Also remove the project's volumes.")
-@click.option("--json", "as_json", is_flag=True, help="The containers that are gone, as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="The removed containers as JSON.")
 @click.argument("services", nargs=-1)
 def down(
     *,
