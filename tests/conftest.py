@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for tests on real containers, and what to show when one fails."""
+"""Fixtures for tests on real containers, and diagnostics when one fails."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzes what containers, hooks and files say: `make fuzz SECONDS=60`.
+"""Fuzzes parsers of input from containers, hooks and files: `make fuzz SECONDS=60`.
 
     python -m tests.fuzz [--seconds N] [NAME...]      each target for so long, one after the other
 

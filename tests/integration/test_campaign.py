@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The campaign tells apart what it counts: an oracle that sees nothing would count everything as recovered."""
+"""The campaign distinguishes outcomes: an oracle that sees nothing would count everything as recovered."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Core files of applications that were brought back, beside the kernel's own of the same death."""
+"""Core files of restored applications, beside the kernel's own of the same death."""
 
 from __future__ import annotations
 

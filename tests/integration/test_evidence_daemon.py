@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an application died of, as its sidecar tells of it: real deaths of real processes."""
+"""What an application died of, as reported by its sidecar: real deaths of real processes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Containers of Podman's that go back together, as their labels ask for it."""
+"""Podman containers that go back together, as requested by their labels."""
 
 from __future__ import annotations
 

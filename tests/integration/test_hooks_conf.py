@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That Podman reads its configuration as avckpt says it does."""
+"""Podman reads its configuration as avckpt assumes."""
 
 from __future__ import annotations
 

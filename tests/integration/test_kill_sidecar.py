@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sidecar is killed while containers run: they go on, and the next sidecar protects them."""
+"""The sidecar is killed while containers run: they keep running, and the next sidecar protects them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Containers that hear of recoveries: by signals, by commands, and whatever goes wrong with them."""
+"""Containers that are notified of recoveries: by signals, by commands, and failures of both."""
 
 from __future__ import annotations
 

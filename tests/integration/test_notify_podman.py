@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notifications between real containers, as their labels ask for them."""
+"""Notifications between real containers, as requested by their labels."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt.restore.max: a state that is poisoned is not gone back to for ever."""
+"""avckpt.restore.max: a poisoned state is not restored forever."""
 
 from __future__ import annotations
 

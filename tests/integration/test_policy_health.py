@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt.restore.on=unhealthy, on real containers, on a machine where nobody else runs health checks."""
+"""avckpt.restore.on=unhealthy, on real containers, on a machine without other health checks."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A host that is short of memory, really, costs the container whose generations hold most its oldest one."""
+"""When the host is really short of memory, the container whose generations hold most loses its oldest one."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A command that the sidecar runs in a container is what `podman exec` would make of it."""
+"""A command that the sidecar runs in a container is like one run by `podman exec`."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generations are given up before an application suffers, on real containers with little memory."""
+"""Generations are dropped before an application suffers, on real containers with little memory."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Protected containers that have devices of a vehicle: a CAN bus, a camera.
+"""Protected containers with devices of a vehicle: a CAN bus, a camera.
 
 make test-kernels KERNELS=trixie KERNEL_TESTS=tests/integration/test_protected_devices.py
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C, on a terminal of Podman's: who ends in its own way then ends; who goes on is protected as before."""
+"""Ctrl-C on Podman's terminal: a program that handles it and exits has ended; one that continues stays protected."""
 
 from __future__ import annotations
 

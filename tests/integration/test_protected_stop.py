@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`podman stop` of a protected container ends it, whatever has become of the sidecar (but one thing)."""
+"""`podman stop` ends a protected container, whatever state the sidecar is in (with one exception)."""
 
 from __future__ import annotations
 

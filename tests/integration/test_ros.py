@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real ROS 1 pipeline, one node a container: the whole chain goes on after each crash.
+"""A real ROS 1 pipeline, one node a container: the whole chain continues after each crash.
 
 Runs where `make bench-ros` (or scripts/setup-ros.sh) has made the image and the drive.
 """

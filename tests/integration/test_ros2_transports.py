@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sequence numbers go back with the memory: what a DDS reader makes of it, and what examples/ros2/kept.h does about it.
+"""Sequence numbers go back with the memory: how a DDS reader reacts, and what examples/ros2/kept.h does about it.
 
 Without Podman, by `avckpt run`, in a network namespace of their own; bench/ros2.py does it in containers.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A database in a protected container: what was committed stays, and memory never goes back behind it.
+"""A database in a protected container: commits survive, and memory never goes back behind them.
 
 `make test-sqlite` kills it hundreds of times.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PostgreSQL, protected with avckpt.files=strict: idle it is restored whole, under write load it starts cold."""
+"""PostgreSQL with avckpt.files=strict: when idle it is restored completely, under write load it starts cold."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builds what the native tests run."""
+"""Builds the programs that the native tests run."""
 
 from __future__ import annotations
 

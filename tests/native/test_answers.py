@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""With default labels nobody gets an answer that is another request's.
+"""With default labels no client gets the answer to another request.
 
-`python -m testkit.answers` asks 20,000 requests of each server (docs/fidelity.md has what came out).
+`python -m testkit.answers` asks 20,000 requests of each server (results in docs/fidelity.md).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a container can make the guard spend on it: memory, descriptors, time."""
+"""What a container can cost its guard: memory, descriptors, time."""
 
 from __future__ import annotations
 

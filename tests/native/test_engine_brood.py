@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Children of every kind, made at any moment of a checkpoint: nobody is left stopped, or killed."""
+"""Children of every kind, created at any moment of a checkpoint: none is left stopped, or killed."""
 
 from __future__ import annotations
 

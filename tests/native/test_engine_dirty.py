@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints by copies of what was written: what is restored is the application, to the byte."""
+"""Checkpoints by copies of written pages: the restored application is equal to the byte."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocked system calls under checkpoints: no EINTR, and timeouts that come when they should."""
+"""Blocked system calls under checkpoints: no EINTR, and timeouts end in time."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whoever holds a lock of something that the application has open does not hold up its guard."""
+"""A process that holds a lock on an open file of the application does not block its guard."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Applications, and what stands in for avckpt-init, that do to avckpt what they can: that harms nobody else."""
+"""Hostile applications, and a hostile avckpt-init: they harm only themselves."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a guard does while nothing happens: it sleeps, and is woken by what concerns it."""
+"""A guard without work sleeps, and wakes up when something happens."""
 
 from __future__ import annotations
 

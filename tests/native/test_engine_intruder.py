@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A container with CAP_SYS_PTRACE: what it gains by avckpt's tasks in its PID namespace."""
+"""A container with CAP_SYS_PTRACE: what it gains from avckpt's tasks in its PID namespace."""
 
 from __future__ import annotations
 

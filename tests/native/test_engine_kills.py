@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every victim under fast checkpoints, killed at random moments: it goes on, and finds nothing wrong."""
+"""Every victim under fast checkpoints, killed at random moments: it continues, and finds nothing wrong."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An application that reads its own /proc, and asks the kernel for all it knows of it, sees no checkpoint."""
+"""An application that reads its own /proc, and all its state in the kernel, notices no checkpoint."""
 
 from __future__ import annotations
 

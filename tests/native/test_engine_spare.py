@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spare: a fork of the newest template, made while the application runs, whose memory a restore gives away."""
+"""The spare: a fork of the newest template, made while the application runs, whose memory a restore uses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An application that hardly gets a CPU: checkpoints are missed, and that is all that happens to it."""
+"""An application that hardly gets a CPU: checkpoints are missed, and nothing else happens to it."""
 
 from __future__ import annotations
 

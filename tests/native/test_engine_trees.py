@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Applications of several processes under a real guard: seen by nobody, and restored whole.
+"""Applications of several processes under a real guard: unnoticed by them, and restored completely.
 
-`make test-trees` runs the long form: more kills, and as many processes as are promised.
+`make test-trees` runs the long form: more kills, and as many processes as are supported.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A restored process and its threads are to the kernel what they were."""
+"""A restored process and its threads have all their attributes in the kernel."""
 
 from __future__ import annotations
 

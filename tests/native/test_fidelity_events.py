@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What waits to be told, by epoll, inotify and timers, and whose a lock is, after a restore."""
+"""Pending events of epoll, inotify and timers, and owners of locks, after a restore."""
 
 from __future__ import annotations
 

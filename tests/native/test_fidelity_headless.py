@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process whose main thread has ended while others go on."""
+"""A process whose main thread has ended while others continue."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes that have open what their parent has."""
+"""Processes with descriptors inherited from their parent."""
 
 from __future__ import annotations
 

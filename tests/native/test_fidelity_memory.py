@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory that a fork does not carry as it is, is there after a restore."""
+"""Memory that a fork does not copy unchanged is restored."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process stands where it stood: in its session and group, below its parent, with its terminal."""
+"""A restored process keeps its place: session and group, parent, terminal."""
 
 from __future__ import annotations
 

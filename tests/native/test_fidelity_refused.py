@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What cannot be protected runs on as if avckpt were not there, and it is told why."""
+"""Applications that cannot be protected run as without avckpt, and the reason is reported."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a restored application is: the same process to itself, to its peers, and to whoever looks at it."""
+"""A restored application is the same process to itself, to its peers, and to observers."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that were sent and not delivered at the checkpoint are still to come after a restore."""
+"""Signals pending at the checkpoint are pending after a restore."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timers go on: with their ids, signals, values, threads, and deadlines."""
+"""Timers continue: with their ids, signals, values, threads, and deadlines."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzz targets in C take their seeds, under ASan and UBSan: what the fuzzer has found is among them."""
+"""The fuzz targets in C take their seeds, under ASan and UBSan: they include what the fuzzer has found."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt-init as a container's init: what `podman run --init` users expect of one.
+"""avckpt-init as a container's init: what users of `podman run --init` expect.
 
 Real processes; `pid1` runs init as PID 1 of a PID namespace of its own.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An application that leaks until the kernel kills it comes back; and nobody is killed for our copies of him."""
+"""An application that leaks until the kernel kills it is restored; and none is killed because of our copies."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt.interval=auto: a guard that finds out itself how often, and when."""
+"""avckpt.interval=auto: the guard decides how often, and when."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The victims of several processes by themselves: content when nothing is wrong, loud when something is.
+"""The victims of several processes by themselves: silent when nothing is wrong, loud when something is.
 
-Below avckpt-init in a PID namespace of their own, so that none of them is left behind; nobody guards them.
+Below avckpt-init in a PID namespace of their own, so that none of them is left behind; without a guard.
 """
 
 from __future__ import annotations

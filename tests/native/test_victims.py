@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The victims by themselves: content when nothing is wrong, loud when something is.
+"""The victims by themselves: silent when nothing is wrong, loud when something is.
 
 What finds faults in checkpoints must be right without any.
 """

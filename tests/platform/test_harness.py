@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The harness itself: the other tests stand on it."""
+"""The harness itself: the other tests rely on it."""
 
 from __future__ import annotations
 

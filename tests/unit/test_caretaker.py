@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading what generations hold takes its time when memory is short; hooks and commands do not wait for it."""
+"""Reading the memory of generations is slow when memory is short; hooks and commands do not wait for it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where control groups are, as /proc tells it."""
+"""Paths of control groups, from /proc."""
 
 from __future__ import annotations
 

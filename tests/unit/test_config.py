@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/etc/avckpt/config.yaml: what it may say, and what is said when it says something else."""
+"""/etc/avckpt/config.yaml: what it may contain, and messages when it contains something else."""
 
 from __future__ import annotations
 

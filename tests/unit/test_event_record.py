@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one record of what happened: what a guard says becomes it, and it goes through JSON unharmed."""
+"""The event record: made from a guard's events, and unchanged by a round trip through JSON."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is made of the kernel's words on a death, and of what the dead have left."""
+"""Interpretation of the kernel's reports of a death, and of a dead process's memory."""
 
 from __future__ import annotations
 

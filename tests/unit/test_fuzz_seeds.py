@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzz targets in Python take their seeds: what the fuzzer has found is among them."""
+"""The fuzz targets in Python take their seeds: they include what the fuzzer has found."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The history: bounded, numbered, and whole whatever happened to the sidecar that wrote it."""
+"""The history: bounded, numbered, and intact whatever happened to the sidecar that wrote it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the hooks write down of a container's health checks."""
+"""What the hooks record of a container's health checks."""
 
 from __future__ import annotations
 

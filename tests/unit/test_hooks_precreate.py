@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The precreate hook on configurations that Podman 4.3.1 really gave it.
+"""The precreate hook on real configurations from Podman 4.3.1.
 
-`hooks_samples/` holds them with what `podman generate spec` said of the same
-container; the seccomp profile was taken out, for it is long and nothing looks
-at it.  The hook's Podman is a program that prints that answer.
+`hooks_samples/` holds them with what `podman generate spec` printed for the same
+container; the seccomp profile was removed, because it is long and not read.  The
+hook's Podman is a program that prints that answer.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""prestart and poststop, as real programs, against a sidecar of any temper."""
+"""prestart and poststop, as real programs, against sidecars that behave well or badly."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt-runtime in front of a program that says how it was called."""
+"""avckpt-runtime in front of a program that prints its arguments."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How hooks say something: with a /dev/log of the test's own, in a mount namespace of its own."""
+"""How hooks log messages: with a /dev/log of the test's own, in a mount namespace of its own."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process's numbers are in its user namespace."""
+"""A process's IDs in its user namespace."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which hook directories are in force: the reading of containers.conf."""
+"""Which hook directories are in force, according to containers.conf."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt doctor: what it says of machines that this one is not."""
+"""avckpt doctor: its results for machines unlike this one."""
 
 from __future__ import annotations
 

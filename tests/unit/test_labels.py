@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What labels may say, and what a user is told when they say something else."""
+"""Values of labels, and messages for wrong ones."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whoever looks at a process that does not answer waits a second; nobody else waits for that."""
+"""Reading a process that does not answer waits a second; nothing else waits for that."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`avckpt check` on Compose files as people have them."""
+"""`avckpt check` on typical Compose files."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""avckpt check: what is right by itself and hardly meant, and Kubernetes' YAML."""
+"""avckpt check: valid settings that are hardly intended, and Kubernetes' YAML."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong with one notification, and with no other.  With a real process as the container that is told."""
+"""Failures of one notification do not affect others.  With a real process as the notified container."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The API's description: valid, and of the paths and fields that there are."""
+"""The API's description: valid, and complete for paths and fields."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When generations are given up for memory, and when they come back."""
+"""When generations are dropped for memory, and when they are taken again."""
 
 from __future__ import annotations
 

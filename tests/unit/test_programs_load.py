@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clients of testkit/programs find what can be wrong with a server: each of these lies in a way of its own."""
+"""The clients of testkit/programs detect wrong servers: each of these lies in a different way."""
 
 from __future__ import annotations
 

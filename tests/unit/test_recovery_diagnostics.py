@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS example, without ROS: what events become, and that it comes back to a sidecar that restarts."""
+"""The ROS example, without ROS: how events are mapped, and that it reconnects to a restarted sidecar."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""scripts/setup-system.sh on systems that this one is not: their programs are stood in for, the script is real."""
+"""scripts/setup-system.sh on other systems: their programs are replaced, the script is real."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From labels to what the engine is told."""
+"""From labels to the engine's configuration."""
 
 from __future__ import annotations
 

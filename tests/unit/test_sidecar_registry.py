@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding a container by what a person calls it, and runs that overlap."""
+"""Finding a container by what users call it, and overlapping runs."""
 
 from __future__ import annotations
 

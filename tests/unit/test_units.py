@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a unit may say of itself, and what is made of it."""
+"""What a unit may claim about itself, and how that is used."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML that would keep a reader busy for ever, or fill its memory, is refused in one line."""
+"""YAML that would keep a reader busy forever, or fill its memory, is refused with one line."""
 
 from __future__ import annotations
 
