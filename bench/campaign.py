@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Injects faults into protected programs, and sees what becomes of them.
+"""Injects faults into protected programs, and counts what follows.
 
     python -m bench.campaign --runs 50 --seconds 60        into bench/results/campaign.json
 
 Each run is a program of bench/faults in a PID namespace of its own, protected by a real sidecar as
-a container is.  It computes a known series and sends each term; an oracle compares.  The fault is
-brought out by a signal; what happens within `--seconds` of the first death (or of the signal,
+a container is.  It computes a known series and sends each term; an oracle compares.  A signal
+triggers the fault; what happens within `--seconds` of the first death (or of the signal,
 where there is none) decides.  Every run is counted, once:
 
     wrong      a wrong term was sent
-    cold       the container ended: all that it knew is lost
-    recrashed  it died more than once, and goes on rightly
-    recovered  it died once, and goes on rightly
+    cold       the container ended: all its state is lost
+    recrashed  it died more than once, and continues correctly
+    recovered  it died once, and continues correctly
     stuck      it lives, and sends nothing
-    unharmed   it did not die, and goes on rightly
+    unharmed   it did not die, and continues correctly
 """
 
 from __future__ import annotations

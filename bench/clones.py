@@ -3,7 +3,7 @@
 
     .venv/bin/python -m bench.clones [--ops 300] [--turns 5]
 
-In turns; the time is what stress-ng says itself.  Prints both medians in s, and their ratio.
+In turns; the time is the one that stress-ng prints.  Prints both medians in s, and their ratio.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ given rate.  Every request changes a word in 8 pages, so that it meets page faul
 as well.  The engine takes checkpoints with the default settings of a container.
 
   latency   of each request, from its sending to its answer; the client does not wait
-            for answers before it asks again, so a server that stands still is seen
-  fault     time that writing a page takes longer when it is the first time since a
-            checkpoint: the kernel copies it (copy-on-write)
+            for answers before it asks again, so that a stopped server is noticed
+  fault     how much longer the first write to a page takes after a checkpoint:
+            the kernel copies it (copy-on-write)
   memory    what 1 to 5 generations hold: all pages of server and templates, less the
             server's own (proportional set sizes, and page tables)
 

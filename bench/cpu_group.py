@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measuring on a machine that others use: a CPU control group that comes first.
+"""Measuring on a machine that others use: a CPU control group with priority.
 
-Niceness is not enough, it counts within a session only (autogroups) or within a
-control group.  Works where Podman manages cgroups v1; elsewhere measure on a quiet
+Niceness is not enough: it only counts within a session (autogroups) or a control
+group.  Works where Podman manages cgroups v1; elsewhere measure on a quiet
 machine.
 """
 

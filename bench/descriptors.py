@@ -5,8 +5,8 @@
 
 tests/victims/openings.c opens so many of a kind, with or without having closed a file that it had
 open at the checkpoint, and is killed.  Prints median and longest time, in ms, from the death's
-report until the program runs again; and what close_range(2) of as many takes in a process that
-nobody protects, in turns with the restores.
+report until the program runs again; and what close_range(2) of as many takes in an
+unprotected process, in turns with the restores.
 """
 
 from __future__ import annotations

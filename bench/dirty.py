@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Freezes of applications that write all the time, by copies of what they write, beside a plain fork().
+"""Freezes of applications that write all the time, by copies of written pages, beside a plain fork().
 
     .venv/bin/python -m bench.dirty [--cycles 40] [--restores 10] [--images auto]
 

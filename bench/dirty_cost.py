@@ -7,10 +7,10 @@ bench/server.c answers a client that asks every millisecond (latency), and then 
 (answers), while another thread writes pages.  Writes bench/results/dirty_cost.json: medians of all turns.
 
   cpu_ms       the server's CPU time for 1,000 answers of the second client and what it writes meanwhile
-  page_us      what to write a page costs, on average
-  first_us     what to write it takes longer the first time since a checkpoint: of pages that met a page fault
+  page_us      average cost of writing a page
+  first_us     how much longer the first write after a checkpoint takes: of pages with a page fault
   guard_cpu    the guard's CPU time, in parts of a core
-  held_mb      what all templates hold that the server does not
+  held_mb      memory of all templates that is not shared with the server
 """
 
 from __future__ import annotations

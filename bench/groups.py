@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ring of members that pass numbered tokens and go back together: do the ledgers agree, and what does it cost?
+"""A ring of members that pass numbered tokens and go back together: do their ledgers agree, and at what cost?
 
     .venv/bin/python -m bench.groups [--members 5] [--kills 500] [--interval 100ms] [--between 2]
 
 Needs root and what `make setup-build` builds; no Podman.  Each member is an avckpt-init in a PID
-namespace of its own with `testkit/programs/ring.py`, which says WRONG when a token is lost, doubled
-or received and not sent.  A random member is killed every `--between` seconds.  Prints what came of
-it and writes bench/results/groups.json; ends with 1 if the ledgers ever disagreed.
+namespace of its own with `testkit/programs/ring.py`, which prints WRONG when a token is lost, duplicated
+or received without having been sent.  A random member is killed every `--between` seconds.  Prints the results
+and writes bench/results/groups.json; ends with 1 if the ledgers ever disagreed.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 
 For a minute the same program (tests/victims/idle.c, 100 MB, 20 threads, awake
 once a second) runs in a container without a label, in a container with
-`avckpt.enable=true`, and under `avckpt run`; all at once, so that what else the
-machine is doing falls on all of them.  CPU times are the scheduler's own
+`avckpt.enable=true`, and under `avckpt run`; all at once, so that other load of the
+machine affects all of them.  CPU times are the scheduler's own
 (/proc/PID/task/TID/schedstat, ns), also those of templates that came and went.
 
     python -m bench.idle [--seconds 60] [--json]

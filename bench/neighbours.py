@@ -4,7 +4,7 @@
     .venv/bin/python -m bench.neighbours [--rounds 100]
 
 A quiet program (tests/victims/idle.c, 4 threads) is checkpointed and restored beside one that forks
-like mad (brood.c), one that opens thousands of descriptors again and again (openings.c) and one
+all the time (brood.c), one that opens thousands of descriptors again and again (openings.c) and one
 that sits on a pipe's lock, as on a file server that does not answer (splicer.c).  The neighbour is
 in turns unprotected and protected every 50 ms, so that what it takes of the CPUs by itself is in
 both.  Prints medians and 95 % in ms: from the command to its answer, and of the restore.

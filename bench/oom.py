@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Containers that leak until the OOM killer takes their application: how many come back?
+"""Containers that leak until the OOM killer takes their application: how many are restored?
 
     .venv/bin/python -m bench.oom [--containers 20] [--at-once 5] [--rates 10,50,200] [--memory 256m]
 

@@ -4,7 +4,7 @@
 A server (bench/server.c) with so much touched memory and so many threads answers a
 client (bench/client.c) that asks every millisecond over one TCP connection.  Again
 and again a checkpoint is taken, and some moments later the server is killed with
-SIGKILL.  Measured is what server and client see, in the same way for everybody:
+SIGKILL.  Server and client measure, in the same way for all subjects:
 
   freeze   longest time between two beats of the server (one every 0.1 ms) around the checkpoint
   outage   longest time without an answer around the kill
@@ -13,7 +13,7 @@ and what is still there afterwards: PID, memory, TCP connection, the container's
 
 Results go into bench/results/peers.json (rows of subjects and sizes that were not
 measured this time stay), plots and a table beside it.  Ends with 1 when something
-could not be measured at all; what a peer cannot do is a result, with its own words.
+could not be measured at all; what a peer cannot do is a result, with its error message.
 """
 
 from __future__ import annotations

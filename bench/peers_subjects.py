@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is compared: each starts bench/server.c, takes checkpoints of it, kills it and has it back.
+"""The subjects compared: each starts bench/server.c, checkpoints it, kills it and restores it.
 
-Every subject gets what is best for it: CRIU's images are in memory, and it is called
-in the moment that the process is dead, as a supervisor that loses no time would.
+Every subject gets the best conditions: CRIU's images are in memory, and it is called
+as soon as the process is dead, as by an ideal supervisor.
 """
 
 from __future__ import annotations

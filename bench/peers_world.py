@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The peers' world: a Debian 13 with Podman 5 and CRIU 4, in memory and in namespaces of its own.
 
-Nothing of it touches the host's Podman, network or files, and it is gone with its
-first process.  scripts/setup-peers.sh has made the tarball.
+It does not touch the host's Podman, network or files, and ends with its first
+process.  scripts/setup-peers.sh creates the tarball.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a ROS 2 node's peer hears nothing when the node is restored: CycloneDDS and zenoh.
+"""How long a ROS 2 node's peer receives nothing when the node is restored: CycloneDDS and zenoh.
 
     make bench-ros2
     .venv/bin/python -m bench.ros2 --only cyclonedds --remedies none,skip --rates 100 --intervals 1

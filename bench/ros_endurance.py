@@ -5,7 +5,7 @@
 
 A crash counts as survived when poses of three later scans come out within five
 seconds, each less than a metre from the truth.  One line of JSON is appended
-for each crash, so a run can be stopped and taken up again.
+for each crash, so a run can be stopped and continued.
 """
 
 from __future__ import annotations

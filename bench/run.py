@@ -3,11 +3,11 @@
 
 For every size and number of threads one victim (tests/victims/idle.c) is
 checkpointed and killed again and again.  Each cycle times one fork(2) of
-bench/fork.c first, so that what else the machine is doing falls on both alike.
+bench/fork.c first, so that other load of the machine affects both alike.
 
 Writes medians to bench/results/engine.json and prints them with the limits that
 the project has set itself.  Ends with 1 when something could not be measured; a
-limit that does not hold is said, and is no failure: clocks on a shared machine
+limit that is exceeded is reported, but is no failure: times on a shared machine
 are no test.
 """
 

@@ -5,7 +5,7 @@ A sidecar daemon protects a C++ program (tests/victims/pool.cpp: thread pool, fu
 condition variables, all of it checking itself) below avckpt-init, in a PID namespace of
 its own.  The program is killed at random moments; twice in a row now and then.  Every few
 seconds all that can leak is counted in the program, in init, in templates and in the
-sidecar (tests/census.py); what has more at the end than after the warm-up is a leak.
+sidecar (tests/census.py); whatever is more at the end than after the warm-up is a leak.
 
     .venv/bin/python -m bench.soak [--seconds 3600] [--again]
 

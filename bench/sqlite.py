@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """SQLite in protected containers, killed under write load: what `avckpt.files` does to a database.
 
-A bank (testkit/databases/bank.py) commits transactions in a container with a real Podman and sidecar, and tells
-an observer outside of each after its COMMIT.  It is killed at random moments, in bursts of writing and in pauses
+A bank (testkit/databases/bank.py) commits transactions in a container with a real Podman and sidecar, and reports
+each to an observer outside after its COMMIT.  It is killed at random moments, in bursts of writing and in pauses
 between them.  After every death the observer asks the database: PRAGMA integrity_check, every transaction that was
-told, the sum of all accounts; and the bank compares what it knows in memory with the database.
+reported, the sum of all accounts; and the bank compares what it knows in memory with the database.
 
 With `avckpt.files=strict` one database is kept for all kills, and Podman's restart policy starts cold what is not
 restored.  With `rewind` a database that is damaged is the end of it, and the next kill has a new one.

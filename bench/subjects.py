@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured: a program below avckpt-init with a guard, and beside it one that just forks."""
+"""The measured programs: one below avckpt-init with a guard, and beside it one that just forks."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ Four questions, each with the limit that the project has set itself:
             time of copying 100 MB plus 5 ms;
 - commands: 1,000 short commands in a loop under 100 ms checkpoints, against the same loop unprotected plus 10 %.
 
-Writes bench/results/trees.json.  A limit that does not hold is said, and is no failure: clocks on a
+Writes bench/results/trees.json.  A limit that is exceeded is reported, but is no failure: times on a
 shared machine are no test.  Ends with 1 when something could not be measured.
 """
 

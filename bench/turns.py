@@ -2,8 +2,8 @@
 """`python -m bench.turns DIR`: freeze and restore of this checkout beside those of another one.
 
 DIR is built (`make setup-build`), a worktree of the commit before a change, say.  Both run the same
-measurements in turns, so that what else the machine does falls on both alike, and the one that goes
-first changes.  A measurement that fails (on a busy machine a checkpoint may be missed) does not
+measurements in turns, so that other load of the machine affects both alike, and take turns in
+going first.  A measurement that fails (on a busy machine a checkpoint may be missed) does not
 count.  Prints the median over the turns of each figure, and its ratio.  Ends with 1 when nothing
 could be measured, and with 2 when a figure is larger by more than --limit per cent.
 """
