@@ -11,7 +11,8 @@
 
 #include "freeze.h"
 
-#define CLONE_NS (10 * NS_PER_S)
+#define STOPPED_NS (2 * NS_PER_S)
+#define CLONES 4 /* times as long as they are expected to take                         */
 
 /* ---- who there is ------------------------------------------------------------------------- */
 
@@ -411,8 +412,9 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
 	start = now_ns();
 	result = stop_and_begin(freeze, err);
-	/* The deadline is for stopping; the clone of a big process may take longer. */
-	tracee_deadline_set(freeze->timer, CLONE_NS);
+	/* That was for stopping; the clone of a big process may take longer. */
+	tracee_deadline_set(freeze->timer,
+			    STOPPED_NS + CLONES * freeze_clones_time_ns(freeze->tree));
 	if (!result)
 		result = read_and_clone(freeze, err);
 	result = hear_and_await(freeze, result, err);

@@ -22,6 +22,8 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err) warn_unused;
 
 /* ---- freeze_clone.c ----------------------------------------------------------------------- */
 
+/* An estimate for all processes, those that have no template yet as well. */
+uint64_t freeze_clones_time_ns(const struct tree *tree);
 /* As soon as all known processes are stopped: starts their clones, as far as they are short, while
  * they answer queries.  A process that is found later is stopped, too, and cannot have changed the
  * memory of the others. (One that shares it is not protected: find_others().) One that has no

@@ -377,8 +377,7 @@ static uint64_t clone_time_ns(long anon_pages)
 	return CLONE_PROCESS_NS + (uint64_t)anon_pages * CLONE_PAGE_NS;
 }
 
-/* All of them, those that have no template yet as well. */
-static uint64_t clones_time_ns(const struct tree *tree)
+uint64_t freeze_clones_time_ns(const struct tree *tree)
 {
 	uint64_t takes_ns = 0;
 
@@ -405,7 +404,7 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 {
 	const struct tree *tree = freeze->tree;
 	const struct image *main = &freeze->generation->image[0];
-	const uint64_t all_ns = tree->count > 1 ? clones_time_ns(tree) : 0;
+	const uint64_t all_ns = tree->count > 1 ? freeze_clones_time_ns(tree) : 0;
 	uint64_t takes_ns = 0;
 
 	/* Not while it is being cloned. */
@@ -428,7 +427,7 @@ int freeze_begin_known(struct freeze *freeze, struct avc_error *err)
 int freeze_begin_others(struct freeze *freeze, struct avc_error *err)
 {
 	const struct generation *generation = freeze->generation;
-	const uint64_t all_ns = generation->images > 1 ? clones_time_ns(freeze->tree) : 0;
+	const uint64_t all_ns = generation->images > 1 ? freeze_clones_time_ns(freeze->tree) : 0;
 
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct process *process = generation->image[i].process;
