@@ -137,20 +137,12 @@ static bool may_go_on(const struct file *f)
 	return s->protocol == IPPROTO_TCP && s->type == SOCK_STREAM;
 }
 
-static int option(int fd, int level, int name)
-{
-	int value = 0;
-	socklen_t bytes = sizeof value;
-
-	return getsockopt(fd, level, name, &value, &bytes) ? -1 : value;
-}
-
 /* Not shut down or broken, and without urgent data or SO_PEEK_OFF. */
 static bool is_whole(int fd)
 {
 	struct pollfd state = { .fd = fd, .events = POLLRDHUP | POLLPRI };
 
-	return poll(&state, 1, 0) == 0 && option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0;
+	return poll(&state, 1, 0) == 0 && file_option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0;
 }
 
 /* IPv4 as mapped to IPv6, because one end may use that. */
@@ -171,9 +163,8 @@ static bool name_address(struct avc_end_name *name, const struct sockaddr_storag
 	} else {
 		return false;
 	}
-	v6 = &(const struct sockaddr_in6){ 0 };
 	if (!memcmp(name->address, &in6addr_loopback, sizeof in6addr_loopback) ||
-	    (!memcmp(name->address, "\0\0\0\0\0\0\0\0\0\0\xff\xff\x7f", 13)))
+	    !memcmp(name->address, "\0\0\0\0\0\0\0\0\0\0\xff\xff\x7f", 13))
 		name->where = network;
 	return true;
 }

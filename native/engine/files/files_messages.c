@@ -109,14 +109,6 @@ static void hear_control(struct msghdr *head, struct file *file)
 
 /* ---- looks --------------------------------------------------------------------------------------- */
 
-static int option(int fd, int name)
-{
-	int value = 0;
-	socklen_t bytes = sizeof value;
-
-	return getsockopt(fd, SOL_SOCKET, name, &value, &bytes) ? -1 : value;
-}
-
 /* Only peeks.  Bytes, or -1; a message is truncated, but its full length is returned. */
 static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 {
@@ -135,7 +127,8 @@ static ssize_t peek(int fd, struct file *file, void *to, size_t room)
 	if (lands)
 		hear_control(&head, file);
 	/* No room for them: truncation shows that there are some. */
-	if (head.msg_flags & MSG_CTRUNC && (lands || option(fd, SO_PASSCRED) <= 0)) {
+	if (head.msg_flags & MSG_CTRUNC &&
+	    (lands || file_option(fd, SOL_SOCKET, SO_PASSCRED) <= 0)) {
 		file->rights_lost = true;
 		file->rights = RIGHTS_UNKNOWN;
 	}
@@ -190,7 +183,7 @@ static void trim(struct file *file)
 /* It is an option of the app's socket, which is reset even if we die. */
 static void look_again(struct process *process, int fd, struct file *file)
 {
-	const int first = 0, before = option(fd, SO_PEEK_OFF);
+	const int first = 0, before = file_option(fd, SOL_SOCKET, SO_PEEK_OFF);
 
 	if (parasite_set_undo(process, SYS_setsockopt,
 			      ARGUMENTS((uint64_t)file->fd, SOL_SOCKET, SO_PEEK_OFF,
@@ -232,7 +225,7 @@ void file_keep_messages(struct process *process, int fd, struct file *file, uint
 
 bool file_has_messages(int fd, const struct file *want)
 {
-	const int first = 0, before = option(fd, SO_PEEK_OFF);
+	const int first = 0, before = file_option(fd, SOL_SOCKET, SO_PEEK_OFF);
 	struct file is = { .kind = FILE_SOCKET, .socket = want->socket };
 	bool same;
 

@@ -39,7 +39,7 @@
 
 /* ---- sockets ---------------------------------------------------------------- */
 
-static int option(int fd, int level, int name)
+int file_option(int fd, int level, int name)
 {
 	int value = 0;
 	socklen_t bytes = sizeof value;
@@ -76,11 +76,11 @@ void file_look_at_socket(int fd, struct file *file)
 
 	if (!s)
 		return;
-	s->domain = option(fd, SOL_SOCKET, SO_DOMAIN);
-	s->type = option(fd, SOL_SOCKET, SO_TYPE);
+	s->domain = file_option(fd, SOL_SOCKET, SO_DOMAIN);
+	s->type = file_option(fd, SOL_SOCKET, SO_TYPE);
 	s->protocol = s->domain == AF_CAN ? can_protocol(fd, s->type)
-					  : option(fd, SOL_SOCKET, SO_PROTOCOL);
-	s->listening = option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0;
+					  : file_option(fd, SOL_SOCKET, SO_PROTOCOL);
+	s->listening = file_option(fd, SOL_SOCKET, SO_ACCEPTCONN) > 0;
 	s->local_bytes = sizeof s->local;
 	if (getsockname(fd, (struct sockaddr *)&s->local, &s->local_bytes))
 		s->local_bytes = 0;
