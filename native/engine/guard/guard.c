@@ -380,7 +380,7 @@ static uint64_t work_due(struct avc_guard *guard)
 		due = earlier(due, guard->remains.until_ns);
 	if (guard->dead.waits)
 		due = earlier(due, now_ns() + DEAD_LOOK_NS);
-	return earlier(due, tracee_any_ending() ? tracee_ending_due() : guard->ahead_ns);
+	return earlier(due, tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : tracee_ending_due());
 }
 
 /* Whether a descriptor became ready. */
@@ -401,7 +401,6 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 {
 	uint64_t due = work_due(guard);
 	nfds_t n = 0;
-	int ending;
 
 	watch(guard, &n, guard->socket);
 	if (n && guard->outbox_count)
@@ -428,8 +427,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 		for (uint32_t k = 0; k < guard->generations[i].images; k++)
 			watch(guard, &n, guard->generations[i].image[k].pidfd);
 	}
-	for (uint32_t i = 0; tracee_ending_late(i, &ending); i++)
-		watch(guard, &n, ending);
+	for (uint32_t i = 0; tracee_ending_pidfd(i) >= 0; i++)
+		watch(guard, &n, tracee_ending_pidfd(i));
 	if (straggling) {
 		const uint64_t now = now_ns();
 		const bool fresh = now - guard->stragglers_since_ns < NS_PER_S;
@@ -537,7 +536,7 @@ static void guard_main(struct avc_guard *guard)
 		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
 			guard_tell_untold(guard);
-		if (now_ns() >= guard->ahead_ns && !tracee_any_ending())
+		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
 			guard_work_ahead(guard);
 		if (now_ns() < guard->next_ns)
 			continue;

@@ -509,7 +509,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 		guard->cramped |= guard->generations[i].spare.pid != 0;
 		spare_drop(&guard->generations[i]);
 	}
-	if (!tracee_any_ending())
+	if (tracee_ending_pidfd(0) < 0)
 		return false;
 	guard_wait_ended();
 	usleep(INIT_REAPS_US);

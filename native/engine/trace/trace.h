@@ -318,9 +318,8 @@ uint64_t tracee_ending_due(void);
 /* Kills them now. */
 void tracee_end_now(void);
 bool tracee_is_ending(pid_t pid);
-bool tracee_any_ending(void);
-/* *pidfd: of the i-th of them, to be polled; -1: not killed yet.  false: there are no more. */
-bool tracee_ending_late(uint32_t i, int *pidfd);
+/* Of the i-th of them, to be polled; -1: there are no more. */
+int tracee_ending_pidfd(uint32_t i);
 /* Whether a STOP_SYSCALL is at the entry of the call, not at its exit. */
 bool tracee_enters_call(pid_t tid);
 /* Whether it is a tracee of this thread. */

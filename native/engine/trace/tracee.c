@@ -361,8 +361,7 @@ static __thread struct {
 	struct {
 		pid_t pid;
 		int pidfd;
-		bool killed;
-		uint64_t due_ns; /* when to kill it                                  */
+		uint64_t kill_ns; /* 0: it was killed                                */
 	} task[ENDING_MAX];
 	uint32_t count;
 } ending;
@@ -376,17 +375,16 @@ void tracee_end(pid_t pid, int pidfd)
 		return;
 	}
 	ending.task[ending.count].pid = pid;
-	ending.task[ending.count].killed = false;
-	ending.task[ending.count].due_ns = now_ns() + END_AFTER_NS;
+	ending.task[ending.count].kill_ns = now_ns() + END_AFTER_NS;
 	ending.task[ending.count++].pidfd = pidfd;
 }
 
 static void end_until(uint64_t now)
 {
 	for (uint32_t i = 0; i < ending.count; i++)
-		if (!ending.task[i].killed && ending.task[i].due_ns <= now) {
+		if (ending.task[i].kill_ns && ending.task[i].kill_ns <= now) {
 			syscall(SYS_pidfd_send_signal, ending.task[i].pidfd, SIGKILL, NULL, 0);
-			ending.task[i].killed = true;
+			ending.task[i].kill_ns = 0;
 		}
 }
 
@@ -419,8 +417,8 @@ uint64_t tracee_ending_due(void)
 	uint64_t due = UINT64_MAX;
 
 	for (uint32_t i = 0; i < ending.count; i++)
-		if (!ending.task[i].killed && ending.task[i].due_ns < due)
-			due = ending.task[i].due_ns;
+		if (ending.task[i].kill_ns && ending.task[i].kill_ns < due)
+			due = ending.task[i].kill_ns;
 	return due;
 }
 
@@ -432,17 +430,7 @@ bool tracee_is_ending(pid_t pid)
 	return false;
 }
 
-bool tracee_any_ending(void)
+int tracee_ending_pidfd(uint32_t i)
 {
-	return ending.count != 0;
-}
-
-bool tracee_ending_late(uint32_t i, int *pidfd)
-{
-	*pidfd = -1;
-	if (i >= ending.count)
-		return false;
-	if (ending.task[i].killed)
-		*pidfd = ending.task[i].pidfd;
-	return true;
+	return i < ending.count ? ending.task[i].pidfd : -1;
 }
