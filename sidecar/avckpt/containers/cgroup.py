@@ -106,12 +106,13 @@ class Groups:
         """What counts against the limit and cannot simply be reclaimed: usage less clean file pages."""
         return None if self.memory is None else _used_bytes(self.memory, self.memory_version)
 
-    def first_to_run_out_bytes(self) -> int | None:
+    def first_to_run_out_bytes(self, used: int | None) -> int | None:
         """`memory_and_swap_bytes()`; None, too, if a group above, or the host, has less room left than this one.
 
         The OOM killer acts where memory runs out first, and counts in thousandths of the memory *there*.
+        `used` is what memory_used_bytes() says.
         """
-        limit, used = self.memory_and_swap_bytes(), self.memory_used_bytes()
+        limit = None if used is None else self.memory_and_swap_bytes()
         if limit is None or used is None:
             return None
         return None if self._room_outside_bytes() < limit - used - OUTSIDE * limit else limit

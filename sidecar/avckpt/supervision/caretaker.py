@@ -72,7 +72,7 @@ class Caretaker(Generic[W]):
         except OSError:  # it has just ended
             groups = Groups((), None, ())
         care = self._cares[ward.container.cookie] = _Care(ward, groups)
-        self._tell_limit(care)
+        self._tell_limit(care, care.groups.memory_used_bytes())
         if policy.restore_on.unhealthy:
             self._watch_health(care)
         self._look_if_needed()
@@ -133,27 +133,27 @@ class Caretaker(Generic[W]):
             if self._host is not None and self._host.fd is None and self._host.is_high():
                 self._host_is_short()
             for care in list(self._cares.values()):
-                self._tell_limit(care)
-                advice = await self._advise(care)
+                limit = care.groups.memory_limit_bytes()
+                used = None if limit is None else care.groups.memory_used_bytes()
+                self._tell_limit(care, used)
+                advice = await self._advise(care, limit, used)
                 if advice is Advice.DROP_OLDEST:
                     self._order(care, Command.DROP_OLDEST)
                 elif advice is Advice.REFILL:
                     self._order(care, Command.REFILL)
 
-    async def _advise(self, care: _Care[W]) -> Advice:
-        limit = care.groups.memory_limit_bytes()
-        used = care.groups.memory_used_bytes() if limit is not None else None
+    async def _advise(self, care: _Care[W], limit: int | None, used: int | None) -> Advice:
         if used is None or limit is None:
             return care.allowance.come_back(now_s())
         container = care.ward.container
         held = await held_by(container) if care.allowance.near_limit(used, limit) else 0
         return care.allowance.advise(used, limit, held, container.generations, now_s())
 
-    def _tell_limit(self, care: _Care[W]) -> None:
+    def _tell_limit(self, care: _Care[W], used: int | None) -> None:
         """Its guard ranks generations by it.  It can change at any time: by `podman update --memory`, or when
         memory runs out elsewhere first."""
         container, guard = care.ward.container, care.ward.guard
-        limit = care.groups.first_to_run_out_bytes() or 0
+        limit = care.groups.first_to_run_out_bytes(used) or 0
         if guard is None or limit == container.config.memory_limit_bytes:
             return
         container.config = replace(container.config, memory_limit_bytes=limit)
