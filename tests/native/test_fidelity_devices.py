@@ -57,7 +57,7 @@ def test_a_camera(scenario: str, where: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize(("scenario", "what"), [("changed", "its buffers are others now"), ("left", "opened anew")])
+@pytest.mark.parametrize(("scenario", "what"), [("changed", "its buffers have changed"), ("left", "opened anew")])
 @pytest.mark.usefixtures("camera")
 def test_a_camera_that_is_not_as_it_was_is_told(scenario: str, what: str, where: str, tmp_path: Path) -> None:
     """And no worse: what looks like its pictures can be read."""

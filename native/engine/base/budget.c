@@ -46,7 +46,7 @@ bool budget_take(uint64_t bytes)
 {
 	if (!budget_has(bytes)) {
 		budget_exceed(AVC_UNSUPPORTED,
-			      "what is to be known of what it has open is more than 128 MB");
+			      "the state of its open files takes more than 128 MB");
 		return false;
 	}
 	budget.bytes += bytes;
@@ -61,7 +61,7 @@ bool budget_step(void)
 		budget.working(budget.arg);
 	if (budget.end_ns && now_ns() > budget.end_ns)
 		budget_exceed(AVC_DEADLINE,
-			      "to read what it has takes longer than it may stand still");
+			      "reading its state takes longer than it may stand still");
 	return !budget.exceeded;
 }
 

@@ -305,9 +305,9 @@ int dirty_capture_one(struct dirty *dirty, const struct image *image, struct avc
 	struct process *process = image->process;
 
 	if (files_may_pin(image->files))
-		return fork_instead(dirty, process, "pages of its may be pinned", err);
+		return fork_instead(dirty, process, "some of its pages may be pinned", err);
 	if (!scan_stopped(dirty, process) || !copy_read(dirty, process))
-		return fork_instead(dirty, process, "too much of it has changed just now", err);
+		return fork_instead(dirty, process, "it has just written too much", err);
 	return read_inherited(&dirty->now, process, err);
 }
 
@@ -322,7 +322,7 @@ static int bring_up_to_date(struct dirty *dirty, struct template_calls *calls,
 	return dirty->idle.inherited->value[INHERITED_BREAK] == dirty->now.value[INHERITED_BREAK]
 		       ? 0
 		       : fail(err, AVC_RETRY, 0, dirty->idle.pid, "keep template", "brk",
-			      "its heap is not where the kernel has it");
+			      "its heap has moved");
 }
 
 static void forget_differences(struct dirty *dirty)
@@ -368,7 +368,7 @@ int dirty_apply_one(struct dirty *dirty, struct image *image, struct avc_error *
 	if (main_thread)
 		inherited_creds(&dirty->now, main_thread);
 	if (!main_thread || !inherited_equal(&dirty->now, dirty->idle.inherited))
-		return fork_instead(dirty, process, "what a fork of it inherits has changed", err);
+		return fork_instead(dirty, process, "what a fork would inherit has changed", err);
 	if (bring_up_to_date(dirty, &calls, &why)) {
 		dirty_drop_idle_one(dirty);
 		return fork_instead(dirty, process, "a template cannot be brought up to date", err);

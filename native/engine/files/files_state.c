@@ -504,13 +504,13 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 		}
 	}
 	if (put < want->content_bytes || !emptied)
-		problem = "what was in it could not be put back";
+		problem = "its contents could not be put back";
 	else if (want->rights_lost)
-		problem = "descriptors that were on their way through it are lost";
+		problem = "descriptors in flight in it are lost";
 	else if (want->content_lost)
-		problem = "what was in it is lost";
+		problem = "its contents are lost";
 	else if (want->senders_lost)
-		problem = "who had sent what was in it is not known any more";
+		problem = "the senders of its contents are not known any more";
 	if (pipe) {
 		close_fd(&in);
 		close_fd(&out);

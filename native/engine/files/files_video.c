@@ -147,7 +147,7 @@ static const char *take(int fd, uint32_t type, uint64_t buffers)
 
 	while (buffers) {
 		if (!wait_filled(fd, end_ns) || command(fd, VIDIOC_DQBUF, &b, type, 0))
-			return "a buffer that it holds is the driver's now";
+			return "the driver has taken back a buffer that it holds";
 		if (buffers >> b.v4l2.index & 1)
 			buffers &= ~(UINT64_C(1) << b.v4l2.index);
 		else if (give(fd, type, UINT64_C(1) << b.v4l2.index))
@@ -167,7 +167,7 @@ const char *file_put_video(int fd, const struct file_video *want)
 	if (!want->count)
 		return now.count ? free_buffers(fd, &now) : NULL;
 	if (now.type != want->type || now.count != want->count)
-		return "its buffers are others now";
+		return "its buffers have changed";
 	problem = give(fd, want->type, now.held & ~want->held);
 	/* It had been stopped (VIDIOC_STREAMOFF), which takes all buffers from the driver. */
 	type = (int)want->type;

@@ -263,7 +263,7 @@ int thread_ask_others(struct process *process, const struct thread *thread, cons
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		process->threads[i].known &= &process->threads[i] == thread;
 	return fail(err, AVC_RETRY, 0, process->pid, "read state", "",
-		    "its threads are just changing what they may do");
+		    "its threads are just changing their credentials");
 }
 
 struct walk {

@@ -95,7 +95,7 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 		return -1;
 	if (made->result < 0)
 		return fail(err, AVC_UNSUPPORTED, (int)-made->result, child, "watch memory",
-			    "userfaultfd", "the kernel does not let it");
+			    "userfaultfd", "the kernel does not allow it");
 	pidfd = proc_pidfd_open(child);
 	fd = pidfd < 0 ? -1 : proc_borrow_fd(pidfd, 0);
 	close_fd(&pidfd);

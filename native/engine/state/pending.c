@@ -164,7 +164,7 @@ int pending_check(const struct process *process, struct avc_error *err)
 	return pending->caught ? fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
 				      "it is about to handle signal %d", pending->deadly)
 			       : fail(err, AVC_GONE, 0, process->pid, "freeze", "",
-				      "it is just being ended by signal %d", pending->deadly);
+				      "it is being killed by signal %d", pending->deadly);
 }
 
 bool pending_contains(const struct pending *pending, int signal, int timer)

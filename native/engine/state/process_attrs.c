@@ -250,7 +250,7 @@ static void put_mm(struct syscall_batch *batch, const struct process_attrs *attr
 	syscall_batch_add(batch, SYS_prctl, PR_SET_MM, PR_SET_MM_MAP,
 			  parasite_remote(batch->parasite, &arguments->map), sizeof arguments->map);
 	syscall_batch_soften(batch,
-			     "what it knows of its heap and arguments could not be put back");
+			     "its heap and argument addresses (PR_SET_MM) could not be put back");
 }
 
 void process_attrs_lift_limit(pid_t pid, int which, uint64_t least)
@@ -339,7 +339,7 @@ static void put_dumped(struct syscall_batch *batch, int64_t dumped)
 	fd = proc_open(batch->pid, "coredump_filter", O_WRONLY);
 	if (fd < 0 || dprintf(fd, "0x%x", (unsigned int)dumped) < 0)
 		fail_errno(batch->notes, batch->inside, "restore", "write(coredump_filter)",
-			   "what of it is dumped could not be put back");
+			   "its core dump settings could not be put back");
 	close_fd(&fd);
 }
 
@@ -399,7 +399,7 @@ int process_attrs_put(struct syscall_batch *batch, const struct image *image, st
 	if (attrs->merging >= 0) {
 		syscall_batch_add(batch, SYS_prctl, PR_SET_MEMORY_MERGE, (uint64_t)attrs->merging);
 		syscall_batch_soften(batch,
-				     "what it says of pages to be merged could not be put back");
+				     "its setting for merging pages (KSM) could not be put back");
 	}
 	return 0;
 }
