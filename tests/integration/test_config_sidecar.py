@@ -31,13 +31,13 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
 
 
 def kinds(sidecar: LocalSidecar, name: str) -> list[str]:
-    """What the history says of a container."""
+    """The kinds of the container's events so far, from the history."""
     lines = sidecar.avckpt("events", "--json").stdout.splitlines()
     return [event["kind"] for event in map(json.loads, lines) if event["container"] == name]
 
 
 def kill_and_wait(sidecar: LocalSidecar, container: Container, restores: int) -> dict[str, object]:
-    """Kills the application; what `avckpt ps` says once it has been restored so often."""
+    """Kills the application; its row of `avckpt ps` once it has been restored that many times."""
     os.kill(container.app_pid, signal.SIGKILL)
     return sidecar.wait_for(container, restores=restores, state="protected")
 
@@ -83,7 +83,7 @@ def test_a_new_one_holds_for_running_containers_and_takes_nothing_from_them(side
 
 
 def test_more_generations_for_a_running_container(sidecar: LocalSidecar) -> None:
-    """Which takes more room than its guard had made in the application."""
+    """They need more room than the guard has mapped in the application."""
     sidecar.config.write_text("defaults: {interval: 100ms, keep: 1}\n")
     sidecar.start()
     plain = sidecar.protected("plain", NAP, ENABLE)

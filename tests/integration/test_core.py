@@ -40,7 +40,7 @@ SAMPLED = [i for i in range(27) if i not in (15, *range(21, 27))]
 
 @dataclass
 class Core:
-    """What is in a core file."""
+    """The parsed contents of a core file."""
 
     loads: list[tuple[int, bytes]] = field(default_factory=list)
     notes: list[tuple[int, bytes]] = field(default_factory=list)
@@ -82,7 +82,7 @@ class Core:
 
 
 def crash(sidecar: LocalSidecar, folder: Path, mode: str) -> dict[str, object]:
-    """Has a victim die that also leaves a core of the kernel's in `folder`; the event that tells of ours."""
+    """Has a victim die that also leaves a core of the kernel's in `folder`; the event that names ours."""
     command = f'ulimit -c unlimited; cd {folder}; exec "$0" -c "$1"'
     labels = {**QUICK, "avckpt.core": mode}
     victim = sidecar.protected(mode, ["sh", "-c", command, sys.executable, VICTIM], labels)
@@ -98,7 +98,7 @@ def crash(sidecar: LocalSidecar, folder: Path, mode: str) -> dict[str, object]:
 
 
 def differences(mine: bytes, kernels: bytes) -> set[tuple[int, int]]:
-    """The words in which two pages differ."""
+    """The 8-byte words in which two pages differ."""
     if mine == kernels:
         return set()
     pairs = zip(struct.unpack("=1024I", mine), struct.unpack("=1024I", kernels))

@@ -31,7 +31,7 @@ pytestmark = [
 
 
 class Docker:
-    """A daemon, and a sidecar that its runtime registers with."""
+    """A Docker daemon, and a sidecar with which its runtime registers containers."""
 
     def __init__(self, folder: Path, sidecar: LocalSidecar) -> None:
         self.folder = folder
@@ -72,7 +72,7 @@ class Docker:
         return done.stdout
 
     def protected(self, image: str, *command: str, options: tuple[str, ...] = ()) -> str:
-        """Starts one; its id."""
+        """Starts a protected container; its id."""
         labels = [word for key, value in LABELS.items() for word in ("--label", f"avckpt.{key}={value}")]
         words = ("run", "--detach", "--network=none", "--runtime=avckpt", *labels, *options, image, *command)
         return self.run(*words)

@@ -358,7 +358,7 @@ def test_wrong_requests_are_json_errors(local: LocalSidecar, method: str, target
 
 
 def scrape(local: LocalSidecar) -> dict[str, float]:
-    """Every sample of /metrics."""
+    """Every sample of /metrics, by name and labels."""
     status, content_type, body = get(local, "/metrics")
     assert status == 200
     assert content_type.startswith("text/plain")
@@ -391,7 +391,7 @@ def test_metrics_of_a_crash(local: LocalSidecar) -> None:
 
 
 def test_memory_that_several_generations_hold_together_counts_once(local: LocalSidecar, tmp_path: Path) -> None:
-    """It is nobody's private memory, and is there all the same."""
+    """Pages shared by templates are no process's private memory, and must be counted nevertheless."""
     again = tmp_path / "again"
     program = (
         "import os, time\nx = bytearray(30_000_000)\nx[::4096] = b'1' * len(x[::4096])\n"
@@ -410,7 +410,7 @@ def test_memory_that_several_generations_hold_together_counts_once(local: LocalS
 
 
 def test_an_application_can_not_write_lines_of_its_own(local: LocalSidecar, tmp_path: Path) -> None:
-    """The name of a file of its own is part of what is told: into the log, and onto a terminal."""
+    """File names that the application chooses appear in messages, in the log and on terminals."""
     name = "x\n2026-01-01 ERROR web: all is lost\x1b[2K"
     path = tmp_path / name
     program = (

@@ -47,12 +47,12 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
 
 
 def crashes(sidecar: LocalSidecar, name: str) -> list[dict[str, Any]]:
-    """The events that say what it died of."""
+    """The crash events of a container."""
     return [json.loads(line) for line in sidecar.avckpt("events", name, "-k", "crash", "--json").stdout.splitlines()]
 
 
 def crash_by(sidecar: LocalSidecar, victim: Container, signum: int) -> dict[str, Any]:
-    """Sends it a signal, waits for what is told of its death, and for the next checkpoint."""
+    """Sends a signal, then waits for the crash event and for the next checkpoint."""
     before = sidecar.wait_for(victim, state="protected")
     told = len(crashes(sidecar, victim.name))
     os.kill(victim.app_pid, signum)

@@ -35,7 +35,7 @@ pytestmark = [
 
 
 def free_ports(count: int) -> int:
-    """The first of so many that nobody has at this moment."""
+    """The first of a number of consecutive free ports."""
     for _ in range(100):
         first = random.randrange(20000, 30000)
         try:
@@ -49,7 +49,7 @@ def free_ports(count: int) -> int:
 
 @pytest.fixture(params=["tcp"])
 def ring(local: LocalSidecar, tmp_path: Path, request: pytest.FixtureRequest) -> list[Container]:
-    """Members that pass numbered tokens at full rate (testkit/programs/ring.py), in a line of all."""
+    """Members that pass numbered tokens at full rate (testkit/programs/ring.py), once all have a common line."""
     where = str(free_ports(MEMBERS)) if request.param == "tcp" else str(tmp_path)
     program = [sys.executable, "-u", str(ROOT / "testkit/programs/ring.py")]
     members = [
@@ -61,7 +61,7 @@ def ring(local: LocalSidecar, tmp_path: Path, request: pytest.FixtureRequest) ->
 
 
 def wait_for_line(local: LocalSidecar, members: list[Container], after: int = 0) -> int:
-    """Until all have one of the same number; that number."""
+    """Waits until all members hold the line of the same number; that number."""
 
     def line() -> int:
         ids = {member.id for member in members}
@@ -73,7 +73,7 @@ def wait_for_line(local: LocalSidecar, members: list[Container], after: int = 0)
 
 
 def row(local: LocalSidecar, container: Container) -> dict[str, Any]:
-    """What the API knows of it."""
+    """The member as the API shows it."""
     return next(each for each in Client(local.run_dir).containers(ended=True) if each["id"] == container.id)
 
 
@@ -86,7 +86,7 @@ def wait_for_restores(local: LocalSidecar, members: list[Container], restores: i
 
 
 def kill_templates(container: Container) -> int:
-    """How many there were."""
+    """Kills a member's templates; how many there were."""
     found = [pid for pid in children_of(container.init_pid) if Path(f"/proc/{pid}/comm").read_text() == "avckpt-tmpl\n"]
     for pid in found:
         os.kill(pid, signal.SIGKILL)
@@ -98,19 +98,19 @@ def said(member: Container) -> list[str]:
 
 
 def tokens(member: Container) -> int:
-    """How many it has got, as it has said last."""
+    """How many tokens the member has received, by its last report."""
     lines = [line.split() for line in said(member)[:-1]]
     return next((int(words[0]) for words in reversed(lines) if len(words) == 3 and words[0].isdigit()), 0)
 
 
 def lost_connections(member: Container) -> int:
-    """As it has said last."""
+    """How many connections the member has lost, by its last report."""
     lines = [line.split() for line in said(member)[:-1]]
     return next(int(words[2]) for words in reversed(lines) if len(words) == 3 and words[2].isdigit())
 
 
 def check_ledgers(ring: list[Container]) -> None:
-    """They agree, and go on to."""
+    """The members' ledgers agree, and keep agreeing as tokens go on."""
     wrong = [line for member in ring for line in said(member) if "WRONG" in line or "Traceback" in line]
     assert wrong == []
     before = [tokens(member) for member in ring]
@@ -218,7 +218,7 @@ RARELY = {**TOGETHER, "avckpt.interval": "1h"}
 
 
 def pair(local: LocalSidecar, programs: list[str], go: Path) -> list[Container]:
-    """The one that listens first, connected to the other, and a line of both: after that there is the file `go`."""
+    """A listening member and its connected peer, both in one line; then the file `go` lets them go on."""
     arguments = [str(free_ports(1)), str(go)]
     members = [local.protected("server", [sys.executable, "-uc", programs[0], *arguments], RARELY)]
     members.append(
@@ -235,7 +235,7 @@ def pair(local: LocalSidecar, programs: list[str], go: Path) -> list[Container]:
 
 @pytest.mark.parametrize("victim", [0, 1])
 def test_what_was_on_its_way_is_so_again(local: LocalSidecar, tmp_path: Path, victim: int) -> None:
-    """It was not read yet at the line, and has been since; and what was sent later never was."""
+    """What was unread at the line and read since is unread again; what was sent later was never sent."""
     members = pair(local, [RECEIVER, SENDER], tmp_path / "go")
     time.sleep(0.2)
     before = said(members[1]).count("ENDED b'!'")

@@ -28,7 +28,7 @@ def guard_of(local: LocalSidecar, container: Container) -> int:
 
 
 def another_guard(local: LocalSidecar, container: Container, guard: int, timeout_s: float) -> dict[str, Any]:
-    """The container's row once another guard protects it."""
+    """The container's row once a new guard protects it."""
     row: dict[str, Any] = {}
 
     def replaced() -> bool:
@@ -41,7 +41,7 @@ def another_guard(local: LocalSidecar, container: Container, guard: int, timeout
 
 
 def crash(local: LocalSidecar, container: Container, restores: int) -> None:
-    """The application dies and is restored."""
+    """Kills the application and waits until it is restored."""
     os.kill(container.app_pid, signal.SIGKILL)
     local.wait_for(container, restores=restores, state="protected")
 

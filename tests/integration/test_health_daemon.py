@@ -39,7 +39,7 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
 
 @pytest.fixture
 def sick(tmp_path: Path) -> Path:
-    """While this file is there, checks fail."""
+    """The file whose presence makes health checks fail."""
     return tmp_path / "sick"
 
 
@@ -48,7 +48,7 @@ def checked(
 ) -> Container:
     """A container with a health check, as the hook's process leaves it for the sidecar, once it is in that state.
 
-    `more` is what the check has besides.
+    `more`: further fields of the check.
     """
     made = sidecar.protected(name, NAP, labels)
     health = sidecar.run_dir / "health"
@@ -66,7 +66,7 @@ def checked(
 
 
 def unhealthy(sidecar: LocalSidecar) -> int:
-    """How often somebody was rolled back because of a health check."""
+    """How many times a container was rolled back because of its health check."""
     lines = sidecar.avckpt("events", "--json").stdout.splitlines()
     return sum(event.get("reason") == "unhealthy" and event["kind"] == "restored" for event in map(json.loads, lines))
 
@@ -140,7 +140,7 @@ def test_a_new_configuration_begins_and_ends_checks(sidecar: LocalSidecar, sick:
 
 
 def test_a_check_works_with_many_descriptors(sidecar: LocalSidecar, sick: Path) -> None:
-    """select(2) ends at 1023: sixty containers or so."""
+    """select(2) is limited to descriptors below 1024, which some sixty containers use up."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     sidecar.start()

@@ -34,7 +34,7 @@ def name(podman: Podman) -> Iterator[str]:
 
 
 def first_process(podman: Podman, name: str, image: str) -> str:
-    """What runs first in a protected container; limits are given, for a file of ours knows none that suit."""
+    """Command line of process 1 of a protected container; limits are given, since no configuration here sets any."""
     limits = ["--ulimit", f"nofile={os.sysconf('SC_OPEN_MAX')}", "--ulimit", "nproc=1024"]
     return podman.run(
         *("run", "--pull=never", "--name", name, "--network=none", "--label", "avckpt.enable=true", *limits),
@@ -60,7 +60,7 @@ def test_a_service_that_runs_already_calls_no_hooks(
 
     @contextlib.contextmanager
     def running_service() -> Iterator[str]:
-        """Yields how its problem begins, if it has one."""
+        """Runs Podman's API service; yields the beginning of its error, if it has one."""
         service = subprocess.Popen([*podman.command, "system", "service", "--time", "0", f"unix://{path}"])
         try:
             wait_until(path.exists, 10, "Podman's service")

@@ -42,7 +42,7 @@ SHOW_PID_1 = "tr '\\0' ' ' </proc/1/cmdline; echo"
 
 @pytest.fixture
 def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where these hooks meet their sidecar."""
+    """The run directory that these hooks share with their sidecar."""
     monkeypatch.setenv("AVCKPT_RUN_DIR", str(tmp_path / "run"))
     (tmp_path / "run").mkdir()
     return tmp_path / "run"
@@ -50,7 +50,7 @@ def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def hooks_dir(tmp_path: Path, run_dir: Path) -> Path:
-    """The project's hook JSON, for the hooks of this checkout."""
+    """The project's hook JSON, pointing to the hooks of this checkout."""
     if not (ROOT / "native" / "build" / "avckpt-init").exists():
         pytest.fail("avckpt-init is not built: run make -C native")
     folder = tmp_path / "oci-hooks.d"
@@ -65,7 +65,7 @@ def hooks_dir(tmp_path: Path, run_dir: Path) -> Path:
 
 @pytest.fixture
 def hooked(podman: Podman, hooks_dir: Path) -> Podman:
-    """Podman with these hooks, and no others."""
+    """Podman with these hooks and no others."""
     return Podman("--hooks-dir", str(hooks_dir))
 
 
@@ -78,14 +78,14 @@ def make(hooked: Podman, base_image: str) -> Iterator[ContainerFactory]:
 
 @pytest.fixture
 def name(podman: Podman) -> Iterator[str]:
-    """For a container that the test runs in the foreground."""
+    """The name of a container that the test runs in the foreground."""
     chosen = f"avckpt-hooks-{os.getpid()}-front"
     yield chosen
     podman.remove(chosen)
 
 
 class Receiver:
-    """Answers hooks as a sidecar would, and keeps what they said."""
+    """Answers hooks as a sidecar would, and records their requests."""
 
     def __init__(self) -> None:
         self.registered: list[protocol.Register] = []
@@ -220,7 +220,7 @@ def test_what_must_be_process_1_is_left_alone(
 
 
 def test_output_for_the_log_goes_to_process_2(hooked: Podman, receiver: Receiver, base_image: str, name: str) -> None:
-    """As cron images have it: process 1 is no longer the application, and not to be written to."""
+    """Cron images write to /proc/1/fd/1; under avckpt-init process 1 is not the application."""
     command = "for n in 1 2; do (echo by way of $n >>/proc/$n/fd/1) 2>/dev/null; done; cat /proc/1/comm"
     options = ["--label", "avckpt.enable=true", "--network=none"]
     _, out, _ = foreground(hooked, name, *options, image=base_image, command=command)
@@ -419,7 +419,7 @@ def test_a_stuck_sidecar_does_not_keep_a_container_from_running(
 def test_a_broken_hook_does_not_keep_a_container_from_running(
     podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, name: str
 ) -> None:
-    """An installation that lost a file, as after an upgrade that broke off."""
+    """An installation with a missing file, as after an interrupted upgrade."""
     broken = tmp_path / "libexec"
     shutil.copytree(ROOT / "hooks", broken, symlinks=True)
     (broken / "avckpt_hooks" / "shared" / "labels.py").unlink()
@@ -440,7 +440,7 @@ def test_a_broken_hook_does_not_keep_a_container_from_running(
 def test_a_slow_machine_does_not_keep_a_container_from_running(
     *, podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, name: str, stage: str, seconds: int
 ) -> None:
-    """A runtime that kills a hook for being late does not start the container."""
+    """A runtime that kills a hook for its timeout does not start the container, so hooks give up earlier."""
     slow = tmp_path / "libexec"
     shutil.copytree(ROOT / "hooks", slow, symlinks=True)
     shutil.copy(ROOT / "native" / "build" / "avckpt-init", slow)
@@ -460,7 +460,7 @@ def test_a_slow_machine_does_not_keep_a_container_from_running(
 
 
 def test_uninstalled_while_a_container_runs(machine: None, podman: Podman, name: str) -> None:
-    """It ends as it was to end, in order, and only then the last of the hooks is gone."""
+    """The container still ends in an orderly way; the last hook is removed only after that."""
     factory = ContainerFactory(podman, name)
     with hooks_installed(), contextlib.ExitStack() as undo:
         undo.callback(run, [*avckpt_command(), "install"])  # others may count on them
@@ -482,7 +482,7 @@ def test_uninstalled_while_a_container_runs(machine: None, podman: Podman, name:
 def test_hooks_that_go_away_do_not_keep_a_container_from_ending(
     podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, run_dir: Path
 ) -> None:
-    """Somebody has removed them by hand."""
+    """The hooks were deleted by hand while the container ran."""
     libexec = tmp_path / "libexec"
     shutil.copytree(ROOT / "hooks", libexec, symlinks=True)
     shutil.copy(ROOT / "native" / "build" / "avckpt-init", libexec)

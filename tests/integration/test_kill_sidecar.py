@@ -22,7 +22,7 @@ pytestmark = pytest.mark.shared_machine(
 
 @pytest.mark.slow
 def test_killed_and_started_again(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """Five times, under checkpoints as fast as they come."""
+    """Five times, while checkpoints are taken as fast as possible."""
     rng = random.Random(5)
     labels = {**QUICK, "interval": "10ms"}
     folders = [tmp_path / str(n) for n in range(2)]
@@ -69,7 +69,7 @@ def test_an_adopted_container_is_protected_within_an_interval(
 def test_a_crash_while_the_sidecar_is_dead_is_as_without_avckpt(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    """At once, with the application's own status."""
+    """The container ends at once, with the application's own status."""
     victim = start_victim(sidecar, container, tmp_path, "crash")
     app = victim.app
     sidecar.kill()
@@ -82,7 +82,7 @@ def test_a_crash_while_the_sidecar_is_dead_is_as_without_avckpt(
 def test_podmans_restart_policy_while_the_sidecar_is_dead(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    """Podman starts it again, unprotected; a sidecar that comes later adopts it."""
+    """Podman restarts the container unprotected; a sidecar that is started later adopts it."""
     victim = start_victim(sidecar, container, tmp_path, "crash", options=["--restart=on-failure"])
     app = victim.app
     sidecar.kill()
@@ -96,7 +96,7 @@ def test_podmans_restart_policy_while_the_sidecar_is_dead(
 
 
 def test_killed_with_its_application(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """Both at the same moment: the container ends, and does not hang."""
+    """Sidecar and application are killed at the same moment: the container ends and does not hang."""
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
     daemon = sidecar.podman.inspect(SIDECAR_NAME)["State"]["Pid"]
     app = victim.app
@@ -112,7 +112,7 @@ def test_killed_with_its_application(sidecar: Sidecar, container: ContainerFacto
 
 
 def test_stopped_in_good_order(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """`podman stop` of the sidecar: containers run on unprotected, with nothing of ours in them."""
+    """`podman stop` of the sidecar: containers run on unprotected, and nothing of avckpt is left in them."""
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
     app = victim.app
     sidecar.stop()

@@ -35,7 +35,7 @@ def comm_of(pid: int) -> str:
 
 @pytest.fixture
 def group() -> Iterator[Path]:
-    """Without a limit; whoever is in it has ended by the end of the test."""
+    """A memory cgroup without a limit; its processes have ended by the end of the test."""
     made = make_group()
     yield made
     remove_group(made)
@@ -83,7 +83,7 @@ def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_pa
 def test_who_shares_memory_with_others_keeps_its_newest_generation(
     local: LocalSidecar, group: Path, tmp_path: Path, rate: int
 ) -> None:
-    """A group above the container's, or the host, is full before the container is: templates are no first victims."""
+    """A parent cgroup, or the host, is full before the container is: templates must not be the first victims."""
     subprocess.run(["make", "-s", "-C", str(VICTIMS.parent)], check=True)
     knob = "memory.limit_in_bytes" if (group / "memory.limit_in_bytes").exists() else "memory.max"
     if knob == "memory.max":

@@ -44,7 +44,7 @@ Json = dict[str, Any]
 
 @pytest.fixture
 def start(local: LocalSidecar, tmp_path: Path) -> Iterator[Any]:
-    """Starts `avckpt-init ARGS`, its output in a file; everything is killed afterwards."""
+    """Starts `avckpt-init ARGS` with its output in a file; everything is killed at the end."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(*args: str, preexec: Any = os.setsid, **env: str) -> subprocess.Popen[bytes]:
@@ -70,7 +70,7 @@ def start(local: LocalSidecar, tmp_path: Path) -> Iterator[Any]:
 
 
 def row(local: LocalSidecar, name: str, **wanted: Any) -> Json:
-    """What `avckpt ps` says of a unit, when it says this."""
+    """A unit's row of `avckpt ps`, once it is in that state."""
     last: list[Json] = []
 
     def found() -> Json:
@@ -246,7 +246,7 @@ wait
 
 
 def test_a_shell_launcher_without_podman(tmp_path: Path) -> None:
-    """`avckpt run`: a node's death is undone, the launcher hears nothing of it, and can stop its nodes."""
+    """`avckpt run`: a node's death is undone without the launcher seeing it, and the launcher can stop its nodes."""
     with (tmp_path / "out").open("wb") as out, (tmp_path / "err").open("wb") as err:
         options = ("-v", "--label", "avckpt.scope=nodes", *QUICK)
         launched = subprocess.Popen(
@@ -299,7 +299,7 @@ def test_a_shell_launcher_without_podman(tmp_path: Path) -> None:
 
 
 def test_a_job_of_a_shell_stops_and_continues(local: LocalSidecar, tmp_path: Path) -> None:
-    """The keys of a terminal reach a unit's program as without: once."""
+    """A key pressed on the terminal reaches a unit's program exactly once, as without avckpt."""
     (tmp_path / "job.py").write_text(
         "import signal, sys, time\n"
         "signal.signal(signal.SIGINT, lambda *_: print('int', flush=True))\n"

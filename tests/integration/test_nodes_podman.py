@@ -50,7 +50,7 @@ def node(tmp_path: Path) -> Path:
 def wait_nodes(
     sidecar: Sidecar, container: Container, count: int, timeout_s: float = 60.0
 ) -> dict[str, dict[str, Any]]:
-    """Waits until so many nodes are protected, with two generations."""
+    """Waits until that many nodes are protected, with two generations each."""
 
     def found() -> dict[str, dict[str, Any]]:
         known = nodes_of(sidecar, container)
@@ -117,7 +117,7 @@ def test_a_restarted_sidecar_knows_them_again(container: ContainerFactory, sidec
 
 
 def test_what_a_container_may_not_do(container: ContainerFactory, sidecar: Sidecar, podman: Podman) -> None:
-    """It may register processes of its own only, and as a container without the label none at all."""
+    """It may register only processes of its own, and none at all without the label."""
     script = "/run/avckpt-init --label avckpt.keep=3 -- sleep 3; echo status $?"
     for labels, options, says in (
         ({"scope": "container"}, (), "there is no avckpt here"),

@@ -38,7 +38,7 @@ pytestmark = [
 
 
 def listener(local: LocalSidecar, name: str, labels: dict[str, str]) -> Container:
-    """Protected only once it listens: what is restored should, too."""
+    """A program that is protected only once it listens, so that a restored one listens, too."""
     container = local.container(name, LISTENER)
     wait_until(lambda: "READY" in container.output.read_text(), 10, f"{name} listens")
     assert container.hook("prestart", labels) == ""
@@ -117,7 +117,7 @@ def test_a_signal_that_would_end_the_application_is_not_sent(local: LocalSidecar
 
 
 def test_a_blocked_signal_waits_for_who_takes_it(local: LocalSidecar) -> None:
-    """sigwait(3), signalfd(2): the signal has its default action, but does not end the program."""
+    """sigwait(3), signalfd(2): the signal's action is the default, yet it does not end the program."""
     program = (
         "import signal\nsignal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})\n"
         "while True: signal.sigwait({signal.SIGUSR1}); print('USR1', flush=True)"
@@ -173,7 +173,7 @@ def test_a_command_that_fails_is_told(local: LocalSidecar, command: str, why: st
 
 
 def test_an_environment_without_an_end(local: LocalSidecar) -> None:
-    """A process says itself where its environment is; one without avckpt-init is the application."""
+    """A process chooses where its environment lies; without avckpt-init the main process is the application itself."""
     odd = local.container("odd", [sys.executable, "-m", "testkit.odd_environ", "300"], init=False)
     wait_until(lambda: "set" in odd.output.read_text(), 10, "it has such an environment")
     assert odd.hook("prestart", {"avckpt.group": "chain", "avckpt.notify": "exec:true"}) == ""
@@ -189,7 +189,7 @@ def test_an_environment_without_an_end(local: LocalSidecar) -> None:
 
 
 def high_water_kb(status: Path) -> int:
-    """The most memory a process ever had."""
+    """The peak resident size of a process."""
     return int(status.read_text().partition("VmHWM:")[2].split()[0])
 
 
@@ -233,7 +233,7 @@ def _is_left(process: Path) -> bool:
 
 
 def test_a_queue_has_an_end(local: LocalSidecar) -> None:
-    """Crashes come quicker than a command is given up; by the API, for the command line takes its time."""
+    """Crashes come faster than commands time out; by the API, since the command line is too slow."""
     protected(local, "stuck", {**IN_GROUP, "avckpt.notify": "exec:sleep 1000"})
     web = protected(local, "web", {**IN_GROUP, "avckpt.restore.max": "60/1s"})
     client = Client(local.run_dir)

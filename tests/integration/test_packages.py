@@ -26,7 +26,7 @@ long = pytest.mark.skipif(os.environ.get("AVCKPT_LONG") != "1", reason="takes mi
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, unpacked as pip does; what it depends on is that of the tests' own environment."""
+    """The wheel, unpacked as pip does it; its dependencies are those of the test environment."""
     folder = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
     subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(folder), "."], cwd=ROOT, check=True)
@@ -36,7 +36,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def installed(site: Path, *args: str, code: str = "from avckpt.cli import main; main()") -> str:
-    """`avckpt ARGS`, as the wheel has it, far from any checkout."""
+    """Runs `avckpt ARGS` from the wheel, outside of any checkout."""
     env = {**os.environ, "PYTHONPATH": str(site)}
     done = subprocess.run(
         [sys.executable, "-c", code, *args], cwd="/", env=env, capture_output=True, text=True, check=False
@@ -61,7 +61,7 @@ def test_what_is_installed_comes_from_the_wheel(site: Path, tmp_path: Path) -> N
 
 
 def test_the_image_is_built_from_what_is_installed(site: Path, tmp_path: Path) -> None:
-    """As far as a context for `podman build`: there the same build runs."""
+    """Up to the context for `podman build`, which the checkout's build shares."""
     code = "import sys, pathlib\nfrom avckpt.cli import sidecar_image\nsidecar_image._fill(pathlib.Path(sys.argv[1]))"
     installed(site, str(tmp_path), code=code)
     assert "aiohttp>=" in (tmp_path / "requirements.txt").read_text()

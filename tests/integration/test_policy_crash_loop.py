@@ -20,7 +20,7 @@ pytestmark = pytest.mark.shared_machine(
 
 @pytest.fixture
 def poison(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Any:
-    """A victim that crashes so many ms after SIGUSR1, and as long after every restore of what came of that."""
+    """A victim that crashes that many ms after SIGUSR1, and again as long after each restore of a state since."""
 
     def start(fuse_ms: int, labels: dict[str, str], *options: str, generation: int = 0) -> ProtectedVictim:
         return start_victim(

@@ -148,7 +148,7 @@ def test_one_generation_is_too_few(sidecar: Sidecar, container: ContainerFactory
 
 
 def test_the_check_is_known_whatever_the_labels_say(sidecar: Sidecar, container: ContainerFactory) -> None:
-    """The sidecar's configuration may ask for it, now or later."""
+    """The sidecar's configuration may turn health checks on, now or later."""
     made = container.protected("sleep", "60", options=check("exit 3"))
     path = RUN_DIR / "health" / f"{made.id}.json"
     wait_until(path.exists, 20, "the health check is known")

@@ -112,7 +112,7 @@ def test_what_goes_on_in_the_background_is_not_waited_for(
 
 
 def test_nothing_of_ours_can_be_written_to_in_there(container: ContainerFactory) -> None:
-    """Who enters a container can be reached there as /proc/PID/exe: that must not be the host's file."""
+    """A process that enters a container is reachable there as /proc/PID/exe, which must not be the host's file."""
     made = container("sleep", "1000")
     pidfd = os.pidfd_open(made.pid)
 
@@ -139,7 +139,7 @@ def test_nothing_of_ours_can_be_written_to_in_there(container: ContainerFactory)
 
 
 def test_a_container_can_hold_only_what_has_no_privileges(container: ContainerFactory, podman: Podman) -> None:
-    """Its quota of CPU time, and more so its freezer, must not meet the host's root in its PID namespace."""
+    """A container's CPU quota and freezer must not stop a process of the host's root in its PID namespace."""
     options = ["--user", "1000:1000", "--cap-drop", "all", "--security-opt", "seccomp=unconfined"]
     made = container("sleep", "1000", options=[*options, "--network", "none"])
     pidfd = os.pidfd_open(made.pid)
@@ -174,7 +174,7 @@ def test_a_container_can_hold_only_what_has_no_privileges(container: ContainerFa
 
 
 def test_nothing_of_the_sidecars_is_in_reach(container: ContainerFactory, tmp_path: Path) -> None:
-    """A container with CAP_SYS_PTRACE takes over what comes into its PID namespace, as soon as it is there."""
+    """A container with CAP_SYS_PTRACE attaches to every process that enters its PID namespace, at once."""
     options = ["--cap-drop", "all", "--cap-add", "SYS_PTRACE", "--security-opt", "seccomp=unconfined"]
     victims = ROOT / "tests/victims"
     subprocess.run(["make", "-s", "-C", str(victims), "STATIC=1", "build-static/intruder"], check=True)
@@ -204,7 +204,7 @@ def test_nothing_of_the_sidecars_is_in_reach(container: ContainerFactory, tmp_pa
 def test_a_directory_that_its_user_may_not_enter(
     container: ContainerFactory, inside: Callable[[Container], Run]
 ) -> None:
-    """The runtime has put the main process there as root."""
+    """The runtime entered the working directory as root before it changed the user."""
     made = container("sleep", "1000", options=["--user", "1000:1000", "--workdir", "/root"])
     done = inside(made)("pwd")
     assert (done.status, done.output) == (0, "/")

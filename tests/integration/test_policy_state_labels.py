@@ -75,7 +75,7 @@ def connected(port: int) -> Iterator[Client]:
 
 
 def start(factory: ContainerFactory, port: int, *options: str, **labels: str) -> Container:
-    """A keeper whose checkpoints are taken on command."""
+    """Starts a keeper whose checkpoints are taken on command."""
     return factory.protected(
         *("python3", "-c", KEEPER, str(port)),
         labels={"interval": "1h", "restore.max": "60/60s", **labels},
@@ -145,7 +145,7 @@ def test_strict(sidecar: Sidecar, container: ContainerFactory, written: bool) ->
     os.kill(sidecar.app_pid(keeper), signal.SIGKILL)
 
     def look() -> int | None:
-        """When the one that answers was started; None while there is only a dying one."""
+        """When the process that answers was started; None while only a dying one is there."""
         try:
             with connected(port) as again:
                 return again.ask("look")[2]

@@ -42,7 +42,7 @@ def running(*command: str | Path, env: dict[str, str] | None = None) -> Iterator
 
 
 def configured(folder: Path, web_port: int) -> Path:
-    """The example as a user has it, but for what is this machine's: port, token's place, a pace for a test."""
+    """The shipped configuration, with this machine's port and token file, and a shorter scrape interval."""
     config = yaml.safe_load((EXAMPLES / "prometheus.yaml").read_text())
     (job,) = config["scrape_configs"]
     job["authorization"]["credentials_file"] = str(folder / "token")

@@ -29,7 +29,7 @@ OPTIONS = {
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
 def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, options: list[str]) -> None:
-    """SIGKILL, a real SIGSEGV, abort(), exit(3): to Podman and everybody inside nothing has happened."""
+    """SIGKILL, a real SIGSEGV, abort(), exit(3): neither Podman nor a process inside sees a difference."""
     # Only when asked for: one that is taken when the signal has just come is an application that crashes at once.
     labels = {**QUICK, "interval": "1h"}
     victim = start_victim(sidecar, container, tmp_path, "crash", labels=labels, options=options, generation=0)
@@ -69,7 +69,7 @@ def test_threads_of_an_unprivileged_user(sidecar: Sidecar, container: ContainerF
 
 
 def test_pause_and_unpause(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """A frozen container is left alone, and protected again afterwards."""
+    """A paused container is left alone, and protected again when it is unpaused."""
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
     made = victim.container
     for _ in range(3):
@@ -86,7 +86,7 @@ def test_pause_and_unpause(sidecar: Sidecar, container: ContainerFactory, tmp_pa
 
 
 def test_killed_while_paused(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """It can only die once it is unpaused, and is restored then."""
+    """It dies when it is unpaused, and is restored then."""
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")
     made = victim.container
     app = victim.app
@@ -127,7 +127,7 @@ def test_nothing_is_left_of_a_removed_container(sidecar: Sidecar, container: Con
 def test_restart_policy_before_the_first_checkpoint(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    """Nothing to restore from: Podman does what it always did."""
+    """There is nothing to restore: Podman's restart policy applies as without avckpt."""
     victim = start_victim(
         sidecar, container, tmp_path, "crash", labels={"interval": "1m"}, options=["--restart=on-failure"], generation=0
     )

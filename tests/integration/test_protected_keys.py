@@ -26,7 +26,7 @@ GOES_ON = ENDS.replace("(time.sleep(0.5), sys.exit(1))", "print('not now', flush
 
 
 def press(made: Container) -> None:
-    """As somebody at `podman attach`, with a terminal of his own."""
+    """Presses a key in `podman attach` on a terminal of its own."""
     master, slave = os.openpty()
     attached = subprocess.Popen(
         ["podman", "attach", made.name], stdin=slave, stdout=slave, stderr=slave, start_new_session=True

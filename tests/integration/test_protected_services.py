@@ -53,7 +53,7 @@ asyncio.run(main())
 
 
 class Peer:
-    """A client with one connection, which it never makes again."""
+    """A client that keeps one connection and never makes another."""
 
     def __init__(self, host: str, port: int) -> None:
         connected = wait_until(lambda: connect(host, port), 15, f"{host}:{port} answers")
@@ -76,7 +76,7 @@ class Peer:
         return self.line()
 
     def redis(self, *words: str) -> bytes:
-        """A command in Redis' own protocol; the answer, for a bulk string its text."""
+        """Sends a command in Redis' protocol; the answer, for a bulk string its text."""
         self.socket.sendall(b"*%d\r\n" % len(words) + b"".join(b"$%d\r\n%s\r\n" % (len(w), w.encode()) for w in words))
         first = self.line()
         return self.line() if first[:1] == b"$" and first != b"$-1" else first
@@ -97,7 +97,7 @@ def ticks(made: Container) -> list[int]:
 
 @pytest.mark.parametrize("network", ["bridge", "host"])
 def test_an_asyncio_server_keeps_its_connection(sidecar: Sidecar, container: ContainerFactory, network: str) -> None:
-    """CPython with threads and an event loop: one connection for all of its lives, and a log that goes on."""
+    """CPython with threads and an event loop: one connection across all restores, and a log that goes on."""
     made = container.protected(
         "python3",
         *("-c", ASYNCIO_SERVER),
@@ -127,7 +127,7 @@ def test_an_asyncio_server_keeps_its_connection(sidecar: Sidecar, container: Con
 
 
 def test_redis_keeps_its_client_and_its_data(sidecar: Sidecar, container: ContainerFactory) -> None:
-    """Everything set before the checkpoint is there; what was set after it is not."""
+    """Keys set before the checkpoint are there; keys set after it are not."""
     made = container.protected(
         "redis-server",
         *("--save", "", "--appendonly", "no", "--protected-mode", "no", "--bind", "0.0.0.0"),
@@ -154,7 +154,7 @@ def test_redis_keeps_its_client_and_its_data(sidecar: Sidecar, container: Contai
 
 
 def test_an_exec_session_survives(sidecar: Sidecar, container: ContainerFactory) -> None:
-    """Another process of the same container: no part of the application, and not touched by its death."""
+    """A `podman exec` process is no part of the application, and is not affected by its death."""
     made = container.protected("sleep", "1000", labels={"interval": "100ms"})
     sidecar.wait_generation(made, 2)
     with subprocess.Popen(
@@ -179,7 +179,7 @@ def test_an_exec_session_survives(sidecar: Sidecar, container: ContainerFactory)
 
 
 def test_a_peer_sees_the_end_of_a_removed_container(sidecar: Sidecar, container: ContainerFactory) -> None:
-    """No template keeps its connections open."""
+    """No template keeps the container's connections open."""
     made = container.protected(
         "python3", "-c", ASYNCIO_SERVER, labels={"interval": "100ms"}, options=["--network=host"]
     )

@@ -21,7 +21,7 @@ STOP_S = min(3.0 * SLOWNESS, 15.0)
 
 
 def stop(made: Container) -> float:
-    """`podman stop`; how long it took, in seconds."""
+    """Runs `podman stop`; how long it took, in seconds."""
     return made.stop(timeout_s=20).took_s
 
 
@@ -43,7 +43,7 @@ def test_stopped_after_a_restore(sidecar: Sidecar, container: ContainerFactory) 
 
 
 def test_an_application_may_take_its_time_to_end(sidecar: Sidecar, container: ContainerFactory) -> None:
-    """It ends in its own way, and is not taken back by a restore."""
+    """It shuts down in its own time, and is not restored in the middle of that."""
     script = (
         "import signal, sys, time\n"
         "def end(*_):\n"
@@ -78,7 +78,7 @@ def test_stopped_when_there_never_was_a_sidecar(sidecar: Sidecar, container: Con
 
 
 def test_stopped_while_the_sidecar_is_stopped(sidecar: Sidecar, container: ContainerFactory) -> None:
-    """What stops the sidecar's process (SIGSTOP, a debugger) stops no guard: the container ends as it should."""
+    """Stopping the sidecar's process (SIGSTOP, a debugger) does not stop guards: the container ends as it should."""
     made = container.protected("sleep", "1000", labels=QUICK)
     sidecar.wait_generation(made, 2)
     (daemon,) = children_of(sidecar.podman.inspect(SIDECAR_NAME)["State"]["Pid"])

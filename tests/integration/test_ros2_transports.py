@@ -56,7 +56,7 @@ class Spawned:
         return self.stderr.read_text()
 
     def app(self) -> int:
-        """The program below `avckpt run`, once it is there and no other is."""
+        """The PID of the program below `avckpt run`, once it is the only one."""
 
         def look() -> int:
             # The engine's probe has children, too, but in our own namespace; init's application is number 2 in its own.
@@ -111,14 +111,14 @@ class Heard:
         return [record[1] for record in RECORD.iter_unpack(data[: len(data) // RECORD.size * RECORD.size])]
 
     def wait_more(self, n: int) -> list[int]:
-        """Waits for n more messages; those that came."""
+        """Waits for n more messages and returns them."""
         before = len(self.counts())
         wait_until(lambda: len(self.counts()) >= before + n, 60, f"{n} more messages are heard")
         return self.counts()[before:]
 
 
 def pair(spawn: Spawn, folder: Path, remedy: str) -> tuple[Spawned, Heard]:
-    """A protected node and its peer, that hear each other; with a checkpoint since they do."""
+    """A protected node and its peer, connected to each other, with a checkpoint taken since."""
     run(["make", "-s", "-C", str(EXAMPLES), f"BUILD={folder}"], timeout_s=100)
     program = str(folder / "dds_node")
     protect = (*avckpt_command(), "run", "-v", "--label", "avckpt.interval=2s", "--label", "avckpt.restore.max=60/60s")

@@ -45,7 +45,7 @@ def avckpt_run(*args: str, stdin: str | None = None, wrapper: tuple[str, ...] = 
 
 @dataclass
 class Running:
-    """An `avckpt run` under way, its standard error in a file."""
+    """A running `avckpt run`, with its standard error in a file."""
 
     process: subprocess.Popen[bytes]
     stderr: Path
@@ -57,7 +57,7 @@ class Running:
 
     @property
     def init(self) -> int:
-        """PID of what is, or is about to become, avckpt-init; waits until it is there."""
+        """PID of avckpt-init, or of the process that is about to execute it; waits until it is there."""
         return wait_until(self._init, 10, "init is there", every_s=0.001)
 
     def _init(self) -> int:
@@ -79,7 +79,7 @@ class Running:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[object]:
-    """Starts `avckpt run ARGS`, output into the file `out`; everything is killed afterwards."""
+    """Starts `avckpt run ARGS`, output into the file `out`; everything is killed at the end."""
     started: list[Running] = []
 
     def start(*args: str) -> Running:
@@ -132,7 +132,7 @@ def test_it_lives_in_a_pid_namespace_with_its_own_proc() -> None:
 
 
 def test_its_mounts_are_its_own() -> None:
-    """Also where mounts are shared, as systemd makes them."""
+    """Also where mount propagation is shared, as systemd sets it up."""
     shared = ("unshare", "--mount", "--propagation", "shared", "sh", "-c", '"$@" && cat /proc/1/comm', "sh")
     done = avckpt_run("--", "cat", "/proc/1/comm", wrapper=shared)
     assert done.stdout.splitlines() == ["avckpt-init", Path("/proc/1/comm").read_text().strip()]
@@ -195,7 +195,7 @@ def test_signals_reach_the_program(signum: int, start, tmp_path: Path) -> None: 
 
 
 def test_a_signal_that_comes_very_early_is_not_lost(start) -> None:  # type: ignore[no-untyped-def]
-    """The kernel drops what is sent to a PID 1 that is not ready: it must have been kept for it."""
+    """The kernel drops signals to a PID 1 that has no handler yet: avckpt must keep it until then."""
     for _ in range(5):
         running = start("--", "sleep", "60")
         assert running.init
@@ -237,7 +237,7 @@ def test_quiet_but_for_deaths_and_restores(start) -> None:  # type: ignore[no-un
 
 @pytest.mark.parametrize("restored", [False, True], ids=["as-started", "restored"])
 def test_a_killed_avckpt_ends_the_program(restored: bool, start) -> None:  # type: ignore[no-untyped-def]
-    """Nobody who looks for it by its parent or its job would find it; what it did meanwhile would go unseen."""
+    """Otherwise it would run on unnoticed, with neither parent nor job by which to find it."""
     running = start("-v", "--label", "avckpt.interval=100ms", "--", sys.executable, "-c", COUNTER)
     running.wait_for("protected: first checkpoint")
     if restored:

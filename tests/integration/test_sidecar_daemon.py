@@ -77,7 +77,7 @@ def test_a_killed_application_comes_back_under_its_pid(local: LocalSidecar) -> N
 
 
 def checkpoint(local: LocalSidecar, *args: str) -> str:
-    """Takes one; a busy machine may miss the freeze deadline, and says so."""
+    """Takes a checkpoint; on a busy machine a freeze may be missed, and is tried again."""
     deadline = time.monotonic() + 20
     while True:
         done = local.avckpt("checkpoint", *args, check=False)
@@ -162,7 +162,7 @@ def test_labels_that_a_sidecar_can_not_honour_are_refused(local: LocalSidecar) -
 
 
 def test_what_is_no_avckpt_init_is_waited_for_and_left_alone(local: LocalSidecar) -> None:
-    """A container that was created but not started looks so, too."""
+    """A container that was created but not started looks the same."""
     web = local.container("web", SLEEPER)
     web.init_pid = web.app_pid  # the hook is told of a plain program
     assert web.hook("prestart", QUICK) == ""
@@ -190,7 +190,7 @@ def test_what_can_not_be_protected_runs_unprotected_and_says_so(local: LocalSide
 def test_a_program_that_executes_another_is_unprotected_until_the_next_checkpoint(
     local: LocalSidecar, tmp_path: Path
 ) -> None:
-    """An entry point that takes its time, say."""
+    """For example an entry point that takes some time before it executes the program."""
     go = tmp_path / "go"
     os.mkfifo(go)
     web = local.protected("web", ["sh", "-c", f"read line < {go}; exec sleep 1000"], ON_COMMAND)
@@ -224,7 +224,7 @@ open(sys.argv[1], "w").close()
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local: LocalSidecar, tmp_path: Path) -> None:
-    """There are more threads than there was room for, and then they cannot be stopped (`podman pause`)."""
+    """There are more threads than there was room for, and the application cannot be stopped (`podman pause`)."""
     there = tmp_path / "there"
     web = local.protected("web", [sys.executable, "-c", MANY, str(there)], ON_COMMAND)
     wait_until(there.exists, 10, "it is ready")
@@ -284,7 +284,7 @@ def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:
 
 
 def missed(local: LocalSidecar, name: str, labels: dict[str, str]) -> Container:
-    """A container whose hook does not reach the sidecar (too many at a time, say), but leaves its record."""
+    """A container whose hook did not reach the sidecar (too many at a time, say) but left its record."""
     made = local.container(name, SLEEPER)
     socket = local.run_dir / "hooks.sock"
     socket.rename(f"{socket}.away")
@@ -304,7 +304,7 @@ def test_a_container_whose_hook_got_no_answer_is_adopted(local: LocalSidecar) ->
 
 @contextlib.contextmanager
 def descriptors_left(local: LocalSidecar, count: int) -> Iterator[None]:
-    """The sidecar can open `count` files more, as long as the block runs; nobody is to talk to it for long."""
+    """Leaves the sidecar `count` free descriptors for the length of the block."""
     assert local.process is not None
     pid = local.process.pid
     limits = resource.prlimit(pid, resource.RLIMIT_NOFILE)
@@ -340,7 +340,7 @@ def test_a_guard_for_which_there_are_no_descriptors_is_started_later(local: Loca
 
 
 def test_a_guard_that_could_not_begin_is_started_anew(local: LocalSidecar) -> None:
-    """Its thread makes a timer, which takes room in the queue of signals."""
+    """Its timer takes a place in the queue of pending signals, of which none is left."""
     assert local.process is not None
     limits = resource.prlimit(local.process.pid, resource.RLIMIT_SIGPENDING)
     resource.prlimit(local.process.pid, resource.RLIMIT_SIGPENDING, (0, limits[1]))
@@ -476,7 +476,7 @@ def test_crashes_are_restored_while_the_event_loop_hangs(local: LocalSidecar) ->
 
 @contextlib.contextmanager
 def stopped_thread(tid: int) -> Iterator[None]:
-    """One thread stands still, the others of its process go on: by ptrace(2)."""
+    """Stops one thread by ptrace(2) while the others of its process run."""
     libc = ctypes.CDLL(None, use_errno=True)
     seize, interrupt, detach = 0x4206, 0x4207, 17
     arguments = (ctypes.c_long(tid), ctypes.c_void_p(), ctypes.c_void_p())
@@ -518,7 +518,7 @@ def test_sockets_are_for_root_only(local: LocalSidecar) -> None:
 
 
 def test_an_idle_sidecar_sleeps(local: LocalSidecar) -> None:
-    """At most a handful of wake-ups: a periodic task would show."""
+    """At most a handful of wake-ups: a periodic task would be visible."""
     assert local.process is not None
     path = Path(f"/proc/{local.process.pid}/status")
 
@@ -555,7 +555,7 @@ def test_who_does_not_ask_for_memory_does_not_have_it_looked_at(local: LocalSide
 
 
 def test_the_table_on_a_narrow_terminal(local: LocalSidecar) -> None:
-    """Nothing of it is cut off; the states have colours."""
+    """Nothing is cut off, and states have colours."""
     local.wait_for(local.protected("web", SLEEPER), state="protected", generations=2)
     ours, terminal = os.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 60, 0, 0))

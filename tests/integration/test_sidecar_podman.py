@@ -34,7 +34,7 @@ def numbers(container: Container) -> list[int]:
 
 
 def check_evidence(sidecar: Sidecar, web: Container) -> None:
-    """A kill and a SIGSEGV from here: who did it, where it was, and what a debugger can see."""
+    """After a kill and a SIGSEGV: who sent it, where it happened, and what a debugger can see."""
     wait_until(lambda: len(told(sidecar, web, "core")) == 2, 20, "two core files are told of", every_s=0.2)
     crashes = [event["crash"] for event in told(sidecar, web, "crash")]
     assert [crash["signal"] for crash in crashes] == ["SIGKILL", "SIGSEGV"]

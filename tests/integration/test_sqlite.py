@@ -26,13 +26,13 @@ KILLS = 8
 
 @pytest.fixture
 def observer() -> Iterator[Observer]:
-    """Who is told of what was committed."""
+    """A process outside that is told of each commit."""
     with Observer() as made:
         yield made
 
 
 def transact(bank: Bank, token: str) -> None:
-    """One transaction from begin to end."""
+    """One whole transaction."""
     begin(bank, token)
     end(bank)
 
@@ -97,9 +97,9 @@ def test_strict_sees_a_database_that_is_opened_for_each_transaction(
 def test_rewind_loses_transactions(
     journal: str, sidecar: Sidecar, container: ContainerFactory, observer: Observer, tmp_path: Path
 ) -> None:
-    """Why there is `strict`: the end of an old transaction is written over newer ones.
+    """Why `strict` exists: a restored process overwrites newer transactions with the end of an old one.
 
-    (With a journal that is deleted, the one that it had open is gone: that often ends in an I/O error instead.)
+    (With a journal that is deleted, its open one is gone, which often ends in an I/O error instead.)
     """
     bank = Bank(container, observer, tmp_path, "rewind", ["--journal", journal], interval="1h")
     transact(bank, "first")

@@ -44,7 +44,7 @@ SILENT = ("-c", "wal_level=minimal", "-c", "max_wal_senders=0", "-c", "autovacuu
 
 
 class Session:
-    """psql with one connection that it never makes again."""
+    """psql with one connection that it never replaces."""
 
     def __init__(self, clients: Container, port: int) -> None:
         self.process = subprocess.Popen(
@@ -60,7 +60,7 @@ class Session:
         )
 
     def ask(self, statement: str) -> str:
-        """One statement that answers with one row.  Raises ConnectionError when the session has ended."""
+        """One statement with one row as its answer.  Raises ConnectionError when the session has ended."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         try:
@@ -85,7 +85,7 @@ class Session:
 
 
 class Database:
-    """A protected PostgreSQL, and a container of the same image, not protected, for its clients."""
+    """A protected PostgreSQL, and an unprotected container of the same image for its clients."""
 
     def __init__(self, sidecar: Sidecar, factory: ContainerFactory, folder: Path, port: int, *options: str) -> None:
         write_files(folder, {"start.sh": START})
@@ -125,7 +125,7 @@ class Database:
         wait_until(lambda: self.is_ready, 60, f"PostgreSQL answers; its log: {self.server.logs()[-800:]}", 0.2)
 
     def run(self, program: str, *args: str, timeout_s: float = 120.0) -> str:
-        """A client program that must succeed."""
+        """Runs a client program that must succeed."""
         connection = ("-h", "127.0.0.1", "-p", str(self.port), "-U", "postgres")
         return self.clients.exec(f"{BIN}/{program}", *connection, *args, timeout_s=timeout_s).stdout
 
@@ -133,12 +133,12 @@ class Database:
         return self.run("psql", "--no-psqlrc", "-qAt", "-c", statement, "postgres").strip()
 
     def wait_protected(self) -> Tree:
-        """For two generations of the server as it runs now."""
+        """Waits for two generations of the server that runs now."""
         self.sidecar.wait_generation(self.server, 2, 60)
         return Tree(self.sidecar, self.server)
 
     def check_contents(self) -> None:
-        """Every table agrees with its indexes and every page with itself."""
+        """Checks every table against its indexes and every page against its checksum."""
         self.run("pg_amcheck", "--install-missing", "--heapallindexed", "--all")
 
 
@@ -158,7 +158,7 @@ def start(
 
 @pytest.mark.timeout(900)
 def test_idle_it_is_restored_whole_with_its_connections(start: Callable[..., Database]) -> None:
-    """Backends, their sessions' state and locks, and whoever works in the background."""
+    """Backends, the state and locks of their sessions, and all background processes."""
     database = start(*SILENT)
     database.run("pgbench", "-i", "-q", "-s", "1", "postgres")
     database.query("checkpoint")
@@ -192,7 +192,7 @@ def test_idle_it_is_restored_whole_with_its_connections(start: Callable[..., Dat
 
 
 def balances(database: Database) -> list[str]:
-    """Four sums that every committed transaction of pgbench changes alike."""
+    """Four sums that every committed pgbench transaction changes by the same amount."""
     return database.query(
         "select (select coalesce(sum(abalance), 0) from pgbench_accounts), "
         "(select coalesce(sum(tbalance), 0) from pgbench_tellers), "
@@ -202,7 +202,7 @@ def balances(database: Database) -> list[str]:
 
 
 class Ledger:
-    """Commits one number after the other, and remembers which it was told are committed."""
+    """Commits consecutive numbers, and remembers which of them were acknowledged."""
 
     def __init__(self, database: Database) -> None:
         self.database = database
@@ -210,7 +210,7 @@ class Ledger:
         self.next = 1
 
     def write_until(self, enough: Callable[[], bool]) -> None:
-        """Ends also when the connection does."""
+        """Commits until told to stop, or until the connection ends."""
         session = self.database.session()
         with contextlib.suppress(ConnectionError):
             while not enough():
@@ -222,7 +222,7 @@ class Ledger:
         self.database.sessions.remove(session)
 
     def check(self) -> None:
-        """Nothing that was acknowledged is missing."""
+        """No acknowledged commit is missing."""
         stored = set(map(int, self.database.query("select id from ledger").split()))
         lost = [number for number in self.acknowledged if number not in stored]
         assert lost == [], f"{len(lost)} of {len(self.acknowledged)} committed transactions are lost: {lost[:10]}"
@@ -230,7 +230,7 @@ class Ledger:
 
 @pytest.mark.timeout(3000)
 def test_under_write_load_it_starts_cold_and_loses_nothing(start: Callable[..., Database]) -> None:
-    """What was written since the checkpoint forbids a restore; PostgreSQL's own recovery does the rest."""
+    """Data written since the checkpoint rules out a restore; PostgreSQL recovers by itself."""
     rng = random.Random(5)
     database = start()
     database.run("pgbench", "-i", "-q", "-s", "2", "postgres")
@@ -270,7 +270,7 @@ def ended(ledger: Ledger, end: float, least: int) -> bool:
 
 
 def settled(database: Database, old_init: int) -> bool:
-    """It was restored, or started anew: the old postmaster's last moments do not count."""
+    """Waits until it was restored or started anew; the old postmaster's last moments do not count."""
     if database.server.pid not in (0, old_init):
         return True
     entry = database.sidecar.find(database.server)

@@ -79,7 +79,7 @@ if __name__ == "__main__":
 
 
 def kill_and_see_it_go_on(tree: Tree, kills: int, pause_s: float = 0.3) -> None:
-    """The log goes on after each kill where the checkpoint was, and nothing is wrong in it."""
+    """After each kill the log goes on from the checkpoint, without an error in it."""
     rng = random.Random(7)
     for n in range(1, kills + 1):
         tree.next_generation()
@@ -108,14 +108,14 @@ def test_a_script_that_loops_over_children(
 
 @pytest.mark.timeout(900)
 def test_a_pool_of_workers_with_shared_memory(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """multiprocessing's Pool, Value, Array and SharedMemory: its semaphores are in shared memory, too."""
+    """multiprocessing's Pool, Value, Array and SharedMemory, whose semaphores are in shared memory, too."""
     write_files(tmp_path, {"pool.py": POOL})
     tree = start_tree(sidecar, container, "python3", "/files/pool.py", options=["--volume", f"{tmp_path}:/files:ro"])
     kill_and_see_it_go_on(tree, KILLS)
 
 
 def test_exec_sessions_survive(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """What `podman exec` started is no part of the application, whatever it has for children itself."""
+    """A process started by `podman exec` is no part of the application, and neither are its children."""
     write_files(tmp_path, {"loop.sh": SHELL})
     tree = start_tree(sidecar, container, "bash", "/files/loop.sh", options=["--volume", f"{tmp_path}:/files:ro"])
     command = 'while read -r line; do echo "$(echo "$line" | tr a-z A-Z)"; done; sleep 0.1; echo end'

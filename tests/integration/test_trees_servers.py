@@ -90,7 +90,7 @@ def paths_of(server: str) -> dict[str, bytes | None]:
 
 
 def workers(tree: Tree) -> list[int]:
-    """PIDs on the host."""
+    """The workers' PIDs on the host."""
     main = tree.main
     return [member.pid for member in tree.members() if member.pid != main and not member.is_zombie]
 
@@ -98,7 +98,7 @@ def workers(tree: Tree) -> list[int]:
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("server", SERVERS)
 def test_restored_whole_under_load(server: str, sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    """The same processes in the same places; every answer that comes is right, and they go on coming."""
+    """The same processes with the same PIDs; every answer is right, and answers keep coming."""
     tree = SERVERS[server](sidecar, container, tmp_path)
     rng = random.Random(server)
     wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
@@ -117,7 +117,7 @@ def test_restored_whole_under_load(server: str, sidecar: Sidecar, container: Con
 def test_a_killed_worker_is_its_masters_business(
     server: str, sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    """The master replaces it, nothing is restored, and checkpoints go on."""
+    """The master replaces it, nothing is restored, and checkpoints are taken as before."""
     tree = SERVERS[server](sidecar, container, tmp_path)
     wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
     with Load(tree.container.ip, 8000, paths_of(server)) as load:
@@ -141,7 +141,7 @@ def test_a_killed_worker_is_its_masters_business(
 def test_workers_share_their_memory_after_a_restore(
     sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
 ) -> None:
-    """gunicorn with --preload: 25 MB of data that the workers have from their master."""
+    """gunicorn --preload: workers inherit 25 MB of data from their master."""
     tree = gunicorn(sidecar, container, tmp_path)
     wait_until(lambda: len(workers(tree)) == 4, 30, "four workers")
     tree.next_generation()

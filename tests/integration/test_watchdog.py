@@ -32,7 +32,7 @@ def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalSide
 
 
 def daemon_of(local: LocalSidecar) -> int:
-    """The watchdog's child; 0: there is none at this moment."""
+    """PID of the watchdog's child; 0 if there is none at the moment."""
     assert local.process is not None
     children = children_of(local.process.pid)
     return children[0] if children else 0

@@ -99,7 +99,7 @@ def browser(tmp_path: Path) -> Iterator[webdriver.Chrome]:
 
 
 def texts(browser: webdriver.Chrome, selector: str) -> list[str]:
-    """What all of them say, in one look: the page may redraw at any time."""
+    """The texts of all matching elements in one call, since the page may redraw at any time."""
     found: list[str] = browser.execute_script(
         "return [...document.querySelectorAll(arguments[0])].map((each) => each.textContent)", selector
     )

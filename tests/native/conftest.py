@@ -12,7 +12,7 @@ from testkit.harness import ROOT
 
 
 def make(folder: str, *goals: str) -> None:
-    """Runs make; its output is the error when it fails."""
+    """Runs make; its output is the error message if it fails."""
     done = subprocess.run(
         ["make", "-s", "-C", str(ROOT / folder), *goals],
         stdout=subprocess.PIPE,
@@ -24,7 +24,7 @@ def make(folder: str, *goals: str) -> None:
 
 @pytest.fixture(scope="session")
 def init_built() -> None:
-    """native/build/avckpt-init is there and up to date."""
+    """native/build/avckpt-init, brought up to date."""
     make("native", "build/avckpt-init")
 
 

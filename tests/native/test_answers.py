@@ -29,7 +29,7 @@ def built(init_built: None) -> None:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("server", SERVERS)
 def test_every_answer_is_its_requests_own(server: str, tmp_path: Path) -> None:
-    """Clients keep their connections; the server is killed at random moments."""
+    """Clients keep their connections while the server is killed at random moments."""
     if why := missing(server):
         pytest.skip(why)
     outcome = run(server, REQUESTS, tmp_path)
@@ -40,5 +40,5 @@ def test_every_answer_is_its_requests_own(server: str, tmp_path: Path) -> None:
 
 @pytest.mark.timeout(300)
 def test_kept_connections_give_wrong_answers(tmp_path: Path) -> None:
-    """What the test above would see if connections simply went on."""
+    """Shows that the test above would fail if connections were simply kept."""
     assert run("prefork", 20 * REQUESTS, tmp_path, {"avckpt.tcp": "keep"}).wrong != []

@@ -25,23 +25,23 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def guard_of(peer: GuardProcess, cookie: int = 1) -> int:
-    """The process that protects that container."""
+    """The guard process of that container."""
     return peer.guards[cookie - 1]
 
 
 def fds(pid: int) -> int:
-    """How many descriptors it has."""
+    """How many descriptors a process has open."""
     return len(os.listdir(f"/proc/{pid}/fd"))
 
 
 def memory_kb(pid: int) -> int:
-    """The most that a process had at any time."""
+    """The peak resident size of a process."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(next(line for line in status.splitlines() if line.startswith("VmHWM:")).split()[1])
 
 
 def test_shared_memory_costs_no_descriptors(tmp_path: Path) -> None:
-    """Neither for the areas of a process, nor for each generation again."""
+    """Neither one for each area of a process, nor one for each generation."""
     with (
         Victim("crowd shared 1 1", tmp_path) as small,
         Victim(f"crowd shared {CHILDREN} 60", tmp_path) as crowd,
@@ -82,7 +82,7 @@ def test_memory_that_was_never_touched_costs_nothing(tmp_path: Path) -> None:
 
 
 def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
-    """Names alone would be 200 MB; it is told in words, and the guard lives on."""
+    """File names alone would take 200 MB; the reason is reported in words, and the guard lives on."""
     with (
         Victim(f"crowd named 4 18000 {tmp_path}", tmp_path) as crowd,
         GuardProcess(config(), [crowd.pid]) as guard,

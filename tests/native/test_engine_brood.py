@@ -29,7 +29,7 @@ def built(init_built: None, victims_built: Path) -> None:
 @pytest.mark.parametrize("where", ["", "--in-child"])
 @pytest.mark.parametrize("late_us", [0, 300])
 def test_children_of_every_kind_end(tmp_path: Path, late_us: int, where: str) -> None:
-    """Most of these kinds cannot be protected, which is tried all the same, again and again."""
+    """Most of these kinds cannot be protected, and every checkpoint tries again."""
     with (
         Victim(f"brood --late-us {late_us} {where}".strip(), tmp_path) as victim,
         GuardProcess(config(0.001), [victim.pid]) as guard,
@@ -46,7 +46,7 @@ def test_children_of_every_kind_end(tmp_path: Path, late_us: int, where: str) ->
 
 @pytest.mark.skipif(not shutil.which(STRESS[0]), reason="it makes the children; it is not installed")
 def test_stress_ng_ends_well(tmp_path: Path) -> None:
-    """Flags of clone(2) at random; how long it takes: bench/clones.py."""
+    """clone(2) with random flags; bench/clones.py measures how long it takes."""
     said = tmp_path / "said"
     with (
         said.open("wb") as output,

@@ -38,7 +38,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def checkpoint(guard: GuardProcess, tries: int = 20) -> Json:
-    """One that is taken: on a busy machine some are missed."""
+    """Takes one; on a busy machine some are missed, and tried again."""
     for _ in range(tries):
         taken = guard.command("checkpoint")
         if taken["kind"] == "checkpoint":
@@ -48,7 +48,7 @@ def checkpoint(guard: GuardProcess, tries: int = 20) -> Json:
 
 
 def until_copied(guard: GuardProcess, tries: int = 60) -> Json:
-    """Takes checkpoints until one is made by a copy; that one."""
+    """Takes checkpoints until one is made by copying pages; returns that one."""
     for _ in range(tries):
         taken = checkpoint(guard)
         if taken["images"] == "dirty":
@@ -82,7 +82,7 @@ def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["dirt 30 4 --rate 20000", "dirt 32 2 --rate 30000 --maps", "busy 4"])
 def test_how_and_how_often_both_by_itself(command: str, tmp_path: Path) -> None:
-    """avckpt.images=auto and avckpt.interval=auto."""
+    """avckpt.images=auto together with avckpt.interval=auto."""
     with Victim(command, tmp_path) as victim, GuardProcess(ALL_AUTO, [victim.pid]) as guard:
         for seed in range(4):
             guard.wait("checkpoint", since=guard.mark())
@@ -95,8 +95,9 @@ def test_how_and_how_often_both_by_itself(command: str, tmp_path: Path) -> None:
 
 
 def how_made(guard: GuardProcess, count: int, victim: Victim | None = None) -> set[str]:
-    """Of the next checkpoints: why they were forked, or that they were not.  The victim writes most of its pages
-    before each."""
+    """For each of the next checkpoints the reason for a fork, or that there was none.  The victim writes most of its
+    pages before each.
+    """
     made = set()
     for _ in range(count):
         if victim:
@@ -122,7 +123,7 @@ def test_changes_over_as_it_writes_more_or_less_and_stays_there(tmp_path: Path) 
 
 
 def mappings_of(pid: int) -> list[tuple[int, int]]:
-    """The private ones, in one piece where they are next to each other."""
+    """A process's private mappings; adjacent ones are merged."""
     found: list[tuple[int, int]] = []
     for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
         ends, mode = line.split()[:2]
@@ -136,7 +137,7 @@ def mappings_of(pid: int) -> list[tuple[int, int]]:
 
 
 def pages_that_differ(one: int, other: int) -> list[int]:
-    """Addresses of pages of private memory.  Raises OSError when one of them has ended."""
+    """Addresses of private pages that differ.  Raises OSError when one of the processes has ended."""
     assert mappings_of(one) == mappings_of(other), (mappings_of(one), mappings_of(other))
     differ = []
     with Path(f"/proc/{one}/mem").open("rb", 0) as first, Path(f"/proc/{other}/mem").open("rb", 0) as second:
@@ -150,7 +151,7 @@ def pages_that_differ(one: int, other: int) -> list[int]:
 
 
 def read_at(mem: int, size: int, at: int) -> bytes:
-    """Guard pages read as nothing, page by page."""
+    """Reads page by page; guard pages read as nothing."""
     try:
         return os.pread(mem, size, at)
     except OSError:
@@ -160,7 +161,7 @@ def read_at(mem: int, size: int, at: int) -> bytes:
 
 
 def newest_template(guard: GuardProcess, victim: Victim) -> int:
-    """By the OOM killer's points, of which it has fewer than the others, once one that was dropped is gone."""
+    """The newest has a lower oom_score_adj than the others; waits until dropped ones are gone."""
 
     def fewest() -> list[int]:
         points: dict[int, list[int]] = {}
@@ -176,7 +177,7 @@ def newest_template(guard: GuardProcess, victim: Victim) -> int:
 
 @pytest.mark.parametrize("command", ["dirt 24 3 --rate 8000", "dirt 64 3 --rate 20000 --maps"])
 def test_the_template_is_the_application(command: str, tmp_path: Path) -> None:
-    """While it stands still: its newest template is the same in every byte that the kernel does not write."""
+    """While it stands still, its newest template equals it in every byte that the kernel does not write."""
     with Victim(command, tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         copies, rounds = 0, 0
         while copies < 12:
@@ -193,7 +194,7 @@ def test_the_template_is_the_application(command: str, tmp_path: Path) -> None:
 
 
 def marked(pid: int) -> int:
-    """Mappings whose writes are watched."""
+    """Mappings that userfaultfd watches for writes."""
     return len(re.findall(r"^VmFlags:.* uw\b", Path(f"/proc/{pid}/smaps").read_text(), re.MULTILINE))
 
 
@@ -221,7 +222,7 @@ def test_the_same_one_is_restored_many_times(tmp_path: Path) -> None:
 
 
 def until_near(guard: GuardProcess) -> Json:
-    """Until the last two checkpoints were copies: there is a template that can take the newest one's place."""
+    """Until the last two checkpoints were copies: then an older template can take the newest one's place."""
     before = until_copied(guard)
     while (taken := until_copied(guard))["generation"] != before["generation"] + 1:
         before = taken
@@ -243,7 +244,7 @@ def test_trees_are_restored_twice_right_after_a_checkpoint(command: str, tmp_pat
 
 @pytest.mark.parametrize("command", ["dirt 60 2 --rate 4000", "dirt 32 2 --rate 20000 --maps"])
 def test_a_restore_right_after_a_checkpoint_forks_nothing(command: str, tmp_path: Path) -> None:
-    """The template gives its memory away, and the one before it takes its place, also for the next restore."""
+    """The template gives its memory to the restored process, and the previous one stands in for it, repeatedly."""
     with Victim(command, tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         given = 0
         for number in range(12):
@@ -263,7 +264,7 @@ def test_a_restore_right_after_a_checkpoint_forks_nothing(command: str, tmp_path
 
 
 def test_templates_are_killed_while_one_gives_its_memory_away(tmp_path: Path) -> None:
-    """From inside the container: the application comes back, if need be as it was a checkpoint earlier."""
+    """From inside the container: the application comes back, possibly in the state of the checkpoint before."""
     rng = random.Random(5)
     with Victim("dirt 60 2 --rate 20000", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         for _ in range(40):
@@ -309,7 +310,7 @@ def test_says_why_it_forks(command: str, reason: str, tmp_path: Path) -> None:
 
 
 def test_a_copy_needs_no_more_memory_than_was_written(tmp_path: Path) -> None:
-    """An idle application: templates have next to nothing of their own."""
+    """An idle application: its templates have almost no memory of their own."""
     with Victim("idle 64 2", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
         until_copied(guard)
         for _ in range(10):

@@ -26,7 +26,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def crash_often(tmp_path: Path, options: str) -> None:
-    """Under checkpoints as frequent as they can be."""
+    """While checkpoints are taken as often as possible."""
     with (
         Victim(f"reporter {options}", tmp_path) as victim,
         GuardProcess(config(0.01, keep=3), [victim.pid]) as guard,
@@ -47,31 +47,31 @@ def crash_often(tmp_path: Path, options: str) -> None:
 
 @pytest.mark.parametrize("style", STYLES)
 def test_styles(tmp_path: Path, style: str) -> None:
-    """As they are installed by the crash reporters of the field."""
+    """Handlers as the usual crash reporters install them."""
     crash_often(tmp_path, f"segv {style}")
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_styles_in_another_thread(tmp_path: Path, style: str) -> None:
-    """The main thread stands still, and is not in the handler."""
+    """The main thread is blocked and is not in the handler."""
     crash_often(tmp_path, f"abrt {style} --in-thread")
 
 
 @pytest.mark.parametrize("name", SIGNALS)
 def test_signals(tmp_path: Path, name: str) -> None:
-    """All that a crash is known by."""
+    """Every signal that means a crash."""
     crash_often(tmp_path, f"{name} plain")
 
 
 @pytest.mark.parametrize("style", ["plain", "open"])
 def test_a_child(tmp_path: Path, style: str) -> None:
-    """Nor is an image of several processes, one of which is dying; the parent ends as that does."""
+    """No image is taken of a tree of which one process is dying; the parent then ends as the child did."""
     crash_often(tmp_path, f"segv {style} --in-child")
 
 
 @pytest.mark.parametrize("where", WHERE)
 def test_faults_that_are_mended(tmp_path: Path, where: str) -> None:
-    """A program that lives by them is protected as any other."""
+    """A program that handles faults as part of its normal work is protected like any other."""
     with (
         Victim(f"reporter segv mend {where}".strip(), tmp_path) as victim,
         GuardProcess(config(0.01), [victim.pid]) as guard,

@@ -32,7 +32,7 @@ def built(init_built: None, victims_built: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_no_eintr_over_thousands_of_checkpoints(tmp_path: Path) -> None:
-    """One process with a thread in each call: every checkpoint stops them all."""
+    """One process with a thread blocked in each call; every checkpoint interrupts all of them."""
     # Above clone's way: one generation, so that the cost is the freeze and not the bookkeeping.
     with Victim("eintr all 0", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
         # A few may miss their deadline on a busy machine.
@@ -50,7 +50,7 @@ def test_no_eintr_over_thousands_of_checkpoints(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("seconds", "interval_s", "late_s"), [(2.0, 0.1, 0.4), (3.0, 0.01, 0.4), (0.3, 0.02, 0.4)])
 def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, tmp_path: Path) -> None:
-    """A relative timeout is not begun again by every checkpoint, and none ends early (the victim sees to that)."""
+    """A checkpoint does not restart a relative timeout, and none ends early (the victim checks that)."""
     # An interval, where the scheduler has moved a thread to another CPU and nobody knows how long it has been
     # waiting.  The rest is for a busy machine, and less than what a wait that forgets the time it was stopped
     # adds up to in the second case.
@@ -69,7 +69,7 @@ def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, 
 
 
 def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
-    """It begins again, at most in full: never early, never for ever."""
+    """It starts again with its full length at most: never early, and never without an end."""
     with (
         Victim("eintr all 0.5 --quiet --late 2", tmp_path) as victim,
         GuardProcess(config(0.05), [victim.pid]) as guard,
@@ -91,9 +91,9 @@ def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
 @pytest.mark.parametrize("interval_s", [0.1, 1.0])
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["", "woken elsewhere"])
 def test_the_wait_before_the_first_stop_counts(elsewhere: bool, interval_s: float, tmp_path: Path) -> None:
-    """How long a call had been waiting before it was stopped is known: it takes what it would have taken.
+    """The time that a call had waited before it was stopped is subtracted: it ends when it would have ended.
 
-    All of them on a machine at rest; one in four may have to wait for a guard that gets no CPU.
+    Holds for every call on an idle machine; on a busy one a call in four may wait for the guard.
     """
     seconds, n = 0.25, 12
     late = []

@@ -41,7 +41,7 @@ def test_a_thread_waits_in_splice(tmp_path: Path, where: str) -> None:
 
 
 def test_somebody_else_waits_in_splice(tmp_path: Path) -> None:
-    """The pipe's contents are not known then; the application runs on, and nobody waits for him."""
+    """The pipe's contents are unknown then; the application runs on, and the guard does not wait."""
     with Victim("splicer --leave", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         end = f"/proc/{victim.app}/fd/{victim.see().counter[2]}"

@@ -26,7 +26,7 @@ SCRIBBLED_S = 3.0
 
 
 def lost(guard: GuardProcess) -> list[dict[str, object]]:
-    """Guards that have died."""
+    """How many guards have died."""
     assert guard.process.poll() is None
     return [event for event in guard.events if event["kind"] == "guard_lost"]
 
@@ -37,7 +37,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def test_what_the_application_writes_is_not_believed(tmp_path: Path) -> None:
-    """The count of calls is in memory that it has, too; a guard that believes it writes behind the parasite."""
+    """The call count is in memory that the application can write; a guard that trusts it writes past the parasite."""
     with (
         Victim("scribble", tmp_path) as hostile,
         Victim("idle 1 1", tmp_path) as peaceful,
@@ -56,9 +56,9 @@ FILE_BYTES = {"long": 16 << 20, "short": 4096}
 
 @pytest.mark.parametrize("kind", FILE_BYTES)
 def test_the_parasite_is_replaced_by_a_file(tmp_path: Path, kind: str) -> None:
-    """A thread maps a file, which it may only read, over the parasite while it is brought in.
+    """While the parasite is mapped, a thread maps a file over it that it may only read.
 
-    The file stays as it is, and the guard lives also if there is less of the file than there was of the parasite.
+    The file must not change, and the guard must survive even if the file is shorter than the parasite.
     """
     attempts = 4
     file = tmp_path / "file"
@@ -86,7 +86,7 @@ def test_the_parasite_is_replaced_by_a_file(tmp_path: Path, kind: str) -> None:
 
 
 def test_the_code_can_not_be_written(tmp_path: Path) -> None:
-    """What runs in the application with more rights than it has is not its to change."""
+    """Code that runs in the application with more privileges than it has must not be writable for it."""
     with Victim("overwrite", tmp_path) as hostile, GuardProcess(config(0.05), [hostile.pid]) as guard:
         wait_until(lambda: hostile.see().counter[0], 15, "the application has tried")
         mprotect, write, remove = hostile.see().counter[1:4]
@@ -100,7 +100,7 @@ def test_the_code_can_not_be_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize("filters", ["", "--little"])
 @pytest.mark.parametrize("where", ["lists", "code", "setup"])
 def test_a_seccomp_filter_holds_for_what_runs_in_it(tmp_path: Path, where: str, filters: str) -> None:
-    """Code of ours that the application changes makes no call that the application's own filter refuses."""
+    """Injected code that the application modifies can make no call that the application's own filter refuses."""
     folder = tmp_path / "smuggled"
     with (
         Victim(f"smuggle {where} {folder} {filters}", tmp_path) as hostile,
@@ -128,7 +128,7 @@ def test_a_seccomp_filter_holds_for_what_runs_in_it(tmp_path: Path, where: str, 
 
 @pytest.mark.parametrize("kind", FOLLY)
 def test_what_init_shows_is_looked_at_first(tmp_path: Path, kind: str) -> None:
-    """Whoever runs in init's place has the guard open and map what it may open and map itself, and nothing else."""
+    """A process in init's place can make the guard open and map only what it could open and map itself."""
     with (
         subprocess.Popen([sys.executable, FAKE_INIT, kind], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as init,
         Victim("idle 1 1", tmp_path) as peaceful,

@@ -30,7 +30,7 @@ os.execv("/bin/sleep", ["sleep", "1000"])
 
 
 def wake_ups(pid: int) -> int:
-    """How often it has gone to sleep."""
+    """How many times the process has gone to sleep."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.split("\nvoluntary_ctxt_switches:")[1].split()[0])
 
@@ -41,7 +41,7 @@ def has_open(pid: int, path: Path) -> bool:
 
 
 def test_it_sleeps(tmp_path: Path) -> None:
-    """Between checkpoints; also one of several processes."""
+    """A guard sleeps between checkpoints, also that of a process tree."""
     for command in ("idle 1 2 --beat-us 1000", "tree 3"):
         with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
             assert guard.command("checkpoint")["kind"] == "checkpoint"
@@ -52,7 +52,7 @@ def test_it_sleeps(tmp_path: Path) -> None:
 
 
 def exec_until_closed_s(fifo: Path) -> float:
-    """Of a program that has run for a while: how long after its exec(2) nobody has that open any more."""
+    """For a program that has run for a while: the time from its exec(2) until its close-on-exec file is closed."""
     os.mkfifo(fifo)
     ours = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
     command = [sys.executable, "-S", "-c", EXECUTES, str(fifo)]
@@ -73,6 +73,6 @@ def exec_until_closed_s(fifo: Path) -> float:
 
 @pytest.mark.shared_machine("a guard that is told of an exec may have to wait for a CPU")
 def test_an_exec_is_heard(tmp_path: Path) -> None:
-    """What is marked O_CLOEXEC is closed at once, however long the program has run, and not after a look around."""
+    """O_CLOEXEC descriptors close at once, however long the program has run, and not at the guard's next look."""
     took = sorted(exec_until_closed_s(tmp_path / f"held-{number}") for number in range(5))
     assert took[1] < 0.03, took

@@ -24,7 +24,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def intrude(guard: GuardProcess, victim: Victim, *options: str) -> str:
-    """Restores the victim until somebody in its namespaces has got hold of a task; what he says."""
+    """Restores the victim until the intruder in its namespaces has attached to a task; the intruder's report."""
     guard.wait("checkpoint", count=2)
     with subprocess.Popen(
         ["nsenter", "--all", f"--target={victim.pid}", str(BUILD / "intruder"), str(SECONDS), *options],
@@ -48,7 +48,7 @@ def intrude(guard: GuardProcess, victim: Victim, *options: str) -> str:
 
 
 def test_its_helper_has_nothing_of_the_sidecars(tmp_path: Path) -> None:
-    """It is looked at, let go, and the restore goes on."""
+    """The intruder inspects the helper and detaches, and the restore goes on."""
     with (
         Victim("threads 4 1", tmp_path) as victim,
         GuardProcess(config(0.05, keep=3), [victim.pid]) as guard,
@@ -60,7 +60,7 @@ def test_its_helper_has_nothing_of_the_sidecars(tmp_path: Path) -> None:
 
 
 def test_its_helper_does_nothing_else(tmp_path: Path) -> None:
-    """Made to open a file it is killed; that costs a restore, and a container its own application at worst."""
+    """A helper that is made to open a file is killed; this costs one restore, and at worst the container itself."""
     with (
         Victim("threads 4 1", tmp_path) as victim,
         GuardProcess(config(0.05, keep=3), [victim.pid]) as guard,

@@ -52,7 +52,7 @@ def test_killed_at_random_moments(command: str, interval_s: float, tmp_path: Pat
 
 @pytest.mark.parametrize("how", ["segv", "kill"])
 def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
-    """Hundreds of times, in the middle of whatever is being done to it; then it ends, and nothing hangs."""
+    """Hundreds of times, at any step of the restore; at last it ends, and nothing hangs."""
     again = config(0.02, restore_window_s=0.000001)
     with Victim(f"crash {how} 1 --threads 6", tmp_path) as victim, GuardProcess(again, [victim.pid]) as guard:
         guard.wait("restored")
@@ -68,12 +68,12 @@ def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
 
 
 def templates_of(victim: Victim) -> int:
-    """Zombies count."""
+    """The container's templates, zombies included."""
     return sum(m is not None and m.name == "avckpt-tmpl" for m in map(look, children_of(victim.pid)))
 
 
 def test_what_is_left_of_old_templates_is_reaped(tmp_path: Path) -> None:
-    """The guard does not wait for their end, which takes a while; but a zombie keeps a container from ending."""
+    """The guard does not wait for a template's slow exit, but a zombie would keep the container from ending."""
     with Victim("threads 4 100 --no-churn", tmp_path) as victim, GuardProcess(config(0, keep=1), [victim.pid]) as guard:
         for _ in range(10):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
@@ -92,7 +92,7 @@ def test_templates_that_go_with_their_container_are_no_news(command: str, tmp_pa
 
 
 def test_why_it_ended_is_what_is_told_last(tmp_path: Path) -> None:
-    """A checkpoint that is due while init ends is not a missed one."""
+    """A checkpoint that falls due while init ends is not reported as missed."""
     often = config(0.001, restore_on_signal=False)
     with Victim("tree 8", tmp_path) as victim, GuardProcess(often, [victim.pid]) as guard:
         guard.wait("checkpoint")

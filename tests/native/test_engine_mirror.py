@@ -23,7 +23,7 @@ def built(init_built: None, victims_built: Path) -> None:
     [("mirror", Images.FORK, 1000), ("mirror --in-child", Images.FORK, 200), ("mirror", Images.DIRTY, 200)],
 )
 def test_it_sees_itself_as_it_was(command: str, images: Images, checkpoints: int, tmp_path: Path) -> None:
-    """Mappings, flags of memory, masks, timers, descriptors, limits, options: whatever there is to be read."""
+    """Mappings, VmFlags, masks, timers, descriptors, limits, options: everything a process can read of itself."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(images=images), [victim.pid]) as guard:
         said = guard.burst(checkpoints)
         assert said["taken"] > 0, said["reasons"]

@@ -50,7 +50,7 @@ def guard_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Guard:
-    """The sanitized guard of one victim, and what it has said."""
+    """The sanitized guard of one victim, with its output."""
 
     def __init__(self, popen: subprocess.Popen[bytes], output: Path) -> None:
         self.popen = popen
@@ -70,7 +70,7 @@ class Guard:
 
 @contextmanager
 def guarding(program: Path, victim: Victim, interval_ms: int, commands: int, output: Path) -> Iterator[Guard]:
-    """Ends it with SIGTERM; then nothing may have been found, leaks included."""
+    """Ends the guard with SIGTERM; the sanitizers must have reported nothing, leaks included."""
     environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=1:detect_stack_use_after_return=0"}
     with output.open("wb") as file:
         popen = subprocess.Popen(
@@ -126,7 +126,7 @@ LIFE_S = 2.0
 
 
 def test_the_parasite_is_written_at_random(guard_program: Path, tmp_path: Path) -> None:
-    """Whatever an application writes into what it shares with its guard, while that uses it: the guard lives."""
+    """The guard survives whatever the application writes to their shared memory while it is in use."""
     first = int.from_bytes(os.urandom(4), "little")
     end = time.monotonic() + SCRIBBLED_S
     found = 0

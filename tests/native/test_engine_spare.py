@@ -46,7 +46,7 @@ def spares(victim: Victim) -> list[int]:
 
 
 def wait_spare(victim: Victim, other_than: int = 0) -> int:
-    """Until there is one, of one template: that of an older one goes before the new one comes."""
+    """Waits until there is a spare of exactly one template: an older template's goes before a new one comes."""
     found: list[int] = []
 
     def is_made() -> bool:
@@ -58,7 +58,7 @@ def wait_spare(victim: Victim, other_than: int = 0) -> int:
 
 
 def open_spare(victim: Victim) -> int:
-    """A pidfd of it."""
+    """A pidfd of the spare."""
     while True:
         with contextlib.suppress(ProcessLookupError):  # an old one, just gone
             return os.pidfd_open(wait_spare(victim))
@@ -87,7 +87,7 @@ def test_it_is_used_up_and_made_again(tmp_path: Path) -> None:
 
 
 def test_killed_it_is_no_loss(tmp_path: Path) -> None:
-    """By the OOM killer, say: the template is still there."""
+    """By the OOM killer, for example: the template is still there."""
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         taken = guard.command("checkpoint")
         os.kill(wait_spare(victim), signal.SIGKILL)
@@ -124,7 +124,7 @@ def test_killed_while_it_is_used(command: str, tmp_path: Path) -> None:
 
 
 def test_killed_while_it_is_made(tmp_path: Path) -> None:
-    """The application dies at any moment of that; a death may wait for it, but comes to no harm."""
+    """The application dies at any moment of that; the restore may have to wait, and succeeds."""
     rng = random.Random(1)
     with Victim(f"idle {MEGABYTES} 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(30):
@@ -134,7 +134,7 @@ def test_killed_while_it_is_made(tmp_path: Path) -> None:
 
 
 def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
-    """From inside the container, at any moment: it costs a generation at most, and is told."""
+    """From inside the container, at any moment: this costs one generation at most, and is reported."""
     rng = random.Random(2)
     with Victim(f"idle {MEGABYTES} 4", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
         for _ in range(30):
@@ -152,7 +152,7 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
 
 
 def test_made_while_the_container_ends_it_is_no_news(tmp_path: Path) -> None:
-    """Its template has been killed with all others, and cannot be seen to have ended yet."""
+    """Its template was killed with all other processes, but its end is not visible yet."""
     rng = random.Random(4)
     for n in range(40):
         (tmp_path / str(n)).mkdir()
@@ -168,7 +168,7 @@ def test_made_while_the_container_ends_it_is_no_news(tmp_path: Path) -> None:
 
 
 def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:
-    """Its number would be theirs when the kernel has copied so much."""
+    """While the kernel copies so much memory, another process could take the PID."""
     with (
         Victim(f"idle {MEGABYTES} 2", tmp_path) as victim,
         forks_beside(victim),
@@ -180,7 +180,7 @@ def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:
 
 
 def test_none_when_checkpoints_are_too_frequent(tmp_path: Path) -> None:
-    """It must not take much of a CPU."""
+    """Spares must not take a large part of a CPU."""
     command = f"idle {MEGABYTES} 1"
     forks = config(0.03, images=Images.FORK)
     with Victim(command, tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
@@ -199,7 +199,7 @@ def processes_of(user: int) -> list[int]:
 
 @contextlib.contextmanager
 def limited(processes: int, victim: str = "idle 0 4") -> Iterator[tuple[Victim, GuardProcess]]:
-    """One that may have so many.  Of four threads, with a holder and a template, there are six."""
+    """A container with that limit of tasks; four threads with a holder and a template are six."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # the victim is not root
         command = f"{SOMEBODY} /usr/bin/prlimit --nproc={processes}:{processes} {BUILD}/{victim}"
@@ -220,7 +220,7 @@ def test_none_when_it_may_not_have_another_process() -> None:
 
 
 def test_it_makes_room_for_a_template() -> None:
-    """The next template is worth more than the spare of the last one."""
+    """At the limit of tasks the next template is worth more than the last one's spare."""
     with limited(7) as (victim, guard):
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         wait_spare(victim)
@@ -233,7 +233,7 @@ def test_it_makes_room_for_a_template() -> None:
 
 
 def test_it_is_one_process_too_many() -> None:
-    """Fewer are allowed than when it was made: the template alone is as good as before."""
+    """The limit was lowered since the spare was made: the template alone is as good."""
     with limited(7) as (victim, guard):
         taken = guard.command("checkpoint")
         wait_spare(victim)
@@ -248,7 +248,7 @@ def test_it_is_one_process_too_many() -> None:
 
 
 def test_there_is_no_room_for_copies_of_a_big_parent() -> None:
-    """Seven processes, as many holders and templates, and somebody who takes numbers: children are forked without."""
+    """Seven processes with their holders and templates, and a program that takes PIDs: no copies are made."""
     with limited(21, "prefork 6 12") as (victim, guard), forks_beside(victim):
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         for _ in range(3):
@@ -261,7 +261,7 @@ def policies(victim: Victim, name: str) -> set[int]:
 
 
 def test_priorities_are_kept(tmp_path: Path) -> None:
-    """It is made at an ordinary priority, so that the application runs; what is restored has its own."""
+    """Spares are made at normal priority, so that the application runs; the restored process has its own."""
     with Victim("idle 50 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         os.sched_setscheduler(victim.app, os.SCHED_FIFO, os.sched_param(7))
         os.sched_setaffinity(victim.app, {0})
@@ -278,7 +278,7 @@ def test_priorities_are_kept(tmp_path: Path) -> None:
 
 
 def throttle() -> Cgroup:
-    """A hundredth of a CPU: `podman run --cpus=0.01`."""
+    """Leaves a hundredth of a CPU, as `podman run --cpus=0.01` does."""
     if Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us").exists():
         return Cgroup(["cpu"], "cpu.cfs_quota_us", go="-1", wait="1000")
     return Cgroup([""], "cpu.max", go="max", wait="1000")
@@ -286,7 +286,7 @@ def throttle() -> Cgroup:
 
 @contextlib.contextmanager
 def inside(cgroup: Cgroup, command: str, folder: Path) -> Iterator[tuple[Victim, GuardProcess]]:
-    """Ends with a container in which is what should be, and no more."""
+    """The container's processes; at the end there are those that should be, and no others."""
     with cgroup, Victim(command, folder) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
         cgroup.take(victim.pid)
         cgroup.take(victim.app)
@@ -298,7 +298,7 @@ def inside(cgroup: Cgroup, command: str, folder: Path) -> Iterator[tuple[Victim,
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("pause_s", [0.05, 1.5])
 def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) -> None:
-    """A template that was to make a spare and could not is still what is restored from."""
+    """A template that failed to make its spare can still be restored from."""
     pause = freezer(version)
     with inside(pause, "threads 4 1", tmp_path) as (victim, guard):
         taken = guard.command("checkpoint")
@@ -312,12 +312,12 @@ def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) 
 
 
 def shares_memory(a: int, b: int) -> bool:
-    """kcmp(2), KCMP_VM; the number of the call is that of x86-64."""
+    """kcmp(2) with KCMP_VM; the syscall number is x86-64's."""
     return bool(ctypes.CDLL(None).syscall(312, a, b, 1, 0, 0) == 0)
 
 
 def test_made_late_it_is_used(tmp_path: Path) -> None:
-    """Its template was frozen in the making; what is restored has its memory, which it shares until it is ended."""
+    """Its template was frozen meanwhile; the restored process shares that template's memory until it is ended."""
     pause = freezer(2)
     with inside(pause, "threads 4 1", tmp_path) as (victim, guard):
         shared = False
@@ -344,7 +344,7 @@ def test_made_late_it_is_used(tmp_path: Path) -> None:
 
 
 def test_made_late_it_makes_room_for_a_template() -> None:
-    """It counts where processes are limited, also as long as nobody has met it."""
+    """It counts towards the limit of processes even before the guard has seen it."""
     with freezer(2) as pause, limited(7) as (victim, guard):
         pause.take(victim.pid)
         pause.take(victim.app)
@@ -366,7 +366,7 @@ def slow_ones() -> list[Any]:
 
 @pytest.mark.parametrize("slow", slow_ones())
 def test_made_slowly(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
-    """The application dies when its template has been told to make one, and has made it, or not."""
+    """The application dies after its template was told to make a spare, before or after it has made it."""
     rng, cgroup = random.Random(1), slow()
     with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
         for number in range(10):
@@ -383,7 +383,7 @@ def test_made_slowly(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("slow", slow_ones())
 def test_its_template_is_killed_in_the_making(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
-    """Nobody knows yet whether there is a spare; none is left."""
+    """The guard does not know yet whether there is a spare; none may be left."""
     rng, cgroup = random.Random(2), slow()
     with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
         for _ in range(6):

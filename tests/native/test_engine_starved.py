@@ -48,9 +48,9 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @contextlib.contextmanager
 def hog(cpu: int, busy_s: float = 0.07) -> Iterator[None]:
-    """Takes a CPU away from everybody else, but for a few milliseconds each time after so long.
+    """Takes a CPU from all others except for a few milliseconds at a time.
 
-    Real-time tasks may have 0.95 of a second (sched(7)).
+    Real-time tasks may use 0.95 of each second (sched(7)).
     """
     with subprocess.Popen([sys.executable, "-c", HOG, str(cpu), str(busy_s)], stdout=subprocess.PIPE) as process:
         try:
@@ -63,7 +63,7 @@ def hog(cpu: int, busy_s: float = 0.07) -> Iterator[None]:
 
 
 def put_on(cpu: int, pid: int) -> None:
-    """All threads of a process; those to come inherit it."""
+    """Moves all threads of a process to a CPU; threads that it starts later inherit this."""
     for tid in os.listdir(f"/proc/{pid}/task"):
         with contextlib.suppress(ProcessLookupError):
             os.sched_setaffinity(int(tid), {cpu})
@@ -75,7 +75,7 @@ def too_late(event: dict[str, object]) -> bool:
 
 @pytest.fixture
 def cpus() -> tuple[int, int]:
-    """One for the application and the hog, and one for everybody else."""
+    """One CPU for the application and the hog, and one for everything else."""
     found = sorted(os.sched_getaffinity(0))
     if len(found) < 2:
         pytest.skip("it takes a CPU for the guard and one for the application")
@@ -83,7 +83,7 @@ def cpus() -> tuple[int, int]:
 
 
 def test_a_starved_application_is_let_go(cpus: tuple[int, int], tmp_path: Path) -> None:
-    """A thread that gets into the parasite too late finds home, and what it does next is its own affair."""
+    """A thread that enters the parasite too late returns from it, and is not used any more."""
     with Victim("threads 6 1", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         guard.wait("checkpoint", count=3)
         put_on(cpus[0], victim.app)
@@ -96,7 +96,7 @@ def test_a_starved_application_is_let_go(cpus: tuple[int, int], tmp_path: Path) 
 
 
 def test_the_next_attempt_comes_at_once(cpus: tuple[int, int], tmp_path: Path) -> None:
-    """Checkpoints on command do not wait for the one that was late: its way home must not be taken for another's."""
+    """Commands do not wait for a late one: its return from the parasite must not be taken for that of another."""
     with Victim("threads 6 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         guard.command("checkpoint")
         put_on(cpus[0], victim.app)
@@ -135,7 +135,7 @@ def test_restored_while_starved(cpus: tuple[int, int], tmp_path: Path) -> None:
 
 
 def test_who_was_killed_and_has_yet_to_die_takes_nothing(cpus: tuple[int, int], tmp_path: Path) -> None:
-    """A child that waits at a pipe would read what the restore puts back, and its number is still its own."""
+    """A killed child that still waits at a pipe would read what the restore puts back, and still has its PID."""
     with Victim("errands", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         [child] = children_of(victim.app)
         wait_until(lambda: victim.see().counter[0] == 1, 5, "an errand is in the pipe")

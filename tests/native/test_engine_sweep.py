@@ -58,12 +58,12 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def numbers() -> Iterator[int]:
-    """Of the calls before which it dies."""
+    """The numbers of the calls before which the guard is killed."""
     yield from range(FIRST, MOST, PART)
 
 
 class Death(Protocol):
-    """What kills a guard, from the moment of arm() on, before whatever it does as the `nth`."""
+    """Kills a guard before the `nth` thing that it does from arm() on."""
 
     def arm(self, guard: GuardProcess, nth: int) -> None: ...
 
@@ -71,7 +71,7 @@ class Death(Protocol):
 
 
 class CallDeath:
-    """strace: before a system call."""
+    """By strace, before a system call."""
 
     def arm(self, guard: GuardProcess, nth: int) -> None:
         (pid,) = guard.guards
@@ -91,7 +91,7 @@ class CallDeath:
 
 
 class StoreDeath:
-    """A guard that counts its stores to what it shares with the application and with init (stores.c)."""
+    """By a guard that counts its stores to memory shared with the application and init (stores.c)."""
 
     def __init__(self, path: Path, patch: pytest.MonkeyPatch) -> None:
         subprocess.run(["make", "-s", "-C", str(ROOT / "native"), "STORES=1"], check=True, timeout=300)
@@ -118,7 +118,7 @@ def death(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[str, Any]:
-    """The answer to a command, or that the guard was killed before it had carried it out."""
+    """The command's answer, or that the guard was killed before it had carried it out."""
     death.arm(guard, nth)
     try:
         since = guard.mark()
@@ -143,7 +143,7 @@ for the first one; a template that is written to comes with the third."""
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("command", VICTIMS)
 def test_checkpoint(tmp_path: Path, command: str, way: str, death: Death) -> None:
-    """Whatever the guard was doing, the application goes on, and the next guard protects it."""
+    """Wherever the guard was killed, the application runs on, and the next guard protects it."""
     images, before = WAYS[way]
     if images is Images.DIRTY and "--in-child" in command:
         pytest.skip("trees are forked")
@@ -178,20 +178,20 @@ def test_checkpoint(tmp_path: Path, command: str, way: str, death: Death) -> Non
 
 
 def tidy(guard: GuardProcess, victim: Victim) -> None:
-    """The next guard's second checkpoint takes away what those that died have mapped, and each has to look at."""
+    """The next guard's second checkpoint removes what dead guards have mapped, once each process was looked at."""
     protects(guard)
     protects(guard)
     guard.start_another(victim.pid)
 
 
 def no_mark_is_left(victim: Victim) -> None:
-    """No memory is watched any more (userfaultfd), nor any of it write-protected."""
+    """No memory is registered with userfaultfd or write-protected any more."""
     smaps = Path(f"/proc/{victim.app}/smaps")
     wait_until(lambda: not re.search(r"VmFlags:.* uw\b", smaps.read_text()), PATIENCE_S, "nothing is watched", 0.01)
 
 
 def protects(guard: GuardProcess) -> None:
-    """The next guard does: at once, or when a thread that waited for the one that died has gone home."""
+    """The next guard protects it: at once, or when a thread has returned from the dead guard's parasite."""
     answers: list[dict[str, object]] = []
 
     def taken() -> bool:
@@ -204,7 +204,7 @@ def protects(guard: GuardProcess) -> None:
 
 
 def wait_goes_on_or_ends(victim: Victim) -> None:
-    """Whichever it is, it is soon."""
+    """Either must happen soon."""
     beats = victim.see().beats
     wait_until(
         lambda: victim.popen.poll() is not None or victim.see().beats > beats + 3, PATIENCE_S, "it goes on, or ends"
@@ -214,7 +214,7 @@ def wait_goes_on_or_ends(victim: Victim) -> None:
 @pytest.mark.parametrize("way", ["next", "dirty"])
 @pytest.mark.parametrize("command", ["steady", "steady --in-child"])
 def test_restore(tmp_path: Path, command: str, way: str, death: Death) -> None:
-    """Nobody can finish it: then init ends at once, and nothing is left of the application."""
+    """Nobody can finish the restore: init ends at once, and nothing is left of the application."""
     images, before = WAYS[way]
     if images is Images.DIRTY and "--in-child" in command:
         pytest.skip("trees are forked")

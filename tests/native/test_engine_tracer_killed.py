@@ -34,7 +34,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.mark.slow
 def test_no_application_notices(tmp_path: Path) -> None:
-    """Three kinds of application at once: each kill hits three guards, whatever they are doing."""
+    """Three kinds of application at once: each kill hits three guards at whatever they are doing."""
     with contextlib.ExitStack() as stack:
         victims = [stack.enter_context(Victim(command, tmp_path)) for command in ("threads 6 4", "fpu 2", "signals 4")]
         names = [threads(victim.app) for victim in victims[1:]]
@@ -64,9 +64,9 @@ def test_no_application_notices(tmp_path: Path) -> None:
 def test_blocked_calls_go_on(tmp_path: Path) -> None:
     """A guard that dies between stopping a thread and mending its call cannot undo the stop.
 
-    Calls that the kernel never makes again by itself (signal(7)) then answer EINTR, once, as after
-    SIGSTOP and SIGCONT.  No other call may, and none may be lost.  recvmmsg that has one of its messages leaves
-    what interrupted it to the socket's next call, which answers just that: an error of the kernel's own.
+    Calls that the kernel never restarts by itself (signal(7)) then fail once with EINTR, as after SIGSTOP and
+    SIGCONT.  No other call may, and no call may be lost.  A recvmmsg that has received a message already leaves
+    its error (512) to the socket's next call, which fails with it: this is an error in the kernel.
     """
     with Victim("eintr all 0", tmp_path) as victim, Victim("signals 4 --pending", tmp_path) as signals:
         said = storm(config(0.002), 60, 40, 2, victim, signals)
@@ -84,7 +84,7 @@ def test_blocked_calls_go_on(tmp_path: Path) -> None:
 
 
 def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
-    """Each guard maps pages of its own into the application; its successor takes them away."""
+    """Each guard maps pages into the application; its successor unmaps them."""
     with Victim("threads 4 1", tmp_path) as victim:
         storm(config(0.002), 20, 40, 3, victim)
         storm(config(0.002), 200, 12, 3, victim)  # many of them while they map theirs
@@ -97,7 +97,7 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace is what kills the guard; it is not installed")
 def test_handlers_run_on_their_own_stack(tmp_path: Path) -> None:
-    """The guard dies before its 1st, 2nd, ... ptrace call: a borrowed thread goes home, and signals find it whole."""
+    """The guard dies before its 1st, 2nd, ... ptrace call: a borrowed thread returns, and handlers find it whole."""
     with Victim("steady", tmp_path) as victim:
         for nth in range(1, PTRACE_CALLS + 1):
             with GuardProcess(config(0.02), [victim.pid]) as guard:

@@ -55,12 +55,12 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def steady(interval_s: float = 0.0, keep: int = 2) -> GuardConfig:
-    """With a second of patience for a freeze: on a busy machine the default of 50 ms would miss most of them."""
+    """A freeze may take a second here: on a busy machine the default of 50 ms would miss most of them."""
     return config(interval_s, keep=keep, freeze_deadline_s=1.0)
 
 
 def checkpoint(guard: GuardProcess) -> None:
-    """Takes one; a missed one is tried again."""
+    """Takes one; tries again when it was missed."""
     for _ in range(20):
         event = guard.command("checkpoint")
         if event["kind"] == "checkpoint":
@@ -71,7 +71,7 @@ def checkpoint(guard: GuardProcess) -> None:
 
 
 def kill_again_and_again(guard: GuardProcess, victim: Victim, kills: int, pause_s: float, orphans: int = 0) -> None:
-    """The main process dies at random moments; each time the tree is there again, and goes on."""
+    """Kills the main process at random moments; each time the whole tree comes back and goes on."""
     rng = random.Random(victim.command)
     guard.wait("checkpoint")
     changes = victim.command.split()[0] in ("churn", "commands")
@@ -90,7 +90,7 @@ def kill_again_and_again(guard: GuardProcess, victim: Victim, kills: int, pause_
 
 
 def wait_counter(victim: Victim, which: int, value: int) -> None:
-    """Until a counter on the board has come so far."""
+    """Waits until a counter on the board has reached a value."""
     wait_until(
         lambda: victim.see().counter[which] >= value or victim.see().violations,
         10,
@@ -101,7 +101,7 @@ def wait_counter(victim: Victim, which: int, value: int) -> None:
 
 @pytest.mark.parametrize("command", [*STATIC, *CHANGING, "terminal --stopped", "tree 9 --orphan"])
 def test_nobody_sees_checkpoints(command: str, tmp_path: Path) -> None:
-    """Not even in the middle of fork, exec, vfork and exit; every few milliseconds."""
+    """Every few milliseconds, also in the middle of fork, exec, vfork and exit."""
     with Victim(command, tmp_path) as victim, GuardProcess(steady(0.005), [victim.pid]) as guard:
         guard.wait("checkpoint", count=CHECKPOINTS, timeout_s=100)
         progress(victim)
@@ -127,13 +127,13 @@ def test_a_stopped_job_is_stopped_again(tmp_path: Path) -> None:
 
 
 def busy_cpus() -> contextlib.AbstractContextManager[None]:
-    """More of them are wanted than there are."""
+    """Runs more busy loops than there are CPUs."""
     return meanwhile([sys.executable, "-c", "while True: pass"], len(os.sched_getaffinity(0)) + 1)
 
 
 @pytest.mark.parametrize("command", ["prefork 6 100", "tree 9 --orphan"])
 def test_numbers_are_taken_by_others(command: str, tmp_path: Path) -> None:
-    """By `podman exec`, say; also of children that take long to fork, or are init's."""
+    """By `podman exec`, for example; also PIDs of children that take long to fork, or are init's."""
     with (
         Victim(command, tmp_path) as victim,
         forks_beside(victim),
@@ -143,7 +143,7 @@ def test_numbers_are_taken_by_others(command: str, tmp_path: Path) -> None:
 
 
 def kill_others(victim: Victim, family: set[int], over: threading.Event) -> None:
-    """Children of the main process that have other numbers than those of the family."""
+    """Kills children of the main process whose PIDs are not those of the family."""
     while not over.is_set():
         for main in children_of(victim.pid):
             for child in children_of(main):
@@ -154,7 +154,7 @@ def kill_others(victim: Victim, family: set[int], over: threading.Event) -> None
 
 
 def test_copies_are_killed(tmp_path: Path) -> None:
-    """Those that others have taken the number of; by the OOM killer, say."""
+    """Those whose PID another process has taken; by the OOM killer, for example."""
     over = threading.Event()
     with (
         Victim("prefork 6 100", tmp_path) as victim,
@@ -179,7 +179,7 @@ def test_copies_are_killed(tmp_path: Path) -> None:
 
 
 def test_killed_before_a_checkpoint_is_complete(tmp_path: Path) -> None:
-    """Who leads a group can be gone when the freeze is over, and is in the checkpoint all the same."""
+    """A group's leader may have ended when the freeze is over, and is in the checkpoint nevertheless."""
     with (
         busy_cpus(),
         Victim("terminal --stopped", tmp_path) as victim,
@@ -189,14 +189,14 @@ def test_killed_before_a_checkpoint_is_complete(tmp_path: Path) -> None:
 
 
 def test_a_daemon_of_the_application_goes_back_with_it(tmp_path: Path) -> None:
-    """It is init's child, because its parent has ended; it shares memory with the others."""
+    """It is init's child, since its parent has ended, and shares memory with the others."""
     with Victim("tree 9 --orphan", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
         kill_again_and_again(guard, victim, KILLS, 0.15, orphans=1)
 
 
 @pytest.mark.parametrize("command", ["tree 8", "tree 9 --orphan"])
 def test_dies_again_at_once(command: str, tmp_path: Path) -> None:
-    """Some have a holder again, which has what they had open, and some have none yet: one end of a pair is there."""
+    """Some processes have holders again and some have not yet, so that only one end of a pair may be held."""
     rng = random.Random(command)
     with Victim(command, tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
         before = places(victim)
@@ -213,7 +213,7 @@ def test_dies_again_at_once(command: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["tree 8 --threads 2", "churn 6"])
 def test_killed_while_it_can_not_be_stopped_in_time(command: str, tmp_path: Path) -> None:
-    """Freezes and holders fail again and again, in every state: no death is final, and checkpoints go on."""
+    """Freezes and holders keep failing, in every state: no death is final, and checkpoints are taken again."""
     rng = random.Random(command)
     hurried = dataclasses.replace(steady(0.01), freeze_deadline_s=0.0003)
     with Victim(command, tmp_path) as victim, GuardProcess(hurried, [victim.pid]) as guard:
@@ -274,7 +274,7 @@ def test_started_since_is_gone_and_ended_since_is_back(tmp_path: Path) -> None:
 
 
 def test_a_dead_child_holds_no_pipe_open(tmp_path: Path) -> None:
-    """$(cmd) sees the end of what cmd says when it ends, and not when its template goes."""
+    """$(cmd) sees end of file when cmd ends, not when its template does."""
     with Victim("commands --gate", tmp_path) as victim, GuardProcess(steady(), [victim.pid]) as guard:
         for n in range(1, 6):
             wait_counter(victim, 3, n)
@@ -306,9 +306,9 @@ def test_a_child_that_is_killed_is_the_applications_business(command: str, tmp_p
 
 @pytest.mark.parametrize("thp", [False, True], ids=["small pages", "huge pages"])
 def test_pages_stay_shared(thp: bool, tmp_path: Path) -> None:
-    """Prefork workers share their data after a restore as they did before it; proportional sizes are the measure.
+    """Prefork workers share pages after a restore as before it, measured by proportional set sizes.
 
-    Of transparent huge pages workers keep all that they have written nothing to.
+    Workers keep the transparent huge pages to which they have not written.
     """
     megabytes, workers = 60, 6
 
@@ -355,7 +355,7 @@ def test_a_template_killed_from_inside_costs_a_generation(tmp_path: Path) -> Non
 
 
 def test_it_ends_as_its_main_process_does(tmp_path: Path) -> None:
-    """A clean end of the main process ends the container, and everybody in it."""
+    """A clean exit of the main process ends the container with all its processes."""
     with Victim("tree 8 --seconds 1.5", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
         guard.wait("checkpoint", count=3)
         assert guard.wait("gave_up")["reason"] == "clean_exit"
@@ -365,7 +365,7 @@ def test_it_ends_as_its_main_process_does(tmp_path: Path) -> None:
 
 
 def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
-    """The guard dies before, in and after checkpoints; no process is harmed or left stopped, no template ever runs."""
+    """The guard dies before, during and after checkpoints; no process is left stopped, no template ever runs."""
     with contextlib.ExitStack() as stack:
         commands = ("tree 8 --threads 2", "churn 4", "churn 3 --vfork", "terminal")
         victims = [stack.enter_context(Victim(command, tmp_path)) for command in commands]
@@ -389,7 +389,7 @@ def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
 
 
 def test_the_tracer_is_killed_after_restores(tmp_path: Path) -> None:
-    """What was restored is the application itself, and lives on without whoever restored it."""
+    """What was restored is the application itself, and does not need the guard that restored it."""
     with Victim("tree 8", tmp_path) as victim:
         before = places(victim)
         for _ in range(KILLS):
@@ -405,7 +405,7 @@ def test_the_tracer_is_killed_after_restores(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(psutil.virtual_memory().available < 12e9, reason="it takes 6 GB, and twice that to be at ease")
 def test_children_wait_as_long_as_a_big_process_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They were asked at the beginning, and must not go on by themselves before the end."""
+    """They were stopped first, and must not run before the last one was cloned."""
     monkeypatch.setattr("testkit.guarded.PATIENCE_S", 60.0)  # 6 GB are to be filled
     with Victim("prefork 2 6000", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(4):

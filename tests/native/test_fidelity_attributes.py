@@ -31,13 +31,13 @@ def test_attributes(command: str, where: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("kind", ["exit-signal", "zombie-group", "vdso", "limits", "hard-limits", "barriers"])
 def test_traits(kind: str, where: str, tmp_path: Path) -> None:
-    """Of children: what their end tells, the group of one that has ended; limits; membarrier(2)."""
+    """Of children: exit signals, the group of an ended one, limits; membarrier(2)."""
     with Victim(f"traits {kind} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 10, (0.01, 0.12))
 
 
 def test_thousands_of_groups(tmp_path: Path) -> None:
-    """They make /proc/PID/status as long as they like; what comes after them there is not missed."""
+    """They make /proc/PID/status very long; the lines behind them must be read nevertheless."""
     groups = range(10**9, 10**9 + 3000)
     with (
         Victim("threads 4 1", tmp_path, preexec=lambda: os.setgroups(groups)) as victim,
@@ -50,7 +50,7 @@ def test_thousands_of_groups(tmp_path: Path) -> None:
 
 
 def credentials(victim: Victim) -> dict[str, str]:
-    """Of its main process, as /proc has them."""
+    """The main process's credentials, as /proc shows them."""
     lines = Path(f"/proc/{victim.app}/status").read_text().splitlines()
     fields = dict(line.split(":", 1) for line in lines)
     names = [name for name in fields if name in ("Uid", "Gid", "Groups", "NoNewPrivs") or name.startswith("Cap")]
@@ -59,7 +59,7 @@ def credentials(victim: Victim) -> dict[str, str]:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_a_personality_that_changes(where: str, tmp_path: Path) -> None:
-    """Also of a process whose holder was made before."""
+    """Also that of a process whose holder was made before the change."""
     with Victim(f"traits personality {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         wait_until(lambda: victim.see().counter[0] == 1, 5, "it changes")
@@ -69,7 +69,7 @@ def test_a_personality_that_changes(where: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["setup", "disarmed"])
 def test_a_thread_that_changes(kind: str, tmp_path: Path) -> None:
-    """One that sets itself up when it is seen for the first time; one in a handler, which has no alternate stack."""
+    """One that sets itself up when it is first seen; one in a handler, whose alternate stack is hidden then."""
     with Victim(f"traits {kind}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(1 if kind == "setup" else 4):
             assert guard.command("checkpoint")["kind"] == "checkpoint"
@@ -80,7 +80,7 @@ def test_a_thread_that_changes(kind: str, tmp_path: Path) -> None:
 
 
 def test_a_thread_that_leaves_a_handler(tmp_path: Path) -> None:
-    """It has its alternate stack again, which it did not have while it was asked in the handler."""
+    """It has its alternate stack again, which was hidden when it was asked inside the handler."""
     with Victim("traits rearmed", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for step in (0, 1, 2):
             lead(victim, step)
@@ -92,7 +92,7 @@ def test_a_thread_that_leaves_a_handler(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_all_threads_change_users(where: str, tmp_path: Path) -> None:
-    """Whichever of them the next checkpoint asks (after many quiet ones not all): it has them all as they are now."""
+    """The next checkpoint asks only some threads after many quiet ones; all must be restored with the new user."""
     with Victim(f"traits users {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for change in range(1, 13):
             for _ in range(change):
@@ -104,13 +104,13 @@ def test_all_threads_change_users(where: str, tmp_path: Path) -> None:
 
 
 def lead(victim: Victim, step: int) -> None:
-    """It waits for the step on its board, takes it, and says so there."""
+    """Lets the victim take the next step, and waits until its board says so."""
     victim.board.set_counter(1, step)
     wait_until(lambda: victim.see().counter[0] == step, 5, f"it has come to step {step}")
 
 
 def kill(guard: GuardProcess, victim: Victim) -> None:
-    """Once; it goes on."""
+    """Kills the victim once; it goes on."""
     since = guard.mark()
     victim.kill_app()
     guard.wait("restored", since=since)
@@ -118,7 +118,7 @@ def kill(guard: GuardProcess, victim: Victim) -> None:
 
 
 def test_one_that_may_not_have_another_process(tmp_path: Path) -> None:
-    """Its limit of processes is reached: it goes on unharmed, and it is said why there is no checkpoint."""
+    """At its limit of processes it runs on unharmed, and the reason for the missing checkpoint is reported."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o777)  # the victim is not root
         user = "/usr/bin/setpriv --reuid 54321 --regid 54321 --clear-groups --bounding-set -all --inh-caps -all"
@@ -137,7 +137,7 @@ def test_one_that_may_not_have_another_process(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["sandbox", "sandbox --kill"])
 def test_a_seccomp_filter_of_its_own(command: str, tmp_path: Path) -> None:
-    """It neither stands in the way of a restore nor is it gone after it."""
+    """It does not prevent a restore, and is in force after it."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 30, (0.01, 0.12))
         for task in Path(f"/proc/{victim.app}/task").iterdir():

@@ -19,7 +19,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_tiles(where: str, tmp_path: Path) -> None:
-    """AMX: a restored thread has to be given room for its tiles before it can have them."""
+    """AMX: a restored thread must be permitted to use its tiles before they can be put back."""
     with Victim(f"tiles 3 {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 40, (0.01, 0.12))
         assert not victim.see().violations
@@ -27,13 +27,13 @@ def test_tiles(where: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_protection_keys(where: str, tmp_path: Path) -> None:
-    """Each thread has the rights that it had, and the keys are allocated."""
+    """Each thread has its access rights again, and the keys are allocated."""
     with Victim(f"pkeys 3 {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 30, (0.01, 0.12))
 
 
 def test_shadow_stacks_are_refused(tmp_path: Path) -> None:
-    """A kernel that has them says so of each thread; a program compiled for them has one."""
+    """A kernel with shadow stacks shows them for each thread; a program compiled for them uses one."""
     if "x86_Thread_features:" not in Path("/proc/self/status").read_text():
         pytest.skip("this kernel has no shadow stacks for programs (CONFIG_X86_USER_SHADOW_STACK)")
     tunables = "/usr/bin/env GLIBC_TUNABLES=glibc.cpu.x86_shstk=on"

@@ -29,7 +29,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def write(victim: Victim) -> None:
-    """Has it write; what was written less than a tick before a checkpoint would count as written since."""
+    """Has it write; waits, since what was written within one tick before a checkpoint counts as written after it."""
     done = victim.see().counter[0]
     victim.kill_app(signal.SIGUSR1)
     wait_until(lambda: victim.see().counter[0] > done, 10, "it has written")
@@ -50,7 +50,7 @@ def test_goes_back_beside_files_that_are_only_written_on(how: str, tmp_path: Pat
 
 
 def test_goes_back_again_and_again_beside_output(tmp_path: Path) -> None:
-    """What it has written since is longer than what it knows of."""
+    """It has written more to its log since than the checkpoint knows of."""
     with (
         Victim(f"ledger output {tmp_path}", tmp_path) as victim,
         GuardProcess(config(files=Files.AUTO), [victim.pid]) as guard,

@@ -28,7 +28,7 @@ def built(init_built: None, victims_built: Path) -> None:
 @pytest.mark.parametrize("scenario", ["can", "buses"])
 @pytest.mark.usefixtures("bus")
 def test_a_bus(scenario: str, where: str, tmp_path: Path) -> None:
-    """Its sockets hear what they had asked for, also those that were closed; what is said in a cycle goes on."""
+    """CAN sockets receive what they had subscribed to, closed ones included; cyclic messages go on."""
     with (
         Victim(f"devices {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -48,7 +48,7 @@ def test_what_was_said_in_a_cycle_is_lost_with_its_socket(tmp_path: Path) -> Non
 @pytest.mark.parametrize("scenario", ["camera", "holding", "stopped", "unused", "again"])
 @pytest.mark.usefixtures("camera")
 def test_a_camera(scenario: str, where: str, tmp_path: Path) -> None:
-    """It films on, into all of its buffers, also after deaths with one of them in hand."""
+    """It keeps filming into all of its buffers, also when it dies while it holds one."""
     with (
         Victim(f"devices {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -60,7 +60,7 @@ def test_a_camera(scenario: str, where: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("scenario", "what"), [("changed", "its buffers have changed"), ("left", "opened anew")])
 @pytest.mark.usefixtures("camera")
 def test_a_camera_that_is_not_as_it_was_is_told(scenario: str, what: str, where: str, tmp_path: Path) -> None:
-    """And no worse: what looks like its pictures can be read."""
+    """This is reported, and its mapped buffers can still be read."""
     with (
         Victim(f"devices {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -72,7 +72,7 @@ def test_a_camera_that_is_not_as_it_was_is_told(scenario: str, what: str, where:
 
 @pytest.mark.usefixtures("camera")
 def test_a_camera_that_fills_the_programs_memory_is_refused(tmp_path: Path) -> None:
-    """A restored program has other memory."""
+    """A restored program's memory is not the memory that the driver fills."""
     with (
         Victim(f"devices own {tmp_path}", tmp_path) as victim,
         GuardProcess(config(0.02), [victim.pid]) as guard,

@@ -23,7 +23,7 @@ def built(init_built: None, victims_built: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("how", ["numbers", "numbers-closed", "numbers-left"])
 def test_what_is_watched_under_a_closed_number(how: str, where: str, tmp_path: Path) -> None:
-    """An epoll set goes on to watch what has another number; several may have been watched under one."""
+    """epoll keeps watching a description after its number is closed; several may have had the same number."""
     with (
         Victim(f"events {how} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -34,7 +34,7 @@ def test_what_is_watched_under_a_closed_number(how: str, where: str, tmp_path: P
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("what", ["timers", "periods", "owner"])
 def test_timers_and_locks(what: str, where: str, tmp_path: Path) -> None:
-    """fdinfo shows the same of timers; F_GETLK and fdinfo name the process that has a lock."""
+    """fdinfo shows the same timer settings; F_GETLK and fdinfo name the process that holds a lock."""
     with (
         Victim(f"events {what} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -43,7 +43,7 @@ def test_timers_and_locks(what: str, where: str, tmp_path: Path) -> None:
 
 
 def test_events_of_a_watch_that_is_gone(tmp_path: Path) -> None:
-    """They were not read before the checkpoint, nor since."""
+    """They were unread at the checkpoint and still are."""
     with (
         Victim(f"events unread {tmp_path}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -58,7 +58,7 @@ def test_events_of_a_watch_that_is_gone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("how", ["unread-read", "unread-closed"])
 def test_lost_events_are_told_of(how: str, where: str, tmp_path: Path) -> None:
-    """Whoever would wait for them gets IN_Q_OVERFLOW."""
+    """A reader that would wait for them gets IN_Q_OVERFLOW."""
     with (
         Victim(f"events {how} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,

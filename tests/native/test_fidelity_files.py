@@ -41,7 +41,7 @@ def built(init_built: None, victims_built: Path) -> None:
     ],
 )
 def test_as_at_the_checkpoint(scenario: str, where: str, tmp_path: Path) -> None:
-    """From one generation many times, then from a later one: each time nothing is missing, and nothing is left."""
+    """Many times from one generation, then from a later one: nothing is missing, and nothing is left over."""
     with (
         Victim(f"descriptors {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -60,7 +60,7 @@ def test_as_at_the_checkpoint(scenario: str, where: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("where", WHERE)
 def test_what_was_watched_since_is_forgotten_though_others_have_it(where: str, tmp_path: Path) -> None:
-    """An epoll set lets go of a description when nobody has it open any more; here we have."""
+    """epoll forgets a description once no process has it open; here another process still has."""
     with (
         Victim(f"descriptors watched {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -95,7 +95,7 @@ def test_a_file_that_is_gone_reads_as_empty_and_is_told(tmp_path: Path) -> None:
 
 
 def test_only_what_the_application_may_open_is_opened_again(tmp_path: Path) -> None:
-    """Its user is nobody, the guard's is root."""
+    """The application's user is nobody, the guard's is root."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
         with (
@@ -113,7 +113,7 @@ def test_only_what_the_application_may_open_is_opened_again(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("where", WHERE)
 def test_thousands_opened_since_are_closed(where: str, tmp_path: Path) -> None:
-    """Nobody looks at them: that would take a second."""
+    """Without looking at each of them, which would take a second."""
     with (
         Victim(f"descriptors many {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -141,7 +141,7 @@ def test_offsets_stay_with_keep(tmp_path: Path) -> None:
 
 @pytest.fixture
 def memory() -> Iterator[Path]:
-    """A folder for the board: mapped for writing, it would be data if it were on a disk."""
+    """A folder for the board; on a disk its writable mapping would count as data."""
     with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
         yield Path(path)
 
@@ -193,7 +193,7 @@ def test_strict_restores_when_nothing_was_written(tmp_path: Path, memory: Path) 
     ],
 )
 def test_strict_sees_files_that_are_not_open(how: str, why: str, tmp_path: Path, memory: Path) -> None:
-    """A file that is opened, written and closed; one that is written through a mapping."""
+    """A file that is opened, written and closed, and one that is written through a mapping."""
     with (
         Victim(f"scribe {how} {tmp_path}/data", memory) as victim,
         GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
@@ -293,7 +293,7 @@ def test_connections_go_on_on_demand(tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["opened", "closed", "replaced", "content", "events", "epoll", "flags", "locks"])
 def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> None:
-    """Before, while and after it changes things, and while it looks at them; the guard keeps nothing of the app's."""
+    """Before, during and after its changes and its checks; the guard keeps no descriptor of the application's."""
     rng = random.Random(scenario)
     with (
         Victim(f"descriptors {scenario} {tmp_path} {where}", tmp_path) as victim,
@@ -330,7 +330,7 @@ def other(memory: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("scenario", ["changed", "closed", "reused"])
 @pytest.mark.usefixtures("other")
 def test_watches(scenario: str, where: str, tmp_path: Path) -> None:
-    """The watches of the checkpoint, under their own numbers, and no event of what was done to them."""
+    """The watches of the checkpoint under the same numbers, without events caused by putting them back."""
     with (
         Victim(f"inotify {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -340,7 +340,7 @@ def test_watches(scenario: str, where: str, tmp_path: Path) -> None:
 
 @pytest.fixture
 def overlay(memory: Path, tmp_path: Path) -> Iterator[Path]:
-    """A folder on an overlay, as a container's root is one; upper folder on a disk."""
+    """A folder on an overlay, like a container's root; its upper folder is on a disk."""
     for name in ("lower", "upper", "work", "merged"):
         (tmp_path / name).mkdir()
     layers = f"lowerdir={tmp_path}/lower,upperdir={tmp_path}/upper,workdir={tmp_path}/work"
@@ -352,7 +352,7 @@ def overlay(memory: Path, tmp_path: Path) -> Iterator[Path]:
 
 @since_linux(6, 6, "an overlay says what is watched")
 def test_watches_on_an_overlay(overlay: Path, memory: Path) -> None:
-    """Of which no handle can be opened."""
+    """Its file handles cannot be opened."""
     with (
         Victim(f"inotify closed {overlay}", memory) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -375,7 +375,7 @@ def test_a_watched_file_that_is_gone_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["messages", "flight", "shut", "pidfds", "child", "full"])
 def test_sockets(scenario: str, where: str, tmp_path: Path) -> None:
-    """Datagrams and records are in them again, each by itself; a pidfd is of the process that it was of."""
+    """Datagrams and records are queued again with their boundaries; a pidfd refers to the same process."""
     with (
         Victim(f"sockets {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -394,7 +394,7 @@ def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("scenario", ["unix", "datagrams", "rebound", "early", "options", "dropped", "family"])
 def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
-    """Under their names, with their options; also those that the restore before had made."""
+    """With their names and options; also sockets that the previous restore had made."""
     with (
         Victim(f"listeners {scenario} {tmp_path} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -409,7 +409,7 @@ def test_sockets_made_again(scenario: str, where: str, tmp_path: Path) -> None:
 
 
 def test_a_socket_that_is_just_being_bound(tmp_path: Path) -> None:
-    """Whatever the moment of the checkpoint, it has a name afterwards if and only if bind(2) was over."""
+    """It has a name after the restore if and only if bind(2) had returned at the checkpoint."""
     with (
         Victim(f"listeners brief {tmp_path}", tmp_path) as victim,
         GuardProcess(config(0.005), [victim.pid]) as guard,
@@ -419,7 +419,7 @@ def test_a_socket_that_is_just_being_bound(tmp_path: Path) -> None:
 
 
 def test_closed_by_workers_while_a_checkpoint_is_looked_through(tmp_path: Path) -> None:
-    """The main process dies right after a freeze, its workers see it and close what they shared with it."""
+    """The main process dies right after a freeze; its workers see this and close what they shared with it."""
     with (
         Victim(f"listeners deserted {tmp_path}", tmp_path) as victim,
         GuardProcess(config(0.005), [victim.pid]) as guard,
@@ -429,7 +429,7 @@ def test_closed_by_workers_while_a_checkpoint_is_looked_through(tmp_path: Path) 
 
 
 def test_what_a_newer_generation_has_open_is_in_nobodys_way(tmp_path: Path) -> None:
-    """A port that a new worker has taken over between two checkpoints, when the older one is gone back to."""
+    """A new worker took a port over between two checkpoints, and the older one is restored."""
     with Victim(f"listeners handed-over {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         older = checkpoint(guard)["generation"]
         for _ in range(3):
@@ -443,7 +443,7 @@ def test_what_a_newer_generation_has_open_is_in_nobodys_way(tmp_path: Path) -> N
 
 
 def test_a_name_that_somebody_else_has_is_told(tmp_path: Path) -> None:
-    """It stays theirs."""
+    """The other process keeps it."""
     with Victim(f"listeners taken {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         checkpoint(guard)
         disturb(victim)

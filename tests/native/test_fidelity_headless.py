@@ -25,7 +25,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def test_it_is_restored_without_its_main_thread(tmp_path: Path) -> None:
-    """The others are who they were; the main thread has ended, as it had before."""
+    """The other threads are the same; the main thread has ended, as it had before."""
     with Victim("headless 5", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         before = threads(victim.app)
         kill_at_random(guard, victim, 40, (0.01, 0.12))
@@ -34,7 +34,7 @@ def test_it_is_restored_without_its_main_thread(tmp_path: Path) -> None:
 
 
 def test_the_end_of_the_last_thread(tmp_path: Path) -> None:
-    """Is the process's."""
+    """It is the end of the process."""
     plain = config(restore_on_exit=False)
     with Victim("headless 3", tmp_path) as victim, GuardProcess(plain, [victim.pid]) as guard:
         guard.wait("attached")
@@ -47,7 +47,7 @@ def test_the_end_of_the_last_thread(tmp_path: Path) -> None:
 
 
 def test_it_is_rolled_back_when_asked(tmp_path: Path) -> None:
-    """Though the thread that stood for the process at the checkpoint has ended since."""
+    """Even though the thread that stood for the process at the checkpoint has ended since."""
     with Victim("headless 3 --changing", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         for _ in range(5):
             guard.wait("checkpoint", since=guard.mark())  # some are missed: that thread ends meanwhile
@@ -57,7 +57,7 @@ def test_it_is_rolled_back_when_asked(tmp_path: Path) -> None:
 
 
 def test_a_guard_that_comes_later(tmp_path: Path) -> None:
-    """Takes it for the application that it is."""
+    """It recognizes the process as the application."""
     with Victim("headless 2", tmp_path) as victim:
         with GuardProcess(config(0.03), [victim.pid]) as guard:
             guard.wait("checkpoint", count=3)

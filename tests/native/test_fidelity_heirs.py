@@ -21,7 +21,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.mark.parametrize("size", ["3/20", "44/400"])
 def test_what_children_have_from_their_parents(size: str, tmp_path: Path) -> None:
-    """The same descriptions under the same numbers, but for those of their own; more than a guard may have open."""
+    """The same open files under the same numbers, except for their own; more than a guard may have open."""
     with (
         Victim(f"heirs {size} {tmp_path}", tmp_path) as victim,
         GuardProcess(config(freeze_deadline_s=1.0 * SLOWNESS), [victim.pid]) as guard,
@@ -38,6 +38,6 @@ def test_what_children_have_from_their_parents(size: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("kind", ["kept", "twins", "saved", "for-good"])
 def test_others_in_their_places(kind: str, tmp_path: Path) -> None:
-    """A child puts another file there, and the parent's back, between the looks of a checkpoint, too."""
+    """A child replaces a file and the parent puts it back, also between the stages of a checkpoint."""
     with Victim(f"redirect {kind}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         kill_at_random(guard, victim, 12, (0.01, 0.12))

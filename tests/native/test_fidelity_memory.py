@@ -28,7 +28,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def flagged(pid: int, flag: str) -> list[str]:
-    """Mappings of a process with a flag of smaps' VmFlags."""
+    """Mappings of a process with that flag in smaps' VmFlags."""
     found, header = [], ""
     for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
         if line.startswith("VmFlags:"):
@@ -40,7 +40,7 @@ def flagged(pid: int, flag: str) -> list[str]:
 
 
 def pages(mappings: list[str]) -> set[int]:
-    """Neighbours may have become one mapping, the heap may have grown."""
+    """Addresses of the pages: mappings may have been merged, and the heap may have grown."""
     bounds = ([int(bound, 16) for bound in mapping.split("-")] for mapping in mappings)
     return {page for start, end in bounds for page in range(start, end, 4096)}
 
@@ -54,7 +54,7 @@ def pages(mappings: list[str]) -> set[int]:
     ],
 )
 def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
-    """The victim compares all of it with one version number all the time."""
+    """The victim keeps one version number in all of it, and compares them all the time."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.05), [victim.pid]) as guard:
         wiped = flagged(victim.player, "wf")
         # Some of it comes and goes.
@@ -70,7 +70,7 @@ def test_every_kind_of_memory(command: str, tmp_path: Path) -> None:
 
 
 def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:
-    """A random number generator relies on it: it must hold at every moment."""
+    """Random number generators rely on it at every moment."""
     with Victim("mappings", tmp_path) as victim, GuardProcess(config(0.01), [victim.pid]) as guard:
         wiped = flagged(victim.player, "wf")
         guard.wait("checkpoint", count=3)
@@ -79,18 +79,18 @@ def test_a_live_process_keeps_its_wipe_on_fork(tmp_path: Path) -> None:
 
 
 def uninherited(victim: Victim) -> set[int]:
-    """Pages that are in no fork of it (MADV_DONTFORK)."""
+    """Pages that a fork does not inherit (MADV_DONTFORK)."""
     return pages(flagged(victim.player, "dc"))
 
 
 def take(guard: GuardProcess) -> None:
-    """A checkpoint; a busy machine misses some."""
+    """Takes a checkpoint; on a busy machine some are missed, and tried again."""
     wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "a checkpoint is taken", 0.02)
 
 
 @pytest.mark.parametrize("command", ["mappings", "mappings --unbound --in-child"])
 def test_what_no_fork_inherits_is_inherited_by_none_after_a_checkpoint(command: str, tmp_path: Path) -> None:
-    """Without a death, and after one; though the template has it."""
+    """Neither without a death nor after one, although the template has inherited it."""
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         before = uninherited(victim)
         assert before
@@ -109,7 +109,7 @@ def test_what_no_fork_inherits_is_inherited_by_none_after_a_checkpoint(command: 
 
 @pytest.mark.parametrize("where", WHERE)
 def test_it_stays_so_if_the_guard_dies(where: str, tmp_path: Path) -> None:
-    """Also between the call that lets it be inherited for a moment and the one that takes that back."""
+    """Also between the madvise(2) that allows its inheritance and the one that takes this back."""
     rng = random.Random(7)
     with Victim(f"mappings 0 {where}", tmp_path) as victim:
         before = uninherited(victim)
@@ -134,7 +134,7 @@ def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) 
 
 @pytest.mark.parametrize(("megabytes", "kind"), [(8, "unprotected"), (2, "checkpoint")])
 def test_more_shared_memory_than_allowed_of_several_processes(megabytes: int, kind: str, tmp_path: Path) -> None:
-    """Refused: those that went back would wait for what the others have in it."""
+    """Refused: a restored process would wait for what the others had stored in it."""
     with Victim(f"crowd common 2 {megabytes}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         answer = guard.command("checkpoint")
         assert answer["kind"] == kind, answer
@@ -151,7 +151,7 @@ def test_small_shared_memory_is_rolled_back_beside_a_large_one(tmp_path: Path) -
 
 
 def restored(victim: Victim, guard: GuardProcess) -> Json:
-    """Disturbs it and kills it; what is told when it is there again and has looked at what it has."""
+    """Disturbs and kills the victim; the restore's notes, once it has checked itself."""
     before, disturbed, since = victim.see().counter[1], victim.see().counter[2], guard.mark()
     os.kill(victim.player, signal.SIGUSR1)
     wait_until(lambda: victim.see().counter[2] > disturbed or victim.see().violations, 5, "it has", 0.001)
@@ -177,7 +177,7 @@ KINDS = [
     ],
 )
 def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
-    """From each of two checkpoints, again and again, with nothing to be told."""
+    """Repeatedly from each of two checkpoints, with no notes."""
     command = f"regions {scenario} {tmp_path} {where}"
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(2):
@@ -207,7 +207,7 @@ def test_what_was_sealed_since_can_not_go_back_and_is_told(where: str, tmp_path:
 
 @pytest.fixture
 def visible(tmp_path: Path) -> Iterator[Path]:
-    """A folder that the victim and everybody else have in /dev/shm."""
+    """A folder in /dev/shm that the victim and all others can reach."""
     folder = Path("/dev/shm") / f"avckpt-test-{tmp_path.name}-{os.getpid()}"
     folder.mkdir()
     yield folder
@@ -216,7 +216,7 @@ def visible(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_what_it_can_not_write_is_not_rolled_back(where: str, visible: Path, tmp_path: Path) -> None:
-    """A reader that dies takes nothing back of what the writer has written since."""
+    """A reader's restore takes back nothing that the writer has written since."""
     with (
         Victim(f"regions viewed {visible} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -229,7 +229,7 @@ def test_what_it_can_not_write_is_not_rolled_back(where: str, visible: Path, tmp
 
 @pytest.mark.parametrize("where", WHERE)
 def test_what_others_wrote_since_is_not_taken_back(where: str, visible: Path, tmp_path: Path) -> None:
-    """They have neither mapped it nor is it open any more when the application dies."""
+    """When the application dies, they neither map it nor have it open any more."""
     with (
         Victim(f"regions published {visible} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
@@ -252,7 +252,7 @@ def test_what_others_have_open_for_writing_is_theirs_and_told(visible: Path, tmp
 
 @pytest.fixture
 def huge_pages() -> Iterator[None]:
-    """A few more in the machine's pool while a test runs."""
+    """Adds a few pages to the machine's pool for the length of a test."""
     pool = Path("/proc/sys/vm/nr_hugepages")
     before = int(pool.read_text())
     pool.write_text(str(before + 8))
@@ -324,7 +324,7 @@ lap();
 
 @pytest.mark.skipif(not shutil.which("node"), reason="Node.js is not installed")
 def test_node(tmp_path: Path) -> None:
-    """V8 marks its heap MADV_DONTFORK; here it grows and shrinks all the time."""
+    """V8 marks its heap MADV_DONTFORK; here the heap grows and shrinks all the time."""
     script = tmp_path / "app.js"
     script.write_text(NODE)
     command = f"{shutil.which('node')} {script}"

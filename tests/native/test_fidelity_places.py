@@ -25,27 +25,27 @@ def run(command: str, folder: Path) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_those_that_have_ended(where: str, tmp_path: Path) -> None:
-    """By each signal, SIGKILL too, and in sessions and groups of their own: with their status."""
+    """Zombies of every signal, SIGKILL included, in sessions and groups of their own: with their status."""
     run(f"places ended {where}", tmp_path)
 
 
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("kind", ["leader", "terminal", "front"])
 def test_a_main_process_that_leads_a_session(kind: str, where: str, tmp_path: Path) -> None:
-    """Before its first checkpoint: its number is not taken by anything of ours; its terminal is its own."""
+    """Since before its first checkpoint: nothing of avckpt's takes the session's number, and it keeps its terminal."""
     run(f"places {kind} {where}", tmp_path)
 
 
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("kind", ["stayed", "adopted", "groups"])
 def test_sessions_and_groups_whose_leader_is_gone(kind: str, where: str, tmp_path: Path) -> None:
-    """Or has left them since: everybody is in the one it was in, under the number that that had."""
+    """Or has left them since: each process is in the session and group with the numbers of the checkpoint."""
     run(f"places {kind} {where}", tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["orphans", "unwaited"])
 def test_orphans_of_sessions_whose_leaders_are_gone(kind: str, tmp_path: Path) -> None:
-    """They are init's, and there are two of these sessions; or the leader has ended, and is there still."""
+    """Children of init in two such sessions; or the leader is a zombie."""
     with Victim(f"places {kind}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         for _ in range(12):
             since = guard.mark()

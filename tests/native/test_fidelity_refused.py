@@ -85,7 +85,7 @@ def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path
     ],
 )
 def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
-    """What was held until then is given up: the application is another one now."""
+    """The generations are dropped: the application can no longer be restored to them."""
     with Victim(f"unsupported {kind} signal", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         guard.wait("checkpoint")
         victim.kill_app(signal.SIGUSR1)
@@ -96,7 +96,7 @@ def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
 
 @NETWORKS
 def test_of_one_thread_and_not_for_long(tmp_path: Path) -> None:
-    """A checkpoint is missed, and those that were held are good."""
+    """One checkpoint is missed, and the generations stay valid."""
     with Victim("unsupported network signal 2", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         victim.kill_app(signal.SIGUSR1)
@@ -110,7 +110,7 @@ def test_of_one_thread_and_not_for_long(tmp_path: Path) -> None:
 
 
 def test_a_tracer_of_its_own(tmp_path: Path) -> None:
-    """Somebody's debugger comes first; when it leaves, protection comes back."""
+    """A debugger was there first; protection comes back when it detaches."""
     with Victim("unsupported traced", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         app = guard.wait("attached")["app_pid"]
         told = guard.wait("unprotected")
@@ -124,7 +124,7 @@ def test_a_tracer_of_its_own(tmp_path: Path) -> None:
 
 
 class Tracer:
-    """strace of one thread, which comes in between two checkpoints."""
+    """strace of one thread, attached between two checkpoints."""
 
     def __init__(self, tid: int) -> None:
         self.process = self._start(tid)
@@ -140,14 +140,14 @@ class Tracer:
         return f"TracerPid:\t{self.process.pid}\n" in Path(f"/proc/{tid}/status").read_text()
 
     def leave(self) -> None:
-        """What it traces runs on."""
+        """Detaches; the traced thread runs on."""
         self.process.terminate()
         self.process.wait()
 
 
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace is what traces the victim; it is not installed")
 def test_a_tracer_from_outside(tmp_path: Path) -> None:
-    """Checkpoints pause; what was held before is good for a crash after it has left."""
+    """Checkpoints pause; generations from before serve for a crash after it has detached."""
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(0.02, keep=2), [victim.pid]) as guard:
         guard.wait("checkpoint", count=3)
         strace = Tracer(victim.app)
@@ -165,7 +165,7 @@ def test_a_tracer_from_outside(tmp_path: Path) -> None:
 
 
 def test_stopped_by_job_control(tmp_path: Path) -> None:
-    """It stays stopped under checkpoints, comes back stopped, and goes on when it is told to."""
+    """It stays stopped across checkpoints, is restored stopped, and continues on SIGCONT."""
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         guard.wait("checkpoint")
         os.kill(victim.app, signal.SIGSTOP)
@@ -185,12 +185,12 @@ def test_stopped_by_job_control(tmp_path: Path) -> None:
 
 
 def is_stopped(pid: int) -> bool:
-    """By job control; in a checkpoint it is a tracer's for a moment, and runs what is ours."""
+    """Whether job control has stopped it; during a checkpoint it is in a ptrace stop, and runs injected code."""
     return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "T"
 
 
 def test_another_program_takes_its_place(tmp_path: Path) -> None:
-    """Again and again, at any moment: no thread of it is sent where only the old one had something."""
+    """Repeatedly, at any moment: no thread is sent to an address that only the old program had."""
     with Victim("reexec 47", tmp_path) as victim, GuardProcess(config(0.004), [victim.pid]) as guard:
         guard.wait("checkpoint")
         wait_until(lambda: victim.see().counter[0] > 100 or victim.popen.poll() is not None, 30, "100 programs")

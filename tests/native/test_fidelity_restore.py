@@ -30,7 +30,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 
 def test_one_generation_restored_many_times(tmp_path: Path) -> None:
-    """Each time from the very same image: nothing of one life is in the next."""
+    """Each time from the same image: no state leaks from one life into the next."""
     with Victim("threads 8 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         taken = guard.command("checkpoint")
         assert taken["kind"] == "checkpoint", taken
@@ -54,7 +54,7 @@ def test_one_generation_restored_many_times(tmp_path: Path) -> None:
 
 
 def test_restore_on_command(tmp_path: Path) -> None:
-    """A live application is rolled back, and its counters with it."""
+    """A live application is rolled back, its counters included."""
     with Victim("busy 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("restore")["kind"] == "refused"
         guard.command("checkpoint")
@@ -70,7 +70,7 @@ def test_restore_on_command(tmp_path: Path) -> None:
 
 
 def test_names_in_the_process_list(tmp_path: Path) -> None:
-    """Templates, spare and holder say what they are; the restored application is called what it was."""
+    """Templates, spare and holder are named as such; the restored application has its own name."""
     forks = config(images=Images.FORK)
     with Victim("idle 1 5", tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
         before = threads(victim.app)
@@ -118,7 +118,7 @@ def test_process_group_and_session_stay(tmp_path: Path) -> None:
 
 
 def test_a_template_that_is_killed_is_a_lost_generation(tmp_path: Path) -> None:
-    """From inside the container, as somebody's cleaning script may do it."""
+    """From inside the container, for example by a script that kills unknown processes."""
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         first = guard.command("checkpoint")
         guard.command("checkpoint")
@@ -136,7 +136,7 @@ def test_a_template_that_is_killed_is_a_lost_generation(tmp_path: Path) -> None:
 
 
 def test_nothing_is_left_behind(tmp_path: Path) -> None:
-    """No process, zombie, mapping or descriptor more after many checkpoints and restores, and none after the end."""
+    """No additional process, zombie, mapping or descriptor after many checkpoints and restores, and none at the end."""
     forks = config(images=Images.FORK)
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(forks, [victim.pid]) as guard:
 
@@ -203,7 +203,7 @@ def test_a_connection_goes_on(echo: tuple[Victim, GuardProcess, socket.socket]) 
 
 
 def test_what_is_closed_after_a_checkpoint_is_closed(echo: tuple[Victim, GuardProcess, socket.socket]) -> None:
-    """Though templates were made while it was open: the peer sees the end, the port is free."""
+    """Although templates were made while it was open: the peer sees the end, and the port is free."""
     victim, guard, peer = echo
     port = victim.see().counter[1]
     for _ in range(3):
@@ -252,7 +252,7 @@ def test_an_exit_status_that_is_not_restored_is_inits(tmp_path: Path) -> None:
 
 
 def test_a_command_that_came_too_late_is_not_carried_out(tmp_path: Path) -> None:
-    """Who gave it was told that it failed."""
+    """Its sender was told that it failed."""
     with Victim("idle 1 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         guard.command("checkpoint")
         app = victim.app
@@ -269,7 +269,7 @@ def test_a_command_that_came_too_late_is_not_carried_out(tmp_path: Path) -> None
 
 
 def test_restores_are_used_up(tmp_path: Path) -> None:
-    """The newest keeps crashing, then the one before it, and then it is over, with the app's own status."""
+    """The newest generation keeps crashing, then the one before it; then the application ends with its own status."""
     few = config(restore_max=2, restore_window_s=60.0)
     with Victim("crash", tmp_path) as victim, GuardProcess(few, [victim.pid]) as guard:
         first = guard.command("checkpoint")["generation"]

@@ -27,14 +27,14 @@ def built(init_built: None, victims_built: Path) -> None:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("command", ["pending 1", "pending 12", "signals 6 --pending"])
 def test_pending_signals(command: str, where: str, tmp_path: Path) -> None:
-    """With their values, codes and senders, in their order; none twice."""
+    """With their values, codes and senders, in order, and each only once."""
     with Victim(f"{command} {where}", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         kill_at_random(guard, victim, 60, (0.005, 0.08))
 
 
 @pytest.mark.parametrize("signum", [signal.SIGABRT, signal.SIGTERM, signal.SIGRTMIN])
 def test_a_deadly_signal_is_in_no_image(signum: int, tmp_path: Path) -> None:
-    """Sent while a checkpoint is being taken, it waits until the application runs: what has it pending cannot live."""
+    """Sent during a checkpoint, it stays pending until the application runs: an image with it could not live."""
     with Victim("busy 64", tmp_path) as victim, GuardProcess(config(0.001), [victim.pid]) as guard:
         guard.wait("checkpoint", count=5)
         for n in range(1, 21):
@@ -48,7 +48,7 @@ def test_a_deadly_signal_is_in_no_image(signum: int, tmp_path: Path) -> None:
 
 
 class Ticks:
-    """A storm of the signal that the guard's deadline sends it (tracee.c), which ends its calls early."""
+    """A storm of the signal that the guard's deadline timer sends (tracee.c), which interrupts its calls."""
 
     SIGNAL = signal.SIGRTMAX - 2
 
@@ -76,7 +76,7 @@ class Ticks:
 
 
 def test_signals_of_the_guard_cut_no_queue_short(tmp_path: Path) -> None:
-    """PTRACE_PEEKSIGINFO tells of fewer signals than there are when one comes for who asks."""
+    """PTRACE_PEEKSIGINFO returns fewer signals than there are when its caller is interrupted."""
     with Victim("pending 12", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         guard.wait("checkpoint")
         with Ticks(guard):

@@ -44,13 +44,13 @@ def send(client: socket.socket, body: bytes) -> None:
 
 
 def more_than(victim: Victim, counter: int, before: int, action: Callable[[], None] = lambda: None) -> None:
-    """Does something, and waits until a counter of the board is greater than that."""
+    """Does something, then waits until a counter of the board exceeds that value."""
     action()
     wait_until(lambda: victim.see().counter[counter] > before, 10, f"counter {counter} of the board grows", 0.001)
 
 
 def sent(victim: Victim, client: socket.socket, messages: int = 1) -> None:
-    """Sends some, one after another, and waits until each was taken."""
+    """Sends messages one after another, and waits until each was received."""
     for _ in range(messages):
         more_than(victim, 0, victim.see().counter[0], lambda: send(client, SHORT))
 
@@ -64,7 +64,7 @@ def is_reset(client: socket.socket) -> bool:
 
 
 def start(victim: Victim, guard: GuardProcess) -> socket.socket:
-    """A connection, and a checkpoint while it is silent."""
+    """A connection, and a checkpoint while it is idle."""
     client = connect(victim)
     sent(victim, client)
     time.sleep(SILENT_S)
@@ -73,7 +73,7 @@ def start(victim: Victim, guard: GuardProcess) -> socket.socket:
 
 
 def kill_inside_a_message(victim: Victim, guard: GuardProcess, client: socket.socket, count: int = 1) -> None:
-    """Kills it while it reads a message of which the rest is in the kernel's buffers already."""
+    """Kills it in the middle of reading a message whose rest is in the kernel's buffers already."""
     before = victim.see().counter[4]
     send(client, LONG)
     wait_until(lambda: victim.see().counter[4] > before + 20_000, 10, "it reads the message", 0.001)
@@ -97,7 +97,7 @@ def test_what_is_left_of_a_message_is_read_away(tmp_path: Path) -> None:
 
 
 def test_without_it_the_stream_is_lost(tmp_path: Path) -> None:
-    """What the test above would see if nothing were done."""
+    """Shows that the test above would fail if nothing were done."""
     with (
         Victim("stream", tmp_path) as victim,
         GuardProcess(config(tcp=Tcp.KEEP), [victim.pid]) as guard,
@@ -125,7 +125,7 @@ def test_between_messages_a_connection_goes_on(tmp_path: Path) -> None:
 
 @AT_SPEED
 def test_a_message_cut_by_the_checkpoint_ends_the_connection(tmp_path: Path) -> None:
-    """The half that the restored process has is followed by something else."""
+    """The restored process has its first half, and other data would follow it."""
     with (
         Victim("stream", tmp_path) as victim,
         GuardProcess(config(tcp=Tcp.MESSAGES), [victim.pid]) as guard,

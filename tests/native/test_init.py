@@ -35,7 +35,7 @@ FORWARDED = [n for n in range(1, 65) if n not in (signal.SIGKILL, signal.SIGSTOP
 
 @pytest.fixture
 def public_init(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The init binary where every user can run it."""
+    """A copy of avckpt-init that every user may execute."""
     folder = Path(subprocess.check_output(["mktemp", "-d", "/tmp/avckpt-init-test.XXXXXX"], text=True).strip())
     folder.chmod(0o755)
     shutil.copy(INIT, folder / "avckpt-init")
@@ -150,7 +150,7 @@ def test_app_has_exactly_the_inherited_descriptors(closed: tuple[int, ...], tmp_
 
 @SHARED
 def test_init_lets_go_of_what_the_app_inherited() -> None:
-    """What the app closes is closed: a reader sees the end although init lives."""
+    """When the application closes a pipe, its reader sees the end although init lives."""
     read_end, write_end = os.pipe()
     script = f"import os, time; os.close({write_end}); os.close(1); time.sleep(60)"
     with Init([PYTHON, "-c", script], pass_fds=(write_end,)) as init:

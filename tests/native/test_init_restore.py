@@ -33,7 +33,7 @@ LONG_WAIT = ("--wait-ms", "60000")
 
 @pytest.fixture
 def init() -> Iterator[Phoenix]:
-    """An app under an init that waits long: whatever ends fast did not end by the timeout."""
+    """An application under an init with a long timeout, so that a quick end is not the timeout's."""
     with Phoenix(options=LONG_WAIT) as started:
         started.app_pid()
         yield started
@@ -111,7 +111,7 @@ def test_failed_attempt_does_not_become_the_exit_status(init: Phoenix, guard: Gu
 
 
 def test_death_right_after_the_verdict_is_a_new_death(init: Phoenix, guard: Guard) -> None:
-    """The verdict is in the pipe and the restored app is dead before init looks at either."""
+    """The verdict is in the pipe and the restored application dead before init looks at either."""
     pid = init.app_pid()
     for seq in range(1, 20):
         init.app.say("die 11")
@@ -132,7 +132,7 @@ def test_death_right_after_the_verdict_is_a_new_death(init: Phoenix, guard: Guar
 
 
 def test_killed_before_the_verdict_is_noticed(init: Phoenix, guard: Guard) -> None:
-    """Somebody kills the restored process before it runs, and the guard does not know yet."""
+    """The restored process is killed before it runs, and the guard does not know yet."""
     pid = init.app_pid()
     init.app.say("die 11")
     assert guard.report().seq == 1
@@ -150,13 +150,13 @@ def test_killed_before_the_verdict_is_noticed(init: Phoenix, guard: Guard) -> No
 
 @both
 def test_every_death_is_reported_once_whenever_it_comes(pid1: bool) -> None:
-    """Failed attempts, deaths just before, at and after the verdict, in any order and as fast as can be."""
+    """Failed attempts, and deaths just before, at and after the verdict, in any order and as fast as possible."""
     chance = random.Random(20)
     with Phoenix(pid1=pid1, options=LONG_WAIT) as init, Guard(init) as guard:
         pid = init.app_pid()
 
         def kill_app() -> None:
-            """Straight away, by its number outside: the newest child of init that is not the template."""
+            """Kills it directly, by its PID outside: the newest child of init that is not the template."""
             host_pid = next(child for child in reversed(children_of(init.pid)) if child != template)
             os.kill(host_pid, signal.SIGKILL)
 
@@ -193,8 +193,9 @@ def test_every_death_is_reported_once_whenever_it_comes(pid1: bool) -> None:
 
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace holds init at the right instant; it is not installed")
 def test_attempt_and_next_verdict_are_not_mixed_up() -> None:
-    """Between the reaping of a failed attempt and whatever init does next, the guard makes another attempt
-    that works, and says so. The dead one must not be taken for the restored app."""
+    """After init has reaped a failed attempt, and before its next step, the guard makes another attempt that works
+    and reports it.  Init must not take the dead one for the restored application.
+    """
     # Init sleeps 100 ms after each wait4 that reaped, which is where the guard gets in.
     prefix = ["strace", "-qq", "-o", "/dev/null", "-e", "trace=wait4", "-e", "inject=wait4:delay_exit=100000"]
     with Phoenix(options=LONG_WAIT, prefix=prefix) as init, Guard(init) as guard:
@@ -257,7 +258,7 @@ def test_guard_that_dies_is_noticed_at_once(pid1: bool) -> None:
 
 
 def test_guard_that_died_long_ago(init: Phoenix, guard: Guard) -> None:
-    """It leaves armed = 1 behind."""
+    """It left armed = 1 behind."""
     guard.die()
     init.app.say("exit 4")
     assert init.end() == 4
@@ -373,7 +374,7 @@ def test_only_armed_is_read_from_the_page(init: Phoenix, guard: Guard) -> None:
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace makes exec slow; it is not installed")
 @pytest.mark.parametrize("program", ["sleep", "no-such-program"])
 def test_guard_does_not_see_the_app_before_its_exec(program: str) -> None:
-    """Until then it is a copy of init. And a guard that comes early learns why there will be no app."""
+    """Until its exec it is a copy of init.  A guard that connects early is told why there will be no application."""
     prefix = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=execve", "-e", "inject=execve:delay_enter=300000"]
     with Init([program, "60"], prefix=prefix, env={"PATH": "/nowhere:/bin"}) as init, Page(init) as page:
         assert (page.ctl().app_pid, page.ctl().exec_errno) == (0, 0)
@@ -432,7 +433,7 @@ def test_death_by_the_very_signal_that_was_sent_is_final(init: Phoenix, guard: G
 
 @pytest.mark.parametrize("sig", [signal.SIGABRT, signal.SIGINT])
 def test_tearing_down_for_a_signal_that_was_sent_is_final(init: Phoenix, guard: Guard, sig: int) -> None:
-    """It ends in its own time, and with a status of its own."""
+    """It shuts down in its own time, and ends with its own status."""
     assert init.app.ask("catch") == "caught"
     init.kill(sig)
     assert init.app.hear().startswith(f"signal {int(sig)}")
@@ -490,7 +491,7 @@ def test_who_asks_twice_does_not_wait(init: Phoenix, guard: Guard) -> None:
 @both
 @pytest.mark.parametrize("moment", ["running", "waiting"])
 def test_stop_never_hangs_on_a_stopped_guard(pid1: bool, moment: str) -> None:
-    """A guard that is SIGSTOPped holds its descriptors and does nothing: a process that is so."""
+    """A guard in SIGSTOP keeps its descriptors open and does nothing; so does this process."""
     with Phoenix(pid1=pid1, options=["--wait-ms", "1000"]) as init, Guard(init) as guard:
         init.app_pid()
         holder = os.fork()

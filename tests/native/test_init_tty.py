@@ -36,7 +36,7 @@ class Terminal:
     slave: int
 
     def take(self) -> None:
-        """In the child: a new session with this as its controlling terminal."""
+        """In the child: makes a new session with this as its controlling terminal."""
         os.setsid()
         fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
@@ -85,7 +85,7 @@ def place(init: Phoenix) -> tuple[int, int, int]:
 
 
 def listeners(init: Phoenix) -> list[int]:
-    """Who listens to the keys."""
+    """The processes that the terminal's keys reach."""
     comms = {pid: Path(f"/proc/{pid}/comm") for pid in children_of(init.pid)}
     return [pid for pid, comm in comms.items() if comm.read_text() == "avckpt-keys\n"]
 
@@ -115,7 +115,7 @@ def test_key_reaches_the_app_once(init: Phoenix, terminal: Terminal) -> None:
 
 @pytest.mark.parametrize("key", [b"\x03", b"\x1c"])
 def test_who_ends_in_its_own_way_after_a_key_ends_for_good(init: Phoenix, terminal: Terminal, key: bytes) -> None:
-    """Many programs exit with 1 on Ctrl-C."""
+    """Many programs exit with status 1 on Ctrl-C."""
     with Guard(init) as guard:
         assert init.app.ask("catch") == "caught"
         terminal.type(key)
@@ -126,7 +126,7 @@ def test_who_ends_in_its_own_way_after_a_key_ends_for_good(init: Phoenix, termin
 
 
 def test_the_same_signal_from_a_process_is_no_key(init: Phoenix, terminal: Terminal) -> None:
-    """Of its own group even, as `kill 0` sends it."""
+    """Even from a process of its own group, as with `kill 0`."""
     with Guard(init) as guard:
         assert init.app.ask("catch") == "caught"
         os.killpg(place(init)[0], signal.SIGINT)
@@ -138,7 +138,7 @@ def test_the_same_signal_from_a_process_is_no_key(init: Phoenix, terminal: Termi
 
 
 def test_a_dead_apps_number_is_free_when_the_guard_hears(init: Phoenix, terminal: Terminal) -> None:
-    """Nobody is left in its group; and who listens to the keys does so again for the restored one."""
+    """No process is left in its group; keys reach the restored application again."""
     with Guard(init) as guard:
         pid = place(init)[0]
         (listener,) = wait_until(lambda: listeners(init), PATIENCE_S, "a listener")
@@ -191,7 +191,7 @@ def test_stop_key_does_not_stop_what_nobody_could_continue(init: Phoenix, termin
 
 
 def test_stopped_by_a_signal_it_stays_so(init: Phoenix, terminal: Terminal) -> None:
-    """Somebody wants it to stand still."""
+    """It was stopped on purpose."""
     pid = place(init)[0]
     os.kill(pid, signal.SIGSTOP)
     wait_until(lambda: state_of(pid) == "T", PATIENCE_S, "the stop")
@@ -217,7 +217,7 @@ def test_hang_up_is_final(init: Phoenix, terminal: Terminal) -> None:
 
 
 def test_restored_app_has_the_terminal(init: Phoenix, terminal: Terminal) -> None:
-    """The same number is not the same group: without init's help the keys go to the dead one."""
+    """The same number is not the same process group: without init's help the keys would go to the dead one."""
     with Guard(init) as guard:
         pid = place(init)[0]
         init.app.say("die 11")
@@ -251,7 +251,7 @@ def test_app_reads_from_the_terminal(terminal: Terminal) -> None:
 
 
 def test_under_a_shells_job_control(terminal: Terminal) -> None:
-    """In a shell, init is the leader of a foreground job, not of the session; the shell gets its terminal back."""
+    """Under a shell, init leads a foreground job and not the session; at the end the shell gets its terminal back."""
     pid = os.fork()
     if pid == 0:
         os.dup2(terminal.slave, 0)

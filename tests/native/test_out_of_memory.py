@@ -31,7 +31,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.fixture
 def group() -> Iterator[MemoryGroup]:
-    """256 MB for all that is started in it."""
+    """A memory cgroup with a limit of 256 MB for what the test starts."""
     with MemoryGroup(LIMIT_BYTES) as made:
         yield made
 
@@ -52,7 +52,7 @@ def test_a_leak_is_restored(rate: int, trial: int, group: MemoryGroup, tmp_path:
 
 
 def test_a_leak_is_restored_where_no_limit_is_known(group: MemoryGroup, tmp_path: Path) -> None:
-    """That of a group above the container's own, or all of the host's memory."""
+    """The limit is that of a parent cgroup, or the host's memory."""
     with (
         Victim(f"leak 100 {BASE_MB}", tmp_path, preexec=group.enter) as victim,
         GuardProcess(config(0.5), [victim.pid]) as guard,
@@ -64,7 +64,7 @@ def test_a_leak_is_restored_where_no_limit_is_known(group: MemoryGroup, tmp_path
 
 
 def test_nobody_is_killed_for_what_a_template_holds(group: MemoryGroup, tmp_path: Path) -> None:
-    """140 MB, all written again under a checkpoint: 280 of 256, and without the template there is room."""
+    """140 MB, all written again after a checkpoint: 280 of 256 MB; without the template it fits."""
     with (
         Victim("hoard 140", tmp_path, preexec=group.enter) as victim,
         GuardProcess(config(memory_limit_bytes=LIMIT_BYTES), [victim.pid]) as guard,
@@ -80,7 +80,7 @@ def test_nobody_is_killed_for_what_a_template_holds(group: MemoryGroup, tmp_path
 
 
 def test_older_generations_go_first(group: MemoryGroup, tmp_path: Path) -> None:
-    """80 MB three times are 240, and a leak from there kills the application: but what is restored is the newest."""
+    """Three times 80 MB are 240; a leak from there kills the application, but the newest generation is restored."""
     with (
         Victim("hoard 80", tmp_path, preexec=group.enter) as victim,
         GuardProcess(config(memory_limit_bytes=LIMIT_BYTES, keep=3), [victim.pid]) as guard,

@@ -79,7 +79,7 @@ while True:
 
 @contextmanager
 def sender(period_s: float) -> Iterator[tuple[Init, socket.socket]]:
-    """One that sends a number every so often, and does next to nothing else; and who hears them."""
+    """A program that sends a number at intervals and is otherwise idle, and its receiver."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
         peer.settimeout(30)
@@ -91,7 +91,7 @@ def sender(period_s: float) -> Iterator[tuple[Init, socket.socket]]:
 
 @since_linux(6, 6, "sock:sock_send_length")
 def test_what_was_sent_is_remembered(tmp_path: Path) -> None:
-    """Without hearing the output there would be a checkpoint every 3 s: it uses too little CPU time."""
+    """If output were not noticed, so idle a program would have a checkpoint every 3 s only."""
     with sender(1.2) as (init, peer), GuardProcess(AUTO, [init.pid]) as guard:
         guard.wait("checkpoint", count=2)
         first, since = int(peer.recv(64)), guard.mark()

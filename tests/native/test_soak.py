@@ -36,7 +36,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.mark.timeout(400)
 def test_nothing_is_left_of_checkpoints_and_restores(tmp_path: Path) -> None:
-    """Memory, page tables, descriptors, threads, processes and zombies of application, init and sidecar."""
+    """Compares memory, page tables, descriptors, threads, processes and zombies of application, init and sidecar."""
     if not (BUILD / "pool").exists():
         pytest.skip(f"no C++ compiler: {shutil.which('c++')}")
     rng = random.Random(1)

@@ -88,7 +88,7 @@ def test_the_tree_is_what_it_says(tmp_path: Path) -> None:
 
 
 def fds(pid: int, kind: str) -> list[int]:
-    """Descriptors of a process whose link has this in it."""
+    """Descriptors of a process whose link contains that text."""
     found = []
     for link in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):  # closed meanwhile
@@ -102,7 +102,7 @@ def named(victim: Victim, name: str) -> int:
 
 
 def quit_a_child(victim: Victim) -> None:
-    """By a signal that no child's number stands for."""
+    """By a signal whose number stands for no child."""
     with contextlib.suppress(ProcessLookupError, StopIteration):
         os.kill(named(victim, "child"), signal.SIGQUIT)
 
@@ -116,7 +116,7 @@ def stop_a_worker(victim: Victim) -> None:
 
 
 def kill_a_parent(victim: Victim) -> None:
-    """Its child has another one then."""
+    """Its child then has another parent."""
     os.kill(named(victim, "reaper"), signal.SIGKILL)
 
 
@@ -173,7 +173,7 @@ NO_STACK = 16
 
 
 def call(name: str, number: int, *args: int) -> Callable[[Victim], None]:
-    """Has a process make a system call in the middle of a nap."""
+    """Has a process make a system call while it sleeps."""
 
     def deed(victim: Victim) -> None:
         pid = main_process(victim) if name == "main" else named(victim, name)
@@ -192,7 +192,7 @@ def call(name: str, number: int, *args: int) -> Callable[[Victim], None]:
 
 
 def rename_a_worker(victim: Victim) -> None:
-    """To what its program's file begins with."""
+    """To the beginning of its program's file name."""
     maps = Path(f"/proc/{named(victim, 'member')}/maps").read_text()
     call("member", PRCTL, PR_SET_NAME, int(maps.split("-")[0], 16))(victim)
 
@@ -294,7 +294,7 @@ def test_a_worker_with_foreign_memory_says_so(tmp_path: Path) -> None:
 
 
 def test_the_end_of_a_pipe_that_somebody_holds_open(tmp_path: Path) -> None:
-    """What a template with a dead command's descriptors would do to a shell."""
+    """As a template with an ended command's descriptors would do to a shell."""
     with Victim("commands --gate", tmp_path) as victim:
         wait_until(lambda: victim.see().counter[3] == 1, 10, "a command")
         command = wait_until(lambda: members(victim)[1:], 10, "its process")[0]
@@ -311,7 +311,7 @@ def test_the_end_of_a_pipe_that_somebody_holds_open(tmp_path: Path) -> None:
 
 
 def test_status_of_a_violation(tmp_path: Path) -> None:
-    """That of the main process is the container's; a child's is on the board."""
+    """A main process's is the container's status; a child's is on the board."""
     with Victim("tree 8", tmp_path) as victim:
         move_the_offset(victim)
         wait_until(lambda: victim.see().violations > 0, 10, "a violation")

@@ -49,7 +49,7 @@ def board(tmp_path: Path) -> Iterator[Board]:
 
 @pytest.fixture
 def start(victims_built: Path, board: Board) -> Iterator[Start]:
-    """Starts a victim with the board; kills what is left at the end."""
+    """Starts a victim with the board; kills all that is left at the end."""
     started: list[subprocess.Popen[str]] = []
 
     def go(*command: str) -> subprocess.Popen[str]:
@@ -137,7 +137,7 @@ def test_blocked_until_the_timeout(start: Start, board: Board, kind: str) -> Non
 
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace is what stops the victim; it is not installed")
 def test_eintr_is_counted(start: Start, board: Board) -> None:
-    """A ptrace stop makes epoll_wait answer EINTR: that is what avckpt has to hide."""
+    """A ptrace stop makes epoll_wait fail with EINTR: this is what avckpt has to hide."""
     victim = start("eintr", "epoll_wait", "30", "--quiet")
     time.sleep(0.1)
     subprocess.run(["timeout", "0.3", "strace", "-qq", "-o", "/dev/null", "-p", str(victim.pid)])
@@ -149,7 +149,7 @@ def test_eintr_is_counted(start: Start, board: Board) -> None:
 
 
 def largest_writable(pid: int) -> tuple[int, int]:
-    """Start and size of the largest private, writable, anonymous mapping in which pages are."""
+    """Start and size of the largest private, writable, anonymous mapping that has pages."""
     best = (0, 0)
     for header, body in re.findall(
         r"^([0-9a-f]+-[0-9a-f]+ rw-p [^\n]*)\n(.*?)(?=^[0-9a-f]+-|\Z)",
@@ -179,7 +179,7 @@ def test_foreign_memory_is_noticed(start: Start, board: Board, command: str) -> 
 
 
 def meddle_until_noticed(victim: subprocess.Popen[str], deed: Callable[[], object]) -> str:
-    """What the victim has to say.  What is changed may be rewritten before it is looked at: more than one try."""
+    """The victim's report.  A changed value may be overwritten before it is checked, so this tries more than once."""
     for _ in range(20):
         deed()
         with contextlib.suppress(subprocess.TimeoutExpired):
