@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Says that its environment is so many MB of untouched memory, then "set", and waits for ever.
 
-python -m testkit.odd_environ MB
+python -m testkit.odd_environ MB [--arguments]     of its arguments instead
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def check(result: int, what: str) -> int:
     return result
 
 
-def set_environ(start: int, length: int) -> None:
+def set_places(start: int, arguments: int, environment: int) -> None:
     """struct prctl_mm_map: all as it is, but for arguments and environment."""
     stat = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     # proc(5): field 26 is startcode; the two words that come after pid and name are missing here.
@@ -34,7 +34,7 @@ def set_environ(start: int, length: int) -> None:
     start_data, end_data, start_brk = (int(stat[number - 3]) for number in (45, 46, 47))
     libc.sbrk.restype = ctypes.c_ulong
     fields = (start_code, end_code, start_data, end_data, start_brk, libc.sbrk(0), stack)
-    packed = struct.pack("12QII", *fields, start, start + 8, start, start + length, 0, 0, NO_FILE)
+    packed = struct.pack("12QII", *fields, start, start + arguments, start, start + environment, 0, 0, NO_FILE)
     check(libc.prctl(PR_SET_MM, PR_SET_MM_MAP, packed, len(packed), 0), "prctl(PR_SET_MM)")
 
 
@@ -42,7 +42,7 @@ def main() -> None:
     length = int(sys.argv[1]) << 20
     memory = mmap.mmap(-1, length, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | MAP_NORESERVE)
     start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
-    set_environ(start, length)
+    set_places(start, *((length, 8) if "--arguments" in sys.argv else (8, length)))
     print("set", flush=True)
     while True:
         signal.pause()

@@ -66,6 +66,12 @@ def threads(pid: int) -> dict[int, str]:
     return found
 
 
+def peak_kb(pid: int) -> int:
+    """The peak resident size of a process.  Raises OSError when it is gone."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0])
+
+
 def figures(pid: int) -> dict[str, int]:
     """What /proc/PID/status and smaps_rollup give as one number each, kB where it is memory.
 

@@ -16,6 +16,7 @@ from avckpt.cli.client import Client
 
 from testkit.harness import take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, local_sidecar
+from testkit.procfs import peak_kb
 
 pytestmark = pytest.mark.shared_machine("a sidecar, its guards and containers have to get CPU time within seconds")
 
@@ -99,6 +100,17 @@ def test_an_exit_has_no_place(sidecar: LocalSidecar) -> None:
     assert os.waitstatus_to_exitcode(event["wait_status"]) == 3
     assert not {"signal", "at"} & set(event["crash"])
     assert event["crash"]["command"] == sys.executable
+
+
+def test_arguments_without_an_end(sidecar: LocalSidecar) -> None:
+    """A process says itself where its arguments are: 300 MB, of which a page is read."""
+    odd = sidecar.protected("odd", [sys.executable, "-m", "testkit.odd_environ", "300", "--arguments"])
+    wait_until(lambda: "set" in odd.output.read_text(), 10, "it has such arguments")
+    assert sidecar.process is not None
+    before_kb = peak_kb(sidecar.process.pid)
+    wait_until(lambda: sidecar.row(odd)["checkpoints"] > 2, 10, "it is protected", every_s=0.05)
+    crash_by(sidecar, odd, signal.SIGKILL)
+    assert peak_kb(sidecar.process.pid) < before_kb + 50_000
 
 
 def _holders(victim: Container) -> list[int]:

@@ -16,7 +16,7 @@ from avckpt.cli.client import Client
 
 from testkit.harness import wait_until
 from testkit.local_sidecar import QUICK, Container, LocalSidecar, ended
-from testkit.procfs import children_of
+from testkit.procfs import children_of, peak_kb
 
 SLEEPER = ["sleep", "1000"]
 # Says READY, then a line for every SIGUSR1.
@@ -179,18 +179,12 @@ def test_an_environment_without_an_end(local: LocalSidecar) -> None:
     assert odd.hook("prestart", {"avckpt.group": "chain", "avckpt.notify": "exec:true"}) == ""
     local.wait_for(odd, state="listening")
     assert local.process is not None
-    status = Path(f"/proc/{local.process.pid}/status")
     web = protected(local, "web", IN_GROUP)
-    before_kb = high_water_kb(status)
+    before_kb = peak_kb(local.process.pid)
     crash(local, web)
     wait_until(lambda: told(local, "notify_failed"), 5, "the failure is told")
     assert "its environment is longer than" in told(local, "notify_failed")[0]["message"]
-    assert high_water_kb(status) < before_kb + 50_000
-
-
-def high_water_kb(status: Path) -> int:
-    """The peak resident size of a process."""
-    return int(status.read_text().partition("VmHWM:")[2].split()[0])
+    assert peak_kb(local.process.pid) < before_kb + 50_000
 
 
 def test_a_stuck_command_is_killed_and_hinders_nobody(local: LocalSidecar, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import SLOWNESS
+from testkit.procfs import peak_kb
 
 pytestmark = pytest.mark.shared_machine(
     "a checkpoint is missed when the application does not stop in time, and how far a guard got is looked at"
@@ -32,12 +33,6 @@ def guard_of(peer: GuardProcess, cookie: int = 1) -> int:
 def fds(pid: int) -> int:
     """How many descriptors a process has open."""
     return len(os.listdir(f"/proc/{pid}/fd"))
-
-
-def memory_kb(pid: int) -> int:
-    """The peak resident size of a process."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM:")).split()[1])
 
 
 def test_shared_memory_costs_no_descriptors(tmp_path: Path) -> None:
@@ -74,11 +69,11 @@ def test_memory_that_was_never_touched_costs_nothing(tmp_path: Path) -> None:
         GuardProcess(config(), [crowd.pid]) as guard,
     ):
         guard.wait("attached")
-        before = memory_kb(guard_of(guard))
+        before = peak_kb(guard_of(guard))
         for _ in range(2):
             taken = guard.command("checkpoint", timeout_s=PATIENCE_S)
             assert taken["kind"] == "checkpoint", taken
-        assert memory_kb(guard_of(guard)) - before < CHILDREN << 10
+        assert peak_kb(guard_of(guard)) - before < CHILDREN << 10
 
 
 def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
@@ -90,5 +85,5 @@ def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:
         told = guard.command("checkpoint", timeout_s=PATIENCE_S)
         assert told["kind"] == "unprotected"
         assert "more than 128 MB" in told["error"]["message"]
-        assert memory_kb(guard_of(guard)) < 400 << 10
+        assert peak_kb(guard_of(guard)) < 400 << 10
         crowd.wait_beats()

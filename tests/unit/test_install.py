@@ -26,6 +26,8 @@ from avckpt.errors import ConfigError
 from avckpt_hooks.shared import protocol
 from avckpt_hooks.shared.protocol import Register
 
+from testkit.procfs import peak_kb
+
 if os.geteuid() != 0:
     pytest.skip("avckpt install needs root", allow_module_level=True)
 
@@ -128,6 +130,32 @@ def test_uninstall_leaves_the_program_that_running_containers_will_call(root: Pa
     install.uninstall(root)
     assert tree(root) == before
     assert install.uninstall(root) == ["nothing is installed"]
+
+
+@pytest.mark.parametrize("name", ["podman", "python"])
+def test_services_older_than_the_drop_in_are_told(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever other processes say that their arguments are: 300 MB, of which little is read."""
+    say = "import time; print(flush=True); time.sleep(1000)"
+    service = [name, "-c", say, "system", "service"]
+    odd = [sys.executable, "-m", "testkit.odd_environ", "300", "--arguments"]
+    with (
+        subprocess.Popen(service, executable=sys.executable, stdout=subprocess.PIPE) as old,
+        subprocess.Popen(odd, stdout=subprocess.PIPE) as other,
+    ):
+        try:
+            for each in (old, other):
+                assert each.stdout is not None
+                each.stdout.readline()
+            drop_in = tmp_path / "drop-in"
+            drop_in.touch()
+            monkeypatch.setattr(install, "DROP_IN", drop_in)
+            before_kb = peak_kb(os.getpid())
+            told = [problem for problem in install.service_problems() if f"(process {old.pid})" in problem]
+            assert len(told) == (name == "podman")
+            assert peak_kb(os.getpid()) < before_kb + 50_000
+        finally:
+            old.kill()
+            other.kill()
 
 
 def test_again_changes_nothing_that_matters(root: Path) -> None:

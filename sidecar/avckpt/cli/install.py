@@ -26,7 +26,7 @@ from avckpt_hooks.shared import protocol
 import avckpt
 from avckpt import artifacts
 from avckpt.cli import containers_conf, leftovers
-from avckpt.containers.process import age_s
+from avckpt.containers.process import age_s, command_line
 from avckpt.containers.records import Records
 from avckpt.errors import ConfigError, Denied, TargetGone
 
@@ -231,14 +231,18 @@ def service_problems() -> list[str]:
     except OSError:
         return []
     found = []
-    for process in psutil.process_iter(["cmdline", "uids"]):
-        command = process.info["cmdline"] or [""]
-        if Path(command[0]).name != "podman" or ("system", "service") not in zip(command, command[1:]):
-            continue
+    for pid in psutil.pids():
+        try:
+            command = command_line(pid)
+            if Path(command[0]).name != "podman" or ("system", "service") not in zip(command, command[1:]):
+                continue
+            is_roots = psutil.Process(pid).uids().real == 0
+        except (OSError, psutil.Error):
+            continue  # it has just ended
         chosen = any(word.startswith("--hooks-dir") for word in command)
-        if not chosen and process.info["uids"].real == 0 and _is_older(process.pid, installed_at):
+        if not chosen and is_roots and _is_older(pid, installed_at):
             found.append(
-                f"Podman's service (process {process.pid}) is older than the installation and calls no hooks: "
+                f"Podman's service (process {pid}) is older than the installation and calls no hooks: "
                 "sudo systemctl restart podman.service, or end it and start it again as you did"
             )
     return found

@@ -10,6 +10,9 @@ from pathlib import Path
 
 from avckpt.errors import TargetGone
 
+COMMAND_BYTES = 4096
+"""A process can set the place and length of its arguments itself (PR_SET_MM): gigabytes, if it likes."""
+
 
 def stat_fields(pid: int) -> list[str]:
     """Those of /proc/PID/stat, proc(5), from the third on: state, parent, ...
@@ -47,6 +50,15 @@ def status(pid: int) -> dict[str, str]:
     text = Path(f"/proc/{pid}/status").read_text(errors="replace")  # its name may be any bytes
     lines = (line.partition(":") for line in text.split("\n"))
     return {name: value.strip() for name, colon, value in lines if colon}
+
+
+def command_line(pid: int) -> list[str]:
+    """The arguments of a process, the first COMMAND_BYTES of them.  Raises OSError, also when there is no such process.
+
+    Not for the daemon's own thread: they are read from its memory, which may take any time.
+    """
+    with Path(f"/proc/{pid}/cmdline").open("rb") as file:
+        return [os.fsdecode(word) for word in file.read(COMMAND_BYTES).split(b"\0")]
 
 
 def open_pidfd(pid: int, started: int) -> int:

@@ -17,12 +17,12 @@ from pathlib import Path
 
 from avckpt_hooks.shared.tell import printable
 
+from avckpt.containers.process import command_line
 from avckpt.evidence.crash import FRAMES_MAX, Frame
 
 MAPS_MAX = 32 << 20
 HEADERS_MAX = 64
 NOTES_MAX = 4096
-COMMAND_MAX = 4096
 STACK_MAX = 32 << 10
 
 _LINE = re.compile(rb"([0-9a-f]+)-([0-9a-f]+) (\S{4}) ([0-9a-f]+) (\S+) (\d+) *(.*)")
@@ -137,8 +137,7 @@ class Remains:
     @property
     def command(self) -> str:
         """The program, and of an interpreter its script; other arguments may be secrets."""
-        words = Path(f"/proc/{self.pid}/cmdline").read_bytes()[:COMMAND_MAX].split(b"\0")
-        texts = [printable(word.decode("utf-8", "replace")) for word in words[:2]]
+        texts = [printable(word) for word in command_line(self.pid)[:2]]
         if len(texts) == 2 and _INTERPRETERS.fullmatch(texts[0].rpartition("/")[2]) and not texts[1].startswith("-"):
             return " ".join(texts)
         return texts[0]
