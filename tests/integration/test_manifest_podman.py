@@ -136,6 +136,33 @@ def test_up_protects_what_podman_compose_alone_protects_too(project: Project, si
     project.compose("down")
 
 
+def test_a_change_makes_only_what_hangs_on_it_anew(project: Project, sidecar: Sidecar) -> None:
+    """Also where something that depends on what has changed has done its work, and ended."""
+
+    def services(step: int) -> str:
+        asked = "labels: {avckpt.enable: true, avckpt.interval: 1h}"
+        job = "command: [echo, done]\n    restart: 'no'\n    depends_on: [by-map]"
+        return (
+            f"{SERVICES.partition('services:')[0]}services:\n"
+            f"  by-map:\n    <<: *node\n    {asked}\n    environment: {{STEP: {step}}}\n"
+            f"  by-list:\n    <<: *node\n    {asked}\n    depends_on: [by-map]\n"
+            f"  plain:\n    <<: *node\n    {asked}\n"
+            f"  job:\n    <<: *node\n    {job}\n"
+        )
+
+    def up(step: int) -> dict[str, str]:
+        project.write(services(step))
+        done = project.avckpt("up", "--json")  # none waits an hour for its first checkpoint
+        assert states(done) == {"by-map": True, "by-list": True, "plain": True, "job": False}
+        return {entry["service"]: entry["id"] for entry in json.loads(done.stdout)}
+
+    first = up(1)
+    wait_until(lambda: project.container("job").status == "exited", 20, "the job is done")
+    assert up(1) == first
+    second = up(2)
+    assert {service for service in first if first[service] != second[service]} == {"by-map", "by-list", "job"}
+
+
 def test_only_the_services_that_are_named(project: Project, sidecar: Sidecar) -> None:
     project.write(SERVICES)
     assert states(project.avckpt("up", "--json", "by-map")) == {"by-map": True}

@@ -96,7 +96,7 @@ def up(compose: Compose, services: Sequence[str], run_dir: Path, wait_s: float, 
     """
     failure: AvckptError | None = None
     try:
-        compose.up(services, say)
+        _up(compose, services, say)
     except AvckptError as error:
         failure = error
     started = [one for one in compose.containers() if not services or one.service in services or _runs(one)]
@@ -104,6 +104,17 @@ def up(compose: Compose, services: Sequence[str], run_dir: Path, wait_s: float, 
         reasons = [f"{one.name} {_why_not_running(one)}" for one in started if not _runs(one)]
         raise AvckptError("; ".join([str(failure), *reasons]))
     return wait_protected(compose, Client(run_dir), started, wait_s)
+
+
+def _up(compose: Compose, services: Sequence[str], say: Say) -> None:
+    before = {one.name for one in compose.containers()}
+    try:
+        compose.up(services, say)
+    except AvckptError:
+        # Of what depends on a changed service podman-compose 1.6 removes all, and makes only what was running.
+        if before <= {one.name for one in compose.containers()}:
+            raise
+        compose.up(services, say)
 
 
 def wait_protected(compose: Compose, client: Client, started: Sequence[Started], wait_s: float) -> list[Protection]:
