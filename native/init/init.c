@@ -335,28 +335,38 @@ static void app_started(void)
 		__atomic_store_n(&self.ctl->app_pid, self.app_pid, __ATOMIC_RELEASE);
 }
 
+/* The PIDs of our children as text, or of as many as fit in. Unreaped children of ours: no PID in
+ * it can be stale. */
+static void read_children(char *text, size_t size)
+{
+	char path[64];
+	ssize_t len;
+	int fd;
+
+	snprintf(path, sizeof(path), "/proc/self/task/%d/children", self.pid);
+	fd = open(path, O_RDONLY | O_CLOEXEC);
+	len = fd < 0 ? 0 : read(fd, text, size - 1);
+	if (fd >= 0)
+		close(fd);
+	if (len == (ssize_t)size - 1)
+		while (len > 0 && text[len - 1] != ' ')
+			len--; /* a number may be cut in two */
+	text[len > 0 ? len : 0] = '\0';
+}
+
 /* Kills and reaps all our children, within END_CHILDREN_MS.  For the PID 1 of a
  * namespace the kernel does it.  Elsewhere they are the app's orphans and the
  * guard's templates, and would outlive the container. */
 static void end_children(void)
 {
 	uint64_t deadline_ns = now_ns() + END_CHILDREN_MS * NS_PER_MS;
-	char path[64], text[4096];
+	char text[4096];
 
-	snprintf(path, sizeof(path), "/proc/self/task/%d/children", self.pid);
 	do {
 		struct timespec nap = { .tv_nsec = 2 * (long)NS_PER_MS };
-		int fd = open(path, O_RDONLY | O_CLOEXEC);
-		ssize_t len = fd < 0 ? 0 : read(fd, text, sizeof(text) - 1);
 		char *at = text, *end;
 
-		if (fd >= 0)
-			close(fd);
-		if (len > 0 && len == (ssize_t)sizeof(text) - 1)
-			while (len > 0 && text[len - 1] != ' ')
-				len--; /* a number may be cut in two */
-		text[len > 0 ? len : 0] = '\0';
-		/* Unreaped children of ours: no PID in here can be stale. */
+		read_children(text, sizeof(text));
 		for (;; at = end) {
 			pid_t pid = (pid_t)strtol(at, &end, 10);
 
@@ -372,6 +382,41 @@ static void end_children(void)
 		/* Killing a child gives us its own children: repeat. */
 		nanosleep(&nap, NULL);
 	} while (now_ns() < deadline_ns);
+}
+
+/* Whether this child is one of avckpt's: a template, a holder, or the listener to keys. */
+static bool is_ours(pid_t pid)
+{
+	char path[64], name[16] = "";
+	int fd;
+
+	snprintf(path, sizeof(path), "/proc/%d/comm", pid);
+	fd = open(path, O_RDONLY | O_CLOEXEC);
+	if (fd < 0)
+		return true; /* it has ended */
+	if (read(fd, name, sizeof(name) - 1) < 0)
+		name[0] = '\0';
+	close(fd);
+	return !strncmp(name, "avckpt-", strlen("avckpt-"));
+}
+
+/* A program that puts itself into the background has ended, as far as a container is concerned. */
+static void tell_of_a_daemon(void)
+{
+	char text[4096], *at = text, *end;
+
+	read_children(text, sizeof(text));
+	for (;; at = end) {
+		pid_t pid = (pid_t)strtol(at, &end, 10);
+
+		if (end == at)
+			return;
+		if (!is_ours(pid))
+			break;
+	}
+	say("%s has ended, and what it left in the background ends with it; a daemon has to be "
+	    "started in the foreground",
+	    self.app_name);
 }
 
 /* Ends as the app ended. A PID 1 cannot die by a signal, so the shell's convention is used, as in
@@ -447,6 +492,8 @@ static void app_died(int status, uint64_t at_ns)
 	bool told;
 
 	self.status = status;
+	if (!wanted && !self.is_unit && status == 0)
+		tell_of_a_daemon();
 	if (!self.ctl)
 		finish(status);
 	/* Both ends are ours: this neither blocks nor raises SIGPIPE. It fails only if the guard

@@ -184,6 +184,20 @@ def test_without_privileges_nothing_is_started(missing: str, tmp_path: Path) -> 
     assert not (tmp_path / "f").exists()
 
 
+def test_who_is_not_root_is_told_to_use_sudo() -> None:
+    reach = ("--inh-caps=-all,+dac_read_search", "--ambient-caps=-all,+dac_read_search")  # of this checkout
+    done = avckpt_run("--", "touch", "f", wrapper=("setpriv", "--reuid=65534", "--clear-groups", *reach))
+    assert done.status == 125
+    assert done.stderr.startswith("avckpt: touch was not started: this needs root: use sudo (")
+    assert done.stderr.count("\n") == 1
+
+
+def test_what_a_daemon_leaves_behind_is_told() -> None:
+    done = avckpt_run("--", "sh", "-c", "setsid sleep 60 >&- 2>&- & exit 0")
+    assert done.status == 0
+    assert "what it left in the background ends with it" in done.stderr
+
+
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGRTMIN + 1])
 def test_signals_reach_the_program(signum: int, start, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     name = signum if signum > 31 else signal.Signals(signum).name[3:]

@@ -408,3 +408,14 @@ def test_what_the_app_leaves_behind_ends_with_it(pid1: bool, tmp_path: Path) -> 
         assert init.end() == 5
         assert os.read(fd, 1) == b""
         os.close(fd)
+        assert init.error_text() == ""
+
+
+@both
+def test_a_program_that_becomes_a_daemon_is_told_of(pid1: bool) -> None:
+    daemon = "import os, time\nif os.fork(): os._exit(0)\nos.setsid()\ntime.sleep(60)"
+    with Init([PYTHON, "-c", daemon], pid1=pid1) as init:
+        assert init.end() == 0
+        assert "and what it left in the background ends with it; a daemon has to be started in the foreground" in (
+            init.error_text()
+        )
