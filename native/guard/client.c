@@ -532,16 +532,6 @@ int avc_guard_recall(struct avc_guard *guard, int meeting, uint64_t line, uint64
 	return guard_send(guard, &request, meeting, err);
 }
 
-int avc_guard_forget(struct avc_guard *guard, uint64_t generation, struct avc_error *err)
-{
-	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
-					     .kind = AVC_REQUEST_FORGET,
-					     .generation = generation };
-
-	*err = (struct avc_error){ 0 };
-	return guard_send(guard, &request, -1, err);
-}
-
 void avc_guard_stop(struct avc_guard *guard)
 {
 	struct avc_engine *engine = guard->engine;

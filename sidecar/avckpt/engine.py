@@ -108,10 +108,6 @@ class Guard:
         """Has it go back to that generation together with its group.  Raises TargetGone, Busy."""
         self._tell("recall", lambda guard, err: lib.avc_guard_recall(guard, meeting, line, generation, ticket, err))
 
-    def forget(self, generation: int) -> None:
-        """Has it drop a generation of a line that other members lack.  Raises TargetGone, Busy."""
-        self._tell("forget", lambda guard, err: lib.avc_guard_forget(guard, generation, err))
-
     def _tell(self, operation: str, tell: Callable[[Any, Any], int]) -> None:
         err = ffi.new("struct avc_error *")
         with self._lock:
@@ -259,6 +255,7 @@ def _event(e: Any) -> Event:
         threads=e.threads,
         generation=e.generation,
         line=e.line,
+        replaced=e.replaced,
         generations=e.generations,
         attempt=e.attempt,
         quiescent=bool(e.quiescent),

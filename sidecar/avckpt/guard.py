@@ -130,6 +130,8 @@ class Event:
     generation: int = 0
     line: int = 0
     """The line of its group; 0: none."""
+    replaced: int = 0
+    """Of a checkpoint: the generation that it replaces; 0: none."""
     generations: int = 0
     attempt: int = 0
     quiescent: bool = False

@@ -188,6 +188,39 @@ def test_without_a_line_nobody_is_killed(local: LocalSidecar) -> None:
     assert (members[1].app_pid, row(local, members[1])["restores"]) == (survivor, 0)
 
 
+def newest_template(container: Container) -> int:
+    """By the time of its start."""
+    pids = [pid for pid in children_of(container.init_pid) if Path(f"/proc/{pid}/comm").read_text() == "avckpt-tmpl\n"]
+    return max(pids, key=lambda pid: int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[19]))
+
+
+def take_line(local: LocalSidecar, members: list[Container]) -> int:
+    """On command; on a busy machine somebody may not stop in time."""
+    before = row(local, members[0])["line"]
+    wait_until(lambda: local.avckpt("checkpoint", members[0].name, check=False).status == 0, 20, "a line on command")
+    return wait_for_line(local, members, before)
+
+
+def test_after_a_death_all_keep_the_same_older_line(local: LocalSidecar) -> None:
+    """What was restored may crash again: its guard keeps the line before, and so must the others."""
+    labels = {**TOGETHER, "avckpt.interval": "1h", "avckpt.keep": "2", "avckpt.restore.max": "5/600s"}
+    members = [local.protected(f"m{i}", ["sleep", "1000"], labels) for i in range(3)]
+    wait_for_line(local, members)
+    time.sleep(1.0)  # each of them had a line taken when it came
+    older = take_line(local, members)
+    take_line(local, members)
+    os.kill(members[0].app_pid, signal.SIGKILL)
+    wait_for_restores(local, members, 1)
+    for _ in range(3):
+        take_line(local, members)
+    # One has lost the newest: there has to be another that all have.
+    os.kill(newest_template(members[2]), signal.SIGKILL)
+    wait_until(lambda: row(local, members[2])["generations"] == 1, 10, "it is dropped")
+    os.kill(members[1].app_pid, signal.SIGKILL)
+    wait_for_restores(local, members, 2)
+    assert {row(local, member)["line"] for member in members} == {older}
+
+
 # What both do after the line, when there is a file that is not rolled back.
 SENDER = """
 import os, socket, sys, time

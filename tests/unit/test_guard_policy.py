@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import subprocess
 from collections.abc import Sequence
@@ -106,6 +107,55 @@ class Guarded:
     def vouch(self, times: int = 1) -> None:
         for _ in range(times):
             self.c.policy_vouch(self.policy)
+
+
+class Together:
+    """Guards of a group: their checkpoints are lines, and all go back when one of them crashes."""
+
+    def __init__(self, members: int, keep: int) -> None:
+        self.members = [Guarded(keep=keep) for _ in range(members)]
+        self.c = self.members[0].c
+        self.line = 0
+
+    def wait(self, seconds: float) -> None:
+        for member in self.members:
+            member.wait(seconds)
+
+    def take(self) -> None:
+        """A line; each replaces what all of them have said can go, as in guard_group.c."""
+        self.line += 1
+        said = [
+            {member.held[i]: self.c.policy_line(member.policy, member.config, i, member.now) for i in range(n)}
+            for member, n in ((member, member.policy.count) for member in self.members)
+        ]
+        for member in self.members:
+            fresh = self.c.policy_new_generation(member.policy, member.config, self.line, member.now)
+            fresh.line = self.line
+            while member.policy.count >= member.policy.room:
+                all_say: Any = cast(Any, _library[0].ffi.new("struct policy_line[]", member.policy.count))
+                for i, line in enumerate(member.held):
+                    all_say[i].held = all(line in each for each in said)
+                    all_say[i].kept = any(each[line].kept for each in said if line in each)
+                    all_say[i].suspect = any(each[line].suspect for each in said if line in each)
+                self.c.policy_drop(member.policy, self.c.policy_line_replaced(member.policy, all_say))
+            self.c.policy_hold(member.policy, fresh)
+
+    def crash(self, which: int) -> int:
+        """The line that all go back to."""
+        line = self.members[which].crash()
+        for member in self.members:
+            while member.held and member.held[-1] > line:
+                self.c.policy_drop(member.policy, member.policy.count - 1)
+            if member is not self.members[which]:
+                assert member.held[-1:] == [line]
+                member.roll_back()
+        return line
+
+    @property
+    def held(self) -> list[int]:
+        """By all."""
+        assert len({tuple(member.held) for member in self.members}) == 1
+        return self.members[0].held
 
 
 def test_it_has_no_side_effects(library: Library) -> None:
@@ -278,6 +328,70 @@ def test_on_a_machine_that_was_just_started_nobody_is_on_probation() -> None:
     assert [guard.record(number).lineage for number in (1, 2)] == [1, 2]
     assert guard.record(2).crashes == 0
     assert guard.c.policy_restores_within(guard.policy, guard.config, guard.now) == 1
+
+
+# --- lines of a group ---------------------------------------------------------------
+
+
+def test_on_probation_the_others_keep_what_it_keeps() -> None:
+    group = Together(members=3, keep=3)
+    for _ in range(4):
+        group.take()
+    assert group.held == [2, 3, 4]
+    assert group.crash(1) == 4
+    for line in (5, 6, 7):
+        group.wait(1)
+        group.take()
+        assert group.held == [2, 3, line]
+    assert group.crash(0) == 7
+    group.wait(WINDOW_S)
+    group.take()
+    assert group.held == [3, 7, 8]
+
+
+def test_who_keeps_crashing_finds_an_older_line_with_all() -> None:
+    group = Together(members=2, keep=2)
+    group.take()
+    group.take()
+    assert group.crash(0) == 2
+    for _ in range(5):
+        group.take()
+    assert [group.crash(0) for _ in range(3)] == [7, 7, 1]
+
+
+def test_what_a_health_check_of_one_needs_all_keep() -> None:
+    group = Together(members=3, keep=3)
+    group.take()
+    group.members[2].vouch(2)
+    for _ in range(5):
+        group.take()
+    assert group.held == [1, 5, 6]
+
+
+def test_what_one_has_lost_goes_first() -> None:
+    group = Together(members=3, keep=3)
+    for _ in range(3):
+        group.take()
+    group.members[1].lose(2)
+    group.take()
+    assert [member.held for member in group.members] == [[1, 3, 4]] * 3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_all_hold_the_same_lines_whoever_crashes(seed: int) -> None:
+    dice = random.Random(seed)
+    group = Together(members=4, keep=dice.randint(1, 4))
+    group.take()
+    for _ in range(100):
+        what = dice.random()
+        group.wait(dice.choice([0.5, 20, 70]))
+        if what < 0.7:
+            group.take()
+        elif what < 0.8:
+            dice.choice(group.members).vouch()
+        elif not group.crash(dice.randrange(4)):
+            return
+        assert group.held
 
 
 # --- when it keeps crashing -------------------------------------------------------

@@ -271,9 +271,6 @@ static void carry_out_one(struct avc_guard *guard, const struct avc_request *req
 	case AVC_REQUEST_RECALL:
 		guard_recall(guard, request, fd);
 		break;
-	case AVC_REQUEST_FORGET:
-		guard_forget(guard, request->generation);
-		break;
 	}
 }
 
@@ -351,9 +348,7 @@ static bool any_lost(const struct avc_guard *guard)
 	return false;
 }
 
-/* Calls of the app that a checkpoint has interrupted: ends those whose time is up.  Returns when
- * the next one is due. */
-static uint64_t end_waits(struct avc_guard *guard)
+uint64_t guard_end_waits(struct avc_guard *guard)
 {
 	uint64_t due = UINT64_MAX;
 
@@ -373,7 +368,7 @@ static uint64_t earlier(uint64_t a, uint64_t b)
 /* When there is work even if no descriptor becomes ready. */
 static uint64_t work_due(struct avc_guard *guard)
 {
-	uint64_t due = earlier(guard->next_ns, end_waits(guard));
+	uint64_t due = earlier(guard->next_ns, guard_end_waits(guard));
 
 	due = earlier(due, guard_tell_due(guard));
 	if (guard->remains.pid)

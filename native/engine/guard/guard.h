@@ -116,6 +116,9 @@ void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, 
 
 /* Releases threads that stop late or return late; how many are left. */
 uint32_t guard_tend_stragglers(struct avc_guard *guard);
+/* Calls of the app that a checkpoint has interrupted: ends those whose time is up.  When the next
+ * one is due. */
+uint64_t guard_end_waits(struct avc_guard *guard);
 
 /* ---- guard_configure.c ----------------------------------------------------- */
 
@@ -160,7 +163,8 @@ void guard_reap_dead(struct avc_guard *guard);
 /* A tracee that is a known thread of the app, or ours (tracee_know()). */
 bool guard_knows_tracee(pid_t tid, const void *guard);
 void guard_reap_unknown(const struct avc_guard *guard);
-void guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
+/* Returns the number of the generation that it replaces, 0: none. */
+uint64_t guard_keep_generation(struct avc_guard *guard, struct generation *fresh);
 /* After a crash with that status: leaves the generation to restore from as the newest, or none;
  * returns why there is none. */
 enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung);
@@ -242,11 +246,13 @@ void guard_hold_all(struct avc_guard *guard);
 /* The daemon's requests; `fd` stays the caller's. */
 void guard_take_line(struct avc_guard *guard, const struct avc_request *request, int fd);
 void guard_recall(struct avc_guard *guard, const struct avc_request *request, int fd);
-void guard_forget(struct avc_guard *guard, uint64_t generation);
 void guard_abandon(struct avc_guard *guard, uint64_t ticket);
-/* Of a checkpoint: ready to freeze; frozen (freeze.meet). */
+/* Of a checkpoint: ready to freeze; frozen (freeze.meet); complete. */
 int guard_meet_ready(struct avc_guard *guard, struct avc_error *err) warn_unused;
 int guard_meet_frozen(void *guard, struct generation *whole, struct avc_error *err) warn_unused;
+int guard_meet_taken(struct avc_guard *guard, struct avc_error *err) warn_unused;
+/* Index of the generation that all members replace by the line just taken. */
+uint32_t guard_line_replaced(const struct avc_guard *guard);
 /* Of a restore: complete. */
 int guard_meet_restored(struct avc_guard *guard, struct avc_error *err) warn_unused;
 /* There is no meeting, or its next step can still be reached. */

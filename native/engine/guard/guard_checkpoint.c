@@ -449,7 +449,8 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	event->stop_ns = freeze->stop_ns;
 	event->clone_ns = freeze->clone_ns;
 	event->threads = generation_threads(fresh);
-	if (result || finish(guard, fresh, err)) {
+	if (result || finish(guard, fresh, err) ||
+	    (guard->meeting && guard_meet_taken(guard, err))) {
 		abandon(guard, fresh);
 		return -1;
 	}
@@ -461,7 +462,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	dirty_follow(&guard->dirty, fresh);
 	fresh->clone_ns = guard->dirty.fork_ns;
 	fresh->freeze_ns = freeze->freeze_ns;
-	guard_keep_generation(guard, fresh);
+	event->replaced = guard_keep_generation(guard, fresh);
 	dirty_compare(&guard->dirty, fresh);
 	begin_ahead(guard, &guard->generations[guard->count - 1]);
 	init_channel_arm(&guard->channel, true);

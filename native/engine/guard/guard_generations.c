@@ -364,24 +364,31 @@ void guard_reap_dead(struct avc_guard *guard)
 
 /* ---- which generations are worth keeping ------------------------------------------ */
 
-void guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
+uint64_t guard_keep_generation(struct avc_guard *guard, struct generation *fresh)
 {
 	const uint64_t now = now_ns();
-	const struct policy_generation record =
-		policy_new_generation(&guard->policy, &guard->config, fresh->number, now);
+	struct policy_generation record = policy_new_generation(&guard->policy, &guard->config,
+								fresh->number, now);
+	uint64_t replaced = 0;
+
+	record.line = guard->line;
 
 	/* Only the newest has a spare. */
 	for (uint32_t i = 0; i < guard->count; i++)
 		spare_drop(&guard->generations[i]);
 	while (guard->count >= guard->policy.room) {
-		const uint32_t i = policy_replaced(&guard->policy, &guard->config, now);
+		const uint32_t i = guard->line
+					   ? guard_line_replaced(guard)
+					   : policy_replaced(&guard->policy, &guard->config, now);
 
+		replaced = guard->generations[i].number;
 		dirty_recycle(&guard->dirty, &guard->generations[i]);
 		guard_drop_generation(guard, i);
 	}
 	guard->generations[guard->count++] = *fresh;
 	policy_hold(&guard->policy, record);
 	guard_rank_generations(guard);
+	return replaced;
 }
 
 enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung)

@@ -10,6 +10,7 @@
  *   a line     0 ready        the app still runs; slow preparations are done
  *              1 still        everything is read and cloned: no member sends any more
  *              2 frozen       data in flight between them is copied, too: all are released
+ *              3 taken        it can be restored everywhere: all keep it, or none
  *   a return   0 able         the app may still run; it could go back
  *              1 dead         nothing that could send runs any more
  *              2 shown        its ends of connections are published: now they are restored
@@ -29,13 +30,14 @@
 #define MEMBERS_MAX 1024
 #define SLICE_NS (2 * NS_PER_MS) /* between checks whether the app has died              */
 #define READY_NS (1 * NS_PER_S)  /* the app runs                                         */
+#define TAKEN_NS (1 * NS_PER_S)  /* ... again                                            */
 #define CLONES 4                 /* wait for so many times the slowest expected clone    */
 #define FIRST_CLONE_MS 250       /* assumed before the first one was measured            */
 #define DEAD_NS (3 * NS_PER_S)
 #define RESTORED_NS (3 * NS_PER_S) /* init is notified meanwhile; INJ_GO_S is longer      */
 #define WAITS_NS (5 * NS_PER_S)    /* for the daemon to choose a line                      */
 
-enum line_step { LINE_READY = 0, LINE_STILL = 1, LINE_FROZEN = 2, LINE_STEPS };
+enum line_step { LINE_READY = 0, LINE_STILL = 1, LINE_FROZEN = 2, LINE_TAKEN = 3, LINE_STEPS };
 enum recall_step {
 	RECALL_ABLE = 0,
 	RECALL_DEAD = 1,
@@ -48,7 +50,7 @@ enum recall_step {
 
 static int fail_broken(const struct avc_guard *guard, struct avc_error *err)
 {
-	return fail(err, AVC_BUSY, 0, guard->main.pid, "meet", "",
+	return fail(err, AVC_DEADLINE, 0, guard->main.pid, "meet", "",
 		    "another member of its group could not, or came too late");
 }
 
@@ -148,6 +150,10 @@ static int meet(struct avc_guard *guard, uint32_t step, uint64_t ns, struct avc_
 		heartbeat();
 		if (guard->dead.waits)
 			init_channel_working(&guard->channel);
+		if (step == LINE_TAKEN && guard->steps == LINE_STEPS) {
+			(void)guard_tend_stragglers(guard);
+			(void)guard_end_waits(guard);
+		}
 	}
 	return state_of(meeting) == AVC_MEETING_BROKEN ? fail_broken(guard, err) : 0;
 }
@@ -174,11 +180,65 @@ static uint64_t expected_ms(const struct avc_guard *guard)
 	return guard->dirty.fork_ns ? guard->dirty.fork_ns / NS_PER_MS : FIRST_CLONE_MS;
 }
 
+/* The entry for that line; NULL: there is none, or `add` and no room. */
+static struct avc_held_line *find_line(struct avc_meeting *meeting, uint64_t line, bool add)
+{
+	for (uint32_t i = 0; i < AVC_MEETING_LINES; i++) {
+		struct avc_held_line *held = &meeting->held[i];
+		uint64_t found = __atomic_load_n(&held->line, __ATOMIC_ACQUIRE);
+
+		if (!found && !add)
+			return NULL;
+		if (!found && __atomic_compare_exchange_n(&held->line, &found, line, false,
+							  __ATOMIC_ACQ_REL, __ATOMIC_ACQUIRE))
+			return held;
+		if (found == line)
+			return held;
+	}
+	return NULL;
+}
+
+/* What is held does not change until the line is taken. */
+static void say_held(struct avc_guard *guard)
+{
+	const uint64_t now = now_ns();
+
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const uint64_t line = guard->policy.held[i].line;
+		const struct policy_line say = policy_line(&guard->policy, &guard->config, i, now);
+		struct avc_held_line *held = line ? find_line(guard->meeting, line, true) : NULL;
+
+		if (!held)
+			continue;
+		__atomic_add_fetch(&held->holders, 1, __ATOMIC_ACQ_REL);
+		__atomic_add_fetch(&held->keepers, say.kept, __ATOMIC_ACQ_REL);
+		__atomic_add_fetch(&held->suspects, say.suspect, __ATOMIC_ACQ_REL);
+	}
+}
+
+uint32_t guard_line_replaced(const struct avc_guard *guard)
+{
+	struct policy_line said[AVC_KEEP_MAX] = { 0 };
+
+	for (uint32_t i = 0; i < guard->count; i++) {
+		const uint64_t line = guard->policy.held[i].line;
+		const struct avc_held_line *held = line ? find_line(guard->meeting, line, false)
+							: NULL;
+
+		if (held)
+			said[i] = (struct policy_line){ .held = held->holders == guard->members,
+							.kept = held->keepers > 0,
+							.suspect = held->suspects > 0 };
+	}
+	return policy_line_replaced(&guard->policy, said);
+}
+
 int guard_meet_ready(struct avc_guard *guard, struct avc_error *err)
 {
 	const uint64_t own = expected_ms(guard);
 	uint32_t *most = &guard->meeting->clone_ms, was = __atomic_load_n(most, __ATOMIC_RELAXED);
 
+	say_held(guard);
 	while (was < own && !__atomic_compare_exchange_n(most, &was, (uint32_t)own, false,
 							 __ATOMIC_RELAXED, __ATOMIC_RELAXED))
 		;
@@ -208,12 +268,10 @@ int guard_meet_frozen(void *arg, struct generation *whole, struct avc_error *err
 	return meet(guard, LINE_FROZEN, guard->config.freeze_deadline_ns, err);
 }
 
-void guard_forget(struct avc_guard *guard, uint64_t generation)
+/* Until then any member may fail to complete its generation, and all have what they had. */
+int guard_meet_taken(struct avc_guard *guard, struct avc_error *err)
 {
-	const int i = guard_find_generation(guard, generation);
-
-	if (i >= 0)
-		guard_drop_generation(guard, (uint32_t)i);
+	return meet(guard, LINE_TAKEN, TAKEN_NS, err);
 }
 
 /* ---- a return -------------------------------------------------------------------- */

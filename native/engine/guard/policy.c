@@ -112,6 +112,33 @@ uint32_t policy_replaced(const struct policy *policy, const struct avc_config *c
 	return policy_dispensable(policy);
 }
 
+struct policy_line policy_line(const struct policy *policy, const struct avc_config *config,
+			       uint32_t i, uint64_t now)
+{
+	return (struct policy_line){
+		.held = true,
+		.kept = (int)i == newest_vouched(policy) || (int)i == newest_seen(policy),
+		.suspect = on_probation(policy, config, now) &&
+			   policy->held[i].lineage == policy->lineage,
+	};
+}
+
+/* Nobody can go back to a line that somebody lacks.  The rest is as in policy_replaced(), for all
+ * of them at once. */
+uint32_t policy_line_replaced(const struct policy *policy, const struct policy_line *said)
+{
+	for (uint32_t i = 0; i < policy->count; i++)
+		if (!said[i].held)
+			return i;
+	for (uint32_t i = policy->count; i-- > 0;)
+		if (said[i].suspect && !said[i].kept)
+			return i;
+	for (uint32_t i = 0; i < policy->count; i++)
+		if (!said[i].kept)
+			return i;
+	return 0;
+}
+
 void policy_hold(struct policy *policy, struct policy_generation fresh)
 {
 	policy->held[policy->count++] = fresh;

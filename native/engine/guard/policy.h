@@ -21,6 +21,7 @@
 /* What is known about a generation that is held. */
 struct policy_generation {
 	uint64_t number;
+	uint64_t line; /* of the group; 0: none                            */
 	uint64_t taken_ns;
 	/* A generation taken on probation is of the lineage of the one that its process was
 	 * restored from, and as suspect.  Any other one begins a lineage. */
@@ -70,6 +71,18 @@ struct policy_generation policy_new_generation(struct policy *policy,
 uint32_t policy_replaced(const struct policy *policy, const struct avc_config *config,
 			 uint64_t now);
 void policy_hold(struct policy *policy, struct policy_generation fresh);
+
+/* In a group: what to say about held[i] to the others, and what all together have said. */
+struct policy_line {
+	bool held;    /* by all                                       */
+	bool kept;    /* a health check needs it                      */
+	bool suspect; /* of the lineage of a process on probation     */
+};
+
+struct policy_line policy_line(const struct policy *policy, const struct avc_config *config,
+			       uint32_t i, uint64_t now);
+/* Instead of policy_replaced(): the same one for all members that hold the same lines. */
+uint32_t policy_line_replaced(const struct policy *policy, const struct policy_line *said);
 
 /* A checkpoint has failed because of the main process, or of another one.  True: no generation is
  * valid, the app is unprotected.  False: it is retried when it is due. */

@@ -171,6 +171,7 @@ struct avc_event {
 	uint32_t threads;       /* of the checkpoint or restore                  */
 	uint64_t generation;    /* number of the generation, from 1              */
 	uint64_t line;          /* of the group, that it is of; 0: of none       */
+	uint64_t replaced;      /* CHECKPOINT: the generation that it replaces, 0: none */
 	uint32_t generations;   /* held now                                      */
 	uint32_t attempt;       /* RESTORED: restores within the window          */
 	uint32_t quiescent;     /* CHECKPOINT: 1 if taken at a quiescent moment  */
@@ -286,8 +287,8 @@ int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config
 int avc_meeting_new(uint32_t members, struct avc_error *err);
 
 /* Has a guard take a checkpoint that is part of a line of its group: no app is released before all
- * members of `meeting` are stopped, or else all of them discard it. Each member gets the same
- * meeting. Answered as AVC_COMMAND_CHECKPOINT. */
+ * members of `meeting` are stopped, and either all of them hold it afterwards, or none.  Each
+ * member gets the same meeting. Answered as AVC_COMMAND_CHECKPOINT. */
 int avc_guard_line(struct avc_guard *guard, int meeting, uint64_t line, uint64_t ticket,
 		   struct avc_error *err);
 
@@ -296,9 +297,6 @@ int avc_guard_line(struct avc_guard *guard, int meeting, uint64_t line, uint64_t
  * REFUSED, and nothing has changed; or WAITS or GAVE_UP. */
 int avc_guard_recall(struct avc_guard *guard, int meeting, uint64_t line, uint64_t generation,
 		     uint64_t ticket, struct avc_error *err);
-
-/* Drops a generation of a line that other members lack. No answer. */
-int avc_guard_forget(struct avc_guard *guard, uint64_t generation, struct avc_error *err);
 
 /* Releases the app (it keeps running, unprotected), drops every generation, waits for the process
  * to exit (it is killed after 15 s) and frees the guard. Blocks for as long as a checkpoint or

@@ -36,7 +36,6 @@ enum avc_request_kind {
 	/* With the memfd of a struct avc_meeting (SCM_RIGHTS).                       */
 	AVC_REQUEST_LINE = 4,   /* line, ticket                                       */
 	AVC_REQUEST_RECALL = 5, /* line, generation, ticket                           */
-	AVC_REQUEST_FORGET = 6, /* generation                                         */
 };
 
 struct avc_request {
@@ -58,7 +57,12 @@ struct avc_request {
  * changes only by compare and exchange, so that all members see the same. So none waits longer than
  * that for one that has died, and what a compromised guard writes here affects only its own
  * group. */
-enum { AVC_MEETING_STEPS = 4, AVC_BOARD_ENDS = 4096, AVC_BOARD_BYTES = 32 << 20 };
+enum {
+	AVC_MEETING_STEPS = 4,
+	AVC_MEETING_LINES = 64,
+	AVC_BOARD_ENDS = 4096,
+	AVC_BOARD_BYTES = 32 << 20
+};
 
 /* One end of a connection: address and port of TCP, inode of a Unix socket. */
 struct avc_end_name {
@@ -80,11 +84,21 @@ struct avc_board {
 	uint8_t content[AVC_BOARD_BYTES];
 };
 
+/* A line that members hold, so that all replace the same one by the next. */
+struct avc_held_line {
+	uint64_t line;     /* 0: none                                          */
+	uint32_t holders;  /* how many members hold it                         */
+	uint32_t keepers;  /* of them, those whose health check needs it       */
+	uint32_t suspects; /* ... those on probation since a restore from it, or
+	                    * from one that it descends from                   */
+};
+
 struct avc_meeting {
 	uint32_t members; /* how many are expected                            */
 	uint32_t state;
 	uint32_t arrived[AVC_MEETING_STEPS];
 	uint32_t clone_ms; /* expected duration of the slowest member's clone    */
+	struct avc_held_line held[AVC_MEETING_LINES];
 	struct avc_board board;
 };
 

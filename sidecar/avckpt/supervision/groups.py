@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -38,6 +39,8 @@ PATIENCE = 2
 it."""
 SKIPPED = 10
 """The number of lines taken without it."""
+TRIES = 2
+"""Attempts to go back to one line: a member may only have been late."""
 
 Answer = tuple[Event, EventRecord]
 
@@ -115,8 +118,9 @@ class Groups:
         cookie = watch.container.cookie
         if event.kind is Kind.ATTACHED:
             group.coming.set()
-        elif event.kind is Kind.DROPPED:
-            group.lines = [line for line in group.lines if line.generations.get(cookie) != event.generation]
+        elif event.kind in (Kind.CHECKPOINT, Kind.DROPPED):
+            gone = event.replaced if event.kind is Kind.CHECKPOINT else event.generation
+            group.lines = [line for line in group.lines if line.generations.get(cookie) != gone]
         elif event.kind is Kind.UNPROTECTED:
             group.lines = [line for line in group.lines if cookie not in line.generations]
         elif event.kind is Kind.WAITS:
@@ -197,16 +201,14 @@ class Groups:
             for cookie, answer in answers.items()
             if isinstance(answer, tuple) and answer[0].kind is Kind.CHECKPOINT
         }
-        if len(taken) == len(members):
+        # If one has it, all have: the others may only have ended since.
+        if taken:
             group.broken = {cookie: n for cookie, n in group.broken.items() if cookie not in members}
             # A line from before a member started: what it has sent since would have no sender after a
             # rollback.
             older = [line for line in group.lines if taken.keys() <= line.generations.keys()]
             group.lines = [*older[1 - KEEP_MAX :], Line(number, taken)]
             return answers
-        for cookie, generation in taken.items():
-            with contextlib.suppress(AvckptError):
-                members[cookie].forget(generation)
         for cookie in self._breakers(answers):
             group.broken[cookie] = group.broken.get(cookie, 0) + 1
         return answers
@@ -260,10 +262,12 @@ class Groups:
     async def _go_back(self, group: Group) -> None:
         """A member has died: back to the newest line that all members have."""
         async with group.busy:
+            tried: Counter[int] = Counter()
             while group.dead:
-                line = self._line_for(group)
+                line = self._line_for(group, tried)
                 if line is None:
                     break
+                tried[line.number] += 1
                 try:
                     await self._recall(group, line)
                 except (AvckptError, OSError) as error:
@@ -277,10 +281,12 @@ class Groups:
                         watch.guard.command(Command.ABANDON, 0)
             group.dead.clear()
 
-    def _line_for(self, group: Group) -> Line | None:
+    def _line_for(self, group: Group, tried: Counter[int]) -> Line | None:
         """The newest line allowed for the dead, and all members that hold it."""
         for line in reversed(self._lines_of_all(group)):
-            if all(line.generations.get(cookie, newest + 1) <= newest for cookie, newest in group.dead.items()):
+            if tried[line.number] < TRIES and all(
+                line.generations.get(cookie, newest + 1) <= newest for cookie, newest in group.dead.items()
+            ):
                 return line
         return None
 
@@ -295,8 +301,8 @@ class Groups:
         for cookie in line.generations.keys() - members.keys():
             label = group.members[cookie].container.label
             log.warning("group %s: %s is paused, and is not rolled back", group.name, label)
-        # Whatever the outcome, newer ones are useless, and this one is added again if it succeeds.
-        group.lines = group.lines[: group.lines.index(line)]
+        # Whatever the outcome, newer ones are useless.
+        group.lines = group.lines[: group.lines.index(line) + 1]
         with meeting(len(members)) as fd:
             answers = await self._ask(
                 group,
@@ -304,6 +310,5 @@ class Groups:
                 lambda cookie, guard, ticket: guard.recall(fd, line.number, line.generations[cookie], ticket),
             )
         if all(isinstance(answer, tuple) and answer[0].kind is Kind.RESTORED for answer in answers.values()):
-            group.lines.append(line)
             log.warning("group %s: went back to line %d together (%d members)", group.name, line.number, len(members))
         return answers
