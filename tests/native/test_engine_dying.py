@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Files
 
 from testkit.guarded import PATIENCE_S, WHERE, GuardProcess, Victim, config
 from testkit.harness import wait_until
@@ -29,7 +30,7 @@ def crash_often(tmp_path: Path, options: str) -> None:
     """While checkpoints are taken as often as possible."""
     with (
         Victim(f"reporter {options}", tmp_path) as victim,
-        GuardProcess(config(0.01, keep=3), [victim.pid]) as guard,
+        GuardProcess(config(0.01, keep=3, files=Files.AUTO), [victim.pid]) as guard,
     ):
         guard.wait("checkpoint", count=3)
         since = guard.mark()
@@ -67,6 +68,11 @@ def test_signals(tmp_path: Path, name: str) -> None:
 def test_a_child(tmp_path: Path, style: str) -> None:
     """No image is taken of a tree of which one process is dying; the parent then ends as the child did."""
     crash_often(tmp_path, f"segv {style} --in-child")
+
+
+def test_a_report_over_the_last_one_is_no_database(tmp_path: Path) -> None:
+    """Every crash writes its report over the same file, which a checkpoint that is not taken sees open."""
+    crash_often(tmp_path, f"segv full --into {tmp_path}/report.log")
 
 
 @pytest.mark.parametrize("where", WHERE)

@@ -1,8 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * reporter SIGNAL STYLE [--in-thread] [--report-ms N]: a program with a crash handler that
- * takes N ms (150) for its report and then dies of the signal, in the styles of the field.
- * It crashes whenever counter[0] is raised from outside.
+ * reporter SIGNAL STYLE [--in-thread] [--report-ms N] [--into FILE]: a program with a crash handler
+ * that takes N ms (150) for its report and then dies of the signal, in the styles of the field.
+ * It crashes whenever counter[0] is raised from outside.  With FILE it writes 100 kB over that file
+ * for its report, half of it at once, as Java does.
  *
  * SIGNAL: segv, bus, fpe, ill, abrt, trap, sys.  STYLE:
  *   plain      signal(2): the signal itself is blocked meanwhile (C, Java)
@@ -20,6 +21,7 @@
  *
  * counter[1]: crashes; counter[2]: reports begun
  */
+#include <fcntl.h>
 #include <poll.h>
 #include <pthread.h>
 #include <sys/prctl.h>
@@ -28,6 +30,7 @@
 #include "victim.h"
 
 #define STACK_BYTES (8 << 20)
+#define REPORT_BYTES 100000
 
 static const struct {
 	const char *name;
@@ -37,6 +40,7 @@ static const struct {
 
 static const char *style;
 static long report_ms = 150;
+static const char *report_file;
 static uint8_t *page; /* that cannot be touched */
 
 static bool is(const char *name)
@@ -63,6 +67,17 @@ static __attribute__((noinline)) void report(int depth)
 	room[1] = room[0];
 }
 
+static void report_to_file(void)
+{
+	static const char text[REPORT_BYTES];
+	const int fd = open(report_file, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
+
+	must(write(fd, text, REPORT_BYTES / 2) == REPORT_BYTES / 2, report_file);
+	report(3);
+	must(write(fd, text, REPORT_BYTES / 2) == REPORT_BYTES / 2, report_file);
+	close(fd);
+}
+
 static void have_it_reported(void)
 {
 	const pid_t parent = getpid(), child = fork();
@@ -87,6 +102,8 @@ static void on_crash(int signal_number)
 	board->counter[2]++;
 	if (is("breakpad"))
 		have_it_reported();
+	else if (report_file)
+		report_to_file();
 	else
 		report(is("open") ? 300 : 3);
 	if (is("exit"))
@@ -192,13 +209,17 @@ int main(int argc, char **argv)
 	const bool in_thread = victim_flag(&argc, argv, "--in-thread");
 	pthread_t thread;
 
-	victim_start(&argc, argv, 2, "SIGNAL STYLE [--in-thread] [--report-ms N]");
+	victim_start(&argc, argv, 2, "SIGNAL STYLE [--in-thread] [--report-ms N] [--into FILE]");
 	for (size_t i = 0; i < sizeof signals / sizeof *signals; i++)
 		if (!strcmp(argv[1], signals[i].name))
 			wanted = signals[i].signal;
 	style = argv[2];
-	if (argc == 5 && !strcmp(argv[3], "--report-ms"))
-		report_ms = atol(argv[4]);
+	for (int i = 3; i + 1 < argc; i += 2) {
+		if (!strcmp(argv[i], "--report-ms"))
+			report_ms = atol(argv[i + 1]);
+		if (!strcmp(argv[i], "--into"))
+			report_file = argv[i + 1];
+	}
 	page = mmap(NULL, 4096, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
 	must(wanted && page != MAP_FAILED, "SIGNAL");
 	prctl(PR_SET_PTRACER, -1L, 0, 0, 0); /* where Yama is in force */

@@ -98,7 +98,8 @@ struct generation {
 	uint64_t clone_ns; /* duration of its clones                          */
 	uint64_t freeze_ns;
 	bool quiescent;
-	char written[FILES_NAME];  /* avckpt.files: what was written since; "": none */
+	bool watched;              /* avckpt.files: all writes since count             */
+	char written[FILES_NAME];  /* what was written since; "": none                 */
 	struct spare spare;        /* of the main process                              */
 	struct restore_plan *plan; /* restore_plan.c; NULL: not begun                   */
 	struct group_ends *ends;   /* of connections in its group; NULL: none           */

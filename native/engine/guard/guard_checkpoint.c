@@ -271,14 +271,26 @@ static bool is_database(const struct avc_guard *guard)
 	return false;
 }
 
-/* avckpt.files=strict, or auto and a database: from here on, all writes to files are detected. */
-static void watch_files(struct avc_guard *guard, struct image *main)
+static bool is_watched(const struct avc_guard *guard)
+{
+	for (uint32_t i = 0; i < guard->count; i++)
+		if (guard->generations[i].watched)
+			return true;
+	return false;
+}
+
+/* avckpt.files=strict, or auto and a database: from here on, all writes to files are detected.  They
+ * count for this generation.  One that was taken before the database was opened knows nothing of its
+ * contents. */
+static void watch_files(struct avc_guard *guard, struct generation *fresh)
 {
 	const bool strict = guard->config.files == AVC_FILES_STRICT;
+	struct image *main = &fresh->image[0];
 	struct process *process = main->process;
 	struct avc_error untold = { 0 };
 
-	if (!strict && (guard->config.files != AVC_FILES_AUTO || !is_database(guard))) {
+	fresh->watched = strict || (guard->config.files == AVC_FILES_AUTO && is_database(guard));
+	if (!fresh->watched && !is_watched(guard)) {
 		files_written_free(guard->written);
 		guard->written = NULL;
 		return;
@@ -375,7 +387,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	if (prepare_files(guard, err) ||
 	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
-	watch_files(guard, main);
+	watch_files(guard, freeze->generation);
 	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, main->slot, guard->timer);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;

@@ -417,7 +417,7 @@ static bool is_old(int fd, const struct stat *st, const void *arg)
 }
 
 /* Before the next generation is taken, and before one is restored: a write to a file makes all
- * generations invalid. */
+ * generations for which writes count invalid. */
 void guard_note_written(struct avc_guard *guard)
 {
 	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
@@ -430,7 +430,8 @@ void guard_note_written(struct avc_guard *guard)
 				 newest, name))
 		return;
 	for (uint32_t i = 0; i < guard->count; i++)
-		memcpy(guard->generations[i].written, name, sizeof name);
+		if (guard->generations[i].watched)
+			memcpy(guard->generations[i].written, name, sizeof name);
 }
 
 /* All processes, also those that have ended: what they have written belongs to the others. */

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runtimes that report a crash themselves before they die: one crash costs one restore.
+
+The programs crash once the file named by their argument is there.  They remove it, and append to
+another one immediately before the fault: an image of the moment before that is good, and crashes
+again.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from testkit.harness import avckpt_command, wait_until
+
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root"),
+    pytest.mark.shared_machine(
+        "init waits two seconds for its guard, which may get no CPU for as long; "
+        "which of two comes first, a death or a checkpoint, is the scheduler's choice"
+    ),
+]
+
+CRASHES = 4
+PROGRAMS = Path(__file__).parents[1] / "victims" / "runtimes"
+
+
+def python(_: Path) -> list[str]:
+    return ["python3", f"{PROGRAMS}/crash.py"]
+
+
+def ruby(_: Path) -> list[str]:
+    return ["ruby", f"{PROGRAMS}/crash.rb"]
+
+
+def go(folder: Path) -> list[str]:
+    subprocess.run(["go", "build", "-o", folder / "crash", PROGRAMS / "crash.go"], check=True)
+    return [f"{folder}/crash"]
+
+
+def java(folder: Path) -> list[str]:
+    subprocess.run(["javac", "-nowarn", "-d", folder, PROGRAMS / "Crash.java"], check=True, stderr=subprocess.DEVNULL)
+    return ["java", "-XX:+UseSerialGC", f"-XX:ErrorFile={folder}/report.log", "-cp", str(folder), "Crash"]
+
+
+NEEDS = {"python": "python3", "ruby": "ruby", "go": "go", "java": "javac"}
+LABELS = ("avckpt.interval=20ms", "avckpt.keep=3")
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("command", [python, ruby, go, java])
+def test_one_restore_for_each_crash(command: Callable[[Path], list[str]], tmp_path: Path) -> None:
+    needed = NEEDS[command.__name__]
+    if not shutil.which(needed):
+        pytest.skip(f"{needed} is not installed")
+    trigger, messages = tmp_path / "trigger", tmp_path / "messages"
+
+    def count(pattern: str) -> int:
+        return len(re.findall(pattern, messages.read_text(errors="replace")))
+
+    def wait_checkpoints(n: int) -> None:
+        before = count(": checkpoint: ")
+        wait_until(lambda: count(": checkpoint: ") >= before + n, 20, "checkpoints")
+
+    argv = [*avckpt_command(), "run", "-v", *(f"--label={label}" for label in LABELS), "--"]
+    with messages.open("wb") as err:
+        process = subprocess.Popen(
+            [*argv, *command(tmp_path), str(trigger)], stdin=subprocess.DEVNULL, stdout=err, stderr=err, cwd=tmp_path
+        )
+    try:
+        for crash in range(1, CRASHES + 1):
+            wait_checkpoints(5)
+            trigger.touch()
+            wait_until(lambda n=crash: count(r" restored in \d") >= n, 30, "it is restored")  # type: ignore[misc]
+            assert not trigger.exists()
+        wait_checkpoints(20)
+        assert count(r" restored in \d") == len((tmp_path / "trigger.crashes").read_text())
+    finally:
+        process.terminate()
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
