@@ -182,23 +182,6 @@ static int keep_all(struct generation *generation, struct mem_seen *seen, struct
 	return 0;
 }
 
-/* The tables do not change while the kernel clones: no task runs. */
-static void capture_files(struct generation *generation)
-{
-	struct scratch scratch = { -1, -1, 0 };
-
-	for (uint32_t i = 0; i < generation->images; i++) {
-		struct image *image = &generation->image[i];
-		/* An orphan shares most with the main process, if at all. */
-		const struct image *parent =
-			i ? &generation->image[image->parent < 0 ? 0 : image->parent] : NULL;
-
-		if (image->process)
-			files_capture(image, parent, generation->images > 1, &scratch);
-	}
-	scratch_close(&scratch);
-}
-
 /* A killed process has no descriptors any more, which looks like an empty table.  Those still
  * answering queries are checked then. */
 static int see_alive(const struct tree *tree, struct avc_error *err)
@@ -323,8 +306,9 @@ static int read_and_clone(struct freeze *freeze, struct avc_error *err)
 	if (find_others(freeze->tree, generation, err) || freeze_begin_others(freeze, err) ||
 	    keep_all(generation, &freeze->seen, err))
 		return -1;
-	/* While main threads are in their parasites: see parasite_set_undo(). */
-	capture_files(generation);
+	/* The tables do not change while the kernel clones: no task runs.  While main threads are in
+	 * their parasites: see parasite_set_undo(). */
+	files_capture(generation->image, generation->images);
 	if (dirty_capture(freeze->dirty, generation, err))
 		return -1;
 	if (see_alive(freeze->tree, err))

@@ -24,7 +24,7 @@
 #include "files.h"
 
 #define ROOM_SPARE 64
-#define OURS_MAX 64 /* duplicates at a time                                          */
+#define OURS_MAX 1024 /* duplicates at a time                                          */
 
 struct look {
 	struct files *files, *known;
@@ -32,7 +32,6 @@ struct look {
 	int pidfd, fd_dir;
 	enum files_depth depth;
 	bool trusts; /* heirs are assumed unchanged: files_check_heirs() */
-	uint32_t ours;
 	struct stat init_stdio[3];
 	bool init_known[3];
 };
@@ -473,9 +472,9 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	if (f->kind == FILE_SOCKET && (look->depth == FILES_NOW || look->files->with_tcp))
 		file_look_at_tcp(fd, f, socket);
 	silent = look->depth != FILES_NOW && file_is_video(f) && file_look_at_video(fd, &f->video);
-	if (look->depth == FILES_FROZEN && is_channel(f) && look->ours < OURS_MAX) {
+	if (look->depth == FILES_FROZEN && is_channel(f) && *files->ours < OURS_MAX) {
 		f->ours = fd; /* until keep_contents() */
-		look->ours++;
+		++*files->ours;
 	} else {
 		close(fd);
 	}
@@ -678,8 +677,9 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->content_bytes = from->content_bytes;
 }
 
-static void keep_content(const struct look *look, struct file *f)
+static void keep_content(const struct image *image, struct file *f, struct scratch *scratch)
 {
+	struct process *process = image->process;
 	struct pollfd end = { .events = POLLIN | POLLRDHUP };
 
 	/* Once for each object, from an end that can be read. */
@@ -687,23 +687,23 @@ static void keep_content(const struct look *look, struct file *f)
 	    f->outside || !is_channel(f))
 		return;
 	if (f->inherited) {
-		copy_content(look->files->parent, f);
+		copy_content(image->files->parent, f);
 		return;
 	}
-	if (f->ours <= 0)
-		f->ours = proc_borrow_fd(look->pidfd, f->fd);
 	if (f->pipe_bytes < 0) {
 		f->content_lost = true;
 		return;
 	}
+	if (f->ours <= 0)
+		f->ours = proc_borrow_fd(process->pidfd, f->fd);
 	end.fd = f->ours;
 	if (f->ours < 0 || poll(&end, 1, 0) != 1)
 		return;
 	if (end.revents & POLLRDHUP && f->socket)
 		f->socket->shut |= SHUT_IN;
-	f->ended = end.revents & POLLHUP && !files_other_end(look->files, f);
-	if (end.revents & POLLIN && (f->ended || may_be_ours(look->files, f)))
-		file_keep_content(look->files->process, f->ours, f, look->files->scratch);
+	f->ended = end.revents & POLLHUP && !files_other_end(image->files, f);
+	if (end.revents & POLLIN && (f->ended || may_be_ours(image->files, f)))
+		file_keep_content(process, f->ours, f, scratch);
 }
 
 static void drop_ours(struct file *f)
@@ -713,14 +713,13 @@ static void drop_ours(struct file *f)
 	f->ours = 0;
 }
 
-static void keep_contents(const struct look *look)
+static void keep_contents(const struct image *image, struct scratch *scratch)
 {
-	files_measure_pipes(look->files, look->pidfd);
-	for (uint32_t i = 0; i < look->files->count; i++) {
-		struct file *f = &look->files->file[i];
+	for (uint32_t i = 0; i < image->files->count; i++) {
+		struct file *f = &image->files->file[i];
 
 		if (budget_step())
-			keep_content(look, f);
+			keep_content(image, f, scratch);
 		drop_ours(f);
 	}
 }
@@ -906,7 +905,6 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 		check_shared(files, pid);
 		files_find_peers(files, pid); /* of pairs that are quite new */
 		files_find_areas(files, pid);
-		keep_contents(&look);
 	} else {
 		find_shared(files, pid);
 		if (depth == FILES_BEFORE)
@@ -1065,30 +1063,51 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 	return 0;
 }
 
-void files_capture(struct image *image, const struct image *parent, bool several,
-		   struct scratch *scratch)
+/* All but the contents. */
+static void look_frozen(struct image *image, const struct image *parent, bool several,
+			uint32_t *ours)
 {
 	struct process *process = image->process;
 	const struct files_owner owner = { process->pid, process->pidfd, process->init };
 	struct files *files = process->files_image;
-	int result;
 
 	process->files_image = NULL;
 	image->files = files;
 	files->several = several;
 	files->parent = parent ? parent->files : NULL;
 	files->parent_pid = parent ? parent->process->pid : 0;
-	files->scratch = scratch;
+	files->ours = ours;
 	files->process = process;
-	result = files_look(files, &owner, FILES_FROZEN, process->files_before,
-			    &image->files_error);
-	files->parent = NULL; /* may be gone before this one */
-	files->scratch = NULL;
-	files->process = NULL;
-	if (result)
+	if (files_look(files, &owner, FILES_FROZEN, process->files_before, &image->files_error))
 		return;
 	find_owners(process, files);
 	find_own_pidfds(process, files);
+}
+
+/* Contents last: the sizes of all pipes are asked for at once. */
+void files_capture(struct image *image, uint32_t images)
+{
+	struct scratch scratch = { -1, -1, 0 };
+	uint32_t ours = 0;
+
+	for (uint32_t i = 0; i < images; i++)
+		/* An orphan shares most with the main process, if at all. */
+		if (image[i].process)
+			look_frozen(&image[i],
+				    i ? &image[image[i].parent < 0 ? 0 : image[i].parent] : NULL,
+				    images > 1, &ours);
+	files_measure_pipes(image, images);
+	for (uint32_t i = 0; i < images; i++)
+		if (files_are_read(&image[i]))
+			keep_contents(&image[i], &scratch);
+	for (uint32_t i = 0; i < images; i++) {
+		if (!image[i].process)
+			continue;
+		image[i].files->parent = NULL; /* may be gone before this one */
+		image[i].files->ours = NULL;
+		image[i].files->process = NULL;
+	}
+	scratch_close(&scratch);
 }
 
 /* flock(2) cannot be observed cheaply: a lock that exists after the freeze, but not before, may be

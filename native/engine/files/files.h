@@ -42,16 +42,9 @@
  * process that was prepared just before, with which it may share many, or NULL. */
 int files_prepare(struct process *process, const struct process *parent,
 		  struct avc_error *err) warn_unused;
-/* Our own pipe, through which others are read; { -1, -1, 0 } at first. */
-struct scratch {
-	int in, out, bytes;
-};
-void scratch_close(struct scratch *scratch);
-/* During it: reads the state of this instant, or records why it could not be read.  `parent`: an
- * image of the same freeze, with which it may share many, or NULL. `several`: the app has other
- * processes, which may have the other ends of pipes. */
-void files_capture(struct image *image, const struct image *parent, bool several,
-		   struct scratch *scratch);
+/* During it: reads the state of this instant of all processes, or records why that of one could not
+ * be read. */
+void files_capture(struct image *image, uint32_t images);
 /* Checks what the freeze left out, in the templates (files_heirs.c).  AVC_RETRY: what a process
  * shares with its parent has changed meanwhile. */
 int files_check_heirs(struct image *image, uint32_t images, struct avc_error *err) warn_unused;
@@ -309,7 +302,7 @@ struct files {
 	 * children do with their parents, is not read again. */
 	const struct files *parent;
 	pid_t parent_pid;
-	struct scratch *scratch; /* during a freeze                                 */
+	uint32_t *ours;          /* during a freeze: duplicates, of all tables      */
 	struct process *process; /* likewise                                       */
 	struct file_rights rights;
 	/* At a restore: of what is not in `known`, only what may be one of these is read. */
@@ -336,6 +329,11 @@ struct files_owner {
 /* `files->parent` may be set. */
 int files_look(struct files *files, const struct files_owner *owner, enum files_depth depth,
 	       struct files *known, struct avc_error *err) warn_unused;
+/* In a freeze: the table, but for sizes and contents. */
+static inline bool files_are_read(const struct image *image)
+{
+	return image->process && !image->files_error.code;
+}
 /* Sorts them. */
 void files_missing_sort(struct files_missing *missing);
 struct file *files_find(const struct files *files, int fd);
@@ -388,7 +386,12 @@ void files_find_partners(struct files *files, pid_t pid);
 bool file_has_name(const struct file_socket *socket);
 /* Whether both ends of this pipe or socket pair are in the table. */
 const struct file *files_other_end(struct files *files, const struct file *file);
+/* Our own pipe, through which others are read; { -1, -1, 0 } at first. */
+struct scratch {
+	int in, out, bytes;
+};
 void file_keep_content(struct process *process, int fd, struct file *file, struct scratch *scratch);
+void scratch_close(struct scratch *scratch);
 /* Whether it has POSIX or OFD locks; and its file system. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
@@ -440,8 +443,8 @@ void files_find_going(struct files *files);
 const char *file_put_stream(int fd, const struct file *want, const struct file *now);
 
 /* files_pipes.c */
-/* Of those that are not inherited from a parent, nor shared with init. */
-void files_measure_pipes(struct files *files, int pidfd);
+/* Of all that are not shared with init. */
+void files_measure_pipes(struct image *image, uint32_t images);
 
 /* files_watches.c */
 /* Gives the inotify descriptor `fd` of ours the watches of `want`; `now` is what it is
