@@ -285,6 +285,16 @@ static int await_clones(struct generation *generation, struct avc_error *err)
 	return 0;
 }
 
+static bool is_template(pid_t pid, const void *arg)
+{
+	const struct generation *generation = arg;
+
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (generation->image[i].template == pid)
+			return true;
+	return false;
+}
+
 /* ---- all of it ------------------------------------------------------------------------------ */
 
 static int stop_and_begin(struct freeze *freeze, struct avc_error *err)
@@ -328,7 +338,11 @@ static int hear_and_await(struct freeze *freeze, int result, struct avc_error *e
 	if (freeze_await_answers(freeze->tree, result ? &failed : err))
 		result = -1;
 	if (!result)
-		result = await_clones(freeze->generation, err);
+		result = await_clones(freeze->generation, err) ||
+					 tree_check_made(freeze->tree, is_template,
+							 freeze->generation, err)
+				 ? -1
+				 : 0;
 	freeze_drop_clones(freeze->tree);
 	return result;
 }

@@ -39,6 +39,10 @@ struct tree {
 	 * images of them. */
 	struct process **process;
 	uint32_t processes;
+	/* Children of init that are tracees, found while clones were being made: templates, unless
+	 * tree_check_made() finds another one. */
+	pid_t *made;
+	uint32_t made_count;
 	/* Whether this child of init is one of our own. */
 	bool (*is_ours)(pid_t pid, const void *arg);
 	const void *arg;
@@ -193,6 +197,9 @@ bool process_is_quiescent(const struct process *process);
 int tree_init(struct tree *tree, struct process *main) warn_unused;
 /* Finds all processes; opens new ones. */
 int tree_scan(struct tree *tree, struct avc_error *err) warn_unused;
+/* After the clones: AVC_RETRY if one of those made meanwhile is not known, and not in a parasite. */
+int tree_check_made(const struct tree *tree, bool (*is_known)(pid_t pid, const void *arg),
+		    const void *arg, struct avc_error *err) warn_unused;
 /* Whether entry[i] or an ancestor adopts orphans, or could not be queried for that. */
 bool tree_has_reaper(const struct tree *tree, uint32_t i);
 /* Whether this is in one of their parasites: then the task there is not the app's. */

@@ -17,7 +17,8 @@ int tree_init(struct tree *tree, struct process *main)
 {
 	tree->entry = calloc(PROCESSES_MAX, sizeof *tree->entry);
 	tree->process = calloc(2 * PROCESSES_MAX, sizeof(struct process *));
-	if (!tree->entry || !tree->process)
+	tree->made = calloc(PROCESSES_MAX, sizeof *tree->made);
+	if (!tree->entry || !tree->process || !tree->made)
 		return -1;
 	tree->process[tree->processes++] = main;
 	return 0;
@@ -68,26 +69,72 @@ bool tree_has_parasite(const struct tree *tree, avc_remote pc)
 	return false;
 }
 
-/* A clone of ours: of a holder that is cloning, or one that was never reported.  A sibling that a
- * thread of the app has created (CLONE_PARENT) may be a tracee, too. 1 or 0. */
-static int is_clone(const struct tree *tree, pid_t pid, struct avc_error *err)
+/* A thread of the app reported that it had created it while it was being stopped. */
+static bool is_reported(const struct tree *tree, pid_t pid)
 {
-	avc_remote pc;
+	for (uint32_t i = 0; i < tree->processes; i++) {
+		const struct thread *t = thread_find(tree->process[i], pid);
 
-	if (has_process(tree, pid) || !tracee_is_ours(pid))
-		return 0;
-	pc = tracee_pc(pid);
+		if (t && t->attached)
+			return true;
+	}
+	return false;
+}
+
+/* 1: its next instruction is in a parasite; 0: it is not. */
+static int is_in_parasite(const struct tree *tree, pid_t pid, struct avc_error *err)
+{
+	const avc_remote pc = tracee_pc(pid);
+
 	if (!pc)
 		return fail(err, AVC_RETRY, 0, pid, "look at processes", "",
 			    "a process has just been made");
-	if (!tree_has_parasite(tree, pc))
+	return tree_has_parasite(tree, pc);
+}
+
+/* A clone of ours: of a holder that is cloning, or one that was never reported.  A sibling that a
+ * thread of the app has created (CLONE_PARENT) may be a tracee, too. 1 or 0. */
+static int is_clone(struct tree *tree, pid_t pid, struct avc_error *err)
+{
+	int result;
+
+	if (has_process(tree, pid) || !tracee_is_ours(pid))
 		return 0;
-	tree_main(tree)->lost |= !any_cloning(tree);
-	return 1;
+	/* Where it is can be seen when the kernel has finished it: tree_check_made(). */
+	if (any_cloning(tree) && tree->made_count < PROCESSES_MAX) {
+		if (is_reported(tree, pid))
+			return 0;
+		tree->made[tree->made_count++] = pid;
+		return 1;
+	}
+	result = is_in_parasite(tree, pid, err);
+	if (result == 1)
+		tree_main(tree)->lost |= !any_cloning(tree);
+	return result;
+}
+
+int tree_check_made(const struct tree *tree, bool (*is_known)(pid_t pid, const void *arg),
+		    const void *arg, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->made_count; i++) {
+		int result;
+
+		if (is_known(tree->made[i], arg))
+			continue;
+		result = is_in_parasite(tree, tree->made[i], err);
+		if (result == 0) {
+			tracee_release_strangers();
+			return fail(err, AVC_RETRY, 0, tree->made[i], "look at processes", "",
+				    "it was made while the application was being stopped");
+		}
+		if (result < 0)
+			return -1;
+	}
+	return 0;
 }
 
 /* A child of init that does not belong to the app. */
-static int is_none(const struct tree *tree, pid_t pid, struct avc_error *err)
+static int is_none(struct tree *tree, pid_t pid, struct avc_error *err)
 {
 	return pid == tree_main(tree)->leader || tree->is_ours(pid, tree->arg)
 		       ? 1
@@ -251,6 +298,7 @@ static int check_sharing(const struct tree *tree, const struct tree_entry *entry
 int tree_scan(struct tree *tree, struct avc_error *err)
 {
 	tree->count = 0;
+	tree->made_count = 0;
 	if (add_entry(tree, tree_main(tree)->leader, PARENT_INIT, err))
 		return -1;
 	tree->entry[0].process = tree_main(tree);
@@ -353,8 +401,10 @@ void tree_free(struct tree *tree)
 		process_free(tree->process[i]);
 	free(tree->process);
 	free(tree->entry);
+	free(tree->made);
 	tree->process = NULL;
 	tree->entry = NULL;
+	tree->made = NULL;
 	tree->processes = 0;
 	tree->count = 0;
 }
