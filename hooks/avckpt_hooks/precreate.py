@@ -30,7 +30,8 @@ INIT_PATH = "/run/avckpt-init"
 WAIT_MS = 2000
 """How long init waits for a sidecar that lives but does not answer."""
 
-IO_URING = ("io_uring_setup", "io_uring_enter", "io_uring_register")
+IO_URING = ("io_uring_setup", "io_uring_enter", "io_uring_register", "io_setup")
+"""Also kernel AIO: what has to do without the one falls back on the other, and neither is protected."""
 
 HOOK_TIMEOUT_S = 120
 """After this the OCI runtime kills our hooks, and the container does not start: a last resort. They bound
@@ -199,7 +200,7 @@ def _mount(data: dict[str, Any], source: str, destination: str) -> None:
 
 
 def take_io_uring_away(data: dict[str, Any]) -> None:
-    """Makes io_uring fail as on a kernel without it, by the container's seccomp profile.  Changes `data`."""
+    """Makes io_uring and AIO fail as on a kernel without them, by the container's seccomp profile.  Changes `data`."""
     linux = data.setdefault("linux", {})
     # A container without a profile (--privileged, seccomp=unconfined) gets one that allows all else.
     profile = linux.get("seccomp") or {"defaultAction": "SCMP_ACT_ALLOW"}

@@ -152,11 +152,13 @@ def test_nohup_is_passed_on() -> None:
     assert ignored & 0b11 == 0b11  # SIGHUP is 1, SIGINT 2
 
 
-IO_URING = "import ctypes; c = ctypes.CDLL(None, use_errno=True); print(c.syscall(425, 0, 0), ctypes.get_errno())"
+ASYNC_IO = "import ctypes; c = ctypes.CDLL(None, use_errno=True); print(c.syscall({}, 0, 0), ctypes.get_errno())"
 
 
-def test_io_uring_can_be_taken_away() -> None:
-    python = ("--", sys.executable, "-c", IO_URING)
+@pytest.mark.parametrize("number", [425, 206], ids=["io_uring_setup", "io_setup"])
+def test_io_uring_can_be_taken_away(number: int) -> None:
+    """And kernel AIO, which programs fall back on."""
+    python = ("--", sys.executable, "-c", ASYNC_IO.format(number))
     assert avckpt_run(*python).stdout.split()[1] != str(errno.ENOSYS)
     assert avckpt_run("--label", "avckpt.io_uring=off", *python).stdout == f"-1 {errno.ENOSYS}\n"
 

@@ -30,7 +30,7 @@ def built(init_built: None, victims_built: Path) -> None:
     ("command", "why"),
     [
         ("unsupported iouring", "io_uring"),
-        ("unsupported aio", "AIO"),
+        ("unsupported aio", "kernel AIO (most programs do without: avckpt.io_uring=off)"),
         ("unsupported userfault", "userfaultfd"),
         ("unsupported nested", "a container in the container"),
         ("unsupported filter", "differ in their seccomp filters"),

@@ -355,7 +355,7 @@ def test_one_that_only_listens_is_made_known_and_not_touched(hook: Hook) -> None
     assert hook(config, with_labels(spec, notify="signal:USR1")).out == config
 
 
-IO_URING = {"io_uring_setup", "io_uring_enter", "io_uring_register"}
+IO_URING = {"io_uring_setup", "io_uring_enter", "io_uring_register", "io_setup"}
 
 
 @pytest.mark.parametrize(
@@ -365,7 +365,7 @@ IO_URING = {"io_uring_setup", "io_uring_enter", "io_uring_register"}
         {
             "defaultAction": "SCMP_ACT_ERRNO",
             "syscalls": [
-                {"names": ["read", "io_uring_enter", "io_uring_setup"], "action": "SCMP_ACT_ALLOW"},
+                {"names": ["read", "io_uring_enter", "io_setup", "io_uring_setup"], "action": "SCMP_ACT_ALLOW"},
                 {"names": ["io_uring_register"], "action": "SCMP_ACT_ALLOW"},
             ],
         },

@@ -41,7 +41,7 @@ def spawn_pid1(path: str, argv: list[str], *, tty: int | None, io_uring: bool = 
     the terminal's foreground group.  SIGPIPE and SIGXFSZ, which Python itself
     ignores, are not ignored in the new process.
 
-    Without `io_uring` the kernel has none for it.
+    Without `io_uring` the kernel has neither that nor AIO for it.
 
     It is killed, with all that it has started, when this process ends, however that comes about.
 
@@ -121,14 +121,15 @@ def _become(path: str, argv: list[str], tty: int | None, io_uring: bool, tell: i
 
 
 def _take_io_uring_away() -> None:
-    """For this process and what it starts: io_uring_setup(2) and its like answer ENOSYS."""
+    """For this process and what it starts: io_uring_setup(2) and its like, and io_setup(2), answer ENOSYS."""
     load, equal, above, at_least, answer = 0x20, 0x15, 0x25, 0x35, 0x06  # linux/bpf_common.h
     program = b"".join(
         struct.pack("HBBI", *instruction)
         for instruction in (
             (load, 0, 0, 4),  # seccomp_data.arch
-            (equal, 0, 4, AUDIT_ARCH_X86_64),
+            (equal, 0, 5, AUDIT_ARCH_X86_64),
             (load, 0, 0, 0),  # seccomp_data.nr
+            (equal, 2, 0, 206),  # io_setup
             (at_least, 0, 2, 425),  # io_uring_setup
             (above, 1, 0, 427),  # io_uring_register
             (answer, 0, 0, SECCOMP_RET_ERRNO | errno.ENOSYS),
