@@ -56,6 +56,7 @@ from avckpt.events.history import History
 from avckpt.events.journal import Journal
 from avckpt.events.metrics import Metrics
 from avckpt.events.record import EventRecord, of_guard
+from avckpt.events.system_journal import SystemJournal
 from avckpt.events.vocabulary import Kind, Reason
 from avckpt.evidence.inquests import Inquests
 from avckpt.guard import Command, Event, generation_to_json
@@ -121,6 +122,7 @@ class Daemon:
         self.records = Records(run_dir / "containers")
         self.feed = Feed()
         self.history = History(run_dir / "history.jsonl")
+        self._system_journal = SystemJournal()
         self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
@@ -193,6 +195,7 @@ class Daemon:
             loop.remove_reader(self._engine.event_fd)
             self._engine.close()
             self.history.close()
+            self._system_journal.close()
 
     def _beat(self) -> None:
         """Gives signs of life to the watchdog, from now on while the loop runs."""
@@ -474,6 +477,8 @@ class Daemon:
         self.notifier.take(record, container, self._watches.values())
         if line is not None:
             log.log(line[0], "%s: %s", container.label, line[1])
+            if line[0] >= logging.INFO:
+                self._system_journal.tell(container.init_pid, container.label, *line)
         self.metrics.take(record)
         self.feed.publish(record)
         return record

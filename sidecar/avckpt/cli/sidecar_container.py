@@ -11,10 +11,12 @@ from pathlib import Path
 
 from avckpt.cli.client import Client
 from avckpt.errors import SidecarUnreachable
+from avckpt.events.system_journal import SOCKET
 
 NAME = "avckpt-sidecar"
 IMAGE = "localhost/avckpt-sidecar"
 CONFIG_DIR = Path("/etc/avckpt")
+JOURNAL = SOCKET.parent
 OUTDATED = f"the container {NAME} is of another build than the image {IMAGE}"
 ANSWERS_WITHIN_S = 20.0
 
@@ -66,7 +68,8 @@ def _ensure(run_dir: Path, say: Callable[[str], None]) -> None:
 def options(run_dir: Path) -> list[str]:
     """What `podman run` has to be told for a sidecar."""
     config = ["--volume", f"{CONFIG_DIR}:{CONFIG_DIR}:ro"] if CONFIG_DIR.is_dir() else []
-    volumes = ["--volume", f"{run_dir}:/run/avckpt", *config]
+    journal = ["--volume", f"{JOURNAL}:{JOURNAL}"] if JOURNAL.is_dir() else []
+    volumes = ["--volume", f"{run_dir}:/run/avckpt", *config, *journal]
     return ["--restart=always", "--privileged", "--pid=host", "--network=none", *volumes]
 
 
