@@ -101,6 +101,8 @@ fuzz|llvm|have llvm-symbolizer|names the lines of what a sanitizer finds
 view|chromium|have chromium|shows the page of avckpt web to a test
 view|chromium-driver|have chromedriver|by which a test uses that browser
 view|prometheus|have prometheus|reads the metrics in a test
+view|zsh|have zsh|completes commands in a test
+view|fish|have fish|completes commands in a test
 optional|runc|have runc|the tests run on both OCI runtimes
 optional|g++|have c++|compiles the C++ program that the tests kill and restore
 optional|cyclonedds-dev|has_cyclonedds|a test of ROS 2's transport
