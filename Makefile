@@ -20,6 +20,8 @@ TESTS  ?= $(wildcard tests/unit tests/native tests/platform tests/integration)
 # `make test-kernels KERNELS=trixie KERNEL_TESTS=tests/native/test_engine_kills.py`
 KERNELS ?= jammy bookworm noble trixie backports
 KERNEL_TESTS ?= tests/native
+# What `make test-machine` runs on Debian 13.
+MACHINE_TESTS ?= demo $(addprefix tests/integration/test_,hooks_podman.py quadlet.py run.py trees_scripts.py packages.py)
 
 # `make test-sqlite KILLS=20`, `make soak SECONDS=600`: shorter.
 KILLS   ?= 200
@@ -83,6 +85,10 @@ test-trees: setup ## the tests of process trees at length: more kills, 200 proce
 test-kernels: ## the engine's tests on other kernels, in emulated machines (KERNELS="jammy bookworm noble trixie backports"; an hour each)
 	@scripts/setup-machine.sh $(KERNELS)
 	@for kernel in $(KERNELS); do scripts/test-machine.sh $$kernel $(KERNEL_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)") || exit; done
+
+test-machine: setup ## demo, hooks, Quadlet, trees, packages on Debian 13 (Podman 5.4, systemd, cgroup v2), in an emulated machine
+	@AVCKPT_MACHINE=trixie scripts/setup-machine.sh trixie
+	@AVCKPT_MACHINE=trixie scripts/test-machine.sh trixie $(MACHINE_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 # All that tests run and would compile themselves, before several runs of pytest do it at once.
 build-tests: setup-build
@@ -157,5 +163,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help deb wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
+.PHONY: help deb wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels test-machine build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
 .DEFAULT_GOAL := help

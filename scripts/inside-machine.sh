@@ -1,18 +1,24 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# Run by an emulated machine when it has booted: the tests that build/machine-arguments names, and
-# how they ended, in its last line.
+# Run by an emulated machine when it has booted: the demo, if build/machine-arguments begins with
+# that word, and the tests that it names; and how they ended, in its last line.
 set -o pipefail
 cd /opt/avckpt || exit 1
 # An emulated machine is about ten times slower (testkit/harness.py).
-export HOME=/root LANG=C.UTF-8 AVCKPT_SLOWNESS=10
+export HOME=/root LANG=C.UTF-8 AVCKPT_SLOWNESS="${AVCKPT_SLOWNESS:-10}"
 mapfile -t arguments <build/machine-arguments
-printf 'Linux %s, %s, %s\n' "$(uname -r)" "$(podman --version)" "$(stat -f -c %T /sys/fs/cgroup)"
+status=0
+printf 'Linux %s, %s, %s, %s, systemd %s, %s\n' "$(uname -r)" "$(podman --version)" "$(crun --version | head -n 1)" \
+	"$(conmon --version | head -n 1)" "$(systemctl --version | awk 'NR == 1 { print $2 }')" "$(stat -f -c %T /sys/fs/cgroup)"
 case "${arguments[*]}" in
-*tests/integration* | *tests/platform*)
-	if [ -f build/images.tar ]; then podman load -q -i build/images.tar; fi
-	{ make setup-images && scripts/setup-trees.sh; } | cat
-	;;
-esac && .venv/bin/python -m pytest -p no:cacheprovider --timeout 900 --color=no "${arguments[@]}"
-printf 'machine: ended with %s\n' $?
+demo* | *tests/integration* | *tests/platform*) { make setup-images && scripts/setup-trees.sh; } | cat || status=1 ;;
+esac
+if [ "${arguments[0]}" = demo ]; then
+	arguments=("${arguments[@]:1}")
+	.venv/bin/python -m scripts.demo || status=1
+fi
+if [ ${#arguments[@]} != 0 ]; then
+	.venv/bin/python -m pytest -p no:cacheprovider --timeout 900 --color=no "${arguments[@]}" || status=1
+fi
+printf 'machine: ended with %s\n' "$status"

@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# setup-machine.sh KERNEL...: what `make test-kernels` boots.  In build/machine: a Debian 12 with
-# systemd, Podman and a compiler, and for each KERNEL a kernel as somebody ships it.
+# setup-machine.sh KERNEL...: what `make test-kernels` and `make test-machine` boot.  In
+# build/machine-SUITE: a Debian (AVCKPT_MACHINE: bookworm or trixie) with systemd, Podman and a
+# compiler, and for each KERNEL a kernel as somebody ships it.
 #
 # The machines are emulated (QEMU's TCG): slow, and the same everywhere, with KVM or without.
 
@@ -10,7 +11,8 @@
 . "$(dirname "$0")/lib.sh"
 
 cd "$ROOT"
-MACHINE=$BUILD/machine
+SUITE=${AVCKPT_MACHINE:-bookworm}
+MACHINE=$BUILD/machine-$SUITE
 WORLD=$MACHINE/root
 KEYRING=$MACHINE/ubuntu.gpg
 DEBIAN=${AVCKPT_MIRROR:-http://deb.debian.org/debian}
@@ -19,6 +21,12 @@ PACKAGES=systemd,systemd-sysv,dbus,udev,kmod,initramfs-tools,zstd,iproute2,procp
 PACKAGES=$PACKAGES,podman,conmon,crun,catatonit,netavark,iptables,nftables,uidmap,mmdebstrap,debian-archive-keyring
 PACKAGES=$PACKAGES,gcc,g++,libc6-dev,binutils,make,git,python3,python3-venv,python3-dev
 PACKAGES=$PACKAGES,strace,gdb,psmisc,cyclonedds-dev,cyclonedds-tools
+case $SUITE in
+bookworm) ;;
+# Shells, for the completion of commands.
+trixie) PACKAGES=$PACKAGES,zsh,fish,bash-completion ;;
+*) echo "AVCKPT_MACHINE is bookworm or trixie, not $SUITE" >&2 && exit 1 ;;
+esac
 
 # source_of KERNEL: the package, and where it comes from (sources.list(5), one line each).
 source_of() {
@@ -52,7 +60,7 @@ install_qemu() {
 make_world() {
 	local new=$tarball.new.$$
 	mmdebstrap --format=tar --variant=minbase --include="$PACKAGES" --dpkgopt='path-exclude=/usr/share/doc/*' \
-		--dpkgopt='path-exclude=/usr/share/man/*' bookworm "$new" "$DEBIAN" || return
+		--dpkgopt='path-exclude=/usr/share/man/*' "$SUITE" "$new" "$DEBIAN" || return
 	# Renamed only when whole: an interrupted run leaves no half tarball behind.
 	mv "$new" "$tarball"
 }
@@ -61,8 +69,9 @@ unpack_world() {
 	rm -rf "$WORLD" || return
 	mkdir -p "$WORLD" || return
 	tar -C "$WORLD" --numeric-owner -xf "$tarball" || return
-	# Its kernels are others', and its only disk is whole.
-	printf '/dev/vda / ext4 rw,relatime 0 0\n' >"$WORLD/etc/fstab" || return
+	# Its kernels are others', and its first disk is whole; the second is the checkout.
+	printf '/dev/vda / ext4 rw,relatime 0 0\n/dev/vdb /opt/avckpt ext4 rw,relatime 0 0\n' >"$WORLD/etc/fstab" || return
+	mkdir -p "$WORLD/opt/avckpt" || return
 	echo machine >"$WORLD/etc/hostname" || return
 	chroot "$WORLD" systemctl -q mask apt-daily.timer apt-daily-upgrade.timer systemd-networkd-wait-online.service || return
 	# The network, for what has to be fetched inside: QEMU's own, by DHCP.
@@ -81,7 +90,7 @@ make_kernel() {
 	rm -rf "$there" "$packages" || return
 	[ -e "$KEYRING" ] || get_keyring || return
 	printf '%s\n' "${sources[@]:1}" | mmdebstrap --variant=extract --include="${sources[0]}" \
-		--aptopt='APT::Install-Recommends "false"' bookworm "$packages" - || return
+		--aptopt='APT::Install-Recommends "false"' "$SUITE" "$packages" - || return
 	for modules in "$packages"/lib/modules/* "$packages"/usr/lib/modules/*; do
 		if [ -d "$modules/kernel" ]; then break; fi
 	done
@@ -113,9 +122,9 @@ if ! have qemu-system-x86_64 || ! have mke2fs || ! have mmdebstrap || ! have zst
 fi
 mkdir -p "$MACHINE"
 key=$(content_key scripts/setup-machine.sh scripts/machine.service)
-cached machine "bookworm-$(content_key -- "$DEBIAN" "$PACKAGES" "$(declare -f make_world)")"
-[ -f "$tarball" ] || step machine-world "making a Debian 12 to boot" make_world || die "no machine: bookworm could not be fetched from $DEBIAN"
-drop_older machine
+cached "machine-$SUITE" "$(content_key -- "$DEBIAN" "$PACKAGES" "$(declare -f make_world)")"
+[ -f "$tarball" ] || step machine-world "making a Debian ($SUITE) to boot" make_world || die "no machine: $SUITE could not be fetched from $DEBIAN"
+drop_older "machine-$SUITE"
 if [ "$(cat "$MACHINE/world" 2>/dev/null)" != "$key" ]; then
 	rm -rf "${MACHINE:?}"/*
 	step machine-unpack "unpacking it" unpack_world || die "no machine: $tarball could not be unpacked"

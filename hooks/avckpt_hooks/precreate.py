@@ -95,7 +95,7 @@ def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) ->
     data = json.loads(config)
     about = json.loads(spec)
     name = about.get("name") or container[:12] or "?"
-    annotations = data.get("annotations") or {}
+    annotations = labels.of_container(data.get("annotations") or {}, name)
     given = about.get("labels") or {}
     try:
         wanted = labels.merge(given, annotations)

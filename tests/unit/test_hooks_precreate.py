@@ -229,6 +229,22 @@ def test_annotations_are_enough_when_labels_can_not_be_read(hook: Hook) -> None:
     assert hook(config, None).config["process"]["args"][0] == "/run/avckpt-init"
 
 
+def test_annotations_of_one_container_reach_no_other(hook: Hook) -> None:
+    """As `podman kube play` gives all of a pod's to each of its containers."""
+    config, spec = sample("plain")
+    name = json.loads(spec)["name"]
+    data = json.loads(config)
+    data["annotations"].update({f"avckpt.enable/{name}": "true", "avckpt.keep/other": "4"})
+    result = hook(json.dumps(data).encode(), spec)
+    assert result.config["process"]["args"][0] == "/run/avckpt-init"
+    stamped = {key: value for key, value in result.config["annotations"].items() if key.startswith("avckpt.")}
+    assert stamped["avckpt.enable"] == "true"
+    assert not any("/" in key for key in stamped)
+    data["annotations"] = {"avckpt.enable/other": "true"}
+    result = hook(json.dumps(data).encode(), spec)
+    assert (result.status, result.config["process"]["args"]) == (0, data["process"]["args"])
+
+
 @pytest.mark.parametrize(
     "command", ["/sbin/init", "/usr/local/sbin/init", "/init", "/opt/systemd/systemd --user", "s6-svscan /etc/s6"]
 )

@@ -39,3 +39,21 @@ def test_pod_and_runtime_class_name_the_same_runtime() -> None:
     named = {path.stem: yaml.safe_load(path.read_text()) for path in FILES}
     assert named["pod"]["spec"]["runtimeClassName"] == named["runtimeclass"]["metadata"]["name"]
     assert pods.check([FOLDER / "pod.yaml"]).services["Pod/drive"].enabled
+
+
+def test_annotations_of_one_container(tmp_path: Path) -> None:
+    pod = yaml.safe_load((FOLDER / "pod.yaml").read_text())
+    pod["metadata"]["annotations"] = {
+        "avckpt.enable/lidar": "true",
+        "avckpt.keep/lidar": "99",
+        "avckpt.keep/radar": "2",
+    }
+    path = tmp_path / "pod.yaml"
+    path.write_text(yaml.safe_dump(pod))
+    found = pods.check([path])
+    assert found.services["Pod/drive/lidar"].enabled
+    assert not found.services["Pod/drive"].enabled
+    said = [problem.message for problem in found.problems]
+    assert len(said) == 2, said
+    assert "avckpt.keep/radar: the pod has no container 'radar'" in said
+    assert any("avckpt.keep=99" in line for line in said)

@@ -18,6 +18,7 @@ from avckpt_hooks.shared.labels import (
     Policy,
     RestoreOn,
     merge,
+    of_container,
     parse_policy,
     shown,
 )
@@ -259,6 +260,21 @@ def test_merge_takes_labels_and_annotations() -> None:
 def test_merge_refuses_two_minds() -> None:
     with pytest.raises(LabelError, match="the annotation of the same name says 4"):
         merge({"avckpt.keep": "3"}, {"avckpt.keep": "4"})
+
+
+def test_an_annotation_may_be_meant_for_one_container_of_a_pod() -> None:
+    annotations = {
+        "avckpt.keep": "1",
+        "avckpt.keep/lidar": "2",
+        "avckpt.keep/front-lidar": "3",
+        "avckpt.enable/lidar": "true",
+        "io.podman/lidar": "x",
+    }
+    others = {"io.podman/lidar": "x"}
+    assert of_container(annotations, "drive-lidar") == {"avckpt.keep": "2", "avckpt.enable": "true", **others}
+    assert of_container(annotations, "drive/lidar") == {"avckpt.keep": "2", "avckpt.enable": "true", **others}
+    assert of_container(annotations, "drive-front-lidar")["avckpt.keep"] == "3"
+    assert of_container(annotations, "drive-radar") == {"avckpt.keep": "1", **others}
 
 
 @pytest.mark.parametrize("key", ["avckpt.version", "avckpt.name"])

@@ -237,6 +237,28 @@ def merge(labels: Mapping[str, str], annotations: Mapping[str, str]) -> dict[str
     return merged
 
 
+def of_container(annotations: Mapping[str, str], name: str) -> dict[str, str]:
+    """The annotations that hold for one container of a pod.
+
+    `avckpt.keep/lidar` is meant for the container `lidar` alone, and precedes `avckpt.keep`.
+    `podman generate kube` writes a container's annotations so, and `podman kube play` gives
+    those of a pod to all of its containers, which it calls POD-CONTAINER; to a runtime of
+    Kubernetes they are POD/CONTAINER.
+    """
+    common: dict[str, str] = {}
+    own: dict[str, tuple[str, str]] = {}
+    for key, value in annotations.items():
+        ours, slash, container = key.partition("/")
+        if not key.startswith(PREFIX) or not slash:
+            common[key] = value
+            continue
+        meant = name == container or name.endswith((f"-{container}", f"/{container}"))
+        # Of `lidar` and `front-lidar`, the longer one.
+        if meant and len(container) >= len(own.get(ours, ("", ""))[0]):
+            own[ours] = (container, value)
+    return {**common, **{key: value for key, (_, value) in own.items()}}
+
+
 @dataclass(frozen=True)
 class Label:
     """One row of the table of labels."""

@@ -70,15 +70,42 @@ def _read(node: yaml.Node, path: Path, found: Manifest) -> None:
             message = f"{setting.key} is no annotation of its pods; put it under the template's metadata"
             found.problems.append(Problem(setting.place, called, message))
         metadata, spec = (yamlfile.lookup(template, key) for key in ("metadata", "spec"))
-    for setting in _settings(yamlfile.lookup(metadata, "annotations"), path, called, found):
-        service.settings[Kind.ANNOTATION][setting.key] = setting
+    containers = {name: Service(f"{called}/{name}", service.place) for name in _containers(spec)}
+    settings = list(_settings(yamlfile.lookup(metadata, "annotations"), path, called, found))
+    for setting in settings:
+        if "/" not in setting.key:
+            for each in (service, *containers.values()):
+                each.settings[Kind.ANNOTATION][setting.key] = setting
+    named = set()
+    for setting in settings:
+        key, slash, container = setting.key.partition("/")
+        if not slash:
+            continue
+        if container in containers:
+            named.add(container)
+            own = Setting(key, setting.value, setting.place)
+            containers[container].settings[Kind.ANNOTATION][key] = own
+        else:
+            message = f"{setting.key}: the pod has no container {container!r}"
+            found.problems.append(Problem(setting.place, called, message))
     for setting in _settings(yamlfile.lookup(metadata, "labels"), path, called, found):
         message = f"{setting.key}: Kubernetes tells a runtime of annotations, and not of labels; make it one of those"
         found.problems.append(Problem(setting.place, called, message, Severity.WARNING))
-    if service.enabled and yamlfile.lookup(spec, "runtimeClassName") is None:
+    services = [service, *(containers[name] for name in sorted(named))]
+    if any(each.enabled for each in services) and yamlfile.lookup(spec, "runtimeClassName") is None:
         message = "without a runtimeClassName Kubernetes starts it unprotected (podman kube play needs none)"
         found.problems.append(Problem(service.place, called, message, Severity.WARNING))
-    found.services[called] = service
+    found.services.update((each.name, each) for each in services)
+
+
+def _containers(spec: yaml.Node | None) -> Iterator[str]:
+    """The names of a pod's containers."""
+    for key in ("initContainers", "containers"):
+        listed = yamlfile.lookup(spec, key)
+        for each in listed.value if isinstance(listed, yaml.SequenceNode) else ():
+            name = yamlfile.lookup(each, "name")
+            if isinstance(name, yaml.ScalarNode):
+                yield name.value
 
 
 def _template(spec: yaml.Node | None) -> yaml.Node | None:
