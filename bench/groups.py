@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ring of members that pass numbered tokens and go back together: do their ledgers agree, and at what cost?
 
-    .venv/bin/python -m bench.groups [--members 5] [--kills 500] [--interval 100ms] [--between 2]
+    .venv/bin/python -m bench.groups [--members 5] [--kills 500] [--interval 100ms] [--between 2] [--name NAME]
 
 Needs root and what `make setup-build` builds; no Podman.  Each member is an avckpt-init in a PID
 namespace of its own with `testkit/programs/ring.py`, which prints WRONG when a token is lost, duplicated
 or received without having been sent.  A random member is killed every `--between` seconds.  Prints the results
-and writes bench/results/groups.json; ends with 1 if the ledgers ever disagreed.
+and adds them to bench/results/groups.json; ends with 1 if the ledgers ever disagreed.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from avckpt.cli.client import Client
 
 from testkit.harness import ROOT, wait_until
 from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
+RESULTS = ROOT / "bench/results/groups.json"
 BACK_S = 20.0
 
 
@@ -37,6 +39,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=500)
     parser.add_argument("--interval", default="100ms")
     parser.add_argument("--between", type=float, default=2.0, metavar="S")
+    parser.add_argument("--name", default="one run", help="of this run in the file of results, where others stay")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory, local_sidecar(Path(directory)) as sidecar:
         sidecar.start()
@@ -44,7 +47,8 @@ def main() -> int:
         freezes, kills, lost = _storm(sidecar, members, asked.kills, asked.between)
         rows = Client(sidecar.run_dir).containers()
         wrong = [line for each in members for line in _said(each) if "WRONG" in line or "Traceback" in line]
-        restored = [event for event in Client(sidecar.run_dir).history() if event["kind"] == "restored"]
+        history = Client(sidecar.run_dir).history()
+        restored = [event for event in history if event["kind"] == "restored"]
         died = [event["restore_s"] for event in restored if event["reason"] != "group"]
         result = {
             "members": asked.members,
@@ -52,6 +56,7 @@ def main() -> int:
             "kills": kills,
             "not_back": lost,
             "wrong": wrong,
+            "lines": min(row["checkpoints"] for row in rows),
             "checkpoints": sum(row["checkpoints"] for row in rows),
             "missed": sum(row["missed"] for row in rows),
             "tokens": int(_said(members[0])[-2].split()[0]) if not wrong else 0,
@@ -59,9 +64,14 @@ def main() -> int:
             "freeze_median_ms": round(statistics.median(freezes) * 1000, 2),
             "freeze_p99_ms": round(sorted(freezes)[len(freezes) * 99 // 100] * 1000, 2),
             "restore_median_ms": round(statistics.median(died) * 1000, 1) if died else 0,
+            "restore_p99_ms": round(sorted(died)[len(died) * 99 // 100] * 1000, 1) if died else 0,
+            "phases_median_ms": _phases(history),
+            "reset": [event["error"]["detail"] for event in restored if "ended" in str(event.get("error"))],
+            "load": round(os.getloadavg()[0], 1),
         }
     print(json.dumps(result, indent=2))
-    (ROOT / "bench/results/groups.json").write_text(json.dumps(result, indent=2) + "\n")
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    RESULTS.write_text(json.dumps({**known, asked.name: result}, indent=2) + "\n")
     return 1 if wrong or lost else 0
 
 
@@ -98,6 +108,22 @@ def _storm(
             return freezes, kill, 1
     time.sleep(1.0)
     return freezes, kills, 0
+
+
+def _phases(history: list[dict[str, Any]]) -> dict[str, float]:
+    """Medians over all returns: from the first death to that of the next member, to that of the last, and to the
+    restore of all, each at the time that its guard gave."""
+    phases: dict[str, list[float]] = {"to_first_other": [], "to_last_other": [], "to_restored": []}
+    deaths: list[float] = []
+    for event in history:
+        if event["kind"] == "died":
+            deaths.append(event["monotonic_s"])
+        elif event["kind"] == "restored" and deaths:
+            if len(deaths) > 1:
+                for name, end in zip(phases, (deaths[1], deaths[-1], event["monotonic_s"])):
+                    phases[name].append(end - deaths[0])
+            deaths = []
+    return {name: round(statistics.median(times) * 1000, 1) for name, times in phases.items() if times}
 
 
 def _lines(sidecar: LocalSidecar) -> set[int]:

@@ -522,14 +522,20 @@ int avc_guard_line(struct avc_guard *guard, int meeting, uint64_t line, uint64_t
 int avc_guard_recall(struct avc_guard *guard, int meeting, uint64_t line, uint64_t generation,
 		     uint64_t ticket, struct avc_error *err)
 {
+	const pid_t pid = avc_guard_pid(guard);
 	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
 					     .kind = AVC_REQUEST_RECALL,
+					     .lent = rt_priority_lend(pid),
 					     .line = line,
 					     .generation = generation,
 					     .ticket = ticket };
 
 	*err = (struct avc_error){ 0 };
-	return guard_send(guard, &request, meeting, err);
+	if (guard_send(guard, &request, meeting, err) == 0)
+		return 0;
+	if (request.lent)
+		rt_priority_reclaim(pid);
+	return -1;
 }
 
 void avc_guard_stop(struct avc_guard *guard)

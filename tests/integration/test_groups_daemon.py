@@ -140,6 +140,25 @@ def test_ledgers_agree_after_any_death(local: LocalSidecar, ring: list[Container
         assert row(local, member)["attempt"] <= 2  # those of others do not count
 
 
+def test_all_hurry_until_they_are_back_and_no_longer(local: LocalSidecar, ring: list[Container]) -> None:
+    assert local.process is not None
+    lent = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    daemon = local.process.pid
+    everybody = [daemon, *(row(local, member)["guard_pid"] for member in ring), *(member.init_pid for member in ring)]
+    for restores in (1, 2):
+        os.kill(daemon, signal.SIGSTOP)
+        try:
+            os.kill(ring[restores].app_pid, signal.SIGKILL)
+            wait_until(lambda: os.sched_getscheduler(daemon) == lent, 4, "the daemon is to hurry")
+        finally:
+            os.kill(daemon, signal.SIGCONT)
+        wait_for_restores(local, ring, restores)
+        wait_for_line(local, ring, row(local, ring[0])["line"])
+        wait_until(
+            lambda: {os.sched_getscheduler(pid) for pid in everybody} == {os.SCHED_OTHER}, 5, "nobody hurries any more"
+        )
+
+
 def test_a_guard_that_stops_or_dies_leaves_nobody_stopped(local: LocalSidecar, ring: list[Container]) -> None:
     for signum in (signal.SIGSTOP, signal.SIGKILL):
         guard_pid = row(local, ring[1])["guard_pid"]

@@ -352,5 +352,11 @@ void rt_priority_end(void);
 bool rt_priority_is(void);
 /* Gives another thread the calling one's priority; best effort. */
 void rt_priority_share(pid_t tid);
+/* Gives it to a process that has an ordinary one, but not to its children; it has to end it itself
+ * (rt_priority_begin_lent()), or rt_priority_reclaim().  False: it was not given. */
+bool rt_priority_lend(pid_t pid);
+void rt_priority_reclaim(pid_t pid);
+/* rt_priority_begin() of a thread to which it was lent. */
+void rt_priority_begin_lent(void);
 
 #endif

@@ -37,6 +37,31 @@ void rt_priority_end(void)
 		sched_setscheduler(0, before.policy, &before.param);
 }
 
+bool rt_priority_lend(pid_t pid)
+{
+	const struct sched_param lowest = { .sched_priority = sched_get_priority_min(SCHED_FIFO) };
+
+	return pid > 0 && sched_getscheduler(pid) == SCHED_OTHER &&
+	       sched_setscheduler(pid, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) == 0;
+}
+
+void rt_priority_reclaim(pid_t pid)
+{
+	const struct sched_param none = { 0 };
+
+	if (pid > 0 && sched_getscheduler(pid) == (SCHED_FIFO | SCHED_RESET_ON_FORK))
+		sched_setscheduler(pid, SCHED_OTHER, &none);
+}
+
+void rt_priority_begin_lent(void)
+{
+	if (!before.depth++) {
+		before.policy = SCHED_OTHER;
+		before.param = (struct sched_param){ 0 };
+		before.changed = true;
+	}
+}
+
 bool rt_priority_is(void)
 {
 	return before.depth > 0;

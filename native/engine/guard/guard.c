@@ -579,6 +579,7 @@ static struct avc_guard *guard_new(int socket, const struct avc_request *start, 
 	guard->cookie = start->cookie;
 	guard->policy.room = start->config.keep;
 	guard->started_ns = now_ns();
+	guard->daemon = getppid();
 	init_channel_init(&guard->channel);
 	process_init(&guard->main);
 	guard->tree = (struct tree){

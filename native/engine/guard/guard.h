@@ -96,6 +96,8 @@ struct avc_guard {
 	uint32_t members, steps, step; /* of the meeting; step: the next one        */
 	uint64_t line, recall;         /* ... its line, and the generation to go back to */
 	struct group_death dead;
+	bool urgent;             /* it goes back because others do: rt_priority_end() is due */
+	pid_t daemon;            /* our parent                                      */
 	struct avc_event untold; /* checkpoints not reported yet                    */
 	uint64_t told_ns;        /* when checkpoints were last reported             */
 	/* The holder of a dead app, for tools that read its memory; 0: none */
@@ -255,6 +257,8 @@ int guard_meet_taken(struct avc_guard *guard, struct avc_error *err) warn_unused
 uint32_t guard_line_replaced(const struct avc_guard *guard);
 /* Of a restore: complete. */
 int guard_meet_restored(struct avc_guard *guard, struct avc_error *err) warn_unused;
+/* It has gone back, or does not: what waited for it needs no more haste. */
+void guard_end_recall(struct avc_guard *guard);
 /* There is no meeting, or its next step can still be reached. */
 bool guard_may_meet(const struct avc_guard *guard);
 /* Breaks it, unless all its steps were reached. */

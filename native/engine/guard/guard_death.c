@@ -395,6 +395,7 @@ out:
 		drop_helper(guard); /* if there was nothing to restore, after all */
 	guard->foreseen = 0;
 	rt_priority_end();
+	guard_end_recall(guard);
 	guard_leave_meeting(guard);
 	guard->restore_asked = AVC_REASON_NONE;
 	guard->restore_ticket = 0;

@@ -289,6 +289,9 @@ static void wait_for_group(struct avc_guard *guard, const struct avc_error *erro
 	event.died_ns = guard->dead.report.reaped_ns;
 	event.ticket = guard->dead.ticket;
 	event.error = *error;
+	/* Everybody waits for it to choose a line; then it ends this itself. */
+	if (getppid() == guard->daemon)
+		(void)rt_priority_lend(guard->daemon);
 	guard_emit(guard, &event);
 }
 
@@ -375,30 +378,61 @@ static int check_able(struct avc_guard *guard, struct avc_error *err)
 				 err);
 }
 
-void guard_recall(struct avc_guard *guard, const struct avc_request *request, int fd)
+/* The others are dead, or just ending. */
+static void begin_recall(struct avc_guard *guard, const struct avc_request *request)
+{
+	if (guard->urgent)
+		return;
+	guard->urgent = true;
+	if (request->lent)
+		rt_priority_begin_lent();
+	else
+		rt_priority_begin();
+}
+
+void guard_end_recall(struct avc_guard *guard)
+{
+	rt_priority_reclaim(guard->channel.init);
+	if (guard->urgent)
+		rt_priority_end();
+	guard->urgent = false;
+}
+
+/* It goes back, or is about to: init reports its death.  False: it does not. */
+static bool recall(struct avc_guard *guard, const struct avc_request *request, int fd)
 {
 	struct avc_error error = { 0 };
 
-	budget_begin(NULL, NULL);
 	if (!enter_meeting(guard, request, fd) || !guard->attached) {
 		guard_leave_meeting(guard);
 		guard_refuse(guard, request->ticket, AVC_EMPTY, "it cannot go back now");
-		return;
+		return false;
 	}
 	if (check_able(guard, &error) || meet(guard, RECALL_ABLE, READY_NS, &error)) {
 		guard_leave_meeting(guard);
 		guard_emit_error(guard, AVC_EVENT_REFUSED, request->ticket, &error);
-		return;
+		return false;
 	}
 	if (guard->dead.waits) {
 		guard->dead.ticket = request->ticket;
 		go_back(guard);
-		return;
+		return false;
 	}
 	guard->restore_asked = AVC_REASON_GROUP;
 	guard->restore_ticket = request->ticket;
-	/* init reports the death. */
 	process_kill(&guard->main);
+	/* Both need a CPU before that. */
+	process_hasten(&guard->main);
+	(void)rt_priority_lend(guard->channel.init);
+	return true;
+}
+
+void guard_recall(struct avc_guard *guard, const struct avc_request *request, int fd)
+{
+	budget_begin(NULL, NULL);
+	begin_recall(guard, request);
+	if (!recall(guard, request, fd))
+		guard_end_recall(guard);
 }
 
 void guard_abandon(struct avc_guard *guard, uint64_t ticket)

@@ -96,6 +96,17 @@ void process_kill(const struct process *process)
 		0);
 }
 
+void process_hasten(const struct process *process)
+{
+	char name[16];
+
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		snprintf(name, sizeof name, "%d", process->threads[i].tid);
+		if (faccessat(process->task_dirfd, name, F_OK, 0) == 0)
+			rt_priority_share(process->threads[i].tid);
+	}
+}
+
 int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_error *err)
 {
 	process->leader = pid;

@@ -39,10 +39,10 @@ enum avc_request_kind {
 };
 
 struct avc_request {
-	uint32_t magic;   /* AVC_GUARD_MAGIC                                  */
-	uint32_t kind;    /* enum avc_request_kind                            */
-	uint32_t command; /* enum avc_command                                 */
-	uint32_t reserved;
+	uint32_t magic;      /* AVC_GUARD_MAGIC                                  */
+	uint32_t kind;       /* enum avc_request_kind                            */
+	uint32_t command;    /* enum avc_command                                 */
+	uint32_t lent;       /* RECALL: it was given real-time priority for it   */
 	uint64_t ticket;     /* of the command                                   */
 	uint64_t until_ns;   /* CLOCK_MONOTONIC: later it is refused; 0: never too late */
 	uint64_t cookie;     /* of the guard's events                            */
