@@ -77,6 +77,7 @@ class Way:
     rate_mb_s: int
     mb: int = MB
     keep: int = KEEP
+    touched: int = TOUCHED
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class Protected:
         self.port = free_port()
         self.board = Board(folder / f"server-{self.port}")
         self.events: list[Event] = []
-        command = [*before, str(PROGRAMS / "server"), str(way.mb), "1", str(self.port), "--touch", str(TOUCHED)]
+        command = [*before, str(PROGRAMS / "server"), str(way.mb), "1", str(self.port), "--touch", str(way.touched)]
         command += ["--write-mb-s", str(way.rate_mb_s), "--board", str(self.board.path)]
         if way.kind == "fork":
             command += ["--fork-ms", str(round(way.interval_s * 1e3)), "--keep", str(way.keep)]

@@ -18,7 +18,7 @@ from avckpt.guard import Images
 from testkit.family import ours
 from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux
 from testkit.harness import wait_until
-from testkit.procfs import children_of
+from testkit.procfs import children_of, figures
 
 PAGE = 4096
 DIRTY = config(images=Images.DIRTY)
@@ -315,3 +315,33 @@ def test_a_copy_needs_no_more_memory_than_was_written(tmp_path: Path) -> None:
         until_copied(guard)
         for _ in range(10):
             assert until_copied(guard)["copied"] < 64
+
+
+def own_mb(victim: Victim) -> float:
+    """Memory that only one template has, of all of them."""
+    kb = 0
+    for pid in ours(victim, "avckpt-tmpl"):
+        with contextlib.suppress(OSError):  # dropped just now
+            kb += figures(pid)["Private_Dirty"]
+    return kb / 1024
+
+
+def test_templates_share_what_was_copied_to_them(tmp_path: Path) -> None:
+    """They are updated in turns, until more has been copied to them than the victim has."""
+    pages = 32 * 256
+    with Victim("dirt 32 2 --rate 8000", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        copied = 0
+        while copied < 4 * pages:
+            victim.wait_beats(10)
+            # What it writes meanwhile would count, too.
+            os.kill(victim.app, signal.SIGSTOP)
+            copied += checkpoint(guard).get("copied", 0)
+            # Three templates, each with an eighth of the process and what was written since it was renewed.
+            wait_until(lambda: own_mb(victim) < 32 * 0.9, 10.0, "they share their pages")
+            os.kill(victim.app, signal.SIGCONT)
+        checkpoint(guard)
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        victim.wait_beats(5)
+        victim.check()

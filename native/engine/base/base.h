@@ -161,6 +161,8 @@ int proc_thread_count(int task_dirfd);
 /* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be
  * NULL): how many are resident and of no file. */
 long proc_vm_pages(int statm_fd, long *anonymous);
+/* How many pages it shares with no other process (slow: reads its page tables), or -1. */
+long proc_private_pages(pid_t pid);
 /* The PID of a pidfd, in our namespace, or -1. */
 pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);

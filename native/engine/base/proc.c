@@ -344,6 +344,19 @@ long proc_vm_pages(int statm_fd, long *anonymous)
 	return pages;
 }
 
+long proc_private_pages(pid_t pid)
+{
+	char buf[2048];
+	const char *line;
+	unsigned long kb;
+
+	if (proc_read(pid, "smaps_rollup", buf, sizeof buf) <= 0)
+		return -1;
+	line = strstr(buf, "\nPrivate_Dirty:");
+	kb = line ? strtoul(line + 15, NULL, 10) : 0;
+	return line ? (long)(kb / (ARCH_PAGE_BYTES / 1024)) : -1;
+}
+
 pid_t proc_pidfd_pid(int pidfd)
 {
 	char name[48], buf[1024], *line;

@@ -39,7 +39,9 @@ struct idle_template {
 	struct arch_regs base;
 	struct inherited *inherited;
 	struct pageset *stale;
-	uint64_t tracker, forked_ns, copied, kinds;
+	uint64_t tracker, kinds;
+	uint64_t forked_ns; /* from the process, it or the template that it was forked from */
+	uint64_t copied;    /* pages written to it since it was forked, at most             */
 	/* Pages that may differ from the template of the generation with this number: those that
 	 * were stale when that was taken, and those written, and copied, since.  0: any page. */
 	uint64_t near;
@@ -195,6 +197,10 @@ int dirty_check(struct dirty_tree *dirty, const struct generation *generation,
 		struct avc_error *err) warn_unused;
 /* From now on, stale pages of its templates are recorded. */
 void dirty_follow(struct dirty_tree *dirty, const struct generation *generation);
+/* Whether a spare of the newest would be a better idle template than the one there is. */
+bool dirty_wants_spare(const struct dirty_tree *dirty, const struct generation *newest);
+/* Before dirty_prepare(): if there is a spare, it becomes the idle template of the main process. */
+void dirty_take_spare(struct dirty_tree *dirty, struct generation *newest);
 /* Its templates are no longer needed: they become idle ones, if they can. */
 void dirty_recycle(struct dirty_tree *dirty, const struct generation *generation);
 /* Once a generation is kept: where the idle template of the main process differs from it. */
@@ -220,6 +226,8 @@ int spare_make_now(struct generation *generation, struct avc_error *err) warn_un
  * spare_make().  -1: AVC_DEADLINE, still not done; or as above. */
 int spare_await(struct generation *generation, struct avc_error *err) warn_unused;
 bool spare_is_there(struct generation *generation);
+/* Whether there is one, which is a template from now on: the caller takes it. */
+bool spare_becomes_template(struct generation *generation);
 /* There may be one whose PID we have not learned (init_channel_kill_lost). */
 bool spare_is_unknown(const struct generation *generation);
 void spare_drop(struct generation *generation);

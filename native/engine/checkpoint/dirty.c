@@ -30,6 +30,8 @@
 #define AGE_NS (60 * NS_PER_S)
 #define STALE_SHARE 2 /* if more than half of its own pages are stale, a fork is better   */
 #define COPIES_SHARE 2
+#define OWN_SHARE 8 /* more than this part of the process: it is to share more with the others */
+#define OWN_LEAST 1024
 #define SMALL_PAGES 1024
 #define SLACK_PAGES 64 /* written until the freeze, by one process of many */
 #define FORK_NS 100000 /* without any pages */
@@ -81,13 +83,24 @@ static bool scan(struct dirty *dirty, const struct attempt *attempt, pid_t templ
 	return false;
 }
 
-/* Until a round leaves little, or hardly less than the one before.  *left: how much. */
+/* How many pages will have been written since the last scan, at the rate before it. */
+static uint64_t expected(uint64_t written, uint64_t before_ns, uint64_t since_ns)
+{
+	return before_ns ? (uint64_t)((double)written * (double)since_ns / (double)before_ns)
+			 : written;
+}
+
+/* Until a round leaves little, or hardly less than the one before.  *left: how much.  A scan takes
+ * time by the size of the process, and is not made if it would find little. */
 static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint64_t *left)
 {
 	const struct process *process = attempt->process;
 	uint64_t before = UINT64_MAX;
 
 	for (int i = 0; i < ROUNDS; i++) {
+		const uint64_t last_ns = process->tracker->scanned_ns;
+		uint64_t scanned_ns, soon;
+
 		if (!scan(dirty, attempt, i ? 0 : dirty->idle.pid, left))
 			return false;
 		if (!i &&
@@ -95,9 +108,15 @@ static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint
 			dirty->reason = AVC_FORK_WRITES;
 			return false;
 		}
+		scanned_ns = process->tracker->scanned_ns;
 		copy_stale(dirty, process);
 		if (process->tracker->broken)
 			return false;
+		soon = expected(*left, scanned_ns - last_ns, now_ns() - scanned_ns);
+		if (soon <= FEW_PAGES) {
+			*left = soon;
+			break;
+		}
 		if (i && (*left <= FEW_PAGES || *left > before / 4 * 3))
 			break;
 		before = i ? *left : UINT64_MAX;
@@ -207,7 +226,8 @@ static enum avc_fork_reason why_not_idle(struct dirty *dirty, const struct proce
 		return AVC_FORK_FIRST;
 	if (now_ns() - idle->forked_ns > AGE_NS)
 		return AVC_FORK_AGE;
-	if (idle->copied > (uint64_t)dirty->own_pages / COPIES_SHARE)
+	/* The main process's is renewed from the newest one (dirty_wants_spare()). */
+	if (process->descendant && idle->copied > (uint64_t)dirty->own_pages / COPIES_SHARE)
 		return AVC_FORK_COPIES;
 	return AVC_FORK_NONE;
 }
@@ -413,16 +433,33 @@ void dirty_follow_one(struct dirty *dirty, struct image *image)
 	}
 }
 
-void dirty_recycle_one(struct dirty *dirty, struct image *image)
+/* Whether it is known where it differs from the process. */
+static bool is_followed(const struct image *image)
 {
 	const struct tracker *tracker = image->process->tracker;
-	struct idle_template *idle = &dirty->idle;
+
+	return image->stale && image->inherited && image->template && tracker && !tracker->over &&
+	       !tracker->broken && tracker->number == image->tracker;
+}
+
+/* When memory is short. */
+static void be_first_victim(const struct idle_template *idle)
+{
 	char score[16];
 
-	if (!image->stale || !image->inherited || !image->template || !tracker || tracker->over ||
-	    tracker->number != image->tracker)
+	snprintf(score, sizeof score, "%d", IDLE_OOM_SCORE);
+	proc_set_oom_score_adj(idle->pid, score);
+}
+
+void dirty_recycle_one(struct dirty *dirty, struct image *image)
+{
+	struct idle_template *idle = &dirty->idle;
+
+	if (!is_followed(image))
 		return;
-	dirty_drop_idle_one(dirty); /* one that was not used is older */
+	if (idle->pid && pageset_count(idle->stale) <= pageset_count(image->stale))
+		return;
+	dirty_drop_idle_one(dirty);
 	*idle = (struct idle_template){
 		.pid = image->template,
 		.pidfd = image->pidfd,
@@ -438,9 +475,90 @@ void dirty_recycle_one(struct dirty *dirty, struct image *image)
 	image->pidfd = -1;
 	image->inherited = NULL;
 	image->stale = NULL;
-	/* The first victim when memory is short. */
-	snprintf(score, sizeof score, "%d", IDLE_OOM_SCORE);
-	proc_set_oom_score_adj(idle->pid, score);
+	be_first_victim(idle);
+}
+
+/* ---- the idle template shares pages with the others ---------------------------------------------
+ *
+ * Each template has pages of its own, as copied to it, and if they are updated in turns for long
+ * enough, each has all that the process ever writes.  A fork of the newest one shares them with it.
+ * It also is the better one if there is more to copy than that fork would take. */
+
+/* Own pages are counted when it may have more than that; where the same ones are copied again and
+ * again, it may not have. */
+bool dirty_wants_spare_one(struct dirty *dirty, const struct image *image)
+{
+	struct idle_template *idle = &dirty->idle;
+	uint64_t most = (uint64_t)dirty->own_pages / OWN_SHARE, stale;
+	long own;
+
+	if (!is_followed(image))
+		return false;
+	if (most < OWN_LEAST)
+		most = OWN_LEAST;
+	if (!idle->pid)
+		return true;
+	stale = pageset_count(idle->stale);
+	if (idle->copied + stale <= most)
+		return false;
+	own = proc_private_pages(idle->pid);
+	if (own < 0)
+		return true;
+	/* The next time not before as much was copied again. */
+	idle->copied = (uint64_t)own < most / 2 ? (uint64_t)own : most / 2;
+	return (uint64_t)own + stale > most;
+}
+
+static struct pageset *copy_set(const struct pageset *set)
+{
+	struct pageset *copy = calloc(1, sizeof *copy);
+
+	if (copy && pageset_add_all(copy, set))
+		return copy;
+	if (copy)
+		pageset_free(copy);
+	free(copy);
+	return NULL;
+}
+
+void dirty_take_spare_one(struct dirty *dirty, struct generation *generation)
+{
+	struct image *image = &generation->image[0];
+	struct idle_template *idle = &dirty->idle;
+	struct inherited *inherited;
+	struct pageset *stale;
+
+	if (!is_followed(image) || !spare_becomes_template(generation))
+		return;
+	dirty_drop_idle_one(dirty);
+	inherited = malloc(sizeof *inherited);
+	stale = copy_set(image->stale);
+	if (!inherited || !stale || !tracker_add(image->process->tracker, stale)) {
+		if (stale)
+			pageset_free(stale);
+		free(stale);
+		free(inherited);
+		spare_drop(generation);
+		return;
+	}
+	*inherited = *image->inherited;
+	*idle = (struct idle_template){
+		.pid = generation->spare.pid,
+		.pidfd = generation->spare.pidfd,
+		.base = generation->spare.base,
+		.inherited = inherited,
+		.stale = stale,
+		.tracker = image->tracker,
+		.forked_ns = image->forked_ns,
+		.kinds = image->kinds,
+	};
+	generation->spare.pid = 0;
+	generation->spare.pidfd = -1;
+	image->copied = 0; /* it shares them with this one */
+	be_first_victim(idle);
+	/* It equals that template, as long as it is not written to. */
+	if (tracker_add(image->process->tracker, &idle->differs))
+		idle->near = generation->number;
 }
 
 /* Not after a fork: pages written between the scan before it and the fork are found only by the

@@ -34,6 +34,8 @@ int dirty_check_one(struct dirty *dirty, const struct image *image,
 		    struct avc_error *err) warn_unused;
 void dirty_follow_one(struct dirty *dirty, struct image *image);
 void dirty_recycle_one(struct dirty *dirty, struct image *image);
+void dirty_take_spare_one(struct dirty *dirty, struct generation *generation);
+bool dirty_wants_spare_one(struct dirty *dirty, const struct image *image);
 void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t number);
 /* Forgets the idle template, which keeps running. */
 void dirty_leave_idle_one(struct dirty *dirty);

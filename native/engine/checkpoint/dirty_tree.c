@@ -189,9 +189,30 @@ void dirty_recycle(struct dirty_tree *dirty, const struct generation *generation
 	}
 }
 
+/* The main process's. */
+static struct dirty *of_main(const struct dirty_tree *dirty, const struct generation *generation)
+{
+	return dirty_find(dirty, generation->image[0].process);
+}
+
+void dirty_take_spare(struct dirty_tree *dirty, struct generation *generation)
+{
+	struct dirty *one = of_main(dirty, generation);
+
+	if (one)
+		dirty_take_spare_one(one, generation);
+}
+
+bool dirty_wants_spare(const struct dirty_tree *dirty, const struct generation *generation)
+{
+	struct dirty *one = of_main(dirty, generation);
+
+	return one && dirty_wants_spare_one(one, &generation->image[0]);
+}
+
 void dirty_compare(struct dirty_tree *dirty, const struct generation *generation)
 {
-	struct dirty *one = dirty_find(dirty, generation->image[0].process);
+	struct dirty *one = of_main(dirty, generation);
 
 	if (one)
 		dirty_compare_one(one, &generation->image[0], generation->number);

@@ -90,19 +90,28 @@ static int end_fork(struct generation *generation, struct avc_error *err)
 	return 0;
 }
 
-static bool name_spare(const struct generation *generation)
+static bool name_spare(const struct generation *generation, const char *name)
 {
 	const struct parasite *parasite = parasite_of(generation);
 	struct inj_call *call = call_of(generation);
 	const pid_t spare = generation->spare.pid;
 	struct avc_error gone = { 0 };
 
-	memcpy(call->out, "avckpt-spare", 13);
+	memcpy(call->out, name, strlen(name) + 1);
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_prctl, PR_SET_NAME, parasite_remote(parasite, call->out));
-	return generation->spare.pidfd >= 0 && tracee_await(spare, NULL, &gone) == STOP_TRAP &&
-	       parasite_send(parasite, spare, &generation->spare.base, call, &gone) == 0 &&
+	return parasite_send(parasite, spare, &generation->spare.base, call, &gone) == 0 &&
 	       parasite_run(spare, call, &gone) == 0;
+}
+
+/* In its first stop. */
+static bool introduce(const struct generation *generation)
+{
+	struct avc_error gone = { 0 };
+
+	return generation->spare.pidfd >= 0 &&
+	       tracee_await(generation->spare.pid, NULL, &gone) == STOP_TRAP &&
+	       name_spare(generation, "avckpt-spare");
 }
 
 static int make(struct generation *generation, bool aside, struct avc_error *err)
@@ -143,8 +152,8 @@ int spare_await(struct generation *generation, struct avc_error *err)
 	if (spare->work == SPARE_REST && tracee_halt(generation->image[0].template, err))
 		return -1;
 	spare->work = SPARE_NO_WORK;
-	if (spare->pid && (!name_spare(generation) ||
-			   (spare->aside && step_back(spare->pid, &spare->scheduling))))
+	if (spare->pid &&
+	    (!introduce(generation) || (spare->aside && step_back(spare->pid, &spare->scheduling))))
 		spare_drop(generation);
 	if (spare->aside && step_back(generation->image[0].template, &spare->scheduling))
 		return fail_errno(err, generation->image[0].template, "make spare", "sched_setattr",
@@ -157,6 +166,16 @@ bool spare_is_there(struct generation *generation)
 	if (generation->spare.pid && pidfd_ended(generation->spare.pidfd))
 		spare_drop(generation);
 	return generation->spare.pid != 0;
+}
+
+bool spare_becomes_template(struct generation *generation)
+{
+	if (!spare_is_there(generation) || generation->spare.work)
+		return false;
+	if (name_spare(generation, "avckpt-tmpl"))
+		return true;
+	spare_drop(generation);
+	return false;
 }
 
 bool spare_is_unknown(const struct generation *generation)

@@ -332,7 +332,9 @@ static bool may_make_spare(const struct avc_guard *guard, const struct generatio
 static bool wants_spare(const struct avc_guard *guard, const struct generation *newest)
 {
 	return !newest->spare.tried && !newest->spare.unwanted && !guard->cramped &&
-	       !stand_in_is_there(&guard->dirty, newest) && may_make_spare(guard, newest);
+	       may_make_spare(guard, newest) &&
+	       (!stand_in_is_there(&guard->dirty, newest) ||
+		dirty_wants_spare(&guard->dirty, newest));
 }
 
 static void make_spare(struct avc_guard *guard, struct generation *newest)
@@ -361,10 +363,10 @@ static void work_ahead(struct avc_guard *guard)
 		return;
 	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
-	if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
-		; /* to be continued before anything else */
-	else if (wants_spare(guard, newest))
+	if (wants_spare(guard, newest))
 		make_spare(guard, newest);
+	else if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
+		; /* to be continued before anything else */
 	else
 		more = !newest->spare.work &&
 		       restore_plan_next(newest); /* which reads its memory */
@@ -388,6 +390,8 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	    memory_prepare(main->process, &main->memory, &freeze->seen, err))
 		return -1;
 	watch_files(guard, freeze->generation);
+	if (guard->count)
+		dirty_take_spare(&guard->dirty, &guard->generations[guard->count - 1]);
 	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, main->slot, guard->timer);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;

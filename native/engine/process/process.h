@@ -162,6 +162,7 @@ struct tracker {
 	struct stretch {
 		avc_remote start, end;
 	} * area;
+	uint64_t scanned_ns;       /* when the last scan ended                           */
 	uint32_t parts, part_room; /* where they have pages of their own, in chunks       */
 	struct stretch *part;
 	struct pageset found;

@@ -137,6 +137,7 @@ int tracker_begin(struct process *process, timer_t timer, struct avc_error *err)
 	if (!tracker)
 		return fail_errno(err, 0, "watch memory", "calloc", "out of memory");
 	tracker->number = ++number;
+	tracker->scanned_ns = now_ns();
 	tracker->pagemap = proc_open(process->pid, "pagemap", O_RDONLY);
 	tracee_deadline_set(timer, MAKE_NS);
 	tracker->uffd = open_uffd(process, err);
@@ -361,6 +362,7 @@ int tracker_scan(struct tracker *tracker, pid_t template, uint64_t *pages)
 	for (uint32_t i = 0; !result && i < tracker->areas; i++)
 		result = each(tracker, &tracker->area[i], true, look_for_written, tracker->pagemap);
 	*pages = pageset_count(&tracker->found);
+	tracker->scanned_ns = now_ns();
 	for (uint32_t i = 0; i < tracker->sets; i++)
 		tracker->broken |= !pageset_add_all(tracker->set[i], &tracker->found);
 	return result || tracker->broken ? -1 : 0;

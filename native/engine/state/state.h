@@ -58,7 +58,7 @@ struct image {
 	struct inherited *inherited;  /* dirty.c: what its template inherited; or NULL */
 	struct pageset *stale;        /* ... and where its memory differs from the process's */
 	uint64_t tracker;             /* ... as recorded by this one (struct tracker) */
-	uint64_t forked_ns, copied;   /* when the template was; pages written to it since     */
+	uint64_t forked_ns, copied;   /* as in struct idle_template                          */
 	uint64_t kinds;               /* mem_image_kinds(), then                              */
 	bool recycled;                /* an older one was updated for it */
 };
