@@ -22,7 +22,7 @@ import psutil
 import pytest
 from avckpt.guard import Images
 
-from testkit.cgroups import Cgroup, freezer
+from testkit.cgroups import Cgroup, freezer, throttle
 from testkit.family import ours
 from testkit.guarded import BUILD, GuardProcess, Victim, config, forks_beside
 from testkit.harness import wait_until
@@ -275,13 +275,6 @@ def test_priorities_are_kept(tmp_path: Path) -> None:
                 assert os.sched_getscheduler(victim.app) == os.SCHED_FIFO
                 assert os.sched_getparam(victim.app).sched_priority == 7
                 assert os.sched_getaffinity(victim.app) == {0}
-
-
-def throttle() -> Cgroup:
-    """Leaves a hundredth of a CPU, as `podman run --cpus=0.01` does."""
-    if Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us").exists():
-        return Cgroup(["cpu"], "cpu.cfs_quota_us", go="-1", wait="1000")
-    return Cgroup([""], "cpu.max", go="max", wait="1000")
 
 
 @contextlib.contextmanager

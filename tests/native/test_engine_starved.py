@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from testkit.cgroups import throttle
 from testkit.family import kill_main
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import WHERE, GuardProcess, Victim, config
 from testkit.harness import wait_until
 from testkit.procfs import children_of
 
@@ -26,6 +27,8 @@ pytestmark = [
 
 ENOUGH = 6
 """Threads that were sent into the parasite and did not get there in time."""
+GUARDS = 60
+"""Each is killed while a thread may be on its way home."""
 
 # More important than the application, and awake nearly all the time.
 HOG = """
@@ -107,6 +110,31 @@ def test_the_next_attempt_comes_at_once(cpus: tuple[int, int], tmp_path: Path) -
                 guard.command("checkpoint")
         assert sum(map(too_late, guard.events)) >= ENOUGH
         assert not [event for event in guard.events if event.get("kind") == "died"]
+        wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "checkpoints go on")
+        victim.wait_beats(20)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_the_way_home_stays_as_it_was(where: str, tmp_path: Path) -> None:
+    """Guards die, or come too late, while threads wait for a CPU in code that they have written: nobody needs it less.
+
+    A thread that goes home by itself gets its signals on the way, and their handlers return there.
+    """
+    with (
+        throttle() as slow,
+        Victim(f"steady {where}", tmp_path) as victim,
+        GuardProcess(config(), [victim.pid]) as guard,
+    ):
+        guard.command("checkpoint")
+        for pid in {victim.app, victim.player}:
+            slow.take(pid)
+        slow.wait()
+        for _ in range(GUARDS):
+            guard.start_another(victim.pid)
+            for _ in range(5):
+                guard.command("checkpoint")
+                victim.check()
+        slow.go()
         wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "checkpoints go on")
         victim.wait_beats(20)
 

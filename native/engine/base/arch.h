@@ -77,6 +77,7 @@ avc_remote arch_frame_build(void *frame, avc_remote remote, const struct arch_re
 struct arch_signal_frame {
 	avc_remote at;    /* what the handler gets as its third argument            */
 	uint64_t sigmask; /* before the handler                                     */
+	avc_remote pc;    /* where it returns to                                    */
 	int signal;       /* 0: unknown */
 };
 #define ARCH_SIGNAL_FRAME_BYTES 1024

@@ -101,8 +101,10 @@ static int hear_of_children(struct process *process, struct avc_error *err)
  * size. */
 static void drop_old_parasites(struct process *process, struct inj_call *call)
 {
-	if (!process->checkpoints)
+	if (!process->checkpoints || (!process->old_parasites && !process->stubs_end) ||
+	    process_needs_old(process))
 		return;
+	process_drop_stubs(process);
 	for (; process->old_parasites && call->count < INJ_CALLS_MAX - 2;
 	     process->old_parasites--) {
 		const avc_remote base = process->old_parasite[process->old_parasites - 1].base;

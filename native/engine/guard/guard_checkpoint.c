@@ -124,8 +124,9 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_e
 	if (process_follow(process, err) || support_check(process, err) ||
 	    process_list_threads(process, err))
 		return -1;
-	if (process->infected && (process->thread_count > process->parasite.threads_max ||
-				  guard->config.keep >= process->parasite.slots))
+	if (process->infected &&
+	    (process->thread_count > process->parasite.threads_max ||
+	     guard->config.keep >= process->parasite.slots || process->parasite.left))
 		process->infected = false;
 	if (!process->infected) {
 		if (process->descendant)

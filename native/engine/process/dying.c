@@ -90,9 +90,12 @@ static int handled(const struct process *process, const struct thread *t,
 	return maybe ? __builtin_ctzll(maybe) + 1 : 0;
 }
 
-/* The signal, 0: none. */
-static int look(const struct process *process, const struct thread *t, avc_remote from,
-		avc_remote end, bool *surely)
+typedef int frame_test(const struct process *process, const struct thread *t,
+		       const struct arch_signal_frame *frame, bool *surely);
+
+/* What fits() says of the first frame that it does not answer by 0. */
+static int look(const struct process *process, const struct thread *t, frame_test *fits,
+		avc_remote from, avc_remote end, bool *surely)
 {
 	/* Frames across the end of a chunk are found in the next one. */
 	static uint8_t chunk[CHUNK_BYTES + ARCH_SIGNAL_FRAME_BYTES] __attribute__((aligned(16)));
@@ -106,7 +109,7 @@ static int look(const struct process *process, const struct thread *t, avc_remot
 		if (n <= 0)
 			return 0;
 		while (arch_signal_frame_find(chunk, (size_t)n, at, &next, &frame))
-			if ((signal = handled(process, t, &frame, surely)))
+			if ((signal = fits(process, t, &frame, surely)))
 				return signal;
 		if (n < (ssize_t)sizeof chunk)
 			return 0;
@@ -124,13 +127,14 @@ static avc_remote stack_end(const struct thread *t)
 	return tls > sp && tls - sp < LOOK_BYTES ? tls : sp + LOOK_BYTES;
 }
 
-static int find(const struct process *process, const struct thread *t, bool *surely)
+static int find(const struct process *process, const struct thread *t, frame_test *fits,
+		bool *surely)
 {
 	const avc_remote sp = arch_sp(&t->regs), top = t->altstack[0] + t->altstack[2];
-	const int signal = look(process, t, sp, stack_end(t), surely);
+	const int signal = look(process, t, fits, sp, stack_end(t), surely);
 
 	if (!signal && on_altstack(t, sp) && top - sp > LOOK_BYTES)
-		return look(process, t, top - LOOK_TOP_BYTES, top, surely);
+		return look(process, t, fits, top - LOOK_TOP_BYTES, top, surely);
 	return signal;
 }
 
@@ -155,7 +159,7 @@ int dying_check(struct process *process, struct thread *t, struct avc_error *err
 	/* It may have another alternate stack by now. */
 	if (t->known && t->asked && thread_ask(process, t, err))
 		return -1;
-	signal = find(process, t, &surely);
+	signal = find(process, t, handled, &surely);
 	if (!signal) {
 		t->looked_at.pc = arch_pc(&t->regs);
 		t->looked_at.sp = arch_sp(&t->regs);
@@ -171,4 +175,23 @@ int dying_check(struct process *process, struct thread *t, struct avc_error *err
 	/* A fault that the handler repairs takes no time: the next attempt will succeed. */
 	return fail(err, AVC_RETRY, 0, process->pid, "freeze", "",
 		    "it is in its own handler of signal %d", signal);
+}
+
+static int returns_to_old(const struct process *process, const struct thread *t,
+			  const struct arch_signal_frame *frame, bool *surely)
+{
+	(void)t;
+	(void)surely;
+	return parasite_is_old(process, frame->pc);
+}
+
+bool process_needs_old(const struct process *process)
+{
+	bool ignored;
+
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].stopped &&
+		    find(process, &process->threads[i], returns_to_old, &ignored))
+			return true;
+	return false;
 }

@@ -36,6 +36,7 @@
 
 /* At the end of a page: what is in it is aligned. */
 #define CAVE_BYTES ((ARCH_STUB_BYTES + 255) & ~255)
+#define CAVES 4 /* so many stubs of guards that died are left as they are      */
 #define PADS_START UINT64_C(0x200000000000)
 #define PADS (UINT64_C(1) << 19)
 #define PARASITE_DISTANCE (UINT64_C(64) << 20)
@@ -89,7 +90,7 @@ static void note_old_parasite(struct process *process, avc_remote base, avc_remo
 struct survey {
 	struct process *process;
 	avc_remote pc, cave, start, end; /* start, end: of the parasite being scanned */
-	bool in_stub;
+	bool in_stub, is_vdso;           /* is_vdso: the cave                             */
 };
 
 /* Of an existing parasite, or one that was being injected (bring_parasite). */
@@ -99,11 +100,34 @@ static bool is_of_parasite(const struct mapping *m)
 	       !strcmp(m->name, "/dev/zero (deleted)");
 }
 
+/* In a stub that is there already a task may still be, or a handler may return to it: a thread that
+ * leaves it without us has its own signal mask there.  So it stays as it is, until process_drop_stubs(). */
+static void survey_caves(struct survey *survey, const struct mapping *m)
+{
+	struct process *process = survey->process;
+	const bool is_vdso = !strcmp(m->name, "[vdso]");
+	avc_remote end = m->end;
+
+	for (int i = 0; i < CAVES && end - m->start > CAVE_BYTES; i++, end -= CAVE_BYTES) {
+		if (has_stub(process->mem_fd, end)) {
+			survey->in_stub |= survey->pc < end && survey->pc >= end - CAVE_BYTES;
+			process->stubs_start = end - CAVE_BYTES;
+			process->stubs_end = m->end;
+			continue;
+		}
+		if ((!survey->cave || (is_vdso && !survey->is_vdso)) &&
+		    has_cave(process->mem_fd, end)) {
+			survey->cave = end - CAVE_BYTES;
+			survey->is_vdso = is_vdso;
+		}
+		return;
+	}
+}
+
 static int survey_mapping(const struct mapping *m, void *arg)
 {
 	struct survey *survey = arg;
 	struct process *process = survey->process;
-	const bool code = m->mode[2] == 'x' && !m->shared;
 
 	/* In adjacent pieces. */
 	if (is_of_parasite(m)) {
@@ -113,11 +137,8 @@ static int survey_mapping(const struct mapping *m, void *arg)
 		}
 		survey->end = m->end;
 	}
-	if (code && survey->pc < m->end && survey->pc >= m->end - CAVE_BYTES)
-		survey->in_stub = has_stub(process->mem_fd, m->end);
-	if (code && m->mode[0] == 'r' && (!survey->cave || !strcmp(m->name, "[vdso]")) &&
-	    (has_cave(process->mem_fd, m->end) || has_stub(process->mem_fd, m->end)))
-		survey->cave = m->end - CAVE_BYTES;
+	if (m->mode[0] == 'r' && m->mode[2] == 'x' && !m->shared)
+		survey_caves(survey, m);
 	return 0;
 }
 
@@ -128,11 +149,14 @@ static int survey(struct process *process, avc_remote pc, avc_remote *cave, stru
 	struct survey survey = { .process = process, .pc = pc };
 
 	*cave = 0;
+	process->stubs_start = process->stubs_end = 0;
 	process->old_parasites = 0;
 	if (proc_mappings(process->pid, "maps", survey_mapping, &survey))
 		return fail_errno(err, process->pid, "infect", "read(maps)", "it has ended");
 	note_old_parasite(process, survey.start, survey.end);
 	*cave = survey.cave;
+	if (!*cave && process->stubs_end) /* all are full: the one that has been so the longest */
+		*cave = process->stubs_end - CAVE_BYTES;
 	if (survey.in_stub || parasite_is_old(process, pc))
 		return fail(err, AVC_DEADLINE, 0, process->pid, "infect", "",
 			    "still on its way home from a guard that died");
@@ -284,6 +308,9 @@ static bool kill_porter(struct process *process, const struct porter *porter)
 		while (seccomp_go_on(porter->tid, &stop) == 0 && stop.kind != STOP_EXIT &&
 		       stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
 			stop = tracee_wait(porter->tid, 0);
+	/* It has exited, and can be reaped. */
+	while (stop.kind == STOP_DYING)
+		stop = tracee_wait(porter->tid, 0);
 	seccomp_end_supervision(porter->tid);
 	if (!porter->is_thread || stop.kind == STOP_EXIT)
 		return true;
@@ -504,6 +531,24 @@ static int check_task(struct process *process, const struct thread *t, struct av
 	return 0;
 }
 
+static void keep_stub(struct process *process, avc_remote stub)
+{
+	if (!process->stubs_end || stub < process->stubs_start)
+		process->stubs_start = stub;
+	if (stub + CAVE_BYTES > process->stubs_end)
+		process->stubs_end = stub + CAVE_BYTES;
+}
+
+void process_drop_stubs(struct process *process)
+{
+	const uint8_t zero[CAVES * CAVE_BYTES] = { 0 };
+	const size_t bytes = process->stubs_end - process->stubs_start;
+
+	if (bytes <= sizeof zero)
+		(void)pwrite(process->mem_fd, zero, bytes, (off_t)process->stubs_start);
+	process->stubs_start = process->stubs_end = 0;
+}
+
 static int infect_thread(struct process *process, struct thread *thread, uint32_t slots,
 			 struct avc_error *err)
 {
@@ -543,11 +588,14 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	result = make_parasite(process, thread, cave,
 			       parasite_layout(&process->parasite, slots, threads_max),
 			       &stub_is_free, err);
+	if (!thread->stopped || (thread->borrowed && thread_give_back(thread, err)))
+		stub_is_free = false;
 	/* No thread is in the stub any more: erase it. */
-	if (stub_is_free && thread->stopped &&
-	    (!thread->borrowed || thread_give_back(thread, err) == 0)) {
+	if (stub_is_free && !parasite_is_old(process, cave)) {
 		if (pwrite(process->mem_fd, zero, bytes, (off_t)cave) != (ssize_t)bytes)
 			err->undo_failures++;
+	} else {
+		keep_stub(process, cave);
 	}
 	if (result)
 		parasite_close(&process->parasite);

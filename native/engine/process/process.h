@@ -102,6 +102,9 @@ void dying_begin(struct process *process);
 void dying_end(struct process *process);
 /* For a stopped thread that was read: AVC_RETRY, it is in the handler of a fatal signal. */
 int dying_check(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;
+/* Whether one of the (stopped) threads is in a handler that returns to what a dead guard has left: a
+ * thread that goes home by itself may get a signal on the way. */
+bool process_needs_old(const struct process *process);
 
 /* ---- stop.c --------------------------------------------------------------------- */
 
@@ -122,6 +125,8 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 /* The same while everything is stopped. */
 int process_infect_stopped(struct process *process, uint32_t slots,
 			   struct avc_error *err) warn_unused;
+/* Erases the stubs that have stayed.  No thread may be in one, or need it (process_needs_old()). */
+void process_drop_stubs(struct process *process);
 /* Makes the holder of one that is not the main process, by its stopped main thread. */
 int process_hold_stopped(struct process *process, pid_t init, struct avc_error *err) warn_unused;
 /* Makes a stopped process that adopts orphans (PR_SET_CHILD_SUBREAPER) leave them to init.  If we

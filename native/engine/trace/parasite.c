@@ -396,7 +396,7 @@ bool parasite_is_old(const struct process *process, avc_remote address)
 	for (uint32_t i = 0; i < process->old_parasites; i++)
 		if (address - process->old_parasite[i].base < process->old_parasite[i].bytes)
 			return true;
-	return false;
+	return address >= process->stubs_start && address < process->stubs_end;
 }
 
 static long options_of(const struct parasite *parasite, bool ours)
@@ -513,6 +513,7 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 	 * returned by itself, and its registers are newer than ours. */
 	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
 		thread->borrowed = false;
+		thread->borrowed_for->left = true;
 		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}

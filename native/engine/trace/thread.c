@@ -186,6 +186,14 @@ void thread_let_go(const struct process *process, struct thread *thread)
 	thread_release(thread);
 }
 
+/* Or its parasite has been replaced, and it returns without us. */
+static bool has_made_calls(const struct process *process)
+{
+	const struct inj_control *control = process->parasite.control;
+
+	return !control || __atomic_load_n(&control->runner.done, __ATOMIC_ACQUIRE);
+}
+
 /* True while it still has to be waited for. */
 static bool straggle(struct process *process, struct thread *thread)
 {
@@ -204,8 +212,10 @@ static bool straggle(struct process *process, struct thread *thread)
 
 	switch (stop.kind) {
 	case STOP_NONE:
-		/* It may have returned by itself meanwhile, and would never stop again. */
-		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		/* It may have returned by itself meanwhile, and would never stop again.  Before that
+		 * it needs a CPU: interrupted again and again, it would never make its calls. */
+		if (!thread->borrowed || !thread->borrowed_for || has_made_calls(process))
+			ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		return true;
 	case STOP_DYING:
 	case STOP_DEADLINE:
@@ -237,13 +247,15 @@ static bool straggle(struct process *process, struct thread *thread)
 		 * (MADV_DONTFORK), or to reap a task that it created for us, which the app would
 		 * find. */
 		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now)) &&
-		    !__atomic_load_n(&process->parasite.control->runner.done, __ATOMIC_ACQUIRE)) {
-			seccomp_go_on(tid, NULL);
+		    !has_made_calls(process)) {
+			seccomp_go_on(tid, &stop);
 			return true;
 		}
 		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {
 			thread_give_back(thread, &ignored);
 		} else {
+			if (thread->borrowed && thread->borrowed_for)
+				thread->borrowed_for->left = true;
 			thread->borrowed = false;
 			thread->regs = now;
 			rewind_call(process, thread);

@@ -102,11 +102,11 @@ struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
 	bool attached, stopped;
-	int stop_signal; /* the process is stopped by job control           */
-	int block;       /* of the slot, main thread 0; -1: not in the image */
-	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
-	const struct parasite *borrowed_for; /* NULL: before there is one (infect.c)        */
-	uint32_t filters_known;              /* of seccomp, at the last check                   */
+	int stop_signal;               /* the process is stopped by job control           */
+	int block;                     /* of the slot, main thread 0; -1: not in the image */
+	bool borrowed;                 /* sent into the parasite; regs and sigmask are its own  */
+	struct parasite *borrowed_for; /* NULL: before there is one (infect.c)              */
+	uint32_t filters_known;        /* of seccomp, at the last check                   */
 	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has checked it at this stop                */
 	struct arch_regs regs; /* as of the stop, EINTR already replaced        */
@@ -149,6 +149,9 @@ struct parasite {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
+	/* A thread has left it by itself, perhaps for a handler that returns there: where it goes
+	 * home to must not be overwritten. */
+	bool left;
 	/* Memory of the guard, not of the app: the code, sealed against writing; and the rest,
 	 * which the app can write as well. */
 	int code_fd, data_fd;
@@ -191,6 +194,8 @@ struct process {
 		size_t bytes;
 	} old_parasite[OLD_PARASITES_MAX];
 	uint32_t old_parasites, checkpoints;
+	/* Stubs that stay, because a task may still be in them, or return there (infect.c). */
+	avc_remote stubs_start, stubs_end;
 	/* A thread died while it may have been cloning: there may be a tracee that is on no list
 	 * (init_channel_kill_lost). */
 	bool lost;
@@ -440,7 +445,7 @@ void parasite_clear_undo(struct process *process);
 /* execve(2) can replace the program at any moment, and the parasite with it: checks, in a stopped
  * thread, that it is there.  If not, the process is not infected any more. */
 int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
-/* Whether this is in a parasite left behind by a dead guard. */
+/* Whether this is in a parasite left behind by a dead guard, or in a stub that stays. */
 bool parasite_is_old(const struct process *process, avc_remote address);
 /* Options for a stopped task of ours, which has the memory of the parasite's process. */
 int parasite_own(const struct parasite *parasite, pid_t tid) warn_unused;

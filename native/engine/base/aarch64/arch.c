@@ -423,6 +423,7 @@ bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, s
 		memcpy(&signal, f->siginfo, sizeof signal);
 		found->at = at + *next + offsetof(struct inj_home, uc_flags);
 		found->sigmask = f->sigmask;
+		found->pc = f->pc;
 		found->signal = signal <= 64 ? (int)signal : 0;
 		*next += 16;
 		return true;

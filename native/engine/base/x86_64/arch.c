@@ -386,6 +386,7 @@ bool arch_signal_frame_find(const uint8_t *stack, size_t bytes, avc_remote at, s
 			continue;
 		found->at = at + *next;
 		found->sigmask = f->sigmask;
+		found->pc = f->rip;
 		found->signal = (int)signal_of(f);
 		*next += 16;
 		return true;
