@@ -29,7 +29,7 @@ from pathlib import Path
 import avckpt.engine
 from avckpt.engine import Engine, Guard
 from avckpt.errors import TargetGone
-from avckpt.events.vocabulary import Kind
+from avckpt.events.vocabulary import Kind, Reason
 from avckpt.guard import Command, Event, GuardConfig
 
 
@@ -143,6 +143,8 @@ class Peer:
                     tell(burst.to_json())
             else:
                 tell({**event.to_json(), "cookie": event.cookie})
+            if event.kind is Kind.GUARD_LOST and event.reason is Reason.FILTER:
+                tell({"kind": "started", "guards": [guard.pid for guard in self.guards.values()]})
 
 
 def tell(message: dict[str, object]) -> None:

@@ -199,6 +199,8 @@ class GuardProcess:
         for line in self.process.stdout:
             with self._news:
                 self.events.append(json.loads(line))
+                if self.events[-1].get("kind") == "started":
+                    self.guards = self.events[-1]["guards"]
                 self._news.notify_all()
         with self._news:
             self._ended = True

@@ -85,3 +85,9 @@ def figures(pid: int) -> dict[str, int]:
             if words and words[0].isdigit():
                 found[key] = int(words[0])
     return found
+
+
+def status_of(tid: int) -> dict[str, str]:
+    """The lines of /proc/TID/status.  Raises OSError when it is gone."""
+    lines = Path(f"/proc/{tid}/status").read_text().splitlines()
+    return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}

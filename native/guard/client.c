@@ -34,6 +34,7 @@ struct avc_guard {
 	struct avc_engine *engine;
 	struct avc_guard *next;
 	uint64_t cookie;
+	struct avc_config config; /* its own; init_pidfd is a duplicate                    */
 	pid_t pid;
 	int pidfd, socket;
 	const struct avc_heartbeat *heartbeat;
@@ -137,6 +138,32 @@ static void guard_lost(struct avc_guard *guard)
 	queue_event(guard->engine, &event);
 }
 
+static int guard_spawn(struct avc_guard *guard, struct avc_error *err);
+static void guard_release(struct avc_guard *guard);
+
+/* Its own seccomp filter stood in its way: another one, without a filter, takes its place. */
+static void guard_succeed(struct avc_guard *guard)
+{
+	struct avc_event event = { .kind = AVC_EVENT_GUARD_LOST,
+				   .reason = AVC_REASON_FILTER,
+				   .cookie = guard->cookie,
+				   .at_ns = now_ns() };
+	struct epoll_event on = { .events = EPOLLIN, .data.ptr = guard };
+
+	fail(&event.error, AVC_GONE, 0, 0, "", "",
+	     "it takes one to suspend the application's own, or to watch its memory");
+	guard_release(guard);
+	guard->config.suspends = 1;
+	guard->beats = 0;
+	guard->beats_ns = now_ns();
+	if (guard_spawn(guard, &event.error) == 0 &&
+	    epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_ADD, guard->socket, &on) == 0)
+		guard->ended = false;
+	else
+		event.reason = AVC_REASON_NONE;
+	queue_event(guard->engine, &event);
+}
+
 static bool is_text(const char *chars, size_t size)
 {
 	return memchr(chars, 0, size) != NULL;
@@ -180,7 +207,11 @@ static void guard_listen(struct avc_guard *guard)
 	if (guard->stopping && !guard->mad)
 		return;
 	guard_reap(guard, guard->mad ? 0 : END_MS);
-	guard_lost(guard);
+	if (!guard->mad && !guard->hung && !guard->config.suspends && WIFEXITED(guard->status) &&
+	    WEXITSTATUS(guard->status) == AVC_GUARD_HINDERED)
+		guard_succeed(guard);
+	else
+		guard_lost(guard);
 }
 
 int avc_engine_next_event(struct avc_engine *engine, struct avc_event *event)
@@ -314,18 +345,25 @@ static int send_start(int socket, const struct avc_config *config, uint64_t cook
 	return send_with(socket, &request, fds, 2) < 0 ? -1 : 0;
 }
 
-static void guard_free(struct avc_guard *guard)
+/* What belongs to its process. */
+static void guard_release(struct avc_guard *guard)
 {
 	if (guard->heartbeat)
 		munmap((void *)guard->heartbeat, sizeof *guard->heartbeat);
+	guard->heartbeat = NULL;
 	close_fd(&guard->pidfd);
 	close_fd(&guard->socket);
+}
+
+static void guard_free(struct avc_guard *guard)
+{
+	guard_release(guard);
+	close_fd(&guard->config.init_pidfd);
 	free(guard);
 }
 
 /* Its memory, its process; guard_free() cleans up after a failure. */
-static int guard_spawn(struct avc_guard *guard, const struct avc_config *config,
-		       struct avc_error *err)
+static int guard_spawn(struct avc_guard *guard, struct avc_error *err)
 {
 	char *const argv[] = { (char *)"avckpt-guard", NULL };
 	int ends[2], heartbeat_fd, result;
@@ -348,7 +386,7 @@ static int guard_spawn(struct avc_guard *guard, const struct avc_config *config,
 	}
 	guard->socket = ends[0];
 	/* Before it starts: the message waits for it. */
-	result = send_start(guard->socket, config, guard->cookie, heartbeat_fd);
+	result = send_start(guard->socket, &guard->config, guard->cookie, heartbeat_fd);
 	if (result)
 		fail_errno(err, 0, "start guard", "sendmsg", "it cannot be told what to do");
 	else if (spawn(guard->engine->program, argv, ends[1], &guard->pid))
@@ -386,7 +424,11 @@ struct avc_guard *avc_guard_start(struct avc_engine *engine, const struct avc_co
 	guard->cookie = cookie;
 	guard->pidfd = guard->socket = -1;
 	guard->beats_ns = now_ns();
-	if (guard_spawn(guard, config, err)) {
+	guard->config = *config;
+	guard->config.init_pidfd = fcntl(config->init_pidfd, F_DUPFD_CLOEXEC, 0);
+	if (guard->config.init_pidfd < 0)
+		fail_errno(err, 0, "start guard", "fcntl", "no descriptors");
+	if (err->code || guard_spawn(guard, err)) {
 		guard_free(guard);
 		return NULL;
 	}
@@ -488,9 +530,20 @@ int avc_guard_configure(struct avc_guard *guard, const struct avc_config *config
 	const struct avc_request request = { .magic = AVC_GUARD_MAGIC,
 					     .kind = AVC_REQUEST_CONFIGURE,
 					     .config = *config };
+	uint8_t suspends;
+	int init_pidfd;
 
 	*err = (struct avc_error){ 0 };
-	return config_check(config, err) ? -1 : guard_send(guard, &request, -1, err);
+	if (config_check(config, err) || guard_send(guard, &request, -1, err))
+		return -1;
+	pthread_mutex_lock(&guard->engine->lock);
+	init_pidfd = guard->config.init_pidfd;
+	suspends = guard->config.suspends;
+	guard->config = *config;
+	guard->config.init_pidfd = init_pidfd;
+	guard->config.suspends = suspends;
+	pthread_mutex_unlock(&guard->engine->lock);
+	return 0;
 }
 
 int avc_meeting_new(uint32_t members, struct avc_error *err)

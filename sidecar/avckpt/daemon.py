@@ -512,7 +512,10 @@ class Daemon:
             self.inquests.take(watch, event, record)
             self.groups.hear(watch, event)
             if event.kind is Kind.GUARD_LOST and watch.guard is not None:
-                self._replace_guard(watch, watch.guard)
+                if event.reason is Reason.FILTER:
+                    self._follow_guard(watch, watch.guard)
+                else:
+                    self._replace_guard(watch, watch.guard)
             self.orders.answer(event, record)
 
     def _lose_guard(self, watch: Watch, guard: Guard) -> None:
@@ -522,6 +525,15 @@ class Daemon:
         guard.stop()  # its process has ended
         watch.guard = None
         watch.container.guard_pid = 0
+
+    def _follow_guard(self, watch: Watch, guard: Guard) -> None:
+        """Its process has been replaced by one without a seccomp filter."""
+        self.caretaker.end(watch)
+        self.groups.leave(watch)
+        self.orders.fail(watch.container, "its guard was replaced before it could be done")
+        watch.container.guard_pid = guard.pid
+        self.caretaker.begin(watch, watch.settings.policy)
+        self.groups.join(watch)
 
     def _replace_guard(self, watch: Watch, guard: Guard) -> None:
         """Its process died or hung. One that dies repeatedly must not keep us busy."""

@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 
+from testkit.guarded import BUILD
 from testkit.harness import wait_until
 from testkit.local_sidecar import Container, LocalSidecar
+from testkit.procfs import status_of
 
 pytestmark = pytest.mark.shared_machine("a guard that gets no CPU for long is taken for one that hangs")
 
@@ -105,12 +107,32 @@ def test_what_it_may_do(local: LocalSidecar) -> None:
             assert not caps >> cap & 1, (kind, cap)
     assert int(status["CapInh"], 16) == int(status["CapAmb"], 16) == 0
     assert status["NoNewPrivs"] == "1"
+    assert (status["Seccomp"], status["Seccomp_filters"]) == ("2", "1")
     hard = resource.prlimit(guard, resource.RLIMIT_NOFILE)[1]
     assert hard <= 32768
     assert resource.prlimit(guard, resource.RLIMIT_DATA)[0] == 1 << 30
     assert resource.prlimit(guard, resource.RLIMIT_CORE) == (0, 0)
     # Of the sidecar's descriptors it has its own socket and what is written to standard error.
     assert not {name for fd in os.listdir(f"/proc/{guard}/fd") if "api.sock" in (name := read_link(guard, fd))}
+
+
+def test_one_whose_filter_is_in_the_way_is_replaced(local: LocalSidecar) -> None:
+    """The application installs a seccomp filter that has to be suspended; its neighbour keeps its guard."""
+    web, cache = local.protected("web", [str(BUILD / "sandbox"), "--late"]), local.protected("cache", SLEEPER)
+    guard, others = guard_of(local, web), guard_of(local, cache)
+    app = web.app_pid
+    os.kill(app, signal.SIGUSR1)
+    another = another_guard(local, web, guard, 10)["guard_pid"]
+    assert status_of(another)["Seccomp"] == "0"
+    assert local.log.count("web: gets a guard without a seccomp filter: it takes one to suspend") == 1
+    assert "web: runs unprotected" not in local.log
+    assert web.app_pid == app
+    crash(local, web, 1)
+    # For good: the next guard, of an application that is as before.
+    os.kill(another, signal.SIGKILL)
+    assert status_of(another_guard(local, web, another, 15)["guard_pid"])["Seccomp"] == "0"
+    assert local.row(cache)["guard_pid"] == others
+    assert status_of(others)["Seccomp"] == "2"
 
 
 def read_link(pid: int, fd: str) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from testkit.harness import ContainerFactory, Sidecar, take_checkpoint, wait_until
+from testkit.procfs import status_of
 from testkit.protected import QUICK, ours, start_victim
 
 pytestmark = pytest.mark.shared_machine(
@@ -66,6 +67,27 @@ def test_threads_of_an_unprivileged_user(sidecar: Sidecar, container: ContainerF
         victim.wait_beats()
     assert sidecar.wait_restores(victim.container, 10)["state"] == "protected"
     assert victim.see().starts == 1
+
+
+FILTERS = {
+    "default profile": ("threads 4 1", [], "2"),
+    "unconfined": ("threads 4 1", ["--security-opt", "seccomp=unconfined"], "2"),
+    "privileged": ("threads 4 1", ["--privileged"], "2"),
+    "a filter of its own": ("sandbox", [], "0"),
+}
+
+
+@pytest.mark.parametrize(("command", "options", "mode"), FILTERS.values(), ids=FILTERS.keys())
+def test_the_seccomp_filter_of_its_guard(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, command: str, options: list[str], mode: str
+) -> None:
+    """A guard has one unless the application has one, beyond its container's, that it may have to suspend."""
+    victim = start_victim(sidecar, container, tmp_path, command, options=options)
+    entry = sidecar.wait_generation(victim.container, 1)
+    assert status_of(entry["guard_pid"])["Seccomp"] == mode
+    entry = victim.kill(signal.SIGKILL)
+    assert (entry["state"], entry["restores"]) == ("protected", 1)
+    assert status_of(entry["guard_pid"])["Seccomp"] == mode
 
 
 def test_pause_and_unpause(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:

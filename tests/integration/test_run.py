@@ -21,7 +21,7 @@ import pytest
 
 from testkit.harness import Completed, avckpt_command, run, wait_until
 from testkit.local_sidecar import app_of
-from testkit.procfs import children_of
+from testkit.procfs import children_of, comm_of, status_of
 
 pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root"),
@@ -249,6 +249,13 @@ def test_quiet_but_for_deaths_and_restores(start) -> None:  # type: ignore[no-un
     running.wait_for("restored in")
     assert running.messages.startswith("avckpt: sleep: killed by SIGKILL, restored in ")
     assert running.messages.count("\n") == 1
+
+
+def test_its_guard_has_a_seccomp_filter(start) -> None:  # type: ignore[no-untyped-def]
+    running = start("-v", sys.executable, "-c", COUNTER)
+    running.wait_for("protected: first checkpoint")
+    guards = [pid for pid in children_of(running.process.pid) if comm_of(pid) == "avckpt-guard"]
+    assert [status_of(pid)["Seccomp"] for pid in guards] == ["2"]
 
 
 @pytest.mark.parametrize("restored", [False, True], ids=["as-started", "restored"])

@@ -74,6 +74,13 @@ def test_the_checkpoint_after_the_last_generation_was_given_up_is_told(reason: R
     assert (journal.line(checkpoint(4)) or (0, ""))[0] == logging.INFO
 
 
+def test_a_guard_that_is_replaced_for_its_filter_is_no_warning() -> None:
+    lost = Event(Kind.GUARD_LOST, 1, error=AvckptError("it was killed"))
+    assert Journal().line(of_guard(lost)) == (logging.WARNING, "runs unprotected: it was killed")
+    replaced = dataclasses.replace(lost, reason=Reason.FILTER, error=AvckptError("a reason"))
+    assert Journal().line(of_guard(replaced)) == (logging.INFO, "gets a guard without a seccomp filter: a reason")
+
+
 def health(at_s: float, detail: str, error: AvckptError | None = None) -> EventRecord:
     return EventRecord(Kind.HEALTH, monotonic_s=at_s, detail=detail, error=error)
 

@@ -1,8 +1,9 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * sandbox [--kill]: puts itself under a seccomp filter that allows little more than
+ * sandbox [--kill] [--late]: puts itself under a seccomp filter that allows little more than
  * sleeping and looking at the clock; anything else is EPERM, with --kill the end.  Two
- * threads see that the filter holds.
+ * threads see that the filter holds.  With --late it does so when it gets SIGUSR1, and counts
+ * in counter 1 that it has.
  */
 #include <linux/filter.h>
 #include <linux/seccomp.h>
@@ -18,6 +19,7 @@
 
 static bool kills;
 static volatile bool started, confined;
+static bool wanted;
 
 static void confine(void)
 {
@@ -60,19 +62,37 @@ static void *work(void *arg)
 	return NULL;
 }
 
+/* Blocked: it interrupts nothing. */
+static bool is_wanted(const sigset_t *asked)
+{
+	const struct timespec now = { 0 };
+
+	return wanted || sigtimedwait(asked, NULL, &now) == SIGUSR1;
+}
+
 int main(int argc, char **argv)
 {
 	pthread_t thread;
+	sigset_t asked;
 
 	kills = victim_flag(&argc, argv, "--kill");
-	victim_start(&argc, argv, 0, "[--kill]");
+	wanted = !victim_flag(&argc, argv, "--late");
+	victim_start(&argc, argv, 0, "[--kill] [--late]");
+	sigemptyset(&asked);
+	sigaddset(&asked, SIGUSR1);
+	must(!pthread_sigmask(SIG_BLOCK, &asked, NULL), "pthread_sigmask");
 	must(!pthread_create(&thread, NULL, work, NULL), "pthread_create");
 	while (!started)
 		nap_us(1000);
-	confine();
-	confined = true;
-	victim_ready();
+	if (!wanted)
+		victim_ready();
 	for (;;) {
+		if (!confined && is_wanted(&asked)) {
+			confine();
+			confined = true;
+			count(1, 1);
+			victim_ready();
+		}
 		nap_us(1000);
 		check();
 		beat();

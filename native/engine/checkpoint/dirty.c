@@ -143,8 +143,8 @@ static bool has_own_filter(const struct process *process)
 	struct proc_status status;
 
 	return process->parasite.seccomp == SECCOMP_SUPERVISED ||
-	       proc_status(process->pid, &status) || status.seccomp == 1 ||
-	       status.seccomp_filters > process->plain_filters;
+	       proc_status(process->pid, &status) ||
+	       !seccomp_is_containers(&status, process->plain_filters);
 }
 
 /* A fork of it takes no longer than the queries that a copy needs. */

@@ -229,7 +229,7 @@ static int fill_slot(struct image *image, struct avc_error *err)
 	close(mem_fd);
 	if (image->headless)
 		fill_ended(image);
-	image->sandboxed = status.seccomp == 1 || status.seccomp_filters > process->plain_filters;
+	image->sandboxed = !seccomp_is_containers(&status, process->plain_filters);
 	if (status.seccomp == 1)
 		process->parasite.seccomp = SECCOMP_SUPERVISED;
 	if (memory_finish(image, status.locked_kb, &setup, err))

@@ -528,6 +528,8 @@ static void guard_main(struct avc_guard *guard)
 		carry_out(guard);
 		if (guard->dead.waits)
 			guard_tend_dead(guard);
+		else if (guard_filter_hinders(guard))
+			break;
 		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
 			guard_tell_untold(guard);
@@ -619,6 +621,7 @@ int guard_run(int socket)
 	struct avc_error error = { 0 };
 	struct avc_guard *guard;
 	int init_pidfd, heartbeat_fd;
+	bool hindered;
 
 	if (receive_start(socket, &start, &init_pidfd, &heartbeat_fd) ||
 	    config_check(&start.config, &error) || heartbeat_open(heartbeat_fd))
@@ -635,6 +638,7 @@ int guard_run(int socket)
 		guard_main(guard);
 	}
 	send_last_words(guard);
+	hindered = guard_filter_hinders(guard);
 	guard_free(guard);
-	return 0;
+	return hindered ? AVC_GUARD_HINDERED : 0;
 }

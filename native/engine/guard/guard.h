@@ -10,6 +10,7 @@
  *   guard_group.c       ... together with others
  *   guard_memory.c      which of its processes the OOM killer takes first
  *   guard_pace.c        when the next checkpoint is worth its cost
+ *   filter.c            its own seccomp filter
  *   output.c            detects that the app sends
  *   policy.c            the decisions behind these
  */
@@ -35,7 +36,8 @@ struct output_event {
 
 /* All zero at the start. */
 struct output {
-	int tracepoint; /* its number; 0: not looked up yet, -1: there is none    */
+	int known;      /* the tracepoint's number; 0: not looked up yet, -1: there is none */
+	int tracepoint; /* the same while it is used, or -1; 0: not yet                     */
 	int signal_fd;
 	bool armed;
 	uint32_t count;
@@ -65,6 +67,7 @@ struct avc_guard {
 	uint64_t helper_for;     /* number of its generation                        */
 	pid_t foreseen;          /* main process that has ended, not yet reported   */
 	bool attached, unprotected;
+	bool filter_decided; /* whether it has a seccomp filter of its own      */
 	struct process main; /* the app's main process                         */
 	struct tree tree;    /* it and the others                              */
 	struct pollfd *fds;  /* room for wait_for_news()                       */
@@ -217,6 +220,8 @@ uint64_t guard_tell_due(const struct avc_guard *guard);
 
 /* From now on the next output of any existing process is detected; a second call changes nothing.
  * Best effort. */
+/* Looks the tracepoint up: it takes calls that the guard's own filter does not allow. */
+void output_learn(struct output *output);
 void output_arm(struct output *output, const struct tree *tree);
 void output_disarm(struct output *output);
 /* Readable after output; -1: not armed. */
@@ -224,6 +229,16 @@ int output_fd(const struct output *output);
 /* Whether there was output.  Then it is no longer armed. */
 bool output_heard(struct output *output);
 void output_end(struct output *output);
+
+/* ---- filter.c --------------------------------------------------------------- */
+
+/* Comes under it, with all threads, for good.  0 or -1. */
+int guard_filter_enter(void) warn_unused;
+/* The same, once all of the app's threads have been looked at, if none has filters that may have to
+ * be suspended. */
+void guard_filter(struct avc_guard *guard);
+/* Only a guard without a filter can go on from here. */
+bool guard_filter_hinders(const struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 

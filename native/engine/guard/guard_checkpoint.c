@@ -539,8 +539,11 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
 		budget_begin(NULL, NULL);
-		if (prepare(guard, err) == 0 && take_once(guard, event, err) == 0)
-			return 0;
+		if (prepare(guard, err) == 0) {
+			guard_filter(guard);
+			if (take_once(guard, event, err) == 0)
+				return 0;
+		}
 		if (tries < TAKE_TRIES && guard_may_meet(guard) &&
 		    (make_way(guard, err) || err->code == AVC_RETRY))
 			continue;
@@ -585,6 +588,11 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	guard_pace_missed(guard, event.freeze_ns);
+	if (guard_filter_hinders(guard)) {
+		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */
+		if (!ticket)
+			return;
+	}
 	if (error.code == AVC_GONE)
 		guard->dying_until_ns = now_ns() + DYING_NS;
 	/* If the app has died, init's report follows: only a command needs an answer. */

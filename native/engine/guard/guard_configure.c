@@ -22,8 +22,10 @@ void guard_set_config(struct avc_guard *guard, const struct avc_config *config)
 void guard_take_config(struct avc_guard *guard, const struct avc_config *config)
 {
 	const uint32_t keep = guard->config.keep;
+	const uint8_t suspends = guard->config.suspends;
 
 	guard_set_config(guard, config);
+	guard->config.suspends = suspends;
 	policy_resize(&guard->policy, keep, config->keep);
 	while (guard->count > guard->policy.room)
 		guard_drop_generation(guard, policy_dispensable(&guard->policy));

@@ -46,6 +46,12 @@ static int tracepoint(void)
 	return id > 0 ? id : -1;
 }
 
+void output_learn(struct output *output)
+{
+	if (!output->known)
+		output->known = tracepoint();
+}
+
 /* ---- its events ------------------------------------------------------------------- */
 
 static void close_all(struct output *output)
@@ -192,7 +198,8 @@ static bool begin(struct output *output)
 void output_arm(struct output *output, const struct tree *tree)
 {
 	if (!output->tracepoint) {
-		output->tracepoint = tracepoint();
+		output_learn(output);
+		output->tracepoint = output->known;
 		if (output->tracepoint > 0 && !begin(output))
 			output->tracepoint = -1;
 	}

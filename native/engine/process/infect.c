@@ -574,6 +574,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	if (process->mem_fd < 0)
 		return fail_errno(err, process->pid, "infect", "open(mem)", "it has ended");
 	if (thread_check_dispatch(thread->tid, err) || check_task(process, thread, err) ||
+	    thread_check_confined(process, thread, err) ||
 	    survey(process, arch_pc(&thread->regs), &cave, err))
 		return -1;
 	thread_fix_rseq(process->mem_fd, thread);

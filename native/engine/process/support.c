@@ -117,7 +117,7 @@ static int check_descendant(const struct process *process, struct avc_error *err
 	}
 	if (proc_status(process->pid, &status))
 		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
-	if (status.seccomp == 1 || status.seccomp_filters > process->plain_filters)
+	if (!seccomp_is_containers(&status, process->plain_filters))
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
 			    "process %d is not the main one and has a seccomp filter of its own",
 			    process->inside);

@@ -402,12 +402,32 @@ bool parasite_is_old(const struct process *process, avc_remote address)
 static long options_of(const struct parasite *parasite, bool ours)
 {
 	return (long)((ours ? TRACE_OPTIONS_OURS : TRACE_OPTIONS_APP) |
-		      (parasite->seccomp == SECCOMP_NONE ? PTRACE_O_SUSPEND_SECCOMP : 0));
+		      (parasite->seccomp == SECCOMP_NONE && !seccomp_is_confined()
+			       ? PTRACE_O_SUSPEND_SECCOMP
+			       : 0));
 }
 
 int parasite_own(const struct parasite *parasite, pid_t tid)
 {
 	return ptrace(PTRACE_SETOPTIONS, tid, NULL, options_of(parasite, true)) ? -1 : 0;
+}
+
+static int read_seccomp(const struct process *process, struct thread *thread, struct avc_error *err)
+{
+	if (!seccomp_read(thread->tid, process->plain_filters, &thread->filters_known,
+			  &thread->seccomp))
+		return 0;
+	if (seccomp_must_suspend())
+		return fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
+			    "it has a seccomp filter of its own now, which takes another guard");
+	return fail_errno(err, thread->tid, "run injected code", "ptrace(SECCOMP_GET_FILTER)",
+			  "its filters cannot be read");
+}
+
+int thread_check_confined(const struct process *process, struct thread *thread,
+			  struct avc_error *err)
+{
+	return seccomp_is_confined() ? read_seccomp(process, thread, err) : 0;
 }
 
 /* Decides how the thread will be resumed: it is borrowed next. */
@@ -417,10 +437,8 @@ static int look_at_seccomp(struct process *process, struct thread *thread, struc
 
 	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as found by a checkpoint */
 		thread->seccomp = SECCOMP_SUPERVISED;
-	if (seccomp_read(thread->tid, process->plain_filters, &thread->filters_known,
-			 &thread->seccomp))
-		return fail_errno(err, thread->tid, "run injected code",
-				  "ptrace(SECCOMP_GET_FILTER)", "its filters cannot be read");
+	if (read_seccomp(process, thread, err))
+		return -1;
 	parasite->seccomp = thread->seccomp;
 	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL, options_of(parasite, false)))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",

@@ -22,6 +22,7 @@
 #include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
+#include <sys/socket.h>
 #include <sys/syscall.h>
 
 #include "trace.h"
@@ -147,6 +148,27 @@ static const struct kind wanted_to_restore[] = {
 	{ SYS_pkey_free, ANY },
 	{ SYS_pkey_mprotect, ANY },
 };
+
+/* What the container's own filters must allow, too, if none can be suspended: an application need not
+ * make such calls. */
+static const struct kind needed[] = {
+	/* of the porter, and the stub that clones it (infect.c) */
+	{ SYS_rt_sigprocmask, ANY },
+	{ SYS_clone, CLONE_VM | CLONE_FILES },
+	{ SYS_clone,
+	  CLONE_VM | CLONE_FILES | CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM },
+	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD },
+	{ SYS_wait4, ANY },
+	{ SYS_waitid, ANY },
+	{ SYS_mmap, ANY },
+	{ SYS_mprotect, ANY },
+	{ SYS_close_range, ANY },
+	{ SYS_socketpair, AF_UNIX },
+	{ SYS_recvmsg, ANY },
+	{ SYS_close, ANY },
+	{ SYS_exit, ANY },
+};
+static const struct kind needed_to_watch = { SYS_userfaultfd, ANY };
 
 #define COUNT(array) (sizeof(array) / sizeof *(array))
 
@@ -298,6 +320,76 @@ static bool bars(const struct program *p, bool containers)
 	return false;
 }
 
+/* The container's filters, as of the first thread that was looked at. */
+static struct {
+	bool known, hinder, hinder_watching;
+} containers_filters;
+
+static void note_containers(const struct program *p)
+{
+	for (size_t i = 0; i < COUNT(needed); i++)
+		containers_filters.hinder |= verdict(p, needed[i].nr, needed[i].arg) != PASSES;
+	containers_filters.hinder |= bars(p, true);
+	containers_filters.hinder_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
+					      PASSES;
+}
+
+/* ---- a guard that has a filter of its own ----------------------------------------------------- */
+
+/* The kernel lets it neither read the filters of others nor suspend them (kernel/seccomp.c,
+ * seccomp_get_filter(); kernel/ptrace.c, check_ptrace_options()). So it can only go on as long as no
+ * task has more filters than the container, whose filters it has read before. */
+static struct {
+	bool is, met;
+} confined;
+
+bool seccomp_can_be_confined(bool watches)
+{
+	return containers_filters.known && !containers_filters.hinder &&
+	       !(watches && containers_filters.hinder_watching);
+}
+
+void seccomp_confined(void)
+{
+	confined.is = true;
+}
+
+bool seccomp_is_confined(void)
+{
+	return confined.is;
+}
+
+bool seccomp_must_suspend(void)
+{
+	return confined.met;
+}
+
+static long suspend_option(void)
+{
+	return confined.is ? 0 : PTRACE_O_SUSPEND_SECCOMP;
+}
+
+bool seccomp_is_containers(const struct proc_status *status, uint32_t containers)
+{
+	const bool is = status->seccomp != SECCOMP_MODE_STRICT &&
+			status->seccomp_filters <= containers;
+
+	confined.met |= confined.is && !is;
+	return is;
+}
+
+/* It is stopped: nothing but another thread of its process could give it a filter. */
+static int read_confined(pid_t tid, uint32_t containers, enum seccomp_way *way)
+{
+	struct proc_status status;
+
+	if (proc_status(tid, &status))
+		return -1;
+	*way = containers ? SECCOMP_IN_FORCE : SECCOMP_NONE;
+	errno = EACCES;
+	return seccomp_is_containers(&status, containers) ? 0 : -1;
+}
+
 static long filter_get(pid_t tid, uint32_t index, void *insn)
 {
 	return ptrace(PTRACE_SECCOMP_GET_FILTER, tid, (long)index, insn);
@@ -308,17 +400,23 @@ int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_w
 	struct program p;
 	uint32_t i;
 
+	if (confined.is)
+		return read_confined(tid, containers, way);
 	/* Filters are only ever added. */
 	if (*way == SECCOMP_SUPERVISED ||
 	    (*known && filter_get(tid, *known, NULL) < 0 && errno == ENOENT))
 		return 0;
-	for (i = 0; (p.count = filter_get(tid, i, p.insn)) > 0; i++)
+	for (i = 0; (p.count = filter_get(tid, i, p.insn)) > 0; i++) {
+		if (i < containers && !containers_filters.known)
+			note_containers(&p);
 		if (i == FILTERS_MAX || bars(&p, i < containers)) {
 			*way = SECCOMP_SUPERVISED;
 			return 0;
 		}
+	}
 	if (errno != ENOENT && errno != EINVAL && errno != EMEDIUMTYPE)
 		return -1;
+	containers_filters.known |= i >= containers;
 	*known = i;
 	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it cannot be read */
 	       : i                  ? SECCOMP_IN_FORCE
@@ -418,7 +516,7 @@ void seccomp_at_call(pid_t tid, pid_t inside, long options)
 	struct arch_regs regs;
 
 	if (tracee_enters_call(tid) && arch_regs_get(tid, &regs) == 0 && is_wanted(&regs, inside))
-		options |= PTRACE_O_SUSPEND_SECCOMP;
+		options |= suspend_option();
 	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* fails if it was killed */
 }
 

@@ -378,6 +378,16 @@ void rewind_date(struct thread *thread);
  * how many there were the last time.  A supervised thread stays so.  0, or -1 with errno. */
 int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known,
 		 enum seccomp_way *way) warn_unused;
+/* Whether the guard may come under a filter of its own, and still protect an application that has
+ * none.  `watches`: it is to watch memory. */
+bool seccomp_can_be_confined(bool watches);
+/* It has come under one. */
+void seccomp_confined(void);
+bool seccomp_is_confined(void);
+/* It has met a task whose filters would have to be suspended: another guard is needed. */
+bool seccomp_must_suspend(void);
+/* Whether a task has no more filters than its container. */
+bool seccomp_is_containers(const struct proc_status *status, uint32_t containers);
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
  * the PID of its process in its own namespace. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
@@ -455,6 +465,10 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
  * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
 int thread_borrow(struct process *process, struct thread *thread,
 		  struct avc_error *err) warn_unused;
+/* Before the first calls of a stopped thread, for which its filters are suspended in any case: whether
+ * a guard that cannot do that need not. */
+int thread_check_confined(const struct process *process, struct thread *thread,
+			  struct avc_error *err) warn_unused;
 int thread_give_back(struct thread *thread, struct avc_error *err);
 
 /* ---- setup.c ------------------------------------------------------------------- */

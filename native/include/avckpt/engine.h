@@ -96,6 +96,8 @@ struct avc_config {
 	uint8_t files;                  /* enum avc_files                            */
 	uint8_t tcp;                    /* enum avc_tcp                              */
 	uint8_t images;                 /* enum avc_images                           */
+	uint8_t suspends;               /* the guard takes no seccomp filter of its own,
+	                                 * which would hinder it; set by the engine   */
 	uint8_t together;               /* one of a group: checkpoints are those of its
 	                                 * lines, and it goes back with the others   */
 	uint8_t restore_on_status[256]; /* [n] != 0: exit status n is abnormal    */
@@ -124,7 +126,8 @@ enum avc_event_kind {
 	                            * UNHEALTHY, MEMORY, KILLED, EXECUTED         */
 	AVC_EVENT_GUARD_LOST = 11, /* the guard's process has died, or hung and was
 	                            * killed; `error` says how.  The application
-	                            * runs on, unprotected.  The guard's last event */
+	                            * runs on, unprotected.  The guard's last event,
+	                            * unless `reason` is FILTER                     */
 	AVC_EVENT_HELD = 12,       /* answers AVC_COMMAND_LIST, one for each of the
 	                            * `generations`, oldest first: its number, age,
 	                            * freeze and threads, and as `attempt` its
@@ -155,7 +158,9 @@ enum avc_reason {
 	AVC_REASON_EXECUTED = 14,  /* dropped: the app is another program now     */
 	AVC_REASON_LOOP = 15,      /* gave up: the same death again, at once      */
 	AVC_REASON_LATE = 16,      /* gave up: later than deadline_ns             */
-	AVC_REASON_GROUP = 17      /* rolled back by avc_guard_recall()           */
+	AVC_REASON_GROUP = 17,     /* rolled back by avc_guard_recall()           */
+	AVC_REASON_FILTER = 18     /* guard lost: its own seccomp filter does not let it
+	                            * suspend the app's; one without has been started */
 };
 
 /* An event. Fields that do not apply to a kind are 0. */

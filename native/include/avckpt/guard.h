@@ -25,6 +25,9 @@
 #include "avckpt/engine.h"
 
 #define AVC_GUARD_FD 3
+/* Exit status: its own seccomp filter does not let it suspend those that the app has now.  Another
+ * one, with avc_config.suspends, can. */
+#define AVC_GUARD_HINDERED 5
 #define AVC_GUARD_MAGIC                                                     \
 	(UINT32_C(0x47560000) + (uint32_t)sizeof(struct avc_request) * 31 + \
 	 (uint32_t)sizeof(struct avc_event))

@@ -81,6 +81,8 @@ class Journal:
             return self._lost(record)
         if kind is Kind.DROPPED and record.reason is Reason.EXECUTED:
             return logging.INFO, record.message  # as the entry points of many images do
+        if kind is Kind.GUARD_LOST and record.reason is Reason.FILTER:
+            return logging.INFO, record.message
         if kind is Kind.GAVE_UP and record.outcome in EXPECTED:
             return logging.INFO, record.message
         if kind is Kind.CONFIGURED and record.error is not None:

@@ -52,8 +52,8 @@ class EventRecord:
     reason: Reason | None = said(  # noqa: RUF009
         "why the application died: `signal`, `exit`, `unhealthy`, `manual` or `group` (it went back with others); "
         "why a generation was dropped: `crashed`, `unhealthy`, `memory`, `killed` (its template) or `executed` "
-        "(another program)",
-        values=tuple(dict.fromkeys((*CAUSES, *DROPPED_WORDS))),
+        "(another program); why a guard was lost: `filter`, or none",
+        values=tuple(dict.fromkeys((*CAUSES, *DROPPED_WORDS, Reason.FILTER))),
     )
     outcome: Reason | None = said(  # noqa: RUF009
         "what followed: `restored`, or why not: `clean_exit`, `stopped` (on request), `policy` (avckpt.restore.on), "
@@ -151,6 +151,7 @@ def field_types() -> dict[str, type]:
 
 
 _DEATHS = frozenset({Kind.DIED, Kind.WAITS, Kind.RESTORED, Kind.GAVE_UP})
+_WHY = frozenset({Kind.DROPPED, Kind.GUARD_LOST})
 _COUNTED = frozenset({Kind.CHECKPOINT, Kind.RESTORED, Kind.DROPPED})
 
 
@@ -178,7 +179,7 @@ def of_guard(
         group=group,
         at=at,
         monotonic_s=event.at_ns / 1e9,
-        reason=event.reason if kind is Kind.DROPPED else _cause(event, commanded) if kind in _DEATHS else None,
+        reason=event.reason if kind in _WHY else _cause(event, commanded) if kind in _DEATHS else None,
         outcome=_outcome(event),
         wait_status=event.wait_status if kind in _DEATHS else None,
         generation=event.generation if counted or kind is Kind.WAITS else None,
@@ -285,6 +286,12 @@ def _ordinal(number: int) -> str:
     return f"{number}{last}"
 
 
+def _guard_lost(record: EventRecord) -> str:
+    if record.reason is Reason.FILTER:
+        return f"gets a guard without a seccomp filter: {record.error}"
+    return f"runs unprotected: {record.error}"
+
+
 def _why(record: EventRecord) -> str:
     return f", once more: {record.error}" if record.error else ""
 
@@ -307,7 +314,7 @@ _MESSAGES: dict[Kind, Callable[[EventRecord], str]] = {
     Kind.CHECKPOINT: lambda record: f"checkpoint: {_checkpoint(record)}",
     Kind.MISSED: lambda record: f"checkpoint missed: {record.error}{_nothing_held(record)}",
     Kind.UNPROTECTED: lambda record: f"runs unprotected: {record.error or record.detail}",
-    Kind.GUARD_LOST: lambda record: f"runs unprotected: {record.error}",
+    Kind.GUARD_LOST: _guard_lost,
     # Only the following event says whether the application was lost.
     Kind.DIED: _died,
     Kind.WAITS: lambda record: f"waits for its group to go back with it{_why(record)}",

@@ -85,6 +85,7 @@ class Reason(_Named):
     LOOP = "loop", 15
     LATE = "late", 16
     GROUP = "group", 17
+    FILTER = "filter", 18
     RESTORED = "restored"
 
 
