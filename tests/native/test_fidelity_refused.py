@@ -14,6 +14,7 @@ import pytest
 
 from testkit.guarded import GuardProcess, Victim, config, since_linux
 from testkit.harness import wait_until
+from testkit.procfs import children_of, state_of
 
 pytestmark = pytest.mark.shared_machine("an application that does not stop in time is told another reason")
 
@@ -92,6 +93,43 @@ def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
         assert why in guard.wait("unprotected")["error"]["message"]
         wait_until(lambda: victim.others() == [], 5, "nothing is left in the container")
         victim.wait_beats(20)
+
+
+def of_victim(victim: Victim, app: int) -> set[int]:
+    """The processes of the application."""
+    found = {app, *children_of(app), *children_of(victim.pid)}
+    return {pid for pid in found if Path(f"/proc/{pid}/comm").read_text() == "unsupported\n" and state_of(pid) != "Z"}
+
+
+def descriptors(pid: int) -> dict[str, str]:
+    folder = f"/proc/{pid}/fd"
+    return {number: os.readlink(f"{folder}/{number}") for number in os.listdir(folder)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "why", "count"),
+    [
+        ("orphan-files", "shares its descriptor table", 2),
+        ("orphan-folder", "shares its working directory", 2),
+        ("siblings-files", "shares its descriptor table", 3),
+    ],
+)
+def test_what_is_shared_by_others_than_parent_and_child(kind: str, why: str, count: int, tmp_path: Path) -> None:
+    """The end of one closes nothing of the other's."""
+    with Victim(f"unsupported {kind} signal", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        app = victim.app
+        os.kill(app, signal.SIGUSR1)
+        wait_until(lambda: len(of_victim(victim, app)) == count, 10, "all its processes are there")
+        wait_until(lambda: victim.see().counter[0] == 1, 10, "they share it")
+        told = guard.wait("unprotected")
+        open_before = {pid: descriptors(pid) for pid in of_victim(victim, app)}
+        os.kill(max(open_before, key=lambda pid: (pid != app, pid)), signal.SIGKILL)
+        wait_until(lambda: len(of_victim(victim, app)) < count, 10, "one has ended")
+        guard.command("checkpoint")
+        time.sleep(0.3)
+        assert all(descriptors(pid) == open_before[pid] for pid in of_victim(victim, app))
+        assert why in told["error"]["message"]
 
 
 @NETWORKS
