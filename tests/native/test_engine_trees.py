@@ -23,7 +23,7 @@ from avckpt.guard import GuardConfig
 from testkit.family import kill_main, look, main_process, members, ours, places, progress, wait_whole
 from testkit.guarded import GuardProcess, Victim, config, forks_beside, meanwhile, storm
 from testkit.harness import wait_until
-from testkit.procfs import children_of, figures
+from testkit.procfs import children_of, figures, status_of
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; "
@@ -74,7 +74,7 @@ def kill_again_and_again(guard: GuardProcess, victim: Victim, kills: int, pause_
     """Kills the main process at random moments; each time the whole tree comes back and goes on."""
     rng = random.Random(victim.command)
     guard.wait("checkpoint")
-    changes = victim.command.split()[0] in ("churn", "commands")
+    changes = bool({"churn", "commands"} & set(victim.command.split()))
     before = places(victim)
     for _ in range(kills):
         time.sleep(rng.uniform(0, pause_s))
@@ -113,6 +113,16 @@ def test_nobody_sees_checkpoints(command: str, tmp_path: Path) -> None:
         progress(victim)
         wait_until(lambda: not ours(victim), 10, "no template is left")
         wait_whole(victim, allowed=command.count("--orphan"))
+
+
+@pytest.mark.parametrize("command", ["tree 8", "tree 5 --threads 3", "prefork 4 20", "churn 3 --threads 4"])
+def test_under_a_seccomp_filter_that_all_have_inherited(command: str, tmp_path: Path) -> None:
+    """As every process of a server has that starts under one."""
+    with Victim(f"under harmless {command}", tmp_path) as victim, GuardProcess(steady(0.05), [victim.pid]) as guard:
+        kill_again_and_again(guard, victim, KILLS, 0.15)
+        if not command.startswith("churn"):  # whose children end at any moment, and have none then
+            main = main_process(victim)
+            assert {status_of(pid)["Seccomp_filters"] for pid in (main, *children_of(main))} == {"1"}
 
 
 @pytest.mark.parametrize("command", [*STATIC, *CHANGING])

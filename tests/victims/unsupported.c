@@ -23,6 +23,8 @@
  *   bounds    one thread with a smaller bounding set, which the main thread may not lower
  *   locked, locked-child  one thread, or a child process, without a securebit that the main
  *             thread has locked
+ *   filtered-child, other-filter   a child process under a seccomp filter that the main one lacks;
+ *             and the main one has another one instead
  *   user      one thread of another user, and the main thread has locked that capabilities are
  *             not kept over that
  *   dropped   one thread of another user, and the main thread has become a third one's
@@ -410,6 +412,28 @@ static bool start_locked_child(void)
 	return start_child(0) && lock_securebits(SECBIT_NOROOT | SECBIT_NOROOT_LOCKED);
 }
 
+static bool start_filtered_child(void)
+{
+	const pid_t pid = fork();
+
+	if (pid == 0) {
+		must(add_filter(), "seccomp");
+		for (;;)
+			pause();
+	}
+	return pid > 0;
+}
+
+static bool start_other_filter(void)
+{
+	struct sock_filter other[] = { BPF_STMT(BPF_LD | BPF_W | BPF_IMM, 0),
+				       BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW) };
+	struct sock_fprog program = { 2, other };
+
+	return start_filtered_child() && !prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) &&
+	       !syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, 0, &program);
+}
+
 /* A child of a process that has unmapped its vDSO afterwards. */
 static bool start_vdso(void)
 {
@@ -602,6 +626,8 @@ static const struct kind {
 	{ "bounds", start_bounds, NULL },
 	{ "locked", start_locked, NULL },
 	{ "locked-child", start_locked_child, NULL },
+	{ "filtered-child", start_filtered_child, NULL },
+	{ "other-filter", start_other_filter, NULL },
 	{ "user", start_user, NULL },
 	{ "dropped", start_dropped, NULL },
 	{ "vfork", start_vfork, NULL },

@@ -172,6 +172,19 @@ static int fill_slot(struct image *image, struct avc_error *err)
 		return fail_errno(err, process->pid, "keep template", "open(status)",
 				  "it has ended");
 	}
+	if (status.seccomp_filters > process->filters) { /* one that has ended has none */
+		close(mem_fd);
+		return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
+			    "its seccomp filters have just changed");
+	}
+	if (process->descendant && !seccomp_is_containers(&status, process->plain_filters) &&
+	    process->parasite.seccomp != SECCOMP_IN_FORCE) {
+		close(mem_fd);
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
+			    "process %d has a seccomp filter that forbids what restoring several "
+			    "processes takes",
+			    process->inside);
+	}
 	image->headless = process->pid != process->leader;
 	image->stop_signal = main_thread->stop_signal;
 	setup_begin(&setup, parasite, image->slot);

@@ -203,6 +203,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 
 		if (!process || (!process->infected && tree_shares_memory(tree, i)))
 			continue;
+		process->main_filters = guard->main.filters;
 		process->shm_bytes = guard->main.shm_bytes;
 		process->tcp_moved = guard->main.tcp_moved;
 		if (prepare_process(guard, i, &failed) == 0)

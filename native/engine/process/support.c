@@ -97,10 +97,10 @@ static int not_seen(pid_t pid, struct avc_error *err)
 }
 
 /* Children are forked by their parents, which must have the same namespaces. */
-static int check_descendant(const struct process *process, struct avc_error *err)
+static int check_descendant(const struct process *process, const struct proc_status *status,
+			    struct avc_error *err)
 {
 	static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "user", "cgroup", "pid" };
-	struct proc_status status;
 
 	for (size_t i = 0; i < sizeof spaces / sizeof *spaces; i++) {
 		char path[64];
@@ -115,13 +115,14 @@ static int check_descendant(const struct process *process, struct avc_error *err
 				    "process %d has a %s namespace of its own", process->inside,
 				    spaces[i]);
 	}
-	if (proc_status(process->pid, &status))
-		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
-	if (!seccomp_is_containers(&status, process->plain_filters))
-		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
-			    "process %d is not the main one and has a seccomp filter of its own",
-			    process->inside);
-	return 0;
+	/* What they are is compared later (attributes.c). */
+	if (status->seccomp != 1 && status->seccomp_filters == process->main_filters)
+		return 0;
+	if (proc_is_exiting(process->pid)) /* it has none any more */
+		return fail(err, AVC_GONE, ESRCH, process->pid, "check", "open(status)",
+			    "it has ended");
+	return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
+		    "process %d has other seccomp filters than the main one", process->inside);
 }
 
 /* The shadow stack would not match the calls made in the parasite, and the thread would fault on
@@ -182,13 +183,27 @@ static int check_namespaces(struct process *process, struct avc_error *err)
 	return 0;
 }
 
+/* Threads are queried again when there are more of them. */
+static void note_filters(struct process *process, uint32_t count)
+{
+	for (uint32_t i = 0; process->filters != count && i < process->thread_count; i++)
+		process->threads[i].known = false;
+	process->filters = count;
+}
+
 int support_check(struct process *process, struct avc_error *err)
 {
+	struct proc_status status;
+
 	if (check_shadow_stack(process, err) || check_namespaces(process, err) ||
 	    check_descriptors(process, err) || check_mappings(process, err))
 		return -1;
 	dying_note_caught(process);
-	return process->descendant ? check_descendant(process, err) : 0;
+	if (proc_status(process->pid, &status))
+		return fail_errno(err, process->pid, "check", "open(status)", "it has ended");
+	(void)seccomp_is_containers(&status, process->plain_filters);
+	note_filters(process, status.seccomp_filters);
+	return process->descendant ? check_descendant(process, &status, err) : 0;
 }
 
 /* Through the process: a second dentry for each thread in /proc would make its exit slower (see

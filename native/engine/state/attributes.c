@@ -333,6 +333,9 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 			    "thread %d has other supplementary groups than the main thread, which "
 			    "cannot be put back",
 			    inside);
+	if ((to->seccomp != from->seccomp || to->filters != from->filters) && process->descendant)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
+			    "process %d has other seccomp filters than the main one", inside);
 	if (to->seccomp != from->seccomp || to->filters != from->filters)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
 			    "its threads differ in their seccomp filters (thread %d)", inside);

@@ -149,6 +149,24 @@ static const struct kind wanted_to_restore[] = {
 	{ SYS_pkey_mprotect, ANY },
 };
 
+/* Of processes below the main one, which are made as forks of it.  They are not supervised for all
+ * of these: the application's own filters must allow them, and those above. */
+static const struct kind wanted_for_trees[] = {
+	{ SYS_clone, CLONE_FILES | SIGCHLD },
+	{ SYS_clone, SIGCHLD },
+	{ SYS_personality, ANY },
+	{ SYS_brk, ANY },
+	{ SYS_shmat, ANY },
+	{ SYS_chroot, ANY },
+	{ SYS_fcntl, ANY },
+	{ SYS_write, ANY },
+	{ SYS_read, ANY },
+	{ SYS_kill, ANY },
+	{ SYS_prctl, 41 /* PR_SET_THP_DISABLE */ },
+	{ SYS_prctl, 67 /* PR_SET_MEMORY_MERGE */ },
+	{ SYS_prctl, PR_SET_MM },
+};
+
 /* What the container's own filters must allow, too, if none can be suspended: an application need not
  * make such calls. */
 static const struct kind needed[] = {
@@ -320,6 +338,20 @@ static bool bars(const struct program *p, bool containers)
 	return false;
 }
 
+static bool refuses_any(const struct program *p, const struct kind *kinds, size_t count)
+{
+	for (size_t i = 0; i < count; i++)
+		if (verdict(p, kinds[i].nr, kinds[i].arg) != PASSES)
+			return true;
+	return false;
+}
+
+static bool hinders_trees(const struct program *p)
+{
+	return refuses_any(p, wanted_to_restore, COUNT(wanted_to_restore)) ||
+	       refuses_any(p, wanted_for_trees, COUNT(wanted_for_trees));
+}
+
 /* The container's filters, as of the first thread that was looked at. */
 static struct {
 	bool known, hinder, hinder_watching;
@@ -327,9 +359,7 @@ static struct {
 
 static void note_containers(const struct program *p)
 {
-	for (size_t i = 0; i < COUNT(needed); i++)
-		containers_filters.hinder |= verdict(p, needed[i].nr, needed[i].arg) != PASSES;
-	containers_filters.hinder |= bars(p, true);
+	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || bars(p, true);
 	containers_filters.hinder_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
 					      PASSES;
 }
@@ -398,6 +428,7 @@ static long filter_get(pid_t tid, uint32_t index, void *insn)
 int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_way *way)
 {
 	struct program p;
+	bool less = false;
 	uint32_t i;
 
 	if (confined.is)
@@ -413,12 +444,14 @@ int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_w
 			*way = SECCOMP_SUPERVISED;
 			return 0;
 		}
+		less |= i >= containers && hinders_trees(&p);
 	}
 	if (errno != ENOENT && errno != EINVAL && errno != EMEDIUMTYPE)
 		return -1;
 	containers_filters.known |= i >= containers;
 	*known = i;
 	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it cannot be read */
+	       : less               ? SECCOMP_LESS
 	       : i                  ? SECCOMP_IN_FORCE
 				    : SECCOMP_NONE;
 	return 0;

@@ -95,6 +95,7 @@ struct questions {
 enum seccomp_way {
 	SECCOMP_NONE,      /* there are none                                       */
 	SECCOMP_IN_FORCE,  /* they allow its calls                                 */
+	SECCOMP_LESS,      /* ... but not all that restoring several processes takes */
 	SECCOMP_SUPERVISED /* they do not: seccomp_supervise()                     */
 };
 
@@ -214,6 +215,8 @@ struct process {
 	struct mem_others *others; /* of the main one, and so of all             */
 	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
 	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
+	uint32_t filters;          /* ... its own, at the last check                  */
+	uint32_t main_filters;     /* ... of the main process                         */
 	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
