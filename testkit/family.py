@@ -25,6 +25,7 @@ class Member:
     session: int
     name: str
     state: str
+    is_traced: bool
 
     @property
     def is_zombie(self) -> bool:
@@ -55,7 +56,14 @@ def look(pid: int) -> Member | None:
     if not numbers.get("pid"):
         return None
     return Member(
-        pid, numbers["pid"], int(line.split()[-1]), numbers.get("pgid", 0), numbers.get("sid", 0), name, state
+        pid,
+        numbers["pid"],
+        int(line.split()[-1]),
+        numbers.get("pgid", 0),
+        numbers.get("sid", 0),
+        name,
+        state,
+        "\nTracerPid:\t0\n" not in status,
     )
 
 
@@ -85,12 +93,13 @@ def kill_main(victim: Victim, signum: int = signal.SIGKILL) -> None:
 def places(victim: Victim) -> list[tuple[int, int, int, int, str, bool]]:
     """Who is where; for a tree that does not change, to be compared with another moment's.
 
-    A template has its name only some moments after it was cloned: a look during a checkpoint is no look.
+    While a guard traces them it is making templates or holders, which get their names, or are reaped, only some
+    moments later, on a busy machine after seconds: a look at that time is no look.
     """
 
     def look_again() -> list[Member]:
         seen = members(victim)
-        return [] if any(member.state == "t" for member in seen) else seen
+        return [] if any(member.is_traced for member in seen) else seen
 
     return sorted(member.place for member in wait_until(look_again, PATIENCE_S, f"{victim.command} is left alone"))
 
