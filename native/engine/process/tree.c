@@ -297,9 +297,15 @@ static int check_sharing_of(pid_t *pid, uint32_t count, enum shared what, struct
 				    "a process has just ended");
 		if (!shares)
 			continue;
-		/* Two that are just ending have none. */
-		if (proc_is_exiting(pid[i - 1]) || proc_is_exiting(pid[i]))
+		/* Two that are just ending have none; and holders and templates of a guard that died
+		 * share theirs until the kernel has ended them. */
+		if (proc_is_killed(pid[i - 1]) || proc_is_killed(pid[i]))
 			continue;
+		/* Its porter has yet to leave the table. */
+		if (proc_same_memory(pid[i - 1], pid[i]))
+			return fail(err, AVC_RETRY, 0, pid[i], "look at processes", "kcmp",
+				    "process %d shares its memory with process %d",
+				    proc_inside(pid[i]), proc_inside(pid[i - 1]));
 		return fail(err, AVC_UNSUPPORTED, 0, pid[i], "look at processes", "",
 			    "process %d shares its %s with process %d", proc_inside(pid[i]),
 			    what == SHARED_FILES ? "descriptor table (CLONE_FILES)"
