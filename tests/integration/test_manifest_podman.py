@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -359,4 +360,45 @@ def test_the_example_goes_on_through_crashes(project: Project, sidecar: Sidecar,
     assert smooth.logs().count("started as PID") == 1
     assert "hung up" not in monitor.logs()
     project.avckpt("down", env=ports)
+    assert project.ids() == []
+
+
+def test_the_example_of_a_group_agrees_after_crashes(
+    project: Project, sidecar: Sidecar, free_port: Callable[[], int]
+) -> None:
+    text = (ROOT / "examples" / "group.yaml").read_text()
+    # A user may have it running.
+    text = text.replace("name: avckpt-group", f"name: {project.name}").replace("name: group-", f"name: {project.name}-")
+    project.path.write_text(text.replace("avckpt.group: drive", f"avckpt.group: {project.name}"))
+    project.path.with_name("group.py").write_text((ROOT / "examples" / "group.py").read_text())
+    port = {"GROUP_PORT": str(free_port())}
+    assert "warning" not in run([*avckpt_command(), "check", str(project.path)], env=port).stdout
+    done = project.avckpt("up", "--json", env=port)
+    assert states(done) == {"driver": True, "planner": True}
+    names = {entry["service"]: entry["name"] for entry in json.loads(done.stdout)}
+    members = [
+        Container(project.podman, names[name], project.podman.inspect(names[name])["Id"])
+        for name in ("driver", "planner")
+    ]
+
+    def rows() -> list[dict[str, Any]]:
+        ids = {member.id for member in members}
+        return [row for row in json.loads(sidecar.avckpt("ps", "--json").stdout) if row["id"] in ids]
+
+    def line() -> int:
+        lines = {row["line"] for row in rows()}
+        return int(lines.pop()) if len(lines) == 1 else 0
+
+    log = members[1].wait_for_log("and they agree", 60)
+    for restores, victim in enumerate(members, 1):
+        before = line()
+        wait_until(lambda: line() > before, 30, "a line of both")  # noqa: B023
+        os.kill(sidecar.app_pid(victim), signal.SIGKILL)
+        for member in members:
+            sidecar.wait_restores(member, restores)
+        assert {row["group"] for row in rows()} == {project.name}
+        log = members[1].wait_for_log("and they agree", 30, count=log.count("and they agree") + 2)
+    assert log.count("planner: connected") == 1
+    assert "DISAGREE" not in log and "hung up" not in log
+    project.avckpt("down", env=port)
     assert project.ids() == []

@@ -40,7 +40,8 @@
 struct group_end {
 	uint64_t ino;
 	struct avc_end_name own, other;
-	bool kept; /* data in flight to it was copied                              */
+	bool kept;       /* data in flight to it was copied                              */
+	const char *why; /* it is not, or cannot be restored                        */
 	uint8_t *content;
 	uint32_t bytes;
 	const struct file *file; /* of any image that has it                              */
@@ -360,9 +361,14 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 		uint64_t unread = 0;
 		int waiting = 0;
 
+		end->why = other ? "what was in flight cannot be kept"
+				 : "its other end is not a connection of the group's";
 		if (other && is_tcp(end)) {
-			end->kept = has_come(end, other->written, &unread, until) &&
-				    keep_bytes(end, unread);
+			const bool come = has_come(end, other->written, &unread, until);
+
+			end->kept = come && keep_bytes(end, unread);
+			if (!come)
+				end->why = "some bytes had not arrived at the line";
 		} else if (other && ioctl(end->fd, SIOCINQ, &waiting) == 0) {
 			struct pollfd some = { .fd = end->fd, .events = POLLIN };
 
@@ -425,14 +431,19 @@ static bool try_show(struct group_end *end, struct avc_board *board)
 {
 	uint64_t written = 0, ignored;
 
-	if (!end->kept || end->bytes > CONTENT_MAX || !is_whole(end->fd) ||
+	if (!end->kept)
+		return false; /* end->why says it */
+	end->why = "it was closed, shut down or changed since";
+	if (end->bytes > CONTENT_MAX || !is_whole(end->fd) ||
 	    (is_tcp(end) && !count_tcp(end->fd, &written, &ignored, &ignored)))
 		return false;
+	end->why = "its other end cannot be restored";
 	if (!is_tcp(end))
 		empty(end->fd);
 	show(end, board, written);
 	if (end->shown < 0 || put_on_board(end, board))
 		return end->shown >= 0;
+	end->why = "what was in flight cannot be kept";
 	memset(&board->end[end->shown], 0, sizeof *board->end);
 	return false;
 }
@@ -564,7 +575,7 @@ static void mend_all(struct group_ends *ends, struct avc_end *others, enum mend_
 }
 
 uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
-			 const struct avc_config *config, struct avc_board *board)
+			 const struct avc_config *config, struct avc_board *board, const char **why)
 {
 	struct avc_end *others = ends ? calloc(ends->count + 1, sizeof *others) : NULL;
 	enum mend_state *states = ends ? calloc(ends->count + 1, sizeof *states) : NULL;
@@ -580,16 +591,20 @@ uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t 
 		struct group_end *end = &ends->end[i];
 		const enum mend_state state = others && states ? states[i] : APART;
 
+		const uint32_t before = ended;
 		if (end->fd < 0)
 			continue;
 		if (state == MENDED) {
 			let_go_on(image, images, end->ino);
 		} else if (state != APART && is_tcp(end)) {
+			end->why = "what was in flight could not be put back";
 			ended += file_reset_tcp(end->fd) == NULL;
 		} else {
 			forget(end->fd, end->file, config);
 			ended += !is_whole(end->fd);
 		}
+		if (ended > before)
+			*why = end->why;
 		drop_end(end);
 	}
 	free(others);

@@ -50,8 +50,9 @@ struct group_death {
 	struct avc_report report;
 	enum avc_reason reason;
 	uint64_t ticket, until_ns;
-	uint32_t had;   /* generations when it died                         */
-	uint32_t ended; /* connections that could not be restored with it   */
+	uint32_t had;    /* generations when it died                         */
+	uint32_t ended;  /* connections that could not be restored with it   */
+	const char *why; /* ... one of them                                  */
 };
 
 struct avc_guard {

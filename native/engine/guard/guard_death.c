@@ -220,8 +220,8 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		budget_begin(say_working, &guard->channel);
 		if (together && guard->dead.ended)
 			fail(&restore.notes, AVC_UNSUPPORTED, 0, guard->main.inside,
-			     "restore descriptors", "", "%u of its connections have ended",
-			     guard->dead.ended);
+			     "restore descriptors", "", "%u of its connections have ended: %s",
+			     guard->dead.ended, guard->dead.why);
 
 		/* Written since the newest means written since all others, also where that cannot
 		 * be seen any more. */
