@@ -32,6 +32,7 @@
 #define COMES_NS (2 * NS_PER_MS)   /* of all, while everything is stopped                */
 #define MEND_NS (500 * NS_PER_MS)  /* of all, when everything is dead                     */
 #define LOOK_US 20
+#define COUNT_TRIES 16
 #define ENDS_MAX 1024
 #define SYN_BYTES 1 /* the connecting end counts its SYN as acknowledged              */
 #define PROTOCOL_UNIX UINT32_C(256)
@@ -191,8 +192,7 @@ static bool name_unix(const struct file *f, struct group_end *end)
 	return true;
 }
 
-/* Bytes written by the application, received, and received but unread; false: unknown. */
-static bool count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
+static bool count_tcp_once(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
 {
 	struct tcp_info info = { 0 };
 	socklen_t bytes = sizeof info;
@@ -213,6 +213,16 @@ static bool count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *u
 	if (*written == sent + SYN_BYTES)
 		*written = sent;
 	return *written == sent;
+}
+
+/* Bytes written by the application, received, and received but unread; false: unknown.  An
+ * acknowledgement may come between two questions to the kernel: the other end may still run. */
+static bool count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
+{
+	for (int tries = 0; tries < COUNT_TRIES; tries++)
+		if (count_tcp_once(fd, written, received, unread))
+			return true;
+	return false;
 }
 
 static void show(struct group_end *end, struct avc_board *board, uint64_t written)
