@@ -39,6 +39,7 @@ static const int plain[] = {
 	SYS_wait4,
 	SYS_waitid,
 	SYS_kcmp,
+	SYS_getppid,
 	SYS_perf_event_open,
 	SYS_get_robust_list,
 	SYS_prlimit64,
