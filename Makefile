@@ -21,7 +21,7 @@ TESTS  ?= $(wildcard tests/unit tests/native tests/platform tests/integration)
 KERNELS ?= jammy bookworm noble trixie backports
 KERNEL_TESTS ?= tests/native
 # What `make test-machine` runs on Debian 13.
-MACHINE_TESTS ?= demo $(addprefix tests/integration/test_,hooks_podman.py quadlet.py run.py trees_scripts.py packages.py)
+MACHINE_TESTS ?= demo $(addprefix tests/integration/test_,hooks_podman.py quadlet.py run.py trees_scripts.py packages.py upgrade.py)
 
 # `make test-sqlite KILLS=20`, `make soak SECONDS=600`: shorter.
 KILLS   ?= 200
@@ -63,6 +63,9 @@ build-aarch64: setup-build ## cross-compile everything for aarch64, below build/
 
 deb: setup-build ## a Debian package for this Debian: command line, hooks, init, guard, sidecar as a service (build/*.deb)
 	@scripts/make-deb.sh
+
+deb-image: setup ## another, for a sidecar that is a container: its image (build/*.deb)
+	@scripts/make-deb-image.sh
 
 wheel: setup-build ## a wheel for pipx or pip, with everything `avckpt install --sidecar` needs (build/wheel)
 	@rm -rf build/wheel && $(VENV)/python -m pip wheel --disable-pip-version-check -q --no-deps --no-build-isolation -w build/wheel . && ls build/wheel
@@ -163,5 +166,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help deb wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels test-machine build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
+.PHONY: help deb deb-image wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels test-machine build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
 .DEFAULT_GOAL := help

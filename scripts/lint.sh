@@ -21,7 +21,7 @@ narrow() {
 	! LC_ALL=C.UTF-8 grep -nHP '^(?!\||    ).{101,}' "$@"
 }
 
-mapfile -t shell < <(git ls-files --cached --others --exclude-standard 'scripts/*.sh' packaging/deb/postinst packaging/deb/prerm .ci/run)
+mapfile -t shell < <(git ls-files --cached --others --exclude-standard 'scripts/*.sh' 'packaging/deb*/postinst' 'packaging/deb*/prerm' .ci/run)
 mapfile -t c < <(git ls-files --cached --others --exclude-standard '*.c' '*.h')
 
 check "ruff check" .venv/bin/ruff check .

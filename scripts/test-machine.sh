@@ -28,6 +28,7 @@ LIMIT=${LIMIT:-3h}
 in_world() {
 	# shellcheck disable=SC2016 # the words are for that shell
 	unshare --mount --pid --fork bash -c '
+		mount --bind "$1" "$1" || exit # Podman changes how its root is mounted
 		for name in sys dev; do mount --rbind "/$name" "$1/$name" || exit; done
 		mount -t proc proc "$1/proc" && mount -t tmpfs shm "$1/dev/shm" && mount -t tmpfs run "$1/run" || exit
 		mount --bind "$2" "$1/opt/avckpt" || exit
@@ -47,7 +48,19 @@ install_checkout() {
 	for file in /etc/resolv.conf /etc/hosts /etc/ssl/certs/ca-certificates.crt /etc/pip.conf; do
 		[ ! -e "$file" ] || cp -L "$file" "$WORLD$file" || return
 	done
-	in_world make -C /opt/avckpt build-tests || return
+	case "$*" in
+	*tests/native*) in_world make -C /opt/avckpt build-tests || return ;;
+	*) in_world sh -c 'make -C /opt/avckpt setup-build && make -s -C /opt/avckpt/tests/victims' || return ;;
+	esac
+	case "$*" in
+	*test_upgrade*)
+		in_world make -C /opt/avckpt deb || return
+		cp -u "$BUILD"/avckpt-sidecar-image_*.deb "$CHECKOUT/build/" || return
+		;;
+	esac
+}
+
+make_checkout_disk() {
 	rm -f "$MACHINE/checkout.disk" || return
 	truncate -s 4G "$MACHINE/checkout.disk" || return
 	mke2fs -q -t ext4 -d "$CHECKOUT" "$MACHINE/checkout.disk"
@@ -85,8 +98,9 @@ case "$*" in
 demo* | *tests/integration* | *tests/platform*) images=$(list_images) ;;
 esac
 key=$(content_key -- "$(cat "$MACHINE/world" "$MACHINE"/*/release)" "$images")
-[ "$(cat "$DISK.key" 2>/dev/null)" = "$key" ] || step machine-disk "making its disk" make_disk || die "no disk could be made"
 step machine-build "compiling this checkout for the machine" install_checkout "$@" || die "it could not be compiled"
+[ "$(cat "$DISK.key" 2>/dev/null)" = "$key" ] || step machine-disk "making its disk" make_disk || die "no disk could be made"
+step machine-checkout "putting the checkout on a disk" make_checkout_disk || die "no disk could be made"
 log=$LOGS/machine-$KERNEL.log
 say "${BOLD}==>${PLAIN} booting Linux $(cat "$MACHINE/$KERNEL/release"), emulated; what it says is in ${LOGS#"$ROOT"/}/machine-$KERNEL.console"
 disk() { printf -- '-drive\nfile=%s,format=raw,if=virtio,cache=unsafe,snapshot=on\n' "$1"; }

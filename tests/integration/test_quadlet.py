@@ -157,7 +157,11 @@ def test_systemd_restarts_what_is_not_undone(service: Callable[..., Service], si
     first = one.id
     crash(one, sidecar_unit, 1)
     os.kill(sidecar_unit.app_pid(one), signal.SIGSEGV)
-    wait_until(lambda: one.shown("NRestarts") == "1", PATIENCE_S, "systemd starts it once more", every_s=0.5)
+    try:
+        wait_until(lambda: one.shown("NRestarts") == "1", PATIENCE_S, "systemd starts it once more", every_s=0.5)
+    except TimeoutError:
+        print(one.shown("NRestarts"), one.shown("ActiveState"), journal(one.unit), sidecar_unit.logs())
+        raise
     wait_until(lambda: one.shown("ActiveState") == "active", PATIENCE_S, "it is ready", every_s=0.5)
     one.id = one.inspect()["Id"]
     assert one.id != first
