@@ -3,17 +3,16 @@
  * How the processes of a generation are made from those that will fork them (restore_tree.c): which
  * forks which, and a memory plan for each (remap.c).
  *
- * Comparing big processes takes longer than forking them: 50 ns a page, because the kernel walks
- * each.  Templates do not change, so it can be done as soon as they exist, while nothing waits for
- * it.  Its cost is limited; the rest is done when it is needed.
+ * Comparing processes takes longer than forking them: 0.4 ms, and 50 ns a page, because the kernel
+ * walks each.  Templates do not change, so it can be done as soon as they exist, while nothing waits
+ * for it.  Its cost is limited; the rest is done when it is needed.
  */
 #include <stdlib.h>
 
 #include "checkpoint.h"
 
-/* Fewer pages are compared at once. */
-#define WORTH_PAGES 1024
-/* The approximate time to compare a page. */
+/* The approximate time to compare a process, and each of its pages. */
+#define PROCESS_NS (400 * NS_PER_MS / 1000)
 #define PAGE_NS 60
 
 /* Of one image. */
@@ -140,12 +139,13 @@ bool restore_plan_next(struct generation *generation)
 		return false;
 	while (all->next < all->entries) {
 		const uint32_t i = all->next++;
-		const uint64_t pages = (uint64_t)generation->image[i].anon_pages;
+		const struct image *image = &generation->image[i];
+		const uint64_t takes_ns = PROCESS_NS + (uint64_t)image->anon_pages * PAGE_NS;
 		struct avc_error later = { 0 }; /* the restore will report it */
 
-		if (pages < WORTH_PAGES || pages * PAGE_NS > all->left_ns)
+		if (!image->process || takes_ns > all->left_ns)
 			continue;
-		all->left_ns -= pages * PAGE_NS;
+		all->left_ns -= takes_ns;
 		(void)restore_plan_of(generation, i, &later);
 		return true;
 	}
