@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Injects faults into protected programs, and counts what follows.
+"""Injects faults into programs in protected containers, and counts what follows.
 
     python -m bench.campaign --runs 50 --seconds 60        into bench/results/campaign.json
 
-Each run is a program of bench/faults in a PID namespace of its own, protected by a real sidecar as
-a container is.  It computes a known series and sends each term; an oracle compares.  A signal
-triggers the fault; what happens within `--seconds` of the first death (or of the signal,
-where there is none) decides.  Every run is counted, once:
+Each run is a program of bench/faults in a container of Podman's, with hooks and sidecar of this
+checkout: its own, so that the machine's are left alone.  It computes a known series and sends each
+term; an oracle compares.  A node of ROS publishes the terms instead, and another node, which is not
+protected, sends on what it hears.  A signal triggers the fault; what happens within `--seconds` of
+the first death (or of the signal, where there is none) decides.  Every run is counted, once:
 
     wrong      a wrong term was sent
     cold       the container ended: all its state is lost
@@ -14,6 +15,8 @@ where there is none) decides.  Every run is counted, once:
     recovered  it died once, and continues correctly
     stuck      it lives, and sends nothing
     unharmed   it did not die, and continues correctly
+
+`--label avckpt.keep=4` and so on change what the containers are protected with.
 """
 
 from __future__ import annotations
@@ -21,7 +24,6 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -32,43 +34,54 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from avckpt.cli.client import Client
+from avckpt.errors import AvckptError
 
-from testkit.harness import ROOT, wait_until
-from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
+from testkit.harness import BASE_IMAGE, ROOT, CommandFailed, Podman, wait_until
+from testkit.local_sidecar import LocalSidecar, local_sidecar
 
 RESULTS = ROOT / "bench" / "results" / "campaign.json"
 FAULTS = ROOT / "bench" / "faults"
+ROS_IMAGE = "localhost/avckpt-ros:latest"
+ROS_BUILD_IMAGE = "localhost/avckpt-ros-build"
 OUTCOMES = ("recovered", "recrashed", "wrong", "cold", "stuck", "unharmed")
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "200ms"}
 POISON_EVERY_S = 1.0
 """Poison comes back: whoever sent it has had no answer."""
 SILENT_S = 2.0
+OUT_OF_MEMORY = "memory leak to the OOM killer"
+MEMORY = "300m"
+"""Of a container that leaks."""
+COMPILE = ("g++", "-O1", "-g", "-w", "-pthread", "-fstack-protector-all")
+"""-w: compilers see some of the faults."""
 
 EVERYWHERE = (
     *("null pointer", "index out of range", "uncaught exception", "stack overflow", "exit with a status"),
     *("descriptor leak", "killed from outside", "fault in another thread", "poison input"),
     *("poison input, one in four", "corruption before the checkpoint", "wrong value, no crash"),
-    *("deadlock", "livelock", "lost wake-up"),
+    *("deadlock", "livelock", "lost wake-up", "disk full", OUT_OF_MEMORY),
 )
+NOT_ROS = ("death of a thread",)
 NOT_GO = (
     *("double free", "assertion", "truncated mapped file", "memory leak to a limit", "death of a child"),
-    *("deadlock, own watchdog", "livelock, own watchdog", "lost wake-up, own watchdog"),
+    *("deadlock, own watchdog", "livelock, own watchdog", "lost wake-up, own watchdog", "timer without a handler"),
 )
+ONLY_CPP = (
+    *("wild pointer", "write to constant", "call through null", "use after free", "heap corruption found later"),
+    *("stack smashed", "division by zero", "illegal instruction", "race", "hang in a callback", "broken pipe"),
+    *("hang in a callback, own watchdog", "the only thread ends", "pure virtual call", "huge allocation"),
+)
+WATCHED_THREAD = "death of a thread, own watchdog"
 LANGUAGES = {
-    "C++": (
-        *EVERYWHERE,
-        *NOT_GO,
-        *("wild pointer", "write to constant", "call through null", "use after free", "heap corruption found later"),
-        *("stack smashed", "division by zero", "illegal instruction", "race", "hang in a callback"),
-        *("hang in a callback, own watchdog", "the only thread ends"),
-    ),
-    "Python": (*EVERYWHERE, *NOT_GO, "abort"),
-    "Go": (*EVERYWHERE, "division by zero", "race"),
+    "C++": (*EVERYWHERE, *NOT_ROS, *NOT_GO, *ONLY_CPP, WATCHED_THREAD),
+    "Python": (*EVERYWHERE, *NOT_ROS, *NOT_GO, "abort", WATCHED_THREAD),
+    "Go": (*EVERYWHERE, *NOT_ROS, "division by zero", "race"),
+    "ROS": (*EVERYWHERE, *NOT_GO, *(fault for fault in ONLY_CPP if fault != "the only thread ends")),
 }
 
 
@@ -119,6 +132,7 @@ class Cell:
 
     fault: str
     language: str
+    image: str
     command: list[str]
     counted: dict[str, int] = field(default_factory=lambda: dict.fromkeys(OUTCOMES, 0))
     detected_s: list[float] = field(default_factory=list)
@@ -139,37 +153,81 @@ class Cell:
         }
 
 
+@dataclass(frozen=True)
+class World:
+    """Where containers run: a Podman whose hooks, and whose sidecar, are this checkout's and ours alone."""
+
+    podman: Podman
+    sidecar: LocalSidecar
+    programs: Path
+    labels: dict[str, str]
+    core: str
+    """The container of ROS's master; empty: there is none."""
+    core_port: int
+
+    def start(self, name: str, image: str, command: Sequence[str], options: Sequence[str], *, protect: bool) -> str:
+        """A container; its id.  Raises CommandFailed."""
+        labels = {key: value for key, value in self.labels.items() if protect}
+        words = [word for key, value in labels.items() for word in ("--label", f"{key}={value}")]
+        env = ("--env", f"ROS_MASTER_URI=http://127.0.0.1:{self.core_port}", "--env", "ROS_IP=127.0.0.1")
+        return self.podman.run(
+            *("run", "--detach", "--pull=never", "--network=host", "--volume", f"{self.programs}:/faults:ro"),
+            *("--name", name, *words, *env, *options, image, *command),
+        ).stdout.strip()
+
+
+@contextlib.contextmanager
+def world(programs: Path, labels: dict[str, str], *, ros: bool) -> Iterator[World]:
+    """One, for some runs."""
+    with tempfile.TemporaryDirectory() as folder, local_sidecar(Path(folder)) as sidecar:
+        sidecar.start()
+        hooks = Path(folder) / "oci-hooks.d"
+        hooks.mkdir()
+        for source in (ROOT / "oci-hooks.d").glob("*.json"):
+            data = json.loads(source.read_text())
+            data["hook"]["path"] = str(ROOT / "hooks" / "avckpt-hook")
+            data["hook"]["env"].append(f"AVCKPT_RUN_DIR={sidecar.run_dir}")
+            (hooks / source.name).write_text(json.dumps(data))
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port: int = probe.getsockname()[1]
+        core = f"avckpt-campaign-{os.getpid()}-core" if ros else ""
+        made = World(Podman("--hooks-dir", str(hooks)), sidecar, programs, labels, core, port)
+        try:
+            if ros:
+                made.start(core, ROS_IMAGE, ["rosmaster", "--core", "-p", str(port)], [], protect=False)
+            yield made
+        finally:
+            if ros:
+                made.podman.remove(core)
+
+
 class Run:
     """One of them."""
 
-    def __init__(self, sidecar: LocalSidecar, cell: Cell, name: str, seconds: float) -> None:
-        self._sidecar = sidecar
-        self._client = Client(sidecar.run_dir)
+    def __init__(self, world: World, cell: Cell, name: str, seconds: float) -> None:
+        self._world = world
+        self._client = Client(world.sidecar.run_dir)
         self._cell = cell
         self._seconds = seconds
         self.name = name
         self._oracle = Oracle()
-        self._container: Container | None = None
 
     def outcome(self) -> str:
-        """Makes it.  Raises TimeoutError, AssertionError or OSError when the program could not be protected."""
+        """Makes it.  Raises TimeoutError, OSError or CommandFailed when the program could not be protected."""
+        cell, port = self._cell, str(self._oracle.port)
         try:
-            command = [*self._cell.command, self._cell.fault, str(self._oracle.port)]
-            # Not the place in a list from which others are taken away at the same time.
-            identity = hashlib.sha256(self.name.encode()).hexdigest()
-            self._container = self._sidecar.container(self.name, command, identity)
-            said = self._container.hook("prestart", LABELS)
-            if said:
-                raise OSError(said.strip())
-            wait_until(lambda: self._row()["generations"] >= 2, 30, "it is protected", every_s=0.1)
+            if cell.language == "ROS":
+                self._world.podman.run("exec", "--detach", self._world.core, cell.command[0], "relay", port)
+            options = ("--memory", MEMORY, "--memory-swap", MEMORY) if cell.fault == OUT_OF_MEMORY else ()
+            self._world.start(self.name, cell.image, [*cell.command, cell.fault, port], options, protect=True)
+            wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
             wait_until(lambda: self._oracle.heard > 20, 30, "it computes", every_s=0.1)
             self._bring_out()
             return self._judge()
         finally:
             self._oracle.close()
-            if self._container is not None:
-                self._container.close()
-                self._sidecar.containers.remove(self._container)
+            self._world.podman.remove(self.name)
 
     def _bring_out(self) -> None:
         pid = int(self._row()["app_pid"])
@@ -199,27 +257,44 @@ class Run:
         return "unharmed" if not row["restores"] else "recovered" if row["restores"] == 1 else "recrashed"
 
     def _row(self) -> dict[str, Any]:
-        assert self._container is not None
         rows = self._client.containers(ended=True, memory=False)
-        return next(row for row in reversed(rows) if row["name"] == self.name)
+        return next((row for row in reversed(rows) if row["name"] == self.name), {})
 
 
 def cells(build: Path, wanted: set[str]) -> list[Cell]:
-    """All that this machine can make, its programs compiled into `build`."""
+    """All that this machine can make, its programs put into `build`."""
+    shutil.copy(FAULTS / "faults.py", build)
     made = []
-    commands = {"Python": [sys.executable, str(FAULTS / "faults.py")]}
+    commands = {"Python": (BASE_IMAGE, ["python3", "/faults/faults.py"])}
     if "C++" in wanted:
-        options = ["-O1", "-g", "-w", "-pthread", "-fstack-protector-all"]  # -w: compilers see some of the faults
-        subprocess.run(["g++", *options, "-o", str(build / "cpp"), str(FAULTS / "faults.cpp")], check=True)
-        commands["C++"] = [str(build / "cpp")]
+        subprocess.run([*COMPILE, "-o", str(build / "cpp"), str(FAULTS / "faults.cpp")], check=True)
+        commands["C++"] = (BASE_IMAGE, ["/faults/cpp"])
     if "Go" in wanted and shutil.which("go"):
-        env = {**os.environ, "GOCACHE": str(build / "cache"), "GO111MODULE": "off"}
+        env = {**os.environ, "GOCACHE": str(build / "cache"), "GO111MODULE": "off", "CGO_ENABLED": "0"}
         subprocess.run(["go", "build", "-o", str(build / "go"), str(FAULTS / "faults.go")], check=True, env=env)
-        commands["Go"] = [str(build / "go")]
+        commands["Go"] = (BASE_IMAGE, ["/faults/go"])
+    if "ROS" in wanted and compile_ros(build):
+        commands["ROS"] = (ROS_IMAGE, ["/faults/ros"])
     for language, faults in LANGUAGES.items():
         if language in commands and language in wanted:
-            made += [Cell(fault, language, commands[language]) for fault in faults]
+            made += [Cell(fault, language, *commands[language]) for fault in faults]
     return made
+
+
+def compile_ros(build: Path) -> bool:
+    """With Debian's ROS 1, in a container (scripts/setup-ros.sh); whether there is one."""
+    podman = Podman()
+    images = podman.run("images", "--format", "{{.Repository}}:{{.Tag}}", ROS_BUILD_IMAGE).stdout.split()
+    if not images or podman.run("image", "exists", ROS_IMAGE, check=False).status != 0:
+        return False
+    compiler = " ".join((*COMPILE, "-DROS", "-o", "/out/ros", "/src/faults.cpp"))
+    libraries = "$(pkg-config --cflags --libs roscpp std_msgs) -lboost_system -lboost_thread"
+    podman.run(
+        *("run", "--rm", "--pull=never", "--network=none", "--volume", f"{FAULTS}:/src:ro"),
+        *("--volume", f"{build}:/out", images[0], "sh", "-c", f"{compiler} {libraries}"),
+        timeout_s=600,
+    )
+    return True
 
 
 def times(sidecar: LocalSidecar, names: dict[str, Cell]) -> None:
@@ -231,50 +306,53 @@ def times(sidecar: LocalSidecar, names: dict[str, Cell]) -> None:
             cell.detected_s += [event["detected_s"]] if "detected_s" in event else []
 
 
-def one_round(made: list[Cell], number: int, parallel: int, seconds: float) -> None:
+def one_round(made: list[Cell], number: int, options: argparse.Namespace, programs: Path) -> None:
     """Each of them once, under a sidecar of its own."""
     names: dict[str, Cell] = {}
-    with tempfile.TemporaryDirectory() as folder, local_sidecar(Path(folder)) as sidecar:
-        sidecar.start()
-        with concurrent.futures.ThreadPoolExecutor(parallel) as pool:
+    labels = {**LABELS, **dict(pair.split("=", 1) for pair in options.label)}
+    with world(programs, labels, ros=any(cell.language == "ROS" for cell in made)) as here:
+        with concurrent.futures.ThreadPoolExecutor(options.parallel) as pool:
             runs: dict[concurrent.futures.Future[str], Cell] = {}
             for i, cell in enumerate(made):
-                name = f"run-{number}-{i}"
+                name = f"avckpt-campaign-{os.getpid()}-{number}-{i}"
                 names[name] = cell
-                runs[pool.submit(lambda c=cell, n=name: Run(sidecar, c, n, seconds).outcome())] = cell  # type: ignore[misc]
+                runs[pool.submit(lambda c=cell, n=name: Run(here, c, n, options.seconds).outcome())] = cell  # type: ignore[misc]
             for done in concurrent.futures.as_completed(runs):
                 cell = runs[done]
                 try:
                     cell.counted[done.result()] += 1
-                except (TimeoutError, AssertionError, OSError, StopIteration, subprocess.SubprocessError) as error:
+                except (OSError, CommandFailed, AvckptError, KeyError, subprocess.SubprocessError) as error:
                     cell.failed += 1
-                    print(f"{cell.language}, {cell.fault}: not made: {str(error)[:200]}", file=sys.stderr)
-        times(sidecar, names)
+                    print(f"{cell.language}, {cell.fault}: not made: {str(error)[-300:]}", file=sys.stderr)
+        times(here.sidecar, names)
 
 
 def main() -> None:
     """Makes the campaign."""
-    parser = argparse.ArgumentParser(description="inject faults into protected programs")
+    parser = argparse.ArgumentParser(description="inject faults into programs in protected containers")
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--parallel", type=int, default=4)
     parser.add_argument("--language", action="append", choices=sorted(LANGUAGES))
     parser.add_argument("--fault", action="append")
+    parser.add_argument("--label", action="append", default=[], metavar="NAME=VALUE", help="another label of theirs")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     begun = time.monotonic()
     with tempfile.TemporaryDirectory() as build:
+        Path(build).chmod(0o755)
         made = cells(Path(build), set(options.language or LANGUAGES))
         made = [cell for cell in made if not options.fault or cell.fault in options.fault]
         for number in range(options.runs):
-            one_round(made, number, options.parallel, options.seconds)
-            write(options.output, made, options.seconds)
+            one_round(made, number, options, Path(build))
+            write(options.output, made, options)
             print(f"round {number + 1} of {options.runs}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
 
-def write(path: Path, made: list[Cell], seconds: float) -> None:
+def write(path: Path, made: list[Cell], options: argparse.Namespace) -> None:
     """The results so far."""
-    path.write_text(json.dumps([{**cell.to_json(), "seconds": seconds} for cell in made], indent=1) + "\n")
+    found = [{**cell.to_json(), "seconds": options.seconds, "labels": options.label} for cell in made]
+    path.write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

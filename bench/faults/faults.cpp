@@ -4,6 +4,9 @@
 //
 // It computes a known series from what it keeps in memory, and sends each term with its number to
 // 127.0.0.1:PORT, a hundred a second.  SIGUSR1 brings the fault out.
+//
+// With -DROS it is a node of ROS 1, which computes in the callback of a timer and publishes on
+// /terms_PORT; `faults relay PORT` is the node that hears it, and sends to PORT.
 #include <arpa/inet.h>
 #include <cassert>
 #include <condition_variable>
@@ -13,6 +16,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <fcntl.h>
+#include <functional>
 #include <map>
 #include <mutex>
 #include <pthread.h>
@@ -25,6 +29,10 @@
 #include <thread>
 #include <unistd.h>
 #include <vector>
+#ifdef ROS
+#include <ros/ros.h>
+#include <std_msgs/String.h>
+#endif
 
 static volatile sig_atomic_t triggered;
 static std::string fault;
@@ -158,6 +166,39 @@ static void use_after_free()
 	sink = dead->area();
 }
 
+static void overflow_disk()
+{
+	FILE *full = fopen("/dev/full", "w");
+
+	if (fputs("result", full) < 0 || fclose(full))
+		throw std::runtime_error("disk full");
+}
+
+static void write_to_nobody()
+{
+	int ends[2];
+
+	if (pipe(ends))
+		abort();
+	close(ends[0]);
+	sink = write(ends[1], "x", 1);
+}
+
+struct Base;
+static void call_early(Base *base);
+struct Base {
+	Base() { call_early(this); }
+	virtual ~Base() = default;
+	virtual int area() = 0;
+};
+struct Derived : Base {
+	int area() override { return 1; }
+};
+__attribute__((noinline)) static void call_early(Base *base)
+{
+	sink = base->area();
+}
+
 static void break_down()
 {
 	if (fault == "null pointer")
@@ -188,6 +229,16 @@ static void break_down()
 		abort();
 	else if (fault == "uncaught exception")
 		throw std::runtime_error("nobody catches this");
+	else if (fault == "pure virtual call")
+		delete new Derived;
+	else if (fault == "huge allocation")
+		sink = *new char[(size_t)1 << 60];
+	else if (fault == "disk full")
+		overflow_disk();
+	else if (fault == "broken pipe")
+		write_to_nobody();
+	else if (fault == "timer without a handler")
+		alarm(1);
 	else if (fault == "index out of range")
 		sink = std::vector<int>(3).at(7);
 	else if (fault == "exit with a status")
@@ -216,59 +267,142 @@ static void break_down()
 		sink = *null_pointer;
 }
 
-int main(int argc, char **argv)
-{
-	if (argc != 3)
-		return 2;
-	fault = argv[1];
-	const bool watched = fault.find("own watchdog") != std::string::npos;
-	const int out = socket(AF_INET, SOCK_DGRAM, 0);
-	sockaddr_in to = {};
-	uint64_t number = 0;
-	std::vector<uint64_t> kept(1000);
-	uint64_t *pointer = kept.data();
-	int corrupted = 0, bad_at = 0;
-	pid_t child = 0;
-
-	to.sin_family = AF_INET;
-	to.sin_port = htons(atoi(argv[2]));
-	to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-	signal(SIGUSR1, on_trigger);
-	srand(getpid());
-	if (fault == "death of a child") {
-		child = fork();
-		if (!child)
-			hang();
+// The series, a term at a time, until it is told to break down.
+class Program {
+public:
+	Program(std::function<void(const std::string &)> send, bool watched)
+		: send_(std::move(send)), watched_(watched)
+	{
+		if (fault == "death of a child") {
+			child_ = fork();
+			if (!child_)
+				hang();
+		}
 	}
-	for (int seen = 0;;) {
-		if (watched)
+
+	// Whether there is another one.
+	bool step()
+	{
+		if (watched_)
 			alarm(2);
-		kept[(number + 1) % 1000] = next_term(pointer[number % 1000]);
-		number++;
-		char text[64];
-		const int length = snprintf(text, sizeof text, "%llu %llu", (unsigned long long)number,
-					    (unsigned long long)pointer[number % 1000]);
-		sendto(out, text, length, 0, (const sockaddr *)&to, sizeof to);
-		if (child && waitpid(child, nullptr, WNOHANG) == child)
+		kept_[(number_ + 1) % 1000] = next_term(pointer_[number_ % 1000]);
+		number_++;
+		send_(std::to_string(number_) + " " + std::to_string(pointer_[number_ % 1000]));
+		if (child_ && waitpid(child_, nullptr, WNOHANG) == child_)
 			exit(4);
 		// Found only half a second after it has come about, with checkpoints in between.
-		if (corrupted && ++bad_at == 50)
-			sink = *(volatile int *)(uintptr_t)corrupted;
-		if (seen != triggered) {
-			seen = triggered;
-			if (fault == "corruption before the checkpoint")
-				corrupted = 8;
-			else if (fault == "wrong value, no crash")
-				kept[number % 1000] ^= 1u << 20;
-			else if (fault == "death of a child")
-				kill(child, SIGKILL);
-			else if (fault == "the only thread ends")
-				pthread_exit(nullptr);
-			else if (fault == "fault in another thread")
-				std::thread([] { sink = *null_pointer; }).detach();
-			else
-				break_down();
-		}
-		nap(10);
+		if (corrupted_ && ++bad_at_ == 50)
+			sink = *(volatile int *)(uintptr_t)corrupted_;
+		if (leaks_)
+			memset(new char[1 << 20], 1, 1 << 20);
+		if (seen_ == triggered)
+			return true;
+		seen_ = triggered;
+		if (fault == "corruption before the checkpoint")
+			corrupted_ = 8;
+		else if (fault == "wrong value, no crash")
+			kept_[number_ % 1000] ^= 1u << 20;
+		else if (fault == "memory leak to the OOM killer")
+			leaks_ = true;
+		else if (fault == "death of a child")
+			kill(child_, SIGKILL);
+		else if (fault == "the only thread ends")
+			pthread_exit(nullptr);
+		else if (fault == "fault in another thread")
+			std::thread([] { sink = *null_pointer; }).detach();
+		else if (ends_silently())
+			return false;
+		else
+			break_down();
+		return true;
 	}
+
+	static bool ends_silently() { return fault.rfind("death of a thread", 0) == 0; }
+
+private:
+	std::function<void(const std::string &)> send_;
+	bool watched_, leaks_ = false;
+	uint64_t number_ = 0;
+	std::vector<uint64_t> kept_ = std::vector<uint64_t>(1000);
+	uint64_t *pointer_ = kept_.data();
+	int corrupted_ = 0, bad_at_ = 0, seen_ = 0;
+	pid_t child_ = 0;
+};
+
+static std::function<void(const std::string &)> sender(const char *port)
+{
+	const int out = socket(AF_INET, SOCK_DGRAM, 0);
+	sockaddr_in to = {};
+
+	to.sin_family = AF_INET;
+	to.sin_port = htons(atoi(port));
+	to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+	return [out, to](const std::string &text) {
+		sendto(out, text.data(), text.size(), 0, (const sockaddr *)&to, sizeof to);
+	};
+}
+
+#ifdef ROS
+
+static int run(const char *port, bool watched)
+{
+	ros::NodeHandle node;
+
+	if (fault == "relay") {
+		const auto send = sender(port);
+		const auto hear = [&](const std_msgs::String::ConstPtr &term) { send(term->data); };
+		const ros::Subscriber terms = node.subscribe<std_msgs::String>(
+			std::string("/terms_") + port, 100, hear);
+		ros::spin();
+		return 0;
+	}
+	const ros::Publisher terms =
+		node.advertise<std_msgs::String>(std::string("/terms_") + port, 100);
+	Program program(
+		[&](const std::string &text) {
+			std_msgs::String term;
+			term.data = text;
+			terms.publish(term);
+		},
+		watched);
+	ros::WallTimer timer;
+	timer = node.createWallTimer(ros::WallDuration(0.01), [&](const ros::WallTimerEvent &) {
+		if (!program.step())
+			timer.stop();
+	});
+	ros::spin();
+	return 0;
+}
+
+#else
+
+static int run(const char *port, bool watched)
+{
+	Program program(sender(port), watched);
+	const auto work = [&] {
+		while (program.step())
+			nap(10);
+	};
+
+	if (Program::ends_silently())
+		std::thread(work).join();
+	else
+		work();
+	hang();
+	return 0;
+}
+
+#endif
+
+int main(int argc, char **argv)
+{
+	if (argc < 3)
+		return 2;
+#ifdef ROS
+	ros::init(argc, argv, std::string(argv[1] == std::string("relay") ? "relay_" : "faults_") + argv[2]);
+#endif
+	fault = argv[1];
+	signal(SIGUSR1, on_trigger);
+	srand(getpid());
+	return run(argv[2], fault.find("own watchdog") != std::string::npos);
 }

@@ -4,6 +4,7 @@
 package main
 
 import (
+	"bytes"
 	"fmt"
 	"math/rand"
 	"net"
@@ -49,6 +50,10 @@ func breakDown(fault string) {
 		fmt.Println(recurse(0))
 	case fault == "exit with a status":
 		os.Exit(3)
+	case fault == "disk full":
+		if err := os.WriteFile("/dev/full", []byte("result"), 0o600); err != nil {
+			panic(err)
+		}
 	case fault == "race":
 		for t := 0; t < 2; t++ {
 			go func() {
@@ -94,27 +99,39 @@ func main() {
 			atomic.AddInt32(&triggered, 1)
 		}
 	}()
-	kept := make([]uint64, 1000)
-	seen, bad := int32(0), 0
-	for number := uint64(1); ; number++ {
-		kept[number%1000] = kept[(number-1)%1000]*6364136223846793005 + 1442695040888963407
-		fmt.Fprintf(out, "%d %d", number, kept[number%1000])
-		if bad > 0 {
-			if bad--; bad == 0 {
-				fmt.Println(*nothing)
+	work := func() {
+		kept := make([]uint64, 1000)
+		seen, bad := int32(0), 0
+		var leaked [][]byte
+		for number := uint64(1); ; number++ {
+			kept[number%1000] = kept[(number-1)%1000]*6364136223846793005 + 1442695040888963407
+			fmt.Fprintf(out, "%d %d", number, kept[number%1000])
+			if bad > 0 {
+				if bad--; bad == 0 {
+					fmt.Println(*nothing)
+				}
 			}
-		}
-		if now := atomic.LoadInt32(&triggered); now != seen {
-			seen = now
-			switch fault {
-			case "corruption before the checkpoint":
-				bad = 50
-			case "wrong value, no crash":
-				kept[number%1000] ^= 1 << 20
-			default:
-				breakDown(fault)
+			if leaked != nil {
+				leaked = append(leaked, bytes.Repeat([]byte{1}, 1<<20))
 			}
+			if now := atomic.LoadInt32(&triggered); now != seen {
+				seen = now
+				switch fault {
+				case "corruption before the checkpoint":
+					bad = 50
+				case "wrong value, no crash":
+					kept[number%1000] ^= 1 << 20
+				case "memory leak to the OOM killer":
+					leaked = [][]byte{}
+				case "death of a thread":
+					return
+				default:
+					breakDown(fault)
+				}
+			}
+			time.Sleep(10 * time.Millisecond)
 		}
-		time.Sleep(10 * time.Millisecond)
 	}
+	go work()
+	select {}
 }

@@ -68,6 +68,11 @@ def break_down(fault: str) -> None:
         os.abort()
     elif fault == "exit with a status":
         sys.exit(3)
+    elif fault == "disk full":
+        with open("/dev/full", "w") as full:
+            full.write("result")
+    elif fault == "timer without a handler":
+        signal.alarm(1)
     elif fault == "truncated mapped file":
         fd = os.memfd_create("mapped")
         os.ftruncate(fd, 8192)
@@ -99,42 +104,74 @@ def break_down(fault: str) -> None:
         raise ValueError("poison")
 
 
+class Program:
+    """The series, a term at a time, until it is told to break down."""
+
+    def __init__(self, fault: str, port: int) -> None:
+        self._fault = fault
+        self._to = ("127.0.0.1", port)
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._kept, self._number, self._seen, self._bad_in = [0] * 1000, 0, 0, 0
+        self._leaked: list[bytearray] | None = None
+        self._child = 0
+        if fault == "death of a child":
+            self._child = os.fork()
+            while not self._child:
+                time.sleep(1000)
+
+    def step(self) -> bool:
+        """Whether there is another one."""
+        if "own watchdog" in self._fault:
+            signal.alarm(2)
+        kept, number = self._kept, self._number
+        kept[(number + 1) % 1000] = (kept[number % 1000] * 6364136223846793005 + 1442695040888963407) % 2**64
+        self._number = number = number + 1
+        self._out.sendto(f"{number} {kept[number % 1000]}".encode(), self._to)
+        if self._child and os.waitpid(self._child, os.WNOHANG)[0] == self._child:
+            sys.exit(4)
+        if self._leaked is not None:
+            self._leaked.append(bytearray(b"x" * (1 << 20)))
+        if self._bad_in:
+            self._bad_in -= 1
+            if not self._bad_in:
+                ctypes.string_at(8)
+        if self._seen == triggered:
+            return True
+        self._seen = triggered
+        return self._break_down()
+
+    def _break_down(self) -> bool:
+        if self._fault == "corruption before the checkpoint":
+            self._bad_in = 50
+        elif self._fault == "wrong value, no crash":
+            self._kept[self._number % 1000] ^= 1 << 20
+        elif self._fault == "memory leak to the OOM killer":
+            self._leaked = []
+        elif self._fault == "death of a child":
+            os.kill(self._child, signal.SIGKILL)
+        elif self._fault == "fault in another thread":
+            threading.Thread(target=lambda: ctypes.string_at(0)).start()
+        elif self._fault.startswith("death of a thread"):
+            return False
+        else:
+            break_down(self._fault)
+        return True
+
+    def work(self) -> None:
+        while self.step():
+            time.sleep(0.01)
+
+
 def main() -> None:
     """Computes, sends, and breaks down when it is told to."""
     fault, port = sys.argv[1], int(sys.argv[2])
-    out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    kept, number, seen, bad_in = [0] * 1000, 0, 0, 0
     signal.signal(signal.SIGUSR1, on_trigger)
-    child = 0
-    if fault == "death of a child":
-        child = os.fork()
-        while not child:
-            time.sleep(1000)
-    while True:
-        if "own watchdog" in fault:
-            signal.alarm(2)
-        kept[(number + 1) % 1000] = (kept[number % 1000] * 6364136223846793005 + 1442695040888963407) % 2**64
-        number += 1
-        out.sendto(f"{number} {kept[number % 1000]}".encode(), ("127.0.0.1", port))
-        if child and os.waitpid(child, os.WNOHANG)[0] == child:
-            sys.exit(4)
-        if bad_in:
-            bad_in -= 1
-            if not bad_in:
-                ctypes.string_at(8)
-        if seen != triggered:
-            seen = triggered
-            if fault == "corruption before the checkpoint":
-                bad_in = 50
-            elif fault == "wrong value, no crash":
-                kept[number % 1000] ^= 1 << 20
-            elif fault == "death of a child":
-                os.kill(child, signal.SIGKILL)
-            elif fault == "fault in another thread":
-                threading.Thread(target=lambda: ctypes.string_at(0)).start()
-            else:
-                break_down(fault)
-        time.sleep(0.01)
+    program = Program(fault, port)
+    if fault.startswith("death of a thread"):
+        threading.Thread(target=program.work).start()
+        while True:
+            time.sleep(0.01)
+    program.work()
 
 
 if __name__ == "__main__":
