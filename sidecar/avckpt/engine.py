@@ -262,6 +262,7 @@ def _event(e: Any) -> Event:
         restores=e.restores,
         checkpoints=e.checkpoints,
         remains_pid=e.remains_pid,
+        likeness_pid=e.likeness_pid,
         interval_s=e.interval_ns / _NS_PER_S,
         freeze_max_s=e.freeze_max_ns / _NS_PER_S,
         freeze_s=e.freeze_ns / _NS_PER_S,

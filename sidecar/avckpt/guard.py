@@ -28,6 +28,7 @@ class Command(enum.IntEnum):
     RELEASE = 8
     LIST = 9
     ABANDON = 10
+    SEEN = 11
 
 
 class Files(enum.IntEnum):
@@ -138,6 +139,7 @@ class Event:
     restores: int = 0
     checkpoints: int = 0
     remains_pid: int = 0
+    likeness_pid: int = 0
     interval_s: float = 0.0
     freeze_max_s: float = 0.0
     freeze_s: float = 0.0

@@ -51,6 +51,14 @@ def test_the_thread_that_was_hit_is_not_one_that_followed() -> None:
     assert (crash.code, crash.fault, crash.thread, crash.tid) == ("SEGV_MAPERR", "0x10", "worker", 6)
 
 
+def test_a_signal_without_a_core_is_delivered_as_a_kill() -> None:
+    death = Death(5, {6: delivery(6, 9, at_ns=90), 5: delivery(5, 9, at_ns=100)})
+    hit = death.fatal(15)
+    assert hit is not None
+    assert hit.tid == 5
+    assert Death(5).fatal(15) is None
+
+
 def test_who_sent_it() -> None:
     death = Death(5, {5: delivery(5, 9)}, [Sent(90, 9, 0, 77, 5, "app"), Sent(200, 9, 0, 78, 5, "app")])
     assert crash_of("SIGKILL", death.fatal(9), death, None).sender_pid == 77

@@ -22,6 +22,7 @@
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
 #define LAST_WORDS_MS 1000
+#define SEEN_NS (200 * NS_PER_MS)     /* for the daemon to look at the memory of the dead */
 #define REQUEST_FDS 2                 /* sent with one, at most                                  */
 #define DEAD_LOOK_NS (50 * NS_PER_MS) /* while it waits for its group: init is notified */
 #define GUARD_UNTOLD 3 /* exit status: no valid start message from the same build      */
@@ -197,6 +198,8 @@ static void obey(struct avc_guard *guard, const struct avc_request *request)
 		if (ticket == (uint64_t)guard->remains.pid)
 			guard_release_remains(guard);
 		break;
+	case AVC_COMMAND_SEEN: /* guard_await_seen(); it was restored meanwhile */
+		break;
 	case AVC_COMMAND_LIST:
 		list(guard, ticket);
 		break;
@@ -270,6 +273,38 @@ static void carry_out_one(struct avc_guard *guard, const struct avc_request *req
 		break;
 	case AVC_REQUEST_RECALL:
 		guard_recall(guard, request, fd);
+		break;
+	}
+}
+
+/* An init that ends takes the memory of the dead with it.  Does not carry out anything: what comes
+ * before the answer ends the wait. */
+void guard_await_seen(struct avc_guard *guard)
+{
+	const pid_t pid = guard->unseen;
+	const uint64_t end = now_ns() + SEEN_NS;
+	struct avc_request request;
+	size_t count;
+	int fds[REQUEST_FDS];
+
+	guard->unseen = 0;
+	if (!pid)
+		return;
+	send_outbox(guard);
+	for (uint64_t now; (now = now_ns()) < end;) {
+		const struct timespec left = timespec_of(end - now);
+		struct pollfd socket = { .fd = guard->socket, .events = POLLIN };
+
+		if (ppoll(&socket, 1, &left, NULL) <= 0)
+			continue;
+		if (receive(guard->socket, &request, MSG_DONTWAIT | MSG_PEEK, fds, &count) ==
+			    sizeof request &&
+		    !count && request.kind == AVC_REQUEST_COMMAND &&
+		    request.command == AVC_COMMAND_SEEN && request.ticket == (uint64_t)pid)
+			(void)receive(guard->socket, &request, MSG_DONTWAIT, fds, &count);
+		else
+			for (size_t i = 0; i < count; i++)
+				close_fd(&fds[i]); /* of a peeked message these are duplicates */
 		break;
 	}
 }

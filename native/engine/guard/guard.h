@@ -110,6 +110,7 @@ struct avc_guard {
 		int pidfd;
 		uint64_t until_ns;
 	} remains;
+	pid_t unseen; /* the same, as told to the daemon, which has to look yet; 0: need not */
 };
 
 /* ---- guard.c: events ------------------------------------------------------- */
@@ -119,6 +120,9 @@ void guard_emit(struct avc_guard *guard, const struct avc_event *event);
 void guard_emit_error(struct avc_guard *guard, enum avc_event_kind kind, uint64_t ticket,
 		      const struct avc_error *error);
 void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, const char *why);
+
+/* Before the container ends: gives the daemon a moment to look at the memory of the dead. */
+void guard_await_seen(struct avc_guard *guard);
 
 /* Releases threads that stop late or return late; how many are left. */
 uint32_t guard_tend_stragglers(struct avc_guard *guard);

@@ -39,6 +39,8 @@ void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enu
 	struct avc_event event = guard_event(guard, AVC_EVENT_GAVE_UP);
 	struct avc_error ignored = { 0 };
 
+	if (reason != AVC_REASON_STOPPED && reason != AVC_REASON_CLEAN_EXIT)
+		guard_await_seen(guard);
 	(void)init_channel_verdict(&guard->channel, AVC_VERDICT_GIVE_UP, &ignored);
 	event.reason = reason;
 	event.wait_status = report->status;
@@ -350,6 +352,9 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 		guard->late_ns = report->reaped_ns + guard->config.deadline_ns;
 	guard_release_remains(guard); /* of the death before */
 	event.remains_pid = guard->config.remains_ns ? guard->main.holder : 0;
+	if (guard->config.remains_ns && guard->count)
+		event.likeness_pid = guard->generations[guard->count - 1].image[0].template;
+	guard->unseen = event.remains_pid ? event.remains_pid : event.likeness_pid;
 	guard_emit(guard, &event);
 	process_close(&guard->main);
 	guard_kill_lost(guard);

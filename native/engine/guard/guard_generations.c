@@ -396,6 +396,8 @@ enum avc_reason guard_fall_back(struct avc_guard *guard, int status, bool hung)
 	const struct policy_fallback left = policy_crashed(&guard->policy, &guard->config, status,
 							   hung, now_ns());
 
+	if (!left.trusted)
+		guard_await_seen(guard);
 	while (guard->count > left.healthy)
 		guard_lose_generation(guard, guard->count - 1, AVC_REASON_UNHEALTHY, 0);
 	while (guard->count > left.trusted)

@@ -185,6 +185,8 @@ struct avc_event {
 	int32_t remains_pid;    /* DIED: a stopped task that has its memory, until
 	                         * AVC_COMMAND_RELEASE or for remains_ns after the
 	                         * restore; 0: there is none                      */
+	int32_t likeness_pid;   /* DIED: one with the memory of the newest
+	                         * generation; 0: there is none                   */
 	uint64_t interval_ns;   /* CHECKPOINT: between two of them, at present    */
 	uint64_t freeze_max_ns; /* CHECKPOINT: the longest freeze of them         */
 	/* CHECKPOINT, MISSED: first PTRACE_INTERRUPT until the last thread runs
@@ -229,8 +231,12 @@ enum avc_command {
 	AVC_COMMAND_RELEASE = 8,     /* the memory of `ticket`, a remains_pid, has been
 	                             * looked at; no answer                       */
 	AVC_COMMAND_LIST = 9,        /* what is held; HELD or REFUSED              */
-	AVC_COMMAND_ABANDON = 10     /* the group cannot go back: an app that WAITS for
+	AVC_COMMAND_ABANDON = 10,    /* the group cannot go back: an app that WAITS for
 	                             * it ends; GAVE_UP, or no answer             */
+	AVC_COMMAND_SEEN = 11        /* what the memory of `ticket`, a remains_pid (or, if
+	                             * there was none, a likeness_pid), tells is known:
+	                             * if the death is final, the container may end; no
+	                             * answer                                     */
 };
 
 struct avc_engine;

@@ -34,6 +34,8 @@ class Case:
     death: Death
     hit: Delivery | None
     remains_pid: int
+    likeness_pid: int
+    """A task with the memory of the last checkpoint; 0: there is none."""
     init_pid: int
     died_ns: int
     """When avckpt-init knew of it, CLOCK_MONOTONIC."""
@@ -82,9 +84,10 @@ class Collector:
         pid, wait_status = event.app_pid, event.wait_status
         signum = wait_status & 0x7F
         name = signal_name(signum) if signum else ""
+        kept = (event.remains_pid, event.likeness_pid, init_pid, event.died_ns)
         if self._deaths is None:
             crash = Crash(signal=name, unknown=self._problem)
-            return Case(pid, wait_status, crash, Death(), None, event.remains_pid, init_pid, event.died_ns)
+            return Case(pid, wait_status, crash, Death(), None, *kept)
         death = self._deaths.of(pid)
         hit = death.fatal(signum) if signum else None
         fault = self._log.of(hit.tid) if hit is not None and self._log is not None else None
@@ -93,29 +96,61 @@ class Collector:
             crash = replace(crash, sender=_name_of(crash.sender_pid))
         if signum and hit is None:
             crash = replace(crash, unknown="the kernel told of too many deaths at once")
-        return Case(pid, wait_status, crash, death, hit, event.remains_pid, init_pid, event.died_ns)
+        return Case(pid, wait_status, crash, death, hit, *kept)
 
     async def examine(self, case: Case) -> Crash:
         """With what the memory of the dead tells."""
         if not case.remains_pid:
-            return self._identified(case, replace(case.crash, unknown=case.crash.unknown or "its memory was not kept"))
+            return await self._compare(
+                case, replace(case.crash, unknown=case.crash.unknown or "its memory was not kept")
+            )
         try:
             crash, frames = await look("remains", case.remains_pid, lambda: _examine(case))
         except (AvckptError, OSError) as error:
             why = f"its memory cannot be read: {error}"
-            return self._identified(case, replace(case.crash, unknown=case.crash.unknown or why))
+            return await self._compare(case, replace(case.crash, unknown=case.crash.unknown or why))
         return self._identified(case, crash, frames)
+
+    async def _compare(self, case: Case, crash: Crash) -> Crash:
+        """Of one whose memory is gone (the OOM killer): places by what was mapped at the last checkpoint."""
+        if not case.likeness_pid:
+            return self._identified(case, crash)
+        try:
+            placed_, frames = await look("remains", case.likeness_pid, lambda: _liken(case, crash))
+        except (AvckptError, OSError):
+            return self._identified(case, crash)
+        return self._identified(case, placed_, frames)
 
     @staticmethod
     def _identified(case: Case, crash: Crash, frames: list[Frame] | None = None) -> Crash:
         return replace(crash, fingerprint=fingerprint(crash, case.wait_status, frames or []))
 
 
+def _remains(pid: int, case: Case) -> Remains:
+    """Raises OSError."""
+    if int(stat_fields(pid)[1]) != case.init_pid:
+        raise ProcessLookupError(f"process {pid} is another one")
+    remains = Remains(pid)
+    if not remains.maps:
+        remains.close()
+        raise ProcessLookupError(f"process {pid} has no memory any more")
+    return remains
+
+
+def _liken(case: Case, crash: Crash) -> tuple[Crash, list[Frame]]:
+    """Raises OSError."""
+    likeness = _remains(case.likeness_pid, case)
+    try:
+        # Only what the kernel told at the death: this stack is another one.
+        frames = likeness.frames(case.hit.callers) if case.hit is not None else []
+        return replace(placed(crash, frames), command=likeness.command), frames
+    finally:
+        likeness.close()
+
+
 def _examine(case: Case) -> tuple[Crash, list[Frame]]:
     """Raises OSError."""
-    if int(stat_fields(case.remains_pid)[1]) != case.init_pid:
-        raise ProcessLookupError(f"process {case.remains_pid} is another one")
-    remains = Remains(case.remains_pid)
+    remains = _remains(case.remains_pid, case)
     try:
         frames = _frames(remains, case.hit)
         return replace(placed(case.crash, frames), command=remains.command), frames

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, cast
 
+from avckpt.events.vocabulary import signal_name
 from avckpt.evidence.deaths import Death, Delivery
 from avckpt.evidence.kernel_log import Fault
 
@@ -109,9 +110,9 @@ def crash_of(signal: str, hit: Delivery | None, death: Death, fault: Fault | Non
     if not signal or hit is None:
         return Crash(signal=signal)
     # The one that was answered by the death is the last before it.
-    sent = [each for each in death.sent if each.signal == hit.signal and each.at_ns <= hit.at_ns]
+    sent = [each for each in death.sent if signal_name(each.signal) == signal and each.at_ns <= hit.at_ns]
     last = max(sent, key=lambda each: each.at_ns, default=None)
-    code = last.code if last is not None and hit.code == 0 else hit.code
+    code = last.code if last is not None and (hit.code == 0 or signal_name(hit.signal) != signal) else hit.code
     outside = last is not None and last.sender_pid not in (0, death.pid) and code in _SENT_BY_USERS
     name = fault.thread if fault is not None else next((each.thread for each in sent if each.tid == hit.tid), "")
     return Crash(
@@ -121,7 +122,7 @@ def crash_of(signal: str, hit: Delivery | None, death: Death, fault: Fault | Non
         tid=hit.tid,
         thread=name,
         sender_pid=last.sender_pid if last is not None and outside else 0,
-        sender="kernel" if code == 128 and hit.signal == 9 else "",
+        sender="kernel" if code == 128 and signal == "SIGKILL" else "",
     )
 
 

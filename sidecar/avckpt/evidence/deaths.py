@@ -115,11 +115,14 @@ class Death:
     sent: list[Sent] = field(default_factory=list)
 
     def fatal(self, signum: int) -> Delivery | None:
-        """The thread that the signal hit first: those that follow die of SIGKILL.  Of a SIGKILL the main thread."""
-        if signum == signal.SIGKILL and self.pid in self.deliveries:
-            return self.deliveries[self.pid]
-        hit = [each for each in self.deliveries.values() if each.signal == signum]
-        return min(hit, key=lambda each: each.at_ns, default=None)
+        """The thread that the signal hit first: those that follow die of SIGKILL.
+
+        Of a SIGKILL the main thread.  Of a signal without a core the kernel itself makes a SIGKILL for every
+        thread (complete_signal(), kernel/signal.c).
+        """
+        hit = [each for each in self.deliveries.values() if each.signal == signum != signal.SIGKILL]
+        first = min(hit, key=lambda each: each.at_ns, default=None)
+        return first or self.deliveries.get(self.pid) or next(iter(self.deliveries.values()), None)
 
 
 class Deaths:

@@ -85,6 +85,7 @@ class Inquests(Generic[W]):
     async def _look_into(self, watch: W, case: Case, outcome: asyncio.Future[EventRecord]) -> None:
         try:
             crash = await self._collector.examine(case)
+            self._command(watch, Command.SEEN, case.remains_pid or case.likeness_pid)
             try:
                 followed = await asyncio.wait_for(outcome, OUTCOME_S)
             except asyncio.TimeoutError:
@@ -98,7 +99,7 @@ class Inquests(Generic[W]):
                 path, size, what = await self._cores.make(watch.container, case, crash, mode)
                 self._tell(watch, EventRecord(Kind.CORE, core=path or None, core_bytes=size or None, detail=what))
         finally:
-            self._release(watch, case)
+            self._command(watch, Command.RELEASE, case.remains_pid)
 
     def _record(
         self, container: Protected, crash: Crash, followed: EventRecord, detected_s: float | None
@@ -130,11 +131,11 @@ class Inquests(Generic[W]):
             self._tell(watch, EventRecord(Kind.LATE, detail=detail, recovered_s=record.recovered_s))
 
     @staticmethod
-    def _release(watch: W, case: Case) -> None:
-        if case.remains_pid and watch.guard is not None:
+    def _command(watch: W, command: Command, pid: int) -> None:
+        if pid and watch.guard is not None:
             # One that has just ended has released them.
             with contextlib.suppress(AvckptError):
-                watch.guard.command(Command.RELEASE, case.remains_pid)
+                watch.guard.command(command, pid)
 
 
 def _is_of(record: EventRecord, container: Protected) -> bool:
