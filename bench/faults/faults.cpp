@@ -144,16 +144,16 @@ static void leak_descriptors()
 			throw std::runtime_error("out of descriptors");
 }
 
+static char *behind;
+
+// Glibc finds it when the block behind is freed.
 static void corrupt_heap()
 {
-	char *first = new char[24];
+	volatile char *first = new char[30000];
 
-	// Glibc finds it when it looks at the chunk behind.
-	memset(first, 0x41, 64);
-	for (int i = 0; i < 64; i++)
-		delete[] new char[24 + i * 16];
-	delete[] first;
-	free(malloc(100000));
+	behind = new char[30000];
+	for (int i = 0; i < 30032; i++)
+		first[i] = 0x41;
 }
 
 static void use_after_free()
@@ -293,6 +293,8 @@ public:
 		// Found only half a second after it has come about, with checkpoints in between.
 		if (corrupted_ && ++bad_at_ == 50)
 			sink = *(volatile int *)(uintptr_t)corrupted_;
+		if (behind && ++bad_at_ == 10)
+			delete[] behind;
 		if (leaks_)
 			memset(new char[1 << 20], 1, 1 << 20);
 		if (seen_ == triggered)
