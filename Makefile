@@ -152,8 +152,9 @@ bench-cri: setup ## a pod of two containers through containerd's CRI socket: KIL
 bench-trees: setup-build ## measure freeze and restore of process trees beside forks, copies and unprotected commands
 	@$(VENV)/python -m bench.trees
 
-campaign: setup-build ## inject faults into protected programs in C++, Python and Go: what becomes of them (RUNS=50 WINDOW=60; hours)
+campaign: setup ## inject faults into protected containers in C++, Python, Go and ROS: what becomes of them (RUNS=50 WINDOW=60; hours)
 	@scripts/setup-campaign.sh
+	@scripts/setup-ros.sh
 	@$(VENV)/python -m bench.campaign --runs $(or $(RUNS),50) --seconds $(or $(WINDOW),60)
 	@$(VENV)/python -m bench.campaign_show
 

@@ -26,6 +26,7 @@ EXPECTED = {
 }
 
 
+@pytest.mark.usefixtures("base_image")
 def test_what_becomes_of_four_faults(tmp_path: Path) -> None:
     output = tmp_path / "campaign.json"
     command = [sys.executable, "-m", "bench.campaign", "--runs", "1", "--seconds", "6", "--language", "Python"]
