@@ -223,10 +223,10 @@ uint64_t guard_tell_due(const struct avc_guard *guard);
 
 /* ---- output.c --------------------------------------------------------------- */
 
-/* From now on the next output of any existing process is detected; a second call changes nothing.
- * Best effort. */
 /* Looks the tracepoint up: it takes calls that the guard's own filter does not allow. */
 void output_learn(struct output *output);
+/* From now on the next output of any existing process is detected; a second call changes nothing.
+ * Best effort. */
 void output_arm(struct output *output, const struct tree *tree);
 void output_disarm(struct output *output);
 /* Readable after output; -1: not armed. */
