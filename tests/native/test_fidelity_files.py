@@ -388,7 +388,7 @@ def test_descriptors_on_their_way_are_told(tmp_path: Path) -> None:
         checkpoint(guard)
         disturb(victim)
         victim.kill_app()
-        assert "descriptors that were on their way" in guard.wait("restored")["error"]["detail"]
+        assert "descriptors in flight" in guard.wait("restored")["error"]["detail"]
 
 
 @pytest.mark.parametrize("where", WHERE)
