@@ -156,8 +156,6 @@ bool proc_same_memory(pid_t a, pid_t b);
  * An exiting task has none. */
 enum shared { SHARED_FILES, SHARED_FOLDERS };
 int proc_shares(pid_t a, pid_t b, enum shared what);
-/* For sorting: 0 if they share it, or if one of them is gone. */
-int proc_order(pid_t a, pid_t b, enum shared what);
 /* How many threads there are, by an open /proc/PID/task; 0: the process is gone. */
 int proc_thread_count(int task_dirfd);
 /* Size of the address space in pages, by an open /proc/PID/statm, or -1; *anonymous (may be

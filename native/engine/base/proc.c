@@ -315,23 +315,12 @@ bool proc_same_memory(pid_t a, pid_t b)
 	return syscall(SYS_kcmp, a, b, KCMP_VM, 0, 0) == 0;
 }
 
-static long compare(pid_t a, pid_t b, enum shared what)
-{
-	return syscall(SYS_kcmp, a, b, what == SHARED_FILES ? KCMP_FILES : KCMP_FS, 0, 0);
-}
-
 int proc_shares(pid_t a, pid_t b, enum shared what)
 {
-	const long order = compare(a, b, what);
+	const long order = syscall(SYS_kcmp, a, b, what == SHARED_FILES ? KCMP_FILES : KCMP_FS, 0,
+				   0);
 
 	return order < 0 ? -1 : order == 0;
-}
-
-int proc_order(pid_t a, pid_t b, enum shared what)
-{
-	const long order = compare(a, b, what);
-
-	return order <= 0 ? 0 : order == 1 ? -1 : 1;
 }
 
 /* A directory has a link for itself and one for each directory in it (fs/proc/base.c,

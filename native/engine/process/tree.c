@@ -275,74 +275,40 @@ static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 	return proc_stat(pid, stat);
 }
 
-static int by_files(const void *a, const void *b)
-{
-	return proc_order(*(const pid_t *)a, *(const pid_t *)b, SHARED_FILES);
-}
-
-static int by_folders(const void *a, const void *b)
-{
-	return proc_order(*(const pid_t *)a, *(const pid_t *)b, SHARED_FOLDERS);
-}
-
-static int check_sharing_of(pid_t *pid, uint32_t count, enum shared what, struct avc_error *err)
-{
-	qsort(pid, count, sizeof *pid, what == SHARED_FILES ? by_files : by_folders);
-	for (uint32_t i = 1; i < count; i++) {
-		const int shares = proc_shares(pid[i - 1], pid[i], what);
-
-		/* The order means nothing. */
-		if (shares < 0)
-			return fail(err, AVC_RETRY, 0, pid[i], "look at processes", "kcmp",
-				    "a process has just ended");
-		if (!shares)
-			continue;
-		/* Two that are just ending have none; and holders and templates of a guard that died
-		 * share theirs until the kernel has ended them. */
-		if (proc_is_killed(pid[i - 1]) || proc_is_killed(pid[i]))
-			continue;
-		/* Its porter has yet to leave the table. */
-		if (proc_same_memory(pid[i - 1], pid[i]))
-			return fail(err, AVC_RETRY, 0, pid[i], "look at processes", "kcmp",
-				    "process %d shares its memory with process %d",
-				    proc_inside(pid[i]), proc_inside(pid[i - 1]));
-		return fail(err, AVC_UNSUPPORTED, 0, pid[i], "look at processes", "",
-			    "process %d shares its %s with process %d", proc_inside(pid[i]),
-			    what == SHARED_FILES ? "descriptor table (CLONE_FILES)"
-						 : "working directory (CLONE_FS)",
-			    proc_inside(pid[i - 1]));
-	}
-	return 0;
-}
-
 /* clone(2): two share what they open, or where they go.  Restored ones would have separate tables
  * and directories, and what the templates of one that has ended close would be closed for the
  * other.  It need not be parent and child: the parent may have ended, or left the table to its
- * children.  Only a clone shares, so those that have been checked share nothing with each other. */
-static int check_sharing(struct tree *tree, struct avc_error *err)
+ * children.  Only a clone shares, so a new process is compared with all that are known. */
+static int check_sharing(const struct tree *tree, const struct tree_entry *entry,
+			 struct avc_error *err)
 {
-	pid_t *pid;
-	uint32_t count = 0, new = 0;
-	int result;
+	const struct process *parent = entry->parent >= 0 ? tree->entry[entry->parent].process
+							  : NULL;
 
-	for (uint32_t i = 0; i < tree->count; i++)
-		new += tree->entry[i].process && !tree->entry[i].process->shares_nothing;
-	if (!new || tree->count < 2)
-		return 0;
-	pid = malloc(tree->count * sizeof *pid);
-	if (!pid)
-		return fail_errno(err, 0, "look at processes", "malloc", "out of memory");
-	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->entry[i].process)
-			pid[count++] = tree->entry[i].pid;
-	result = check_sharing_of(pid, count, SHARED_FILES, err);
-	if (!result)
-		result = check_sharing_of(pid, count, SHARED_FOLDERS, err);
-	free(pid);
-	for (uint32_t i = 0; !result && i < tree->count; i++)
-		if (tree->entry[i].process)
-			tree->entry[i].process->shares_nothing = true;
-	return result;
+	for (uint32_t i = 0; i < tree->processes; i++) {
+		const pid_t other = tree->process[i]->leader;
+		const char *what = NULL;
+
+		if (other == entry->pid) /* it had that number before */
+			continue;
+		if (proc_shares(entry->pid, other, SHARED_FILES) == 1)
+			what = "descriptor table (CLONE_FILES)";
+		else if (proc_shares(entry->pid, other, SHARED_FOLDERS) == 1)
+			what = "working directory (CLONE_FS)";
+		/* Two that are just ending have none; and holders and templates of a guard that died
+		 * share theirs until the kernel has ended them. */
+		if (!what || proc_is_killed(entry->pid) || proc_is_killed(other))
+			continue;
+		/* Its porter has yet to leave the table. */
+		if (tree->process[i] != parent && proc_same_memory(entry->pid, other))
+			return fail(err, AVC_RETRY, 0, entry->pid, "look at processes", "kcmp",
+				    "process %d shares its memory with process %d",
+				    proc_inside(entry->pid), proc_inside(other));
+		return fail(err, AVC_UNSUPPORTED, 0, entry->pid, "look at processes", "",
+			    "process %d shares its %s with process %d", proc_inside(entry->pid),
+			    what, proc_inside(other));
+	}
+	return 0;
 }
 
 int tree_scan(struct tree *tree, struct avc_error *err)
@@ -373,6 +339,8 @@ int tree_scan(struct tree *tree, struct avc_error *err)
 			if (!entry->process) {
 				struct avc_error gone = { 0 };
 
+				if (check_sharing(tree, entry, err))
+					return -1;
 				entry->process = add_process(tree, entry->pid, stat.start, &gone);
 				if (!entry->process && gone.code != AVC_GONE) {
 					*err = gone;
@@ -390,7 +358,7 @@ int tree_scan(struct tree *tree, struct avc_error *err)
 		    look_below(tree, entry->process->task_dirfd, (int)i, err))
 			return -1;
 	}
-	return check_sharing(tree, err);
+	return 0;
 }
 
 /* One that could not be queried is exiting, which is not known yet: the result also applies to the

@@ -220,10 +220,9 @@ struct process {
 	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
-	bool heirs_vary;     /* inherited files changed in a freeze                    */
-	bool shares_nothing; /* no descriptor table or directory with another process */
-	bool tcp_moved;      /* bytes of connections are counted                 */
-	bool tcp_messages;   /* quiescent only between two messages              */
+	bool heirs_vary;   /* inherited files changed in a freeze                    */
+	bool tcp_moved;    /* bytes of connections are counted                 */
+	bool tcp_messages; /* quiescent only between two messages              */
 	/* Of a process that is not the main one (tree.c). */
 	bool descendant;
 	uint64_t start;               /* start time; tells it from one with the same PID  */
