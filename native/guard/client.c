@@ -182,6 +182,16 @@ static bool event_is_sound(const struct avc_guard *guard, const struct avc_event
 	       is_text(event->error.detail, sizeof event->error.detail);
 }
 
+/* As recv(2).  When it has exited without reading a last command, the kernel says so (unix_release_sock(),
+ * net/unix/af_unix.c), once, and before the events that it has sent. */
+static ssize_t receive_event(int socket, struct avc_event *event)
+{
+	const int flags = MSG_DONTWAIT | MSG_TRUNC;
+	const ssize_t n = recv(socket, event, sizeof *event, flags);
+
+	return n < 0 && errno == ECONNRESET ? recv(socket, event, sizeof *event, flags) : n;
+}
+
 /* Queues its events so far, or a part of them: one that never stops sending must not keep us
  * busy. */
 static void guard_listen(struct avc_guard *guard)
@@ -190,7 +200,7 @@ static void guard_listen(struct avc_guard *guard)
 	ssize_t n = 0;
 
 	for (int i = 0; i < EVENTS_AT_ONCE; i++) {
-		n = recv(guard->socket, &event, sizeof event, MSG_DONTWAIT | MSG_TRUNC);
+		n = receive_event(guard->socket, &event);
 		if (n <= 0)
 			break;
 		guard->mad = n != sizeof event || !event_is_sound(guard, &event);
@@ -519,7 +529,7 @@ int avc_guard_command(struct avc_guard *guard, enum avc_command command, uint64_
 					     .until_ns = until_ns };
 
 	*err = (struct avc_error){ 0 };
-	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_ABANDON)
+	if (command < AVC_COMMAND_CHECKPOINT || command > AVC_COMMAND_SEEN)
 		return fail(err, AVC_CONFIG, EINVAL, 0, "command", "", "no such command");
 	return guard_send(guard, &request, -1, err);
 }

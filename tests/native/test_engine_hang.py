@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that holds a lock on an open file of the application does not block its guard."""
+"""A process that holds a lock on an open file of the application does not block its guard; commands and events reach
+their ends."""
 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from avckpt.guard import Command
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
+from testkit.procfs import state_of
 
 pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
 HOLD = """
@@ -64,3 +68,31 @@ def test_somebody_else_waits_in_splice(tmp_path: Path) -> None:
         assert guard.command("checkpoint")["kind"] == "checkpoint"
         assert guard.command("restore")["kind"] == "restored"
         victim.wait_beats(3)
+
+
+def test_a_last_command_that_it_does_not_read_hides_no_event(tmp_path: Path) -> None:
+    """The kernel reports it in place of the events that the guard sent before it exited."""
+    with (
+        Victim("idle 1 1", tmp_path) as victim,
+        Victim("idle 1 1", tmp_path) as other,
+        GuardProcess(config(), [victim.pid, other.pid]) as guard,
+    ):
+        guard.wait("attached", cookie=1)
+        os.kill(guard.pid, signal.SIGSTOP)
+        victim.kill(signal.SIGKILL)
+        victim.end()
+        guard.say_command("list", cookie=1)
+        guard.command("list", cookie=2)  # so the first one has been sent
+        guard.process.send_signal(signal.SIGSTOP)
+        os.kill(guard.pid, signal.SIGCONT)
+        wait_until(lambda: state_of(guard.pid) == "Z", PATIENCE_S, "it has exited")
+        guard.process.send_signal(signal.SIGCONT)
+        guard.wait_for(lambda event: event["kind"] in ("ended", "guard_lost"), "an end")
+        assert not [event for event in guard.events if event["kind"] == "guard_lost"]
+
+
+def test_every_command_reaches_it(tmp_path: Path) -> None:
+    with Victim("idle 1 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for command in Command:
+            guard.say_command(command.name)
+        assert guard.command("list")["kind"] == "held"

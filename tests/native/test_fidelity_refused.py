@@ -14,7 +14,7 @@ import pytest
 
 from testkit.guarded import GuardProcess, Victim, config, since_linux
 from testkit.harness import wait_until
-from testkit.procfs import children_of, state_of
+from testkit.procfs import children_of, comm_of, state_of
 
 pytestmark = pytest.mark.shared_machine("an application that does not stop in time is told another reason")
 
@@ -73,7 +73,7 @@ def test_it_runs_unprotected_and_says_why(command: str, why: str, tmp_path: Path
         answer = guard.command("checkpoint")
         assert why in answer["error"]["message"]
         victim.wait_beats(20)
-        wait_until(lambda: victim.others() == [], 5, "nothing is left in the container")
+        wait_until(lambda: victim.others() == [], 5, "nothing is left in the container", every_s=0.001)
         victim.kill_app()
         # Nothing to restore from: the end is the app's own, at once.
         assert victim.end(2) == 128 + signal.SIGKILL
@@ -94,14 +94,17 @@ def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
         guard.wait("checkpoint")
         victim.kill_app(signal.SIGUSR1)
         assert why in guard.wait("unprotected")["error"]["message"]
-        wait_until(lambda: victim.others() == [], 5, "nothing is left in the container")
+        wait_until(lambda: victim.others() == [], 5, "nothing is left in the container", every_s=0.001)
         victim.wait_beats(20)
 
 
 def of_victim(victim: Victim, app: int) -> set[int]:
     """The processes of the application."""
-    found = {app, *children_of(app), *children_of(victim.pid)}
-    return {pid for pid in found if Path(f"/proc/{pid}/comm").read_text() == "unsupported\n" and state_of(pid) != "Z"}
+    return {
+        pid
+        for pid in {app, *children_of(app), *children_of(victim.pid)}
+        if state_of(pid) not in "ZX" and comm_of(pid) == "unsupported"
+    }
 
 
 def descriptors(pid: int) -> dict[str, str]:
@@ -131,7 +134,10 @@ def test_what_is_shared_by_others_than_parent_and_child(kind: str, why: str, cou
         wait_until(lambda: len(of_victim(victim, app)) < count, 10, "one has ended")
         guard.command("checkpoint")
         time.sleep(0.3)
-        assert all(descriptors(pid) == open_before[pid] for pid in of_victim(victim, app))
+        # Alone, one is protected again: there may be copies.
+        left = open_before.keys() & of_victim(victim, app)
+        assert left
+        assert all(descriptors(pid) == open_before[pid] for pid in left)
         assert why in told["error"]["message"]
 
 

@@ -14,7 +14,7 @@ from typing import Generic, Protocol, TypeVar
 
 from avckpt.containers.protected import Protected
 from avckpt.engine import Guard
-from avckpt.errors import AvckptError
+from avckpt.errors import Busy, TargetGone
 from avckpt.events.history import History
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
@@ -134,7 +134,7 @@ class Inquests(Generic[W]):
     def _command(watch: W, command: Command, pid: int) -> None:
         if pid and watch.guard is not None:
             # One that has just ended has released them.
-            with contextlib.suppress(AvckptError):
+            with contextlib.suppress(TargetGone, Busy):
                 watch.guard.command(command, pid)
 
 

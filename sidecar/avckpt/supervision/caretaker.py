@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 from avckpt_hooks.shared.labels import Policy
 
 from avckpt.containers.cgroup import Groups, groups_of
-from avckpt.errors import AvckptError
+from avckpt.errors import Busy, TargetGone
 from avckpt.events.record import EventRecord
 from avckpt.guard import Command
 from avckpt.supervision.health import Ward, watch_health
@@ -157,7 +157,7 @@ class Caretaker(Generic[W]):
         if guard is None or limit == container.config.memory_limit_bytes:
             return
         container.config = replace(container.config, memory_limit_bytes=limit)
-        with contextlib.suppress(AvckptError):  # it has ended
+        with contextlib.suppress(TargetGone, Busy):  # it has ended
             guard.configure(container.config)
 
     def _host_is_short(self) -> None:
@@ -184,7 +184,7 @@ class Caretaker(Generic[W]):
 
     def _order(self, care: _Care[W], command: Command) -> None:
         if care.ward.guard is not None:
-            with contextlib.suppress(AvckptError):  # it has ended
+            with contextlib.suppress(TargetGone, Busy):  # it has ended
                 care.ward.guard.command(command, 0)
 
 

@@ -22,7 +22,7 @@ from avckpt_hooks.shared.labels import KEEP_MAX
 
 from avckpt.containers import cgroup
 from avckpt.engine import Guard, meeting
-from avckpt.errors import AvckptError, Busy, NothingToRestore
+from avckpt.errors import AvckptError, Busy, NothingToRestore, TargetGone
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command, Event
@@ -302,7 +302,7 @@ class Groups:
             for cookie in list(group.dead):
                 watch = group.members[cookie]
                 log.error("group %s: there is no line to go back to with %s", group.name, watch.container.label)
-                with contextlib.suppress(AvckptError):
+                with contextlib.suppress(TargetGone, Busy):
                     if watch.guard is not None:
                         watch.guard.command(Command.ABANDON, 0)
             group.dead.clear()

@@ -30,7 +30,7 @@ from avckpt_hooks.shared.tell import printable
 from avckpt.containers.cgroup import is_paused
 from avckpt.containers.process import age_s
 from avckpt.containers.protected import Protected
-from avckpt.errors import AvckptError, TargetGone, of_any
+from avckpt.errors import AvckptError, Busy, TargetGone, of_any
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Command
@@ -224,7 +224,7 @@ class _Watcher:
         if self.troubled:
             self.tell(EventRecord(Kind.HEALTH, detail="its health check passes again"))
         self.troubled = False
-        with contextlib.suppress(AvckptError):  # it has ended, or the next check that passes vouches
+        with contextlib.suppress(TargetGone, Busy):  # it has ended, or the next check that passes vouches
             self._order(Command.VOUCH)
 
     def _failed(self, done: Done, unhealthy: bool) -> None:
