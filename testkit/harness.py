@@ -477,3 +477,13 @@ def running_sidecar(podman: Podman) -> Iterator[Sidecar]:
             yield sidecar
         finally:
             sidecar.stop()
+
+
+def write_hooks(folder: Path, run_dir: Path) -> None:
+    """The hook JSON into a new folder, for the hooks of this checkout and the sidecar of that run directory."""
+    folder.mkdir()
+    for source in (ROOT / "oci-hooks.d").glob("*.json"):
+        data = json.loads(source.read_text())
+        data["hook"]["path"] = str(ROOT / "hooks" / "avckpt-hook")
+        data["hook"]["env"].append(f"AVCKPT_RUN_DIR={run_dir}")
+        (folder / source.name).write_text(json.dumps(data))

@@ -20,7 +20,7 @@ from avckpt.containers.process import has_ended
 from avckpt.errors import SidecarUnreachable
 from avckpt_hooks import VERSION
 
-from testkit.harness import ROOT, Completed, Podman, avckpt_command, run, wait_until
+from testkit.harness import ROOT, Completed, Podman, avckpt_command, run, wait_until, write_hooks
 from testkit.procfs import children_of, inside
 
 QUICK = {"avckpt.enable": "true", "avckpt.interval": "100ms"}
@@ -210,12 +210,7 @@ def local_sidecar(directory: Path) -> Iterator[LocalSidecar]:
 def hooked_podman(sidecar: LocalSidecar) -> Podman:
     """A Podman whose containers this sidecar protects: with the hooks of this checkout, and no others."""
     folder = sidecar.run_dir.with_name("oci-hooks.d")
-    folder.mkdir()
-    for source in (ROOT / "oci-hooks.d").glob("*.json"):
-        data = json.loads(source.read_text())
-        data["hook"]["path"] = str(ROOT / "hooks" / "avckpt-hook")
-        data["hook"]["env"].append(f"AVCKPT_RUN_DIR={sidecar.run_dir}")
-        (folder / source.name).write_text(json.dumps(data))
+    write_hooks(folder, sidecar.run_dir)
     return Podman("--hooks-dir", str(folder))
 
 

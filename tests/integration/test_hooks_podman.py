@@ -31,6 +31,7 @@ from testkit.harness import (
     hooks_installed,
     run,
     wait_until,
+    write_hooks,
 )
 
 pytestmark = pytest.mark.shared_machine("a hook that gets no CPU for ten seconds is late")
@@ -54,12 +55,7 @@ def hooks_dir(tmp_path: Path, run_dir: Path) -> Path:
     if not (ROOT / "native" / "build" / "avckpt-init").exists():
         pytest.fail("avckpt-init is not built: run make -C native")
     folder = tmp_path / "oci-hooks.d"
-    folder.mkdir()
-    for source in (ROOT / "oci-hooks.d").glob("*.json"):
-        data = json.loads(source.read_text())
-        data["hook"]["path"] = str(ROOT / "hooks" / "avckpt-hook")
-        data["hook"]["env"].append(f"AVCKPT_RUN_DIR={run_dir}")
-        (folder / source.name).write_text(json.dumps(data))
+    write_hooks(folder, run_dir)
     return folder
 
 
