@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -121,9 +122,13 @@ class GuardProcess:
             select.select([pidfd], [], [], PATIENCE_S)
             os.close(pidfd)
 
-    def fds(self) -> int:
-        """How many descriptors it has."""
-        return len(os.listdir(f"/proc/{self.pid}/fd"))
+    def fds(self) -> Counter[str]:
+        """Its descriptors: how many there are of each kind."""
+        kinds: Counter[str] = Counter()
+        for number in os.listdir(f"/proc/{self.pid}/fd"):
+            with contextlib.suppress(FileNotFoundError):
+                kinds[re.sub(r"\d+", "N", os.readlink(f"/proc/{self.pid}/fd/{number}"))] += 1
+        return kinds
 
     def mark(self) -> int:
         """A moment: give it to wait() as `since`."""

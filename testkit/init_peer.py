@@ -25,7 +25,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from testkit.harness import ROOT, SLOWNESS, wait_until
-from testkit.procfs import children_of
+from testkit.procfs import children_of, comm_of
 
 INIT = Path(os.environ.get("AVCKPT_TEST_INIT") or ROOT / "native/build/avckpt-init")  # another build of it
 PHOENIX = ROOT / "tests/victims/build/phoenix"
@@ -173,15 +173,13 @@ class Init:
         """avckpt-init among the descendants of pid."""
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
-            todo = [pid]
+            todo = [(pid, pid)]
             while todo:
-                here = todo.pop()
-                try:
-                    if Path(f"/proc/{here}/comm").read_text() == "avckpt-init\n":
-                        return here
-                except (FileNotFoundError, ProcessLookupError):
-                    continue
-                todo += children_of(here)
+                above, here = todo.pop()
+                if comm_of(here) == "avckpt-init":
+                    # It may have become that, and forked the application, since it was looked at: both have the name.
+                    return above if comm_of(above) == "avckpt-init" else here
+                todo += [(here, child) for child in children_of(here)]
             if self.popen.poll() is not None:
                 return pid  # over already: there is only the status to look at
             time.sleep(0.002)

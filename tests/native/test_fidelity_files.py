@@ -303,7 +303,7 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
         restored(victim, guard, looks=False)
         # All holders are there again, and the second generation.
         assert guard.command("checkpoint")["kind"] == "checkpoint"
-        fds = guard.fds()
+        before = guard.fds()
         for n in range(40):
             if n % 10 == 9:
                 disturb(victim)
@@ -317,7 +317,10 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
         restored(victim, guard)
         # What is open for a moment, while the next holder is made.
         processes = 1 + len(below(victim.app))
-        wait_until(lambda: guard.fds() <= fds + 2 * processes, 5, "no descriptor is left open")
+        try:
+            wait_until(lambda: guard.fds().total() <= before.total() + 2 * processes, 5, "no descriptor is left open")
+        except TimeoutError as late:
+            raise AssertionError(f"left open: {guard.fds() - before}") from late
 
 
 @pytest.fixture

@@ -150,7 +150,7 @@ def test_nothing_is_left_behind(tmp_path: Path) -> None:
                 victim.wait_beats(2)
                 guard.burst(5)
             wait_until(lambda: len(victim.others()) == 4, 5, "two templates, a spare and the holder are left")
-            return (guard.fds(), parasites(victim.app), len(children_of(victim.pid)), mappings(guard.pid))
+            return (guard.fds().total(), parasites(victim.app), len(children_of(victim.pid)), mappings(guard.pid))
 
         first = cycle(3)
         second = cycle(20)
