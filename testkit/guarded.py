@@ -180,6 +180,10 @@ class GuardProcess:
         self.wait("attached", cookie=cookie)
         return self._say(f"{name} {cookie} %d {within_s}")
 
+    def say_seen(self, pid: int, cookie: int = 1) -> None:
+        """The memory of the dead, a `remains_pid` or `likeness_pid`, has been looked at."""
+        self._say(f"seen {cookie} {pid}")
+
     def burst(self, n: int, cookie: int = 1, timeout_s: float = 110.0) -> Json:
         """`n` checkpoints back to back."""
         self.wait("attached", cookie=cookie)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process that holds a lock on an open file of the application does not block its guard; commands and events reach
-their ends."""
+their ends, and a final death waits for one of them."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ print("ready", flush=True)
 os.splice(theirs.fileno(), pipe, 1)
 """
 """Waits in splice(2) for what is to go into a pipe, with the pipe's lock."""
+SEEN_S = 0.2
+"""SEEN_NS of guard.c."""
 
 
 @pytest.fixture(autouse=True)
@@ -96,3 +98,26 @@ def test_every_command_reaches_it(tmp_path: Path) -> None:
         for command in Command:
             guard.say_command(command.name)
         assert guard.command("list")["kind"] == "held"
+
+
+def final_death_s(folder: Path, seen: bool) -> float:
+    """How long a container waits at its final death, when the guard is told that its memory was looked at, or not."""
+    with (
+        Victim("idle 1 1", folder) as victim,
+        GuardProcess(config(restore_on_signal=False, remains_s=1.0), [victim.pid]) as guard,
+    ):
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        victim.kill_app()
+        died = guard.wait("died")
+        if seen:
+            guard.say_seen(died["remains_pid"])
+        over = guard.wait("gave_up")
+        assert over["reason"] == "policy"
+        waited: float = (over["at_ns"] - died["died_ns"]) / 1e9
+        return waited
+
+
+def test_a_final_death_waits_until_it_has_been_looked_at(tmp_path: Path) -> None:
+    assert final_death_s(tmp_path, seen=False) >= SEEN_S
+    # One of five: the word itself may be late.
+    assert any(final_death_s(tmp_path, seen=True) < SEEN_S for _ in range(5))

@@ -36,11 +36,12 @@ static int say_restored(void *arg, struct avc_error *err)
 void guard_give_up(struct avc_guard *guard, const struct avc_report *report, enum avc_reason reason,
 		   const struct avc_error *error)
 {
-	struct avc_event event = guard_event(guard, AVC_EVENT_GAVE_UP);
 	struct avc_error ignored = { 0 };
+	struct avc_event event;
 
 	if (reason != AVC_REASON_STOPPED && reason != AVC_REASON_CLEAN_EXIT)
 		guard_await_seen(guard);
+	event = guard_event(guard, AVC_EVENT_GAVE_UP);
 	(void)init_channel_verdict(&guard->channel, AVC_VERDICT_GIVE_UP, &ignored);
 	event.reason = reason;
 	event.wait_status = report->status;
