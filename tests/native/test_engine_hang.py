@@ -4,11 +4,13 @@ their ends, and a final death waits for one of them."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ from avckpt.guard import Command
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
-from testkit.procfs import state_of
+from testkit.procfs import children_of, comm_of, state_of
 
 pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
 HOLD = """
@@ -27,6 +29,7 @@ print("ready", flush=True)
 os.splice(theirs.fileno(), pipe, 1)
 """
 """Waits in splice(2) for what is to go into a pipe, with the pipe's lock."""
+PR_SET_CHILD_SUBREAPER = 36
 SEEN_S = 0.2
 """SEEN_NS of guard.c."""
 
@@ -100,7 +103,7 @@ def test_every_command_reaches_it(tmp_path: Path) -> None:
         assert guard.command("list")["kind"] == "held"
 
 
-def final_death_s(folder: Path, seen: bool) -> float:
+def final_death_s(folder: Path, *, seen: bool) -> float:
     """How long a container waits at its final death, when the guard is told that its memory was looked at, or not."""
     with (
         Victim("idle 1 1", folder) as victim,
@@ -113,6 +116,7 @@ def final_death_s(folder: Path, seen: bool) -> float:
             guard.say_seen(died["remains_pid"])
         over = guard.wait("gave_up")
         assert over["reason"] == "policy"
+        victim.end()
         waited: float = (over["at_ns"] - died["died_ns"]) / 1e9
         return waited
 
@@ -121,3 +125,22 @@ def test_a_final_death_waits_until_it_has_been_looked_at(tmp_path: Path) -> None
     assert final_death_s(tmp_path, seen=False) >= SEEN_S
     # One of five: the word itself may be late.
     assert any(final_death_s(tmp_path, seen=True) < SEEN_S for _ in range(5))
+
+
+@pytest.fixture
+def reaper() -> Iterator[None]:
+    """Orphans become our children, and nobody reaps them: the machine's init has more to do."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.prctl(PR_SET_CHILD_SUBREAPER, 1) == 0
+    yield
+    assert libc.prctl(PR_SET_CHILD_SUBREAPER, 0) == 0
+    for pid in children_of(os.getpid()):
+        if comm_of(pid) == "avckpt-pid":
+            os.waitpid(pid, 0)
+
+
+@pytest.mark.usefixtures("reaper")
+def test_a_final_death_leaves_no_orphan(tmp_path: Path) -> None:
+    """The container's init exits only when all of its PID namespace are reaped."""
+    for _ in range(5):
+        final_death_s(tmp_path, seen=False)

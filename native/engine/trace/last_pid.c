@@ -42,6 +42,7 @@ extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end") HIDDEN
 #define ENGINE_SPINS 100
 #define SLICE_NS (20 * (long)NS_PER_MS)
 #define END_MS 1000
+#define KILL_MS 100
 #define STOP_NS (100 * NS_PER_MS)
 #define LOCK_NS (300 * NS_PER_MS)
 #define LOCK_URGENT_NS NS_PER_S
@@ -198,11 +199,12 @@ static int give_birth(struct last_pid *helper, struct birth *birth, int init_pid
 }
 
 /* The process inside does not outlive the one outside: it has set PR_SET_PDEATHSIG, unless it was
- * taken over before it could. */
-static void kill_inside(const struct last_pid *helper)
+ * taken over before it could.  Returns whether it was there. */
+static bool kill_inside(const struct last_pid *helper)
 {
 	pid_t children[4];
 	const int count = proc_children(helper->task, children, 4);
+	bool found = false;
 
 	for (int i = 0; i < count; i++) {
 		int pidfd = proc_pidfd_open(children[i]);
@@ -210,9 +212,10 @@ static void kill_inside(const struct last_pid *helper)
 
 		/* Still its child: the pidfd refers to it. */
 		if (pidfd >= 0 && proc_stat(children[i], &stat) == 0 && stat.parent == helper->task)
-			syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
+			found |= syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0) == 0;
 		close_fd(&pidfd);
 	}
+	return found;
 }
 
 static void helper_end(struct last_pid *helper)
@@ -222,8 +225,10 @@ static void helper_end(struct last_pid *helper)
 	const bool unused = helper->slot && !helper->page->stop;
 
 	if (helper->task && (unused || helper->pidfd < 0 || poll(&ending, 1, END_MS) != 1)) {
-		kill_inside(helper);
-		kill(helper->task, SIGKILL); /* our unreaped child: the PID is still its own */
+		/* It reaps the one inside, and exits.  Otherwise the machine's init would have to
+		 * reap that: until then the container's init cannot exit (zap_pid_ns_processes()). */
+		if (!kill_inside(helper) || poll(&ending, 1, KILL_MS) != 1)
+			kill(helper->task, SIGKILL); /* our unreaped child: the PID is its own */
 	}
 	if (helper->task)
 		while (waitpid(helper->task, NULL, __WALL | __WNOTHREAD) < 0 && errno == EINTR)
