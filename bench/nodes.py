@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes below a launcher: kills random ones of many in one container, again and again.
 
-    python -m bench.nodes [--launcher shell|roslaunch] [--nodes 20] [--kills 1000] [--idle SECONDS]
+    python -m bench.nodes [--launcher shell|supervisord|roslaunch] [--nodes 20] [--kills 1000] [--idle SECONDS]
 
 Every node (tests/victims/crash.c) beats a thousand times a second.  It is killed by a signal from
 outside, or faults, aborts or exits by itself.  What counts is the gap between two beats of the one
 that was killed, and of its siblings, whose longest gap of the same length of time without a kill is
 measured first.  With --idle nothing is killed: what the nodes cost is measured for that time.
 
-Needs root, Podman and what `make setup` builds; roslaunch needs scripts/setup-ros.sh.  Takes the
-machine's sidecar and hooks for itself, as the tests do.  Prints a table and writes
-bench/results/nodes.json.
+Needs root, Podman and what `make setup` builds; roslaunch needs scripts/setup-ros.sh, supervisord
+PyPI's supervisor.  Takes the machine's sidecar and hooks for itself, as the tests do.  Prints a
+table and writes bench/results/nodes.json.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import random
@@ -62,6 +63,12 @@ NODE = "#!/bin/sh\nexec /victims/crash --board /bench/$NODE.board\n"
 SHELL = """
 for i in {numbers}; do NODE=$i $AVCKPT_INIT --name n$i -- /bench/nodes/node & done
 while wait -n; s=$?; [ $s != 127 ]; do echo ended $s; done
+"""
+SUPERVISORD = "[supervisord]\nnodaemon=true\nuser=root\nlogfile=/dev/null\nlogfile_maxbytes=0\n"
+PROGRAM = """
+[program:n{n}]
+command=%(ENV_AVCKPT_INIT)s --name n{n} -- /bench/nodes/node
+environment=NODE="{n}"
 """
 PACKAGE = "<package><name>nodes</name><version>1.0.0</version><description>n</description></package>\n"
 LAUNCH_NODE = """ <node pkg="nodes" type="node" name="n{n}" output="screen"
@@ -147,16 +154,29 @@ def start(
     (package / "all.launch").write_text(
         "<launch>\n" + "".join(LAUNCH_NODE.format(n=n) for n in numbers) + "</launch>\n"
     )
-    command, image, environment = ["bash", "-c", SHELL.format(numbers=" ".join(map(str, numbers)))], BASE_IMAGE, []
-    if options.launcher == "roslaunch":
+    command, image = ["bash", "-c", SHELL.format(numbers=" ".join(map(str, numbers)))], BASE_IMAGE
+    volumes, environment = ["-v", f"{folder}:/bench", "-v", f"{VICTIMS}:/victims:ro"], []
+    if options.launcher == "supervisord":
+        (folder / "supervisord.conf").write_text(SUPERVISORD + "".join(PROGRAM.format(n=n) for n in numbers))
+        command = ["python3", "-m", "supervisor.supervisord", "-c", "/bench/supervisord.conf"]
+        volumes += ["-v", f"{supervisor_library()}:/lib/supervisor/supervisor:ro"]
+        environment = ["-e", "PYTHONPATH=/lib/supervisor"]
+    elif options.launcher == "roslaunch":
         command, image = ["roslaunch", "nodes", "all.launch"], ros_image(factory.podman)
         environment = ["-e", "ROS_PACKAGE_PATH=/bench:/usr/share", "-e", "ROS_MASTER_URI=http://localhost:11311"]
     labels = {"scope": "nodes", "restore.max": "64/1s", "restore.on": "signal,exit", "files": "rewind"}
     if options.interval:
         labels["interval"] = options.interval
-    volumes = ["-v", f"{folder}:/bench", "-v", f"{VICTIMS}:/victims:ro"]
     container = factory.protected(*command, labels=labels, image=image, options=[*volumes, *environment])
     return Nodes(sidecar, container, boards)
+
+
+def supervisor_library() -> Path:
+    """PyPI's supervisor in this environment, which the container borrows."""
+    found = importlib.util.find_spec("supervisor")
+    if found is None or found.origin is None:
+        raise SystemExit("error: there is no supervisord: .venv/bin/pip install supervisor")
+    return Path(found.origin).parent
 
 
 def ros_image(podman: Podman) -> str:
@@ -241,7 +261,7 @@ def idle(nodes: Nodes, options: argparse.Namespace) -> Idle:
 def main() -> None:
     """Starts, kills or waits, removes; results of other launchers stay in the file."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--launcher", choices=("shell", "roslaunch"), default="shell")
+    parser.add_argument("--launcher", choices=("shell", "supervisord", "roslaunch"), default="shell")
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--interval", default="", help="avckpt.interval of all nodes (that of the release)")

@@ -66,11 +66,6 @@ def units_dir() -> str:
     return os.path.join(run_dir(), "units")
 
 
-def units_socket() -> str:
-    """Where the sidecar listens for avckpt-init in front of a node (native/init/unit.c)."""
-    return os.path.join(units_dir(), "units.sock")
-
-
 def records_dir() -> str:
     """The directory with one record per live protected container."""
     return os.path.join(run_dir(), "containers")

@@ -490,8 +490,6 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 	      const char **why);
 /* Both ends of a pipe or socket pair; of a pipe the one to read from comes first. */
 int file_make_pair(const struct file *want, const struct file *other, int ends[2]);
-/* A socket or pipe that reads as closed by the peer, after its contents. */
-int file_make_dead(const struct file *want, pid_t template);
 
 /* files_restore.c and files_calls.c */
 /* One restore of a table: from `now` to `want`. */

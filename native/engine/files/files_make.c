@@ -194,7 +194,8 @@ static void leave_content(int fd, int other_fd, const struct file *want)
 		(void)file_put_content(fd, other_fd, want);
 }
 
-int file_make_dead(const struct file *want, pid_t template)
+/* A socket or pipe that reads as closed by the peer, after its contents. */
+static int make_dead(const struct file *want, pid_t template)
 {
 	const struct file_socket *s = want->socket;
 	int ends[2], fd;
@@ -258,11 +259,11 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 		/* A closed connection need not be reported. */
 		if (s && s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6)
 			*why = not_again;
-		return file_make_dead(want, template);
+		return make_dead(want, template);
 	}
 	fd = socket_of(template, s->domain, s->type, s->protocol);
 	if (fd < 0)
-		return file_make_dead(want, template);
+		return make_dead(want, template);
 	/* Only sockets of one user can share a port (socket(7), SO_REUSEPORT). */
 	if (fchown(fd, s->uid, s->gid))
 		*why = "it does not belong to its user any more";
@@ -270,7 +271,7 @@ static int make_socket(const struct file *want, pid_t template, pid_t init, cons
 	if (s->domain == AF_UNIX ? file_bind_unix(fd, s, template, init, why)
 				 : bind_socket(fd, s, why)) {
 		close(fd);
-		return file_make_dead(want, template);
+		return make_dead(want, template);
 	}
 	problem = file_put_options(fd, s); /* one was in the way of bind(2) */
 	*why = *why ? *why : problem;
@@ -325,7 +326,7 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 		return fd >= 0 ? fd : make_named(want, template, init, rights, why);
 	case FILE_PIPE:
 		fd = take_from_init(want, init);
-		return fd >= 0 ? fd : file_make_dead(want, template);
+		return fd >= 0 ? fd : make_dead(want, template);
 	case FILE_SOCKET:
 		fd = take_from_init(want, init);
 		return fd >= 0 ? fd : make_socket(want, template, init, why);

@@ -148,9 +148,8 @@ void guard_drop_newer(struct avc_guard *guard, uint64_t number);
 uint32_t guard_free_slot(const struct avc_guard *guard);
 void guard_lose_generation(struct avc_guard *guard, uint32_t i, enum avc_reason reason,
 			   uint64_t ticket);
-/* A template or holder; guard_knows_process(): or a process of the app. */
+/* A template or holder. */
 bool guard_owns(pid_t pid, const void *guard);
-bool guard_knows_process(pid_t pid, const void *guard);
 /* Gives up a process that is gone.  We must not keep its descriptors open: a reader may be waiting
  * for the end of a pipe. */
 void guard_release(struct avc_guard *guard, struct process *process);

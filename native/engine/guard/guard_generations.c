@@ -109,7 +109,8 @@ bool guard_owns(pid_t pid, const void *arg)
 	return init_channel_listens(&guard->channel, pid);
 }
 
-bool guard_knows_process(pid_t pid, const void *arg)
+/* Ours, or a process of the app. */
+static bool knows_process(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
@@ -177,7 +178,7 @@ static bool is_not_lost(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	return guard_knows_process(pid, guard) || is_known(pid, guard) || !tracee_is_ours(pid) ||
+	return knows_process(pid, guard) || is_known(pid, guard) || !tracee_is_ours(pid) ||
 	       !tree_has_parasite(&guard->tree, tracee_pc(pid));
 }
 

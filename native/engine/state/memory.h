@@ -112,7 +112,6 @@ static inline size_t area_bytes(const struct area *a)
 
 /* ---- memory_areas.c ---------------------------------------------------------- */
 
-bool areas_add(struct areas *areas, const struct area *area);
 /* Shrinks it to what it holds; false: out of memory. */
 bool areas_copy(struct areas *to, const struct areas *from);
 void areas_free(struct areas *areas);

@@ -13,7 +13,7 @@
 
 #define AREAS_MAX 4096
 
-bool areas_add(struct areas *areas, const struct area *area)
+static bool add_area(struct areas *areas, const struct area *area)
 {
 	if (!make_room(&areas->area, areas->count, &areas->room, sizeof *areas->area))
 		return false;
@@ -204,7 +204,7 @@ static int find_area(const struct mapping *m, void *arg)
 		.protection = (uint8_t)mapping_protection(m),
 		.way = m->mode[1] == 'w' ? WAY_MAPPING : WAY_NONE,
 	};
-	return areas_add(&survey->areas, &area) ? 0 : -1;
+	return add_area(&survey->areas, &area) ? 0 : -1;
 }
 
 /* ---- what of it is to be rolled back ----------------------------------------------------- */
@@ -255,14 +255,14 @@ static bool is_to_be_kept(struct survey *survey, struct area *a)
 	if (a->named && mem_others_have(survey->process->others, a)) {
 		survey->others_bytes += area_bytes(a);
 		/* If there is no memory to record it, it is searched again. */
-		(void)areas_add(&survey->foreign, a);
+		(void)add_area(&survey->foreign, a);
 		return false;
 	}
 	a->way = way_of(survey->template, a);
 	if (a->way == WAY_NONE ||
 	    survey->shared_bytes + area_bytes(a) > survey->process->shm_bytes) {
 		survey->left_bytes += a->way == WAY_NONE ? 0 : area_bytes(a);
-		survey->lost_some |= !areas_add(&survey->unkept, a);
+		survey->lost_some |= !add_area(&survey->unkept, a);
 		return false;
 	}
 	survey->shared_bytes += area_bytes(a);

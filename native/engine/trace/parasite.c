@@ -446,7 +446,9 @@ static int look_at_seccomp(struct process *process, struct thread *thread, struc
 	return 0;
 }
 
-int parasite_check(struct process *process, pid_t tid, struct avc_error *err)
+/* execve(2) can replace the program at any moment, and the parasite with it: checks, in a stopped
+ * thread, that it is there.  If not, the process is not infected any more. */
+static int check_there(struct process *process, pid_t tid, struct avc_error *err)
 {
 	const avc_remote at = process->parasite.base + INJ_CODE_BYTES +
 			      offsetof(struct inj_control, nonce);
@@ -474,7 +476,7 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
 {
 	if (thread_check_dispatch(thread->tid, err))
 		return -1;
-	if (!has_memory_of_holder(process) && parasite_check(process, thread->tid, err))
+	if (!has_memory_of_holder(process) && check_there(process, thread->tid, err))
 		return -1;
 	/* A thread must return into the app, never into a parasite that will be unmapped. */
 	if (parasite_is_old(process, arch_pc(&thread->regs)))

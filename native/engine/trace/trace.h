@@ -455,9 +455,6 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
  * parasite_clear_undo(). */
 int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
 void parasite_clear_undo(struct process *process);
-/* execve(2) can replace the program at any moment, and the parasite with it: checks, in a stopped
- * thread, that it is there.  If not, the process is not infected any more. */
-int parasite_check(struct process *process, pid_t tid, struct avc_error *err) warn_unused;
 /* Whether this is in a parasite left behind by a dead guard, or in a stub that stays. */
 bool parasite_is_old(const struct process *process, avc_remote address);
 /* Options for a stopped task of ours, which has the memory of the parasite's process. */

@@ -494,5 +494,5 @@ void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_re
 	arch_enter(regs, base, last ? stub + STUB_LAST : stub, 0, 0);
 	regs->r.regs[8] = (unsigned long long)nr;
 	for (unsigned int i = 0; i < 6; i++)
-		arch_syscall_arg_set(regs, i, arg[i]);
+		regs->r.regs[i] = arg[i];
 }

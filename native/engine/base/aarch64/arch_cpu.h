@@ -61,11 +61,6 @@ static inline uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned i
 {
 	return n < 6 ? regs->r.regs[n] : 0;
 }
-static inline void arch_syscall_arg_set(struct arch_regs *regs, unsigned int n, uint64_t value)
-{
-	if (n < 6)
-		regs->r.regs[n] = value;
-}
 
 static inline avc_remote arch_pc(const struct arch_regs *regs)
 {

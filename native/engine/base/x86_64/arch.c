@@ -60,7 +60,7 @@ uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned int n)
 	return n < 6 ? arg[n] : 0;
 }
 
-void arch_syscall_arg_set(struct arch_regs *regs, unsigned int n, uint64_t value)
+static void arg_set(struct arch_regs *regs, unsigned int n, uint64_t value)
 {
 	unsigned long long *arg[6] = { &regs->r.rdi, &regs->r.rsi, &regs->r.rdx,
 				       &regs->r.r10, &regs->r.r8,  &regs->r.r9 };
@@ -497,5 +497,5 @@ void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_re
 	regs->r.orig_rax = -1ULL;
 	regs->r.rax = (unsigned long long)nr;
 	for (unsigned int i = 0; i < 6; i++)
-		arch_syscall_arg_set(regs, i, arg[i]);
+		arg_set(regs, i, arg[i]);
 }

@@ -49,7 +49,6 @@ static inline void arch_result_note(struct arch_regs *regs, long result)
 	regs->r.rax = (unsigned long long)result;
 }
 uint64_t arch_syscall_arg(const struct arch_regs *regs, unsigned int n);
-void arch_syscall_arg_set(struct arch_regs *regs, unsigned int n, uint64_t value);
 
 static inline avc_remote arch_pc(const struct arch_regs *regs)
 {
