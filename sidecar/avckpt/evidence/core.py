@@ -7,7 +7,8 @@ A program of its own, at the lowest priority: a gigabyte of somebody's memory is
 It is an ELF core as the kernel writes it (core(5)), compressed by zstd, of the pages that there
 are: those that were never touched, and files that can be read elsewhere, are left out.
 
-What the kernel did not tell is not in it: FPU and vector registers, and the bases of FS and GS.
+What the kernel did not tell is not in it: FPU and vector registers.  The base of FS is where a thread's
+own memory says so (`_thread_pointers`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import struct
 import sys
 import time
@@ -38,6 +40,12 @@ MINI_DATA, MINI_DATA_ALL = 256 << 10, 16 << 20
 """A mini core has private mappings up to this size each, and all together: data of programs and libraries."""
 MINI_STACK = 256 << 10
 RED_ZONE = 128
+STACK_ALL = 64 << 20
+"""Of a thread's stack, above its end: the C library keeps the thread's own data there."""
+BLOCK = 1 << 16
+"""Of addresses that differ in their low two bytes only."""
+TLS_MAX = 1 << 20
+"""A mapping that ld.so makes for the data of the main thread is smaller."""
 
 _EHDR = struct.Struct("=16sHHIQQQIHHHHHH")
 _PHDR = struct.Struct("=IIQQQQQQ")
@@ -258,7 +266,8 @@ def _note(kind: int, body: bytes) -> bytes:
 
 def _notes(remains: Remains, request: Request) -> bytes:
     threads = request.threads or [Thread(request.app_pid, {})]
-    first, *others = (_note(_NT_PRSTATUS, _prstatus(request, each)) for each in threads)
+    pointers = _thread_pointers(remains, threads)
+    first, *others = (_note(_NT_PRSTATUS, _prstatus(request, each, pointers.get(each.tid, 0))) for each in threads)
     name = request.command.rpartition("/")[2].encode()[:15]
     info = _PRPSINFO.pack(
         *(b"\0", b"R", b"\0", 0, 0, 0, 0, request.app_pid, 0, 0, 0, name, request.command.encode()[:79])
@@ -269,8 +278,54 @@ def _notes(remains: Remains, request: Request) -> bytes:
     return b"".join([*notes, _note(_NT_FILE, _files(remains.maps)), *others])
 
 
-def _prstatus(request: Request, thread: Thread) -> bytes:
-    known = {"orig_rax": 2**64 - 1, **thread.registers}
+def _thread_pointers(remains: Remains, threads: list[Thread]) -> dict[int, int]:
+    """The base of FS by thread, of those that can be told.
+
+    Where FS points to, programs of the C library have the address itself, twice (`tcb` and `self` of tcbhead_t).
+    Of a thread that pthread_create(3) made this is above its stack; of the main thread it is in a small mapping.
+    """
+    found: dict[int, int] = {}
+    stacks = [each.registers["rsp"] for each in threads if each.registers]
+    for each in threads:
+        stack = each.registers.get("rsp", 0)
+        mapping = next((one for one in remains.maps if one.start <= stack < one.end), None)
+        if mapping is None or mapping.path == "[stack]":
+            continue
+        # Usually at the end of a mapping that is this stack and nothing else.  What was never touched takes
+        # page tables when it is read.
+        alone = sum(mapping.start <= at < mapping.end for at in stacks) == 1
+        above = _self_pointers(remains, max(stack, mapping.end - BLOCK), mapping.end) if alone else []
+        above = above or _self_pointers(remains, stack, min(mapping.end, stack + STACK_ALL))
+        if above:
+            found[each.tid] = above[0]
+    rest = [each.tid for each in threads if each.registers and each.tid not in found]
+    small = [
+        one
+        for one in remains.maps
+        if "rw" in one.flags and one.inode == 0 and one.end - one.start <= TLS_MAX and one.path in ("", "[heap]")
+    ]
+    others = {at for one in small for at in _self_pointers(remains, one.start, one.end)} - set(found.values())
+    if len(rest) == len(others) == 1:
+        found[rest[0]] = others.pop()
+    return found
+
+
+def _self_pointers(remains: Remains, start: int, end: int) -> list[int]:
+    found = []
+    for begin in range(start // BLOCK * BLOCK, end, BLOCK):
+        base = max(begin, start // 8 * 8)
+        # 16 bytes further than the block: the second address may be there.
+        words = remains.read(base, min(begin + BLOCK, end) + 24 - base)
+        high = re.escape(struct.pack("=Q", begin)[2:])
+        for match in re.finditer(rb"(?=" + high + rb")", words):
+            at = match.start() - 2
+            if at % 8 == 0 and words[at : at + 8] == words[at + 16 : at + 24] == struct.pack("=Q", base + at):
+                found.append(base + at)
+    return found
+
+
+def _prstatus(request: Request, thread: Thread, thread_pointer: int) -> bytes:
+    known = {"orig_rax": 2**64 - 1, "fs_base": thread_pointer, **thread.registers}
     registers = [known.get(name, 0) for name in _REGS]
     signum = request.signal  # of all threads, as the kernel has it
     return _PRSTATUS.pack(signum, 0, 0, signum, 0, 0, 0, thread.tid, 0, 0, 0, *[0] * 8, *registers, 0, 0)
