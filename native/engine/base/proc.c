@@ -19,6 +19,7 @@
 #include "base.h"
 
 #define PF_EXITING 4 /* include/linux/sched.h; not for user space otherwise */
+#define PF_SIGNALED 0x400
 
 int proc_open(pid_t pid, const char *name, int flags)
 {
@@ -386,6 +387,14 @@ bool proc_is_exiting(pid_t tid)
 	struct proc_stat stat;
 
 	return proc_stat(tid, &stat) || stat.flags & PF_EXITING;
+}
+
+/* All threads get the flag before the kernel writes a core (kernel/signal.c, get_signal()). */
+bool proc_is_dying(pid_t tid)
+{
+	struct proc_stat stat;
+
+	return proc_stat(tid, &stat) == 0 && stat.flags & PF_SIGNALED;
 }
 
 bool proc_is_killed(pid_t pid)

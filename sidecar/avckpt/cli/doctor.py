@@ -83,6 +83,8 @@ class Facts:
     ns_last_pid: bool
     map_files: bool
     pidfd: bool
+    core_pattern: str
+    """Empty: it is not known."""
     podman: PodmanFacts | str
     """A string: why Podman does not answer."""
     hooks_dir_problems: tuple[str, ...]
@@ -181,6 +183,17 @@ def _judge_machine(facts: Facts) -> Iterator[Check]:
     else:
         shown = "no Yama" if facts.yama_scope is None else f"kernel.yama.ptrace_scope={facts.yama_scope}"
         yield Check("ptrace", Status.OK, f"{shown}, which leaves ptrace to a privileged sidecar")
+    if facts.core_pattern.startswith("|"):
+        collector = facts.core_pattern[1:].split()[:1]
+        yield Check(
+            "core dumps",
+            Status.WARN,
+            f"a death by SIGSEGV or abort() is complete only when {''.join(collector)} has read the core",
+            "have containers that should be back at once leave none: --ulimit core=1:1 (0 does not do it), and "
+            "avckpt.core",
+        )
+    else:
+        yield Check("core dumps", Status.OK, f"kernel.core_pattern={facts.core_pattern}")
     lacking = [name for name, bit in _CAPABILITIES.items() if not facts.capabilities >> bit & 1]
     if lacking:
         yield Check(
@@ -314,6 +327,7 @@ def gather() -> Facts:
         ns_last_pid=os.path.exists("/proc/sys/kernel/ns_last_pid"),
         map_files=os.path.exists("/proc/self/map_files"),
         pidfd=_has_pidfd(),
+        core_pattern=_text_in(Path("/proc/sys/kernel/core_pattern")),
         podman=podman_facts(),
         hooks_dir_problems=tuple(containers_conf.problems(HOOKS_DIR, environ=os.environ)),
         service=service_facts(SERVICE),
@@ -490,6 +504,13 @@ def _number_in(path: Path) -> int | None:
         return int(path.read_text())
     except (OSError, ValueError):
         return None
+
+
+def _text_in(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""
 
 
 def _has_pidfd() -> bool:
