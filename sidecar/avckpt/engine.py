@@ -222,6 +222,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.interval_ns = 0 if config.together else _ns("interval", config.interval_s)
     c.together = config.together
     c.interval_min_ns = _ns("least interval", config.interval_min_s)
+    c.apart_ns = _ns("time between generations", config.apart_s)
     c.budget_freeze_ppm = round(config.budget_freeze * 1e6)
     c.budget_cpu_ppm = round(config.budget_cpu * 1e6)
     c.freeze_deadline_ns = _ns("freeze deadline", config.freeze_deadline_s)

@@ -113,6 +113,8 @@ class GuardConfig:
     """The fraction of the application's time."""
     budget_cpu: float = 0.05
     """The fraction of one CPU's time."""
+    apart_s: float = 0.0
+    """All generations but the newest are at least so far apart; with `interval_min_s`, 0: `interval_s`."""
 
 
 @dataclass(frozen=True)

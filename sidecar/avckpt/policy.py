@@ -81,7 +81,8 @@ def guard_config(policy: Policy) -> GuardConfig:
         budget_cpu=policy.budget_cpu,
         # One more for rollbacks from a hang, and one where the newest is only a moment old: see
         # docs/policy.md.
-        keep=min(policy.keep + policy.restore_on.unhealthy + policy.automatic, KEEP_MAX),
+        keep=min(policy.keep + policy.restore_on.unhealthy + (policy.automatic or policy.keep_apart_s > 0), KEEP_MAX),
+        apart_s=policy.keep_apart_s,
         restore_on_signal=policy.restore_on.signal,
         restore_on_exit=policy.restore_on.exit,
         restore_on_statuses=policy.restore_on.statuses,

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config, since_linux
-from testkit.harness import app_pid
+from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, since_linux
+from testkit.harness import app_pid, wait_until
 from testkit.init_peer import Init
 
 pytestmark = pytest.mark.shared_machine("a guard that gets no CPU for a second takes fewer checkpoints")
@@ -115,3 +115,18 @@ def test_what_listens_is_given_up_with_the_application_that_it_listens_to(tmp_pa
             for _ in range(4):
                 peer.recv(64)
         assert guard.fds().total() < fds + 10
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 1.5])
+def test_a_fault_that_shows_late_needs_older_ones(tmp_path: Path, apart_s: float) -> None:
+    """It poisons the state, and kills half a second later; a checkpoint every 50 ms."""
+    often = config(0.05, keep=3, apart_s=apart_s, restore_max=3, restore_window_s=60.0)
+    with Victim("poison 500", tmp_path) as victim, GuardProcess(often, [victim.pid]) as guard:
+        guard.wait("checkpoint", count=10)
+        wait_until(lambda: guard.command("list")["age_s"] >= apart_s, 2 * apart_s + PATIENCE_S, "an old one", 0.05)
+        victim.kill_app(signal.SIGUSR1)
+        if not apart_s:
+            assert guard.wait("gave_up")["reason"] == "limit"
+            return
+        guard.wait_for(lambda event: event["kind"] == "restored" and event["age_s"] > 1, "an older one")
+        victim.wait_beats(1000)

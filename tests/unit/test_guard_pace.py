@@ -177,3 +177,18 @@ def test_a_checkpoint_at_once_is_no_proof_that_it_got_somewhere(library: Library
     pace.now += SECOND
     pace.hold()
     assert pace.policy.proved
+
+
+@pytest.mark.parametrize(("automatic", "apart_s", "oldest_s"), [(False, 0, 0.4), (False, 10, 10), (True, 10, 10)])
+def test_those_of_any_interval_can_be_apart(library: Library, automatic: bool, apart_s: float, oldest_s: float) -> None:
+    pace = Pace(library, keep=3)
+    pace.config.apart_ns = int(apart_s * SECOND)
+    if not automatic:
+        pace.config.interval_min_ns = 0
+    for _ in range(1000):
+        pace.now += 200 * MS
+        pace.hold()
+    oldest, middle, newest = pace.ages_s
+    assert newest == 0
+    assert oldest - middle >= apart_s
+    assert oldest_s <= oldest <= 2 * oldest_s + 0.2

@@ -50,6 +50,7 @@ def test_a_group_that_goes_back_together() -> None:
             "label avckpt.deadline.late=cold: no member of a group that recovers together",
         ),
         ({"avckpt.scope": "nodes"}, "label avckpt.scope=nodes: nodes cannot recover together"),
+        ({"avckpt.keep.apart": "3s"}, "label avckpt.keep.apart=3s: a group that recovers together keeps its newest"),
     ],
 )
 def test_what_does_not_go_with_a_return_together(labels: dict[str, str | None], says: str) -> None:
@@ -100,12 +101,13 @@ def test_the_rest_of_the_table() -> None:
         {
             **ON,
             "avckpt.keep": "16",
+            "avckpt.keep.apart": "1m",
             "avckpt.restore.on": "signal, 3,42",
             "avckpt.restore.max": "1/1h",
             "avckpt.quiesce": "0",
         }
     )
-    assert policy.keep == 16
+    assert (policy.keep, policy.keep_apart_s) == (16, 60)
     assert policy.restore_on == RestoreOn(signal=True, exit=False, statuses=frozenset({3, 42}))
     assert (policy.restore_max, policy.restore_window_s) == (1, 3600)
     assert policy.quiesce_s == 0

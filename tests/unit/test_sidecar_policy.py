@@ -31,6 +31,7 @@ def test_every_label_arrives() -> None:
             "avckpt.enable": "true",
             "avckpt.interval": "250ms",
             "avckpt.keep": "7",
+            "avckpt.keep.apart": "10s",
             "avckpt.restore.on": "signal,3,99",
             "avckpt.restore.max": "9/2m",
             "avckpt.quiesce": "0",
@@ -43,7 +44,8 @@ def test_every_label_arrives() -> None:
     ).config
     assert config == GuardConfig(
         interval_s=0.25,
-        keep=7,
+        keep=8,
+        apart_s=10.0,
         restore_on_signal=True,
         restore_on_exit=False,
         restore_on_statuses=frozenset({3, 99}),

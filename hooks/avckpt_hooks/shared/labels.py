@@ -87,6 +87,8 @@ class Policy:
     """With `automatic`: the fraction of one CPU that they may use."""
     keep: int = 2
     """Generations kept, 1..KEEP_MAX."""
+    keep_apart_s: float = 0.0
+    """These are at least so far apart; 0: as far as the checkpoints that they are of."""
     restore_on: RestoreOn = field(default_factory=RestoreOn)
     restore_max: int = 5
     """At most so many restores within `restore_window_s`."""
@@ -190,6 +192,13 @@ def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
     if policy.scope == "nodes":
         raise LabelError(
             "avckpt.scope", "nodes", "nodes cannot recover together with others", "use avckpt.scope=container there"
+        )
+    if policy.keep_apart_s:
+        raise LabelError(
+            "avckpt.keep.apart",
+            mapping["avckpt.keep.apart"],
+            "a group that recovers together keeps its newest lines",
+            "leave it out, or give a longer avckpt.interval",
         )
     if policy.automatic:
         raise LabelError(
@@ -361,6 +370,10 @@ def _parse_restore_max(text: str) -> dict[str, Any]:
     }
 
 
+def _parse_keep_apart(text: str) -> dict[str, Any]:
+    return {"keep_apart_s": 0.0 if text == "0" else _duration_s(text, "", "24h")}
+
+
 def _parse_deadline(text: str) -> dict[str, Any]:
     return {"deadline_s": _duration_s(text, "1ms", "1h")}
 
@@ -445,6 +458,7 @@ LABELS: dict[str, Label] = {
     "avckpt.budget.freeze": Label("3%", "a percentage from 0.1% to 50%, as 3%", _share("budget_freeze")),
     "avckpt.budget.cpu": Label("5%", "a percentage from 0.1% to 50%, as 5%", _share("budget_cpu")),
     "avckpt.keep": Label("2", f"a whole number from 1 to {KEEP_MAX}", _parse_keep),
+    "avckpt.keep.apart": Label("0", f"0, or {_DURATION}, up to 24h, as 3s", _parse_keep_apart),
     "avckpt.restore.on": Label(
         "signal,exit",
         "signal, exit, unhealthy and exit codes from 1 to 255, joined by commas",

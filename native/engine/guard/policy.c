@@ -91,6 +91,12 @@ struct policy_generation policy_new_generation(struct policy *policy,
 	return fresh;
 }
 
+static uint64_t apart_ns(const struct avc_config *config)
+{
+	return config->apart_ns || !policy_is_automatic(config) ? config->apart_ns
+								: config->interval_ns;
+}
+
 uint32_t policy_replaced(const struct policy *policy, const struct avc_config *config, uint64_t now)
 {
 	const int vouched = newest_vouched(policy), seen = newest_seen(policy);
@@ -102,11 +108,11 @@ uint32_t policy_replaced(const struct policy *policy, const struct avc_config *c
 				return i;
 	/* If taken often, they would all be of the last moments: the newest is replaced until it is
 	 * as far from the one before it as if they were taken seldom. */
-	if (policy_is_automatic(config) && policy->count > 1) {
+	if (policy->count > 1) {
 		const uint32_t i = policy->count - 1;
 
 		if ((int)i != vouched && (int)i != seen &&
-		    policy->held[i].taken_ns - policy->held[i - 1].taken_ns < config->interval_ns)
+		    policy->held[i].taken_ns - policy->held[i - 1].taken_ns < apart_ns(config))
 			return i;
 	}
 	return policy_dispensable(policy);

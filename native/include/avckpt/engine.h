@@ -77,6 +77,9 @@ struct avc_config {
 	uint64_t interval_min_ns;
 	uint32_t budget_freeze_ppm;
 	uint32_t budget_cpu_ppm;
+	/* All generations but the newest are at least so far apart; 0: with interval_min_ns it is
+	 * interval_ns, else no matter. */
+	uint64_t apart_ns;
 	uint64_t freeze_deadline_ns; /* the app is never held longer than this to
 	                              * get it stopped; 0: 50 ms                  */
 	uint64_t quiesce_ns;         /* how long to wait for a quiescent moment */
