@@ -65,11 +65,11 @@ class Cores:
             return "", 0, f"no core: {printable(str(answer['problem']))}"
         size = int(answer["bytes"])
         kind = "mini core" if mode == "mini" else "core"
-        self._prune(_file_name(container.label), path)
+        self.prune(_file_name(container.label), path)
         what = f"{kind} of {answer['threads']} thread(s), {answer['memory_bytes'] / 1e6:.1f} MB of memory in "
         return str(path), size, f"{what}{size / 1e6:.1f} MB, after {answer['seconds']:.2f} s: {path}"
 
-    def _prune(self, name: str, newest: Path) -> None:
+    def prune(self, name: str, newest: Path) -> None:
         """Makes room, oldest first; the newest stays."""
         found = []
         for path in self._folder.glob(f"*{SUFFIX}"):

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many core files stay, how large and how old."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from avckpt.evidence.cores import KEPT_BYTES, KEPT_OF_EACH, KEPT_S, SUFFIX, Cores
+
+
+def core(folder: Path, name: str, age_s: float, size: int = 1000) -> Path:
+    """A file with a hole of that size."""
+    path = folder / f"{name}.{int(age_s)}{SUFFIX}"
+    path.touch()
+    os.truncate(path, size)
+    os.utime(path, (time.time() - age_s,) * 2)
+    return path
+
+
+def left(folder: Path, newest: Path) -> set[str]:
+    """What is there when the newest, of `web`, has been written."""
+    Cores(folder).prune("web", newest)
+    return {path.name[: -len(SUFFIX)] for path in folder.iterdir()}
+
+
+def test_the_oldest_of_a_container_make_way(tmp_path: Path) -> None:
+    for age in range(1, KEPT_OF_EACH + 3):
+        core(tmp_path, "web", age)
+        core(tmp_path, "other", age)
+    found = left(tmp_path, core(tmp_path, "web", 0))
+    assert {name for name in found if name.startswith("web.")} == {f"web.{age}" for age in range(KEPT_OF_EACH)}
+    assert len(found) == KEPT_OF_EACH + KEPT_OF_EACH + 2
+
+
+def test_all_together_are_bounded(tmp_path: Path) -> None:
+    for age in (1, 2, 3):
+        core(tmp_path, f"c{age}", age, KEPT_BYTES // 3)
+    assert left(tmp_path, core(tmp_path, "web", 0, KEPT_BYTES // 3)) == {"web.0", "c1.1", "c2.2"}
+
+
+def test_old_ones_go(tmp_path: Path) -> None:
+    core(tmp_path, "other", KEPT_S - 100)
+    core(tmp_path, "other", KEPT_S + 100)
+    assert left(tmp_path, core(tmp_path, "web", 0)) == {"web.0", f"other.{int(KEPT_S) - 100}"}
+
+
+def test_the_newest_stays(tmp_path: Path) -> None:
+    assert left(tmp_path, core(tmp_path, "web", 0, KEPT_BYTES + 1)) == {"web.0"}
