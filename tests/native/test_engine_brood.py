@@ -19,6 +19,7 @@ pytestmark = pytest.mark.shared_machine(
 
 CHILDREN = 6000
 STRESS = ("stress-ng", "--clone", "1", "--clone-ops", "30", "--verify")
+WHEN_TOLD = ("sh", "-c", 'read line; exec "$@"', "sh")
 
 
 @pytest.fixture(autouse=True)
@@ -50,9 +51,16 @@ def test_stress_ng_ends_well(tmp_path: Path) -> None:
     said = tmp_path / "said"
     with (
         said.open("wb") as output,
-        Init([*STRESS, "--temp-path", tmp_path], pid1=True, stdout=output.fileno(), stderr=subprocess.STDOUT) as init,
+        Init(
+            [*WHEN_TOLD, *STRESS, "--temp-path", tmp_path],
+            pid1=True,
+            stdin=subprocess.PIPE,
+            stdout=output.fileno(),
+            stderr=subprocess.STDOUT,
+        ) as init,
         GuardProcess(config(0.05), [init.pid]) as guard,
     ):
         guard.wait("attached")
-        assert init.popen.wait(timeout=4 * PATIENCE_S) == 0, said.read_text()
+        init.popen.communicate(b"\n", timeout=4 * PATIENCE_S)
+        assert init.popen.returncode == 0, said.read_text()
         assert guard.process.poll() is None
