@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import signal
 import subprocess
@@ -105,6 +106,22 @@ def test_a_filter_that_comes_at_any_moment_kills_nobody(tmp_path: Path) -> None:
             guard.wait("checkpoint", count=3)
             time.sleep(0.0017 * i)
             victim.kill_app(signal.SIGUSR1)
+            lost = guard.wait("guard_lost")
+            assert lost["reason"] == "filter"
+            guard.wait("checkpoint", since=guard.events.index(lost))
+            victim.wait_beats(5)
+            assert not [event for event in guard.events if event["kind"] in ("died", "restored")]
+
+
+def test_a_filter_for_all_threads_kills_none_that_is_in_the_parasite(tmp_path: Path) -> None:
+    """One thread installs it for all the moment that another one is queried, or would, if it could run then."""
+    for _ in range(6):
+        with Victim("ambush", tmp_path) as victim, GuardProcess(config(0.005), [victim.pid]) as guard:
+            guard.wait("checkpoint", count=2)
+            victim.kill_app(signal.SIGUSR1)
+            with contextlib.suppress(TimeoutError):
+                wait_until(lambda: victim.see().counter[0], 1, "it saw a thread in there")  # noqa: B023
+            victim.kill_app(signal.SIGUSR2)
             lost = guard.wait("guard_lost")
             assert lost["reason"] == "filter"
             guard.wait("checkpoint", since=guard.events.index(lost))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -15,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from testkit.fake_init import FAKE_INIT, FOLLY
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import GuardProcess, Victim, config, meanwhile
 from testkit.harness import wait_until
 
 pytestmark = pytest.mark.shared_machine(
@@ -99,10 +100,13 @@ def test_the_code_can_not_be_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("filters", ["", "--little"])
 @pytest.mark.parametrize("where", ["lists", "code", "setup"])
-def test_a_seccomp_filter_holds_for_what_runs_in_it(tmp_path: Path, where: str, filters: str) -> None:
-    """Injected code that the application modifies can make no call that the application's own filter refuses."""
+def test_a_seccomp_filter_holds_for_what_runs_in_it(
+    tmp_path: Path, where: str, filters: str, victims_built: Path
+) -> None:
+    """Injected code that somebody modifies can make no call that the application's own filter refuses."""
     folder = tmp_path / "smuggled"
     with (
+        contextlib.ExitStack() as accomplice,
         Victim(f"smuggle {where} {folder} {filters}", tmp_path) as hostile,
         Victim("idle 1 1", tmp_path) as peaceful,
         GuardProcess(config(0.02), [hostile.pid, peaceful.pid]) as guard,
@@ -110,6 +114,9 @@ def test_a_seccomp_filter_holds_for_what_runs_in_it(tmp_path: Path, where: str, 
         guard.wait("checkpoint", cookie=1, count=3)  # what attempts have left behind is gone by then
         hostile.kill_app(signal.SIGUSR1)
         wait_until(lambda: hostile.see().counter[0], 15, "the application has found the parasite")
+        if where == "lists":
+            program, address = victims_built / "smuggle", hostile.see().counter[3]
+            accomplice.enter_context(meanwhile([str(program), "outside", str(hostile.app), str(address)]))
         # The newest checkpoint may be younger than the last time that the application got a CPU.
         for _ in range(10 if where == "setup" else 0):
             guard.wait("checkpoint", cookie=1, since=guard.mark(), count=2)

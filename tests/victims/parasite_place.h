@@ -17,14 +17,16 @@ struct place {
 	uint64_t start, bytes; /* 0: there is none yet */
 };
 
-static inline struct place find_parasite(void)
+static inline struct place find_parasite_of(const char *pid)
 {
 	struct place found = { 0, 0 };
-	FILE *maps = fopen("/proc/self/maps", "re");
 	uint64_t start, end;
 	char line[512], mode[5];
+	FILE *maps;
 
-	must(maps != NULL, "/proc/self/maps");
+	snprintf(line, sizeof(line), "/proc/%s/maps", pid);
+	maps = fopen(line, "re");
+	must(maps != NULL, line);
 	while (fgets(line, sizeof(line), maps)) {
 		if (sscanf(line, "%lx-%lx %4s", &start, &end, mode) != 3)
 			continue;
@@ -36,6 +38,11 @@ static inline struct place find_parasite(void)
 	}
 	fclose(maps);
 	return found;
+}
+
+static inline struct place find_parasite(void)
+{
+	return find_parasite_of("self");
 }
 
 static inline struct place await_parasite(void)

@@ -3,12 +3,16 @@
  * smuggle WHERE FOLDER [--little]: an application whose own seccomp filter refuses it mkdir(2), and
  * with --little all but a few calls, has what avckpt runs in it make that call:
  *
- *   lists    it writes it into the list of calls that a thread of its is about to make
+ *   lists    it is written into the list of calls that a thread of its is about to make, by an
+ *            accomplice outside: nothing of the application runs then
  *   code     it maps code of its own over that of the parasite
  *   setup    it writes it into what a process restored from it will call
  *
  * It begins at SIGUSR1, when there is one parasite only.  counter[0] says that it has found it,
- * counter[1] how often the call was made and refused, counter[2] how often it was not.
+ * counter[1] how often the call was made and refused, counter[2] how often it was not; counter[3] is
+ * the address of FOLDER.
+ *
+ * smuggle outside PID ADDRESS: the accomplice, of the process PID, with FOLDER at ADDRESS there.
  */
 #include <linux/filter.h>
 #include <linux/seccomp.h>
@@ -21,6 +25,7 @@
 
 #define SLOTS 3 /* avckpt.keep is 2 in the tests */
 #define UNTOUCHED INT64_C(0x7777)
+#define LISTED 48
 
 #define ALLOW(nr)                                        \
 	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
@@ -79,24 +84,52 @@ static void note(int64_t result)
 		count(2, 1);
 }
 
-static void write_lists(struct inj_call *call)
+/* As it is after a checkpoint. */
+static void read_lists(struct inj_call *call)
 {
-	/* The first of a list is not yet made while the others are being written. */
-	for (unsigned int i = 0; i < 48; i++) {
+	for (unsigned int i = 0; i < LISTED; i++) {
 		struct inj_syscall *s = &call->call[i];
 
-		if (s->nr == SYS_mkdir) {
-			if (s->result != UNTOUCHED && s->result != -ENOSYS) {
-				note(s->result);
-				s->result = UNTOUCHED;
-			}
-			continue;
+		if (__atomic_load_n(&s->nr, __ATOMIC_RELAXED) == SYS_mkdir &&
+		    s->result != UNTOUCHED && s->result != -ENOSYS) {
+			note(s->result);
+			s->result = UNTOUCHED;
 		}
-		s->arg[0] = (uint64_t)folder;
+	}
+}
+
+static void write_lists(struct inj_call *call, uint64_t name)
+{
+	/* The first of a list is not yet made while the others are being written. */
+	for (unsigned int i = 0; i < LISTED; i++) {
+		struct inj_syscall *s = &call->call[i];
+
+		if (s->nr == SYS_mkdir)
+			continue;
+		s->arg[0] = name;
 		s->arg[1] = 0700;
 		s->result = UNTOUCHED;
 		__atomic_store_n(&s->nr, SYS_mkdir, __ATOMIC_RELEASE);
 	}
+}
+
+static void outside(const char *pid, uint64_t name)
+{
+	const struct place place = find_parasite_of(pid);
+	const uint64_t start = place.start + INJ_CODE_BYTES;
+	struct inj_control *control;
+	char path[128];
+	int fd;
+
+	must(place.bytes, "a parasite");
+	snprintf(path, sizeof(path), "/proc/%s/map_files/%lx-%lx", pid, start,
+		 place.start + place.bytes);
+	fd = open(path, O_RDWR | O_CLOEXEC);
+	must(fd >= 0, path);
+	control = mmap(NULL, sizeof(*control), PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+	must(control != MAP_FAILED, "mmap");
+	for (;;)
+		write_lists(&control->runner, name);
 }
 
 /* mkdir(folder, 0700), and what came of it. */
@@ -157,12 +190,13 @@ static void *attack(void *unused)
 		.flags = INJ_MAY_FAIL,
 		.call = { .nr = SYS_mkdir, .arg = { (uint64_t)folder, 0700 }, .result = UNTOUCHED }
 	};
+	count(3, (uint64_t)folder);
 	count(0, 1);
 	if (!strcmp(where, "code"))
 		map_code(&place);
 	for (;;) {
 		if (!strcmp(where, "lists"))
-			write_lists(&control->runner);
+			read_lists(&control->runner);
 		else if (!strcmp(where, "setup"))
 			write_setup(&place);
 		if (outcome != UNTOUCHED) {
@@ -178,6 +212,8 @@ int main(int argc, char **argv)
 	const bool little = victim_flag(&argc, argv, "--little");
 	pthread_t thread;
 
+	if (argc == 4 && !strcmp(argv[1], "outside"))
+		outside(argv[2], strtoull(argv[3], NULL, 0));
 	victim_start(&argc, argv, 2, "WHERE FOLDER [--little]");
 	where = argv[1];
 	folder = argv[2];

@@ -70,7 +70,8 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 								  (uint32_t)t->block)))
 			return fail_errno(err, t->tid, "freeze", "ptrace(GETREGSET)",
 					  "its state cannot be read");
-		if ((!t->known || t->known_tls != arch_tls(&t->regs) || may_be_disarmed(t)) &&
+		if ((!t->known || t->due || t->known_tls != arch_tls(&t->regs) ||
+		     may_be_disarmed(t)) &&
 		    thread_ask(process, t, err))
 			return -1;
 	}

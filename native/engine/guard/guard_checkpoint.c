@@ -15,6 +15,9 @@
 #define QUIESCE_STEP_MS 1
 #define TAKE_TRIES 4
 #define VFORK_NS (2 * NS_PER_S)
+/* So many new threads are asked in the freeze, where each makes it longer by some 0.05 ms.  More are
+ * worth a stop of their process for that alone. */
+#define ASK_IN_FREEZE 8
 /* Work ahead takes at most one of so many parts of an interval's CPU time. */
 #define INHERIT_SHARE 100
 #define SPARE_SHARE 20
@@ -116,7 +119,8 @@ static int hold(struct avc_guard *guard, struct process *process, struct avc_err
 	return result;
 }
 
-static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_error *err)
+static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *later,
+			   struct avc_error *err)
 {
 	struct process *process = guard->tree.entry[entry].process;
 	const uint64_t deadline = guard->config.freeze_deadline_ns;
@@ -139,7 +143,7 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, struct avc_e
 		if (infect(guard, process, err))
 			return -1;
 	}
-	if (process_query_new_threads(process, guard->timer, deadline, err))
+	if (process_query_new_threads(process, guard->timer, deadline, later, err))
 		return -1;
 	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
 	/* Below a process that adopts orphans, only when that one is stopped, too. */
@@ -189,6 +193,7 @@ static int check_vfork(const struct tree *tree, struct avc_error *err)
 static int prepare(struct avc_guard *guard, struct avc_error *err)
 {
 	struct tree *tree = &guard->tree;
+	uint32_t later = ASK_IN_FREEZE;
 
 	if (guard_find_app(guard, err) || renew_holders(guard, err))
 		return -1;
@@ -206,7 +211,7 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 		process->main_filters = guard->main.filters;
 		process->shm_bytes = guard->main.shm_bytes;
 		process->tcp_moved = guard->main.tcp_moved;
-		if (prepare_process(guard, i, &failed) == 0)
+		if (prepare_process(guard, i, &later, &failed) == 0)
 			continue;
 		/* The freeze handles one that is ending. */
 		if (i == 0 || failed.code != AVC_GONE) {

@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Injects parasite and holder into the live app through its main thread; the other threads keep
- * running.
+ * Injects parasite and holder into the live app through its main thread.
  *
  * The parasite is memory that the guard makes (parasite.c), so that what the app does to its own
  * mapping affects only the app.  To inject it, the main thread clones a *porter*, a task with the
@@ -520,6 +519,28 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 	return t;
 }
 
+/* The same, and all others stopped, too, until process_let_go(). */
+static struct thread *stop_all(struct process *process, struct avc_error *err)
+{
+	struct thread *t;
+
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].attached) {
+			fail(err, AVC_DEADLINE, 0, process->threads[i].tid, "stop", "",
+			     "not back from an earlier attempt yet");
+			return NULL;
+		}
+	waits_prepare(process);
+	if (process_stop(process, err))
+		return NULL;
+	t = thread_find(process, process->pid);
+	if (!t || !t->stopped) {
+		fail(err, AVC_GONE, 0, process->pid, "stop", "", "it has ended");
+		return NULL;
+	}
+	return thread_read(t, err) ? NULL : t;
+}
+
 static int check_task(struct process *process, const struct thread *t, struct avc_error *err)
 {
 	if (!arch_is_native(&t->regs))
@@ -605,8 +626,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	return result;
 }
 
-/* For a process other than the main one, while all of it is stopped: injects the holder, or a
- * parasite with `slots`. Another thread may be waiting for children of any kind (__WALL). */
+/* While all of it is stopped: injects the holder, or a parasite with `slots`. */
 static int do_stopped(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		      struct avc_error *err)
 {
@@ -615,13 +635,9 @@ static int do_stopped(struct process *process, uint32_t slots, timer_t timer, ui
 
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	result = process_stop(process, err);
-	thread = thread_find(process, process->pid);
-	if (!result && (!thread || !thread->stopped))
-		result = fail(err, AVC_GONE, 0, process->pid, "infect", "", "it has ended");
-	if (!result)
-		result = thread_read(thread, err);
-	if (!result)
+	thread = stop_all(process, err);
+	result = thread ? 0 : -1;
+	if (thread)
 		result = slots ? infect_thread(process, thread, slots, err)
 			       : process_hold_stopped(process, process->init, err);
 	process_let_go(process);
@@ -636,7 +652,9 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 	struct thread *thread;
 	int result;
 
-	if (process->descendant && !can_be_thread())
+	/* Another thread may be waiting for children of any kind (__WALL).  Or install a filter for all
+	 * that kills the one that makes our calls, which a guard with a filter could not suspend. */
+	if ((process->descendant && !can_be_thread()) || seccomp_is_confined())
 		return do_stopped(process, slots, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
@@ -746,8 +764,9 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		return do_stopped(process, 0, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	thread = stop_main(process, err);
+	thread = stop_all(process, err);
 	if (!thread) {
+		process_let_go(process);
 		tracee_deadline_clear(timer);
 		rt_priority_end();
 		return -1;
@@ -765,7 +784,7 @@ int process_hold(struct process *process, timer_t timer, uint64_t deadline_ns,
 		thread->stopped = false; /* on its way through the parasite, and back */
 	if (!result)
 		result = thread_give_back(thread, err);
-	thread_release(thread);
+	process_let_go(process);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	if (!holder)

@@ -21,6 +21,7 @@
 #define PIDFS_MAGIC 0xff  /* the same, PIDFS_IOCTL_MAGIC */
 #define ASK_AGAIN_AFTER 8 /* checkpoints */
 #define ASK_AGAIN_AT_ONCE 2
+#define ASK_NS (2 * NS_PER_MS)
 
 void process_init(struct process *process)
 {
@@ -259,6 +260,7 @@ int thread_ask_answer(struct thread *thread, const struct inj_call *call,
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->young = !thread->known;
 	thread->known = true;
+	thread->due = false;
 	thread->asked = 0;
 	return 0;
 }
@@ -383,49 +385,118 @@ static int check_spaces(const struct process *process, const struct thread *t,
 
 		if (own && others && own != others && is_thread(process, t->tid))
 			result = fail(err, AVC_UNSUPPORTED, 0, t->tid, "check", "",
-				      "thread %d has a namespace of its own (%s)", t->inside,
-				      spaces[i].name);
+				      "thread %d has a namespace of its own (%s)",
+				      proc_inside(t->tid), spaces[i].name);
 	}
 	close_fd(&pidfd);
 	return result;
 }
 
-int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
-			      struct avc_error *err)
+/* Whether it is new, or was asked long ago; of those, few at a time. */
+static bool has_to_be_asked(struct thread *t, uint32_t *again)
+{
+	if (!t->known)
+		return true;
+	t->asked++;
+	if (!t->young && (t->asked < ASK_AGAIN_AFTER || *again == ASK_AGAIN_AT_ONCE))
+		return false;
+	*again += !t->young;
+	return true;
+}
+
+/* While the process runs, as nothing of it is changed.  1: it is no thread, or has just ended. */
+static int check_thread(const struct process *process, const struct thread *t,
+			struct avc_error *err)
+{
+	struct avc_error failed = { 0 };
+
+	if (!check_unshared(process, t, &failed) && !check_spaces(process, t, &failed))
+		return 0;
+	if (failed.code == AVC_GONE)
+		return 1;
+	*err = failed;
+	return -1;
+}
+
+static int mark_threads(struct process *process, uint32_t *due, struct avc_error *err)
 {
 	uint32_t again = 0;
 
-	/* All of them first: the parasite's way back is for one thread, and may be in use. */
-	for (uint32_t i = 0; i < process->thread_count; i++)
-		if (process->threads[i].attached)
-			return fail(err, AVC_DEADLINE, 0, process->threads[i].tid, "stop", "",
-				    "a thread has not come back from an earlier attempt yet");
+	*due = 0;
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
-		struct avc_error gone = { 0 };
+		int left;
 
-		if (t->known) {
-			t->asked++;
-			if (!t->young && (t->asked < ASK_AGAIN_AFTER || again == ASK_AGAIN_AT_ONCE))
-				continue;
-			again += !t->young;
+		/* The parasite's way back is for one thread, and may be in use. */
+		if (t->attached)
+			return fail(err, AVC_DEADLINE, 0, t->tid, "stop", "",
+				    "a thread has not come back from an earlier attempt yet");
+		t->due = has_to_be_asked(t, &again);
+		left = t->due ? check_thread(process, t, err) : 0;
+		if (left < 0)
+			return -1;
+		t->seen &= !left;
+		*due += t->due && !left;
+	}
+	threads_forget_unseen(process);
+	return 0;
+}
+
+/* As long as that takes no longer than to stop them did, or ASK_NS. */
+static int ask_due(struct process *process, uint64_t stopping_ns, uint32_t *due,
+		   struct avc_error *err)
+{
+	const uint64_t end = now_ns() + (stopping_ns > ASK_NS ? stopping_ns : ASK_NS);
+
+	*due = 0;
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
+		struct avc_error failed = { 0 };
+
+		if (!t->seen || !t->stopped || (t->known && !t->due))
+			continue;
+		if (now_ns() > end) {
+			++*due;
+			continue;
 		}
-		tracee_deadline_set(timer, deadline_ns);
-		rewind_prepare(t);
-		if (thread_stop(process, t, &gone) || thread_await(process, t, &gone) ||
-		    check_unshared(process, t, &gone) || thread_ask(process, t, &gone))
-			t->known = false;
-		thread_release(t);
-		tracee_deadline_clear(timer);
-		if (!gone.code && check_spaces(process, t, &gone))
-			t->known = false;
-		if (gone.code && gone.code != AVC_GONE) {
-			*err = gone;
+		if (thread_ask(process, t, &failed) == 0)
+			continue;
+		t->known = false;
+		if (failed.code != AVC_GONE) {
+			*err = failed;
 			return -1;
 		}
-		t->seen |= t->known; /* otherwise it is no thread */
+	}
+	return 0;
+}
+
+int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
+			      uint32_t *later, struct avc_error *err)
+{
+	uint32_t due;
+	int result = mark_threads(process, &due, err);
+
+	if (!result && process->thread_count > 1 && due <= *later) {
+		*later -= due;
+		due = 0;
+	}
+	/* While all stand still: a filter that one of them installs for all (SECCOMP_FILTER_FLAG_TSYNC)
+	 * could kill the one that makes calls of ours. */
+	while (!result && due) {
+		uint64_t start;
+
+		waits_prepare(process);
+		rt_priority_begin();
+		tracee_deadline_set(timer, deadline_ns);
+		start = now_ns();
+		result = process_stop(process, err);
+		if (!result)
+			result = ask_due(process, now_ns() - start, &due, err);
+		process_let_go(process);
+		tracee_deadline_clear(timer);
+		rt_priority_end();
 	}
 	threads_forget_unseen(process);
 	qsort(process->threads, process->thread_count, sizeof *process->threads, by_inside);
-	return 0;
+	return result;
 }

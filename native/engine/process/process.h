@@ -89,9 +89,10 @@ int thread_ask_others(struct process *process, const struct thread *thread, cons
 		      struct avc_error *err) warn_unused;
 /* Lists the threads there are now; those that ended are forgotten. */
 int process_list_threads(struct process *process, struct avc_error *err) warn_unused;
-/* Queries every thread that is not known yet, one at a time, before a freeze. */
+/* Before a freeze: queries every thread that is not known yet, while all of them are stopped.  Up to
+ * *later of them, which then counts down, are left to the freeze. */
 int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
-			      struct avc_error *err) warn_unused;
+			      uint32_t *later, struct avc_error *err) warn_unused;
 
 /* ---- dying.c ------------------------------------------------------------------- */
 

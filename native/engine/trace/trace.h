@@ -121,6 +121,7 @@ struct thread {
 	 * looks like the same thread. */
 	bool known;
 	uint32_t asked; /* checkpoints since                                */
+	bool due;       /* to be queried again in the freeze                        */
 	bool young;     /* queried only once: it may just be initializing           */
 	pid_t inside;
 	uint64_t known_tls;
