@@ -120,7 +120,7 @@ def test_a_filter_for_all_threads_kills_none_that_is_in_the_parasite(tmp_path: P
             guard.wait("checkpoint", count=2)
             victim.kill_app(signal.SIGUSR1)
             with contextlib.suppress(TimeoutError):
-                wait_until(lambda: victim.see().counter[0], 1, "it saw a thread in there")  # noqa: B023
+                wait_until(lambda: victim.see().counter[0], 1, "it saw a thread in there")
             victim.kill_app(signal.SIGUSR2)
             lost = guard.wait("guard_lost")
             assert lost["reason"] == "filter"
