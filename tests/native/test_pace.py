@@ -128,5 +128,5 @@ def test_a_fault_that_shows_late_needs_older_ones(tmp_path: Path, apart_s: float
         if not apart_s:
             assert guard.wait("gave_up")["reason"] == "limit"
             return
-        guard.wait_for(lambda event: event["kind"] == "restored" and event["age_s"] > 1, "an older one")
+        guard.wait_for(lambda event: event["kind"] == "restored" and event["age_s"] > 0.5, "an older one")
         victim.wait_beats(1000)

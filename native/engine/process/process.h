@@ -43,6 +43,9 @@ struct tree {
 	 * tree_check_made() finds another one. */
 	pid_t *made;
 	uint32_t made_count;
+	/* One that shares its descriptor table or directory with another: refused if it stays. */
+	pid_t sharer;
+	uint64_t sharer_since_ns;
 	/* Whether this child of init is one of our own. */
 	bool (*is_ours)(pid_t pid, const void *arg);
 	const void *arg;

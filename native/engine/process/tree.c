@@ -13,6 +13,8 @@
 
 #include "process.h"
 
+#define SHARER_NS (100 * NS_PER_MS)
+
 int tree_init(struct tree *tree, struct process *main)
 {
 	tree->entry = calloc(PROCESSES_MAX, sizeof *tree->entry);
@@ -279,8 +281,7 @@ static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
  * and directories, and what the templates of one that has ended close would be closed for the
  * other.  It need not be parent and child: the parent may have ended, or left the table to its
  * children.  Only a clone shares, so a new process is compared with all that are known. */
-static int check_sharing(const struct tree *tree, const struct tree_entry *entry,
-			 struct avc_error *err)
+static int check_sharing(struct tree *tree, const struct tree_entry *entry, struct avc_error *err)
 {
 	const struct process *parent = entry->parent >= 0 ? tree->entry[entry->parent].process
 							  : NULL;
@@ -304,7 +305,15 @@ static int check_sharing(const struct tree *tree, const struct tree_entry *entry
 			return fail(err, AVC_RETRY, 0, entry->pid, "look at processes", "kcmp",
 				    "process %d shares its memory with process %d",
 				    proc_inside(entry->pid), proc_inside(other));
-		return fail(err, AVC_UNSUPPORTED, 0, entry->pid, "look at processes", "",
+		/* It may be a porter or clone that a guard has left behind when it died just now. */
+		if (tree->sharer != entry->pid) {
+			tree->sharer = entry->pid;
+			tree->sharer_since_ns = now_ns();
+		}
+		return fail(err,
+			    now_ns() - tree->sharer_since_ns < SHARER_NS ? AVC_RETRY
+									 : AVC_UNSUPPORTED,
+			    0, entry->pid, "look at processes", "",
 			    "process %d shares its %s with process %d", proc_inside(entry->pid),
 			    what, proc_inside(other));
 	}
