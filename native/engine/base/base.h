@@ -172,8 +172,8 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size);
 bool proc_is_exiting(pid_t tid);
 /* Whether it was killed by SIGKILL, even if it has not exited yet. */
 bool proc_is_killed(pid_t pid);
-/* Whether a signal is killing it; the kernel may be writing its core. */
-bool proc_is_dying(pid_t tid);
+/* Whether a signal is killing it, by an open /proc/PID/stat; the kernel may be writing its core. */
+bool proc_is_dying(int stat_fd);
 bool pidfd_ended(int pidfd);
 enum mapping_flag {
 	MAPPING_DONTFORK = 1,     /* dc */

@@ -390,11 +390,11 @@ bool proc_is_exiting(pid_t tid)
 }
 
 /* All threads get the flag before the kernel writes a core (kernel/signal.c, get_signal()). */
-bool proc_is_dying(pid_t tid)
+bool proc_is_dying(int stat_fd)
 {
 	struct proc_stat stat;
 
-	return proc_stat(tid, &stat) == 0 && stat.flags & PF_SIGNALED;
+	return proc_stat_of(stat_fd, &stat) == 0 && stat.flags & PF_SIGNALED;
 }
 
 bool proc_is_killed(pid_t pid)

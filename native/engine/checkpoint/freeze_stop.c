@@ -19,7 +19,7 @@ int freeze_stop_known(struct tree *tree, struct avc_error *err)
 	/* A stop wakes a thread that writes a core into a pipe, and the kernel gives the core up
 	 * (fs/coredump.c, dump_emit()). */
 	for (uint32_t i = 0; i < tree->processes; i++)
-		if (tree->process[i]->leader && proc_is_dying(tree->process[i]->leader))
+		if (proc_is_dying(tree->process[i]->stat_fd))
 			return fail(err, AVC_GONE, 0, tree->process[i]->pid, "stop", "",
 				    "a signal is killing it");
 	/* So that they stop at the same time, and not one after the other. */

@@ -93,8 +93,9 @@ struct policy_generation policy_new_generation(struct policy *policy,
 
 static uint64_t apart_ns(const struct avc_config *config)
 {
-	return config->apart_ns || !policy_is_automatic(config) ? config->apart_ns
-								: config->interval_ns;
+	if (!config->apart_ns && policy_is_automatic(config))
+		return config->interval_ns;
+	return config->apart_ns;
 }
 
 uint32_t policy_replaced(const struct policy *policy, const struct avc_config *config, uint64_t now)
