@@ -9,7 +9,6 @@ Needs root; takes some minutes.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import statistics
@@ -17,7 +16,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 from testkit.harness import wait_until
 from testkit.local_sidecar import QUICK, Container, LocalSidecar, local_sidecar
@@ -34,27 +32,21 @@ SPARE_S = 0.7
 """After a checkpoint there is a spare."""
 
 
-def events(sidecar: LocalSidecar, name: str, kind: str) -> list[dict[str, Any]]:
-    """What has been told of it."""
-    lines = sidecar.avckpt("events", name, "-k", kind, "--json").stdout.splitlines()
-    return [json.loads(line) for line in lines]
-
-
 def kill(sidecar: LocalSidecar, victim: Container, with_core: bool) -> tuple[float, float]:
     """Its restore and, 0 without one, its core; s."""
-    restored, cores = (len(events(sidecar, victim.name, kind)) for kind in ("restored", "core"))
+    restored, cores = (len(sidecar.events(victim.name, kind)) for kind in ("restored", "core"))
     checkpoints = sidecar.row(victim)["checkpoints"]
     wait_until(lambda: sidecar.row(victim)["checkpoints"] > checkpoints, PATIENCE_S, "a checkpoint", every_s=0.1)
     time.sleep(SPARE_S)
     os.kill(victim.app_pid, signal.SIGKILL)
-    wait_until(lambda: len(events(sidecar, victim.name, "restored")) > restored, PATIENCE_S, "restored", every_s=0.2)
+    wait_until(lambda: len(sidecar.events(victim.name, "restored")) > restored, PATIENCE_S, "restored", every_s=0.2)
     if with_core:
-        wait_until(lambda: len(events(sidecar, victim.name, "core")) > cores, PATIENCE_S, "a core", every_s=0.2)
-        event = events(sidecar, victim.name, "core")[-1]
+        wait_until(lambda: len(sidecar.events(victim.name, "core")) > cores, PATIENCE_S, "a core", every_s=0.2)
+        event = sidecar.events(victim.name, "core")[-1]
         if "core" not in event:
             raise RuntimeError(event["detail"])
         Path(event["core"]).unlink()
-    restore_s: float = events(sidecar, victim.name, "restored")[-1]["restore_s"]
+    restore_s: float = sidecar.events(victim.name, "restored")[-1]["restore_s"]
     return restore_s, float(event["detail"].partition("after ")[2].partition(" s")[0]) if with_core else 0.0
 
 

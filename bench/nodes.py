@@ -16,7 +16,6 @@ table and writes bench/results/nodes.json.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import random
@@ -47,7 +46,7 @@ from testkit.harness import (
     running_sidecar,
     wait_until,
 )
-from testkit.nodes import app_pid, nodes_of
+from testkit.nodes import SUPERVISORD, SUPERVISORD_CONF, app_pid, nodes_of, supervisor_options
 
 RESULTS = ROOT / "bench/results/nodes.json"
 WITHIN_MS = 20.0
@@ -64,7 +63,6 @@ SHELL = """
 for i in {numbers}; do NODE=$i $AVCKPT_INIT --name n$i -- /bench/nodes/node & done
 while wait -n; s=$?; [ $s != 127 ]; do echo ended $s; done
 """
-SUPERVISORD = "[supervisord]\nnodaemon=true\nuser=root\nlogfile=/dev/null\nlogfile_maxbytes=0\n"
 PROGRAM = """
 [program:n{n}]
 command=%(ENV_AVCKPT_INIT)s --name n{n} -- /bench/nodes/node
@@ -155,28 +153,20 @@ def start(
         "<launch>\n" + "".join(LAUNCH_NODE.format(n=n) for n in numbers) + "</launch>\n"
     )
     command, image = ["bash", "-c", SHELL.format(numbers=" ".join(map(str, numbers)))], BASE_IMAGE
-    volumes, environment = ["-v", f"{folder}:/bench", "-v", f"{VICTIMS}:/victims:ro"], []
+    volumes, others = ["-v", f"{folder}:/bench", "-v", f"{VICTIMS}:/victims:ro"], []
     if options.launcher == "supervisord":
-        (folder / "supervisord.conf").write_text(SUPERVISORD + "".join(PROGRAM.format(n=n) for n in numbers))
-        command = ["python3", "-m", "supervisor.supervisord", "-c", "/bench/supervisord.conf"]
-        volumes += ["-v", f"{supervisor_library()}:/lib/supervisor/supervisor:ro"]
-        environment = ["-e", "PYTHONPATH=/lib/supervisor"]
+        (folder / "supervisord.conf").write_text(SUPERVISORD_CONF + "".join(PROGRAM.format(n=n) for n in numbers))
+        command, others = [*SUPERVISORD, "/bench/supervisord.conf"], supervisor_options()
+        if not others:
+            raise SystemExit("error: there is no supervisord: .venv/bin/pip install supervisor")
     elif options.launcher == "roslaunch":
         command, image = ["roslaunch", "nodes", "all.launch"], ros_image(factory.podman)
-        environment = ["-e", "ROS_PACKAGE_PATH=/bench:/usr/share", "-e", "ROS_MASTER_URI=http://localhost:11311"]
+        others = ["-e", "ROS_PACKAGE_PATH=/bench:/usr/share", "-e", "ROS_MASTER_URI=http://localhost:11311"]
     labels = {"scope": "nodes", "restore.max": "64/1s", "restore.on": "signal,exit", "files": "rewind"}
     if options.interval:
         labels["interval"] = options.interval
-    container = factory.protected(*command, labels=labels, image=image, options=[*volumes, *environment])
+    container = factory.protected(*command, labels=labels, image=image, options=[*volumes, *others])
     return Nodes(sidecar, container, boards)
-
-
-def supervisor_library() -> Path:
-    """PyPI's supervisor in this environment, which the container borrows."""
-    found = importlib.util.find_spec("supervisor")
-    if found is None or found.origin is None:
-        raise SystemExit("error: there is no supervisord: .venv/bin/pip install supervisor")
-    return Path(found.origin).parent
 
 
 def ros_image(podman: Podman) -> str:

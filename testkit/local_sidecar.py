@@ -116,6 +116,10 @@ class LocalSidecar:
         listed: list[dict[str, Any]] = json.loads(self.avckpt("ps", "--json", *options).stdout)
         return listed
 
+    def events(self, name: str, kind: str) -> list[dict[str, Any]]:
+        """What `avckpt events` tells of that container, of that kind, oldest first."""
+        return [json.loads(line) for line in self.avckpt("events", name, "-k", kind, "--json").stdout.splitlines()]
+
     def row(self, container: Container, *options: str) -> dict[str, Any]:
         """What `avckpt ps` knows of a container; empty: nothing."""
         rows = [row for row in self.ps(*options) if row["id"] == container.id and row["init_pid"] == container.init_pid]

@@ -3,10 +3,25 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
 from typing import Any
 
 from testkit.harness import Container, Sidecar
 from testkit.procfs import children_of, inside
+
+SUPERVISORD = ("python3", "-m", "supervisor.supervisord", "-c")
+"""In a container with `supervisor_options()`; a path follows, of a file that begins with SUPERVISORD_CONF."""
+SUPERVISORD_CONF = "[supervisord]\nnodaemon=true\nuser=root\nlogfile=/dev/null\nlogfile_maxbytes=0\n"
+
+
+def supervisor_options() -> list[str]:
+    """Options of `podman run` that lend a container PyPI's supervisor of this environment; empty: it has none."""
+    found = importlib.util.find_spec("supervisor")
+    if found is None or found.origin is None:
+        return []
+    library = Path(found.origin).parent
+    return ["-v", f"{library}:/lib/supervisor/supervisor:ro", "-e", "PYTHONPATH=/lib/supervisor"]
 
 
 def nodes_of(sidecar: Sidecar, container: Container) -> dict[str, dict[str, Any]]:

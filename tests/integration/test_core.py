@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import struct
@@ -90,10 +89,7 @@ def crash(sidecar: LocalSidecar, folder: Path, mode: str) -> dict[str, object]:
     sidecar.wait_for(victim, state="protected", generations=2, threads=2)
     os.kill(victim.app_pid, signal.SIGUSR1)
 
-    def told() -> list[str]:
-        return sidecar.avckpt("events", mode, "-k", "core", "--json").stdout.splitlines()
-
-    event: dict[str, object] = json.loads(wait_until(told, 20, "the core is told of", every_s=0.1)[0])
+    event = wait_until(lambda: sidecar.events(mode, "core"), 20, "the core is told of", every_s=0.1)[0]
     assert "core" in event, event["detail"]
     return event
 

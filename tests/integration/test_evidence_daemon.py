@@ -17,7 +17,7 @@ from avckpt.cli.client import Client
 
 from testkit.harness import take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, local_sidecar
-from testkit.procfs import peak_kb
+from testkit.procfs import children_of, comm_of, peak_kb
 
 pytestmark = pytest.mark.shared_machine("a sidecar, its guards and containers have to get CPU time within seconds")
 
@@ -129,15 +129,7 @@ def test_arguments_without_an_end(sidecar: LocalSidecar) -> None:
 
 
 def _holders(victim: Container) -> list[int]:
-    children = Path(f"/proc/{victim.init_pid}/task/{victim.init_pid}/children").read_text().split()
-    return [int(pid) for pid in children if _name_of(pid) == "avckpt-hold"]
-
-
-def _name_of(pid: str) -> str:
-    try:
-        return Path(f"/proc/{pid}/comm").read_text().strip()
-    except (FileNotFoundError, ProcessLookupError):
-        return ""
+    return [pid for pid in children_of(victim.init_pid) if comm_of(pid) == "avckpt-hold"]
 
 
 def test_back_to_an_older_generation(sidecar: LocalSidecar) -> None:
@@ -189,10 +181,7 @@ def test_a_recovery_that_comes_late(sidecar: LocalSidecar) -> None:
         sidecar.wait_for(each, timeout_s=20, state="protected", threads=151)
         os.kill(each.app_pid, signal.SIGKILL)
 
-    def told(name: str, kind: str) -> list[dict[str, Any]]:
-        lines = sidecar.avckpt("events", name, "-k", kind, "--json").stdout.splitlines()
-        return [json.loads(line) for line in lines]
-
+    told = sidecar.events
     (event,) = wait_until(lambda: told("late", "late"), 10, "it is told of", every_s=0.1)
     (crash,) = told("late", "crash")
     assert event["recovered_s"] == crash["recovered_s"] == crash["detected_s"] + crash["restore_s"] > 0.001

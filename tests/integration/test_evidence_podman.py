@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Iterator
@@ -56,8 +55,8 @@ def crash_of(local: LocalSidecar, factory: ContainerFactory, signum: int, labels
     wait_until(lambda: row(local, made.name).get("checkpoints", 0) > ready + 2, 20, "it is protected", every_s=0.1)
 
     def told() -> dict[str, Any]:
-        lines = local.avckpt("events", made.name, "-k", "crash", "--json").stdout.splitlines()
-        event: dict[str, Any] = json.loads(lines[-1]) if lines else {}
+        crashes = local.events(made.name, "crash")
+        event = crashes[-1] if crashes else {}
         known = row(local, made.name)
         if event.get("outcome") == "restored" and labels and known["state"] == "protected":
             os.kill(known["app_pid"], signum)

@@ -15,7 +15,7 @@ from testkit.board import Board
 from testkit.harness import ROOT, take_checkpoint, wait_until
 from testkit.host_pressure import make_group, remove_group
 from testkit.local_sidecar import ON_COMMAND, LocalSidecar, local_sidecar
-from testkit.procfs import children_of
+from testkit.procfs import children_of, comm_of
 
 VICTIMS = ROOT / "tests/victims/build"
 HOARD = VICTIMS / "hoard"
@@ -24,13 +24,6 @@ pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
     pytest.mark.shared_machine("the guard is given a time to see a new limit"),
 ]
-
-
-def comm_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/comm").read_text().strip()
-    except OSError:
-        return ""
 
 
 @pytest.fixture

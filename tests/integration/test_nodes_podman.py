@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import random
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from testkit.harness import RUN_DIR, wait_until
-from testkit.nodes import app_pid, nodes_of
+from testkit.nodes import SUPERVISORD, SUPERVISORD_CONF, app_pid, nodes_of, supervisor_options
 
 if TYPE_CHECKING:
     from testkit.harness import Container, ContainerFactory, Podman, Sidecar
@@ -138,12 +137,7 @@ def test_what_a_container_may_not_do(container: ContainerFactory, sidecar: Sidec
     assert "label avckpt.group: it is for whoever starts the container to give, not for a node" in car.logs()
 
 
-SUPERVISORD = """
-[supervisord]
-nodaemon=true
-user=root
-logfile=/dev/null
-logfile_maxbytes=0
+PROGRAMS = """\
 loglevel=debug
 
 [program:a]
@@ -162,22 +156,12 @@ exitcodes=7
 
 
 def test_supervisord(container: ContainerFactory, sidecar: Sidecar, node: Path) -> None:
-    found = importlib.util.find_spec("supervisor")
-    if found is None or found.origin is None:
+    lent = supervisor_options()
+    if not lent:
         pytest.skip("PyPI's supervisor is not in .venv: pip install supervisor")
-    library = Path(found.origin).parent
-    (node / "supervisord.conf").write_text(SUPERVISORD)
+    (node / "supervisord.conf").write_text(SUPERVISORD_CONF + PROGRAMS)
     car = container.protected(
-        *("python3", "-m", "supervisor.supervisord", "-c", "/node/supervisord.conf"),
-        labels=NODES,
-        options=(
-            "-v",
-            f"{node}:/node",
-            "-v",
-            f"{library}:/lib/supervisor/supervisor:ro",
-            "-e",
-            "PYTHONPATH=/lib/supervisor",
-        ),
+        *SUPERVISORD, "/node/supervisord.conf", labels=NODES, options=("-v", f"{node}:/node", *lent)
     )
     wait_nodes(sidecar, car, 2)
     car.wait_for_log("exited: c (exit status 7; expected)")

@@ -98,6 +98,14 @@ def test_one_that_installs_a_filter_gets_another_guard(command: str, tmp_path: P
         assert len([event for event in guard.events if event["kind"] == "guard_lost"]) == 1
 
 
+def lives_on_with_another_guard(victim: Victim, guard: GuardProcess) -> None:
+    lost = guard.wait("guard_lost")
+    assert lost["reason"] == "filter"
+    guard.wait("checkpoint", since=guard.events.index(lost))
+    victim.wait_beats(5)
+    assert not [event for event in guard.events if event["kind"] in ("died", "restored")]
+
+
 @pytest.mark.shared_machine("an application whose filter kills may die of it while it waits for a CPU in a checkpoint")
 def test_a_filter_that_comes_at_any_moment_kills_nobody(tmp_path: Path) -> None:
     """Checkpoints back to back while the application installs a filter that kills it at calls of ours."""
@@ -106,11 +114,7 @@ def test_a_filter_that_comes_at_any_moment_kills_nobody(tmp_path: Path) -> None:
             guard.wait("checkpoint", count=3)
             time.sleep(0.0017 * i)
             victim.kill_app(signal.SIGUSR1)
-            lost = guard.wait("guard_lost")
-            assert lost["reason"] == "filter"
-            guard.wait("checkpoint", since=guard.events.index(lost))
-            victim.wait_beats(5)
-            assert not [event for event in guard.events if event["kind"] in ("died", "restored")]
+            lives_on_with_another_guard(victim, guard)
 
 
 def test_a_filter_for_all_threads_kills_none_that_is_in_the_parasite(tmp_path: Path) -> None:
@@ -122,11 +126,7 @@ def test_a_filter_for_all_threads_kills_none_that_is_in_the_parasite(tmp_path: P
             with contextlib.suppress(TimeoutError):
                 wait_until(lambda: victim.see().counter[0], 1, "it saw a thread in there")
             victim.kill_app(signal.SIGUSR2)
-            lost = guard.wait("guard_lost")
-            assert lost["reason"] == "filter"
-            guard.wait("checkpoint", since=guard.events.index(lost))
-            victim.wait_beats(5)
-            assert not [event for event in guard.events if event["kind"] in ("died", "restored")]
+            lives_on_with_another_guard(victim, guard)
 
 
 REFUSES = {
