@@ -59,8 +59,8 @@ def test_restore_on_command(tmp_path: Path) -> None:
         assert guard.command("restore")["kind"] == "refused"
         guard.command("checkpoint")
         pid = inside(victim.app)
-        at = victim.see().counter[1]
-        wait_until(lambda: victim.see().counter[1] > at + 1000, 10, "it works")
+        # So long that the test looks again before it has counted as far once more.
+        time.sleep(2)
         before = victim.see().counter[1]
         answer = guard.command("restore")
         assert (answer["kind"], answer["reason"]) == ("restored", "manual")
