@@ -76,6 +76,13 @@ def test_a_report_over_the_last_one_is_no_database(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("name", ["segv", "bus", "fpe", "ill"])
+def test_the_handler_is_left_for_good(tmp_path: Path, name: str, where: str) -> None:
+    """As a Go panic does, which makes its report after it has left the handler of the fault."""
+    crash_often(tmp_path, f"{name} leave --report-ms 60 {where}".strip())
+
+
+@pytest.mark.parametrize("where", WHERE)
 def test_faults_that_are_mended(tmp_path: Path, where: str) -> None:
     """A program that handles faults as part of its normal work is protected like any other."""
     with (

@@ -377,7 +377,8 @@ def test_it_ends_as_its_main_process_does(tmp_path: Path) -> None:
 def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
     """The guard dies before, during and after checkpoints; no process is left stopped, no template ever runs."""
     with contextlib.ExitStack() as stack:
-        commands = ("tree 8 --threads 2", "churn 4", "churn 3 --vfork", "terminal")
+        # --usual-waits: limits.md, "A thread that waits for children of every kind"
+        commands = ("tree 8 --threads 2 --usual-waits", "churn 4", "churn 3 --vfork", "terminal")
         victims = [stack.enter_context(Victim(command, tmp_path)) for command in commands]
         before = [places(victim) for victim in victims]
         said = storm(config(0.002), STORM, 60, 1, *victims)

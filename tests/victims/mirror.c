@@ -36,7 +36,7 @@
 #define WAITERS 6
 #define LOOKS 50
 
-static char first[VIEW_BYTES], view[VIEW_BYTES];
+static char first[VIEW_BYTES], view[VIEW_BYTES], file_text[256 * 1024];
 static size_t used;
 static char *region, *mapped;
 static int sockets[2], datagrams[2], pipes[2];
@@ -245,7 +245,7 @@ static bool no_time_left(const char *line)
 /* Each line apart, as a string of its own. */
 static void look_at(const char *path, is_kept kept)
 {
-	static char text[256 * 1024];
+	char *const text = file_text;
 	const int fd = open(path, O_RDONLY | O_CLOEXEC);
 	size_t bytes = 0;
 	ssize_t n;
@@ -254,7 +254,7 @@ static void look_at(const char *path, is_kept kept)
 		say("%s: %s\n", path, strerror(errno));
 		return;
 	}
-	while ((n = read(fd, text + bytes, sizeof text - 1 - bytes)) > 0)
+	while ((n = read(fd, text + bytes, sizeof file_text - 1 - bytes)) > 0)
 		bytes += (size_t)n;
 	close(fd);
 	for (size_t i = 0; i < bytes; i++) /* environ, cmdline, auxv */
@@ -477,9 +477,12 @@ int main(int argc, char **argv)
 	nap_us(200000); /* they wait; what is seen after all this is seen for ever */
 	memset(first, 1, sizeof first); /* is all there */
 	memset(view, 1, sizeof view);
+	memset(file_text, 1, sizeof file_text); /* smaps becomes longer */
 	look();
-	look();
-	memcpy(first, view, sizeof first);
+	do {
+		memcpy(first, view, sizeof first);
+		look();
+	} while (memcmp(first, view, sizeof first)); /* a waiter that is woken to wait again */
 	victim_ready();
 	for (;;) {
 		look_again();

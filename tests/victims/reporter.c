@@ -15,6 +15,8 @@
  *   sysv       SA_RESETHAND and SA_NODEFER, nothing blocked (signal(2) of System V)
  *   breakpad   on an alternate stack; a child traces the process and makes the report
  *   exit       as plain; it tears down and ends with status 1
+ *   leave      on an alternate stack, which it leaves for good; then it makes its report and ends
+ *              with status 2 (a Go panic)
  *
  * mend: no crashes at all; a fault every millisecond is seen to by the handler, in all
  * threads, one of which blocks all signals, as virtual machines and garbage collectors do.
@@ -24,6 +26,7 @@
 #include <fcntl.h>
 #include <poll.h>
 #include <pthread.h>
+#include <setjmp.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
 
@@ -41,7 +44,8 @@ static const struct {
 static const char *style;
 static long report_ms = 150;
 static const char *report_file;
-static uint8_t *page; /* that cannot be touched */
+static uint8_t *page;  /* that cannot be touched */
+static sigjmp_buf out; /* of the handler */
 
 static bool is(const char *name)
 {
@@ -97,6 +101,8 @@ static void on_crash(int signal_number)
 	const struct sigaction plain = { .sa_handler = SIG_DFL };
 	sigset_t set;
 
+	if (is("leave"))
+		siglongjmp(out, 1);
 	if (is("python"))
 		sigaction(signal_number, &plain, NULL);
 	board->counter[2]++;
@@ -134,7 +140,7 @@ static void install(int signal_number)
 		action.sa_flags |= SA_NODEFER;
 	if (is("open") || is("sysv"))
 		action.sa_flags |= SA_RESETHAND;
-	if (is("full") || is("open") || is("python") || is("breakpad"))
+	if (is("full") || is("open") || is("python") || is("breakpad") || is("leave"))
 		action.sa_flags |= SA_ONSTACK;
 	must(sigaction(signal_number, &action, NULL) == 0, "sigaction");
 }
@@ -150,6 +156,11 @@ static void crash(int signal_number)
 {
 	volatile int zero = 0;
 
+	if (sigsetjmp(out, 1)) {
+		board->counter[2]++;
+		report(3);
+		_exit(2);
+	}
 	board->counter[1]++;
 	switch (signal_number) {
 	case SIGSEGV:

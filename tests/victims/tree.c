@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * tree WORKERS [--threads T] [--lap-us N] [--orphan] [--reaper]: processes that hang together.
+ * tree WORKERS [--threads T] [--lap-us N] [--orphan] [--reaper] [--usual-waits]: processes that
+ * hang together.
  *
  * The main process forks WORKERS others that live as long as it does.  Each
  * knows its place (family.h), and what it shares with the others agrees with
@@ -13,6 +14,7 @@
  * What a worker is besides goes by its number: kinds[], below.  With --threads
  * each worker has T threads in all.  --orphan: one process more, whose parent has
  * ended, so that it is a child of init.  --reaper: some adopt orphans themselves.
+ * --usual-waits: nobody waits for children without a signal at their exit (__WALL).
  * Counter 0: laps of all in shared memory; 1: records received by the main process; 2, 3:
  * forks (family.h).
  */
@@ -37,6 +39,7 @@ struct ends {
 static long lap_us = 1000, threads = 1;
 static int workers;
 static bool with_reapers;
+static int all = __WALL;
 static const char *board_path;
 
 /* ---- kinds of workers --------------------------------------------------------------- */
@@ -182,7 +185,7 @@ static void *wait_for_ever(void *unused)
 
 	(void)unused;
 	for (;;) {
-		pid = waitpid(-1, &status, __WALL);
+		pid = waitpid(-1, &status, all);
 		came_apart("a wait without end: %d, status %x, %s", pid, status,
 			   pid < 0 ? strerror(errno) : "");
 	}
@@ -512,6 +515,8 @@ int main(int argc, char **argv)
 	int i;
 
 	with_reapers = victim_flag(&argc, argv, "--reaper");
+	if (victim_flag(&argc, argv, "--usual-waits"))
+		all = 0;
 	watch_sigchld();
 	if (argc > 2 && !strcmp(argv[1], "--member"))
 		be_execed(argv);
@@ -523,7 +528,8 @@ int main(int argc, char **argv)
 		else if (!strcmp(argv[i], "--board"))
 			board_path = argv[i + 1];
 	}
-	victim_start(&argc, argv, 1, "WORKERS [--threads T] [--lap-us N] [--orphan] [--reaper]");
+	victim_start(&argc, argv, 1,
+		     "WORKERS [--threads T] [--lap-us N] [--orphan] [--reaper] [--usual-waits]");
 	workers = atoi(argv[1]);
 	must(workers <= WORKERS_MAX && (workers + 2) * threads <= SLOTS_MAX, "too many");
 	family.main = getpid();

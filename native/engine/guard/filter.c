@@ -223,6 +223,7 @@ static const struct rule rules[] = {
 	{ SYS_ioctl, 1, IS(UFFDIO_WRITEPROTECT) },
 	{ SYS_ioctl, 1, IS(PERF_EVENT_IOC_ENABLE) },
 	{ SYS_ioctl, 1, IS(PERF_EVENT_IOC_DISABLE) },
+	{ SYS_ioctl, 1, IS(PERF_EVENT_IOC_SET_FILTER) },
 	{ SYS_ioctl, 1, 'V' << 8, 0xff00 },  /* cameras */
 	{ SYS_ioctl, 1, 0xff << 8, 0xff00 }, /* namespaces of a pidfd */
 
@@ -352,6 +353,7 @@ void guard_filter(struct avc_guard *guard)
 		if (has_own_filters(guard->tree.process[i]))
 			return;
 	output_learn(&guard->output);
+	faults_learn(&guard->faults);
 	if (!guard_filter_enter())
 		seccomp_confined();
 }

@@ -405,6 +405,7 @@ static uint64_t work_due(struct avc_guard *guard)
 {
 	uint64_t due = earlier(guard->next_ns, guard_end_waits(guard));
 
+	due = earlier(due, faults_due(&guard->faults, &guard->tree, guard->next_ns));
 	due = earlier(due, guard_tell_due(guard));
 	if (guard->remains.pid)
 		due = earlier(due, guard->remains.until_ns);
@@ -496,6 +497,16 @@ static void tell_straggling(struct avc_guard *guard)
 	guard_tell_unstoppable(guard, &error);
 }
 
+/* A checkpoint that is due, of an app that may be dying. */
+static bool put_off(struct avc_guard *guard)
+{
+	const uint64_t until = faults_put_off(&guard->faults, now_ns());
+
+	if (until)
+		guard->next_ns = until;
+	return until != 0;
+}
+
 static void let_go(struct avc_guard *guard)
 {
 	const uint64_t end = now_ns() + NS_PER_S;
@@ -506,6 +517,7 @@ static void let_go(struct avc_guard *guard)
 	last_pid_end(guard->helper);
 	last_pid_forget();
 	output_end(&guard->output);
+	faults_end(&guard->faults);
 	guard_drop_all(guard);
 	guard_release_remains(guard);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
@@ -570,13 +582,15 @@ static void guard_main(struct avc_guard *guard)
 			guard_tell_untold(guard);
 		if (now_ns() >= guard->ahead_ns && tracee_ending_pidfd(0) < 0)
 			guard_work_ahead(guard);
+		if (now_ns() >= faults_due(&guard->faults, &guard->tree, guard->next_ns))
+			faults_arm(&guard->faults, &guard->tree);
 		if (now_ns() < guard->next_ns)
 			continue;
 		if (!guard->attached)
 			attach(guard);
 		else if (guard_tend_stragglers(guard))
 			tell_straggling(guard);
-		else if (guard_pace_wants(guard))
+		else if (guard_pace_wants(guard) && !put_off(guard))
 			guard_checkpoint(guard, 0);
 	}
 	guard_tell_untold(guard);

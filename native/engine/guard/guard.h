@@ -11,7 +11,9 @@
  *   guard_memory.c      which of its processes the OOM killer takes first
  *   guard_pace.c        when the next checkpoint is worth its cost
  *   filter.c            its own seccomp filter
- *   output.c            detects that the app sends
+ *   thread_events.c     perf events of all threads of the app
+ *   output.c            ... which detect that the app sends
+ *   faults.c            ... or has handled a fault
  *   policy.c            the decisions behind these
  */
 #ifndef AVCKPT_GUARD_H
@@ -28,20 +30,39 @@
 #define AHEAD_AFTER_NS (20 * NS_PER_MS) /* the app was stopped, and goes first               */
 
 /* A perf event of one thread, inherited by the threads that it creates. */
-struct output_event {
+struct thread_event {
 	int fd;
 	pid_t tid, leader;
 	uint64_t start;
+	uint64_t heard; /* so many times */
+};
+
+struct thread_event_kind {
+	const char *tracepoint; /* below the root of tracefs              */
+	const char *filter;     /* what counts, or NULL: everything       */
+	bool signals;           /* each one sends us SIGIO                */
+};
+
+/* All zero at the start. */
+struct thread_events {
+	int number; /* of the tracepoint; 0: not looked up yet, -1: it cannot be used */
+	uint32_t count;
+	struct thread_event *event;
 };
 
 /* All zero at the start. */
 struct output {
-	int known;      /* the tracepoint's number; 0: not looked up yet, -1: there is none */
-	int tracepoint; /* the same while it is used, or -1; 0: not yet                     */
+	struct thread_events events;
 	int signal_fd;
+	bool begun, armed;
+};
+
+/* All zero at the start. */
+struct faults {
+	struct thread_events events;
 	bool armed;
-	uint32_t count;
-	struct output_event *event;
+	uint32_t put_off;  /* the checkpoint that is due: so many times      */
+	uint32_t survived; /* checkpoints that were put off, and then taken  */
 };
 
 /* A death after which the whole group goes back. */
@@ -94,6 +115,7 @@ struct avc_guard {
 	 * CPU time and faults of the app: as of the last checkpoint. */
 	uint64_t pace_cpu_ns, pace_began_ns, pace_app_cpu_ns, pace_faults;
 	struct output output;
+	struct faults faults;
 	uint64_t sent_ns;              /* when the app was last seen to send; 0: never      */
 	bool sent;                     /* since the last checkpoint                         */
 	struct avc_meeting *meeting;   /* of the group, under way; NULL: none             */
@@ -220,9 +242,23 @@ void guard_tell_taken(struct avc_guard *guard, struct avc_event *event);
 void guard_tell_untold(struct avc_guard *guard);
 uint64_t guard_tell_due(const struct avc_guard *guard);
 
-/* ---- output.c --------------------------------------------------------------- */
+/* ---- thread_events.c ------------------------------------------------------- */
 
 /* Looks the tracepoint up: it takes calls that the guard's own filter does not allow. */
+void thread_events_learn(struct thread_events *events, const struct thread_event_kind *kind);
+/* Of all threads of all existing processes.  False: there are none, and never will be. */
+bool thread_events_enable(struct thread_events *events, const struct thread_event_kind *kind,
+			  const struct tree *tree);
+void thread_events_disable(const struct thread_events *events);
+/* Whether it has happened, while they were enabled, since the last call. */
+bool thread_events_heard(struct thread_events *events);
+/* For now, and for good. */
+void thread_events_drop(struct thread_events *events);
+void thread_events_close(struct thread_events *events);
+
+/* ---- output.c --------------------------------------------------------------- */
+
+/* thread_events_learn() */
 void output_learn(struct output *output);
 /* From now on the next output of any existing process is detected; a second call changes nothing.
  * Best effort. */
@@ -233,6 +269,21 @@ int output_fd(const struct output *output);
 /* Whether there was output.  Then it is no longer armed. */
 bool output_heard(struct output *output);
 void output_end(struct output *output);
+
+/* ---- faults.c --------------------------------------------------------------- */
+
+/* thread_events_learn() */
+void faults_learn(struct faults *faults);
+/* When to begin counting before a checkpoint that is due then; UINT64_MAX: need not. */
+uint64_t faults_due(const struct faults *faults, const struct tree *tree, uint64_t checkpoint_ns);
+void faults_arm(struct faults *faults, const struct tree *tree);
+/* A checkpoint has been taken or missed, or the app restored; the next one is due then. */
+void faults_settle(struct faults *faults, const struct tree *tree, uint64_t next_ns);
+/* Whether there was one since the last look. */
+bool faults_heard(struct faults *faults);
+/* Until when a checkpoint that is due now is put off; 0: it is not. */
+uint64_t faults_put_off(struct faults *faults, uint64_t now);
+void faults_end(struct faults *faults);
 
 /* ---- filter.c --------------------------------------------------------------- */
 

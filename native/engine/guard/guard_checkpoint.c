@@ -424,6 +424,9 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 
 	if (generation_files_error(fresh, err))
 		return -1;
+	if (faults_heard(&guard->faults))
+		return fail(err, AVC_DEADLINE, 0, guard->main.pid, "freeze", "",
+			    "it has just handled a fault, and may be dying");
 	tracee_deadline_set(guard->timer, NS_PER_S);
 	result = dirty_apply(&guard->dirty, fresh, err);
 	if (!result)
@@ -563,6 +566,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
 	struct avc_error error = { 0 };
+	bool taken;
 
 	guard->next_ns = policy_due(&guard->config, now_ns());
 	if (init_channel_stop_asked(&guard->channel)) {
@@ -584,7 +588,9 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	guard_pace_begin(guard);
-	if (take(guard, &event, &error) == 0) {
+	taken = take(guard, &event, &error) == 0;
+	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
+	if (taken) {
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
 		event.app_pid_inside = guard->main.inside;
