@@ -215,7 +215,7 @@ def test_an_application_that_is_refused_is_asked_more_and_more_seldom() -> None:
     c, policy = guard.c, guard.policy
 
     def pause_s(code: int = c.AVC_UNSUPPORTED) -> float:
-        return (c.policy_refused(policy, guard.config, code, 10 * SECOND) - 10 * SECOND) / SECOND
+        return float(c.policy_refused(policy, guard.config, code, 10 * SECOND) - 10 * SECOND) / SECOND
 
     assert [pause_s() for _ in range(7)] == [3, 6, 12, 24, 48, 60, 60]
     assert pause_s(c.AVC_BUSY) == 3, "a debugger leaves some day"
