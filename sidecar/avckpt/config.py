@@ -7,8 +7,10 @@
     names:
       "*_lidar_*":
         interval: 100ms
+    sidecar:
+      budget.cpu: 25%
 
-Keys are those of the labels, without their prefix. The labels' own parser checks
+Keys are those of the labels, without their prefix; those of `sidecar` are its own. The labels' own parser checks
 every value, so that file and labels always agree on what is allowed.
 """
 
@@ -17,6 +19,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import os
+import re
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -26,6 +29,7 @@ import yaml
 from avckpt_hooks.shared.labels import LABELS, PREFIX, LabelError, parse_policy, shown
 
 from avckpt import yamlfile
+from avckpt.budget import TOTAL
 from avckpt.errors import ConfigError
 from avckpt.yamlfile import Place, Unreadable
 
@@ -35,6 +39,8 @@ GROUP = f"{PREFIX}group"
 AT_START = (ENABLE, f"{PREFIX}io_uring", f"{PREFIX}scope")
 """Settings that take effect when a container starts: only its own labels set them."""
 NOTIFY = f"{PREFIX}notify"
+LEAST_PERCENT = 0.1
+CPU_TOTAL_ALLOWED = "a percentage of one CPU from 0.1% to 9999%, as 25%"
 
 
 def default_path() -> Path:
@@ -49,6 +55,8 @@ class Defaults:
     common: Mapping[str, str] = field(default_factory=dict)
     by_name: tuple[tuple[str, Mapping[str, str]], ...] = ()
     """Patterns of container names, in the order of the file."""
+    cpu_total: float = TOTAL
+    """Of one CPU: what all guards with `avckpt.interval=auto` may use together."""
 
     def under(self, labels: Mapping[str, str], name: str) -> dict[str, str]:
         """The effective settings of a container.
@@ -147,15 +155,32 @@ class _Reader:
     def whole(self, root: yaml.Node | None) -> Defaults:
         common: dict[str, str] = {}
         by_name: list[tuple[str, Mapping[str, str]]] = []
+        cpu_total = TOTAL
         for key, (place, node) in self._mapping("the file", Place(str(self.path), 1), root).items():
             if key == "defaults":
                 common = self._settings(key, place, node)
             elif key == "names":
                 patterns = self._mapping(key, place, node)
                 by_name = [(name, self._settings(f"{key}.{name}", *found)) for name, found in patterns.items()]
+            elif key == "sidecar":
+                cpu_total = self._cpu_total(place, node)
             else:
-                self._complain(place, f"{key}: unknown key; known are defaults and names")
-        return Defaults(common, tuple(by_name))
+                self._complain(place, f"{key}: unknown key; known are defaults, names and sidecar")
+        return Defaults(common, tuple(by_name), cpu_total)
+
+    def _cpu_total(self, place: Place, node: yaml.Node) -> float:
+        total = TOTAL
+        for key, (here, value) in self._mapping("sidecar", place, node).items():
+            text = str(value.value).strip()
+            found = re.fullmatch(r"(\d{1,4}(?:\.\d{1,3})?)\s*%", text, re.ASCII)
+            if key != "budget.cpu":
+                self._complain(here, f"sidecar.{key}: unknown key; known is budget.cpu")
+            elif found is None or float(found[1]) < LEAST_PERCENT:
+                said = "not a single value" if not isinstance(value, yaml.ScalarNode) else shown(text)
+                self._complain(here, f"sidecar.budget.cpu: {said}: allowed: {CPU_TOTAL_ALLOWED}")
+            else:
+                total = float(found[1]) / 100
+        return total
 
     def _mapping(self, called: str, place: Place, node: yaml.Node | None) -> dict[str, tuple[Place, yaml.Node]]:
         found: dict[str, tuple[Place, yaml.Node]] = {}

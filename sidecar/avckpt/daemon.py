@@ -28,6 +28,7 @@ from avckpt_hooks.shared.protocol import Deregister, Register
 
 from avckpt import __version__
 from avckpt.api.server import ApiServer
+from avckpt.budget import CpuBudget
 from avckpt.config import Configuration
 from avckpt.containers import cgroup, units
 from avckpt.containers.listener import HookListener
@@ -59,7 +60,7 @@ from avckpt.events.record import EventRecord, of_guard
 from avckpt.events.system_journal import SystemJournal
 from avckpt.events.vocabulary import Kind, Reason
 from avckpt.evidence.inquests import Inquests
-from avckpt.guard import Command, Event, generation_to_json
+from avckpt.guard import Command, Event, GuardConfig, generation_to_json
 from avckpt.orders import Orders
 from avckpt.policy import Reloaded, Settings, changes, settings_of
 from avckpt.supervision import watchdog
@@ -137,6 +138,7 @@ class Daemon:
         self._names = Names()
         self._presence = Presence(run_dir / "present.json")
         self.groups = Groups(self.orders)
+        self._cpu = CpuBudget()
 
     async def run(self) -> None:
         """Serves until SIGTERM or SIGINT, then releases every container, unprotected.
@@ -153,6 +155,7 @@ class Daemon:
         except ConfigError as error:
             # A wrong interval is better than no sidecar.
             log.error("the built-in defaults hold: %s", error)
+        self._cpu.total = self.configuration.defaults.cpu_total
         loop.add_reader(self._engine.event_fd, self._take_events)
         api = ApiServer(self, self.run_dir / "api.sock")
         # Listen first, adopt second: a container that starts in between is then seen twice, not missed.
@@ -248,6 +251,7 @@ class Daemon:
         wrong.
         """
         self.configuration.load()
+        self._cpu.total = self.configuration.defaults.cpu_total
         log.info("%s was read", self.configuration.path)
         outcomes = [self._reconfigure(watch) for watch in list(self._watches.values())]
         self._catch_up()
@@ -263,6 +267,7 @@ class Daemon:
             if not changed:
                 return None
             config = dataclasses.replace(after.config, memory_limit_bytes=container.config.memory_limit_bytes)
+            config = self._with_share(container, config, after.config)
             if watch.guard is not None:
                 watch.guard.configure(config)
         except TargetGone:
@@ -446,6 +451,7 @@ class Daemon:
         """A failure to start is reported, and retried at the next scan."""
         container = watch.container
         try:
+            container.config = self._with_share(container, container.config, watch.settings.config)
             watch.guard = self._engine.start_guard(watch.pidfd, container.config, container.cookie)
         except AvckptError as error:
             container.fail(str(error))
@@ -511,12 +517,28 @@ class Daemon:
             record = self.tell(watch, self._record(watch, event, at))
             self.inquests.take(watch, event, record)
             self.groups.hear(watch, event)
+            if event.kind is Kind.CHECKPOINT and watch.guard is not None:
+                self._share_cpu(watch, watch.guard)
             if event.kind is Kind.GUARD_LOST and watch.guard is not None:
                 if event.reason is Reason.FILTER:
                     self._follow_guard(watch, watch.guard)
                 else:
                     self._replace_guard(watch, watch.guard)
             self.orders.answer(event, record)
+
+    def _with_share(self, container: Protected, config: GuardConfig, by_labels: GuardConfig) -> GuardConfig:
+        """With what its guard may use now of the machine's CPUs."""
+        return dataclasses.replace(config, budget_cpu=self._cpu.share(container.cookie, by_labels, time.monotonic()))
+
+    def _share_cpu(self, watch: Watch, guard: Guard) -> None:
+        """It has taken checkpoints; others that also do have begun or ended."""
+        container = watch.container
+        config = self._with_share(container, container.config, watch.settings.config)
+        if config != container.config:
+            # One that cannot be told now is ending, or is told after its next one.
+            with contextlib.suppress(AvckptError):
+                guard.configure(config)
+                container.config = config
 
     def _lose_guard(self, watch: Watch, guard: Guard) -> None:
         """It could not do its work, and said why; the next one may succeed."""

@@ -7,7 +7,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -182,3 +182,31 @@ def test_a_sidecar_that_starts_with_a_broken_one_protects_all_the_same(sidecar: 
     assert f"the built-in defaults hold: {sidecar.config}:2: defaults.interval: soon" in sidecar.log
     made = sidecar.protected("node", NAP, ENABLE)
     assert sidecar.wait_for(made, state="protected")["interval_s"] == 3.0
+
+
+SENDER = """
+import socket, time
+to = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+to.bind(("127.0.0.1", 0))
+while True:
+    to.sendto(b"x", to.getsockname())
+    to.recv(64)
+    time.sleep(0.02)
+"""
+
+
+def test_guards_that_choose_their_interval_share_what_all_may_use(sidecar: LocalSidecar) -> None:
+    """A checkpoint uses at least half a millisecond: at 0.1 % of a CPU, for both, there is less than one a second."""
+    sidecar.config.write_text("sidecar: {budget.cpu: 0.1%}\n")
+    sidecar.start()
+    auto = {**ENABLE, "avckpt.interval": "auto"}
+    for name in ("one", "two"):
+        sidecar.protected(name, [sys.executable, "-S", "-c", SENDER], auto)
+
+    def spaced(bound: Callable[[float], bool]) -> bool:
+        return all(row["checkpoints"] > 2 and bound(row["interval_s"]) for row in sidecar.ps())
+
+    wait_until(lambda: spaced(lambda s: s > 0.9), 30, "the total holds both back", every_s=0.1)
+    sidecar.config.write_text("sidecar: {budget.cpu: 100%}\n")
+    sidecar.avckpt("reload")
+    wait_until(lambda: spaced(lambda s: s < 0.9), 30, "each has its own", every_s=0.1)

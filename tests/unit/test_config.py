@@ -73,7 +73,7 @@ def test_no_file_is_no_mistake(path: Path) -> None:
         ("defaults:\n  interval: ''\n", "2: defaults.interval: an empty value: not a duration"),
         ("names:\n  web*:\n    quiesce: 5s\n", "3: names.web*.quiesce: 5s: more than 1s"),
         ("names:\n  web*: 3s\n", "2: names.web*: not a mapping"),
-        ("default:\n  interval: 3s\n", "1: default: unknown key; known are defaults and names"),
+        ("default:\n  interval: 3s\n", "1: default: unknown key; known are defaults, names and sidecar"),
         ("- interval\n", "1: the file: not a mapping"),
         ("defaults:\n  interval: [3s\nnames:\n", "3: not YAML: while parsing a flow sequence"),
         ("defaults: &a\n  keep: [*a]\n", "1: an anchor that holds itself"),
@@ -152,3 +152,24 @@ def test_a_directory_is_no_file(path: Path) -> None:
     path.mkdir()
     with pytest.raises(ConfigError, match="Is a directory"):
         read(path)
+
+
+def test_the_sidecar_has_settings_of_its_own(path: Path) -> None:
+    path.write_text("sidecar: {budget.cpu: 12.5 %}\n")
+    assert read(path).cpu_total == 0.125
+    path.write_text("defaults: {budget.cpu: 1%}\n")
+    assert read(path).cpu_total == Defaults().cpu_total == 0.25
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("{budget.cpu: 0%}", "sidecar.budget.cpu: 0%: allowed: a percentage of one CPU from 0.1% to 9999%, as 25%"),
+        ("{budget.cpu: [1]}", "sidecar.budget.cpu: not a single value: allowed: a percentage of one CPU"),
+        ("{keep: 3}", "sidecar.keep: unknown key; known is budget.cpu"),
+        ("3", "sidecar: not a mapping"),
+    ],
+)
+def test_what_is_wrong_with_them_is_said(path: Path, text: str, problem: str) -> None:
+    (found,) = problems(path, f"sidecar: {text}\n")
+    assert found.startswith(f"1: {problem}")

@@ -15,18 +15,21 @@ import selectors
 import shutil
 import socket
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from avckpt.budget import CpuBudget
 from avckpt.cli.run import Job, Supervisor, memory_limit_bytes, say
 from avckpt.containers import units
 from avckpt.containers.process import has_ended, pid_of, status
 from avckpt.engine import Engine, Guard
-from avckpt.errors import Busy, Denied
+from avckpt.errors import AvckptError, Busy, Denied
 from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
 from avckpt.events.vocabulary import Kind
+from avckpt.guard import GuardConfig
 from avckpt.policy import settings_of
 
 LOOK_S = 0.02
@@ -38,6 +41,10 @@ class _Node:
     name: str
     peer: units.Peer
     guard: Guard
+    config: GuardConfig
+    """By its labels."""
+    share: float
+    """Of a CPU, as its guard was told."""
     journal: Journal = field(default_factory=Journal)
 
 
@@ -64,6 +71,7 @@ class NodesSupervisor(Supervisor):
         self._pid = pid_of(init_pidfd)
         self._nodes: dict[int, _Node] = {}
         self._cookies = itertools.count(1)
+        self._cpu = CpuBudget()
         self._engine: Engine
         self._selector: selectors.BaseSelector
         self._listening: socket.socket
@@ -131,9 +139,10 @@ class NodesSupervisor(Supervisor):
         config = settings_of(units.labels_of_node(claim.labels, self._labels)).config
         cookie = next(self._cookies)
         config = replace(config, memory_limit_bytes=memory_limit_bytes(peer.pid), remains_s=0.0)
-        guard = self._engine.start_guard(peer.pidfd, config, cookie)
+        share = self._cpu.share(cookie, config, time.monotonic())
+        guard = self._engine.start_guard(peer.pidfd, replace(config, budget_cpu=share), cookie)
         name = units.unique_name(claim.name, [node.name for node in self._nodes.values()])
-        self._nodes[cookie] = _Node(name, peer, guard)
+        self._nodes[cookie] = _Node(name, peer, guard, config, share)
         self._selector.register(peer.pidfd, selectors.EVENT_READ, cookie)
 
     def _end(self, cookie: int) -> None:
@@ -148,10 +157,23 @@ class NodesSupervisor(Supervisor):
     def _take_events(self, engine: Engine) -> None:
         while (event := engine.next_event()) is not None:
             node = self._nodes.get(event.cookie)
-            line = node.journal.line(of_guard(event)) if node is not None else None
-            if node is None or line is None:
+            if node is None:
+                continue
+            if event.kind is Kind.CHECKPOINT:
+                self._share_cpu(event.cookie, node)
+            line = node.journal.line(of_guard(event))
+            if line is None:
                 continue
             level, text = line
             quiet = level < logging.WARNING or event.kind is Kind.MISSED
             if self._verbose or not quiet:
                 say(f"{node.name}: {text}")
+
+    def _share_cpu(self, cookie: int, node: _Node) -> None:
+        """It has taken checkpoints; others that also do have begun or ended."""
+        share = self._cpu.share(cookie, node.config, time.monotonic())
+        if share != node.share:
+            # One that cannot be told now is ending, or is told after its next one.
+            with contextlib.suppress(AvckptError):
+                node.guard.configure(replace(node.config, budget_cpu=share))
+                node.share = share
