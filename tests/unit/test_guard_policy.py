@@ -210,25 +210,6 @@ def test_a_failed_checkpoint_leaves_what_is_held_unless_nothing_is_any_good() ->
     assert c.policy_missed(policy, c.AVC_UNSUPPORTED, False)
 
 
-def test_an_application_that_is_refused_is_asked_more_and_more_seldom() -> None:
-    guard = Guarded(interval_s=3)
-    c, policy = guard.c, guard.policy
-
-    def pause_s(code: int = c.AVC_UNSUPPORTED) -> float:
-        return float(c.policy_refused(policy, guard.config, code, 10 * SECOND) - 10 * SECOND) / SECOND
-
-    assert [pause_s() for _ in range(7)] == [3, 6, 12, 24, 48, 60, 60]
-    assert pause_s(c.AVC_BUSY) == 3, "a debugger leaves some day"
-    c.policy_changed(policy)
-    assert [pause_s(c.AVC_DENIED) for _ in range(2)] == [3, 6]
-    guard.take()
-    assert pause_s() == 3
-    guard.config.interval_ns = 600 * SECOND
-    assert [pause_s() for _ in range(3)] == [600, 600, 600]
-    guard.config.interval_ns = 0
-    assert c.policy_refused(policy, guard.config, c.AVC_UNSUPPORTED, 10 * SECOND) == NEVER
-
-
 # --- which deaths are undone ----------------------------------------------------
 
 

@@ -614,8 +614,6 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
-		guard->next_ns = policy_refused(&guard->policy, &guard->config, error.code,
-						now_ns());
 		guard_unprotect(guard, ticket, &error);
 		return;
 	}

@@ -235,8 +235,6 @@ static void lose_program(struct avc_guard *guard)
 	tracee_end_now(); /* they have the descriptors from before execve(2) */
 	process_unhold(&guard->main);
 	guard->main.infected = false; /* the parasite went with its memory */
-	policy_changed(&guard->policy);
-	guard->next_ns = policy_due_again(&guard->config, guard->next_ns, now_ns());
 }
 
 /* A process that executes another program closes its O_CLOEXEC descriptors, and another process may

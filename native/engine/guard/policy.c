@@ -13,7 +13,6 @@
 #include "policy.h"
 
 #define MISSES_UNTIL_UNPROTECTED 3
-#define REFUSED_NS (60000 * MS) /* between attempts, at most */
 #define MS UINT64_C(1000000)
 #define FIRST_NS (500 * MS)
 #define PROOF_NS (1000 * MS) /* an app that lives this long has made progress */
@@ -151,7 +150,6 @@ void policy_hold(struct policy *policy, struct policy_generation fresh)
 {
 	policy->held[policy->count++] = fresh;
 	policy->misses = 0;
-	policy->refusals = 0;
 	/* Only a health check can show that a process does not hang; and an immediate checkpoint of
 	 * one that was just restored shows no progress. */
 	if (!policy->vouching && fresh.proves)
@@ -168,28 +166,6 @@ bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
 	if (code != AVC_UNSUPPORTED && code != AVC_DENIED)
 		return false;
 	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
-}
-
-uint64_t policy_refused(struct policy *policy, const struct avc_config *config, enum avc_code code,
-			uint64_t now)
-{
-	const uint64_t interval = config->interval_ns;
-	uint64_t pause = interval;
-
-	if (!interval || code == AVC_BUSY)
-		return policy_due(config, now);
-	for (uint32_t i = 0; i < policy->refusals && pause < REFUSED_NS; i++)
-		pause *= 2;
-	if (pause < REFUSED_NS)
-		policy->refusals++;
-	else
-		pause = interval > REFUSED_NS ? interval : REFUSED_NS;
-	return now + pause;
-}
-
-void policy_changed(struct policy *policy)
-{
-	policy->refusals = 0;
 }
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */

@@ -41,7 +41,6 @@ struct policy {
 	uint32_t room;     /* generations that may be held now                */
 	uint32_t lineages; /* that have existed */
 	uint32_t misses;   /* in a row, because of a child process */
-	uint32_t refusals; /* in a row: pauses that were doubled   */
 	uint32_t restores; /* after a crash, not on command                   */
 	uint64_t restored_at[AVC_RESTORES_MAX]; /* the last of these        */
 	bool vouching;                          /* a health check says when the app is healthy */
@@ -88,13 +87,6 @@ uint32_t policy_line_replaced(const struct policy *policy, const struct policy_l
 /* A checkpoint has failed because of the main process, or of another one.  True: no generation is
  * valid, the app is unprotected.  False: it is retried when it is due. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
-
-/* policy_missed() was true: each attempt stops the app for nothing, so the next one comes after a
- * pause twice as long as the last, of a minute at most.  Not while it is only traced (AVC_BUSY). */
-uint64_t policy_refused(struct policy *policy, const struct avc_config *config, enum avc_code code,
-			uint64_t now);
-/* It may be another app now: the pauses begin anew. */
-void policy_changed(struct policy *policy);
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
 
