@@ -32,6 +32,7 @@ void process_init(struct process *process)
 				     .timers_fd = -1,
 				     .stat_fd = -1,
 				     .statm_fd = -1,
+				     .status_fd = -1,
 				     .holder_pidfd = -1,
 				     .exec_sign.fd = -1,
 				     .due_ns = UINT64_MAX };
@@ -69,11 +70,13 @@ static int follow(struct process *process, struct avc_error *err)
 		return fail(err, AVC_GONE, ESRCH, process->leader, "attach", "", "it has ended");
 	close_fd(&process->pidfd);
 	close_fd(&process->statm_fd);
+	close_fd(&process->status_fd);
 	process->pid = pid;
 	/* Its PID is not reused while other threads exist. */
 	if (pid != process->leader && process->leader_pidfd < 0)
 		process->leader_pidfd = proc_pidfd_open(process->leader);
 	process->statm_fd = proc_open(pid, "statm", O_RDONLY);
+	process->status_fd = proc_open(pid, "status", O_RDONLY);
 	process->pidfd = pid == process->leader ? proc_pidfd_open(pid)
 						: (int)syscall(SYS_pidfd_open, pid, PIDFD_THREAD_);
 	if (process->pidfd < 0 && errno == EINVAL)
@@ -121,7 +124,8 @@ int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_er
 	}
 	process->mem_fd = proc_open(process->pid, "mem", O_RDWR);
 	if (process->pidfd < 0 || process->task_dirfd < 0 || process->mem_fd < 0 ||
-	    process->timers_fd < 0 || process->stat_fd < 0 || process->statm_fd < 0) {
+	    process->timers_fd < 0 || process->stat_fd < 0 || process->statm_fd < 0 ||
+	    process->status_fd < 0) {
 		fail_errno(err, pid, "attach", "open(/proc)", "its /proc cannot be read");
 		process_close(process);
 		return -1;
@@ -138,6 +142,7 @@ void process_close(struct process *process)
 	close_fd(&process->timers_fd);
 	close_fd(&process->stat_fd);
 	close_fd(&process->statm_fd);
+	close_fd(&process->status_fd);
 	process_listen_no_more(process);
 	process->pid = 0;
 	process->leader = 0;

@@ -414,7 +414,9 @@ int parasite_own(const struct parasite *parasite, pid_t tid)
 
 static int read_seccomp(const struct process *process, struct thread *thread, struct avc_error *err)
 {
-	if (!seccomp_read(thread->tid, process->plain_filters, &thread->filters_known,
+	const int status_fd = thread->tid == process->pid ? process->status_fd : -1;
+
+	if (!seccomp_read(thread->tid, status_fd, process->plain_filters, &thread->filters_known,
 			  &thread->seccomp))
 		return 0;
 	if (seccomp_must_suspend())

@@ -422,37 +422,27 @@ static bool parse_counts(const char *text, struct proc_status *status)
 	return true;
 }
 
-/* Only these two lines; and the file of the last task stays open, because all of this is done while
+/* Only these two lines, and from an open file where there is one, because all of this is done while
  * the application is stopped. */
-static int read_counts(pid_t tid, struct proc_status *status)
+static int read_counts(pid_t tid, int status_fd, struct proc_status *status)
 {
-	static struct {
-		pid_t tid;
-		int fd;
-	} last = { .fd = -1 };
 	char text[8192];
-	ssize_t n = last.tid == tid ? pread(last.fd, text, sizeof text - 1, 0) : -1;
+	const ssize_t n = status_fd < 0 ? -1 : pread(status_fd, text, sizeof text - 1, 0);
 
-	if (n <= 0) {
-		close_fd(&last.fd);
-		last.tid = tid;
-		last.fd = proc_open(tid, "status", O_RDONLY);
-		n = last.fd < 0 ? -1 : pread(last.fd, text, sizeof text - 1, 0);
-	}
 	if (n > 0) {
 		text[n] = 0;
 		if (parse_counts(text, status))
 			return 0;
 	}
-	return proc_status(tid, status); /* longer than that */
+	return proc_status(tid, status);
 }
 
 /* It is stopped: nothing but another thread of its process could give it a filter. */
-static int read_confined(pid_t tid, uint32_t containers, enum seccomp_way *way)
+static int read_confined(pid_t tid, int status_fd, uint32_t containers, enum seccomp_way *way)
 {
 	struct proc_status status;
 
-	if (read_counts(tid, &status))
+	if (read_counts(tid, status_fd, &status))
 		return -1;
 	*way = containers ? SECCOMP_IN_FORCE : SECCOMP_NONE;
 	errno = EACCES;
@@ -464,14 +454,15 @@ static long filter_get(pid_t tid, uint32_t index, void *insn)
 	return ptrace(PTRACE_SECCOMP_GET_FILTER, tid, (long)index, insn);
 }
 
-int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known, enum seccomp_way *way)
+int seccomp_read(pid_t tid, int status_fd, uint32_t containers, uint32_t *known,
+		 enum seccomp_way *way)
 {
 	struct program p;
 	bool less = false;
 	uint32_t i;
 
 	if (confined.is)
-		return read_confined(tid, containers, way);
+		return read_confined(tid, status_fd, containers, way);
 	/* Filters are only ever added. */
 	if (*way == SECCOMP_SUPERVISED ||
 	    (*known && filter_get(tid, *known, NULL) < 0 && errno == ENOENT))

@@ -179,7 +179,7 @@ struct process {
 	pid_t pid;
 	pid_t leader; /* the process's own PID                               */
 	pid_t inside; /* the same in its own namespace                       */
-	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd;
+	int pidfd, task_dirfd, mem_fd, timers_fd, stat_fd, statm_fd, status_fd;
 	int leader_pidfd; /* when pidfd is of another thread: of the process    */
 	struct parasite parasite;
 	bool infected; /* the parasite is known to be in this process           */
@@ -379,8 +379,9 @@ void rewind_date(struct thread *thread);
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
 /* Reads a stopped thread's filters, of which the first `containers` are the container's; *known:
- * how many there were the last time.  A supervised thread stays so.  0, or -1 with errno. */
-int seccomp_read(pid_t tid, uint32_t containers, uint32_t *known,
+ * how many there were the last time.  `status_fd`: its status in /proc, or -1.  A supervised thread
+ * stays so.  0, or -1 with errno. */
+int seccomp_read(pid_t tid, int status_fd, uint32_t containers, uint32_t *known,
 		 enum seccomp_way *way) warn_unused;
 /* Whether the guard may come under a filter of its own, and still protect an application that has
  * none.  `watches`: it is to watch memory. */
