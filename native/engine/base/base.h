@@ -41,6 +41,21 @@
 
 #define warn_unused __attribute__((warn_unused_result))
 
+/* The first index i below `count` of which `before`, an expression of i, is false; `count`: of none.
+ * It is true of all before that one, and of none after it. */
+#define LOWER_BOUND(count, i, before)                                 \
+	({                                                            \
+		uint32_t low_ = 0, high_ = (count);                   \
+		while (low_ < high_) {                                \
+			const uint32_t i = low_ + (high_ - low_) / 2; \
+			if (before)                                   \
+				low_ = i + 1;                         \
+			else                                          \
+				high_ = i;                            \
+		}                                                     \
+		low_;                                                 \
+	})
+
 /* ---- error.c --------------------------------------------------------------- */
 
 /* Fills *err in unless it holds an error already.  Always returns -1. */

@@ -18,20 +18,10 @@ static avc_remote chunk_of(avc_remote address)
 /* The first chunk that does not end before `start`. */
 static uint32_t find(const struct pageset *set, avc_remote start)
 {
-	uint32_t low = 0, high = set->count;
-
 	/* Pages are usually added in order. */
-	if (high && set->chunk[high - 1].start < start)
-		return high;
-	while (low < high) {
-		const uint32_t middle = low + (high - low) / 2;
-
-		if (set->chunk[middle].start < start)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return low;
+	if (set->count && set->chunk[set->count - 1].start < start)
+		return set->count;
+	return LOWER_BOUND(set->count, i, set->chunk[i].start < start);
 }
 
 static struct page_chunk *chunk_at(struct pageset *set, avc_remote start)

@@ -82,19 +82,9 @@ void files_free(struct files *files)
 /* Among the first `count`, which are in order. */
 static struct file *find_among(const struct files *files, uint32_t count, int fd)
 {
-	uint32_t low = 0, high = count;
+	const uint32_t at = LOWER_BOUND(count, i, files->file[i].fd < fd);
 
-	while (low < high) {
-		const uint32_t middle = (low + high) / 2;
-
-		if (files->file[middle].fd == fd)
-			return &files->file[middle];
-		if (files->file[middle].fd < fd)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return NULL;
+	return at < count && files->file[at].fd == fd ? &files->file[at] : NULL;
 }
 
 struct file *files_find(const struct files *files, int fd)

@@ -98,17 +98,7 @@ bool files_watch_closed(const struct files *files)
 /* The first with this number. */
 static uint32_t first_of(const struct file *set, int fd)
 {
-	uint32_t low = 0, high = set->watch_count;
-
-	while (low < high) {
-		const uint32_t middle = (low + high) / 2;
-
-		if (set->watch[middle].fd < fd)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return low;
+	return LOWER_BOUND(set->watch_count, i, set->watch[i].fd < fd);
 }
 
 const struct file_watch *files_find_watch(const struct file *now, const struct file_watch *watch)

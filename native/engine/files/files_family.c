@@ -196,17 +196,7 @@ static int list_spots(const struct tables *tables, struct spots *spots, bool fam
 /* The first that has this key, as all that follow until it is another one. */
 static const struct spot *first_spot(const struct spots *spots, uint64_t key)
 {
-	uint32_t low = 0, high = spots->count;
-
-	while (low < high) {
-		const uint32_t middle = (low + high) / 2;
-
-		if (spots->spot[middle].key < key)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return spots->spot + low;
+	return spots->spot + LOWER_BOUND(spots->count, i, spots->spot[i].key < key);
 }
 
 static bool has_key(const struct spots *spots, const struct spot *spot, uint64_t key)

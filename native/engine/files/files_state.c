@@ -363,22 +363,14 @@ const struct file *files_other_end(struct files *files, const struct file *file)
 {
 	const uint64_t ino = file->kind == FILE_SOCKET ? file->socket ? file->socket->peer : 0
 						       : file->ino;
-	uint32_t low = 0, high;
+	uint32_t at;
 
 	if (!ino || !sort_ends(files))
 		return NULL;
-	high = files->end_count;
-	while (low < high) {
-		const uint32_t middle = (low + high) / 2;
-
-		if (files->ends[middle]->ino < ino)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	for (; low < files->end_count && files->ends[low]->ino == ino; low++)
-		if (is_other_end(file, files->ends[low]))
-			return files->ends[low];
+	at = LOWER_BOUND(files->end_count, i, files->ends[i]->ino < ino);
+	for (; at < files->end_count && files->ends[at]->ino == ino; at++)
+		if (is_other_end(file, files->ends[at]))
+			return files->ends[at];
 	return NULL;
 }
 

@@ -184,20 +184,11 @@ static int open_marked(const struct file_system *fs, const struct file_mark *mar
 
 static const struct file_mark *find_mark(const struct file *f, const struct file_mark *mark)
 {
-	uint32_t low = 0, high = f ? f->mark_count : 0;
+	const uint32_t count = f ? f->mark_count : 0;
+	const uint32_t at = LOWER_BOUND(count, i, f->mark[i].wd < mark->wd);
+	const struct file_mark *m = at < count ? &f->mark[at] : NULL;
 
-	while (low < high) {
-		const uint32_t middle = (low + high) / 2;
-		const struct file_mark *m = &f->mark[middle];
-
-		if (m->wd == mark->wd)
-			return m->dev == mark->dev && m->ino == mark->ino ? m : NULL;
-		if (m->wd < mark->wd)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return NULL;
+	return m && m->wd == mark->wd && m->dev == mark->dev && m->ino == mark->ino ? m : NULL;
 }
 
 /* More than the longest queue (fs.inotify.max_queued_events) holds. */
