@@ -5,7 +5,8 @@
 
 Each is a program that computes for a tenth of a millisecond and sends a message, 50 times a second, under an
 avckpt-init of its own and a sidecar daemon without Podman. Needs root and what `make setup-build` builds.
-Prints a table and writes bench/results/shares.json.
+Prints a table and writes bench/results/shares.json. With `--idle` each is one that wakes up ten times a second and
+does nothing, and the table is only printed, at avckpt.interval=auto and 3s in turns.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,28 +41,36 @@ while True:
     time.sleep(0.02)
 """
 
+BUSY = (sys.executable, "-S", "-c", SENDER)
+IDLE = (sys.executable, "-S", "-c", "import time\nwhile True: time.sleep(0.1)")
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--counts", default="1,5,20")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--totals", default="25%,9999%")
+    parser.add_argument("--idle", action="store_true")
     options = parser.parse_args()
-    rows = [
-        measure(int(count), total, options.seconds)
-        for count in options.counts.split(",")
-        for total in options.totals.split(",")
-    ]
+    counts = [int(count) for count in options.counts.split(",")]
+    if options.idle:
+        for count in counts:
+            for interval in ("auto", "3s", "auto", "3s"):
+                measure(count, "25%", options.seconds, interval, IDLE)
+        return
+    rows = [measure(count, total, options.seconds) for count in counts for total in options.totals.split(",")]
     RESULTS.write_text(json.dumps(rows, indent=1) + "\n")
 
 
-def measure(count: int, total: str, seconds: float) -> dict[str, Any]:
+def measure(
+    count: int, total: str, seconds: float, interval: str = "auto", command: Sequence[str] = BUSY
+) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory, local_sidecar(Path(directory)) as sidecar:
         sidecar.config.write_text(f"sidecar: {{budget.cpu: {total}}}\n")
         sidecar.start()
-        labels = {"avckpt.enable": "true", "avckpt.interval": "auto"}
+        labels = {"avckpt.enable": "true", "avckpt.interval": interval}
         for n in range(count):
-            sidecar.protected(f"c{n}", [sys.executable, "-S", "-c", SENDER], labels)
+            sidecar.protected(f"c{n}", command, labels)
         wait_until(lambda: all(row["state"] == "protected" for row in sidecar.ps()), 60, "all are protected")
         time.sleep(SETTLE_S)
         before, began = sidecar.ps(), time.monotonic()
@@ -72,6 +82,7 @@ def measure(count: int, total: str, seconds: float) -> dict[str, Any]:
         taken = sum(row["checkpoints"] for row in after) - sum(row["checkpoints"] for row in before)
         row = {
             "containers": count,
+            "interval": interval,
             "total": total,
             "guards_cpu_percent": round(100 * used / took, 1),
             "checkpoints_per_s": round(taken / took, 1),
