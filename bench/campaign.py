@@ -54,6 +54,8 @@ LABELS = {"avckpt.enable": "true", "avckpt.interval": "200ms"}
 POISON_EVERY_S = 1.0
 """Poison comes back: whoever sent it has had no answer."""
 SILENT_S = 2.0
+ROWS_S = 0.1
+"""So old may be what the sidecar has said of all runs: each asking for itself would keep it busy."""
 OUT_OF_MEMORY = "memory leak to the OOM killer"
 MEMORY = "150m"
 """Of a container that leaks."""
@@ -83,6 +85,24 @@ LANGUAGES = {
     "Go": (*EVERYWHERE, *NOT_ROS, "division by zero", "race"),
     "ROS": (*EVERYWHERE, *NOT_GO, *(fault for fault in ONLY_CPP if fault != "the only thread ends")),
 }
+
+
+class Rows:
+    """What the sidecar says of its containers, for all runs together."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._client = Client(run_dir)
+        self._lock = threading.Lock()
+        self._rows: dict[str, dict[str, Any]] = {}
+        self._at_s = 0.0
+
+    def of(self, name: str) -> dict[str, Any]:
+        """Of the newest container of that name; empty: it knows none.  Raises AvckptError, OSError."""
+        with self._lock:
+            if time.monotonic() - self._at_s > ROWS_S:
+                self._rows = {row["name"]: row for row in self._client.containers(ended=True, memory=False)}
+                self._at_s = time.monotonic()
+            return self._rows.get(name, {})
 
 
 class Oracle:
@@ -159,6 +179,7 @@ class World:
 
     podman: Podman
     sidecar: LocalSidecar
+    rows: Rows
     programs: Path
     labels: dict[str, str]
     core: str
@@ -192,7 +213,7 @@ def world(programs: Path, labels: dict[str, str], *, ros: bool) -> Iterator[Worl
             probe.bind(("127.0.0.1", 0))
             port: int = probe.getsockname()[1]
         core = f"avckpt-campaign-{os.getpid()}-core" if ros else ""
-        made = World(hooked_podman(sidecar), sidecar, programs, labels, core, port)
+        made = World(hooked_podman(sidecar), sidecar, Rows(sidecar.run_dir), programs, labels, core, port)
         try:
             if ros:
                 made.start(core, ROS_IMAGE, ["rosmaster", "--core", "-p", str(port)], [], protect=False)
@@ -207,7 +228,6 @@ class Run:
 
     def __init__(self, world: World, cell: Cell, name: str, seconds: float) -> None:
         self._world = world
-        self._client = Client(world.sidecar.run_dir)
         self._cell = cell
         self._seconds = seconds
         self.name = name
@@ -257,8 +277,7 @@ class Run:
         return "unharmed" if not row["restores"] else "recovered" if row["restores"] == 1 else "recrashed"
 
     def _row(self) -> dict[str, Any]:
-        rows = self._client.containers(ended=True, memory=False)
-        return next((row for row in reversed(rows) if row["name"] == self.name), {})
+        return self._world.rows.of(self.name)
 
 
 def cells(build: Path, wanted: set[str]) -> list[Cell]:
