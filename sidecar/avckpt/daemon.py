@@ -127,7 +127,7 @@ class Daemon:
         self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
         self.caretaker: Caretaker[Watch] = Caretaker(run_dir, self.tell)
-        self.inquests: Inquests[Watch] = Inquests(self.tell, self.history, run_dir / "cores")
+        self.inquests: Inquests[Watch] = Inquests(self.tell, self.history, run_dir / "cores", self._app_pids)
         self.started_at = time.time()
         self._engine = Engine()
         self._watches: dict[int, Watch] = {}
@@ -497,6 +497,9 @@ class Daemon:
         watch = self._watches.get(container.cookie)
         if watch is not None:
             self.tell(watch, EventRecord(kind, detail=detail))
+
+    def _app_pids(self) -> set[int]:
+        return {watch.container.app_pid for watch in self._watches.values()}
 
     def _take_events(self) -> None:
         while (event := self._engine.next_event()) is not None:

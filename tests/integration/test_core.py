@@ -89,7 +89,7 @@ def crash(sidecar: LocalSidecar, folder: Path, mode: str) -> dict[str, object]:
     sidecar.wait_for(victim, state="protected", generations=2, threads=2)
     os.kill(victim.app_pid, signal.SIGUSR1)
 
-    event = wait_until(lambda: sidecar.events(mode, "core"), 20, "the core is told of", every_s=0.1)[0]
+    event = wait_until(lambda: sidecar.events(mode, "core"), 60, "the core is told of", every_s=0.1)[0]
     assert "core" in event, event["detail"]
     return event
 

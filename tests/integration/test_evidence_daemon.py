@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ from typing import Any
 
 import pytest
 from avckpt.cli.client import Client
+from avckpt.evidence.deaths import PROCESSES_MAX, RING_PAGES_MAX, Deaths
 
 from testkit.harness import take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, local_sidecar
@@ -126,6 +129,89 @@ def test_arguments_without_an_end(sidecar: LocalSidecar) -> None:
     wait_until(lambda: sidecar.row(odd)["checkpoints"] > 2, 10, "it is protected", every_s=0.05)
     crash_by(sidecar, odd, signal.SIGKILL)
     assert peak_kb(sidecar.process.pid) < before_kb + 50_000
+
+
+@contextlib.contextmanager
+def asleep(sidecar: LocalSidecar) -> Iterator[None]:
+    """The sidecar reads nothing meanwhile."""
+    assert sidecar.process is not None
+    sidecar.process.send_signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        sidecar.process.send_signal(signal.SIGCONT)
+
+
+def kill_unheard(victim: Container, signum: int) -> None:
+    """Has it die, and waits until its guard has restored it."""
+    dead = victim.app_pid
+    os.kill(dead, signum)
+    wait_until(lambda: victim.app_pid not in (0, dead), 10, "it is restored", every_s=0.05)
+
+
+def test_others_that_die_in_masses_take_nothing_away(sidecar: LocalSidecar) -> None:
+    # With a core, because the memory of the dead is kept for a second only otherwise.
+    victim = sidecar.protected("victim", [sys.executable, "-c", VICTIM], {**QUICK, "avckpt.core": "on"})
+    sidecar.wait_for(victim, state="protected", generations=2)
+    die = "import os\nfor _ in range(%d):\n    os.fork() or os.kill(os.getpid(), 9)\n    os.wait()"
+    with asleep(sidecar):
+        kill_unheard(victim, signal.SIGUSR1)
+        subprocess.run([sys.executable, "-c", die % (PROCESSES_MAX + 50)], check=True, timeout=60)
+    event = wait_until(lambda: crashes(sidecar, "victim"), 10, "the crash is told of", every_s=0.05)[0]
+    assert (event["crash"]["signal"], event["crash"]["thread"]) == ("SIGSEGV", "worker")
+    assert "_ctypes" in event["crash"]["backtrace"]
+    assert event["detected_s"] > 0
+
+
+def test_a_death_that_was_not_heard_of_has_a_core_all_the_same(sidecar: LocalSidecar) -> None:
+    """More threads die at once than the kernel has room to report: the signal, the memory and the restore are left."""
+    cpu = min(os.sched_getaffinity(0))
+    victim = sidecar.protected(
+        "victim", ["taskset", "--cpu-list", str(cpu), sys.executable, "-c", VICTIM], {**QUICK, "avckpt.core": "on"}
+    )
+    sidecar.wait_for(victim, state="protected", generations=2, threads=2)
+    # A report has more than 256 bytes.
+    crowd = RING_PAGES_MAX * 4096 // 256 // 1000 + 1
+    many = "import threading\nthreading.stack_size(65536)\nlock = threading.Lock()\nlock.acquire()\n"
+    many += "for _ in range(1000):\n    threading.Thread(target=lock.acquire).start()\nprint(flush=True)"
+    command = ["taskset", "--cpu-list", str(cpu), sys.executable, "-c", many]
+    with asleep(sidecar):
+        for _ in range(crowd):
+            with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+                assert process.stdout is not None
+                assert process.stdout.readline() == b"\n"
+                process.kill()
+        kill_unheard(victim, signal.SIGUSR1)
+    event = wait_until(lambda: crashes(sidecar, "victim"), 10, "the crash is told of", every_s=0.05)[0]
+    assert event["outcome"] == "restored"
+    assert event["crash"]["signal"] == "SIGSEGV"
+    assert event["crash"]["command"].endswith(sys.executable)
+    assert "report of it was lost" in event["crash"]["unknown"]
+    assert "detected_s" not in event
+    (core,) = wait_until(lambda: sidecar.events("victim", "core"), 60, "the core is told of", every_s=0.1)
+    assert "without registers" in core["detail"]
+    assert Path(core["core"]).stat().st_size > 0
+    assert "had no room to report" in sidecar.log
+
+    # And the next one is known again.
+    assert crash_by(sidecar, victim, signal.SIGUSR1)["crash"]["thread"] == "worker"
+
+
+def test_signals_without_a_death_wake_nobody() -> None:
+    """They cost their sender nothing; the newest are known all the same."""
+    program = "import os, signal\nsignal.signal(signal.SIGTERM, lambda *_: None)\n"
+    program += "for _ in range(20000):\n    os.kill(os.getpid(), signal.SIGTERM)\nprint(flush=True)\nsignal.pause()"
+    deaths = Deaths(set, pages=1)
+    try:
+        with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as sender:
+            assert sender.stdout is not None
+            assert sender.stdout.readline() == b"\n"
+            sender.kill()
+        death = deaths.of(sender.pid)
+    finally:
+        deaths.close()
+    assert [(each.signal, each.sender_pid) for each in death.sent] == [(signal.SIGKILL, os.getpid())]
+    assert death.fatal(signal.SIGKILL) is not None
 
 
 def _holders(victim: Container) -> list[int]:

@@ -59,6 +59,11 @@ def test_a_signal_without_a_core_is_delivered_as_a_kill() -> None:
     assert Death(5).fatal(15) is None
 
 
+def test_a_report_that_was_lost_blames_no_other_thread() -> None:
+    death = Death(5, {5: delivery(5, 9), 6: delivery(6, 9)})
+    assert death.fatal(11) is None
+
+
 def test_who_sent_it() -> None:
     death = Death(5, {5: delivery(5, 9)}, [Sent(90, 9, 0, 77, 5, "app"), Sent(200, 9, 0, 78, 5, "app")])
     assert crash_of("SIGKILL", death.fatal(9), death, None).sender_pid == 77
@@ -122,7 +127,7 @@ def test_maps_and_notes_may_be_anything() -> None:
 
 
 def test_a_machine_that_tells_nothing_costs_the_place_only() -> None:
-    case = Collector().open_case(Event(Kind.DIED, 1, app_pid=1, wait_status=11), 1)
+    case = Collector(set).open_case(Event(Kind.DIED, 1, app_pid=1, wait_status=11), 1)
     assert case.crash == Crash(signal="SIGSEGV", unknown="the sidecar does not listen")
 
 

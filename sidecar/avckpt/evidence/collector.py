@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -49,7 +50,8 @@ class Case:
 class Collector:
     """For one event loop; `start()` it there.  What cannot be known is said in the crash, and is no error."""
 
-    def __init__(self) -> None:
+    def __init__(self, protected: Callable[[], Collection[int]]) -> None:
+        self._protected = protected
         self._deaths: Deaths | None = None
         self._log: KernelLog | None = None
         self._problem = "the sidecar does not listen"
@@ -57,7 +59,7 @@ class Collector:
     def start(self) -> None:
         """Begins to hear of deaths."""
         try:
-            self._deaths = Deaths()
+            self._deaths = Deaths(self._protected)
         except AvckptError as error:
             self._problem = str(error)
             log.info("where applications die will not be known: %s", error)
@@ -95,20 +97,18 @@ class Collector:
         if crash.sender_pid:
             crash = replace(crash, sender=_name_of(crash.sender_pid))
         if signum and hit is None:
-            crash = replace(crash, unknown="the kernel told of too many deaths at once")
+            crash = replace(crash, unknown="the kernel's report of it was lost: too many deaths at once")
         return Case(pid, wait_status, crash, death, hit, *kept)
 
     async def examine(self, case: Case) -> Crash:
         """With what the memory of the dead tells."""
         if not case.remains_pid:
-            return await self._compare(
-                case, replace(case.crash, unknown=case.crash.unknown or "its memory was not kept")
-            )
+            return await self._compare(case, replace(case.crash, unknown="its memory was not kept"))
         try:
             crash, frames = await look("remains", case.remains_pid, lambda: _examine(case))
         except (AvckptError, OSError) as error:
             why = f"its memory cannot be read: {error}"
-            return await self._compare(case, replace(case.crash, unknown=case.crash.unknown or why))
+            return await self._compare(case, replace(case.crash, unknown=why))
         return self._identified(case, crash, frames)
 
     async def _compare(self, case: Case, crash: Crash) -> Crash:

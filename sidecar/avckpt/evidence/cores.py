@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import platform
 import re
 import sys
 import time
@@ -46,7 +47,9 @@ class Cores:
 
     async def make(self, container: Protected, case: Case, crash: Crash, mode: str) -> tuple[str, int, str]:
         """Writes one; its path and size, and in words what it is or why there is none."""
-        if crash.unknown:
+        if platform.machine() != "x86_64":
+            return "", 0, f"no core: none is written on {platform.machine()}"
+        if crash.unknown != case.crash.unknown:
             return "", 0, f"no core: {crash.unknown}"
         if _is_cramped(case.init_pid):
             return "", 0, "no core: its container has no memory left to keep what is dead"
@@ -66,7 +69,8 @@ class Cores:
         size = int(answer["bytes"])
         kind = "mini core" if mode == "mini" else "core"
         self.prune(_file_name(container.label), path)
-        what = f"{kind} of {answer['threads']} thread(s), {answer['memory_bytes'] / 1e6:.1f} MB of memory in "
+        threads = f"without registers ({crash.unknown})" if crash.unknown else f"of {answer['threads']} thread(s)"
+        what = f"{kind} {threads}, {answer['memory_bytes'] / 1e6:.1f} MB of memory in "
         return str(path), size, f"{what}{size / 1e6:.1f} MB, after {answer['seconds']:.2f} s: {path}"
 
     def prune(self, name: str, newest: Path) -> None:

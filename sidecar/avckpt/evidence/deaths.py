@@ -9,7 +9,12 @@ Two of the kernel's tracepoints as perf events (perf_event_open(2)), on every CP
 - `signal:signal_generate` of signals that end a process: who sent it, and the thread's name.
 
 The events belong to CPUs, not to processes: no context switch takes longer, and nothing happens
-until a process dies.  The rings are read when a death is reported, or one is half full.
+until a process dies.  They are of the whole machine, so that others must not take the room:
+
+- A delivery is a real death.  Rings of these are read when a death is reported, or much has come; what
+  was heard of applications that are protected makes way for nobody's.
+- Signals cost their sender nothing, so that anybody can send millions.  They wake nobody: each ring keeps
+  the newest, and is read only when a death is reported.
 """
 
 from __future__ import annotations
@@ -17,13 +22,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
+import logging
 import mmap
 import os
 import platform
 import signal
 import struct
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,10 +45,15 @@ _ABI_64 = 2
 
 CALLERS_MAX = 32
 PROCESSES_MAX = 256
-"""Dead processes that are remembered; the oldest make way."""
+"""Dead processes of others that are remembered; the oldest make way."""
 THREADS_MAX = 4096
 """Of each."""
-RING_PAGES = 32
+SENT_MAX = 2048
+DELIVERED_PAGES = 2048
+"""Rings of all CPUs together; each has a power of two, within these: """
+RING_PAGES_MIN, RING_PAGES_MAX = 32, 256
+SENT_PAGES = 32
+WAKE_BYTES = 64 << 10
 
 OURS = ("avckpt-tmpl", "avckpt-spare", "avckpt-hold", "avckpt-guard")
 """Names of tasks that are killed, and kill, at every checkpoint."""
@@ -54,16 +65,25 @@ _ALWAYS = " || ".join(
     f"sig == {number}"
     for number in (signal.SIGABRT, signal.SIGKILL, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSYS)
 )
-_GENERATE = f"({_ALWAYS} || ((code == 0 || code == -1 || code == -6) && ({_SENT}))) && {_NOT_OURS}"
+_GENERATE = f"({_ALWAYS} || ((code == 0 || code == -1 || code == -6) && ({_SENT}))) && result == 0 && {_NOT_OURS}"
+"""Result 0: it was not dropped, or pending already."""
+
+# What a signal that leaves a core is delivered as; of any other the kernel itself makes a SIGKILL for every
+# thread (complete_signal(), kernel/signal.c).
+_WITH_CORE = frozenset(
+    (signal.SIGQUIT, signal.SIGILL, signal.SIGTRAP, signal.SIGABRT, signal.SIGFPE, signal.SIGSEGV, signal.SIGBUS)
+) | {signal.SIGSYS, signal.SIGXCPU, signal.SIGXFSZ}
 
 # linux/perf_event.h
 _TYPE_TRACEPOINT = 2
 _SAMPLE_TID, _SAMPLE_TIME, _SAMPLE_CALLCHAIN, _SAMPLE_RAW, _SAMPLE_REGS_USER = 1 << 1, 1 << 2, 1 << 5, 1 << 10, 1 << 12
-_FLAG_DISABLED, _FLAG_WATERMARK, _FLAG_NO_KERNEL_CALLERS, _FLAG_CLOCKID = 1 << 0, 1 << 14, 1 << 21, 1 << 25
+_FLAG_DISABLED, _FLAG_WATERMARK, _FLAG_NO_KERNEL_CALLERS = 1 << 0, 1 << 14, 1 << 21
+_FLAG_CLOCKID, _FLAG_BACKWARD = 1 << 25, 1 << 27
 _ATTR = struct.Struct("=IIQQQQQIIQQQQIiQIHH")
 _OPEN_CLOEXEC = 8
-_ENABLE, _SET_OUTPUT, _SET_FILTER = 0x2400, 0x2405, 0x40082406
-_RECORD_SAMPLE = 9
+_ENABLE, _SET_FILTER, _PAUSE_OUTPUT = 0x2400, 0x40082406, 0x40042409
+_RECORD_LOST, _RECORD_SAMPLE = 2, 9
+_HEADER = struct.Struct("=IHH")
 _HEAD, _TAIL = 1024, 1032
 _CONTEXT_FROM = 2**64 - 4095
 """Callers from here on are no addresses, but say whose the following are."""
@@ -73,6 +93,8 @@ _NR_FSOPEN, _NR_FSCONFIG, _NR_FSMOUNT = 430, 431, 432
 _FSCONFIG_CREATE = 6
 
 _libc = ctypes.CDLL(None, use_errno=True)
+
+log = logging.getLogger("avckpt")
 
 
 @dataclass(frozen=True)
@@ -117,31 +139,40 @@ class Death:
     def fatal(self, signum: int) -> Delivery | None:
         """The thread that the signal hit first: those that follow die of SIGKILL.
 
-        Of a SIGKILL the main thread.  Of a signal without a core the kernel itself makes a SIGKILL for every
-        thread (complete_signal(), kernel/signal.c).
+        Of a SIGKILL the main thread.  None: the kernel's report of it was lost.
         """
         hit = [each for each in self.deliveries.values() if each.signal == signum != signal.SIGKILL]
         first = min(hit, key=lambda each: each.at_ns, default=None)
-        return first or self.deliveries.get(self.pid) or next(iter(self.deliveries.values()), None)
+        if first is not None or signum in _WITH_CORE:
+            return first
+        return self.deliveries.get(self.pid) or next(iter(self.deliveries.values()), None)
 
 
 class Deaths:
-    """What has died lately.  For one thread.  Raises AvckptError when this machine does not tell."""
+    """What has died lately.  For one thread.  Raises AvckptError when this machine does not tell.
 
-    def __init__(self) -> None:
+    `protected` says which processes it is about.  `pages`: of the ring of each CPU; 0: by their number.
+    """
+
+    def __init__(self, protected: Callable[[], Collection[int]], pages: int = 0) -> None:
         if platform.machine() != "x86_64":
             raise Unsupported(f"registers of {platform.machine()} are not known", operation="hear of deaths")
         self._known: OrderedDict[int, Death] = OrderedDict()
         self._sent: OrderedDict[int, Sent] = OrderedDict()
-        self._rings: list[_Ring] = []
+        self._protected = protected
+        self.lost = 0
+        """Deaths of threads that the kernel had no room to report."""
+        self._delivered: list[_Ring] = []
+        self._generated: list[_Newest] = []
         try:
             with _tracefs() as root:
-                self._deliver = _tracepoint(root, "signal_deliver")
+                deliver = _tracepoint(root, "signal_deliver")
                 generate = _tracepoint(root, "signal_generate")
-            for cpu in _online():
-                ring = _Ring(cpu, self._deliver, _DELIVER)
-                self._rings.append(ring)
-                ring.add(generate, _GENERATE)
+            cpus = _online()
+            pages = pages or _pages_of_ring(len(cpus))
+            for cpu in cpus:
+                self._delivered.append(_Ring(cpu, deliver, pages))
+                self._generated.append(_Newest(cpu, generate))
         except OSError as error:
             self.close()
             raise KernelError(
@@ -153,17 +184,28 @@ class Deaths:
 
     @property
     def fds(self) -> list[int]:
-        """Readable when a ring is half full: call `take()`."""
-        return [ring.fd for ring in self._rings]
+        """Readable when there is much to read: call `take()`."""
+        return [ring.fd for ring in self._delivered]
 
     def take(self) -> None:
-        """Reads the rings."""
-        for ring in self._rings:
-            ring.read(self._sample)
+        """Reads who has died."""
+        lost = sum(ring.read(self._take_delivery) for ring in self._delivered)
+        if lost:
+            self.lost += lost
+            log.warning("too many deaths at once: the kernel had no room to report %d of a thread", lost)
+        if len(self._known) > PROCESSES_MAX:
+            protected = self._protected()
+            others = [pid for pid in self._known if pid not in protected]
+            for pid in others[:-PROCESSES_MAX]:
+                del self._known[pid]
 
     def of(self, pid: int) -> Death:
         """What was heard of a process that has ended, in our PID namespace."""
         self.take()
+        for ring in self._generated:
+            ring.read(self._take_sent)
+        while len(self._sent) > SENT_MAX:
+            self._sent.popitem(last=False)
         death = self._known.pop(pid, Death(pid))
         tids = {pid, *death.deliveries}
         death.sent = [sent for sent in self._sent.values() if sent.tid in tids]
@@ -171,87 +213,121 @@ class Deaths:
 
     def close(self) -> None:
         """Hears no more."""
-        for ring in self._rings:
+        for ring in (*self._delivered, *self._generated):
             ring.close()
-        self._rings.clear()
+        self._delivered.clear()
+        self._generated.clear()
 
-    def _sample(self, body: bytes) -> None:
+    def _take_delivery(self, body: bytes) -> None:
         pid, tid, at_ns, count = struct.unpack_from("=iiQQ", body)
         chain = struct.unpack_from(f"={count}Q", body, 24)
         at = 24 + 8 * count
         (size,) = struct.unpack_from("=I", body, at)
-        raw = body[at + 4 : at + 4 + size]
-        (number,) = struct.unpack_from("=H", raw)
-        signum, _, code = struct.unpack_from("=iii", raw, 8)
-        if number == self._deliver:
-            callers = tuple(address for address in chain if address < _CONTEXT_FROM)[:CALLERS_MAX]
-            registers = _registers(body, at + 4 + size)
-            self._remember(pid, Delivery(tid, at_ns, signum, code, callers, registers))
-        else:
-            name, target = struct.unpack_from("=16si", raw, 20)
-            thread = name.partition(b"\0")[0].decode("utf-8", "replace")
-            self._sent[target] = Sent(at_ns, signum, code, pid, target, thread)
-            self._sent.move_to_end(target)
-            while len(self._sent) > PROCESSES_MAX:
-                self._sent.popitem(last=False)
-
-    def _remember(self, pid: int, delivery: Delivery) -> None:
+        signum, _, code = struct.unpack_from("=iii", body, at + 4 + 8)
+        callers = tuple(address for address in chain if address < _CONTEXT_FROM)[:CALLERS_MAX]
         death = self._known.setdefault(pid, Death(pid))
         if len(death.deliveries) < THREADS_MAX:
-            death.deliveries.setdefault(delivery.tid, delivery)
-        while len(self._known) > PROCESSES_MAX:
-            self._known.popitem(last=False)
+            registers = _registers(body, at + 4 + size)
+            death.deliveries.setdefault(tid, Delivery(tid, at_ns, signum, code, callers, registers))
+
+    def _take_sent(self, body: bytes) -> None:
+        pid, _, at_ns, _ = struct.unpack_from("=iiQI", body)
+        signum, _, code, name, target = struct.unpack_from("=iii16si", body, 20 + 8)
+        thread = name.partition(b"\0")[0].decode("utf-8", "replace")
+        self._sent[target] = Sent(at_ns, signum, code, pid, target, thread)
+        self._sent.move_to_end(target)
 
 
-class _Ring:
-    """What one CPU has to tell.  Raises OSError."""
+class _Event:
+    """A tracepoint on one CPU, with a ring for its samples.  Raises OSError."""
 
-    def __init__(self, cpu: int, tracepoint: int, what: str) -> None:
-        self._cpu = cpu
+    def __init__(self, fd: int, what: str, pages: int, prot: int) -> None:
+        self.fd = fd
         self._map: mmap.mmap | None = None
-        self.fd = _open_event(cpu, tracepoint)
-        self._fds = [self.fd]
+        self._size = pages * mmap.PAGESIZE
         try:
-            _filter(self.fd, what)
-            self._map = mmap.mmap(self.fd, (1 + RING_PAGES) * mmap.PAGESIZE)
-            fcntl.ioctl(self.fd, _ENABLE, 0)
+            _filter(fd, what)
+            self._map = mmap.mmap(fd, mmap.PAGESIZE + self._size, prot=prot)
+            fcntl.ioctl(fd, _ENABLE, 0)
         except OSError:
             self.close()
             raise
 
-    def add(self, tracepoint: int, what: str) -> None:
-        """Another event, into the same ring."""
-        fd = _open_event(self._cpu, tracepoint)
-        self._fds.append(fd)
-        _filter(fd, what)
-        fcntl.ioctl(fd, _SET_OUTPUT, self.fd)
-        fcntl.ioctl(fd, _ENABLE, 0)
-
-    def read(self, take: Callable[[bytes], None]) -> None:
-        """Gives each sample to `take`, and frees its room."""
+    def _head(self) -> int:
         assert self._map is not None
-        size = RING_PAGES * mmap.PAGESIZE
-        (head,) = struct.unpack_from("=Q", self._map, _HEAD)
-        (tail,) = struct.unpack_from("=Q", self._map, _TAIL)
-        while tail < head:
-            kind, _, length = struct.unpack("=IHH", self._bytes(tail % size, 8))
-            if kind == _RECORD_SAMPLE:
-                take(self._bytes((tail + 8) % size, length - 8))
-            tail += length
-        struct.pack_into("=Q", self._map, _TAIL, tail)
+        head: int = struct.unpack_from("Q", self._map, _HEAD)[0]
+        return head
 
     def _bytes(self, at: int, length: int) -> bytes:
         assert self._map is not None
-        size, begin = RING_PAGES * mmap.PAGESIZE, mmap.PAGESIZE
-        part = self._map[begin + at : begin + min(at + length, size)]
+        at, begin = at % self._size, mmap.PAGESIZE
+        part = self._map[begin + at : begin + min(at + length, self._size)]
         return part + self._map[begin : begin + length - len(part)]
 
     def close(self) -> None:
         if self._map is not None:
             self._map.close()
-        for fd in self._fds:
-            os.close(fd)
-        self._fds.clear()
+        os.close(self.fd)
+
+
+class _Ring(_Event):
+    """Deliveries: what has been read makes room; what finds none is lost, and counted."""
+
+    def __init__(self, cpu: int, tracepoint: int, pages: int) -> None:
+        sample = _SAMPLE_TID | _SAMPLE_TIME | _SAMPLE_CALLCHAIN | _SAMPLE_RAW | _SAMPLE_REGS_USER
+        wake = min(WAKE_BYTES, pages * mmap.PAGESIZE // 2)
+        fd = _open_event(cpu, tracepoint, sample, _FLAG_NO_KERNEL_CALLERS, wake)
+        super().__init__(fd, _DELIVER, pages, mmap.PROT_READ | mmap.PROT_WRITE)
+
+    def read(self, take: Callable[[bytes], None]) -> int:
+        """Gives each sample to `take`, and frees its room; how many were lost."""
+        assert self._map is not None
+        head, lost = self._head(), 0
+        (tail,) = struct.unpack_from("Q", self._map, _TAIL)
+        while tail < head:
+            kind, _, length = _HEADER.unpack(self._bytes(tail, _HEADER.size))
+            body = self._bytes(tail + _HEADER.size, length - _HEADER.size)
+            if kind == _RECORD_SAMPLE:
+                take(body)
+            elif kind == _RECORD_LOST:
+                lost += struct.unpack_from("=QQ", body)[1]
+            tail += length
+        struct.pack_into("Q", self._map, _TAIL, tail)
+        return lost
+
+
+class _Newest(_Event):
+    """Signals: the kernel writes backwards, over the oldest."""
+
+    def __init__(self, cpu: int, tracepoint: int) -> None:
+        sample = _SAMPLE_TID | _SAMPLE_TIME | _SAMPLE_RAW
+        fd = _open_event(cpu, tracepoint, sample, _FLAG_BACKWARD, SENT_PAGES * mmap.PAGESIZE)
+        super().__init__(fd, _GENERATE, SENT_PAGES, mmap.PROT_READ)
+        self._seen = 0
+
+    def read(self, take: Callable[[bytes], None]) -> None:
+        """Gives those that are new to `take`, the newest last."""
+        fcntl.ioctl(self.fd, _PAUSE_OUTPUT, 1)
+        head = self._head()
+        new = self._bytes(head, min((self._seen - head) % 2**64, self._size))
+        fcntl.ioctl(self.fd, _PAUSE_OUTPUT, 0)
+        self._seen = head
+        samples, at = [], 0
+        while at + _HEADER.size <= len(new):
+            kind, _, length = _HEADER.unpack_from(new, at)
+            if length < _HEADER.size or at + length > len(new):
+                break  # the oldest is half overwritten
+            if kind == _RECORD_SAMPLE:
+                samples.append(new[at + _HEADER.size : at + length])
+            at += length
+        for body in reversed(samples):
+            take(body)
+
+
+def _pages_of_ring(cpus: int) -> int:
+    """A power of two."""
+    wanted = max(RING_PAGES_MIN, min(RING_PAGES_MAX, DELIVERED_PAGES // cpus))
+    return 1 << (wanted.bit_length() - 1)
 
 
 def _registers(body: bytes, at: int) -> dict[str, int]:
@@ -262,14 +338,14 @@ def _registers(body: bytes, at: int) -> dict[str, int]:
     return dict(zip(REGISTERS, struct.unpack_from(f"={len(REGISTERS)}Q", body, at + 8)))
 
 
-def _open_event(cpu: int, tracepoint: int) -> int:
-    sample = _SAMPLE_TID | _SAMPLE_TIME | _SAMPLE_CALLCHAIN | _SAMPLE_RAW | _SAMPLE_REGS_USER
-    flags = _FLAG_DISABLED | _FLAG_WATERMARK | _FLAG_NO_KERNEL_CALLERS | _FLAG_CLOCKID
+def _open_event(cpu: int, tracepoint: int, sample: int, flags: int, wake_bytes: int) -> int:
+    flags |= _FLAG_DISABLED | _FLAG_WATERMARK | _FLAG_CLOCKID
+    registers, callers = (_REGISTERS_MASK, CALLERS_MAX) if sample & _SAMPLE_REGS_USER else (0, 0)
     attr = ctypes.create_string_buffer(
         _ATTR.pack(
             *(_TYPE_TRACEPOINT, _ATTR.size, tracepoint, 1, sample, 0, flags),
-            *(RING_PAGES * mmap.PAGESIZE // 2, 0, 0, 0, 0),
-            *(_REGISTERS_MASK, 0, 1, 0, 0, CALLERS_MAX, 0),  # 1: CLOCK_MONOTONIC
+            *(wake_bytes, 0, 0, 0, 0),
+            *(registers, 0, 1, 0, 0, callers, 0),  # 1: CLOCK_MONOTONIC
         )
     )
     return _syscall(_NR_PERF_EVENT_OPEN, attr, -1, cpu, -1, _OPEN_CLOEXEC)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
@@ -44,10 +44,16 @@ W = TypeVar("W", bound=Watched)
 class Inquests(Generic[W]):
     """One for each death, beside whatever the daemon does.  For one event loop; `start()` it there."""
 
-    def __init__(self, tell: Callable[[W, EventRecord], EventRecord], history: History, cores: Path) -> None:
+    def __init__(
+        self,
+        tell: Callable[[W, EventRecord], EventRecord],
+        history: History,
+        cores: Path,
+        protected: Callable[[], Collection[int]],
+    ) -> None:
         self._tell = tell
         self._history = history
-        self._collector = Collector()
+        self._collector = Collector(protected)
         self._cores = Cores(cores)
         self._tasks: set[asyncio.Task[None]] = set()
         self._open: dict[int, asyncio.Future[EventRecord]] = {}
