@@ -182,6 +182,7 @@ class World:
     rows: Rows
     programs: Path
     labels: dict[str, str]
+    options: list[str]
     core: str
     """The container of ROS's master; empty: there is none."""
     core_port: int
@@ -193,7 +194,7 @@ class World:
         env = ("--env", f"ROS_MASTER_URI=http://127.0.0.1:{self.core_port}", "--env", "ROS_IP=127.0.0.1")
         return self.podman.run(
             *("run", "--detach", "--pull=never", "--network=host", "--volume", f"{self.programs}:/faults:ro"),
-            *("--name", name, *words, *env, *options, image, *command),
+            *("--name", name, *words, *env, *self.options, *options, image, *command),
         ).stdout.strip()
 
     def remove(self, name: str) -> None:
@@ -205,7 +206,7 @@ class World:
 
 
 @contextlib.contextmanager
-def world(programs: Path, labels: dict[str, str], *, ros: bool) -> Iterator[World]:
+def world(programs: Path, labels: dict[str, str], options: list[str], *, ros: bool) -> Iterator[World]:
     """One, for some runs."""
     with tempfile.TemporaryDirectory() as folder, local_sidecar(Path(folder)) as sidecar:
         sidecar.start()
@@ -213,7 +214,7 @@ def world(programs: Path, labels: dict[str, str], *, ros: bool) -> Iterator[Worl
             probe.bind(("127.0.0.1", 0))
             port: int = probe.getsockname()[1]
         core = f"avckpt-campaign-{os.getpid()}-core" if ros else ""
-        made = World(hooked_podman(sidecar), sidecar, Rows(sidecar.run_dir), programs, labels, core, port)
+        made = World(hooked_podman(sidecar), sidecar, Rows(sidecar.run_dir), programs, labels, options, core, port)
         try:
             if ros:
                 made.start(core, ROS_IMAGE, ["rosmaster", "--core", "-p", str(port)], [], protect=False)
@@ -230,6 +231,7 @@ class Run:
         self._world = world
         self._cell = cell
         self._seconds = seconds
+        self._begun = time.time()
         self.name = name
         self._oracle = Oracle()
 
@@ -244,7 +246,9 @@ class Run:
             wait_until(lambda: self._row().get("generations", 0) >= 2, 30, "it is protected", every_s=0.1)
             wait_until(lambda: self._oracle.heard > 20, 30, "it computes", every_s=0.1)
             self._bring_out()
-            return self._judge()
+            outcome = self._judge()
+            self._note_times()
+            return outcome
         finally:
             self._oracle.close()
             self._world.remove(self.name)
@@ -275,6 +279,13 @@ class Run:
         if time.monotonic() - self._oracle.last_s > SILENT_S:
             return "stuck"
         return "unharmed" if not row["restores"] else "recovered" if row["restores"] == 1 else "recrashed"
+
+    def _note_times(self) -> None:
+        """How long detection and restore took, as the sidecar has told.  Now: it forgets the oldest events."""
+        for event in Client(self._world.sidecar.run_dir).history(self._begun):
+            if event["container"] == self.name and event["kind"] == "crash":
+                self._cell.restored_s += [event["restore_s"]] if "restore_s" in event else []
+                self._cell.detected_s += [event["detected_s"]] if "detected_s" in event else []
 
     def _row(self) -> dict[str, Any]:
         return self._world.rows.of(self.name)
@@ -316,34 +327,23 @@ def compile_ros(build: Path) -> bool:
     return True
 
 
-def times(sidecar: LocalSidecar, names: dict[str, Cell]) -> None:
-    """How long detection and restore took, as the sidecar has told."""
-    for event in Client(sidecar.run_dir).history():
-        cell = names.get(event["container"])
-        if cell is not None and event["kind"] == "crash":
-            cell.restored_s += [event["restore_s"]] if "restore_s" in event else []
-            cell.detected_s += [event["detected_s"]] if "detected_s" in event else []
-
-
 def one_round(made: list[Cell], number: int, options: argparse.Namespace, programs: Path) -> None:
     """Each of them once, under a sidecar of its own."""
-    names: dict[str, Cell] = {}
     labels = {**LABELS, **dict(pair.split("=", 1) for pair in options.label)}
-    with world(programs, labels, ros=any(cell.language == "ROS" for cell in made)) as here:
-        with concurrent.futures.ThreadPoolExecutor(options.parallel) as pool:
-            runs: dict[concurrent.futures.Future[str], Cell] = {}
-            for i, cell in enumerate(made):
-                name = f"avckpt-campaign-{os.getpid()}-{number}-{i}"
-                names[name] = cell
-                runs[pool.submit(lambda c=cell, n=name: Run(here, c, n, options.seconds).outcome())] = cell  # type: ignore[misc]
-            for done in concurrent.futures.as_completed(runs):
-                cell = runs[done]
-                try:
-                    cell.counted[done.result()] += 1
-                except (OSError, CommandFailed, AvckptError, KeyError, subprocess.SubprocessError) as error:
-                    cell.failed += 1
-                    print(f"{cell.language}, {cell.fault}: not made: {str(error)[-300:]}", file=sys.stderr)
-        times(here.sidecar, names)
+    ros = any(cell.language == "ROS" for cell in made)
+    pool = concurrent.futures.ThreadPoolExecutor(options.parallel)
+    with world(programs, labels, options.podman, ros=ros) as here, pool:
+        runs: dict[concurrent.futures.Future[str], Cell] = {}
+        for i, cell in enumerate(made):
+            run = Run(here, cell, f"avckpt-campaign-{os.getpid()}-{number}-{i}", options.seconds)
+            runs[pool.submit(run.outcome)] = cell
+        for done in concurrent.futures.as_completed(runs):
+            cell = runs[done]
+            try:
+                cell.counted[done.result()] += 1
+            except (OSError, CommandFailed, AvckptError, KeyError, subprocess.SubprocessError) as error:
+                cell.failed += 1
+                print(f"{cell.language}, {cell.fault}: not made: {str(error)[-300:]}", file=sys.stderr)
 
 
 def main() -> None:
@@ -355,6 +355,9 @@ def main() -> None:
     parser.add_argument("--language", action="append", choices=sorted(LANGUAGES))
     parser.add_argument("--fault", action="append")
     parser.add_argument("--label", action="append", default=[], metavar="NAME=VALUE", help="another label of theirs")
+    parser.add_argument(
+        "--podman", action="append", default=[], metavar="OPTION", help="of podman run, for all of them"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     begun = time.monotonic()

@@ -33,11 +33,11 @@ Json = dict[str, Any]
 def table(cells: list[Json]) -> str:
     """Markdown: a row for each fault and language, and sums."""
     head = [
-        f"| fault | language | runs | {' | '.join(OUTCOMES)} | restore, ms |",
-        f"|---|---|{'---:|' * (len(OUTCOMES) + 2)}",
+        f"| fault | language | runs | {' | '.join(OUTCOMES)} | detection, ms | restore, ms |",
+        f"|---|---|{'---:|' * (len(OUTCOMES) + 3)}",
     ]
     rows = [
-        _row(cell["fault"], cell["language"], cell, cell["restored_max_s"])
+        _row(cell["fault"], cell["language"], cell, cell["detected_max_s"], cell["restored_max_s"])
         for cell in sorted(cells, key=lambda each: (each["fault"], each["language"]))
     ]
     for language in sorted({cell["language"] for cell in cells}):
@@ -45,13 +45,13 @@ def table(cells: list[Json]) -> str:
         for cell in cells:
             if cell["language"] == language:
                 total.update({name: cell[name] for name in ("runs", *OUTCOMES)})
-        rows.append(_row("**all**", language, total, None))
+        rows.append(_row("**all**", language, total))
     return "\n".join([*head, *rows]) + "\n"
 
 
-def _row(fault: str, language: str, counted: Any, longest_s: float | None) -> str:
+def _row(fault: str, language: str, counted: Any, *longest_s: float | None) -> str:
     numbers = " | ".join(str(counted[name] or "") for name in OUTCOMES)
-    longest = "" if longest_s is None else f"{longest_s * 1000:.1f}"
+    longest = " | ".join("" if each is None else f"{each * 1000:.1f}" for each in longest_s or (None, None))
     return f"| {fault} | {language} | {counted['runs']} | {numbers} | {longest} |"
 
 
