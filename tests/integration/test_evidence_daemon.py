@@ -62,9 +62,13 @@ def crash_by(sidecar: LocalSidecar, victim: Container, signum: int) -> dict[str,
     told = len(crashes(sidecar, victim.name))
     os.kill(victim.app_pid, signum)
     wait_until(lambda: len(crashes(sidecar, victim.name)) > told, 10, "the crash is told of", every_s=0.05)
-    wait_until(
-        lambda: sidecar.row(victim)["checkpoints"] > before["checkpoints"] + 1, 10, "it is protected", every_s=0.05
-    )
+
+    def protected_again() -> bool:
+        row = sidecar.row(victim)
+        assert row, f"it has ended; log:\n{sidecar.log}"
+        return bool(row["checkpoints"] > before["checkpoints"] + 1)
+
+    wait_until(protected_again, 10, "it is protected", every_s=0.05)
     return crashes(sidecar, victim.name)[-1]
 
 
