@@ -154,16 +154,16 @@ def kill_unheard(victim: Container, signum: int) -> None:
 
 
 def test_others_that_die_in_masses_take_nothing_away(sidecar: LocalSidecar) -> None:
-    # With a core, because the memory of the dead is kept for a second only otherwise.
-    victim = sidecar.protected("victim", [sys.executable, "-c", VICTIM], {**QUICK, "avckpt.core": "on"})
+    victim = sidecar.protected("victim", [sys.executable, "-c", VICTIM])
     sidecar.wait_for(victim, state="protected", generations=2)
     die = "import os\nfor _ in range(%d):\n    os.fork() or os.kill(os.getpid(), 9)\n    os.wait()"
     with asleep(sidecar):
         kill_unheard(victim, signal.SIGUSR1)
         subprocess.run([sys.executable, "-c", die % (PROCESSES_MAX + 50)], check=True, timeout=60)
     event = wait_until(lambda: crashes(sidecar, "victim"), 10, "the crash is told of", every_s=0.05)[0]
-    assert (event["crash"]["signal"], event["crash"]["thread"]) == ("SIGSEGV", "worker")
-    assert "_ctypes" in event["crash"]["backtrace"]
+    # Its memory is not kept for so long; this is what the kernel told at the death.
+    assert (event["crash"]["signal"], event["crash"]["code"]) == ("SIGSEGV", "SEGV_MAPERR")
+    assert event["crash"]["tid"] > 0
     assert event["detected_s"] > 0
 
 
@@ -198,7 +198,7 @@ def test_a_death_that_was_not_heard_of_has_a_core_all_the_same(sidecar: LocalSid
     assert "had no room to report" in sidecar.log
 
     # And the next one is known again.
-    assert crash_by(sidecar, victim, signal.SIGUSR1)["crash"]["thread"] == "worker"
+    assert crash_by(sidecar, victim, signal.SIGUSR1)["crash"]["code"] == "SEGV_MAPERR"
 
 
 def test_signals_without_a_death_wake_nobody() -> None:
