@@ -52,8 +52,40 @@ def test_annotations_of_one_container(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(pod))
     found = pods.check([path])
     assert found.services["Pod/drive/lidar"].enabled
-    assert not found.services["Pod/drive"].enabled
+    assert "Pod/drive" not in found.services  # it has no other container
     said = [problem.message for problem in found.problems]
     assert len(said) == 2, said
     assert "avckpt.keep/radar: the pod has no container 'radar'" in said
     assert any("avckpt.keep=99" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("annotation", "more", "words"),
+    [
+        ("avckpt.keep", {"resources": {"limits": {"nvidia.com/gpu": 1}}}, ["nvidia.com/gpu: a process"]),
+        ("avckpt.keep/lidar", {"resources": {"limits": {"amd.com/gpu": 1}}}, ["amd.com/gpu: a process"]),
+        ("avckpt.restore.on", {}, ["unhealthy needs a healthcheck"]),
+        ("avckpt.restore.on", {"livenessProbe": {"exec": {"command": ["true"]}}}, []),
+        ("avckpt.group", {}, ["no other service here is in the group"]),
+        ("avckpt.group/lidar", {}, ["no other service here is in the group"]),
+    ],
+)
+def test_what_is_hardly_meant(annotation: str, more: dict[str, Any], words: list[str], tmp_path: Path) -> None:
+    values = {"avckpt.keep": "3", "avckpt.restore.on": "unhealthy", "avckpt.group": "drive"}
+    pod = yaml.safe_load((FOLDER / "pod.yaml").read_text())
+    pod["metadata"]["annotations"][annotation] = values[annotation.partition("/")[0]]
+    pod["spec"]["containers"][0].update(more)
+    path = tmp_path / "pod.yaml"
+    path.write_text(yaml.safe_dump(pod))
+    said = [problem.message for problem in pods.check([path]).problems]
+    assert len(said) == len(words), said
+    assert all(line.startswith(words[0]) for line in said), said
+
+
+def test_containers_of_a_pod_are_a_group(tmp_path: Path) -> None:
+    pod = yaml.safe_load((FOLDER / "pod.yaml").read_text())
+    pod["metadata"]["annotations"]["avckpt.group"] = "drive"
+    pod["spec"]["containers"].append({**pod["spec"]["containers"][0], "name": "radar"})
+    path = tmp_path / "pod.yaml"
+    path.write_text(yaml.safe_dump(pod))
+    assert pods.check([path]).problems == []

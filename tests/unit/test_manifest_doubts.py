@@ -26,6 +26,7 @@ def said(tmp_path: Path, text: str, *, of: str = "services:\n") -> list[str]:
         (f"{PROTECTED}, avckpt.restore.on: unhealthy}}, healthcheck: {{disable: true}}", "and the service has none"),
         (f"{PROTECTED}}}, devices: ['/dev/nvidia0:/dev/nvidia0']", "/dev/nvidia0:/dev/nvidia0: a process that uses"),
         (f"{PROTECTED}}}, gpus: all", "gpus: a process that uses a GPU"),
+        (f"{PROTECTED}}}, runtime: nvidia", "runtime nvidia: a process that uses a GPU"),
         (
             f"{PROTECTED}}}, deploy: {{resources: {{reservations: {{devices: [{{capabilities: [gpu]}}]}}}}}}",
             "deploy.resources.reservations.devices: a process that uses a GPU",

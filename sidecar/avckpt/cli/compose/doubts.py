@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 ENABLE = f"{PREFIX}enable"
 RECOVERY = f"{PREFIX}group.recovery"
-_GPUS = ("/dev/nvidia", "/dev/dri", "/dev/kfd", "nvidia.com/gpu", "amd.com/gpu")
+_GPUS = ("/dev/nvidia", "/dev/dri", "/dev/kfd", "nvidia.com/", "amd.com/gpu", "gpu.intel.com/")
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class Facts:
     depends_on: frozenset[str] = frozenset()
     gpu: str = ""
     """The device it asks for."""
+    containers: int = 1
+    """How many are started of it."""
 
     def over(self, base: Facts) -> Facts:
         """These, and what only `base` says."""
@@ -45,6 +47,14 @@ def facts_of(node: yaml.Node) -> Facts:
     depends = yamlfile.lookup(node, "depends_on")
     names = [key.value for key, _ in yamlfile.entries(depends)] or list(_words(depends))
     return Facts(None if health is None else not off, frozenset(names), _gpu(node))
+
+
+def facts_of_pod(containers: Iterable[yaml.Node]) -> Facts:
+    """Those of a pod, or of some of its containers."""
+    listed = list(containers)
+    checked = bool(listed) and all(yamlfile.lookup(each, "livenessProbe") is not None for each in listed)
+    gpus = (gpu for each in listed for gpu in _gpus_of_container(each))
+    return Facts(checked or None, gpu=next(gpus, ""), containers=len(listed))
 
 
 def of_service(service: Service) -> Iterator[tuple[Place, str]]:
@@ -77,7 +87,7 @@ def of_groups(services: Iterable[Service]) -> Iterator[tuple[Service, Place, str
         for group, place in named.items():
             members.setdefault(group, []).append((service, place))
     for group, found in members.items():
-        if len(found) == 1 and group and "$" not in group:
+        if sum(service.facts.containers for service, _ in found) == 1 and group and "$" not in group:
             service, place = found[0]
             yield service, place, f"no other service here is in the group {group}: nobody hears of anybody"
 
@@ -126,6 +136,9 @@ def _awaited(services: Mapping[str, Service], name: str) -> Iterator[str]:
 def _gpu(node: yaml.Node) -> str:
     if yamlfile.lookup(node, "gpus") is not None:
         return "gpus"
+    runtime = yamlfile.lookup(node, "runtime")
+    if isinstance(runtime, yaml.ScalarNode) and runtime.value.startswith("nvidia"):
+        return f"runtime {runtime.value}"
     for device in _words(yamlfile.lookup(node, "devices")):
         if device.startswith(_GPUS):
             return device
@@ -136,6 +149,14 @@ def _gpu(node: yaml.Node) -> str:
         if "gpu" in _words(yamlfile.lookup(each, "capabilities")):
             return "deploy.resources.reservations.devices"
     return ""
+
+
+def _gpus_of_container(node: yaml.Node) -> Iterator[str]:
+    resources = yamlfile.lookup(node, "resources")
+    for key in ("limits", "requests"):
+        for name, _ in yamlfile.entries(yamlfile.lookup(resources, key)):
+            if name.value.startswith(_GPUS):
+                yield name.value
 
 
 def _words(node: yaml.Node | None) -> Iterator[str]:

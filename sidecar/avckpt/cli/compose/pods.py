@@ -13,7 +13,7 @@ import yaml
 from avckpt_hooks.shared.labels import PREFIX, meant_by
 
 from avckpt import yamlfile
-from avckpt.cli.compose import manifest
+from avckpt.cli.compose import doubts, manifest
 from avckpt.cli.compose.manifest import Kind, Manifest, Problem, Service, Setting, Severity
 from avckpt.yamlfile import Unreadable
 
@@ -70,7 +70,11 @@ def _read(node: yaml.Node, path: Path, found: Manifest) -> None:
             message = f"{setting.key} is no annotation of its pods; put it under the template's metadata"
             found.problems.append(Problem(setting.place, called, message))
         metadata, spec = (yamlfile.lookup(template, key) for key in ("metadata", "spec"))
-    containers = {name: Service(f"{called}/{name}", service.place) for name in _containers(spec)}
+    listed = dict(_containers(spec))
+    containers = {
+        name: Service(f"{called}/{name}", service.place, facts=doubts.facts_of_pod([each]))
+        for name, each in listed.items()
+    }
     settings = list(_settings(yamlfile.lookup(metadata, "annotations"), path, called, found))
     for setting in settings:
         if "/" not in setting.key:
@@ -91,21 +95,25 @@ def _read(node: yaml.Node, path: Path, found: Manifest) -> None:
     for setting in _settings(yamlfile.lookup(metadata, "labels"), path, called, found):
         message = f"{setting.key}: Kubernetes tells a runtime of annotations, and not of labels; make it one of those"
         found.problems.append(Problem(setting.place, called, message, Severity.WARNING))
-    services = [service, *(containers[name] for name in sorted(named))]
+    # The pod stands for those of its containers that no annotation names.
+    services = [containers[name] for name in sorted(named)]
+    if not listed or len(named) < len(listed):
+        service.facts = doubts.facts_of_pod(each for name, each in listed.items() if name not in named)
+        services.insert(0, service)
     if any(each.enabled for each in services) and yamlfile.lookup(spec, "runtimeClassName") is None:
         message = "without a runtimeClassName Kubernetes starts it unprotected (podman kube play needs none)"
         found.problems.append(Problem(service.place, called, message, Severity.WARNING))
     found.services.update((each.name, each) for each in services)
 
 
-def _containers(spec: yaml.Node | None) -> Iterator[str]:
-    """The names of a pod's containers."""
+def _containers(spec: yaml.Node | None) -> Iterator[tuple[str, yaml.Node]]:
+    """A pod's containers by name."""
     for key in ("initContainers", "containers"):
         listed = yamlfile.lookup(spec, key)
         for each in listed.value if isinstance(listed, yaml.SequenceNode) else ():
             name = yamlfile.lookup(each, "name")
             if isinstance(name, yaml.ScalarNode):
-                yield name.value
+                yield name.value, each
 
 
 def _template(spec: yaml.Node | None) -> yaml.Node | None:
