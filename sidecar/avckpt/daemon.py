@@ -521,7 +521,7 @@ class Daemon:
             self.inquests.take(watch, event, record)
             self.groups.hear(watch, event)
             if event.kind is Kind.CHECKPOINT and watch.guard is not None:
-                self._share_cpu(watch, watch.guard)
+                self._share_cpu(watch, watch.guard, event)
             if event.kind is Kind.GUARD_LOST and watch.guard is not None:
                 if event.reason is Reason.FILTER:
                     self._follow_guard(watch, watch.guard)
@@ -529,14 +529,17 @@ class Daemon:
                     self._replace_guard(watch, watch.guard)
             self.orders.answer(event, record)
 
-    def _with_share(self, container: Protected, config: GuardConfig, by_labels: GuardConfig) -> GuardConfig:
+    def _with_share(
+        self, container: Protected, config: GuardConfig, by_labels: GuardConfig, taken: Event | None = None
+    ) -> GuardConfig:
         """With what its guard may use now of the machine's CPUs."""
-        return dataclasses.replace(config, budget_cpu=self._cpu.share(container.cookie, by_labels, time.monotonic()))
+        share = self._cpu.share(container.cookie, by_labels, time.monotonic(), taken)
+        return dataclasses.replace(config, budget_cpu=share)
 
-    def _share_cpu(self, watch: Watch, guard: Guard) -> None:
+    def _share_cpu(self, watch: Watch, guard: Guard, taken: Event) -> None:
         """It has taken checkpoints; others that also do have begun or ended."""
         container = watch.container
-        config = self._with_share(container, container.config, watch.settings.config)
+        config = self._with_share(container, container.config, watch.settings.config, taken)
         if config != container.config:
             # One that cannot be told now is ending, or is told after its next one.
             with contextlib.suppress(AvckptError):

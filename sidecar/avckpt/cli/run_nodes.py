@@ -29,7 +29,7 @@ from avckpt.errors import AvckptError, Busy, Denied
 from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
 from avckpt.events.vocabulary import Kind
-from avckpt.guard import GuardConfig
+from avckpt.guard import Event, GuardConfig
 from avckpt.policy import settings_of
 
 LOOK_S = 0.02
@@ -160,7 +160,7 @@ class NodesSupervisor(Supervisor):
             if node is None:
                 continue
             if event.kind is Kind.CHECKPOINT:
-                self._share_cpu(event.cookie, node)
+                self._share_cpu(event, node)
             line = node.journal.line(of_guard(event))
             if line is None:
                 continue
@@ -169,9 +169,9 @@ class NodesSupervisor(Supervisor):
             if self._verbose or not quiet:
                 say(f"{node.name}: {text}")
 
-    def _share_cpu(self, cookie: int, node: _Node) -> None:
+    def _share_cpu(self, taken: Event, node: _Node) -> None:
         """It has taken checkpoints; others that also do have begun or ended."""
-        share = self._cpu.share(cookie, node.config, time.monotonic())
+        share = self._cpu.share(taken.cookie, node.config, time.monotonic(), taken)
         if share != node.share:
             # One that cannot be told now is ending, or is told after its next one.
             with contextlib.suppress(AvckptError):
