@@ -30,6 +30,9 @@ ENOUGH = 6
 GUARDS = 60
 """Each is killed while a thread may be on its way home."""
 
+IN_STUB = 3
+"""Threads that have not left the first injected instructions in time."""
+
 # More important than the application, and awake nearly all the time.
 HOG = """
 import os, time
@@ -137,6 +140,39 @@ def test_the_way_home_stays_as_it_was(where: str, tmp_path: Path) -> None:
         slow.go()
         wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "checkpoints go on")
         victim.wait_beats(20)
+
+
+def in_the_stub(event: dict[str, object]) -> bool:
+    return event.get("kind") == "missed" and "infect: it did not get to run in time" in str(event)
+
+
+def test_the_filters_of_a_late_one_do_not_kill_it(tmp_path: Path) -> None:
+    """Its own would end it for the calls of the first injected instructions, where a guard has left it."""
+    with (
+        throttle() as slow,
+        Victim("sandbox --kill", tmp_path) as victim,
+        subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other,
+    ):
+        try:
+            victim.wait_beats(5)
+            for pid in (victim.app, other.pid):
+                slow.take(pid)
+            late, end = 0, time.monotonic() + 60
+            while late < IN_STUB and time.monotonic() < end:
+                with GuardProcess(config(), [victim.pid]) as guard:
+                    slow.wait()
+                    for _ in range(30):
+                        if guard.command("checkpoint")["kind"] == "checkpoint":
+                            break
+                    late += sum(map(in_the_stub, guard.events))
+                    assert not [event for event in guard.events if event["kind"] == "died"]
+                    slow.go()
+                    victim.wait_beats(2)
+                    guard.stop()
+            assert late
+        finally:
+            other.kill()
+        victim.wait_beats(5)
 
 
 def test_restored_while_starved(cpus: tuple[int, int], tmp_path: Path) -> None:

@@ -248,7 +248,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 					? CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM
 				: process->descendant ? 0
 						      : CLONE_PARENT | SIGCHLD;
-	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared }, nothing[6] = { 0 };
+	const uint64_t arg[6] = { CLONE_VM | CLONE_FILES | shared };
 	const long options = (long)(porter->is_thread ? TRACE_OPTIONS_APP : TRACE_OPTIONS_OURS);
 	const struct sched_param first = { .sched_priority = 1 };
 	struct arch_regs homeward, regs;
@@ -258,7 +258,9 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	/* If we die before its signals are blocked, it must not clone a porter, which would handle
 	 * the app's signals on its stack: it makes a call that fails (a mask of 0 bytes) and
 	 * returns.  But it is never in the app with every signal blocked. */
-	arch_stub_call(&homeward, &thread->regs, porter->cave, false, SYS_rt_sigprocmask, nothing);
+	thread->borrowed_for = NULL;
+	thread->stub = porter->cave;
+	thread_head_home(thread, &homeward);
 	arch_stub_call(&regs, &thread->regs, porter->cave, false, SYS_clone, arg);
 	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
 	    arch_regs_set(thread->tid, &homeward) ||
@@ -266,7 +268,6 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	    arch_regs_set(thread->tid, &regs))
 		return fail_errno(err, thread->tid, "infect", "ptrace(SETREGS)", "it has gone");
 	thread->borrowed = true;
-	thread->borrowed_for = NULL;
 	born = step_over(thread->tid, SYS_clone, &refused, &porter->tid, err);
 	if (born < 0) {
 		process->lost = true;

@@ -520,9 +520,16 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	return 0;
 }
 
-static avc_remote homeward(const struct thread *thread)
+void thread_head_home(const struct thread *thread, struct arch_regs *regs)
 {
-	return thread->borrowed_for ? thread->borrowed_for->base + INJ_GO_HOME_OFFSET : 0;
+	const uint64_t nothing[6] = { 0 };
+
+	if (thread->borrowed_for)
+		arch_enter(regs, &thread->regs, thread->borrowed_for->base + INJ_GO_HOME_OFFSET, 0,
+			   0);
+	else
+		arch_stub_call(regs, &thread->regs, thread->stub, false, SYS_rt_sigprocmask,
+			       nothing);
 }
 
 int thread_give_back(struct thread *thread, struct avc_error *err)
@@ -540,10 +547,10 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 			    "it has gone on by itself, for the guard came too late");
 	}
 	/* The mask before the registers, for the same reason. But not while it is on the parasite's
-	 * stack, where a handler would run if we died: it is sent to inj_go_home first, which it
-	 * would reach with any mask. */
-	arch_enter(&now, &thread->regs, homeward(thread), 0, 0);
-	if ((thread->borrowed_for && arch_regs_set(thread->tid, &now)) ||
+	 * stack, where a handler would run if we died, or about to clone a porter: it is sent to
+	 * where it goes home from first, which it would reach with any mask. */
+	thread_head_home(thread, &now);
+	if (arch_regs_set(thread->tid, &now) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");

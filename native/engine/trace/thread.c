@@ -194,6 +194,45 @@ static bool has_made_calls(const struct process *process)
 	return !control || __atomic_load_n(&control->runner.done, __ATOMIC_ACQUIRE);
 }
 
+static bool is_in_stub(const struct thread *thread, const struct arch_regs *now)
+{
+	return thread->borrowed && !thread->borrowed_for &&
+	       arch_pc(now) - thread->stub < ARCH_STUB_BYTES;
+}
+
+/* From where it can be given back: it has no porter.  Otherwise it still has to reap that. */
+static bool has_no_porter(const struct thread *thread, const struct arch_regs *now)
+{
+	return arch_pc(now) == thread->stub ||
+	       (arch_syscall_nr(now) == SYS_clone && arch_syscall_result(now) < 0);
+}
+
+/* What a thread has created that was no longer waited for. */
+static void take_child(struct process *process, struct thread *thread, pid_t child)
+{
+	struct avc_error ignored = { 0 };
+	struct arch_regs now;
+	const bool borrowed = thread->borrowed && arch_regs_get(thread->tid, &now) == 0;
+	const bool in_stub = borrowed && is_in_stub(thread, &now);
+	const avc_remote stub = thread->stub;
+	struct thread *born;
+
+	/* A borrowed thread may have returned by itself, and what it creates then belongs to the
+	 * app: killing one thread kills them all. */
+	if ((in_stub && !(arch_syscall_arg(&now, 0) & CLONE_THREAD)) ||
+	    (borrowed && parasite_contains(&process->parasite, arch_pc(&now)))) {
+		tracee_kill(child); /* our clone, too late */
+		return;
+	}
+	born = adopt(process, child, &ignored);
+	if (!born || !in_stub)
+		return;
+	/* A porter that is a thread exits by itself, but not under the app's filters. */
+	born->borrowed_for = NULL;
+	born->stub = stub;
+	born->borrowed = seccomp_supervise(child, 0, (long)TRACE_OPTIONS_APP) == 0;
+}
+
 /* True while it still has to be waited for. */
 static bool straggle(struct process *process, struct thread *thread)
 {
@@ -222,17 +261,12 @@ static bool straggle(struct process *process, struct thread *thread)
 		return true;
 	case STOP_EXIT:
 		process->lost = process->lost || thread->borrowed;
+		seccomp_end_supervision(tid);
 		thread->attached = false;
 		thread->borrowed = false;
 		return false;
 	case STOP_FORK:
-		/* A borrowed thread may have returned by itself, and what it creates then belongs
-		 * to the app: killing one thread kills them all. */
-		if (thread->borrowed && arch_regs_get(tid, &now) == 0 &&
-		    parasite_contains(&process->parasite, arch_pc(&now)))
-			tracee_kill(stop.message); /* our clone, too late */
-		else
-			adopt(process, stop.message, &ignored);
+		take_child(process, thread, stop.message);
 		/* fall through */
 	case STOP_SYSCALL:
 		/* Registers cannot be changed at this stop: let it reach another one. */
@@ -246,12 +280,17 @@ static bool straggle(struct process *process, struct thread *thread)
 		/* Not in the middle of its calls: it may still have to restore something
 		 * (MADV_DONTFORK), or to reap a task that it created for us, which the app would
 		 * find. */
-		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now)) &&
-		    !has_made_calls(process)) {
+		const bool in_stub = is_in_stub(thread, &now);
+		const bool in_parasite = thread->borrowed &&
+					 parasite_contains(&process->parasite, arch_pc(&now));
+
+		/* Let go in the stub, it would make its calls under the app's filters. */
+		if ((in_parasite && !has_made_calls(process)) ||
+		    (in_stub && !has_no_porter(thread, &now))) {
 			seccomp_go_on(tid, &stop);
 			return true;
 		}
-		if (thread->borrowed && parasite_contains(&process->parasite, arch_pc(&now))) {
+		if (in_parasite || in_stub) {
 			thread_give_back(thread, &ignored);
 		} else {
 			if (thread->borrowed && thread->borrowed_for)
@@ -263,6 +302,7 @@ static bool straggle(struct process *process, struct thread *thread)
 	}
 	if (ptrace(PTRACE_DETACH, tid, NULL, (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))
 		return true; /* killed: to be reaped */
+	seccomp_end_supervision(tid);
 	thread->attached = false;
 	return false;
 }

@@ -107,6 +107,7 @@ struct thread {
 	int block;                     /* of the slot, main thread 0; -1: not in the image */
 	bool borrowed;                 /* sent into the parasite; regs and sigmask are its own  */
 	struct parasite *borrowed_for; /* NULL: before there is one (infect.c)              */
+	avc_remote stub;               /* where it has been sent instead                     */
 	uint32_t filters_known;        /* of seccomp, at the last check                   */
 	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has checked it at this stop                */
@@ -471,6 +472,8 @@ int thread_borrow(struct process *process, struct thread *thread,
  * a guard that cannot do that need not. */
 int thread_check_confined(const struct process *process, struct thread *thread,
 			  struct avc_error *err) warn_unused;
+/* The registers of a borrowed thread that goes home by itself, whatever its signal mask. */
+void thread_head_home(const struct thread *thread, struct arch_regs *regs);
 int thread_give_back(struct thread *thread, struct avc_error *err);
 
 /* ---- setup.c ------------------------------------------------------------------- */
