@@ -210,6 +210,30 @@ def test_a_failed_checkpoint_leaves_what_is_held_unless_nothing_is_any_good() ->
     assert c.policy_missed(policy, c.AVC_UNSUPPORTED, False)
 
 
+def test_what_cannot_be_protected_is_tried_less_and_less_often() -> None:
+    guard = Guarded(interval_s=1)
+    c, policy = guard.c, guard.policy
+
+    def tries(count: int) -> list[float]:
+        """The pauses between so many refusals."""
+        pauses = []
+        for _ in range(count):
+            due = c.policy_refused(policy, c.policy_due(guard.config, guard.now), guard.now)
+            pauses.append((due - guard.now) / SECOND)
+            guard.now = due
+        return pauses
+
+    assert tries(10) == [1, 1, 2, 4, 8, 16, 32, 60, 60, 60]
+    c.policy_retry(policy)  # on command
+    assert tries(4) == [1, 1, 2, 4]
+    guard.take()  # the reason has gone
+    assert tries(4) == [1, 1, 2, 4]
+    guard.config.interval_ns = 0
+    assert c.policy_refused(policy, c.policy_due(guard.config, guard.now), guard.now) == NEVER
+    guard.config.interval_ns = 300 * SECOND
+    assert tries(3) == [300, 300, 300]
+
+
 # --- which deaths are undone ----------------------------------------------------
 
 

@@ -339,6 +339,7 @@ static void attach(struct avc_guard *guard)
 		}
 		guard->attached = true;
 		guard->unprotected = false;
+		policy_retry(&guard->policy);
 		guard->next_ns = policy_first_due(&guard->config, now_ns());
 		{
 			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);

@@ -587,6 +587,8 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
 		return;
 	}
+	if (ticket)
+		policy_retry(&guard->policy);
 	guard_pace_begin(guard);
 	taken = take(guard, &event, &error) == 0;
 	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
@@ -614,6 +616,8 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
+		if (!guard_filter_hinders(guard))
+			guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
 		guard_unprotect(guard, ticket, &error);
 		return;
 	}

@@ -20,6 +20,7 @@
 #define AVERAGE_OF 8
 #define LOOK_NS (20 * MS)
 #define LOOK_LONG_NS (200 * MS)
+#define REFUSED_LONG_NS UINT64_C(60000000000)
 /* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
 /* After a restore: an app that dies within this time has met the bug in the image. */
@@ -150,6 +151,7 @@ void policy_hold(struct policy *policy, struct policy_generation fresh)
 {
 	policy->held[policy->count++] = fresh;
 	policy->misses = 0;
+	policy_retry(policy);
 	/* Only a health check can show that a process does not hang; and an immediate checkpoint of
 	 * one that was just restored shows no progress. */
 	if (!policy->vouching && fresh.proves)
@@ -166,6 +168,23 @@ bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
 	if (code != AVC_UNSUPPORTED && code != AVC_DENIED)
 		return false;
 	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
+}
+
+uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now)
+{
+	uint64_t pause;
+
+	if (!policy->refused_ns)
+		policy->refused_ns = now;
+	pause = now - policy->refused_ns;
+	if (pause > REFUSED_LONG_NS)
+		pause = REFUSED_LONG_NS;
+	return due > now + pause ? due : now + pause;
+}
+
+void policy_retry(struct policy *policy)
+{
+	policy->refused_ns = 0;
 }
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */

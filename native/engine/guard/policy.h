@@ -49,6 +49,7 @@ struct policy {
 	uint64_t restored_from; /* generation, 0: never restored              */
 	uint64_t restored_ns;   /* after a crash; 0: not, or long ago         */
 	bool proved;            /* has made progress since it was restored */
+	uint64_t refused_ns;    /* since when it cannot be protected; 0: it can   */
 	/* The last immediate death that was the program's own. */
 	int at_once_status;
 	uint32_t at_once_lineage;
@@ -87,6 +88,12 @@ uint32_t policy_line_replaced(const struct policy *policy, const struct policy_l
 /* A checkpoint has failed because of the main process, or of another one.  True: no generation is
  * valid, the app is unprotected.  False: it is retried when it is due. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
+/* It is unprotected: when to try again.  At `due` at the earliest, and after as long again as it has
+ * been refused, up to a minute: what lasts for a moment costs little protection, and an app that
+ * cannot be protected is hardly ever stopped. */
+uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now);
+/* On command, or another application: as if it had not been refused yet. */
+void policy_retry(struct policy *policy);
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
 
