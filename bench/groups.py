@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ring of members that pass numbered tokens and go back together: do their ledgers agree, and at what cost?
 
-    .venv/bin/python -m bench.groups [--members 5] [--kills 500] [--interval 100ms] [--between 2] [--name NAME]
+    .venv/bin/python -m bench.groups [--members 5] [--lines 10000] [--kills 500] [--interval 25ms] [--name NAME]
 
 Needs root and what `make setup-build` builds; no Podman.  Each member is an avckpt-init in a PID
 namespace of its own with `testkit/programs/ring.py`, which prints WRONG when a token is lost, duplicated
-or received without having been sent.  A random member is killed every `--between` seconds.  Prints the results
-and adds them to bench/results/groups.json; ends with 1 if the ledgers ever disagreed.
+or received without having been sent.  The kills, of random members, are spread over the lines.  Prints the
+results and adds them to bench/results/groups.json; ends with 1 if the ledgers ever disagreed.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -19,11 +20,14 @@ import signal
 import statistics
 import sys
 import tempfile
+import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from avckpt.cli.client import Client
+from avckpt.errors import AvckptError
 
 from testkit.harness import ROOT, wait_until
 from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
@@ -36,36 +40,41 @@ def main() -> int:
     """Starts, kills, counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--members", type=int, default=5)
+    parser.add_argument("--lines", type=int, default=10000)
     parser.add_argument("--kills", type=int, default=500)
-    parser.add_argument("--interval", default="100ms")
-    parser.add_argument("--between", type=float, default=2.0, metavar="S")
+    parser.add_argument("--minutes", type=float, default=40, help="ends then, with as many as there are")
+    parser.add_argument("--interval", default="25ms")
     parser.add_argument("--name", default="one run", help="of this run in the file of results, where others stay")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory, local_sidecar(Path(directory)) as sidecar:
         sidecar.start()
+        heard = Heard(asked.members)
+        threading.Thread(target=heard.listen, args=(sidecar,), daemon=True).start()
         members = _start(sidecar, asked.members, asked.interval)
-        freezes, kills, lost = _storm(sidecar, members, asked.kills, asked.between)
+        began = time.monotonic()
+        kills, lost = _storm(sidecar, members, heard, asked)
         rows = Client(sidecar.run_dir).containers()
         wrong = [line for each in members for line in _said(each) if "WRONG" in line or "Traceback" in line]
-        history = Client(sidecar.run_dir).history()
-        restored = [event for event in history if event["kind"] == "restored"]
-        died = [event["restore_s"] for event in restored if event["reason"] != "group"]
+        restored = [event for event in heard.deaths if event["kind"] == "restored"]
         result = {
             "members": asked.members,
             "interval": asked.interval,
+            "minutes": round((time.monotonic() - began) / 60, 1),
             "kills": kills,
             "not_back": lost,
             "wrong": wrong,
-            "lines": min(row["checkpoints"] for row in rows),
+            "lines": len(heard.lines),
             "checkpoints": sum(row["checkpoints"] for row in rows),
             "missed": sum(row["missed"] for row in rows),
             "tokens": int(_said(members[0])[-2].split()[0]) if not wrong else 0,
             "connections_lost": sum(int(_said(each)[-2].split()[2]) for each in members) if not wrong else 0,
-            "freeze_median_ms": round(statistics.median(freezes) * 1000, 2),
-            "freeze_p99_ms": round(sorted(freezes)[len(freezes) * 99 // 100] * 1000, 2),
-            "restore_median_ms": round(statistics.median(died) * 1000, 1) if died else 0,
-            "restore_p99_ms": round(sorted(died)[len(died) * 99 // 100] * 1000, 1) if died else 0,
-            "phases_median_ms": _phases(history),
+            "freeze_ms": _spread([line.freeze_s for line in heard.lines]),
+            "freeze_beyond_longest_members_ms": _spread([line.freeze_s - line.longest_s for line in heard.lines]),
+            "within_1_ms_of_longest_members": sum(line.freeze_s - line.longest_s <= 0.001 for line in heard.lines),
+            "instants_apart_ms": _spread([line.apart_s for line in heard.lines]),
+            "instants_apart_less_than_the_freeze": sum(line.apart_s < line.freeze_s for line in heard.lines),
+            "restore_ms": _spread([event["restore_s"] for event in restored if event["reason"] != "group"]),
+            "phases_median_ms": _phases(heard.deaths),
             "reset": [event["error"]["detail"] for event in restored if "ended" in str(event.get("error"))],
             "load": round(os.getloadavg()[0], 1),
         }
@@ -73,6 +82,53 @@ def main() -> int:
     known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     RESULTS.write_text(json.dumps({**known, asked.name: result}, indent=2) + "\n")
     return 1 if wrong or lost else 0
+
+
+@dataclass
+class Line:
+    """One line of all members."""
+
+    freeze_s: float
+    """The longest time that one of them was stopped."""
+    longest_s: float
+    """The same, had it not waited for the others."""
+    apart_s: float
+    """From the instant in which the first was stopped to that of the last."""
+
+
+class Heard:
+    """What the sidecar reports."""
+
+    def __init__(self, members: int) -> None:
+        self._members = members
+        self._parts: dict[int, list[dict[str, Any]]] = {}
+        self.lines: list[Line] = []
+        self.deaths: list[dict[str, Any]] = []
+
+    def listen(self, sidecar: LocalSidecar) -> None:
+        """Until the sidecar ends."""
+        with contextlib.suppress(OSError, AvckptError):
+            for event in Client(sidecar.run_dir).events(routine=True):
+                if event["kind"] in ("died", "restored"):
+                    self.deaths.append(event)
+                elif event["kind"] == "checkpoint" and event.get("line"):
+                    self._add(event)
+
+    def _add(self, event: dict[str, Any]) -> None:
+        parts = self._parts.setdefault(event["line"], [])
+        parts.append(event)
+        if len(parts) == self._members:
+            instants = [part["monotonic_s"] for part in parts]
+            longest, own = (max(part[name] for part in parts) for name in ("freeze_s", "freeze_own_s"))
+            self.lines.append(Line(longest, own, max(instants) - min(instants)))
+            self._parts.clear()
+
+
+def _spread(times_s: list[float]) -> dict[str, float]:
+    """Median, 99th percentile and longest, in ms."""
+    ordered = sorted(times_s) or [0.0]
+    found = {"median": statistics.median(ordered), "p99": ordered[len(ordered) * 99 // 100], "longest": ordered[-1]}
+    return {name: round(each * 1000, 2) for name, each in found.items()}
 
 
 def _start(sidecar: LocalSidecar, count: int, interval: str) -> list[Container]:
@@ -90,24 +146,27 @@ def _start(sidecar: LocalSidecar, count: int, interval: str) -> list[Container]:
     return members
 
 
-def _storm(
-    sidecar: LocalSidecar, members: list[Container], kills: int, between_s: float
-) -> tuple[list[float], int, int]:
-    """Freezes of single checkpoints in seconds, kills, and those after which not all came back."""
-    freezes: list[float] = []
-    for kill in range(1, kills + 1):
-        end = time.monotonic() + random.uniform(0.5, 1.5) * between_s
-        while time.monotonic() < end:
-            freezes += [row["last_freeze_s"] for row in Client(sidecar.run_dir).containers() if row["last_freeze_s"]]
-            time.sleep(0.1)
+def _storm(sidecar: LocalSidecar, members: list[Container], heard: Heard, asked: argparse.Namespace) -> tuple[int, int]:
+    """The number of kills, and of those after which not all came back."""
+    end = time.monotonic() + asked.minutes * 60
+    for kill in range(1, asked.kills + 1):
+        # Half a step early or late: at all ages of a line, and soon after a restore, too.
+        due = (kill + random.uniform(-0.5, 0.5)) * asked.lines / asked.kills
+        while len(heard.lines) < due:
+            if time.monotonic() > end:
+                return kill - 1, 0
+            time.sleep(random.uniform(0.005, 0.05))
         os.kill(random.choice(members).app_pid, signal.SIGKILL)
         try:
             wait_until(lambda kill=kill: _restores(sidecar) == {kill}, BACK_S, f"restore {kill}")  # type: ignore[misc]
         except TimeoutError as error:
             print(error, [_said(each)[-1:] for each in members], sidecar.log[-2000:], file=sys.stderr)
-            return freezes, kill, 1
+            return kill, 1
+        print(f"\r{kill} kills, {len(heard.lines)} lines", end="", file=sys.stderr, flush=True)
+    while len(heard.lines) < asked.lines and time.monotonic() < end:
+        time.sleep(0.2)
     time.sleep(1.0)
-    return freezes, kills, 0
+    return asked.kills, 0
 
 
 def _phases(history: list[dict[str, Any]]) -> dict[str, float]:

@@ -480,6 +480,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 		abandon(guard, fresh);
 		return -1;
 	}
+	event->at_ns = fresh->taken_ns;
 	event->error = *generation_notice(fresh);
 	settle_files(guard, fresh);
 	fresh->number = ++guard->number;

@@ -47,7 +47,7 @@ class EventRecord:
     id: str = said("its id, 64 hex digits", "")
     group: str = said("its `avckpt.group`, empty: none", "")
     at: float = said("time of day, seconds since 1970", 0.0)
-    monotonic_s: float = said("the same instant on CLOCK_MONOTONIC, for differences", 0.0)
+    monotonic_s: float = said("the same instant on CLOCK_MONOTONIC; of a checkpoint: all threads were stopped", 0.0)
     seq: int = said("number in the history, increasing; 0: routine (every checkpoint), reported but not stored", 0)
     reason: Reason | None = said(  # noqa: RUF009
         "why the application died: `signal`, `exit`, `unhealthy`, `manual` or `group` (it went back with others); "
@@ -68,6 +68,7 @@ class EventRecord:
     age_s: float | None = said("age of the restored generation when the application died, or of the dropped one")
     lost_s: float | None = said("time that the application lost: age_s and restore_s together")
     freeze_s: float | None = said("how long the application was stopped for this generation's checkpoint")
+    freeze_own_s: float | None = said("of freeze_s, what it would have been without waiting for the rest of its group")
     checkpoints: int | None = said("checkpoints taken since the last event of this kind, this one included")
     freeze_max_s: float | None = said("the longest freeze of these")
     interval_s: float | None = said("current time between checkpoints")
@@ -188,6 +189,7 @@ def of_guard(
         age_s=event.age_s if restored or kind is Kind.DROPPED else None,
         lost_s=event.age_s + event.restore_s if restored else None,
         freeze_s=event.freeze_s if taken or restored or kind is Kind.MISSED else None,
+        freeze_own_s=event.stop_s + event.clone_s if taken and event.line else None,
         checkpoints=event.checkpoints if taken else None,
         freeze_max_s=event.freeze_max_s if taken else None,
         interval_s=event.interval_s if taken else None,
