@@ -8,12 +8,14 @@ import os
 import random
 import signal
 import socket
+import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from avckpt.artifacts import init_binary
 from avckpt.cli.client import Client
 
 from testkit.harness import ROOT, wait_until
@@ -138,6 +140,44 @@ def test_ledgers_agree_after_any_death(local: LocalSidecar, ring: list[Container
         assert sorted(event["reason"] for event in these) == ["group"] * (MEMBERS - 1) + ["signal"]
     for member in ring:
         assert row(local, member)["attempt"] <= 2  # those of others do not count
+
+
+def unit(local: LocalSidecar, name: str, argv: list[str]) -> Container:
+    """A unit of the host: as a node below a launcher, it shares its PID namespace with others."""
+    output = local.run_dir.parent / f"{name}.out"
+    labels = [word for key, value in TOGETHER.items() for word in ("--label", f"{key}={value}")]
+    with output.open("wb") as out:
+        process = subprocess.Popen(
+            [str(init_binary()), "--name", name, *labels, "--", *argv],
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=out,
+            env={**os.environ, **local.env},
+            start_new_session=True,
+        )
+
+    def known() -> list[str]:
+        return [each["id"] for each in Client(local.run_dir).containers() if each["init_pid"] == process.pid]
+
+    [identity] = wait_until(known, 20, f"{name} is registered; log:\n{local.log}")
+    member = Container(identity, name, local.env, process, process.pid, os.pidfd_open(process.pid), output)
+    local.containers.append(member)
+    return member
+
+
+def test_units_of_one_pid_namespace_go_back_together(local: LocalSidecar) -> None:
+    program = [sys.executable, "-u", str(ROOT / "testkit/programs/ring.py")]
+    port = str(free_ports(MEMBERS))
+    members = [unit(local, f"unit{i}", [*program, str(i), str(MEMBERS), port]) for i in range(MEMBERS)]
+    wait_for_line(local, members)
+    pids = [row(local, member)["app_pid"] for member in members]
+    for death in range(1, 4):
+        os.kill(pids[death % MEMBERS], signal.SIGKILL)
+        wait_for_restores(local, members, death)
+        wait_for_line(local, members, row(local, members[0])["line"])
+    check_ledgers(members)
+    assert [row(local, member)["app_pid"] for member in members] == pids
+    assert {event["line"] for event in told(local, "restored")} - {0} != set()
 
 
 def test_all_hurry_until_they_are_back_and_no_longer(local: LocalSidecar, ring: list[Container]) -> None:

@@ -49,7 +49,6 @@ def test_a_group_that_goes_back_together() -> None:
             {"avckpt.deadline": "50ms", "avckpt.deadline.late": "cold"},
             "label avckpt.deadline.late=cold: no member of a group that recovers together",
         ),
-        ({"avckpt.scope": "nodes"}, "label avckpt.scope=nodes: nodes cannot recover together"),
         ({"avckpt.keep.apart": "3s"}, "label avckpt.keep.apart=3s: a group that recovers together keeps its newest"),
     ],
 )

@@ -189,10 +189,6 @@ def _check_together(policy: Policy, mapping: Mapping[str, str]) -> None:
     """Raises LabelError for settings that cannot be combined with avckpt.group.recovery=together."""
     if not policy.group:
         raise LabelError("avckpt.group.recovery", "together", "there is no group", "add avckpt.group=NAME")
-    if policy.scope == "nodes":
-        raise LabelError(
-            "avckpt.scope", "nodes", "nodes cannot recover together with others", "use avckpt.scope=container there"
-        )
     if policy.keep_apart_s:
         raise LabelError(
             "avckpt.keep.apart",

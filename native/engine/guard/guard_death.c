@@ -28,6 +28,8 @@ static int say_restored(void *arg, struct avc_error *err)
 	if (is_late(guard))
 		return fail(err, AVC_DEADLINE, 0, 0, "restore", "",
 			    "it would come later than avckpt.deadline");
+	/* No more PIDs are chosen: a sibling that is in the group, too, may choose its own. */
+	last_pid_unlock(guard->channel.numbers_fd);
 	if (guard->meeting && guard_meet_restored(guard, err))
 		return -1;
 	return init_channel_verdict(&guard->channel, AVC_VERDICT_RESTORED, err);
@@ -176,6 +178,9 @@ static void ready_helper(struct avc_guard *guard)
 	const struct generation *newest;
 
 	if (!guard->count)
+		return;
+	/* It would take a PID, just when siblings in the group choose theirs. */
+	if (guard->config.together && guard->channel.numbers_fd >= 0)
 		return;
 	newest = &guard->generations[guard->count - 1];
 	if (guard->helper &&

@@ -57,7 +57,7 @@ struct last_pid {
 	uint32_t count;
 };
 
-/* ---- one at a time ------------------------------------------------------------------ */
+/* ---- who chooses, and who forks ------------------------------------------------------------------ */
 
 int last_pid_lock_open(pid_t init)
 {
@@ -68,7 +68,7 @@ bool last_pid_lock(int fd, bool urgent)
 {
 	const uint64_t end = now_ns() + (urgent ? LOCK_URGENT_NS : LOCK_NS);
 
-	while (fd >= 0 && flock(fd, LOCK_EX | LOCK_NB)) {
+	while (fd >= 0 && flock(fd, (urgent ? LOCK_EX : LOCK_SH) | LOCK_NB)) {
 		if (now_ns() > end)
 			return false;
 		heartbeat();

@@ -610,10 +610,10 @@ struct last_pid_slot {
 	const struct parasite *parasite;
 	uint32_t number;
 };
-/* In a PID namespace with several guards, one at a time forks, or chooses PIDs: a template or spare
- * that another one makes meanwhile would take them.  A restore is urgent: it tries more often.  Any
- * process in the namespace can take the lock: false if it was not free in time.  fd < 0: not
- * needed. */
+/* In a PID namespace with several guards, either one of them chooses PIDs, for a restore (urgent), or
+ * any number of them fork: a template or spare that one makes meanwhile would take the chosen PID.
+ * Members of a group fork while they wait for each other.  Any process in the namespace can take the
+ * lock: false if it was not free in time.  fd < 0: not needed. */
 int last_pid_lock_open(pid_t init);
 bool last_pid_lock(int fd, bool urgent);
 void last_pid_unlock(int fd);

@@ -133,8 +133,6 @@ def labels_of_host_unit(claimed: Mapping[str, str]) -> dict[str, str]:
         raise LabelsWrong(str(error)) from error
     if policy.restore_on.unhealthy:
         raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
-    if policy.together:
-        raise LabelsWrong("label avckpt.group.recovery=together: only containers go back together")
     if policy.scope != "container":
         raise LabelsWrong("label avckpt.scope=nodes: here each program is a unit already, leave it out")
     if not policy.enable:
