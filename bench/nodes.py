@@ -29,6 +29,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from avckpt.cli.client import Client
 from avckpt.supervision.pressure import held_bytes, templates_of
 from rich.console import Console
 
@@ -37,16 +38,16 @@ from testkit.board import Board
 from testkit.harness import (
     BASE_IMAGE,
     ROOT,
+    RUN_DIR,
     SIDECAR_NAME,
     Container,
     ContainerFactory,
     Podman,
-    Sidecar,
     machine_lock,
     running_sidecar,
     wait_until,
 )
-from testkit.nodes import SUPERVISORD, SUPERVISORD_CONF, app_pid, nodes_of, supervisor_options
+from testkit.nodes import SUPERVISORD, SUPERVISORD_CONF, app_pid, supervisor_options
 
 RESULTS = ROOT / "bench/results/nodes.json"
 WITHIN_MS = 20.0
@@ -116,12 +117,13 @@ class Idle:
 class Nodes:
     """The container, and a board for each node."""
 
-    def __init__(self, sidecar: Sidecar, container: Container, boards: dict[str, Board]) -> None:
-        self.sidecar, self.container, self.boards = sidecar, container, boards
+    def __init__(self, container: Container, boards: dict[str, Board]) -> None:
+        self.container, self.boards = container, boards
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """By name."""
-        return nodes_of(self.sidecar, self.container)
+        """By name.  Asked directly: the command line takes seconds on a busy machine."""
+        rows = Client(RUN_DIR).containers(memory=False)
+        return {row["name"].partition("/")[2]: row for row in rows if row["node_of"] == self.container.id}
 
     def wait_protected(self) -> dict[str, dict[str, Any]]:
         def found() -> dict[str, dict[str, Any]]:
@@ -139,9 +141,7 @@ class Nodes:
         return max(board.see().gap_ns for board in self.boards.values()) / 1e6
 
 
-def start(
-    factory: ContainerFactory, sidecar: Sidecar, folder: Path, stack: ExitStack, options: argparse.Namespace
-) -> Nodes:
+def start(factory: ContainerFactory, folder: Path, stack: ExitStack, options: argparse.Namespace) -> Nodes:
     numbers = range(1, options.nodes + 1)
     boards = {f"n{n}": stack.enter_context(Board(folder / f"{n}.board")) for n in numbers}
     package = folder / "nodes"
@@ -166,12 +166,12 @@ def start(
     if options.interval:
         labels["interval"] = options.interval
     container = factory.protected(*command, labels=labels, image=image, options=[*volumes, *others])
-    return Nodes(sidecar, container, boards)
+    return Nodes(container, boards)
 
 
 def ros_image(podman: Podman) -> str:
     names = podman.run("images", "--format", "{{.Repository}}:{{.Tag}}").stdout.split()
-    found = [name for name in names if name.startswith("localhost/avckpt-ros:")]
+    found = [name for name in names if name.startswith("localhost/avckpt-ros-run:")]
     if not found:
         raise SystemExit("error: there is no image of ROS: run scripts/setup-ros.sh")
     return found[0]
@@ -265,9 +265,9 @@ def main() -> None:
         stack.enter_context(machine_lock(timeout_s=600))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="avckpt-nodes-")))
         folder.chmod(0o777)
-        sidecar = stack.enter_context(running_sidecar(podman))
+        stack.enter_context(running_sidecar(podman))
         stack.callback(factory.close)
-        nodes = start(factory, sidecar, folder, stack, options)
+        nodes = start(factory, folder, stack, options)
         result = idle(nodes, options) if options.idle else run(nodes, options)
     console.print()
     for key, value in asdict(result).items():
