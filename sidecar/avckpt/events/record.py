@@ -87,7 +87,10 @@ class EventRecord:
     detail: str = said("a clause for users, where the other fields do not say it", "")
     core: str | None = said("path of the core file; missing: none was written, and `detail` says why")
     core_bytes: int | None = said("its size, compressed")
-    detected_s: float | None = said("from the fatal signal until avckpt-init noticed the death; unknown for exits")
+    detected_s: float | None = said(
+        "from the fatal signal until avckpt-init noticed the death; unknown for exits, and where the kernel's report "
+        "was lost (`crash.unknown`)"
+    )
     recovered_s: float | None = said("detected_s and restore_s together")
     crash: Crash | None = said("what it died of, and where")  # noqa: RUF009
     error: AvckptError | None = said("what went wrong, as in the API's errors")  # noqa: RUF009
