@@ -12,6 +12,32 @@
 #define LOOKS 64
 #define LOOK_US 100
 
+/* Whether there are threads of the other kind. */
+static bool interrupt(struct tree *tree, bool real_time)
+{
+	bool others = false;
+
+	for (uint32_t i = 0; i < tree->count; i++)
+		if (tree->entry[i].process && tree->entry[i].process->infected)
+			others |= process_interrupt(tree->entry[i].process, real_time);
+	return others;
+}
+
+static int await(const struct tree *tree, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < tree->count; i++) {
+		struct process *process = tree->entry[i].process;
+		struct avc_error failed = { 0 };
+
+		if (process && process->infected && process_await(process, &failed) &&
+		    (!process->descendant || failed.code != AVC_GONE)) {
+			*err = failed;
+			return -1;
+		}
+	}
+	return 0;
+}
+
 int freeze_stop_known(struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->processes; i++)
@@ -23,9 +49,11 @@ int freeze_stop_known(struct tree *tree, struct avc_error *err)
 			return fail(err, AVC_GONE, 0, tree->process[i]->pid, "stop", "",
 				    "a signal is killing it");
 	/* So that they stop at the same time, and not one after the other. */
-	for (uint32_t i = 0; i < tree->count; i++)
-		if (tree->entry[i].process && tree->entry[i].process->infected)
-			process_interrupt(tree->entry[i].process);
+	if (interrupt(tree, false)) {
+		if (await(tree, err))
+			return -1;
+		interrupt(tree, true);
+	}
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
 		struct avc_error failed = { 0 };

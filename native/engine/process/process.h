@@ -112,12 +112,16 @@ bool process_needs_old(const struct process *process);
 
 /* ---- stop.c --------------------------------------------------------------------- */
 
-/* Stops every thread of one process; process_let_go() releases them. */
+/* Stops every thread of one process; process_let_go() releases them.  A thread of ordinary priority
+ * may have to wait for a CPU before it stops, during which one of real-time priority should not
+ * stand still: those are stopped last and released first. */
 int process_stop(struct process *process, struct avc_error *err) warn_unused;
 /* The same in parts, for several at a time: forgets the state of the last freeze; interrupts known
- * threads; waits for all, and finds the others. */
+ * threads of one kind, and says whether there are any of the other; waits for those; waits for all,
+ * and finds the others. */
 void process_stop_begin(struct process *process);
-void process_interrupt(struct process *process);
+bool process_interrupt(struct process *process, bool real_time);
+int process_await(struct process *process, struct avc_error *err) warn_unused;
 int process_stop_all(struct process *process, struct avc_error *err) warn_unused;
 void process_let_go(struct process *process);
 

@@ -3,6 +3,9 @@
  * Stops every thread of a process, until none is left that could create another one; and releases
  * them.
  */
+#include <sched.h>
+#include <string.h>
+
 #include "process.h"
 
 struct walk {
@@ -38,16 +41,46 @@ static int stop_task(pid_t tid, void *arg)
 	return 0;
 }
 
-/* The known ones; failures show when they are waited for. */
-void process_interrupt(struct process *process)
+/* As of the last checkpoint. */
+static bool is_real_time(const struct thread *thread)
 {
+	uint32_t policy; /* struct sched_attr, sched_setattr(2): after its size */
+
+	memcpy(&policy, thread->scheduling.attr + sizeof(uint32_t), sizeof policy);
+	return policy == SCHED_FIFO || policy == SCHED_RR || policy == SCHED_DEADLINE;
+}
+
+bool process_interrupt(struct process *process, bool real_time)
+{
+	bool others = false;
+
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread *t = &process->threads[i];
 		struct avc_error ignored = { 0 };
 
-		if (!t->attached)
+		if (is_real_time(t) != real_time)
+			others = true;
+		else if (!t->attached) /* failures show when it is waited for */
 			t->seen = thread_stop(process, t, &ignored) == 0;
 	}
+	return others;
+}
+
+int process_await(struct process *process, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < process->thread_count; i++) {
+		struct thread *t = &process->threads[i];
+		struct avc_error gone = { 0 };
+
+		if (!t->attached || t->stopped || !thread_await(process, t, &gone))
+			continue;
+		if (gone.code == AVC_GONE && t->tid != process->pid)
+			continue;
+		if (!err->code)
+			*err = gone;
+		return -1;
+	}
+	return 0;
 }
 
 /* Then no thread is left that could create another one. */
@@ -75,18 +108,8 @@ int process_stop_all(struct process *process, struct avc_error *err)
 	for (;;) {
 		struct walk walk = { .process = process, .err = err };
 
-		for (uint32_t i = 0; i < process->thread_count; i++) {
-			struct thread *t = &process->threads[i];
-			struct avc_error gone = { 0 };
-
-			if (!t->attached || t->stopped || !thread_await(process, t, &gone))
-				continue;
-			if (gone.code == AVC_GONE && t->tid != process->pid)
-				continue;
-			if (!err->code)
-				*err = gone;
+		if (process_await(process, err))
 			return -1;
-		}
 		if (everybody_stopped(process))
 			return 0;
 		if (proc_tasks(process->task_dirfd, stop_task, &walk))
@@ -101,12 +124,19 @@ int process_stop_all(struct process *process, struct avc_error *err)
 int process_stop(struct process *process, struct avc_error *err)
 {
 	process_stop_begin(process);
-	process_interrupt(process);
+	if (process_interrupt(process, false)) {
+		if (process_await(process, err))
+			return -1;
+		process_interrupt(process, true);
+	}
 	return process_stop_all(process, err);
 }
 
 void process_let_go(struct process *process)
 {
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (is_real_time(&process->threads[i]))
+			thread_let_go(process, &process->threads[i]);
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		thread_let_go(process, &process->threads[i]);
 }
