@@ -23,7 +23,7 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.mark.parametrize("where", WHERE)
 def test_it_is_stopped_last(where: str, tmp_path: Path) -> None:
-    gaps = []
+    gaps: list[float] = []
     with (
         Victim(f"urgent 60 {where}".strip(), tmp_path) as victim,
         GuardProcess(config(freeze_deadline_s=1.0), [victim.pid]) as guard,
