@@ -82,8 +82,11 @@ void files_free(struct files *files)
 /* Among the first `count`, which are in order. */
 static struct file *find_among(const struct files *files, uint32_t count, int fd)
 {
-	const uint32_t at = LOWER_BOUND(count, i, files->file[i].fd < fd);
+	uint32_t at = (uint32_t)fd;
 
+	/* Most tables have no gaps, and a freeze may look up tens of thousands. */
+	if (at >= count || files->file[at].fd != fd)
+		at = LOWER_BOUND(count, i, files->file[i].fd < fd);
 	return at < count && files->file[at].fd == fd ? &files->file[at] : NULL;
 }
 
