@@ -24,6 +24,7 @@ import pytest
 from avckpt.cli.client import Client
 
 from testkit.cgroups import freezer
+from testkit.family import look
 from testkit.harness import ROOT, avckpt_command, run, take_checkpoint, wait_until
 from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, ended, local_sidecar
 from testkit.procfs import children_of
@@ -465,11 +466,17 @@ def test_crashes_are_restored_while_the_event_loop_hangs(local: LocalSidecar) ->
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
     assert local.process is not None
+
+    def runs() -> int:
+        """Its PID, once it is restored, and no longer while it is being so."""
+        seen = look(web.app_pid)
+        return seen.pid if seen and not seen.is_traced and seen.state == "S" else 0
+
     with stopped_thread(local.process.pid):
         for _ in range(3):
-            app = wait_until(lambda: web.app_pid, 10, "it is there")
+            app = wait_until(runs, 10, "it is there")
             os.kill(app, signal.SIGKILL)
-            wait_until(lambda app=app: web.app_pid not in (0, app), 10, "it is there again")  # type: ignore[misc]
+            wait_until(lambda app=app: runs() not in (0, app), 10, "it is there again")  # type: ignore[misc]
         assert not ended(web)
     assert local.wait_for(web, restores=3, state="protected")["last_death"] == "killed by SIGKILL"
 
