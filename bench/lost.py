@@ -30,7 +30,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from testkit.harness import ROOT, wait_until
+from testkit.harness import ROOT, free_port, wait_until
 from testkit.local_sidecar import Container, LocalSidecar, local_sidecar
 
 RESULTS = ROOT / "bench" / "results" / "lost.json"
@@ -110,12 +110,6 @@ def command(server: str, port: int) -> list[str]:
     if server == "http":
         return [sys.executable, "-S", "-c", HTTP, str(port)]
     return ["redis-server", "--save", "", "--appendonly", "no", "--bind", "127.0.0.1", "--port", str(port)]
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
 
 
 def main() -> None:

@@ -22,6 +22,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
+
+from bench.scale import cpu_s
 from testkit.harness import ROOT, wait_until
 from testkit.local_sidecar import local_sidecar
 
@@ -74,10 +77,11 @@ def measure(
         wait_until(lambda: all(row["state"] == "protected" for row in sidecar.ps()), 60, "all are protected")
         time.sleep(SETTLE_S)
         before, began = sidecar.ps(), time.monotonic()
-        cpu = cpu_s(row["guard_pid"] for row in before)
+        guards = [psutil.Process(row["guard_pid"]) for row in before]
+        cpu = cpu_s(guards)
         time.sleep(seconds)
         took = time.monotonic() - began
-        used = cpu_s(row["guard_pid"] for row in before) - cpu
+        used = cpu_s(guards) - cpu
         after = sidecar.ps()
         taken = sum(row["checkpoints"] for row in after) - sum(row["checkpoints"] for row in before)
         row = {
@@ -91,15 +95,6 @@ def measure(
         }
         print(row, flush=True)
         return row
-
-
-def cpu_s(pids: Any) -> float:
-    """The CPU time of these processes and all of their threads."""
-    used = 0
-    for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        used += int(fields[11]) + int(fields[12])
-    return used / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

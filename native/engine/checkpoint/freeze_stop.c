@@ -23,13 +23,23 @@ static bool interrupt(struct tree *tree, bool real_time)
 	return others;
 }
 
-static int await(const struct tree *tree, struct avc_error *err)
+static int stop_all(struct process *process, struct avc_error *err)
+{
+	if (process_stop_all(process, err))
+		return -1;
+	process->stage = FREEZE_STOPPED;
+	return 0;
+}
+
+/* What `wait` says of each known one; a descendant may have ended. */
+static int await(const struct tree *tree, int (*wait)(struct process *, struct avc_error *),
+		 struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
 		struct avc_error failed = { 0 };
 
-		if (process && process->infected && process_await(process, &failed) &&
+		if (process && process->infected && wait(process, &failed) &&
 		    (!process->descendant || failed.code != AVC_GONE)) {
 			*err = failed;
 			return -1;
@@ -50,24 +60,11 @@ int freeze_stop_known(struct tree *tree, struct avc_error *err)
 				    "a signal is killing it");
 	/* So that they stop at the same time, and not one after the other. */
 	if (interrupt(tree, false)) {
-		if (await(tree, err))
+		if (await(tree, process_await, err))
 			return -1;
 		interrupt(tree, true);
 	}
-	for (uint32_t i = 0; i < tree->count; i++) {
-		struct process *process = tree->entry[i].process;
-		struct avc_error failed = { 0 };
-
-		if (!process || !process->infected)
-			continue;
-		if (process_stop_all(process, &failed) == 0) {
-			process->stage = FREEZE_STOPPED;
-		} else if (!process->descendant || failed.code != AVC_GONE) {
-			*err = failed;
-			return -1;
-		}
-	}
-	return 0;
+	return await(tree, stop_all, err);
 }
 
 int freeze_stop_others(struct tree *tree, struct avc_error *err)
@@ -91,14 +88,13 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 			if (!t || t->stage >= FREEZE_STOPPED)
 				continue;
 			all = false;
-			if (process_stop_all(t, &failed) == 0) {
-				t->stage = FREEZE_STOPPED;
-			} else if (failed.code != AVC_GONE) {
+			if (!stop_all(t, &failed))
+				continue;
+			if (failed.code != AVC_GONE) {
 				*err = failed;
 				return -1;
-			} else {
-				usleep(LOOK_US); /* until it is a zombie, or nothing */
 			}
+			usleep(LOOK_US); /* until it is a zombie, or nothing */
 		}
 		if (all)
 			return 0;

@@ -57,7 +57,7 @@ struct last_pid {
 	uint32_t count;
 };
 
-/* ---- who chooses, and who forks ------------------------------------------------------------------ */
+/* ---- who chooses, and who forks ------------------------------------------------------ */
 
 int last_pid_lock_open(pid_t init)
 {
