@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import time
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from testkit.family import kill_main, look
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
-from testkit.procfs import children_of
+from testkit.procfs import children_of, inside
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
@@ -65,6 +66,44 @@ def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
         victim.end(5)
         assert guard.wait("ended")
         assert sum(event["kind"] == "restored" for event in guard.events if "kind" in event) > 20
+
+
+def spare_of_time(s: float) -> None:
+    """A sleep would be rounded up by a scheduler's tick."""
+    until = time.perf_counter() + s
+    while time.perf_counter() < until:
+        pass
+
+
+def numbered(init: int, number: int, old: int) -> int:
+    """The child of init with this number inside that is not `old`, also one that does not run yet; 0: none."""
+    return next((m.pid for m in map(look, children_of(init)) if m and m.inside == number and m.pid != old), 0)
+
+
+@pytest.mark.parametrize("command", ["threads 6 4 --no-churn", "tree 3"])
+def test_is_killed_while_it_is_restored(command: str, tmp_path: Path) -> None:
+    """By somebody else, and there is only one generation: that is as good as before."""
+    rng, during = random.Random(1), 0
+    only_one = config(0, keep=1, restore_window_s=0.000001)
+    with Victim(command, tmp_path) as victim, GuardProcess(only_one, [victim.pid]) as guard:
+        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        number = inside(victim.app)
+        for _ in range(40):
+            dead, since = victim.app, guard.mark()
+            os.kill(dead, signal.SIGKILL)
+            again = wait_until(
+                lambda dead=dead: numbered(victim.pid, number, dead),
+                5,
+                "it is there again",
+                0,  # type: ignore[misc]
+            )
+            spare_of_time(rng.uniform(0, 0.0005))
+            os.kill(again, signal.SIGKILL)
+            guard.wait("restored", since=since)
+            victim.wait_beats(3)
+            restored = [event for event in guard.events[since:] if event.get("kind") == "restored"]
+            during += len(restored) == 1
+        assert during > 3
 
 
 def templates_of(victim: Victim) -> int:

@@ -267,11 +267,12 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_kill_lost(guard);
 			break;
 		}
-		/* Perhaps because the spare was killed when it was needed, or was one process too
-		 * many.  The template is still good. */
-		if (whole && generation->spare.pid && !again) {
+		/* Perhaps because the new process or the spare was killed, or the spare was one
+		 * process too many.  The template is still good. */
+		if (whole && !again) {
+			generation->spare.unwanted = generation->spare.pid &&
+						     failed.errnum == EAGAIN;
 			spare_drop(generation);
-			generation->spare.unwanted = failed.errnum == EAGAIN;
 			again = true;
 		} else {
 			if (!error->code)

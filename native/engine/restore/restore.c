@@ -31,13 +31,13 @@ static const char *const step_names[] = {
 	[INJ_STEP_TID] = "clone",           [INJ_STEP_BASE] = "arch_prctl",
 };
 
-/* Waits while *word == value; false after `end`. */
-static bool wait_word(uint32_t *word, uint32_t value, uint64_t end)
+/* Waits while *word == value; false after `end`, or when the process has ended. */
+static bool wait_word(uint32_t *word, uint32_t value, int pidfd, uint64_t end)
 {
-	const struct timespec slice = { .tv_nsec = 20 * (long)NS_PER_MS };
+	const struct timespec slice = { .tv_nsec = (long)NS_PER_MS };
 
 	while (__atomic_load_n(word, __ATOMIC_ACQUIRE) == value) {
-		if (now_ns() > end)
+		if (now_ns() > end || pidfd_ended(pidfd))
 			return false;
 		syscall(SYS_futex, word, FUTEX_WAIT, value, &slice, NULL, 0);
 	}
@@ -45,12 +45,18 @@ static bool wait_word(uint32_t *word, uint32_t value, uint64_t end)
 }
 
 /* Until the new process has restored itself, or has failed. */
-static bool await_state(struct inj_slot *slot, struct sandbox *sandbox)
+static int await_state(struct inj_slot *slot, struct sandbox *sandbox, int pidfd,
+		       struct avc_error *err)
 {
 	const uint64_t end = now_ns() + READY_NS;
 
-	return sandbox ? sandbox_wait(sandbox, &slot->state, end)
-		       : wait_word(&slot->state, INJ_IDLE, end);
+	if (sandbox ? sandbox_wait(sandbox, &slot->state, end)
+		    : wait_word(&slot->state, INJ_IDLE, pidfd, end))
+		return 0;
+	return pidfd_ended(pidfd) ? fail(err, AVC_GONE, ESRCH, slot->pid, "restore", "",
+					 "the new process was killed")
+				  : fail(err, AVC_KERNEL, ETIMEDOUT, slot->pid, "restore", "",
+					 "the new process does not answer");
 }
 
 static void reset(const struct parasite *parasite, uint32_t slot_number)
@@ -187,9 +193,8 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 			restore->fork_ns = now_ns() - start;
 		}
 		start = now_ns();
-		if (!await_state(slot, restore->sandbox))
-			return fail(err, AVC_KERNEL, ETIMEDOUT, restore->pid, "restore", "",
-				    "the new process does not answer");
+		if (await_state(slot, restore->sandbox, restore->pidfd, err))
+			return -1;
 		restore->threads_ns = now_ns() - start;
 		if (slot->state == INJ_READY)
 			return 0;
@@ -215,15 +220,14 @@ int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
 	return send_off(image, pid, sandbox, err);
 }
 
-int restore_await(const struct image *image, pid_t pid, struct sandbox *sandbox,
+int restore_await(const struct image *image, int pidfd, struct sandbox *sandbox,
 		  struct avc_error *err)
 {
 	const struct parasite *parasite = &image->process->parasite;
 	struct inj_slot *slot = parasite_slot(parasite, image->slot);
 
-	if (!await_state(slot, sandbox))
-		return fail(err, AVC_KERNEL, ETIMEDOUT, pid, "restore", "",
-			    "the new process does not answer");
+	if (await_state(slot, sandbox, pidfd, err))
+		return -1;
 	return slot->state == INJ_READY ? 0 : describe_failure(parasite, slot, err);
 }
 
@@ -372,12 +376,12 @@ static void go(struct restore *restore)
 	}
 	restore_go(main, restore->sandbox);
 	spare_drop(generation); /* it shares memory with what runs now */
-	for (uint64_t end = now_ns() + READY_NS;;) {
+	for (const uint64_t end = now_ns() + READY_NS;;) {
 		const uint32_t running = __atomic_load_n(&slot->running, __ATOMIC_ACQUIRE);
 
-		if (running == slot->threads || now_ns() > end || pidfd_ended(restore->pidfd))
+		if (running == slot->threads ||
+		    !wait_word(&slot->running, running, restore->pidfd, end) || now_ns() > end)
 			break; /* or it has died again already */
-		wait_word(&slot->running, running, now_ns() + NS_PER_MS);
 	}
 	restore->restore_ns = now_ns() - restore->died_ns;
 	for (uint32_t i = 0; i < generation->images; i++)

@@ -53,7 +53,7 @@ int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
  * reports what failed; releases it. */
 int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
 		  struct sandbox **sandbox, struct avc_error *err) warn_unused;
-int restore_await(const struct image *image, pid_t pid, struct sandbox *sandbox,
+int restore_await(const struct image *image, int pidfd, struct sandbox *sandbox,
 		  struct avc_error *err) warn_unused;
 void restore_note(const struct image *image, pid_t pid, struct avc_error *notes);
 void restore_go(const struct image *image, struct sandbox *sandbox);

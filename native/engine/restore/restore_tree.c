@@ -452,7 +452,7 @@ static int await_one(struct restore_tree *restored, uint32_t index, struct avc_e
 	struct forked *forked = &restored->forked[index];
 	struct avc_error *notes = &restored->restore->notes;
 
-	if (restore_await(image, forked->pid, forked->sandbox, err))
+	if (restore_await(image, forked->pidfd, forked->sandbox, err))
 		return -1;
 	restore_note(image, forked->pid, notes);
 	return memory_put_back(image, forked->pid, notes, err);
