@@ -58,6 +58,8 @@ def measure(interval: str, seconds: int) -> dict[str, Any]:
                 guard = stack.enter_context(GuardProcess(CONFIGS[interval], [init.pid]))
             time.sleep(seconds + 0.5)
             while not path.exists() or "# Max" not in path.read_text():
+                if init.popen.poll() is not None:
+                    raise SystemExit(f"cyclictest ended with {init.popen.returncode}; is rt-tests installed?")
                 time.sleep(0.2)
             events = guard.events if guard is not None else []
         taken = [event for event in events if event.get("kind") == "checkpoint"]

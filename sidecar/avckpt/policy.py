@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from avckpt_hooks.shared.labels import KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy, shown
+from avckpt_hooks.shared.labels import AUTOMATIC_MAX, KEEP_MAX, LABELS, PREFIX, LabelError, Policy, parse_policy, shown
 
 from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Images, Tcp
@@ -25,12 +25,17 @@ class Settings:
     policy: Policy
     config: GuardConfig
 
+    def text(self, key: str) -> str:
+        """The setting of a label, as in a label; empty: there is none."""
+        if key == "avckpt.interval" and not self.policy.automatic:
+            return self.said.get(key, AUTOMATIC_MAX)
+        return self.said.get(key, LABELS[key].default)
+
     @property
     def in_force(self) -> dict[str, str]:
         """Every setting without its prefix, as in a label; empty: there is none. Of commands only the
         program."""
-        texts = {key: self.said.get(key, label.default) for key, label in LABELS.items()}
-        return {key[len(PREFIX) :]: shown(text) if text else "" for key, text in texts.items()}
+        return {key[len(PREFIX) :]: shown(text) if (text := self.text(key)) else "" for key in LABELS}
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,7 @@ def changes(before: Settings, after: Settings) -> list[Change]:
     """The differences, in alphabetical order; 3s and 3000ms are equal."""
     found = []
     for key in sorted(LABELS):
-        texts = [settings.said.get(key, LABELS[key].default) for settings in (before, after)]
+        texts = [settings.text(key) for settings in (before, after)]
         if texts[0] != texts[1] and _meaning(key, texts[0]) != _meaning(key, texts[1]):
             found.append(Change(key[len(PREFIX) :], texts[0], texts[1]))
     return found

@@ -320,7 +320,7 @@ def test_the_sidecar_is_started_and_reads_the_machines_configuration(project: Pr
         assert "again" in said
         assert "warning: the sidecar goes by older or built-in defaults: /etc/avckpt/config.yaml:2: " in said
         [by_map] = [entry for entry in sidecar.ps() if entry["name"].startswith(f"{project.name}_by-map")]
-        assert by_map["interval_s"] == 3.0
+        assert by_map["automatic"]
         config.write_text("defaults:\n  keep: 5\n")
         project.podman.run("kill", "--signal", "HUP", "avckpt-sidecar")
         wait_until(lambda: "config.yaml was read" in sidecar.logs(), 5, "the sidecar has read it")

@@ -121,7 +121,7 @@ def test_a_unit_that_is_not_restored_ends_as_its_program(start: Any, script: str
 def test_options_and_environment_are_labels(local: LocalSidecar, start: Any) -> None:
     start("--", "sleep", "1000", AVCKPT_INIT=INIT, AVCKPT_LABELS="avckpt.keep=4  avckpt.interval=200ms")
     assert (lambda r: (r["keep"], r["interval_s"]))(row(local, "host/sleep", state="protected")) == (4, 0.2)
-    start("--label", "avckpt.keep=5", "--", "sleep", "1000", AVCKPT_LABELS="avckpt.keep=4")
+    start("--label", "avckpt.keep=5", "--", "sleep", "1000", AVCKPT_LABELS="avckpt.keep=4 avckpt.interval=200ms")
     assert row(local, "host/sleep-2")["keep"] == 5
 
 

@@ -7,13 +7,22 @@ import pytest
 from avckpt.cli.run import settings_of_run
 from avckpt.errors import LabelsWrong
 from avckpt.guard import Files, GuardConfig, Tcp
-from avckpt.policy import settings_of
+from avckpt.policy import changes, settings_of
+
+
+def test_a_group_that_recovers_together_has_a_fixed_interval() -> None:
+    together = {"avckpt.enable": "true", "avckpt.group": "drive", "avckpt.group.recovery": "together"}
+    alone, member = settings_of({"avckpt.enable": "true"}), settings_of(together)
+    assert (member.config.interval_s, member.config.interval_min_s, member.config.keep) == (3.0, 0.0, 2)
+    assert (alone.in_force["interval"], member.in_force["interval"]) == ("auto", "3s")
+    assert "interval auto -> 3s" in map(str, changes(alone, member))
 
 
 def test_defaults_are_those_of_the_label_table() -> None:
     assert settings_of({"avckpt.enable": "true"}).config == GuardConfig(
         interval_s=3.0,
-        keep=2,
+        interval_min_s=0.02,
+        keep=3,
         restore_on_signal=True,
         restore_on_exit=True,
         restore_on_statuses=frozenset(),

@@ -31,7 +31,7 @@ RESTORES_MAX = 64
 
 SHM_MAX_BYTES = 1_000_000_000
 AUTOMATIC_MAX = "3s"
-"""The longest time between two checkpoints at avckpt.interval=auto."""
+"""The longest time between two checkpoints at avckpt.interval=auto, and the default where that cannot be."""
 
 
 class LabelError(ValueError):
@@ -77,7 +77,7 @@ class Policy:
     enable: bool = False
     interval_s: float = 3.0
     """Time between checkpoints; with `automatic` the longest."""
-    automatic: bool = False
+    automatic: bool = True
     """As often as the budgets allow, and not while the application is idle."""
     interval_min_s: float = 0.02
     """With `automatic`: the shortest time between two."""
@@ -156,6 +156,8 @@ def parse_policy(mapping: Mapping[str, str]) -> Policy:
             fields.update(label.parse(value))
         except ValueError as error:
             raise LabelError(key, value, str(error), "allowed: " + label.allowed) from None
+    if fields.get("recovery") == "together":
+        fields.setdefault("automatic", False)
     policy = Policy(**fields)
     if policy.restore_on.unhealthy and policy.keep < 2:
         # A hang is detected late: by then the newest generation hangs, too.
@@ -449,7 +451,7 @@ _DURATION = "a number with ms, s, m or h"
 
 LABELS: dict[str, Label] = {
     "avckpt.enable": Label("false", "true or false", _parse_enable),
-    "avckpt.interval": Label("3s", f"auto, or {_DURATION}, from 10ms to 24h, as 500ms, 3s or 1m", _parse_interval),
+    "avckpt.interval": Label("auto", f"auto, or {_DURATION}, from 10ms to 24h, as 500ms, 3s or 1m", _parse_interval),
     "avckpt.interval.min": Label("20ms", f"{_DURATION}, from 5ms to {AUTOMATIC_MAX}, as 20ms", _parse_interval_min),
     "avckpt.budget.freeze": Label("3%", "a percentage from 0.1% to 50%, as 3%", _share("budget_freeze")),
     "avckpt.budget.cpu": Label("5%", "a percentage from 0.1% to 50%, as 5%", _share("budget_cpu")),
