@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -91,12 +92,7 @@ def test_is_killed_while_it_is_restored(command: str, tmp_path: Path) -> None:
         for _ in range(40):
             dead, since = victim.app, guard.mark()
             os.kill(dead, signal.SIGKILL)
-            again = wait_until(
-                lambda dead=dead: numbered(victim.pid, number, dead),
-                5,
-                "it is there again",
-                0,  # type: ignore[misc]
-            )
+            again = wait_until(partial(numbered, victim.pid, number, dead), 5, "it is there again", 0)
             spare_of_time(rng.uniform(0, 0.0005))
             os.kill(again, signal.SIGKILL)
             guard.wait("restored", since=since)
