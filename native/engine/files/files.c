@@ -337,14 +337,30 @@ static bool copy_frozen(const struct look *look, const struct file *is, struct f
 	return take_known(look, f) != NULL;
 }
 
+/* What belongs to the table matters as little as in a freeze; and a table of its own is rebuilt. */
+static bool copy_now(const struct look *look, const struct file *is, struct file *f)
+{
+	if (!copy_frozen(look, is, f))
+		return false;
+	f->inherited = NULL;
+	return true;
+}
+
 static bool look_at_inherited(const struct look *look, int number, struct file *f)
 {
 	const struct file *is = look->files->parent ? files_find(look->files->parent, number)
 						    : NULL;
 
-	if (!is || is->remote || look->depth == FILES_NOW)
+	if (!is || is->remote)
 		return false;
-	return look->depth == FILES_BEFORE ? copy_before(look, is, f) : copy_frozen(look, is, f);
+	switch (look->depth) {
+	case FILES_BEFORE:
+		return copy_before(look, is, f);
+	case FILES_FROZEN:
+		return copy_frozen(look, is, f);
+	default:
+		return copy_now(look, is, f);
+	}
 }
 
 static bool is_channel(const struct file *f)

@@ -511,12 +511,16 @@ struct files_work {
 	bool *kept;              /* of want: inherited from the process that forks it */
 	struct files_work *host; /* of which process that is; NULL: none            */
 	uint32_t listed;         /* calls for the template, not made yet */
+	bool busy;               /* the task makes calls */
 	uint32_t problems;
 	struct avc_error *notes;
 };
 
 int files_work_begin(struct files_work *work, struct avc_error *err) warn_unused;
+/* Afterwards the holder of a descendant is busy; to be halted, and then awaited. */
 int files_work_gather(struct files_work *work, struct avc_error *err) warn_unused;
+int files_work_halt(struct files_work *work, struct avc_error *err) warn_unused;
+int files_work_await(struct files_work *work, struct avc_error *err) warn_unused;
 int files_work_place(struct files_work *work, struct avc_error *err) warn_unused;
 void files_work_finish(struct files_work *work);
 int files_work_table(const struct files_work *work, struct fd_table *table,

@@ -526,10 +526,25 @@ static struct files_work *work_of(const struct tables *tables, const struct proc
 	return NULL;
 }
 
+/* Until no holder makes the calls of files_work_gather() any more. */
+static int await_gathered(struct tables *tables, struct avc_error *err)
+{
+	int result = 0;
+
+	for (uint32_t i = 0; i < tables->count; i++)
+		if (tables->work[i].busy && files_work_halt(&tables->work[i], err))
+			result = -1;
+	for (uint32_t i = 0; i < tables->count; i++)
+		if (tables->work[i].busy && files_work_await(&tables->work[i], err))
+			result = -1;
+	return result;
+}
+
 int files_restore(struct image *image, uint32_t images, const struct avc_config *config, pid_t init,
 		  struct avc_error *notes, struct avc_error *err)
 {
 	struct tables tables = { .work = calloc(images, sizeof *tables.work) };
+	struct avc_error ignored = { 0 };
 	int result = -1;
 
 	if (!tables.work)
@@ -558,6 +573,8 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 	for (uint32_t i = 0; i < tables.count; i++)
 		if (files_work_gather(&tables.work[i], err))
 			goto out;
+	if (await_gathered(&tables, err))
+		goto out;
 	if (list_spots(&tables, &tables.ends, false) || list_spots(&tables, &tables.family, true)) {
 		result = fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 		goto out;
@@ -582,6 +599,8 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 	}
 	result = 0;
 out:
+	if (result)
+		(void)await_gathered(&tables, &ignored);
 	for (uint32_t i = 0; i < tables.count; i++)
 		files_work_end(&tables.work[i]);
 	free(tables.ends.spot);

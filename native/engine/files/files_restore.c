@@ -384,23 +384,48 @@ static void note_refused(struct files_work *work, uint32_t count)
 	}
 }
 
-int files_work_flush(struct files_work *work, struct avc_error *err)
+/* Has the task begin with its calls. */
+static int start_calls(struct files_work *work, struct avc_error *err)
 {
 	const struct process *process = work->process;
 	struct inj_call *call = call_of(work);
-	const uint32_t listed = work->listed;
-	int result = 0;
 
 	close_list(work);
-	if (call->count)
-		result = parasite_send(&process->parasite, work->table,
-				       process->descendant ? &process->holder_base
-							   : &work->image->base,
-				       call, err) ||
-			 parasite_run(work->table, call, err);
+	if (!call->count)
+		return 0;
+	work->busy = parasite_send(&process->parasite, work->table,
+				   process->descendant ? &process->holder_base : &work->image->base,
+				   call, err) == 0 &&
+		     parasite_start(work->table, err) == 0;
+	return work->busy ? 0 : -1;
+}
+
+int files_work_halt(struct files_work *work, struct avc_error *err)
+{
+	if (!work->busy || parasite_halt(work->table, call_of(work), err) == 0)
+		return 0;
+	work->busy = false;
+	return -1;
+}
+
+int files_work_await(struct files_work *work, struct avc_error *err)
+{
+	const bool stopped = !work->busy || tracee_await(work->table, NULL, err) == STOP_TRAP;
+
+	work->busy = false;
+	call_begin(call_of(work), INJ_AFTER_PARK);
+	return stopped ? 0 : -1;
+}
+
+int files_work_flush(struct files_work *work, struct avc_error *err)
+{
+	const uint32_t listed = work->listed;
+	int result = start_calls(work, err) || files_work_halt(work, err);
+
+	if (files_work_await(work, err))
+		result = -1;
 	if (!result)
 		note_refused(work, listed);
-	call_begin(call, INJ_AFTER_PARK);
 	return result ? -1 : 0;
 }
 
@@ -656,6 +681,7 @@ static void put_states(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i], *n = files_now_of(work, i);
+		const int local = work->local[i];
 		int fd;
 
 		(void)budget_step();
@@ -664,7 +690,7 @@ static void put_states(struct files_work *work)
 		if (w->remote && n && n->offset == w->offset && n->flags == w->flags &&
 		    !n->lock_count && !w->lock_count)
 			continue;
-		fd = files_borrow_placed(work, w);
+		fd = local >= 0 ? local : proc_borrow_fd(work->table_pidfd, w->fd);
 		if (fd < 0) {
 			files_note(work, w, "it could not be put in its place");
 			continue;
@@ -680,7 +706,8 @@ static void put_states(struct files_work *work)
 		else if (!w->goes_on && n && n->tcp_state == 1 /* TCP_ESTABLISHED */ &&
 			 work->config->tcp == AVC_TCP_MESSAGES && file_tcp_moved(w, n))
 			files_note(work, w, file_put_stream(fd, w, n));
-		close(fd);
+		if (fd != local)
+			close(fd);
 	}
 }
 
@@ -721,9 +748,14 @@ static int look_once(struct files_work *work, const struct files_missing *missin
 	int result = 0;
 
 	work->now->missing = missing;
+	if (work->host && work->host->table) {
+		work->now->parent = work->host->now;
+		work->now->parent_pid = work->host->table;
+	}
 	if (work->table)
 		result = files_look(work->now, &owner, FILES_NOW, work->want, err);
 	work->now->missing = NULL;
+	work->now->parent = NULL;
 	if (result)
 		return -1;
 	work->claimed_by = filled(work->now->count, -1);
@@ -845,10 +877,11 @@ static void give_to_host(struct files_work *work, uint32_t i)
 		fcntl(local, F_DUPFD_CLOEXEC, 0);
 }
 
-/* All other processes get a rebuilt table. */
+/* All other processes get a rebuilt table.  Its holder closes what is new only when everything has
+ * been taken from it; all holders do so at the same time (files_work_await()). */
 static int gather_anew(struct files_work *work, struct avc_error *err)
 {
-	if (unlock_all(work, err) || files_work_flush(work, err))
+	if (unlock_all(work, err))
 		return -1;
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const int h = find_in_host(work, &work->want->file[i]);
@@ -859,7 +892,7 @@ static int gather_anew(struct files_work *work, struct avc_error *err)
 	gather(work);
 	for (uint32_t i = 0; i < work->want->count; i++)
 		give_to_host(work, i);
-	return 0;
+	return start_calls(work, err);
 }
 
 int files_work_gather(struct files_work *work, struct avc_error *err)
