@@ -208,7 +208,7 @@ def test_signals_without_a_death_wake_nobody() -> None:
     """They cost their sender nothing; the newest are known all the same."""
     program = "import os, signal\nsignal.signal(signal.SIGTERM, lambda *_: None)\n"
     program += "for _ in range(20000):\n    os.kill(os.getpid(), signal.SIGTERM)\nprint(flush=True)\nsignal.pause()"
-    deaths = Deaths(set, pages=16)  # far fewer than 20,000 signals take
+    deaths = Deaths(set, pages=16)  # room for the deaths of others meanwhile
     try:
         with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as sender:
             assert sender.stdout is not None

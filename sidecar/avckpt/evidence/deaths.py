@@ -234,6 +234,9 @@ class Deaths:
         pid, _, at_ns, _ = struct.unpack_from("=iiQI", body)
         signum, _, code, name, target = struct.unpack_from("=iii16si", body, 20 + 8)
         thread = name.partition(b"\0")[0].decode("utf-8", "replace")
+        known = self._sent.get(target)
+        if known is not None and known.at_ns > at_ns:
+            return  # sent on another CPU, whose ring was read before
         self._sent[target] = Sent(at_ns, signum, code, pid, target, thread)
         self._sent.move_to_end(target)
 
