@@ -14,7 +14,7 @@
  *   userfault has a userfaultfd
  *   huge      private memory of huge pages
  *   nested    children would get a PID namespace of their own
- *   filter    one thread under a seccomp filter more than the others, which have one
+ *   filter    one thread under a seccomp filter that asks another process (SECCOMP_RET_USER_NOTIF)
  *   groups    one thread with other groups, which the main thread may not set
  *   hugefile  the same, of a file (a memfd)
  *   folder    one thread with a working directory of its own
@@ -23,8 +23,8 @@
  *   bounds    one thread with a smaller bounding set, which the main thread may not lower
  *   locked, locked-child  one thread, or a child process, without a securebit that the main
  *             thread has locked
- *   filtered-child, other-filter   a child process under a seccomp filter that the main one lacks;
- *             and the main one has another one instead
+ *   unfiltered-child, other-filter   the main process has a seccomp filter that a child process has
+ *             not; and the child has another one instead
  *   user      one thread of another user, and the main thread has locked that capabilities are
  *             not kept over that
  *   dropped   one thread of another user, and the main thread has become a third one's
@@ -54,6 +54,7 @@
 #include <pthread.h>
 #include <sched.h>
 #include <signal.h>
+#include <stddef.h>
 #include <sys/ipc.h>
 #include <sys/prctl.h>
 #include <sys/ptrace.h>
@@ -214,7 +215,16 @@ static bool add_filter(void)
 
 static void *filtered(void *arg)
 {
-	if (!add_filter())
+	struct sock_filter ask[] = {
+		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
+		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_getppid, 0, 1),
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_USER_NOTIF),
+		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW),
+	};
+	struct sock_fprog program = { 4, ask };
+
+	if (prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) ||
+	    syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, 0, &program))
 		unavailable("seccomp");
 	(void)arg;
 	for (;;)
@@ -226,7 +236,7 @@ static bool start_filter(void)
 {
 	pthread_t thread;
 
-	return add_filter() && !pthread_create(&thread, NULL, filtered, NULL);
+	return !pthread_create(&thread, NULL, filtered, NULL);
 }
 
 static void *grouped(void *arg)
@@ -422,6 +432,11 @@ static bool start_filtered_child(void)
 			pause();
 	}
 	return pid > 0;
+}
+
+static bool start_unfiltered_child(void)
+{
+	return start_child(0) && add_filter();
 }
 
 static bool start_other_filter(void)
@@ -626,7 +641,7 @@ static const struct kind {
 	{ "bounds", start_bounds, NULL },
 	{ "locked", start_locked, NULL },
 	{ "locked-child", start_locked_child, NULL },
-	{ "filtered-child", start_filtered_child, NULL },
+	{ "unfiltered-child", start_unfiltered_child, NULL },
 	{ "other-filter", start_other_filter, NULL },
 	{ "user", start_user, NULL },
 	{ "dropped", start_dropped, NULL },

@@ -71,7 +71,7 @@ static int read_all(struct process *process, uint32_t slot, struct avc_error *er
 			return fail_errno(err, t->tid, "freeze", "ptrace(GETREGSET)",
 					  "its state cannot be read");
 		if ((!t->known || t->due || t->known_tls != arch_tls(&t->regs) ||
-		     may_be_disarmed(t)) &&
+		     may_be_disarmed(t) || filters_are_more(t)) &&
 		    thread_ask(process, t, err))
 			return -1;
 	}
@@ -319,7 +319,7 @@ static int ask_end(struct process *process, struct avc_error *err)
 	if (thread_give_back(thread, err) || pending_read(process, err))
 		return -1;
 	timers_answer(process, call, now_ns() - process->asked_ns);
-	if (thread_ask_answer(thread, call, &process->questions, err))
+	if (thread_ask_answer(process, thread, call, &process->questions, err))
 		return -1;
 	return thread_ask_others(process, thread, &was, err) || hear_of_children(process, err) ? -1
 											       : 0;

@@ -58,6 +58,7 @@ static int hear_template(struct process *process, struct thread *cloned,
 	cloned->creds.death_signal = was.death_signal;
 	cloned->creds.subreaper = was.subreaper;
 	cloned->creds.slack_ns = was.slack_ns;
+	cloned->creds.seccomp = was.seccomp;
 	cloned->creds.filters = was.filters;
 	cloned->creds.future_lock = was.future_lock;
 	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
@@ -177,17 +178,13 @@ static int fill_slot(struct image *image, struct avc_error *err)
 		return fail(err, AVC_RETRY, 0, process->pid, "keep template", "",
 			    "its seccomp filters have just changed");
 	}
-	if (process->descendant && !seccomp_is_containers(&status, process->plain_filters) &&
-	    process->parasite.seccomp != SECCOMP_IN_FORCE) {
-		close(mem_fd);
-		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
-			    "process %d has a seccomp filter that forbids what restoring several "
-			    "processes takes",
-			    process->inside);
-	}
 	image->headless = process->pid != process->leader;
 	image->stop_signal = main_thread->stop_signal;
 	setup_begin(&setup, parasite, image->slot);
+	if (filters_setup(image, main_thread, &setup, err)) {
+		close(mem_fd);
+		return -1;
+	}
 	for (uint32_t i = 0; i < process->thread_count; i++) {
 		struct thread t = process->threads[i];
 		const uint32_t b = (uint32_t)t.block;
@@ -238,11 +235,13 @@ static int fill_slot(struct image *image, struct avc_error *err)
 			return -1;
 		}
 		pending_setup_thread(process, &t, &setup);
+		filters_setup_thread(image, main_thread, &process->threads[i], &setup);
 	}
 	close(mem_fd);
 	if (image->headless)
 		fill_ended(image);
-	image->sandboxed = !seccomp_is_containers(&status, process->plain_filters);
+	image->sandboxed = image->installs ||
+			   !seccomp_is_containers(&status, process->plain_filters);
 	if (status.seccomp == 1)
 		process->parasite.seccomp = SECCOMP_SUPERVISED;
 	if (memory_finish(image, status.locked_kb, &setup, err))
@@ -307,6 +306,19 @@ static int finish(struct image *image, struct avc_error *err)
 	return fill_slot(image, err);
 }
 
+/* Others are forked by the main process, and restored, under its filters. */
+static int check_forks(const struct generation *generation, struct avc_error *err)
+{
+	const struct process *main = generation->image[0].process;
+
+	if (generation->images == 1 || main->filters <= main->plain_filters ||
+	    main->parasite.seccomp == SECCOMP_IN_FORCE)
+		return 0;
+	return fail(err, AVC_UNSUPPORTED, 0, main->pid, "keep template", "",
+		    "the main process has a seccomp filter that forbids what restoring several "
+		    "processes takes");
+}
+
 int generation_finish(struct generation *generation, struct avc_error *err)
 {
 	struct process *main = generation->image[0].process;
@@ -315,6 +327,8 @@ int generation_finish(struct generation *generation, struct avc_error *err)
 
 	if (!main_thread)
 		return fail(err, AVC_GONE, ESRCH, main->pid, "keep template", "", "it has ended");
+	if (check_forks(generation, err))
+		return -1;
 	for (uint32_t i = 0; i < generation->images; i++) {
 		struct image *image = &generation->image[i];
 		struct avc_error failed = { 0 };
@@ -397,6 +411,7 @@ static void image_drop(struct image *image)
 		close_fd(&image->pidfd);
 	mem_image_free(image->memory);
 	free(image->attributes);
+	free(image->seal);
 	process_attrs_forget(image);
 	files_free(image->files);
 	files_mapped_free(image->mapped);

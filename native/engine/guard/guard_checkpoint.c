@@ -119,6 +119,16 @@ static int hold(struct avc_guard *guard, struct process *process, struct avc_err
 	return result;
 }
 
+/* It has come under seccomp filters, or strict mode, after its holder was made. */
+static bool has_filters_since(const struct process *process)
+{
+	struct proc_status own, holders;
+
+	return !seccomp_is_confined() && proc_status(process->pid, &own) == 0 &&
+	       proc_status(process->holder, &holders) == 0 &&
+	       (own.seccomp_filters > holders.seccomp_filters || own.seccomp > holders.seccomp);
+}
+
 static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *later,
 			   struct avc_error *err)
 {
@@ -145,6 +155,9 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 	}
 	if (process_query_new_threads(process, guard->timer, deadline, later, err))
 		return -1;
+	/* Its holder makes calls from memory that the process can write. */
+	if (process->holder && has_filters_since(process))
+		process_unhold(process);
 	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
 	/* Below a process that adopts orphans, only when that one is stopped, too. */
 	if (!process->holder && !process->adopts && hold(guard, process, err))

@@ -52,6 +52,7 @@ void process_free_room(struct process *process)
 {
 	free(process->threads);
 	memory_free(process->memory);
+	filters_forget(process);
 	free(process->pending);
 	free(process->timers);
 	process->threads = NULL;
@@ -229,12 +230,13 @@ int thread_ask(struct process *process, struct thread *thread, struct avc_error 
 	if (read_signal_state(thread, err) || thread_borrow(process, thread, err) ||
 	    parasite_run(thread->tid, call, err))
 		return -1;
-	if (thread_give_back(thread, err) || thread_ask_answer(thread, call, &questions, err))
+	if (thread_give_back(thread, err) ||
+	    thread_ask_answer(process, thread, call, &questions, err))
 		return -1;
 	return is_main && asked_before ? thread_ask_others(process, thread, &was, err) : 0;
 }
 
-int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+int thread_ask_answer(struct process *process, struct thread *thread, const struct inj_call *call,
 		      const struct questions *questions, struct avc_error *err)
 {
 	const struct inj_syscall *altstack = questions->altstack, *inside = questions->inside,
@@ -261,7 +263,7 @@ int thread_ask_answer(struct thread *thread, const struct inj_call *call,
 	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
-	thread->creds.filters = attributes_read_filters(thread->tid);
+	filters_read(process, thread);
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->young = !thread->known;
 	thread->known = true;

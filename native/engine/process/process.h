@@ -82,7 +82,7 @@ int thread_read(struct thread *thread, struct avc_error *err) warn_unused;
  * (mlockall(2)), for which it temporarily has one more mapping. */
 void thread_ask_add(const struct process *process, bool with_locks, struct inj_call *call,
 		    struct questions *questions);
-int thread_ask_answer(struct thread *thread, const struct inj_call *call,
+int thread_ask_answer(struct process *process, struct thread *thread, const struct inj_call *call,
 		      const struct questions *questions, struct avc_error *err) warn_unused;
 /* Has a stopped thread make only those; if it is the main thread, thread_ask_others(). */
 int thread_ask(struct process *process, struct thread *thread, struct avc_error *err) warn_unused;

@@ -115,14 +115,16 @@ static int check_descendant(const struct process *process, const struct proc_sta
 				    "process %d has a %s namespace of its own", process->inside,
 				    spaces[i]);
 	}
-	/* What they are is compared later (attributes.c). */
-	if (status->seccomp != 1 && status->seccomp_filters == process->main_filters)
+	/* What they are is compared later (filters.c). */
+	if (status->seccomp_filters >= process->main_filters)
 		return 0;
 	if (proc_is_exiting(process->pid)) /* it has none any more */
 		return fail(err, AVC_GONE, ESRCH, process->pid, "check", "open(status)",
 			    "it has ended");
 	return fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
-		    "process %d has other seccomp filters than the main one", process->inside);
+		    "process %d has not the seccomp filters of the main one, which its restore "
+		    "would give it",
+		    process->inside);
 }
 
 /* The shadow stack would not match the calls made in the parasite, and the thread would fault on

@@ -90,7 +90,7 @@ static int send_off(const struct image *image, pid_t child, struct sandbox **san
 	if (!image->headless)
 		arch_tls_set(&regs, parasite_thread(parasite, image->slot, 0)->tls);
 	if ((image->sandboxed || image->stop_signal) && arch_regs_set(child, &regs) == 0) {
-		*sandbox = sandbox_begin(child, image->process->inside, err);
+		*sandbox = sandbox_begin(image, child, err);
 		if (*sandbox)
 			return 0;
 		tracee_kill(child);
@@ -197,7 +197,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 			return -1;
 		restore->threads_ns = now_ns() - start;
 		if (slot->state == INJ_READY)
-			return 0;
+			return restore->sandbox ? sandbox_halt(restore->sandbox, err) : 0;
 		if (restore->sandbox)
 			sandbox_end(restore->sandbox);
 		restore->sandbox = NULL;
@@ -228,7 +228,9 @@ int restore_await(const struct image *image, int pidfd, struct sandbox *sandbox,
 
 	if (await_state(slot, sandbox, pidfd, err))
 		return -1;
-	return slot->state == INJ_READY ? 0 : describe_failure(parasite, slot, err);
+	if (slot->state != INJ_READY)
+		return describe_failure(parasite, slot, err);
+	return sandbox ? sandbox_halt(sandbox, err) : 0;
 }
 
 /* What was allowed to fail, and did: to be reported. */
@@ -255,7 +257,7 @@ void restore_go(const struct image *image, struct sandbox *sandbox)
 	const struct parasite *parasite = &image->process->parasite;
 
 	if (sandbox)
-		sandbox_go(sandbox, parasite, image->slot, image->stop_signal);
+		sandbox_go(sandbox);
 	let_go(parasite_slot(parasite, image->slot), INJ_GO_ALL);
 }
 

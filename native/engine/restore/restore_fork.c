@@ -40,7 +40,7 @@ static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64
 {
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_clone, flags);
-	if (parasite_send(batch->parasite, batch->pid, &batch->base, call, err) ||
+	if (syscall_batch_send(batch, call, err) ||
 	    parasite_run_clone_while(batch->pid, call, birth ? birth->meanwhile : NULL,
 				     birth ? birth->arg : NULL, child, err))
 		return -1;

@@ -88,7 +88,7 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 		call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list),
 			 batch->listed);
 		batch->listed = 0;
-		if (parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err))
+		if (syscall_batch_send(batch, batch->call, err))
 			return -1;
 	}
 	/* SIGKILL kills it where it is. */

@@ -26,7 +26,6 @@
 #define IOPRIO_WHO_PROCESS 1
 #define CAPABILITY_VERSION_3 0x20080522
 #define NODE_BITS (64 * NODE_WORDS)
-#define FILTER_MAX 4096   /* instructions (linux/bpf_common.h, BPF_MAXINSNS) */
 #define LOCKS 0xaaaaaaaau /* securebits: each locks the one below it (linux/securebits.h) */
 
 struct attributes {
@@ -131,25 +130,6 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	c->slack_ns = (uint64_t)first[SLACK].result;
 	c->death_signal = a->death_signal;
 	c->subreaper = a->subreaper;
-}
-
-uint64_t attributes_read_filters(pid_t tid)
-{
-	static uint64_t last;
-	uint64_t program[FILTER_MAX], sum = 0; /* of struct sock_filter */
-
-	/* Then all have the same: those of the container. */
-	if (seccomp_is_confined())
-		return last;
-	for (long i = 0;; i++) {
-		const long n = ptrace(PTRACE_SECCOMP_GET_FILTER, tid, i, program);
-
-		if (n <= 0)
-			return last = sum; /* that was the last one; or there is none */
-		for (long k = 0; k < n && k < FILTER_MAX; k++)
-			sum = (sum ^ program[k]) * UINT64_C(0x100000001b3);
-		sum = sum * 31 + (uint64_t)n;
-	}
 }
 
 /* ---- when the app runs again ------------------------------------------------------------ */
@@ -333,12 +313,6 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 			    "thread %d has other supplementary groups than the main thread, which "
 			    "cannot be put back",
 			    inside);
-	if ((to->seccomp != from->seccomp || to->filters != from->filters) && process->descendant)
-		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
-			    "process %d has other seccomp filters than the main one", inside);
-	if (to->seccomp != from->seccomp || to->filters != from->filters)
-		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
-			    "its threads differ in their seccomp filters (thread %d)", inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return refuse(process, inside, "privileges that", " has given up", err);
 	if (!may_become(from, to))

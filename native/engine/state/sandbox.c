@@ -1,10 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Restoring an app that has put itself under a seccomp filter, or into strict mode: the calls that
- * restore a process would be denied, or kill it.  So it stays traced and is supervised (seccomp.c)
- * until all is ready; its own first call without us is rt_sigreturn(2).  The code and lists that it
+ * Restoring a process that has put itself under a seccomp filter, or into strict mode: the calls that
+ * restore it would be denied, or kill it.  So it stays traced and is supervised (seccomp.c) until
+ * all is ready; its own first call without us is rt_sigreturn(2).  The code and lists that it
  * executes until then are in the parasite, where the app could have written anything: it cannot
- * make more calls than injected code may.
+ * make more calls than injected code may.  That holds for one that has yet to install its filters
+ * (filters.c), too, and none of its threads runs that is not under its own.
  */
 #include <errno.h>
 #include <sched.h>
@@ -24,12 +25,13 @@
 #define END_NS NS_PER_S
 
 struct sandbox {
+	const struct image *image;
 	pid_t pid, inside;
 	uint32_t count;
 	pid_t tid[THREADS_MAX];
 };
 
-struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err)
+struct sandbox *sandbox_begin(const struct image *image, pid_t child, struct avc_error *err)
 {
 	struct sandbox *sandbox = calloc(1, sizeof *sandbox);
 
@@ -40,10 +42,19 @@ struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err)
 		free(sandbox);
 		return NULL;
 	}
+	sandbox->image = image;
 	sandbox->pid = child;
-	sandbox->inside = inside;
+	sandbox->inside = image->process->inside;
 	sandbox->tid[sandbox->count++] = child;
 	return sandbox;
+}
+
+static void at_call(const struct sandbox *sandbox, pid_t tid)
+{
+	if (sandbox->image->installs)
+		seccomp_at_call_only(tid, sandbox->inside, SANDBOX_OPTIONS);
+	else
+		seccomp_at_call(tid, sandbox->inside, SANDBOX_OPTIONS);
 }
 
 /* Takes one event of the new process or its threads; false: there is none. */
@@ -64,7 +75,7 @@ static bool pump(struct sandbox *sandbox, bool *ended)
 	    ptrace(PTRACE_GETEVENTMSG, tid, NULL, &born) == 0 && sandbox->count < THREADS_MAX)
 		sandbox->tid[sandbox->count++] = (pid_t)born;
 	if (WSTOPSIG(status) == (SIGTRAP | 0x80))
-		seccomp_at_call(tid, sandbox->inside, SANDBOX_OPTIONS);
+		at_call(sandbox, tid);
 	ptrace(PTRACE_SYSCALL, tid, NULL, 0L);
 	return true;
 }
@@ -100,13 +111,13 @@ void sandbox_end(struct sandbox *sandbox)
 	free(sandbox);
 }
 
-static int thread_of(const struct parasite *parasite, uint32_t slot, pid_t tid)
+static int thread_of(const struct image *image, pid_t tid)
 {
+	const struct parasite *parasite = &image->process->parasite;
 	const pid_t inside = proc_inside(tid);
 
-	for (uint32_t i = 0;
-	     i < parasite_slot(parasite, slot)->threads && i < parasite->threads_max; i++)
-		if (parasite_thread(parasite, slot, i)->tid == inside)
+	for (uint32_t i = 0; i < image->threads && i < parasite->threads_max; i++)
+		if (parasite_thread(parasite, image->slot, i)->tid == inside)
 			return (int)i;
 	return -1;
 }
@@ -126,48 +137,86 @@ static void bring_home(pid_t tid)
 	}
 }
 
-/* Each is stopped where it waits for `go`, and returns from there. */
-void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32_t slot_number,
-		int stop_signal)
+/* False: it has exited, or was killed. */
+static bool halt(const struct sandbox *sandbox, pid_t tid)
 {
-	struct inj_slot *slot = parasite_slot(parasite, slot_number);
-	struct avc_error ignored = { 0 };
+	for (;;) {
+		struct stop stop;
 
-	for (uint32_t i = 0; i < sandbox->count; i++) {
-		const pid_t tid = sandbox->tid[i];
-		struct arch_regs regs, now;
-		uint64_t frame;
-		int block;
-
-		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL) ||
-		    seccomp_supervise(tid, sandbox->inside, SANDBOX_OPTIONS) ||
-		    tracee_await(tid, NULL, &ignored) != STOP_TRAP || arch_regs_get(tid, &now))
-			continue; /* it has exited, or was killed */
-		seccomp_end_supervision(tid);
-		block = thread_of(parasite, slot_number, tid);
-		if (block < 0)
-			continue;
-		frame = parasite_thread(parasite, slot_number, (uint32_t)block)->frame;
-		if (frame)
-			arch_call(&regs, &now, parasite->base + INJ_SIGRETURN_OFFSET, arch_sp(&now),
-				  frame);
-		else
-			arch_call(&regs, &now, parasite->base + INJ_END_OFFSET, arch_sp(&now), 0);
-		(void)arch_regs_set(tid, &regs); /* fails if it was killed */
-		if (frame && stop_signal)
-			bring_home(tid);
+		/* Again after each stop, which clears it (tracee_await_while()). */
+		if (ptrace(PTRACE_INTERRUPT, tid, NULL, NULL))
+			return false;
+		stop = tracee_wait(tid, 0);
+		if (stop.kind == STOP_TRAP || stop.kind == STOP_GROUP)
+			return true;
+		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+			return false;
+		if (stop.kind == STOP_SYSCALL)
+			at_call(sandbox, tid);
+		ptrace(PTRACE_SYSCALL, tid, NULL, 0L);
 	}
-	if (stop_signal)
-		tracee_signal(sandbox->pid, stop_signal);
+}
+
+/* Each is stopped where it waits for `go`, and is to return from there.  One that is none of its
+ * threads, or of the main thread's number and had ended, ends. */
+static int halt_one(struct sandbox *sandbox, pid_t tid, uint32_t *halted, struct avc_error *err)
+{
+	const struct image *image = sandbox->image;
+	const struct parasite *parasite = &image->process->parasite;
+	struct arch_regs regs, now;
+	const struct seal *seal;
+	uint64_t frame = 0;
+	int block;
+
+	if (!halt(sandbox, tid) || arch_regs_get(tid, &now))
+		return 0;
+	seal = filters_seal_of(image, tid);
+	block = seal ? thread_of(image, tid) : -1;
+	if (block >= 0)
+		frame = parasite_thread(parasite, image->slot, (uint32_t)block)->frame;
+	if (seal && image->sandboxed && filters_check(seal, tid, err))
+		return -1;
+	if (frame)
+		arch_call(&regs, &now, parasite->base + INJ_SIGRETURN_OFFSET, arch_sp(&now), frame);
+	else
+		arch_call(&regs, &now, parasite->base + INJ_END_OFFSET, arch_sp(&now), 0);
+	*halted += frame != 0;
+	(void)arch_regs_set(tid, &regs); /* fails if it was killed */
+	return 0;
+}
+
+int sandbox_halt(struct sandbox *sandbox, struct avc_error *err)
+{
+	uint32_t halted = 0;
+
+	for (uint32_t i = 0; i < sandbox->count; i++)
+		if (halt_one(sandbox, sandbox->tid[i], &halted, err))
+			return -1;
+	return halted == sandbox->image->seals ? 0
+					       : fail(err, AVC_GONE, 0, sandbox->pid, "restore", "",
+						      "the new process was killed");
+}
+
+void sandbox_go(struct sandbox *sandbox)
+{
+	const struct image *image = sandbox->image;
+	const struct parasite *parasite = &image->process->parasite;
+	struct inj_slot *slot = parasite_slot(parasite, image->slot);
+
+	for (uint32_t i = 0; image->stop_signal && i < sandbox->count; i++)
+		if (filters_seal_of(image, sandbox->tid[i]))
+			bring_home(sandbox->tid[i]);
+	if (image->stop_signal)
+		tracee_signal(sandbox->pid, image->stop_signal);
 	slot->running = slot->threads;
 	for (uint32_t i = 0; i < sandbox->count; i++) {
 		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);
 		/* The others regard it as exited. */
-		if (i == 0 && !parasite_thread(parasite, slot_number, 0)->frame)
+		if (i == 0 && image->headless)
 			proc_await_end(sandbox->pid);
 	}
 	/* Its parent may check at once. */
-	for (uint64_t end = now_ns() + END_NS; stop_signal && now_ns() < end;) {
+	for (uint64_t end = now_ns() + END_NS; image->stop_signal && now_ns() < end;) {
 		struct proc_stat stat;
 
 		if (proc_stat(sandbox->pid, &stat) || stat.state == 'T')

@@ -9,6 +9,7 @@
  *   pending.c       signals that have not been delivered
  *   timers.c        interval timers, POSIX timers
  *   memory*.c       memory that a clone does not carry as it is
+ *   filters.c       seccomp filters that a fork of the main process has not
  *   sandbox.c       restoring an app that has a seccomp filter of its own
  */
 #ifndef AVCKPT_STATE_H
@@ -43,10 +44,14 @@ struct image {
 	/* oom_score_adj: the app's own, and that of the template (guard_memory.c) */
 	int oom_own, oom_told;
 	bool oom_known;
-	bool sandboxed;   /* has seccomp filters of its own                   */
-	bool headless;    /* its main thread had ended                       */
-	int stop_signal;  /* stopped by that (job control), 0: it was not     */
-	int64_t dumpable; /* prctl(2), PR_GET_DUMPABLE                        */
+	bool sandboxed;    /* has seccomp filters of its own                   */
+	bool installs;     /* ... some of them while it is restored: filters.c                */
+	struct seal *seal; /* of each of its threads                          */
+	uint32_t seals;
+	uint64_t shared_filters; /* a hash of those that all of its threads have          */
+	bool headless;           /* its main thread had ended                       */
+	int stop_signal;         /* stopped by that (job control), 0: it was not     */
+	int64_t dumpable;        /* prctl(2), PR_GET_DUMPABLE                        */
 	struct attributes *attributes;
 	struct process_attrs *attrs;  /* of one to be forked by its parent */
 	struct mem_image *memory;     /* that is not in the template                     */
@@ -115,8 +120,6 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 int attributes_setup_thread(const struct process *process, const struct thread *main_thread,
 			    const struct thread *thread, struct setup *setup,
 			    struct avc_error *err) warn_unused;
-/* A hash of a stopped thread's seccomp filters. */
-uint64_t attributes_read_filters(pid_t tid);
 int attributes_keep(struct image *image, struct avc_error *err) warn_unused;
 /* Before the restored threads run: what can only be done from outside. */
 void attributes_put_back(const struct attributes *attributes, pid_t pid, struct avc_error *notice);
@@ -169,17 +172,44 @@ int inherited_read(struct inherited *inherited, pid_t pid, struct avc_error *err
 void inherited_creds(struct inherited *inherited, const struct thread *thread);
 bool inherited_equal(const struct inherited *a, const struct inherited *b);
 
+/* ---- filters.c --------------------------------------------------------------------- */
+
+/* What a thread must be under before it runs. */
+struct seal {
+	pid_t inside;
+	int32_t mode;     /* prctl(2), PR_GET_SECCOMP                          */
+	uint64_t filters; /* a hash                                            */
+};
+
+/* A stopped thread's: sets creds.filters, and keeps what a restore has to install. */
+void filters_read(struct process *process, struct thread *thread);
+/* Whether it has installed one since then. */
+bool filters_are_more(const struct thread *thread);
+void filters_forget(struct process *process);
+/* When the app runs again: seals, and what all threads install together; then what each does by
+ * itself, after everything else. */
+int filters_setup(struct image *image, const struct thread *main_thread, struct setup *setup,
+		  struct avc_error *err) warn_unused;
+void filters_setup_thread(const struct image *image, const struct thread *main_thread,
+			  const struct thread *thread, struct setup *setup);
+/* Of a restored thread that is stopped; NULL: there was none with its number.  Whether it is under
+ * what it was under. */
+const struct seal *filters_seal_of(const struct image *image, pid_t tid);
+int filters_check(const struct seal *seal, pid_t tid, struct avc_error *err) warn_unused;
+
 /* ---- sandbox.c --------------------------------------------------------------------- */
 
 /* Keeps a new process, which is stopped, as a tracee, and resumes it. */
-struct sandbox *sandbox_begin(pid_t child, pid_t inside, struct avc_error *err);
+struct sandbox *sandbox_begin(const struct image *image, pid_t child, struct avc_error *err);
 /* Waits while *state is INJ_IDLE; false when it exited or was too late. */
 bool sandbox_wait(struct sandbox *sandbox, const uint32_t *state, uint64_t end);
-/* Ends it: kills it, or releases its threads to where they were; stop_signal: they stop there (job
- * control), 0: they continue. */
+/* Ends it: kills it. */
 void sandbox_end(struct sandbox *sandbox);
-void sandbox_go(struct sandbox *sandbox, const struct parasite *parasite, uint32_t slot,
-		int stop_signal);
+/* When it is ready: stops its threads, and checks that they are under their filters. */
+int sandbox_halt(struct sandbox *sandbox, struct avc_error *err) warn_unused;
+/* And releases them to where they were; those of a process that is stopped by job control stop
+ * there.  Ends it, too. */
+void sandbox_go(struct sandbox *sandbox);
 
 /* ---- memory.c ------------------------------------------------------------------ */
 

@@ -32,7 +32,11 @@
 
 #define ANY (~UINT64_C(0))
 #define FILTERS_MAX 16
-#define SUPERVISED_MAX 64
+#define SUPERVISED_MAX 512
+/* Threads of a process being restored (parasite.c, spawn()). */
+#define SPAWN_FLAGS                                                                         \
+	(CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD | CLONE_SYSVSEM | \
+	 CLONE_SETTLS)
 
 /* A system call, with the first argument where a filter is likely to check it. */
 struct kind {
@@ -57,10 +61,14 @@ static const struct kind wanted[] = {
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_PARENT | SIGCHLD },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND },
 	{ SYS_clone, CLONE_VM | CLONE_FILES | CLONE_FS | CLONE_SIGHAND | SIGCHLD },
-	{ SYS_clone, CLONE_VM | CLONE_FS | CLONE_FILES | CLONE_SIGHAND | CLONE_THREAD |
-			     CLONE_SYSVSEM | CLONE_SETTLS },
+	{ SYS_clone, SPAWN_FLAGS },
 	{ SYS_setpgid, ANY },
 	{ SYS_setsid, ANY },
+	/* queries of a template */
+	{ SYS_brk, 0 },
+	{ SYS_prctl, PR_GET_THP_DISABLE },
+	{ SYS_prctl, 68 /* PR_GET_MEMORY_MERGE */ },
+	{ SYS_pkey_alloc, ANY },
 	/* queries */
 	{ SYS_prctl, PR_GET_TID_ADDRESS },
 	{ SYS_prctl, PR_GET_NAME },
@@ -147,7 +155,6 @@ static const struct kind wanted_to_restore[] = {
 	{ SYS_umask, ANY },
 	{ SYS_fchdir, ANY },
 	{ SYS_rt_sigtimedwait, ANY },
-	{ SYS_pkey_alloc, ANY },
 	{ SYS_pkey_free, ANY },
 	{ SYS_pkey_mprotect, ANY },
 };
@@ -580,6 +587,44 @@ void seccomp_at_call(pid_t tid, pid_t inside, long options)
 
 	if (tracee_enters_call(tid) && arch_regs_get(tid, &regs) == 0 && is_wanted(&regs, inside))
 		options |= suspend_option();
+	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* fails if it was killed */
+}
+
+/* Its threads; a process would not be a tracee of ours.  And filters, which take something away. */
+static bool is_restoring(const struct arch_regs *regs, pid_t inside)
+{
+	const uint64_t arg = arch_syscall_arg(regs, 0), second = arch_syscall_arg(regs, 1);
+
+	switch (arch_syscall_nr(regs)) {
+	case SYS_clone:
+		return arg == SPAWN_FLAGS;
+	case SYS_seccomp:
+		return arg == SECCOMP_SET_MODE_FILTER &&
+		       !(second &
+			 ~(uint64_t)(SECCOMP_FILTER_FLAG_LOG | SECCOMP_FILTER_FLAG_SPEC_ALLOW));
+	case SYS_prctl:
+		return (arg == PR_SET_SECCOMP && second == SECCOMP_MODE_STRICT) ||
+		       is_wanted(regs, inside);
+	default:
+		return is_wanted(regs, inside);
+	}
+}
+
+void seccomp_at_call_only(pid_t tid, pid_t inside, long options)
+{
+	struct arch_regs regs;
+
+	if (tracee_enters_call(tid)) {
+		if (arch_regs_get(tid, &regs))
+			return; /* it was killed */
+		if (is_restoring(&regs, inside)) {
+			options |= suspend_option();
+		} else {
+			arch_syscall_nr_set(&regs, -1); /* ENOSYS */
+			if (arch_regs_set(tid, &regs))
+				return;
+		}
+	}
 	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* fails if it was killed */
 }
 

@@ -101,6 +101,17 @@ static int await_end(const struct syscall_batch *batch, const struct inj_syscall
 	}
 }
 
+/* It is not supervised, whatever filters its process had: it has only those of the main one, which
+ * allow its calls, and gets others when nothing is left to be done. */
+int syscall_batch_send(const struct syscall_batch *batch, struct inj_call *call,
+		       struct avc_error *err)
+{
+	if (parasite_send(batch->parasite, batch->pid, &batch->base, call, err))
+		return -1;
+	seccomp_end_supervision(batch->pid);
+	return 0;
+}
+
 static int run(struct syscall_batch *batch, struct avc_error *err)
 {
 	const uint32_t listed = batch->listed;
@@ -115,8 +126,7 @@ static int run(struct syscall_batch *batch, struct avc_error *err)
 			    "there is no room for so many system calls");
 	call_begin(batch->call, INJ_AFTER_PARK);
 	call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list), listed + 1);
-	return parasite_send(batch->parasite, batch->pid, &batch->base, batch->call, err) ||
-			       parasite_start(batch->pid, err) ||
+	return syscall_batch_send(batch, batch->call, err) || parasite_start(batch->pid, err) ||
 			       await_end(batch, &batch->list[listed - 1], err)
 		       ? -1
 		       : 0;

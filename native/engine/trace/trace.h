@@ -109,6 +109,7 @@ struct thread {
 	struct parasite *borrowed_for; /* NULL: before there is one (infect.c)              */
 	avc_remote stub;               /* where it has been sent instead                     */
 	uint32_t filters_known;        /* of seccomp, at the last check                   */
+	uint32_t filter_count;         /* ... when it was queried (state/filters.c)        */
 	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has checked it at this stop                */
 	struct arch_regs regs; /* as of the stop, EINTR already replaced        */
@@ -219,6 +220,7 @@ struct process {
 	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
 	uint32_t filters;          /* ... its own, at the last check                  */
 	uint32_t main_filters;     /* ... of the main process                         */
+	struct chains *chains;     /* ... of its threads (state/filters.c)            */
 	pid_t init;                /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
@@ -402,6 +404,9 @@ void seccomp_end_supervision(pid_t tid);
 bool seccomp_is_supervised(pid_t tid);
 /* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
 void seccomp_at_call(pid_t tid, pid_t inside, long options);
+/* The same for a task that has yet to get its filters, by calls from memory that the application
+ * could change: it makes no other call than those of a restore. */
+void seccomp_at_call_only(pid_t tid, pid_t inside, long options);
 /* ptrace(PTRACE_CONT) for tasks that run injected code: from `stop`, with its signal if it is one;
  * NULL: that stop was handled before. */
 long seccomp_go_on(pid_t tid, const struct stop *stop);
@@ -578,6 +583,9 @@ int syscall_batch_append_any(struct syscall_batch *batch, struct avc_error *err,
 /* The last one may fail: then `problem`, if any, is noted. */
 void syscall_batch_soften(struct syscall_batch *batch, const char *problem);
 int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+/* parasite_send(): the task makes those calls when it is resumed. */
+int syscall_batch_send(const struct syscall_batch *batch, struct inj_call *call,
+		       struct avc_error *err) warn_unused;
 void *syscall_batch_data(const struct syscall_batch *batch, avc_remote *remote);
 /* Two ends of a socket: ours, and the number of the other one there.  Both -1: there is none. */
 struct fd_channel {
