@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 from pathlib import Path
 
@@ -25,12 +26,14 @@ def built(init_built: None, victims_built: Path) -> None:
 def confinement(victim: Victim) -> dict[int, tuple[str, str]]:
     """What each thread of each process is under: mode and number of filters, by its number in the container."""
     found, left = {}, [victim.app]
-    while left:
-        pid = left.pop()
-        left += children_of(pid)
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            status = status_of(int(task.name))
-            found[inside(int(task.name))] = (status["Seccomp"], status["Seccomp_filters"])
+    # A template that is just being made, or ends, looks like one of them.
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        while left:
+            pid = left.pop()
+            left += children_of(pid)
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                status = status_of(int(task.name))
+                found[inside(int(task.name))] = (status["Seccomp"], status["Seccomp_filters"])
     return found
 
 
