@@ -345,7 +345,7 @@ CANNOT = {
 
 TOLD = {
     "full": "1 of its connections have ended: some bytes had not arrived at the line",
-    "urgent": "1 of its connections have ended: its other end is not a connection of the group's",
+    "urgent": "1 of its connections have ended: it has urgent data (127.0.0.1:",
 }
 
 

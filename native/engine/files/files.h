@@ -100,12 +100,15 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board);
 void files_ends_free(struct group_ends *ends);
 /* At a rollback, when all members are dead: discards what others have sent since, and publishes the
  * ends that can be kept; when all members have done that, puts back in flight what was.  Returns how
- * many connections had to be closed, and *why one of them. */
+ * many connections had to be closed, and why the last of them. */
+struct group_ended {
+	uint32_t count;
+	char why[160];
+};
 void files_ends_show(struct group_ends *ends, struct image *image, uint32_t images,
 		     const struct avc_config *config, struct avc_board *board);
-uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
-			 const struct avc_config *config, struct avc_board *board,
-			 const char **why);
+struct group_ended files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
+				   const struct avc_config *config, struct avc_board *board);
 
 /* files_mapped.c: contents of files that are mapped for writing.  Before a freeze; NULL: out of
  * memory. */

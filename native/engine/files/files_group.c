@@ -18,6 +18,7 @@
 #include <linux/tcp.h>
 #include <netinet/in.h>
 #include <poll.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
@@ -36,13 +37,15 @@
 #define ENDS_MAX 1024
 #define SYN_BYTES 1 /* the connecting end counts its SYN as acknowledged              */
 #define PROTOCOL_UNIX UINT32_C(256)
+#define END_TEXT (INET6_ADDRSTRLEN + 8) /* an address and its port                      */
 
 /* One end of a connection. */
 struct group_end {
 	uint64_t ino;
 	struct avc_end_name own, other;
+	bool over;       /* had ended already when all were dead                          */
 	bool kept;       /* data in flight to it was copied                              */
-	const char *why; /* it is not, or cannot be restored                        */
+	const char *why; /* it is not, or cannot be restored; NULL at a line: perhaps it can */
 	uint8_t *content;
 	uint32_t bytes;
 	const struct file *file; /* of any image that has it                              */
@@ -139,12 +142,23 @@ static bool may_go_on(const struct file *f)
 	return s->protocol == IPPROTO_TCP && s->type == SOCK_STREAM;
 }
 
-/* Not shut down or broken, and without urgent data or SO_PEEK_OFF. */
-static bool is_whole(int fd)
+static bool has_ended(int fd)
 {
-	struct pollfd state = { .fd = fd, .events = POLLRDHUP | POLLPRI };
+	struct pollfd state = { .fd = fd, .events = POLLRDHUP };
 
-	return poll(&state, 1, 0) == 0 && file_option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0;
+	return poll(&state, 1, 0) != 0;
+}
+
+/* NULL: it can be kept. */
+static const char *why_not(int fd)
+{
+	struct pollfd state = { .fd = fd, .events = POLLPRI };
+
+	if (has_ended(fd))
+		return "an end of it was shut down or closed";
+	if (poll(&state, 1, 0) != 0)
+		return "it has urgent data";
+	return file_option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0 ? NULL : "it has SO_PEEK_OFF";
 }
 
 /* IPv4 as mapped to IPv6, because one end may use that. */
@@ -184,15 +198,16 @@ static bool name_tcp(int fd, struct group_end *end)
 	       name_address(&end->own, &own, network) && name_address(&end->other, &other, network);
 }
 
-static bool name_unix(const struct file *f, struct group_end *end)
+static void name_unix(const struct file *f, struct group_end *end)
 {
 	end->own = (struct avc_end_name){ .where = f->ino, .protocol = PROTOCOL_UNIX };
 	end->other = (struct avc_end_name){ .where = f->socket->partner,
 					    .protocol = PROTOCOL_UNIX };
-	return true;
 }
 
-static bool count_tcp_once(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
+static const char uncounted[] = "its bytes could not be counted";
+
+static const char *count_tcp_once(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
 {
 	struct tcp_info info = { 0 };
 	socklen_t bytes = sizeof info;
@@ -202,27 +217,31 @@ static bool count_tcp_once(int fd, uint64_t *written, uint64_t *received, uint64
 	uint64_t sent;
 
 	if (getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &bytes) ||
-	    bytes < offsetof(struct tcp_info, tcpi_dsack_dups) || info.tcpi_state != 1 ||
-	    ioctl(fd, SIOCINQ, &waiting) || ioctl(fd, SIOCOUTQ, &going) ||
-	    (getsockopt(fd, IPPROTO_TCP, TCP_ULP, layer, &layer_bytes) == 0 && layer_bytes))
-		return false;
+	    bytes < offsetof(struct tcp_info, tcpi_dsack_dups) || ioctl(fd, SIOCINQ, &waiting) ||
+	    ioctl(fd, SIOCOUTQ, &going))
+		return "the kernel does not tell its state";
+	if (info.tcpi_state != 1)
+		return "it is not established";
+	if (getsockopt(fd, IPPROTO_TCP, TCP_ULP, layer, &layer_bytes) == 0 && layer_bytes)
+		return "it has kernel TLS, or is MPTCP";
 	sent = info.tcpi_bytes_sent - info.tcpi_bytes_retrans + info.tcpi_notsent_bytes;
 	*written = info.tcpi_bytes_acked + (uint64_t)going;
 	*received = info.tcpi_bytes_received;
 	*unread = (uint64_t)waiting;
 	if (*written == sent + SYN_BYTES)
 		*written = sent;
-	return *written == sent;
+	return *written == sent ? NULL : uncounted;
 }
 
-/* Bytes written by the application, received, and received but unread; false: unknown.  An
- * acknowledgement may come between two questions to the kernel: the other end may still run. */
-static bool count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
+/* Bytes written by the application, received, and received but unread; not NULL: unknown, and why.
+ * An acknowledgement may come between two questions to the kernel: the other end may still run. */
+static const char *count_tcp(int fd, uint64_t *written, uint64_t *received, uint64_t *unread)
 {
-	for (int tries = 0; tries < COUNT_TRIES; tries++)
-		if (count_tcp_once(fd, written, received, unread))
-			return true;
-	return false;
+	const char *why = uncounted;
+
+	for (int tries = 0; why == uncounted && tries < COUNT_TRIES; tries++)
+		why = count_tcp_once(fd, written, received, unread);
+	return why;
 }
 
 static void show(struct group_end *end, struct avc_board *board, uint64_t written)
@@ -270,26 +289,40 @@ static void drop_end(struct group_end *end)
 
 /* ---- a line ------------------------------------------------------------------------------------ */
 
+static const char *examine(struct group_end *end, uint64_t *written)
+{
+	uint64_t ignored;
+	const char *why;
+
+	if (end->fd < 0)
+		return "it could not be looked at";
+	why = why_not(end->fd);
+	if (end->file->socket->domain == AF_UNIX) {
+		name_unix(end->file, end);
+		return why;
+	}
+	if (!name_tcp(end->fd, end) && !why)
+		why = "its addresses are unknown";
+	return why ? why : count_tcp(end->fd, written, &ignored, &ignored);
+}
+
+/* Also one that cannot be kept: so a rollback can say why. */
 static void add_end(struct group_ends *ends, const struct file *f, int pidfd,
 		    struct avc_board *board)
 {
 	struct group_end *end = &ends->end[ends->count];
-	uint64_t written = 0, ignored;
+	uint64_t written = 0;
 
 	if (ends->count == ENDS_MAX || find_end(ends, f->ino))
 		return;
 	*end = (struct group_end){ .ino = f->ino, .file = f, .shown = -1 };
 	end->fd = proc_borrow_fd(pidfd, f->fd);
-	if (end->fd >= 0 && is_whole(end->fd) &&
-	    (f->socket->domain == AF_UNIX
-		     ? name_unix(f, end)
-		     : name_tcp(end->fd, end) &&
-			       count_tcp(end->fd, &written, &ignored, &ignored))) {
-		show(end, board, written);
-		ends->count++;
-	} else {
+	end->why = examine(end, &written);
+	if (end->why)
 		drop_end(end);
-	}
+	else
+		show(end, board, written);
+	ends->count++;
 }
 
 struct group_ends *files_ends_new(const struct image *image, uint32_t images,
@@ -329,7 +362,7 @@ static bool has_come(const struct group_end *end, uint64_t written, uint64_t *un
 {
 	uint64_t ignored, received;
 
-	while (count_tcp(end->fd, &ignored, &received, unread)) {
+	while (!count_tcp(end->fd, &ignored, &received, unread)) {
 		if (received == written)
 			return true;
 		if (now_ns() > until)
@@ -371,6 +404,8 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 		uint64_t unread = 0;
 		int waiting = 0;
 
+		if (end->why)
+			continue;
 		end->why = other ? "what was in flight cannot be kept"
 				 : "its other end is not a connection of the group's";
 		if (other && is_tcp(end)) {
@@ -443,9 +478,10 @@ static bool try_show(struct group_end *end, struct avc_board *board)
 
 	if (!end->kept)
 		return false; /* end->why says it */
-	end->why = "it was closed, shut down or changed since";
-	if (end->bytes > CONTENT_MAX || !is_whole(end->fd) ||
-	    (is_tcp(end) && !count_tcp(end->fd, &written, &ignored, &ignored)))
+	end->why = why_not(end->fd);
+	if (!end->why && is_tcp(end))
+		end->why = count_tcp(end->fd, &written, &ignored, &ignored);
+	if (end->why || end->bytes > CONTENT_MAX)
 		return false;
 	end->why = "its other end cannot be restored";
 	if (!is_tcp(end))
@@ -485,6 +521,7 @@ void files_ends_show(struct group_ends *ends, struct image *image, uint32_t imag
 			if (end) {
 				end->fd = fd;
 				end->file = f;
+				end->over = has_ended(fd); /* before any member resets it */
 				if (!try_show(end, board))
 					end->shown = -1;
 			} else {
@@ -542,7 +579,7 @@ static bool begin_mend(struct group_end *end, struct avc_end *copy, const struct
 	if (!is_tcp(end))
 		return true;
 	/* Up to what the other end had written before any of this is sent, and no further. */
-	if (!count_tcp(end->fd, &ignored, &received, &unread) || copy->written + unread < received)
+	if (count_tcp(end->fd, &ignored, &received, &unread) || copy->written + unread < received)
 		return false;
 	end->surplus = copy->written + unread - received;
 	return true;
@@ -584,12 +621,38 @@ static void mend_all(struct group_ends *ends, struct avc_end *others, enum mend_
 	}
 }
 
-uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
-			 const struct avc_config *config, struct avc_board *board, const char **why)
+static void say_address(char *text, const struct avc_end_name *name)
+{
+	const bool v4 = !memcmp(name->address, "\0\0\0\0\0\0\0\0\0\0\xff\xff", 12);
+	char address[INET6_ADDRSTRLEN] = "?";
+
+	if (v4)
+		inet_ntop(AF_INET, name->address + 12, address, sizeof address);
+	else
+		inet_ntop(AF_INET6, name->address, address, sizeof address);
+	snprintf(text, END_TEXT, v4 ? "%s:%u" : "[%s]:%u", address, ntohs((uint16_t)name->port));
+}
+
+static void say_why(struct group_ended *ended, const struct group_end *end)
+{
+	char own[END_TEXT], other[END_TEXT];
+
+	ended->count++;
+	say_address(own, &end->own);
+	say_address(other, &end->other);
+	if (is_tcp(end))
+		snprintf(ended->why, sizeof ended->why, "%s (%s to %s)", end->why, own, other);
+	else
+		snprintf(ended->why, sizeof ended->why, "%s (descriptor %d)", end->why,
+			 end->file->fd);
+}
+
+struct group_ended files_ends_mend(struct group_ends *ends, struct image *image, uint32_t images,
+				   const struct avc_config *config, struct avc_board *board)
 {
 	struct avc_end *others = ends ? calloc(ends->count + 1, sizeof *others) : NULL;
 	enum mend_state *states = ends ? calloc(ends->count + 1, sizeof *states) : NULL;
-	uint32_t ended = 0;
+	struct group_ended ended = { 0 };
 
 	for (uint32_t i = 0; others && states && i < ends->count; i++)
 		states[i] = ends->end[i].fd >= 0 && begin_mend(&ends->end[i], &others[i], board)
@@ -601,20 +664,18 @@ uint32_t files_ends_mend(struct group_ends *ends, struct image *image, uint32_t 
 		struct group_end *end = &ends->end[i];
 		const enum mend_state state = others && states ? states[i] : APART;
 
-		const uint32_t before = ended;
 		if (end->fd < 0)
 			continue;
 		if (state == MENDED) {
 			let_go_on(image, images, end->ino);
 		} else if (state != APART && is_tcp(end)) {
 			end->why = "what was in flight could not be put back";
-			ended += file_reset_tcp(end->fd) == NULL;
+			(void)file_reset_tcp(end->fd);
 		} else {
 			forget(end->fd, end->file, config);
-			ended += !is_whole(end->fd);
 		}
-		if (ended > before)
-			*why = end->why;
+		if (!end->over && has_ended(end->fd))
+			say_why(&ended, end);
 		drop_end(end);
 	}
 	free(others);

@@ -71,9 +71,8 @@ struct group_death {
 	struct avc_report report;
 	enum avc_reason reason;
 	uint64_t ticket, until_ns;
-	uint32_t had;    /* generations when it died                         */
-	uint32_t ended;  /* connections that could not be restored with it   */
-	const char *why; /* ... one of them                                  */
+	uint32_t had; /* generations when it died                         */
+	struct group_ended ended;
 };
 
 struct avc_guard {

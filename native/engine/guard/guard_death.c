@@ -226,10 +226,10 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			break;
 		}
 		budget_begin(say_working, &guard->channel);
-		if (together && guard->dead.ended)
+		if (together && guard->dead.ended.count)
 			fail(&restore.notes, AVC_UNSUPPORTED, 0, guard->main.inside,
 			     "restore descriptors", "", "%u of its connections have ended: %s",
-			     guard->dead.ended, guard->dead.why);
+			     guard->dead.ended.count, guard->dead.ended.why);
 
 		/* Written since the newest means written since all others, also where that cannot
 		 * be seen any more. */

@@ -312,8 +312,7 @@ static int meet_shown(struct avc_guard *guard, struct avc_error *err)
 	files_ends_show(to->ends, to->image, to->images, &guard->config, board);
 	if (meet(guard, RECALL_SHOWN, DEAD_NS, err))
 		return -1;
-	guard->dead.ended = files_ends_mend(to->ends, to->image, to->images, &guard->config, board,
-					    &guard->dead.why);
+	guard->dead.ended = files_ends_mend(to->ends, to->image, to->images, &guard->config, board);
 	return 0;
 }
 
