@@ -408,8 +408,10 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 
 	rt_priority_begin();
 	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
-	start = now_ns();
-	result = stop_and_begin(freeze, err);
+	result = freeze_stop_prepare(freeze->tree, err);
+	start = generation->taken_ns = now_ns();
+	if (!result)
+		result = stop_and_begin(freeze, err);
 	/* That was for stopping; the clone of a big process may take longer. */
 	tracee_deadline_set(freeze->timer,
 			    STOPPED_NS + CLONES * freeze_clones_time_ns(freeze->tree));

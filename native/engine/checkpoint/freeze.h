@@ -13,6 +13,8 @@
 
 /* ---- freeze_stop.c ------------------------------------------------------------------------ */
 
+/* Before anything is stopped.  Fails if a signal is killing one of them. */
+int freeze_stop_prepare(struct tree *tree, struct avc_error *err) warn_unused;
 /* Those that are infected; another child may have to execute a program before its parent can be
  * stopped (vfork(2)). */
 int freeze_stop_known(struct tree *tree, struct avc_error *err) warn_unused;

@@ -48,7 +48,7 @@ static int await(const struct tree *tree, int (*wait)(struct process *, struct a
 	return 0;
 }
 
-int freeze_stop_known(struct tree *tree, struct avc_error *err)
+int freeze_stop_prepare(struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->processes; i++)
 		process_stop_begin(tree->process[i]);
@@ -58,6 +58,11 @@ int freeze_stop_known(struct tree *tree, struct avc_error *err)
 		if (proc_is_dying(tree->process[i]->stat_fd))
 			return fail(err, AVC_GONE, 0, tree->process[i]->pid, "stop", "",
 				    "a signal is killing it");
+	return 0;
+}
+
+int freeze_stop_known(struct tree *tree, struct avc_error *err)
+{
 	/* So that they stop at the same time, and not one after the other. */
 	if (interrupt(tree, false)) {
 		if (await(tree, process_await, err))

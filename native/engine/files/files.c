@@ -25,6 +25,7 @@
 
 #define ROOM_SPARE 64
 #define OURS_MAX 1024 /* duplicates at a time                                          */
+#define READ_TOGETHER 128
 
 struct look {
 	struct files *files, *known;
@@ -329,7 +330,7 @@ static bool copy_frozen(const struct look *look, const struct file *is, struct f
 
 	/* For locks and watches there is more to read. */
 	if (!k || !is->known || k->remote || k->lock_count || is->lock_count || is->watch_count ||
-	    is->mark_count || k->kind != is->kind || k->id != is->id ||
+	    is->mark_count || !files_same_object(k, is) ||
 	    (is->kind == FILE_REGULAR && is->told_ino) ||
 	    !((look->trusts && k->heir) || is_parents(look, is)))
 		return false;
@@ -686,10 +687,64 @@ static void copy_content(const struct files *parent, struct file *f)
 	f->content_bytes = from->content_bytes;
 }
 
-static void keep_content(const struct image *image, struct file *f, struct scratch *scratch)
+/* Ends that are read together. */
+struct reading {
+	const struct image *image;
+	struct scratch *scratch;
+	struct pollfd end[READ_TOGETHER];
+	struct file *file[READ_TOGETHER];
+	uint32_t count;
+	uint32_t begun, kept; /* of all files: [kept, begun) have duplicates            */
+};
+
+/* Most duplicates are numbered one after the other. */
+static void drop_duplicates(struct reading *reading)
 {
-	struct process *process = image->process;
-	struct pollfd end = { .events = POLLIN | POLLRDHUP };
+	struct file *file = reading->image->files->file;
+	int first = 0, next = 0; /* [first, next) */
+
+	for (; reading->kept < reading->begun; reading->kept++) {
+		const int fd = file[reading->kept].ours;
+
+		file[reading->kept].ours = 0;
+		if (fd <= 0)
+			continue;
+		if (fd != next) {
+			if (first < next)
+				syscall(SYS_close_range, first, next - 1, 0);
+			first = fd;
+		}
+		next = fd + 1;
+	}
+	if (first < next)
+		syscall(SYS_close_range, first, next - 1, 0);
+}
+
+static void keep_end(struct reading *reading, struct file *f, short revents)
+{
+	struct files *files = reading->image->files;
+
+	if (!revents)
+		return;
+	if (revents & POLLRDHUP && f->socket)
+		f->socket->shut |= SHUT_IN;
+	f->ended = revents & POLLHUP && !files_other_end(files, f);
+	if (revents & POLLIN && (f->ended || may_be_ours(files, f)))
+		file_keep_content(reading->image->process, f->ours, f, reading->scratch);
+}
+
+static void keep_gathered(struct reading *reading)
+{
+	if (reading->count && poll(reading->end, reading->count, 0) > 0)
+		for (uint32_t i = 0; i < reading->count; i++)
+			keep_end(reading, reading->file[i], reading->end[i].revents);
+	reading->count = 0;
+	drop_duplicates(reading);
+}
+
+static void keep_content(struct reading *reading, struct file *f)
+{
+	const struct image *image = reading->image;
 
 	/* Once for each object, from an end that can be read. */
 	if ((f->kind == FILE_PIPE && (f->flags & O_ACCMODE) == O_WRONLY) || f->shared != f->fd ||
@@ -704,15 +759,14 @@ static void keep_content(const struct image *image, struct file *f, struct scrat
 		return;
 	}
 	if (f->ours <= 0)
-		f->ours = proc_borrow_fd(process->pidfd, f->fd);
-	end.fd = f->ours;
-	if (f->ours < 0 || poll(&end, 1, 0) != 1)
+		f->ours = proc_borrow_fd(image->process->pidfd, f->fd);
+	if (f->ours < 0)
 		return;
-	if (end.revents & POLLRDHUP && f->socket)
-		f->socket->shut |= SHUT_IN;
-	f->ended = end.revents & POLLHUP && !files_other_end(image->files, f);
-	if (end.revents & POLLIN && (f->ended || may_be_ours(image->files, f)))
-		file_keep_content(process, f->ours, f, scratch);
+	reading->end[reading->count] = (struct pollfd){ .fd = f->ours,
+							.events = POLLIN | POLLRDHUP };
+	reading->file[reading->count++] = f;
+	if (reading->count == READ_TOGETHER)
+		keep_gathered(reading);
 }
 
 static void drop_ours(struct file *f)
@@ -724,13 +778,15 @@ static void drop_ours(struct file *f)
 
 static void keep_contents(const struct image *image, struct scratch *scratch)
 {
-	for (uint32_t i = 0; i < image->files->count; i++) {
-		struct file *f = &image->files->file[i];
+	struct reading reading = { .image = image, .scratch = scratch };
+
+	while (reading.begun < image->files->count) {
+		struct file *f = &image->files->file[reading.begun++];
 
 		if (budget_step())
-			keep_content(image, f, scratch);
-		drop_ours(f);
+			keep_content(&reading, f);
 	}
+	keep_gathered(&reading);
 }
 
 struct linux_dirent64 {

@@ -436,15 +436,23 @@ int thread_check_confined(const struct process *process, struct thread *thread,
 static int look_at_seccomp(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	struct parasite *parasite = &process->parasite;
+	long options;
+	bool plain;
 
 	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as found by a checkpoint */
 		thread->seccomp = SECCOMP_SUPERVISED;
 	if (read_seccomp(process, thread, err))
 		return -1;
 	parasite->seccomp = thread->seccomp;
-	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL, options_of(parasite, false)))
+	options = options_of(parasite, false);
+	plain = options == (long)TRACE_OPTIONS_APP;
+	/* A supervised one changes them at each call (seccomp_at_call()). */
+	if (plain && thread->plain && thread->seccomp != SECCOMP_SUPERVISED)
+		return 0;
+	if (ptrace(PTRACE_SETOPTIONS, thread->tid, NULL, options))
 		return fail_errno(err, thread->tid, "run injected code", "ptrace(SETOPTIONS)",
 				  "it has gone");
+	thread->plain = plain;
 	return 0;
 }
 

@@ -70,6 +70,7 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 {
 	int errnum;
 
+	thread->plain = false;
 	if (ptrace(PTRACE_SEIZE, thread->tid, NULL, (long)TRACE_OPTIONS_APP)) {
 		if (errno == ESRCH)
 			return fail(err, AVC_GONE, ESRCH, thread->tid, "stop", "ptrace(SEIZE)",
@@ -87,6 +88,7 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 			return -1;
 	}
 	thread->attached = true;
+	thread->plain = true;
 	thread->stopped = false;
 	if (ptrace(PTRACE_INTERRUPT, thread->tid, NULL, NULL))
 		return fail_errno(err, thread->tid, "stop", "ptrace(INTERRUPT)", "it has ended");
@@ -102,6 +104,7 @@ static struct thread *adopt(struct process *process, pid_t tid, struct avc_error
 		born = thread_add(process, tid, err);
 	if (born && !born->attached) {
 		born->attached = true;
+		born->plain = false;
 		born->stopped = false;
 	}
 	return born;

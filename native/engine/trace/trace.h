@@ -103,9 +103,10 @@ struct thread {
 	pid_t tid; /* in our namespace                                 */
 	bool seen; /* there at this freeze                             */
 	bool attached, stopped;
-	int stop_signal;               /* the process is stopped by job control           */
-	int block;                     /* of the slot, main thread 0; -1: not in the image */
-	bool borrowed;                 /* sent into the parasite; regs and sigmask are its own  */
+	bool plain;      /* traced with TRACE_OPTIONS_APP, unless it is supervised    */
+	int stop_signal; /* the process is stopped by job control           */
+	int block;       /* of the slot, main thread 0; -1: not in the image */
+	bool borrowed;   /* sent into the parasite; regs and sigmask are its own  */
 	struct parasite *borrowed_for; /* NULL: before there is one (infect.c)              */
 	avc_remote stub;               /* where it has been sent instead                     */
 	uint32_t filters_known;        /* of seccomp, at the last check                   */
