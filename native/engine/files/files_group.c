@@ -481,7 +481,9 @@ static bool try_show(struct group_end *end, struct avc_board *board)
 	end->why = why_not(end->fd);
 	if (!end->why && is_tcp(end))
 		end->why = count_tcp(end->fd, &written, &ignored, &ignored);
-	if (end->why || end->bytes > CONTENT_MAX)
+	if (!end->why && end->bytes > CONTENT_MAX)
+		end->why = "too much was in flight";
+	if (end->why)
 		return false;
 	end->why = "its other end cannot be restored";
 	if (!is_tcp(end))
