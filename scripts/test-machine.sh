@@ -53,8 +53,12 @@ install_checkout() {
 	*) in_world sh -c 'make -C /opt/avckpt setup-build && make -s -C /opt/avckpt/tests/victims' || return ;;
 	esac
 	case "$*" in
+	*test_docker*) in_world sh -c 'apt-get update -q && /opt/avckpt/scripts/setup-docker.sh' || return ;;
+	esac
+	case "$*" in
 	*test_upgrade*)
 		in_world make -C /opt/avckpt deb || return
+		scripts/make-deb-image.sh || return
 		cp -u "$BUILD"/avckpt-sidecar-image_*.deb "$CHECKOUT/build/" || return
 		;;
 	esac

@@ -19,14 +19,14 @@ from typing import Any
 import pytest
 
 from testkit.family import Member, look
-from testkit.harness import Container, ContainerFactory, Podman, Sidecar, wait_until
+from testkit.harness import SLOWNESS, Container, ContainerFactory, Podman, Sidecar, wait_until
 from testkit.procfs import below
 
 IMAGE = "localhost/avckpt-trees:latest"
 LONG = os.environ.get("AVCKPT_LONG") == "1"
 """`make test-trees`."""
 LABELS = {"interval": "100ms", "restore.max": "64/1s"}
-RESTORE_S = 30.0
+RESTORE_S = 30.0 * SLOWNESS
 
 
 def trees_image(podman: Podman) -> str:
@@ -54,7 +54,7 @@ class Tree:
             except LookupError:
                 return 0
 
-        return wait_until(find, 10, f"the application of {self.container.name} is there", every_s=0.005)
+        return wait_until(find, RESTORE_S, f"the application of {self.container.name} is there", every_s=0.005)
 
     def members(self) -> list[Member]:
         """The application's processes."""
@@ -94,7 +94,7 @@ def start_tree(
         *command, labels={**LABELS, **(labels or {})}, options=options, image=trees_image(factory.podman)
     )
     tree = Tree(sidecar, made)
-    sidecar.wait_generation(made, 2, 60)
+    sidecar.wait_generation(made, 2, 2 * RESTORE_S)
     return tree
 
 
@@ -133,7 +133,7 @@ class Load:
         for thread in self._threads:
             thread.join()
 
-    def wait_answers(self, n: int, timeout_s: float = 30.0) -> None:
+    def wait_answers(self, n: int, timeout_s: float = RESTORE_S) -> None:
         """For `n` more right answers."""
         wanted = self.answers + n
         wait_until(lambda: self.answers >= wanted or self.wrong, timeout_s, f"{n} answers of {self.host}:{self.port}")

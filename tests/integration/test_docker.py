@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from testkit.harness import ROOT, wait_until
+from testkit.harness import ROOT, SLOWNESS, wait_until
 from testkit.local_sidecar import LocalSidecar, local_sidecar
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 DEBIANS = ROOT / "build/docker/root/usr"
 COUNT = "import itertools, time\nfor n in itertools.count():\n    print(n, flush=True)\n    time.sleep(0.02)"
+PATIENCE_S = 20 * SLOWNESS
 LABELS = {"enable": "true", "interval": "50ms", "restore.max": "64/1s"}
 
 pytestmark = [
@@ -56,18 +57,22 @@ class Docker:
         command += ["--pidfile", f"{self.folder}/pid", "--iptables=false", "--ip6tables=false", "--bridge=none"]
         with (self.folder / "log").open("wb") as log:
             daemon = subprocess.Popen(command, env=self.env, stdout=log, stderr=log)
-        wait_until(lambda: not self.run("info", check=False).startswith("?"), 30, "dockerd answers")
+        wait_until(lambda: not self.run("info", check=False).startswith("?"), PATIENCE_S, "dockerd answers")
         return daemon
 
     def run(self, *args: str, check: bool = True) -> str:
-        done = subprocess.run(["docker", *args], env=self.env, capture_output=True, text=True, check=False, timeout=90)
+        done = subprocess.run(
+            ["docker", *args], env=self.env, capture_output=True, text=True, check=False, timeout=4 * PATIENCE_S
+        )
         if check:
             assert done.returncode == 0, done.stderr
         return done.stdout.strip() if done.returncode == 0 else f"? {done.stderr}"
 
     def ctr(self, *args: str) -> str:
         command = ["ctr", "-a", f"{self.folder}/exec/containerd/containerd.sock", "-n", "avckpt-test", *args]
-        done = subprocess.run(command, env=self.env, capture_output=True, text=True, check=False, timeout=90)
+        done = subprocess.run(
+            command, env=self.env, capture_output=True, text=True, check=False, timeout=4 * PATIENCE_S
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -82,9 +87,9 @@ class Docker:
 
     def crash(self, name: str, restores: int) -> None:
         fit = lambda: self.row(name).get("state") == "protected" and self.row(name)["restores"] == restores - 1  # noqa: E731
-        wait_until(fit, 20, f"{name} is protected")
+        wait_until(fit, PATIENCE_S, f"{name} is protected")
         os.kill(int(str(self.row(name)["app_pid"])), (signal.SIGSEGV, signal.SIGKILL)[restores % 2])
-        wait_until(lambda: self.row(name).get("restores") == restores, 20, f"{name} is restored")
+        wait_until(lambda: self.row(name).get("restores") == restores, PATIENCE_S, f"{name} is restored")
 
 
 @pytest.fixture(scope="module")
@@ -95,14 +100,14 @@ def docker(tmp_path_factory: pytest.TempPathFactory, podman: Podman, base_image:
         made = Docker(folder, sidecar)
         daemon = made.start()
         try:
-            podman.run("save", "-o", str(folder / "base.tar"), base_image, timeout_s=60)
+            podman.run("save", "-o", str(folder / "base.tar"), base_image, timeout_s=4 * PATIENCE_S)
             made.run("load", "-i", str(folder / "base.tar"))
             yield made
         finally:
             for left in made.run("ps", "-aq", check=False).split():
                 made.run("rm", "-f", left, check=False)
             daemon.terminate()
-            daemon.wait(30)
+            daemon.wait(PATIENCE_S)
 
 
 def test_a_container_of_dockers_lives_through_crashes(docker: Docker, base_image: str) -> None:
@@ -112,14 +117,16 @@ def test_a_container_of_dockers_lives_through_crashes(docker: Docker, base_image
         docker.crash("web", restores)
     state = "{{.State.Status}} {{.RestartCount}}"
     assert docker.run("inspect", "-f", state, "web") == "running 0"
-    wait_until(lambda: docker.run("inspect", "-f", "{{.State.Health.Status}}", "web") == "healthy", 20, "healthy")
+    wait_until(
+        lambda: docker.run("inspect", "-f", "{{.State.Health.Status}}", "web") == "healthy", PATIENCE_S, "healthy"
+    )
     assert docker.run("logs", "web").split().count("0") == 1
     assert docker.run("exec", "web", "echo", "in it") == "in it"
     docker.run("restart", "-t", "5", "web")
-    wait_until(lambda: docker.row("web").get("state") == "protected", 20, "protected after docker restart")
+    wait_until(lambda: docker.row("web").get("state") == "protected", PATIENCE_S, "protected after docker restart")
     docker.run("stop", "-t", "9", "web")
     assert docker.run("inspect", "-f", "{{.State.ExitCode}}", "web") == str(128 + signal.SIGTERM)
-    wait_until(lambda: not docker.row("web"), 10, "its end is known")
+    wait_until(lambda: not docker.row("web"), PATIENCE_S, "its end is known")
     assert not list((docker.sidecar.run_dir / "containers").iterdir())
 
 
@@ -145,6 +152,6 @@ def test_a_container_of_containerds_by_its_annotations(docker: Docker, base_imag
             docker.crash("lidar", restores)
     finally:
         docker.ctr("tasks", "kill", "-s", "KILL", "lidar")
-        wait_until(lambda: "STOPPED" in docker.ctr("tasks", "ls"), 10, "it has ended")
+        wait_until(lambda: "STOPPED" in docker.ctr("tasks", "ls"), PATIENCE_S, "it has ended")
         docker.ctr("tasks", "rm", "lidar")
         docker.ctr("containers", "rm", "lidar")

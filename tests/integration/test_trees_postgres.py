@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from testkit.harness import Container, ContainerFactory, Sidecar, wait_until
-from testkit.trees import LONG, Tree, trees_image, write_files
+from testkit.trees import LONG, RESTORE_S, Tree, trees_image, write_files
 
 pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; "
@@ -117,14 +117,16 @@ class Database:
     @property
     def is_ready(self) -> bool:
         done = self.clients.exec(
-            *(f"{BIN}/pg_isready", "-q", "-h", "127.0.0.1", "-p", str(self.port)), check=False, timeout_s=20
+            *(f"{BIN}/pg_isready", "-q", "-h", "127.0.0.1", "-p", str(self.port)), check=False, timeout_s=RESTORE_S
         )
         return done.status == 0
 
     def wait_ready(self) -> None:
-        wait_until(lambda: self.is_ready, 60, f"PostgreSQL answers; its log: {self.server.logs()[-800:]}", 0.2)
+        wait_until(
+            lambda: self.is_ready, 2 * RESTORE_S, f"PostgreSQL answers; its log: {self.server.logs()[-800:]}", 0.2
+        )
 
-    def run(self, program: str, *args: str, timeout_s: float = 120.0) -> str:
+    def run(self, program: str, *args: str, timeout_s: float = 4 * RESTORE_S) -> str:
         """Runs a client program that must succeed."""
         connection = ("-h", "127.0.0.1", "-p", str(self.port), "-U", "postgres")
         return self.clients.exec(f"{BIN}/{program}", *connection, *args, timeout_s=timeout_s).stdout
@@ -134,7 +136,7 @@ class Database:
 
     def wait_protected(self) -> Tree:
         """Waits for two generations of the server that runs now."""
-        self.sidecar.wait_generation(self.server, 2, 60)
+        self.sidecar.wait_generation(self.server, 2, 2 * RESTORE_S)
         return Tree(self.sidecar, self.server)
 
     def check_contents(self) -> None:
@@ -253,8 +255,8 @@ def test_under_write_load_it_starts_cold_and_loses_nothing(start: Callable[..., 
             ledger.write_until(lambda end=enough, least=count: ended(ledger, end, least))  # type: ignore[misc]
             os.kill(tree.main, signal.SIGKILL)
             database.clients.exec("pkill", "pgbench", check=False)
-            load.wait(30)
-        wait_until(lambda old=init: database.is_ready and settled(database, old), 90, "it is back")  # type: ignore[misc]
+            load.wait(RESTORE_S)
+        wait_until(lambda old=init: database.is_ready and settled(database, old), 3 * RESTORE_S, "it is back")  # type: ignore[misc]
         restores += database.server.pid == init
         ledger.check()
         sums = balances(database)

@@ -137,7 +137,7 @@ def test_exec_sessions_survive(sidecar: Sidecar, container: ContainerFactory, tm
         assert session.stdout.readline() == "LAST\n"
         session.stdin.close()
         assert session.stdout.readline() == "end\n"
-        assert session.wait(10) == 0
+        assert session.wait(RESTORE_S) == 0
     entry = sidecar.find(tree.container)
     assert entry is not None
     assert entry["state"] == "protected"
@@ -151,7 +151,7 @@ def test_a_terminal_with_jobs(sidecar: Sidecar, container: ContainerFactory) -> 
         options=["--interactive", "--tty"],
     )
     tree = Tree(sidecar, made)
-    sidecar.wait_generation(made, 2, 60)
+    sidecar.wait_generation(made, 2, 2 * RESTORE_S)
     with subprocess.Popen(
         ["script", "-qec", f"podman attach {made.name}", "/dev/null"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as terminal:
@@ -163,25 +163,25 @@ def test_a_terminal_with_jobs(sidecar: Sidecar, container: ContainerFactory) -> 
             terminal.stdin.flush()
 
         say("value=kept; sleep 1000 &")
-        wait_until(lambda: any(m.name == "sleep" for m in tree.members()), 10, "the job")
+        wait_until(lambda: any(m.name == "sleep" for m in tree.members()), RESTORE_S, "the job")
         tree.next_generation()
         before = tree.places()
         for n in range(3):
             tree.kill()
             assert tree.places() == before
             say(f"echo answer {n} $value $(jobs | grep -c Running)")
-            made.wait_for_log(f"answer {n} kept 1")
+            made.wait_for_log(f"answer {n} kept 1", RESTORE_S)
             tree.next_generation()
         say("fg")
-        wait_until(lambda: foreground(tree) == "sleep", 10, "the job is in the foreground")
+        wait_until(lambda: foreground(tree) == "sleep", RESTORE_S, "the job is in the foreground")
         tree.next_generation()
         tree.kill()
-        wait_until(lambda: foreground(tree) == "sleep", 10, "the job is in the foreground again")
+        wait_until(lambda: foreground(tree) == "sleep", RESTORE_S, "the job is in the foreground again")
         terminal.stdin.write(b"\x03")
         terminal.stdin.flush()
-        wait_until(lambda: foreground(tree) == "bash", 10, "^C has ended it")
+        wait_until(lambda: foreground(tree) == "bash", RESTORE_S, "^C has ended it")
         say("echo the end")
-        made.wait_for_log("\nthe end")
+        made.wait_for_log("\nthe end", RESTORE_S)
         terminal.kill()
 
 
