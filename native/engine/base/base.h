@@ -73,6 +73,11 @@ ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
  * and nothing has changed. */
 bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 
+/* ---- keyed_sum.c ------------------------------------------------------------ */
+
+/* Of `before` and the words, by a key of this process: SipHash-2-4. */
+uint64_t keyed_sum(uint64_t before, const uint64_t *words, size_t count);
+
 /* ---- heartbeat.c ------------------------------------------------------------ */
 
 /* Takes the memory for it, and closes the descriptor.  0 or -1. */

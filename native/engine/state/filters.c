@@ -51,16 +51,14 @@ static size_t programs; /* bytes                                                
 
 /* ---- while it is stopped ------------------------------------------------------------------ */
 
+/* A thread could install others with the same sum, if it could find some: so it has a key. */
 static uint64_t add_to_sum(uint64_t sum, const struct sock_filter *program, long count)
 {
-	uint64_t word;
+	uint64_t words[BPF_MAXINSNS];
 
-	_Static_assert(sizeof word == sizeof *program, "an instruction is a word");
-	for (long i = 0; i < count; i++) {
-		memcpy(&word, &program[i], sizeof word);
-		sum = (sum ^ word) * UINT64_C(0x100000001b3);
-	}
-	return sum * 31 + (uint64_t)count;
+	_Static_assert(sizeof *words == sizeof *program, "an instruction is a word");
+	memcpy(words, program, (size_t)count * sizeof *words);
+	return keyed_sum(sum, words, (size_t)count);
 }
 
 static long get(pid_t tid, uint32_t index, struct sock_filter *program)
