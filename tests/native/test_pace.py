@@ -37,7 +37,7 @@ def test_an_application_at_work_is_checkpointed_often_and_told_of_seldom(tmp_pat
         assert all(event["freeze_max_s"] >= event["freeze_s"] > 0 for event in told)
         assert all(0.02 <= event["interval_s"] <= 3 for event in told)
         gaps = [(b["at_ns"] - a["at_ns"]) / 1e9 for a, b in zip(told, told[1:])]
-        assert min(gaps) > 0.9, gaps
+        assert min(gaps) > 0.8, gaps  # they are a second apart, but not told at once
         victim.check()
 
 

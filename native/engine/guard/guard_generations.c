@@ -10,6 +10,7 @@
 #include "guard.h"
 
 #define CONTAINER_END_MS 20
+#define CONTAINER_ENDS_MS 1000
 #define LATE_SPARE_NS (1 * NS_PER_MS)
 #define ENDED_NS (50 * NS_PER_MS)
 #define ENDED_STEP_US 200
@@ -328,6 +329,12 @@ static bool has_ended(const struct generation *generation)
 	return false;
 }
 
+/* init has been killed, and may have to wait for a CPU. */
+static bool container_ends(const struct avc_guard *guard, int ms)
+{
+	return ms < CONTAINER_ENDS_MS && proc_is_killed(guard->channel.init);
+}
+
 /* Templates that were killed: by us, from inside the container or by the OOM killer. */
 void guard_reap_dead(struct avc_guard *guard)
 {
@@ -340,7 +347,7 @@ void guard_reap_dead(struct avc_guard *guard)
 
 	/* When the PID namespace ends, everything dies, init last, once we have reaped our tracees:
 	 * then lost generations are not reported.  A death of the app is handled at once. */
-	for (int ms = 0; ms < CONTAINER_END_MS; ms++) {
+	for (int ms = 0; ms < CONTAINER_END_MS || container_ends(guard, ms); ms++) {
 		(void)tracee_reap_ending();
 		for (uint32_t i = 0; i < guard->count; i++)
 			(void)spare_is_there(&guard->generations[i]);
