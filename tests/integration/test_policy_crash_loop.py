@@ -31,7 +31,7 @@ def poison(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> Any
 
 
 def test_a_poisoned_generation_is_left_for_an_older_one(poison: Any) -> None:
-    victim = poison(int(300 * SLOWNESS), {"interval": "1h", "restore.max": "4/60s"})
+    victim = poison(int(1000 * SLOWNESS), {"interval": "1h", "restore.max": "4/60s"})
     victim.checkpoint()
     os.kill(victim.app, signal.SIGUSR1)
     victim.checkpoint()  # before it crashes: this image is poisoned
