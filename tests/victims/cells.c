@@ -11,16 +11,13 @@
  *   strict    in strict mode (SECCOMP_MODE_STRICT), unless under a filter already
  *
  * With --forge there is only one, and when counter 1 is 1 it changes what the parasite keeps of its
- * filter, to be without it after a restore: the program, the call that installs it, or that call into another one,
- * which makes a folder at PATH.  Counter 3: how often it has.  Counter 4: of the six that come under
- * filters, how many have.
+ * filter, to be without it after a restore: the program, the call that installs it, or that call
+ * into another one, which makes a folder at PATH.  Counter 3: how often it has.  Counter 4: of the
+ * six that come under filters, how many have.
  */
-#include <linux/filter.h>
-#include <linux/seccomp.h>
 #include <pthread.h>
-#include <stddef.h>
-#include <sys/prctl.h>
 
+#include "confine.h"
 #include "parasite_place.h"
 
 #define MARK 0x5ec0de
@@ -33,20 +30,9 @@ static const char *path;
 static volatile bool first_is_there, done;
 static int to_strict[2], from_strict[2];
 
-static void install(struct sock_filter *filter, size_t length, unsigned int flags)
-{
-	struct sock_fprog program = { (unsigned short)length, filter };
-
-	must(!prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "PR_SET_NO_NEW_PRIVS");
-	must(!syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, flags, &program), "seccomp");
-}
-
 /* Little more than sleeping; `error` for everything else. */
 static void confine(bool more_filters, unsigned int flags)
 {
-#define ALLOW(nr)                                        \
-	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
-		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
 	struct sock_filter filter[] = {
 		BPF_STMT(BPF_LD | BPF_W | BPF_IMM, MARK),
 		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
@@ -62,7 +48,7 @@ static void confine(bool more_filters, unsigned int flags)
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM),
 	};
 
-	install(filter, COUNT(filter), flags);
+	install_filter(filter, COUNT(filter), flags);
 }
 
 static void forbid(long nr, int error)
@@ -76,7 +62,7 @@ static void forbid(long nr, int error)
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW),
 	};
 
-	install(filter, COUNT(filter), 0);
+	install_filter(filter, COUNT(filter), 0);
 }
 
 static void check(long nr, int error)
@@ -163,7 +149,7 @@ static void be_below(void)
 	struct sock_filter all[] = { BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW) };
 	const pid_t parent = getpid();
 
-	install(all, 1, SECCOMP_FILTER_FLAG_LOG);
+	install_filter(all, 1, SECCOMP_FILTER_FLAG_LOG);
 	count(4, 1);
 	if (fork() == 0) {
 		confine(false, 0);
@@ -227,7 +213,7 @@ static void be_forger(void)
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW),
 	};
 
-	install(filter, COUNT(filter), 0);
+	install_filter(filter, COUNT(filter), 0);
 	for (;;) {
 		check(SYS_getppid, EPERM);
 		if (board->counter[1])

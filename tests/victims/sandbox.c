@@ -5,17 +5,9 @@
  * threads see that the filter holds.  With --late it does so when it gets SIGUSR1, and counts
  * in counter 1 that it has.
  */
-#include <linux/filter.h>
-#include <linux/seccomp.h>
 #include <pthread.h>
-#include <stddef.h>
-#include <sys/prctl.h>
 
-#include "victim.h"
-
-#define ALLOW(nr)                                        \
-	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
-		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
+#include "confine.h"
 
 static bool kills;
 static volatile bool started, confined;
@@ -36,11 +28,8 @@ static void confine(void)
 		BPF_STMT(BPF_RET | BPF_K,
 			 kills ? SECCOMP_RET_KILL_PROCESS : SECCOMP_RET_ERRNO | EPERM),
 	};
-	struct sock_fprog program = { sizeof(filter) / sizeof(*filter), filter };
 
-	must(!prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "PR_SET_NO_NEW_PRIVS");
-	must(!syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC, &program),
-	     "seccomp");
+	install_filter(filter, sizeof(filter) / sizeof(*filter), SECCOMP_FILTER_FLAG_TSYNC);
 }
 
 static void check(void)

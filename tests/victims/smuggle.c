@@ -14,22 +14,15 @@
  *
  * smuggle outside PID ADDRESS: the accomplice, of the process PID, with FOLDER at ADDRESS there.
  */
-#include <linux/filter.h>
-#include <linux/seccomp.h>
 #include <pthread.h>
-#include <stddef.h>
-#include <sys/prctl.h>
 #include <sys/stat.h>
 
+#include "confine.h"
 #include "parasite_place.h"
 
 #define SLOTS 3 /* avckpt.keep is 2 in the tests */
 #define UNTOUCHED INT64_C(0x7777)
 #define LISTED 48
-
-#define ALLOW(nr)                                        \
-	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
-		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
 
 static const char *folder, *where;
 static struct inj_setup fake;
@@ -66,13 +59,11 @@ static void confine(bool little)
 		ALLOW(SYS_exit_group),
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM),
 	};
-	struct sock_fprog program = { sizeof(most) / sizeof(*most), most };
 
 	if (little)
-		program = (struct sock_fprog){ sizeof(few) / sizeof(*few), few };
-	must(!prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0), "PR_SET_NO_NEW_PRIVS");
-	must(!syscall(SYS_seccomp, SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC, &program),
-	     "seccomp");
+		install_filter(few, sizeof(few) / sizeof(*few), SECCOMP_FILTER_FLAG_TSYNC);
+	else
+		install_filter(most, sizeof(most) / sizeof(*most), SECCOMP_FILTER_FLAG_TSYNC);
 	CHECK(mkdir(folder, 0700) < 0 && errno == EPERM, "the filter does not hold");
 }
 
