@@ -75,8 +75,8 @@ bool make_room(void *array, uint32_t count, uint32_t *room, size_t bytes);
 
 /* ---- keyed_sum.c ------------------------------------------------------------ */
 
-/* Of `before` and the words, by a key of this process: SipHash-2-4. */
-uint64_t keyed_sum(uint64_t before, const uint64_t *words, size_t count);
+/* Of `before` and words of 64 bits, by a key of this process: SipHash-2-4. */
+uint64_t keyed_sum(uint64_t before, const void *words, size_t count);
 
 /* ---- heartbeat.c ------------------------------------------------------------ */
 

@@ -3,6 +3,7 @@
  * SipHash-2-4 (Aumasson, Bernstein: SipHash: a fast short-input PRF, 2012) of whole words, with a key
  * that only this process knows: nobody can choose two contents with the same sum.
  */
+#include <string.h>
 #include <sys/random.h>
 
 #include "base.h"
@@ -35,11 +36,11 @@ static void add(uint64_t v[4], uint64_t word)
 	v[0] ^= word;
 }
 
-uint64_t keyed_sum(uint64_t before, const uint64_t *words, size_t count)
+uint64_t keyed_sum(uint64_t before, const void *words, size_t count)
 {
 	static uint64_t key[2];
 	static bool known;
-	uint64_t v[4];
+	uint64_t v[4], word;
 
 	while (!known)
 		known = getrandom(key, sizeof key, 0) == sizeof key;
@@ -48,9 +49,11 @@ uint64_t keyed_sum(uint64_t before, const uint64_t *words, size_t count)
 	v[2] = key[0] ^ UINT64_C(0x6c7967656e657261);
 	v[3] = key[1] ^ UINT64_C(0x7465646279746573);
 	add(v, before);
-	for (size_t i = 0; i < count; i++)
-		add(v, words[i]);
-	add(v, (uint64_t)(count + 1) * sizeof *words << 56);
+	for (size_t i = 0; i < count; i++) {
+		memcpy(&word, (const char *)words + i * sizeof word, sizeof word);
+		add(v, word);
+	}
+	add(v, (uint64_t)(count + 1) * sizeof word << 56);
 	v[2] ^= 0xff;
 	rounds(v, 4);
 	return v[0] ^ v[1] ^ v[2] ^ v[3];

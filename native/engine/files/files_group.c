@@ -152,11 +152,11 @@ static bool has_ended(int fd)
 /* NULL: it can be kept. */
 static const char *why_not(int fd)
 {
-	struct pollfd state = { .fd = fd, .events = POLLPRI };
+	struct pollfd state = { .fd = fd, .events = POLLRDHUP | POLLPRI };
 
-	if (has_ended(fd))
+	if (poll(&state, 1, 0) < 0 || state.revents & ~POLLPRI)
 		return "an end of it was shut down or closed";
-	if (poll(&state, 1, 0) != 0)
+	if (state.revents)
 		return "it has urgent data";
 	return file_option(fd, SOL_SOCKET, SO_PEEK_OFF) < 0 ? NULL : "it has SO_PEEK_OFF";
 }

@@ -54,11 +54,8 @@ static size_t programs; /* bytes                                                
 /* A thread could install others with the same sum, if it could find some: so it has a key. */
 static uint64_t add_to_sum(uint64_t sum, const struct sock_filter *program, long count)
 {
-	uint64_t words[BPF_MAXINSNS];
-
-	_Static_assert(sizeof *words == sizeof *program, "an instruction is a word");
-	memcpy(words, program, (size_t)count * sizeof *words);
-	return keyed_sum(sum, words, (size_t)count);
+	_Static_assert(sizeof(uint64_t) == sizeof *program, "an instruction is a word");
+	return keyed_sum(sum, program, (size_t)count);
 }
 
 static long get(pid_t tid, uint32_t index, struct sock_filter *program)
