@@ -6,7 +6,8 @@
  * die at every restore, and no signal frame shows it (dying.c).
  *
  * Faults are counted for a moment before each checkpoint, of programs with such handlers only.  If
- * there was one, the checkpoint is put off: by then a dying program has ended.  Programs that live
+ * there was one, also during the freeze, the checkpoint is put off: by then a dying program has
+ * ended.  Programs that live
  * on after faults, as a matter of course, are soon not asked any more.
  */
 #include <signal.h>
@@ -51,10 +52,12 @@ void faults_arm(struct faults *faults, const struct tree *tree)
 	faults->armed = thread_events_enable(&faults->events, &FAULTS, tree);
 }
 
-static void disarm(struct faults *faults)
+void faults_disarm(struct faults *faults)
 {
 	thread_events_drop(&faults->events);
 	faults->armed = false;
+	faults->put_off = 0;
+	faults->heard_ns = 0;
 }
 
 void faults_settle(struct faults *faults, const struct tree *tree, uint64_t next_ns)
@@ -65,23 +68,27 @@ void faults_settle(struct faults *faults, const struct tree *tree, uint64_t next
 	if (faults->survived < SURVIVED_MAX && next_ns < now_ns() + LISTEN_NS)
 		faults_arm(faults, tree); /* there may be new processes */
 	else
-		disarm(faults);
+		faults_disarm(faults);
 }
 
 bool faults_heard(struct faults *faults)
 {
-	return faults->armed && thread_events_heard(&faults->events);
+	if (!faults->armed || !thread_events_heard(&faults->events))
+		return false;
+	faults->heard_ns = now_ns();
+	return true;
 }
 
 uint64_t faults_put_off(struct faults *faults, uint64_t now)
 {
 	const bool heard = faults_heard(faults);
+	const uint64_t until = faults->heard_ns ? faults->heard_ns + LISTEN_NS : 0;
 
-	if (heard && ++faults->put_off <= PUT_OFF_MAX)
-		return now + LISTEN_NS;
+	if (now < until && ++faults->put_off <= PUT_OFF_MAX)
+		return until;
 	faults->survived += faults->put_off != 0;
 	if (heard)
-		disarm(faults); /* there are always some */
+		faults_disarm(faults); /* there are always some */
 	return 0;
 }
 

@@ -61,6 +61,7 @@ struct output {
 struct faults {
 	struct thread_events events;
 	bool armed;
+	uint64_t heard_ns; /* the last one; 0: none since it was armed              */
 	uint32_t put_off;  /* the checkpoint that is due: so many times      */
 	uint32_t survived; /* checkpoints that were put off, and then taken  */
 };
@@ -276,7 +277,9 @@ void faults_learn(struct faults *faults);
 /* When to begin counting before a checkpoint that is due then; UINT64_MAX: need not. */
 uint64_t faults_due(const struct faults *faults, const struct tree *tree, uint64_t checkpoint_ns);
 void faults_arm(struct faults *faults, const struct tree *tree);
-/* A checkpoint has been taken or missed, or the app restored; the next one is due then. */
+/* What has been heard is of no importance any more. */
+void faults_disarm(struct faults *faults);
+/* A checkpoint has been taken or missed; the next one is due then. */
 void faults_settle(struct faults *faults, const struct tree *tree, uint64_t next_ns);
 /* Whether there was one since the last look. */
 bool faults_heard(struct faults *faults);

@@ -605,17 +605,18 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		policy_retry(&guard->policy);
 	guard_pace_begin(guard);
 	taken = take(guard, &event, &error) == 0;
-	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
 	if (taken) {
 		event.ticket = ticket;
 		event.app_pid = guard->main.leader;
 		event.app_pid_inside = guard->main.inside;
 		guard_pace_taken(guard, &event);
+		faults_settle(&guard->faults, &guard->tree, guard->next_ns);
 		guard_tell_taken(guard, &event);
 		guard->unprotected = false;
 		return;
 	}
 	guard_pace_missed(guard, event.freeze_ns);
+	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
 	if (guard_filter_hinders(guard)) {
 		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */
 		if (!ticket)

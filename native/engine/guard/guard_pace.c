@@ -116,7 +116,7 @@ void guard_pace_missed(struct avc_guard *guard, uint64_t held_ns)
 void guard_pace_restored(struct avc_guard *guard)
 {
 	guard->next_ns = policy_due(&guard->config, now_ns());
-	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
+	faults_disarm(&guard->faults); /* it was the dead one's */
 	if (!policy_is_automatic(&guard->config))
 		return;
 	guard->pace.taken_ns = now_ns();
