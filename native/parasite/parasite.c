@@ -264,9 +264,8 @@ static long set_timer(uint64_t nr, uint64_t timer, const struct inj_timer *was, 
 	return SYS4(nr, timer, 0, &is, 0);
 }
 
-static long open_pidfd(uint64_t fd, uint64_t pid, uint64_t flags, uint64_t cloexec)
+static long move_descriptor(uint64_t fd, int64_t opened, uint64_t cloexec)
 {
-	const long opened = SYS2(__NR_pidfd_open, pid, flags);
 	long r;
 
 	if (opened < 0)
@@ -314,8 +313,8 @@ static long make_call(const struct inj_syscall *s)
 		return set_timer(arg[0], arg[1], (const struct inj_timer *)arg[2], arg[3]);
 	if (s->nr == INJ_LOCK)
 		return own_lock(arg[0], arg[1], (struct inj_flock *)arg[2]);
-	if (s->nr == INJ_PIDFD_OPEN)
-		return open_pidfd(arg[0], arg[1], arg[2], arg[3]);
+	if (s->nr == INJ_MOVE)
+		return move_descriptor(arg[0], (int64_t)arg[1], arg[2]);
 	if (s->nr == INJ_CAPS_CHANGE)
 		return change_caps(arg[0], arg[1]);
 	if (s->nr == INJ_LIMIT)

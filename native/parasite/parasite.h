@@ -112,8 +112,9 @@ struct inj_setup {
 
 /* Instead of a system call: timer_create(clock, event, &id) that gives the id arg[3]. */
 #define INJ_TIMER_CREATE (-1)
-/* Likewise: pidfd_open(arg[1], arg[2]), as the descriptor arg[0] with the flags arg[3]. */
-#define INJ_PIDFD_OPEN (-2)
+/* Likewise: what an earlier call has opened, arg[1], becomes the descriptor arg[0] with the flags
+ * arg[2]; if that call failed, its result. */
+#define INJ_MOVE (-2)
 /* Likewise, for each capability of the set arg[1]: removes it from the bounding set (arg[0]
  * PR_CAPBSET_DROP) or adds it to the ambient one (PR_CAP_AMBIENT). */
 #define INJ_CAPS_CHANGE (-3)

@@ -8,6 +8,7 @@
  *                 ended with what is no signal
  *   zombie-group  a process in the group of one that has ended, which nobody waited for
  *   vdso          a child that has unmapped its vDSO
+ *   proc          files below its own /proc/PID and its child's are open, in the middle
  *   limits        a child that has more than its parent may have, which has lowered its limits
  *   hard-limits   a child that may give itself more than its parent, which has lowered its own
  *                 hard limits; it has given up the right to raise such (CAP_SYS_RESOURCE)
@@ -19,6 +20,7 @@
  *   users         threads that change their groups and user, all of them (setuid(3)), each time
  *                 counter 1 of the board does; counter 0 follows
  */
+#include <fcntl.h>
 #include <grp.h>
 #include <linux/capability.h>
 #include <linux/membarrier.h>
@@ -27,6 +29,7 @@
 #include <sys/personality.h>
 #include <sys/prctl.h>
 #include <sys/resource.h>
+#include <sys/stat.h>
 
 #include "victim.h"
 
@@ -153,6 +156,61 @@ static void look_at_vdso(char *to, size_t size)
 {
 	snprintf(to, size, "%d of the kernel's mappings, its child %d",
 		 victim_vdso(getpid(), false), victim_vdso(kid, false));
+}
+
+/* ---- proc --------------------------------------------------------------------------------- */
+
+static struct {
+	int maps, again, status, kids, folder;
+} open_files;
+
+static int open_proc(const char *name, pid_t pid)
+{
+	char path[48];
+	int fd;
+
+	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
+	fd = open(path, O_RDONLY | O_CLOEXEC);
+	must(fd >= 0, path);
+	return fd;
+}
+
+static void setup_proc(void)
+{
+	char some[100];
+
+	kid = fork();
+	if (!kid)
+		rest();
+	open_files.maps = open_proc("maps", getpid());
+	must(read(open_files.maps, some, sizeof some) == sizeof some, "read");
+	open_files.again = dup(open_files.maps);
+	open_files.status = open_proc("status", getpid());
+	open_files.kids = open_proc("status", kid);
+	open_files.folder = open_proc("", getpid());
+}
+
+static void first_line(int fd, char *line)
+{
+	const ssize_t bytes = pread(fd, line, 31, 0);
+
+	line[bytes < 0 ? 0 : bytes] = 0;
+	line[strcspn(line, "\n")] = 0;
+}
+
+/* Where the position is, and that the rest of it can be read from there. */
+static void look_at_proc(char *to, size_t size)
+{
+	char own[32], child[32], byte[32];
+	struct stat st;
+
+	first_line(open_files.status, own);
+	first_line(open_files.kids, child);
+	snprintf(to, size, "at %ld and %ld, %zd bytes there, closes at exec: %d %d; %s, its child %s; %d",
+		 (long)lseek(open_files.maps, 0, SEEK_CUR), (long)lseek(open_files.again, 0, SEEK_CUR),
+		 pread(open_files.again, byte, sizeof byte, 100), fcntl(open_files.maps, F_GETFD),
+		 fcntl(open_files.again, F_GETFD), own, child,
+		 fstatat(open_files.folder, "task", &st, 0));
 }
 
 /* ---- limits ------------------------------------------------------------------------------- */
@@ -474,6 +532,7 @@ static const struct {
 	{ "exit-signal", setup_exit_signal, look_at_exit_signal },
 	{ "zombie-group", setup_zombie_group, look_at_zombie_group },
 	{ "vdso", setup_vdso, look_at_vdso },
+	{ "proc", setup_proc, look_at_proc },
 	{ "limits", setup_limits, look_at_limits },
 	{ "hard-limits", setup_hard_limits, look_at_hard_limits },
 	{ "barriers", setup_barriers, look_at_barriers },

@@ -56,6 +56,8 @@ void files_unmap_areas(const struct image *image);
  * `before`: the previous checkpoint's images. */
 void files_settle_family(struct image *image, uint32_t images, struct image *before,
 			 uint32_t befores);
+/* After that: what is open below /proc/PID of the app's own processes. */
+void files_find_own(struct image *image, uint32_t images);
 void files_forget(struct process *process);
 void files_free(struct files *files);
 /* Restores the tables of a dead app: that of the main process, which its templates hold, at once;
@@ -243,8 +245,11 @@ struct file {
 	int clock, settime_flags;
 	uint64_t ticks, deadline_ns, interval_ns;
 	uint64_t mask; /* signalfd                                                  */
-	/* pidfd: in our namespace; of the app itself or a thread of it, in its own      */
-	pid_t pid, pid_inside;
+	/* pidfd: in our namespace */
+	pid_t pid;
+	/* Of a pidfd, or a file below /proc/PID: the process or thread of the app, in its own
+	 * namespace.  The restored process opens it anew. */
+	pid_t pid_inside;
 	uint32_t watch_count;
 	struct file_watch *watch; /* epoll, allocated                              */
 	uint32_t mark_count;

@@ -5,12 +5,66 @@
  * locks to its PID.
  */
 #include <fcntl.h>
+#include <stdio.h>
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/resource.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/sysmacros.h>
+#include <unistd.h>
 
 #include "files.h"
+
+/* ---- what is opened anew -------------------------------------------------------------------- */
+
+/* The process that a path below /proc names; 0: none. */
+static pid_t named_in(const char *name)
+{
+	int pid, end = 0;
+
+	if (!name || strncmp(name, "/proc/", 6) || sscanf(name, "/proc/%d%n", &pid, &end) != 1)
+		return 0;
+	return name[end] && name[end] != '/' ? 0 : pid;
+}
+
+/* The application may have mounted something else there, or see another /proc. */
+static bool is_in_proc(const struct file *f, pid_t template)
+{
+	char path[32];
+	struct statx st;
+
+	snprintf(path, sizeof path, "/proc/%d/root/proc", template);
+	return !statx(AT_FDCWD, path, AT_SYMLINK_NOFOLLOW, STATX_TYPE, &st) &&
+	       makedev(st.stx_dev_major, st.stx_dev_minor) == f->dev;
+}
+
+static bool is_there(const struct image *image, uint32_t images, pid_t inside)
+{
+	for (uint32_t i = 0; i < images; i++)
+		if (image[i].process && image[i].inside == inside)
+			return true;
+	return false;
+}
+
+/* A process with seccomp filters of its own would have to be allowed openat(2) for that. */
+void files_find_own(struct image *image, uint32_t images)
+{
+	for (uint32_t i = 0; i < images; i++) {
+		struct files *files = image[i].files;
+
+		for (uint32_t k = 0; files && !image[i].sandboxed && k < files->count; k++) {
+			struct file *f = &files->file[k];
+			const pid_t inside = named_in(f->name);
+
+			if (inside > 0 && is_there(image, images, inside) &&
+			    is_in_proc(f, image[i].template))
+				f->pid_inside = inside;
+		}
+	}
+}
+
+/* ---- the list ------------------------------------------------------------------------------- */
 
 static void list_lock(struct setup *setup, const struct file *w, const struct file_lock *lock,
 		      short type)
@@ -64,16 +118,41 @@ static void list_owner(struct setup *setup, const struct file *w)
 		->flags = INJ_MAY_FAIL;
 }
 
-/* What was open refers to a dead process. */
-static void list_pidfd(struct setup *setup, const struct file *w)
+static struct inj_setup *list_open(struct setup *setup, const struct file *w)
 {
-	setup_add(setup, INJ_OWNERS, "pidfd_open", INJ_PIDFD_OPEN, (uint64_t)w->fd,
-		  (uint64_t)w->pid_inside, (uint64_t)w->flags & (O_NONBLOCK | O_EXCL),
-		  w->cloexec ? O_CLOEXEC : 0)
-		->flags = INJ_MAY_FAIL;
+	if (w->kind == FILE_PIDFD)
+		return setup_add(setup, INJ_OWNERS, "", SYS_pidfd_open, (uint64_t)w->pid_inside,
+				 (uint64_t)w->flags & (O_NONBLOCK | O_EXCL));
+	return setup_add(setup, INJ_OWNERS, "", SYS_openat, (uint64_t)AT_FDCWD,
+			 setup_data(setup, w->name, strlen(w->name) + 1),
+			 (uint64_t)w->flags | O_CLOEXEC);
 }
 
-static bool has_pidfds(const struct files *files)
+/* What was open refers to a dead process. */
+static void list_anew(struct setup *setup, const struct file *w)
+{
+	const uint64_t cloexec = w->cloexec ? O_CLOEXEC : 0;
+	struct inj_setup *opens, *move;
+
+	if (w->shared != w->fd) {
+		setup_add(setup, INJ_OWNERS, "dup3", SYS_dup3, (uint64_t)w->shared, (uint64_t)w->fd,
+			  cloexec)
+			->flags = INJ_MAY_FAIL;
+		return;
+	}
+	opens = list_open(setup, w);
+	opens->flags = INJ_MAY_FAIL;
+	move = setup_add(setup, INJ_OWNERS, "open", INJ_MOVE, (uint64_t)w->fd, 0, cloexec);
+	move->flags = INJ_MAY_FAIL;
+	if (!setup->full)
+		opens->store = parasite_remote(setup->parasite, &move->call.arg[1]);
+	if (w->offset > 0)
+		setup_add(setup, INJ_OWNERS, "lseek", SYS_lseek, (uint64_t)w->fd, (uint64_t)w->offset,
+			  SEEK_SET)
+			->flags = INJ_MAY_FAIL;
+}
+
+static bool has_anew(const struct files *files)
 {
 	for (uint32_t i = 0; i < files->count; i++)
 		if (files->file[i].pid_inside)
@@ -83,7 +162,7 @@ static bool has_pidfds(const struct files *files)
 
 static bool needs_numbers(const struct files *want)
 {
-	return has_pidfds(want) || files_watch_closed(want);
+	return has_anew(want) || files_watch_closed(want);
 }
 
 void files_lift_limit(const struct files *want, pid_t pid)
@@ -153,7 +232,7 @@ void files_list_calls(struct files_work *work)
 		list_area(setup, &work->want->area[i]);
 	for (uint32_t i = 0; i < work->want->count; i++)
 		if (work->want->file[i].pid_inside)
-			list_pidfd(setup, &work->want->file[i]);
+			list_anew(setup, &work->want->file[i]);
 	if (!work->process->descendant && needs_numbers(work->want))
 		list_limit(work, setup);
 	/* Numbers are used temporarily, and closing a file drops its locks. */

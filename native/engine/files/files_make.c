@@ -317,6 +317,8 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 	int fd;
 
 	*why = NULL;
+	if (want->pid_inside)
+		return open_empty(want); /* for the moment: files_calls.c */
 	switch (want->kind) {
 	case FILE_REGULAR:
 	case FILE_DIRECTORY:
@@ -343,8 +345,6 @@ int file_make(const struct file *want, pid_t template, pid_t init, const struct 
 	case FILE_INOTIFY:
 		return inotify_init1(IN_CLOEXEC | (nonblock ? IN_NONBLOCK : 0));
 	case FILE_PIDFD:
-		if (want->pid_inside)
-			return open_empty(want); /* for the moment: files_calls.c */
 		fd = make_pidfd(want, init);
 		if (fd < 0)
 			*why = "it was closed since the checkpoint, and its process has ended";

@@ -187,8 +187,8 @@ static void give_up_useless(struct files_work *work)
 	}
 }
 
-/* For a process of the app, it refers to a dead one. */
-static void give_up_pidfds(struct files_work *work)
+/* Of a process of the app: it refers to a dead one. */
+static void give_up_own(struct files_work *work)
 {
 	for (uint32_t i = 0; i < work->want->count; i++) {
 		const struct file *w = &work->want->file[i];
@@ -821,7 +821,7 @@ int files_work_begin(struct files_work *work, struct avc_error *err)
 		return fail_errno(err, 0, "restore descriptors", "malloc", "out of memory");
 	find_moved(work);
 	give_up_useless(work);
-	give_up_pidfds(work);
+	give_up_own(work);
 	break_pairs(work);
 	return 0;
 }

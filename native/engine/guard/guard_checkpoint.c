@@ -463,6 +463,7 @@ static void settle_files(struct avc_guard *guard, struct generation *fresh)
 	if (fresh->images > 1)
 		files_settle_family(fresh->image, fresh->images, before ? before->image : NULL,
 				    before ? before->images : 0);
+	files_find_own(fresh->image, fresh->images);
 }
 
 static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_event *event,
