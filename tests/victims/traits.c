@@ -206,8 +206,10 @@ static void look_at_proc(char *to, size_t size)
 
 	first_line(open_files.status, own);
 	first_line(open_files.kids, child);
-	snprintf(to, size, "at %ld and %ld, %zd bytes there, closes at exec: %d %d; %s, its child %s; %d",
-		 (long)lseek(open_files.maps, 0, SEEK_CUR), (long)lseek(open_files.again, 0, SEEK_CUR),
+	snprintf(to, size,
+		 "at %ld and %ld, %zd bytes there, closes at exec: %d %d; %s, its child %s; %d",
+		 (long)lseek(open_files.maps, 0, SEEK_CUR),
+		 (long)lseek(open_files.again, 0, SEEK_CUR),
 		 pread(open_files.again, byte, sizeof byte, 100), fcntl(open_files.maps, F_GETFD),
 		 fcntl(open_files.again, F_GETFD), own, child,
 		 fstatat(open_files.folder, "task", &st, 0));

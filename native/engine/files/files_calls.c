@@ -147,8 +147,8 @@ static void list_anew(struct setup *setup, const struct file *w)
 	if (!setup->full)
 		opens->store = parasite_remote(setup->parasite, &move->call.arg[1]);
 	if (w->offset > 0)
-		setup_add(setup, INJ_OWNERS, "lseek", SYS_lseek, (uint64_t)w->fd, (uint64_t)w->offset,
-			  SEEK_SET)
+		setup_add(setup, INJ_OWNERS, "lseek", SYS_lseek, (uint64_t)w->fd,
+			  (uint64_t)w->offset, SEEK_SET)
 			->flags = INJ_MAY_FAIL;
 }
 
