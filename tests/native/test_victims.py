@@ -180,7 +180,7 @@ def test_foreign_memory_is_noticed(start: Start, board: Board, command: str) -> 
 
 def meddle_until_noticed(victim: subprocess.Popen[str], deed: Callable[[], object]) -> str:
     """The victim's report.  A changed value may be overwritten before it is checked, so this tries more than once."""
-    for _ in range(20):
+    for _ in range(100):
         deed()
         with contextlib.suppress(subprocess.TimeoutExpired):
             victim.wait(0.5)
