@@ -74,6 +74,7 @@ FILTERS = {
     "unconfined": ("threads 4 1", ["--security-opt", "seccomp=unconfined"], "2"),
     "privileged": ("threads 4 1", ["--privileged"], "2"),
     "a filter of its own": ("sandbox", [], "0"),
+    "filters of children": ("cells", [], "0"),
 }
 
 
