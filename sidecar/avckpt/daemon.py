@@ -469,14 +469,15 @@ class Daemon:
         Fills in the container and the time (now) where the record lacks them.
         """
         container = watch.container
-        record = dataclasses.replace(
-            record,
-            container=container.label,
-            id=container.id,
-            group=container.group,
-            at=record.at or time.time(),
-            monotonic_s=record.monotonic_s or time.monotonic(),
-        )
+        if not record.id:
+            record = dataclasses.replace(
+                record,
+                container=container.label,
+                id=container.id,
+                group=container.group,
+                at=record.at or time.time(),
+                monotonic_s=record.monotonic_s or time.monotonic(),
+            )
         line = watch.journal.line(record)
         if line is not None and line[0] >= logging.INFO:
             record = self.history.add(record)
@@ -534,13 +535,13 @@ class Daemon:
     ) -> GuardConfig:
         """With what its guard may use now of the machine's CPUs."""
         share = self._cpu.share(container.cookie, by_labels, time.monotonic(), taken)
-        return dataclasses.replace(config, budget_cpu=share)
+        return config if share == config.budget_cpu else dataclasses.replace(config, budget_cpu=share)
 
     def _share_cpu(self, watch: Watch, guard: Guard, taken: Event) -> None:
         """It has taken checkpoints; others that also do have begun or ended."""
         container = watch.container
         config = self._with_share(container, container.config, watch.settings.config, taken)
-        if config != container.config:
+        if config is not container.config:
             # One that cannot be told now is ending, or is told after its next one.
             with contextlib.suppress(AvckptError):
                 guard.configure(config)
@@ -573,7 +574,15 @@ class Daemon:
             self._start_guard(watch)
 
     def _record(self, watch: Watch, event: Event, at: float) -> EventRecord:
-        return of_guard(event, at=at, commanded=watch.rolling_back)
+        container = watch.container
+        return of_guard(
+            event,
+            container=container.label,
+            id=container.id,
+            group=container.group,
+            at=at,
+            commanded=watch.rolling_back,
+        )
 
     # The end of a container, or of the sidecar
 

@@ -154,7 +154,7 @@ bool guard_pace_dozes(struct avc_guard *guard)
 	if (!policy_is_automatic(&guard->config) || !guard->attached || !guard->output.armed ||
 	    now < guard->next_ns || wants(guard, now))
 		return false;
-	guard->next_ns = policy_look_again(&guard->pace, now);
+	guard->next_ns = policy_look_again(&guard->pace, &guard->config, now);
 	return true;
 }
 
@@ -171,7 +171,7 @@ bool guard_pace_wants(struct avc_guard *guard)
 	guard_pace_begin(guard);
 	output_arm(&guard->output, &guard->tree);
 	guard_pace_end(guard);
-	guard->next_ns = policy_look_again(&guard->pace, now);
+	guard->next_ns = policy_look_again(&guard->pace, &guard->config, now);
 	return false;
 }
 

@@ -19,7 +19,6 @@
 #define AGAIN_NS (50 * MS)
 #define AVERAGE_OF 8
 #define LOOK_NS (20 * MS)
-#define LOOK_LONG_NS (200 * MS)
 #define REFUSED_LONG_NS UINT64_C(60000000000)
 /* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
@@ -277,15 +276,17 @@ bool policy_wants(const struct policy_pace *pace, const struct avc_config *confi
 	       now - pace->taken_ns >= config->interval_ns;
 }
 
-uint64_t policy_look_again(const struct policy_pace *pace, uint64_t now)
+uint64_t policy_look_again(const struct policy_pace *pace, const struct avc_config *config,
+			   uint64_t now)
 {
+	const uint64_t longest = config->interval_ns / 4;
 	uint64_t pause = (now - pace->taken_ns) / 4;
 
 	if (now < pace->spent_ns)
 		return pace->spent_ns;
-	if (pause < LOOK_NS)
-		pause = LOOK_NS;
-	return now + (pause < LOOK_LONG_NS ? pause : LOOK_LONG_NS);
+	if (pause > longest)
+		pause = longest;
+	return now + (pause > LOOK_NS ? pause : LOOK_NS);
 }
 
 /* ---- what is held ------------------------------------------------------------ */

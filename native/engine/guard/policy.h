@@ -133,8 +133,9 @@ uint64_t policy_ready(const struct policy_pace *pace, const struct avc_config *c
 /* Whether one is due. */
 bool policy_wants(const struct policy_pace *pace, const struct avc_config *config,
 		  struct policy_activity activity, uint64_t now);
-/* It is not: when to check again. */
-uint64_t policy_look_again(const struct policy_pace *pace, uint64_t now);
+/* It is not: when to check again.  Work that begins meanwhile is noticed a quarter of avckpt.interval late, at most. */
+uint64_t policy_look_again(const struct policy_pace *pace, const struct avc_config *config,
+			   uint64_t now);
 
 /* ---- what is held ------------------------------------------------------------ */
 
