@@ -85,11 +85,11 @@ static void *apart(void *arg)
 	done = true;
 	while (!first_is_there)
 		usleep(1000);
-	forbid(SYS_getpgrp, EXDEV);
+	forbid(SYS_getpgid, EXDEV);
 	count(4, 1);
 	for (;;) {
 		check(SYS_getppid, EPERM);
-		check(SYS_getpgrp, EXDEV); /* the newest filter's */
+		check(SYS_getpgid, EXDEV); /* the newest filter's */
 		check(SYS_seccomp, EACCES);
 		CHECK(syscall(SYS_gettid) > 0, "this is the other thread's filter");
 		nap_us(2000);
@@ -193,9 +193,10 @@ static void forge_all(void)
 			forged = true;
 		}
 		if (forges > PROGRAM && s->call.nr == SYS_seccomp && !strcmp(s->name, "seccomp")) {
-			s->call.nr = forges == CALL ? SYS_getpid : SYS_mkdir;
-			s->call.arg[0] = (uint64_t)path;
-			s->call.arg[1] = 0700;
+			s->call.nr = forges == CALL ? SYS_getpid : SYS_mkdirat;
+			s->call.arg[0] = (uint64_t)AT_FDCWD;
+			s->call.arg[1] = (uint64_t)path;
+			s->call.arg[2] = 0700;
 			forged = true;
 		}
 	}
@@ -208,7 +209,7 @@ static void be_forger(void)
 		BPF_STMT(BPF_LD | BPF_W | BPF_IMM, MARK),
 		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
 		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_getppid, 1, 0),
-		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_mkdir, 0, 1),
+		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_mkdirat, 0, 1),
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM),
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW),
 	};
