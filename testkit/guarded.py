@@ -10,6 +10,7 @@ import os
 import random
 import re
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -354,6 +355,27 @@ def meanwhile(command: Sequence[str], count: int = 1) -> Iterator[None]:
         for loop in loops:
             loop.kill()
             loop.wait()
+
+
+@contextlib.contextmanager
+def injected(guard: GuardProcess, calls: str, what: str) -> Iterator[None]:
+    """strace does something to these system calls of the guard: inject=... of strace(1)."""
+    if not shutil.which("strace"):
+        pytest.skip("strace is what meddles with the guard's system calls; it is not installed")
+    status = Path(f"/proc/{guard.pid}/status")
+    with subprocess.Popen(
+        [
+            *("strace", "-f", "-qq", "-o", "/dev/null", "-e", f"trace={calls}"),
+            *("-e", f"inject={calls}:{what}", "-p", str(guard.pid)),
+        ],
+        stderr=subprocess.DEVNULL,
+    ) as strace:
+        try:
+            traced = f"TracerPid:\t{strace.pid}\n"
+            wait_until(lambda: traced in status.read_text(), PATIENCE_S, "strace traces it", 0.001)
+            yield
+        finally:
+            strace.kill()
 
 
 def forks_beside(victim: Victim) -> contextlib.AbstractContextManager[None]:

@@ -8,10 +8,10 @@ AVCKPT_SWEEP names.
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
 import re
-import shutil
 import struct
 import subprocess
 import time
@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import pytest
 from avckpt.guard import Images
 
-from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config
+from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, injected
 from testkit.harness import ROOT, wait_until
 
 CHANGES = ",".join(
@@ -74,20 +74,11 @@ class CallDeath:
     """By strace, before a system call."""
 
     def arm(self, guard: GuardProcess, nth: int) -> None:
-        (pid,) = guard.guards
-        kill = f"inject={CHANGES}:signal=KILL:when={nth}"
-        self.process = subprocess.Popen(
-            ["strace", "-f", "-qq", "-o", "/dev/null", "-e", f"trace={CHANGES}", "-e", kill, "-p", str(pid)],
-            stderr=subprocess.DEVNULL,
-        )
-        status = Path(f"/proc/{pid}/status")
-        wait_until(
-            lambda: f"TracerPid:\t{self.process.pid}\n" in status.read_text(), PATIENCE_S, "strace traces it", 0.001
-        )
+        self.injected = contextlib.ExitStack()
+        self.injected.enter_context(injected(guard, CHANGES, f"signal=KILL:when={nth}"))
 
     def disarm(self) -> None:
-        self.process.kill()
-        self.process.wait()
+        self.injected.close()
 
 
 class StoreDeath:
@@ -112,8 +103,6 @@ class StoreDeath:
 def death(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Death:
     if request.param == "stores":
         return StoreDeath(tmp_path / "stores", monkeypatch)
-    if not shutil.which("strace"):
-        pytest.skip("strace is what kills the guard before its system calls; it is not installed")
     return CallDeath()
 
 

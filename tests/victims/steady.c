@@ -4,6 +4,7 @@
  * comes every millisecond; its handler has to run on the program's own stack (now and
  * then: on its alternate one), and takes more of that than a borrower could have.  Between
  * two calls, and over each of them, registers, mask and stacks are the same (inlined.h).
+ * The handler of SIGUSR2 takes half a second.
  */
 #include <sys/epoll.h>
 #include <sys/time.h>
@@ -12,6 +13,7 @@
 
 #define STACK_BYTES (256 * 1024)
 #define USED_BYTES (48 * 1024)
+#define DWELL_NS 500000000
 
 static uintptr_t own_low, own_high;
 static uint8_t other[STACK_BYTES];
@@ -46,10 +48,21 @@ static void set_handler(bool on_other)
 	sigprocmask(SIG_SETMASK, &before, NULL);
 }
 
+static void dwell(int signal)
+{
+	const uint64_t end = now_ns() + DWELL_NS;
+
+	(void)signal;
+	while (now_ns() < end)
+		usleep(1000);
+	count(2, 1);
+}
+
 int main(int argc, char **argv)
 {
 	const struct itimerval often = { { 0, 1000 }, { 0, 1000 } };
 	const stack_t alternate = { .ss_sp = other, .ss_size = sizeof other };
+	struct sigaction slow = { .sa_handler = dwell };
 	const int epoll_fd = epoll_create1(EPOLL_CLOEXEC);
 	struct timespec ts = { 0, 3000000 };
 	struct epoll_event event;
@@ -58,6 +71,8 @@ int main(int argc, char **argv)
 	own_high = (uintptr_t)__builtin_frame_address(0);
 	own_low = own_high - (1 << 20);
 	must(!sigaltstack(&alternate, NULL), "sigaltstack");
+	sigfillset(&slow.sa_mask);
+	must(!sigaction(SIGUSR2, &slow, NULL), "sigaction");
 	set_handler(false);
 	must(!setitimer(ITIMER_REAL, &often, NULL), "setitimer");
 	victim_ready();

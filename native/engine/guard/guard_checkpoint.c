@@ -15,6 +15,7 @@
 #define QUIESCE_STEP_MS 1
 #define TAKE_TRIES 4
 #define VFORK_NS (2 * NS_PER_S)
+#define HOMEWARD_NS (2 * NS_PER_S)
 /* So many new threads are asked in the freeze, where each makes it longer by some 0.05 ms.  More are
  * worth a stop of their process for that alone. */
 #define ASK_IN_FREEZE 8
@@ -129,6 +130,18 @@ static bool has_filters_since(const struct process *process)
 	       (own.seccomp_filters > holders.seccomp_filters || own.seccomp > holders.seccomp);
 }
 
+/* The handler of a signal that came on a thread's way home ends soon, or never (siglongjmp(3)).
+ * Then the process gets another parasite. */
+static int await_home(struct process *process, struct avc_error *err)
+{
+	if (!parasite_is_awaited(&process->parasite))
+		return 0;
+	process->infected = now_ns() - process->parasite.left_ns < HOMEWARD_NS;
+	return process->infected ? fail(err, AVC_DEADLINE, 0, process->pid, "stop", "",
+					"a thread is still on its way home")
+				 : 0;
+}
+
 static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *later,
 			   struct avc_error *err)
 {
@@ -138,10 +151,11 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 	if (process_follow(process, err) || support_check(process, err) ||
 	    process_list_threads(process, err))
 		return -1;
-	if (process->infected &&
-	    (process->thread_count > process->parasite.threads_max ||
-	     guard->config.keep >= process->parasite.slots || process->parasite.left))
+	if (process->infected && (process->thread_count > process->parasite.threads_max ||
+				  guard->config.keep >= process->parasite.slots))
 		process->infected = false;
+	if (process->infected && await_home(process, err))
+		return -1;
 	if (!process->infected) {
 		if (process->descendant)
 			drop_images(guard, process);

@@ -116,6 +116,7 @@ int process_open(struct process *process, pid_t pid, pid_t inside, struct avc_er
 {
 	process->leader = pid;
 	process->inside = inside;
+	process->parasite.left_ns = 0; /* by a thread of the process before */
 	process->task_dirfd = proc_open(pid, "task", O_RDONLY | O_DIRECTORY);
 	process->timers_fd = proc_open(pid, "timers", O_RDONLY);
 	process->stat_fd = proc_open(pid, "stat", O_RDONLY);

@@ -500,6 +500,13 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
 	return 0;
 }
 
+bool parasite_is_awaited(struct parasite *parasite)
+{
+	if (parasite->left_ns && __atomic_load_n(&parasite->control->arrived, __ATOMIC_ACQUIRE))
+		parasite->left_ns = 0;
+	return parasite->left_ns;
+}
+
 int thread_borrow(struct process *process, struct thread *thread, struct avc_error *err)
 {
 	const uint64_t all = ~UINT64_C(0);
@@ -511,9 +518,13 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	if (arch_is_delicate(thread->tid))
 		return fail(err, AVC_RETRY, 0, thread->tid, "run injected code", "",
 			    "it is in the middle of vector code");
+	if (parasite_is_awaited(&process->parasite))
+		return fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
+			    "a thread is still on its way home");
 	home = thread->regs;
 	arch_resume(&home);
 	arch_home_set(&control->home, &home, thread->sigmask);
+	control->arrived = 0;
 	/* Registers first: if we die between the two, the thread enters the parasite with its own
 	 * mask, and blocks signals by itself (inj_enter()). In the other order it would be in the
 	 * app with every signal blocked, forever. */
@@ -550,7 +561,7 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 	 * returned by itself, and its registers are newer than ours. */
 	if (thread->borrowed_for && !parasite_contains(thread->borrowed_for, arch_pc(&now))) {
 		thread->borrowed = false;
-		thread->borrowed_for->left = true;
+		thread->borrowed_for->left_ns = now_ns();
 		return fail(err, AVC_RETRY, 0, thread->tid, "give back", "",
 			    "it has gone on by itself, for the guard came too late");
 	}

@@ -297,7 +297,7 @@ static bool straggle(struct process *process, struct thread *thread)
 			thread_give_back(thread, &ignored);
 		} else {
 			if (thread->borrowed && thread->borrowed_for)
-				thread->borrowed_for->left = true;
+				thread->borrowed_for->left_ns = now_ns();
 			thread->borrowed = false;
 			thread->regs = now;
 			rewind_call(process, thread);

@@ -154,9 +154,7 @@ struct parasite {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
-	/* A thread has left it by itself, perhaps for a handler that returns there: where it goes
-	 * home to must not be overwritten. */
-	bool left;
+	uint64_t left_ns; /* when a thread has left it by itself (parasite_is_awaited()); or 0 */
 	/* Memory of the guard, not of the app: the code, sealed against writing; and the rest,
 	 * which the app can write as well. */
 	int code_fd, data_fd;
@@ -464,6 +462,9 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
  * parasite_clear_undo(). */
 int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
 void parasite_clear_undo(struct process *process);
+/* A thread that has left it by itself may still be in the handler of a signal that came on the way,
+ * and return to it: where it goes home to must not be overwritten, and it is in no image. */
+bool parasite_is_awaited(struct parasite *parasite);
 /* Whether this is in a parasite left behind by a dead guard, or in a stub that stays. */
 bool parasite_is_old(const struct process *process, avc_remote address);
 /* Options for a stopped task of ours, which has the memory of the parasite's process. */

@@ -9,6 +9,7 @@
 #define HOME_FPSIMD 592 /* struct fpsimd_context in it; parasite.S fills in the registers */
 #define HOME_SVE 1120   /* what follows that                                               */
 #define HOME_SVE_VL 1128
+#define HOME_ARRIVED 1152 /* struct inj_control */
 
 #ifndef __ASSEMBLER__
 #include <stddef.h>

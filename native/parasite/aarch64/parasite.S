@@ -42,7 +42,8 @@ all_signals:
 
 /* Go back to the context in `home`, signal mask included.  The vector registers are the
  * app's own all the time, and so are put into the frame only here; unless they were longer
- * ones, which no system call leaves alone: those the tracer has put there. */
+ * ones, which no system call leaves alone: those the tracer has put there.  No signal
+ * comes before the kernel has read the frame. */
 	.globl	inj_go_home
 	.type	inj_go_home, @function
 inj_go_home:
@@ -69,6 +70,8 @@ inj_go_home:
 	stp	q26, q27, [x1, #432]
 	stp	q28, q29, [x1, #464]
 	stp	q30, q31, [x1, #496]
+	mov	w1, #1
+	str	w1, [x0, #HOME_ARRIVED]
 	mov	x8, #NR_RT_SIGRETURN
 	svc	#0
 	brk	#0

@@ -10,6 +10,7 @@
 #define HOME_FLAGS 136
 #define HOME_DIRECTION 140
 #define HOME_RIP 144
+#define HOME_ARRIVED 168 /* struct inj_control */
 
 #ifndef __ASSEMBLER__
 #include <stddef.h>

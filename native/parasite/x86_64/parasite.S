@@ -43,7 +43,11 @@ all_signals:
  * handler that runs between here and home then finds the stack (and the red
  * zone, which the kernel leaves alone) as if it had come a moment earlier.
  * From there on nothing is written to the stack, so flags are put back without
- * popf. */
+ * popf.
+ *
+ * Such a handler returns here, and may take its time: `home` stays as it is until
+ * `arrived` is set.  Only a signal between the last two instructions is not covered, whose
+ * handler runs for longer than until the next borrower. */
 	.globl	inj_go_home
 	.type	inj_go_home, @function
 inj_go_home:
@@ -76,6 +80,7 @@ inj_go_home:
 	movq	home+96(%rip), %rdx
 	movq	home+104(%rip), %rsi
 	movq	home+112(%rip), %rdi
+	movl	$1, home+HOME_ARRIVED(%rip)
 	jmp	*home+HOME_RIP(%rip)
 
 /* clone(2) without a new stack.  The child is meant to be stopped and sent
