@@ -608,6 +608,7 @@ class Daemon:
             watch.connection.close()
         del self._watches[container.cookie]
         self.registry.remove(container)
+        self._names.forget(container.id, container.init_pid)
         if ended:
             self._presence.keep(self.registry.live())
             container.end(time.time())

@@ -15,6 +15,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from avckpt_hooks.shared.files import read_bounded
+
 log = logging.getLogger("avckpt")
 
 CLONE_NEWCGROUP = 0x02000000
@@ -22,6 +24,7 @@ OWN_MOUNTS = Path("/run/avckpt-cgroup")
 """In the sidecar's own file system."""
 UNLIMITED_BYTES = 1 << 62
 """Version 1 writes "no limit" as a number near 2**63."""
+FILE_BYTES = 1 << 16
 OUTSIDE = 0.05
 """Less must be left outside by this part of the limit.  A pod has hardly more memory than its only container."""
 
@@ -240,6 +243,6 @@ def _lines(path: Path) -> list[str]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text().strip()
-    except OSError:
+        return read_bounded(str(path), FILE_BYTES).decode().strip()
+    except (OSError, ValueError):
         return ""

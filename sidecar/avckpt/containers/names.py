@@ -20,18 +20,27 @@ class Names:
 
     def __init__(self) -> None:
         self._read: dict[Path, tuple[tuple[int, int, int], dict[str, str]]] = {}
+        self._lists: dict[tuple[str, int], tuple[Path, Path]] = {}
+        """The folder, and the list as conmon sees it, by container and init."""
 
     def of(self, container_id: str, bundle: str, init_pid: int) -> str:
         """Its current name; "" if unknown. A bundle of Podman is FOLDER/ID/userdata."""
-        path = Path(bundle)
+        path, run = Path(bundle), (container_id, init_pid)
         if path.name != "userdata" or path.parent.name != container_id:
             return ""
         with contextlib.suppress(OSError, ValueError, RecursionError, psutil.Error):
-            # conmon's files are on the host.
-            host = Path(f"/proc/{psutil.Process(init_pid).ppid()}/root")
-            folder = path.parents[1].relative_to("/")
-            return self._names(folder, host / folder / LIST).get(container_id, "")
+            if run not in self._lists:
+                # conmon's files are on the host.
+                host = Path(f"/proc/{psutil.Process(init_pid).ppid()}/root")
+                folder = path.parents[1].relative_to("/")
+                self._lists[run] = (folder, host / folder / LIST)
+            return self._names(*self._lists[run]).get(container_id, "")
+        self._lists.pop(run, None)
         return ""
+
+    def forget(self, container_id: str, init_pid: int) -> None:
+        """It has ended."""
+        self._lists.pop((container_id, init_pid), None)
 
     def _names(self, folder: Path, path: Path) -> dict[str, str]:
         """Raises OSError, ValueError, RecursionError."""

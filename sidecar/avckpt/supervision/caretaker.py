@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -36,6 +37,8 @@ log = logging.getLogger("avckpt")
 
 LOOK_S = 1.0
 """Seconds between checks of limits."""
+SELDOM = 5
+"""A container without one may get one (`podman update --memory`): every so many checks."""
 W = TypeVar("W", bound=Ward)
 
 
@@ -128,11 +131,16 @@ class Caretaker(Generic[W]):
             self._looking.add_done_callback(_log_failure)
 
     async def _look(self) -> None:
-        while self._must_look():
+        for number in itertools.count():
+            if not self._must_look():
+                return
             await asyncio.sleep(LOOK_S)
             if self._host is not None and self._host.fd is None and self._host.is_high():
                 self._host_is_short()
             for care in list(self._cares.values()):
+                limited = care.ward.container.config.memory_limit_bytes or care.allowance.short
+                if not limited and number % SELDOM:
+                    continue
                 limit = care.groups.memory_limit_bytes()
                 used = None if limit is None else care.groups.memory_used_bytes()
                 self._tell_limit(care, used)
