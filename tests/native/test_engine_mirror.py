@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from avckpt.guard import Images
 
-from testkit.guarded import GuardProcess, Victim, config
+from testkit.guarded import WHERE, GuardProcess, Victim, config
 
 pytestmark = pytest.mark.shared_machine("a thousand checkpoints have to be taken in time")
 
@@ -31,3 +31,14 @@ def test_it_sees_itself_as_it_was(command: str, images: Images, checkpoints: int
         guard.stop()
         # And when it is protected no more.
         victim.wait_beats(3)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_nor_does_it_notice_who_looks_for_what_dead_guards_have_left(where: str, tmp_path: Path) -> None:
+    """Its stacks are searched for that: memory above them that was never touched is not read, which would show."""
+    with Victim(f"mirror {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(3):
+            said = guard.burst(5)
+            assert said["taken"] > 2, said["reasons"]
+            victim.wait_beats(3)
+            guard.start_another(victim.pid)

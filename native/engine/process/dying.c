@@ -13,7 +13,9 @@
  * One without any of these signs (SA_NODEFER, nothing blocked, no stack of its own, installed
  * permanently) is not recognized.
  */
+#include <fcntl.h>
 #include <signal.h>
+#include <string.h>
 #include <unistd.h>
 
 #include "process.h"
@@ -93,28 +95,53 @@ static int handled(const struct process *process, const struct thread *t,
 typedef int frame_test(const struct process *process, const struct thread *t,
 		       const struct arch_signal_frame *frame, bool *surely);
 
+/* Reads memory of the process, in which pages that it has never touched are zeros: to read those
+ * would make them present, which mincore(2) shows. Ends where nothing may be read. */
+static size_t read_touched(const struct process *process, int pagemap, uint8_t *to, size_t bytes,
+			   avc_remote at)
+{
+	uint64_t entry[(CHUNK_BYTES + ARCH_SIGNAL_FRAME_BYTES) / ARCH_PAGE_BYTES + 2] = { 0 };
+	const avc_remote first = at / ARCH_PAGE_BYTES;
+	/* Fewer at the end of the address space. */
+	const bool known = pread(pagemap, entry, sizeof entry, (off_t)(first * sizeof *entry)) > 0;
+	size_t done = 0;
+
+	while (done < bytes) {
+		const avc_remote from = at + done;
+		const uint64_t page = entry[from / ARCH_PAGE_BYTES - first];
+		const size_t left = ARCH_PAGE_BYTES - from % ARCH_PAGE_BYTES;
+		const size_t n = left < bytes - done ? left : bytes - done;
+
+		if (known && !(page & PAGEMAP_PRESENT) && !page_is_own(page & ~PAGEMAP_FILE))
+			memset(to + done, 0, n);
+		else if (pread(process->mem_fd, to + done, n, (off_t)from) != (ssize_t)n)
+			return done;
+		done += n;
+	}
+	return done;
+}
+
 /* What fits() says of the first frame that it does not answer by 0. */
 static int look(const struct process *process, const struct thread *t, frame_test *fits,
 		avc_remote from, avc_remote end, bool *surely)
 {
 	/* Frames across the end of a chunk are found in the next one. */
 	static uint8_t chunk[CHUNK_BYTES + ARCH_SIGNAL_FRAME_BYTES] __attribute__((aligned(16)));
+	int pagemap = proc_open(process->pid, "pagemap", O_RDONLY);
+	int signal = 0;
 
-	for (avc_remote at = from & ~UINT64_C(15); at < end; at += CHUNK_BYTES) {
-		const ssize_t n = pread(process->mem_fd, chunk, sizeof chunk, (off_t)at);
+	for (avc_remote at = from & ~UINT64_C(15); at < end && !signal; at += CHUNK_BYTES) {
+		const size_t n = read_touched(process, pagemap, chunk, sizeof chunk, at);
 		struct arch_signal_frame frame;
 		size_t next = 0;
-		int signal;
 
-		if (n <= 0)
-			return 0;
-		while (arch_signal_frame_find(chunk, (size_t)n, at, &next, &frame))
-			if ((signal = fits(process, t, &frame, surely)))
-				return signal;
-		if (n < (ssize_t)sizeof chunk)
-			return 0;
+		while (!signal && arch_signal_frame_find(chunk, n, at, &next, &frame))
+			signal = fits(process, t, &frame, surely);
+		if (n < sizeof chunk)
+			break;
 	}
-	return 0;
+	close_fd(&pagemap);
+	return signal;
 }
 
 /* Thread-local storage is above the stack in a library's allocation; beyond it is other memory. */
