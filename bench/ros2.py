@@ -2,12 +2,13 @@
 """How long a ROS 2 node's peer receives nothing when the node is restored: CycloneDDS and zenoh.
 
     make bench-ros2
-    .venv/bin/python -m bench.ros2 --only cyclonedds --remedies none,skip --rates 100 --intervals 1
+    .venv/bin/python -m bench.ros2 --only cyclonedds --remedies none,skip --rates 100 --intervals auto,1
 
 Real protected containers on Podman's bridge network: a node and, unprotected, its peer; both send to each other at a
 fixed rate.  The node's application is killed with SIGKILL at random moments.  Two gaps are measured, each from the last
 message before the death to the first after it: `out`, as the peer hears the node, and `in`, as the node hears the peer
-(it tells in each message what it has heard).  ddsperf tells no more than how many pongs came: what is missing, divided
+(it tells in each message what it has heard).  `together` protects the peer, too, in a group with the node that goes
+back to one instant.  ddsperf tells no more than how many pongs came: what is missing, divided
 by the rate, is the outage there.
 
 Needs root and what `make setup` and scripts/setup-ros2.sh build.  Takes the machine's sidecar and hooks for itself.
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import random
@@ -55,6 +57,9 @@ NS_PER_MS = 1e6
 PATIENCE_S = 30.0
 SETTLE_S = 0.5
 STEADY_S = 0.4
+AUTO_S = 3.0
+"""The longest interval of `auto`."""
+GAP = re.compile(r"^\w+: after (\d+) came (\d+)$", re.MULTILINE)
 NODE = "/opt/ros2/build/dds_node"
 ZENOH = "python3 /opt/ros2/zenoh_node.py"
 PEER_TOPICS = "--in from_node --out to_node --log /log/heard"
@@ -69,6 +74,7 @@ class Case:
     node: str
     peer: str
     labels: tuple[tuple[str, str], ...] = ()
+    together: bool = False
 
     @property
     def name(self) -> str:
@@ -101,6 +107,26 @@ CASES = (
         f"{NODE} --rate {{rate}} --after-restore participant",
         f"{NODE} --rate {{rate}} {PEER_TOPICS}",
         HEAR,
+    ),
+    Case(
+        "cyclonedds",
+        "together",
+        f"{NODE} --rate {{rate}}",
+        f"{NODE} --rate {{rate}} {PEER_TOPICS}",
+        together=True,
+    ),
+    Case(
+        "zenoh",
+        "default",
+        f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447",
+        f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+    ),
+    Case(
+        "zenoh",
+        "together",
+        f"{ZENOH} --rate {{rate}} --listen tcp/0.0.0.0:7447",
+        f"{ZENOH} --rate {{rate}} --connect tcp/{{address}}:7447 {PEER_TOPICS}",
+        together=True,
     ),
     Case(
         "zenoh",
@@ -140,7 +166,8 @@ class Trial:
     subject: str
     remedy: str
     rate_hz: int
-    interval_s: float
+    interval_s: float | None
+    """None: no label, which is `auto`."""
     age_s: float
     restore_ms: float
     freeze_ms: float
@@ -150,6 +177,9 @@ class Trial:
     """None with ddsperf, which does not tell."""
     steady_ms: float
     """Largest gap that the peer saw in the time before the kill, STEADY_S; 0 with ddsperf."""
+    lost: int | None = None
+    """Messages of the node that nobody gets, at its rate; with `together`, numbers that are missing in what both
+    remember."""
 
 
 class Events:
@@ -248,18 +278,20 @@ class PongCounts:
         return 1000 * max(0.0, expected - sum(count for _, count in lines[first:last])) / self._rate_hz
 
 
-def measure(case: Case, rate_hz: int, interval_s: float, restores: int, world: World) -> list[Trial]:
+def measure(case: Case, rate_hz: int, interval_s: float | None, restores: int, world: World) -> list[Trial]:
     """Starts a pair, kills its node `restores` times."""
-    with world.pair(case, rate_hz, interval_s) as (node, folder):
+    with world.pair(case, rate_hz, interval_s) as (node, peer, folder):
         kill = kill_ddsperf if case.subject == "ddsperf" else kill_node
         gaps = []
+        missing = [missing_numbers(node, peer)]
         for number in range(restores):
             # One checkpoint at least after the restore before; then any moment between two.
-            time.sleep(SETTLE_S + interval_s * (1 + random.random()))
+            time.sleep(SETTLE_S + (interval_s or AUTO_S) * (1 + random.random()))
             gaps.append(kill(world.sidecar, node, folder, rate_hz))
+            missing.append(missing_numbers(node, peer) if case.together else 0)
             outage = "never" if gaps[-1][0] is None else f"{gaps[-1][0]:.0f} ms"
             print(
-                f"{case.name} {rate_hz} Hz, every {interval_s:g} s: {number + 1} of {restores}, {outage}",
+                f"{case.name} {rate_hz} Hz, every {interval_name(interval_s)}: {number + 1} of {restores}, {outage}",
                 flush=True,
             )
         wait_until(
@@ -278,9 +310,26 @@ def measure(case: Case, rate_hz: int, interval_s: float, restores: int, world: W
                 out_ms=out and round(out, 1),
                 in_ms=heard and round(heard, 1),
                 steady_ms=round(steady, 1),
+                lost=after - before if case.together else missed(out, rate_hz),
             )
-            for event, (out, heard, steady) in zip(world.events.of(node, "restored"), gaps)
+            for event, (out, heard, steady), before, after in zip(
+                world.events.of(node, "restored"), gaps, missing, missing[1:]
+            )
         ]
+
+
+def missed(out_ms: float | None, rate_hz: int) -> int | None:
+    """How many messages would have been sent in an outage."""
+    return None if out_ms is None else max(0, round(out_ms * rate_hz / 1000) - 1)
+
+
+def missing_numbers(node: Container, peer: Container) -> int:
+    """Of messages, in what the two remember: they tell each that is not the next one."""
+    return sum(abs(int(came) - int(last) - 1) for each in (node, peer) for last, came in GAP.findall(each.logs()))
+
+
+def interval_name(interval_s: float | None) -> str:
+    return "auto" if interval_s is None else f"{interval_s:g} s"
 
 
 Gaps = tuple["float | None", "float | None", float]
@@ -321,7 +370,7 @@ class World:
     domains: Iterator[int]
 
     @contextlib.contextmanager
-    def pair(self, case: Case, rate_hz: int, interval_s: float) -> Iterator[tuple[Container, Path]]:
+    def pair(self, case: Case, rate_hz: int, interval_s: float | None) -> Iterator[tuple[Container, Container, Path]]:
         """A protected node and its peer, in a DDS domain of their own, that hear each other; and the peer's folder."""
         domain = next(self.domains)
         folder = self.folder / str(domain)
@@ -330,9 +379,14 @@ class World:
         env = ["--env", f'CYCLONEDDS_URI=<CycloneDDS><Domain Id="{domain}"/></CycloneDDS>']
         if case.subject == "ddsperf":  # it has an option for that, and does not want both
             env = []
+        labels = {"restore.max": "60/60s", **dict(case.labels)}
+        if interval_s is not None:
+            labels["interval"] = f"{round(1000 * interval_s)}ms"
+        if case.together:
+            labels |= {"group": f"pair-{os.getpid()}-{domain}", "group.recovery": "together"}
         node = self.factory.protected(
             *case.node.format(**words).split(),
-            labels={"interval": f"{round(1000 * interval_s)}ms", "restore.max": "60/60s", **dict(case.labels)},
+            labels=labels,
             options=env,
             image=IMAGE,
         )
@@ -340,7 +394,8 @@ class World:
         command = case.peer.format(**words).split()
         if case.subject == "ddsperf":
             command = ["sh", "-c", f"exec {' '.join(command)} >/log/ping"]
-        peer = self.factory(*command, options=(*env, "--volume", f"{folder}:/log"), image=IMAGE)
+        start = functools.partial(self.factory.protected, labels=labels) if case.together else self.factory
+        peer = start(*command, options=(*env, "--volume", f"{folder}:/log"), image=IMAGE)
         try:
             started = time.monotonic_ns()
             if case.subject == "ddsperf":
@@ -350,7 +405,12 @@ class World:
                 heard = HeardLog(folder / "heard")
                 wait_until(lambda: heard.heard_since(started), PATIENCE_S, f"the pair of {case.name} hears each other")
             self.sidecar.wait_generation(node)
-            yield node, folder
+            if case.together:
+                # Of both, and not of before they heard each other.
+                line = (self.sidecar.find(node) or {}).get("line", 0)
+                for each in (node, peer):
+                    self.sidecar.wait_for(each, lambda entry: entry["line"] > line + 1, "a line")
+            yield node, peer, folder
         finally:
             node.remove()
             peer.remove()
@@ -366,6 +426,7 @@ def run(options: argparse.Namespace) -> list[Trial]:
         if case.subject in options.only and (not options.remedies or case.remedy in options.remedies)
         for rate in options.rates
         for interval in options.intervals
+        if not (case.together and interval is None)  # it is refused
     ]
     with (
         machine_lock(timeout_s=options.wait),
@@ -396,9 +457,10 @@ def write(trials: list[Trial], path: Path) -> None:
     """In one step, so that no reader ever sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     order = {(case.subject, case.remedy): number for number, case in enumerate(CASES)}
-    trials.sort(key=lambda t: (order.get((t.subject, t.remedy), 99), t.rate_hz, t.interval_s))
+    trials.sort(key=lambda t: (order.get((t.subject, t.remedy), 99), t.rate_hz, t.interval_s or 0))
     draft = path.with_suffix(".tmp")
-    draft.write_text('{"trials": [\n' + ",\n".join(json.dumps(asdict(trial)) for trial in trials) + "\n]}\n")
+    entries = [{key: value for key, value in asdict(t).items() if (key, value) != ("lost", None)} for t in trials]
+    draft.write_text('{"trials": [\n' + ",\n".join(map(json.dumps, entries)) + "\n]}\n")
     draft.replace(path)
 
 
@@ -408,7 +470,9 @@ def main() -> int:
     parser.add_argument("--restores", type=int, default=10, help="kills per point")
     parser.add_argument("--rates", type=lambda text: [int(part) for part in text.split(",")], default=[100, 1000])
     parser.add_argument(
-        "--intervals", type=lambda text: [float(part) for part in text.split(",")], default=[0.1, 0.5, 1.0, 3.0]
+        "--intervals",
+        type=lambda text: [None if part == "auto" else float(part) for part in text.split(",")],
+        default=[None, 0.1, 0.5, 1.0, 3.0],
     )
     parser.add_argument("--only", type=lambda text: text.split(","), default=subjects, help=",".join(subjects))
     parser.add_argument("--remedies", type=lambda text: text.split(","), help="e.g. none,skip")

@@ -20,13 +20,14 @@ class Trial(Protocol):
     subject: str
     remedy: str
     rate_hz: int
-    interval_s: float
+    interval_s: float | None
     age_s: float
     restore_ms: float
     freeze_ms: float
     out_ms: float | None
     in_ms: float | None
     steady_ms: float
+    lost: int | None
 
 
 def _both(values: Sequence[float | None]) -> str:
@@ -41,20 +42,22 @@ def table(trials: Sequence[Trial]) -> str:
     """Markdown; median / largest, ms."""
     lines = [
         "| middleware | remedy | Hz | interval s | n | freeze | restore | checkpoint's age | peer hears node again "
-        "| node hears peer again | largest gap just before |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| node hears peer again | largest gap just before | lost |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    groups: dict[tuple[str, str, int, float], list[Trial]] = {}
+    groups: dict[tuple[str, str, int, float | None], list[Trial]] = {}
     for trial in trials:
         groups.setdefault((trial.subject, trial.remedy, trial.rate_hz, trial.interval_s), []).append(trial)
     for (subject, remedy, rate, interval), group in groups.items():
+        every = "auto" if interval is None else f"{interval:g}"
         cells = (
-            *(subject, remedy, str(rate), f"{interval:g}", str(len(group)), f"{group[0].freeze_ms:.1f}"),
+            *(subject, remedy, str(rate), every, str(len(group)), f"{group[0].freeze_ms:.1f}"),
             _both([t.restore_ms for t in group]),
             _both([1000 * t.age_s for t in group]),
             _both([t.out_ms for t in group]),
             "-" if subject == "ddsperf" else _both([t.in_ms for t in group]),
             "-" if subject == "ddsperf" else _both([t.steady_ms for t in group]),
+            _both([t.lost for t in group]),
         )
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

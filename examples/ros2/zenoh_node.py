@@ -11,7 +11,9 @@ zenoh numbers the frames of a session.  What a node can do when its numbers have
     --after-restore skip    sends as many fillers as there were messages since the checkpoint (kept.py); they must not
                             be batched (express), for numbers are those of frames
 
---log: for each message heard, 4 x 64 bits: now (CLOCK_MONOTONIC, ns), and its count, sent and heard.
+--log: for each message heard, 4 x 64 bits: now (CLOCK_MONOTONIC, ns), and its count, sent and heard.  Appended, so
+that a restore does not overwrite what was written since its checkpoint.  Standard error tells each message that is not
+the next one after the last one remembered: "after 41 came 43".
 """
 
 from __future__ import annotations
@@ -37,9 +39,10 @@ class Node:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.skip = options.after_restore == "skip"
-        self.log = os.open(options.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) if options.log else None
+        self.log = os.open(options.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND) if options.log else None
         self.padding = bytes(options.size)
         self.heard = 0
+        self.heard_count = 0
         self.sent = 0
         self.kept = Kept()
         self.session = zenoh.open(configuration(options))
@@ -53,6 +56,9 @@ class Node:
         if count == 0:
             return
         self.heard = sent
+        if self.heard_count and count != self.heard_count + 1:
+            print(f"zenoh_node: after {self.heard_count} came {count}", file=sys.stderr, flush=True)
+        self.heard_count = count
         if self.log is not None:
             os.write(self.log, RECORD.pack(now, count, sent, heard))
 
