@@ -5,8 +5,10 @@
 
 Every node (tests/victims/crash.c) beats a thousand times a second.  It is killed by a signal from
 outside, or faults, aborts or exits by itself.  What counts is the gap between two beats of the one
-that was killed, and of its siblings, whose longest gap of the same length of time without a kill is
-measured first.  With --idle nothing is killed: what the nodes cost is measured for that time.
+that was killed, and of its siblings; theirs is compared with as many windows without a kill, in
+which the sidecar is asked as often.  Of each longest gap it is told for how long that node was
+runnable and got no CPU in the whole window (schedstat).  With --idle nothing is killed: what the
+nodes cost is measured for that time.
 
 Needs root, Podman and what `make setup` builds; roslaunch needs scripts/setup-ros.sh, supervisord
 PyPI's supervisor.  Takes the machine's sidecar and hooks for itself, as the tests do.  Prints a
@@ -16,6 +18,8 @@ table and writes bench/results/nodes.json.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
 import json
 import os
 import random
@@ -91,8 +95,11 @@ class Result:
     gap_max_ms: float
     siblings_gap_ms: float
     """The longest gap of a node that was not killed."""
+    siblings_delay_ms: float
+    """How long it was runnable without a CPU, in the window of its longest gap."""
     quiet_gap_ms: float
-    """The longest gap of any node in as much time without kills."""
+    """The longest gap of any node in as many windows without kills."""
+    quiet_delay_ms: float
     not_back: list[str]
     """Who did not come back, from what."""
     launcher_said: list[str]
@@ -133,12 +140,17 @@ class Nodes:
 
         return wait_until(found, 120, f"{len(self.boards)} nodes are protected", every_s=0.5)
 
-    def quiet_gap_ms(self, seconds: float) -> float:
-        """The longest gap of any of them in that time."""
-        for board in self.boards.values():
-            board.forget_gap()
-        time.sleep(seconds)
-        return max(board.see().gap_ns for board in self.boards.values()) / 1e6
+
+@dataclass(frozen=True, order=True)
+class Gap:
+    """The longest of some nodes, and for how long that node was runnable without a CPU; ms."""
+
+    gap_ms: float = 0.0
+    delay_ms: float = 0.0
+
+
+def run_delay_ms(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e6
 
 
 def start(factory: ContainerFactory, folder: Path, stack: ExitStack, options: argparse.Namespace) -> Nodes:
@@ -177,27 +189,48 @@ def ros_image(podman: Podman) -> str:
     return found[0]
 
 
-def kill_one(nodes: Nodes, name: str, signum: signal.Signals) -> tuple[float, float]:
-    """The gaps of the one and of all others in ms; infinite: it did not come back."""
-    row = nodes.rows()[name]
+def found_pid(row: dict[str, Any]) -> int:
+    """app_pid(), again where a template that it looks at has just been replaced."""
+
+    def look() -> int:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            return app_pid(row)
+        return 0
+
+    return wait_until(look, HOPELESS_S, f"{row['name']} runs", every_s=0.001)
+
+
+def kill_one(nodes: Nodes, name: str, signum: signal.Signals | None) -> tuple[float, Gap]:
+    """The gap of the one in ms (infinite: it did not come back) and of all others.  None: the same without a kill."""
+    rows = nodes.rows()
+    row = rows[name]
+    siblings = {key: found_pid(other) for key, other in rows.items() if key != name}
+    before = {key: run_delay_ms(pid) for key, pid in siblings.items()}
     for board in nodes.boards.values():
         board.forget_gap()
-    pid = wait_until(lambda: app_pid(row), HOPELESS_S, f"{name} runs")
-    os.kill(pid, signum)
+    pid = found_pid(row)
+    if signum is not None:
+        os.kill(pid, signum)
+    # Without a kill the second look is enough, as it nearly always is with one.
+    looks = itertools.count()
     try:
-        wait_until(lambda: nodes.rows().get(name, row)["restores"] > row["restores"], HOPELESS_S, "it is restored")
+        wait_until(
+            lambda: nodes.rows().get(name, row)["restores"] > row["restores"] or (signum is None and next(looks) > 0),
+            HOPELESS_S,
+            "it is restored",
+        )
         beats = nodes.boards[name].see().beats
         wait_until(lambda: nodes.boards[name].see().beats > beats, HOPELESS_S, "it goes on")
     except TimeoutError:
-        return float("inf"), 0.0
+        return float("inf"), Gap()
     gaps = {key: board.see().gap_ns / 1e6 for key, board in nodes.boards.items()}
-    return gaps.pop(name), max(gaps.values(), default=0.0)
+    own = gaps.pop(name)
+    return own, max((Gap(gaps[key], run_delay_ms(pid) - before[key]) for key, pid in siblings.items()), default=Gap())
 
 
 def run(nodes: Nodes, options: argparse.Namespace) -> Result:
     dice = random.Random(options.seed)
     nodes.wait_protected()
-    began = time.monotonic()
     gaps, siblings, not_back = [], [], []
     for n in range(options.kills):
         name, signum = dice.choice(list(nodes.boards)), dice.choice(SIGNALS)
@@ -209,7 +242,10 @@ def run(nodes: Nodes, options: argparse.Namespace) -> Result:
         siblings.append(others)
         time.sleep(dice.uniform(*PAUSE_S))
         print(f"\r{n + 1} of {options.kills} killed", end="", flush=True)
-    quiet = nodes.quiet_gap_ms(time.monotonic() - began)
+    quiet = Gap()
+    for _ in range(options.kills):
+        quiet = max(quiet, kill_one(nodes, dice.choice(list(nodes.boards)), None)[1])
+        time.sleep(dice.uniform(*PAUSE_S))
     back = sorted(gap for gap in gaps if gap != float("inf"))
     words = ("ended", "process has died", "process has finished", "exited:")
     return Result(
@@ -221,8 +257,10 @@ def run(nodes: Nodes, options: argparse.Namespace) -> Result:
         gap_median_ms=round(statistics.median(back), 2),
         gap_p99_ms=round(back[int(0.99 * (len(back) - 1))], 2),
         gap_max_ms=round(back[-1], 2),
-        siblings_gap_ms=round(max(siblings), 2),
-        quiet_gap_ms=round(quiet, 2),
+        siblings_gap_ms=round(max(siblings).gap_ms, 2),
+        siblings_delay_ms=round(max(siblings).delay_ms, 2),
+        quiet_gap_ms=round(quiet.gap_ms, 2),
+        quiet_delay_ms=round(quiet.delay_ms, 2),
         not_back=not_back,
         launcher_said=[line for line in nodes.container.logs().splitlines() if any(word in line for word in words)],
         load=round(os.getloadavg()[0], 1),
