@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-ros-long`: crashes one of the ROS chain's nodes, or both, every one or two seconds, again and again.
 
-    python -m bench.ros_endurance --crashes 1000 [--tcp messages] [--output FILE]
+    python -m bench.ros_endurance --crashes 1000 [--tcp messages] [--together] [--output FILE]
 
 A crash counts as survived when poses of three later scans come out within five
-seconds, each less than a metre from the truth.  One line of JSON is appended
+seconds, each less than a metre from the truth.  With --together all containers, the player and the
+monitor included, are one group that goes back together.  One line of JSON is appended
 for each crash, so a run can be stopped and continued.
 """
 
@@ -119,14 +120,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Crashes the nodes of the ROS chain again and again.")
     parser.add_argument("--crashes", type=int, default=1000, help="how many (%(default)s)")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so many")
-    parser.add_argument("--tcp", default="messages", help="avckpt.tcp (%(default)s)")
+    parser.add_argument("--tcp", help="avckpt.tcp (messages; of a group: reset-moved)")
+    parser.add_argument("--together", action="store_true", help="avckpt.group.recovery=together")
     parser.add_argument("--interval", default="500ms", help="avckpt.interval (%(default)s)")
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--output", type=Path, default=OUTPUT)
     args = parser.parse_args()
     args.output.parent.mkdir(parents=True, exist_ok=True)
     end = time.monotonic() + args.minutes * 60
-    settings = {"TCP": args.tcp, "INTERVAL": args.interval}
+    tcp = args.tcp or ("reset-moved" if args.together else "messages")
+    recovery = "together" if args.together else "apart"
+    settings = {"TCP": tcp, "INTERVAL": args.interval, "RECOVERY": recovery}
     results = []
     try:
         with (
@@ -136,7 +140,7 @@ def main() -> int:
         ):
             for result in crashes(pipeline, args.crashes, random.Random(args.seed)):
                 results.append(result)
-                output.write(json.dumps({"tcp": args.tcp, **result}) + "\n")
+                output.write(json.dumps({"tcp": tcp, "recovery": recovery, **result}) + "\n")
                 output.flush()
                 if time.monotonic() > end:
                     break
