@@ -24,7 +24,7 @@
 
 #define QUEUE_MAX 4096
 #define STOP_MS 15000     /* a guard may be in the middle of a restore */
-#define END_MS 1000       /* from the end of its socket to the exit of the process */
+#define END_NS NS_PER_S   /* from the end of its socket to the exit of the process */
 #define EVENTS_AT_ONCE 64 /* taken from one guard before it is the others' turn */
 #define STARVED_FACTOR 10 /* factor of patience for one that only waits for a CPU */
 
@@ -103,13 +103,13 @@ static void queue_event(struct avc_engine *engine, const struct avc_event *event
 }
 
 /* Reaps it. It may exit a moment after the end of its socket. */
-static void guard_reap(struct avc_guard *guard, int patience_ms)
+static void guard_reap(struct avc_guard *guard, uint64_t patience_ns)
 {
 	struct pollfd ending = { .fd = guard->pidfd, .events = POLLIN };
 
 	if (!guard->pid)
 		return;
-	if (poll(&ending, 1, patience_ms) != 1)
+	if (poll_for(&ending, 1, patience_ns) != 1)
 		syscall(SYS_pidfd_send_signal, guard->pidfd, SIGKILL, NULL, 0);
 	while (waitpid(guard->pid, &guard->status, 0) < 0 && errno == EINTR)
 		;
@@ -216,7 +216,7 @@ static void guard_listen(struct avc_guard *guard)
 	epoll_ctl(guard->engine->epoll_fd, EPOLL_CTL_DEL, guard->socket, NULL);
 	if (guard->stopping && !guard->mad)
 		return;
-	guard_reap(guard, guard->mad ? 0 : END_MS);
+	guard_reap(guard, guard->mad ? 0 : END_NS);
 	if (!guard->mad && !guard->hung && !guard->config.suspends && WIFEXITED(guard->status) &&
 	    WEXITSTATUS(guard->status) == AVC_GUARD_HINDERED)
 		guard_succeed(guard);
@@ -615,7 +615,7 @@ void avc_guard_stop(struct avc_guard *guard)
 		struct pollfd news = { .fd = guard->socket, .events = POLLIN };
 
 		pthread_mutex_unlock(&engine->lock);
-		(void)poll(&news, 1, END_MS);
+		(void)poll_for(&news, 1, END_NS);
 		pthread_mutex_lock(&engine->lock);
 		if (!guard->ended)
 			guard_listen(guard);
@@ -626,6 +626,6 @@ void avc_guard_stop(struct avc_guard *guard)
 		;
 	*at = guard->next;
 	pthread_mutex_unlock(&engine->lock);
-	guard_reap(guard, guard->ended ? END_MS : 0);
+	guard_reap(guard, guard->ended ? END_NS : 0);
 	guard_free(guard);
 }

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from avckpt.guard import Files, Tcp
 
-from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, since_linux
+from testkit.guarded import WHERE, GuardProcess, Victim, config, injected, kill_at_random, since_linux
 from testkit.harness import SLOWNESS, wait_until
 from testkit.meddle import get_fd
 from testkit.procfs import below
@@ -56,6 +56,17 @@ def test_as_at_the_checkpoint(scenario: str, where: str, tmp_path: Path) -> None
             victim.wait_beats()
             if scenario == "timer":
                 break  # it goes off once
+
+
+@pytest.mark.parametrize("command", ["descriptors content", "sockets shut", "sockets messages"])
+def test_a_question_that_a_signal_cuts_short_is_asked_again(command: str, tmp_path: Path) -> None:
+    """The timer of the guard's deadline ticks: with a signal pending, poll(2) fails even if it is not to wait."""
+    with Victim(f"{command} {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.wait("attached")
+        with injected(guard, "poll,ppoll", "error=EINTR:when=1+2"):
+            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            disturb(victim)
+            assert "error" not in restored(victim, guard)
 
 
 @pytest.mark.parametrize("where", WHERE)

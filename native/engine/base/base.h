@@ -23,6 +23,7 @@
 #ifndef AVCKPT_BASE_H
 #define AVCKPT_BASE_H
 
+#include <poll.h>
 #include <pthread.h>
 #include <stdbool.h>
 #include <stdint.h>
@@ -67,6 +68,9 @@ int fail_errno(struct avc_error *err, pid_t pid, const char *operation, const ch
 uint64_t now_ns(void);
 struct timespec timespec_of(uint64_t ns);
 void close_fd(int *fd);
+/* Like poll(2), and for as long although a signal comes: the timer of a deadline (trace.h) ticks
+ * meanwhile, and with one pending poll(2) fails even if it is not to wait (fs/select.c, do_poll()). */
+int poll_for(struct pollfd *fds, uint32_t count, uint64_t ns);
 /* Returns the bytes read; -1: unreadable. */
 ssize_t read_whole(int fd, uint8_t *to, size_t bytes, off_t at);
 /* Room for one more element of `bytes` in *array, which has `count`; false: out of memory,

@@ -76,6 +76,20 @@ struct timespec timespec_of(uint64_t ns)
 				  .tv_nsec = (long)(ns % NS_PER_S) };
 }
 
+int poll_for(struct pollfd *fds, uint32_t count, uint64_t ns)
+{
+	const uint64_t end = now_ns() + ns;
+	int ready;
+
+	do {
+		const uint64_t now = now_ns();
+		const struct timespec left = timespec_of(now < end ? end - now : 0);
+
+		ready = ppoll(fds, count, &left, NULL);
+	} while (ready < 0 && errno == EINTR);
+	return ready;
+}
+
 void close_fd(int *fd)
 {
 	if (*fd >= 0)

@@ -417,7 +417,7 @@ bool pidfd_ended(int pidfd)
 {
 	struct pollfd p = { .fd = pidfd, .events = POLLIN };
 
-	return poll(&p, 1, 0) == 1;
+	return poll_for(&p, 1, 0) == 1;
 }
 
 int proc_borrow_fd(int pidfd, int fd)

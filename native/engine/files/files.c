@@ -735,7 +735,7 @@ static void keep_end(struct reading *reading, struct file *f, short revents)
 
 static void keep_gathered(struct reading *reading)
 {
-	if (reading->count && poll(reading->end, reading->count, 0) > 0)
+	if (reading->count && poll_for(reading->end, reading->count, 0) > 0)
 		for (uint32_t i = 0; i < reading->count; i++)
 			keep_end(reading, reading->file[i], reading->end[i].revents);
 	reading->count = 0;

@@ -146,7 +146,7 @@ static bool has_ended(int fd)
 {
 	struct pollfd state = { .fd = fd, .events = POLLRDHUP };
 
-	return poll(&state, 1, 0) != 0;
+	return poll_for(&state, 1, 0) != 0;
 }
 
 /* NULL: it can be kept. */
@@ -154,7 +154,7 @@ static const char *why_not(int fd)
 {
 	struct pollfd state = { .fd = fd, .events = POLLRDHUP | POLLPRI };
 
-	if (poll(&state, 1, 0) < 0 || state.revents & ~POLLPRI)
+	if (poll_for(&state, 1, 0) < 0 || state.revents & ~POLLPRI)
 		return "an end of it was shut down or closed";
 	if (state.revents)
 		return "it has urgent data";
@@ -418,7 +418,7 @@ void files_ends_keep(struct group_ends *ends, struct avc_board *board)
 			struct pollfd some = { .fd = end->fd, .events = POLLIN };
 
 			/* An empty message counts as one, too. */
-			end->kept = (waiting || poll(&some, 1, 0) == 0) &&
+			end->kept = (waiting || poll_for(&some, 1, 0) == 0) &&
 				    keep_bytes(end, (uint64_t)waiting);
 		}
 		drop_end(end);

@@ -252,7 +252,7 @@ static bool is_out_shut(int fd)
 uint8_t file_shut(int fd)
 {
 	struct pollfd in = { .fd = fd, .events = POLLRDHUP };
-	const bool is_in = poll(&in, 1, 0) == 1 && in.revents & POLLRDHUP;
+	const bool is_in = poll_for(&in, 1, 0) == 1 && in.revents & POLLRDHUP;
 
 	return (uint8_t)((is_in ? SHUT_IN : 0) | (is_out_shut(fd) ? SHUT_OUT : 0));
 }

@@ -52,7 +52,7 @@ static bool is_idle(int fd, const struct file_socket *s)
 	struct pollfd state = { .fd = fd, .events = POLLRDHUP };
 
 	if ((s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6) ||
-	    s->type == SOCK_RAW || s->listening || s->connected || poll(&state, 1, 0) < 0 ||
+	    s->type == SOCK_RAW || s->listening || s->connected || poll_for(&state, 1, 0) < 0 ||
 	    state.revents & POLLRDHUP)
 		return false;
 	/* A stream without a connection reports HUP, but not while connecting (tcp_poll()). */

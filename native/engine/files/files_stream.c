@@ -59,7 +59,7 @@ bool file_is_going(int fd)
 {
 	struct pollfd writable = { .fd = fd, .events = POLLOUT };
 
-	return poll(&writable, 1, 0) == 0;
+	return poll_for(&writable, 1, 0) == 0;
 }
 
 /* A writer that has written part of a message waits for room to write more.  Edge-triggered sets

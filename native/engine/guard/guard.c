@@ -21,7 +21,7 @@
 #define LOOK_OFTEN_NS (5 * NS_PER_S)
 #define STRAGGLER_NS (NS_PER_MS / 5)
 #define STRAGGLER_LONG_NS (20 * NS_PER_MS)
-#define LAST_WORDS_MS 1000
+#define LAST_WORDS_NS NS_PER_S
 #define SEEN_NS (200 * NS_PER_MS)     /* for the daemon to look at the memory of the dead */
 #define REQUEST_FDS 2                 /* sent with one, at most                                  */
 #define DEAD_LOOK_NS (50 * NS_PER_MS) /* while it waits for its group: init is notified */
@@ -660,7 +660,7 @@ static void send_last_words(struct avc_guard *guard)
 	struct pollfd daemon = { .fd = guard->socket, .events = POLLOUT };
 
 	send_outbox(guard);
-	while (guard->outbox_count && poll(&daemon, 1, LAST_WORDS_MS) == 1 &&
+	while (guard->outbox_count && poll_for(&daemon, 1, LAST_WORDS_NS) == 1 &&
 	       !(daemon.revents & (POLLERR | POLLHUP)))
 		send_outbox(guard);
 }

@@ -12,7 +12,7 @@
 #define SPARE_NS (NS_PER_S / 2)
 #define READ_NS (2 * NS_PER_S) /* to read its state while it is stopped                        */
 #define INIT_REAPS_US 3000     /* processes that we have reaped are zombies of init until then   */
-#define QUIESCE_STEP_MS 1
+#define QUIESCE_STEP_NS NS_PER_MS
 #define TAKE_TRIES 4
 #define VFORK_NS (2 * NS_PER_S)
 #define HOMEWARD_NS (2 * NS_PER_S)
@@ -63,7 +63,7 @@ static void wait_quiescent(struct avc_guard *guard, bool *found)
 	if (!guard->config.quiesce_ns)
 		return;
 	while (!(*found = process_is_quiescent(&guard->main)) && now_ns() < end &&
-	       poll(&death, 1, QUIESCE_STEP_MS) == 0)
+	       poll_for(&death, 1, QUIESCE_STEP_NS) == 0)
 		;
 }
 

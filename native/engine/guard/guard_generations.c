@@ -359,7 +359,7 @@ void guard_reap_dead(struct avc_guard *guard)
 			    pidfd_ended(guard->tree.process[i]->holder_pidfd))
 				process_unhold(guard->tree.process[i]);
 		dirty_drop_ended(&guard->dirty);
-		if (!count || (poll(news, 2, 1) > 0 && news[0].revents))
+		if (!count || (poll_for(news, 2, NS_PER_MS) > 0 && news[0].revents))
 			return;
 		if (news[1].revents & POLLIN)
 			break;

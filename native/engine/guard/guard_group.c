@@ -127,7 +127,7 @@ static bool is_called_away(const struct avc_guard *guard)
 		{ .fd = guard->channel.init_pidfd, .events = POLLIN },
 	};
 
-	return poll(news, 2, 0) > 0;
+	return poll_for(news, 2, 0) > 0;
 }
 
 /* Until all have arrived at this step, for `ns` at most. */

@@ -22,6 +22,7 @@
 #define TRY_NS NS_PER_S
 #define TRY_AGAIN_NS (NS_PER_MS / 2)
 #define READY_NS (2 * NS_PER_S)
+#define GONE_NS NS_PER_S
 #define FORK_NS (5 * NS_PER_S)
 
 static const char *const step_names[] = {
@@ -357,7 +358,7 @@ static void take_back(struct restore *restore)
 		struct pollfd gone = { .fd = restore->pidfd, .events = POLLIN };
 
 		syscall(SYS_pidfd_send_signal, restore->pidfd, SIGKILL, NULL, 0);
-		poll(&gone, 1, 1000);
+		(void)poll_for(&gone, 1, GONE_NS);
 	}
 	if (restore->tree)
 		restore_tree_kill(restore->tree);

@@ -20,6 +20,7 @@
 #include "restore_tree.h"
 
 #define STEP_NS (5 * NS_PER_S)
+#define GONE_NS NS_PER_S
 #define FILES_SPARE 64
 /* The number of children with their own fd_channel. */
 #define FEW 2
@@ -518,7 +519,7 @@ void restore_tree_kill(struct restore_tree *restored)
 		struct pollfd gone = { .fd = restored->forked[i].pidfd, .events = POLLIN };
 
 		if (gone.fd >= 0)
-			poll(&gone, 1, 1000);
+			(void)poll_for(&gone, 1, GONE_NS);
 	}
 }
 

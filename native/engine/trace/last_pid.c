@@ -41,8 +41,8 @@ extern const uint8_t lastpid_program_end[] __asm__("lastpid_program_end") HIDDEN
 #define HIGH_FD 16 /* above those that it is given */
 #define ENGINE_SPINS 100
 #define SLICE_NS (20 * (long)NS_PER_MS)
-#define END_MS 1000
-#define KILL_MS 100
+#define END_NS NS_PER_S
+#define KILL_NS (100 * NS_PER_MS)
 #define STOP_NS (100 * NS_PER_MS)
 #define LOCK_NS (300 * NS_PER_MS)
 #define LOCK_URGENT_NS NS_PER_S
@@ -224,10 +224,10 @@ static void helper_end(struct last_pid *helper)
 	/* One that was serving and not stopped has written nothing, and the slots may be gone. */
 	const bool unused = helper->slot && !helper->page->stop;
 
-	if (helper->task && (unused || helper->pidfd < 0 || poll(&ending, 1, END_MS) != 1)) {
+	if (helper->task && (unused || helper->pidfd < 0 || poll_for(&ending, 1, END_NS) != 1)) {
 		/* It reaps the one inside, and exits.  Otherwise the machine's init would have to
 		 * reap that: until then the container's init cannot exit (zap_pid_ns_processes()). */
-		if (!kill_inside(helper) || poll(&ending, 1, KILL_MS) != 1)
+		if (!kill_inside(helper) || poll_for(&ending, 1, KILL_NS) != 1)
 			kill(helper->task, SIGKILL); /* our unreaped child: the PID is its own */
 	}
 	if (helper->task)
