@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from avckpt.cli.client import Client
+from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.errors import SidecarUnreachable
 from avckpt.events.system_journal import SOCKET
 
@@ -26,8 +26,15 @@ def ensure(run_dir: Path, say: Callable[[str], None]) -> None:
 
     Raises SidecarUnreachable with what is to be done when that cannot be.
     """
-    _ensure(run_dir, say)
-    if is_outdated():
+    try:
+        _ensure(run_dir, say)
+        outdated = is_outdated()
+    except PodmanFailed as error:
+        raise SidecarUnreachable(
+            f"the container {NAME} cannot be started: {error}; "
+            f"mend that, or remove it (podman rm -f {NAME}) and try again"
+        ) from error
+    if outdated:
         say(f"warning: {OUTDATED} (sudo podman rm -f {NAME}, then sudo avckpt up)")
 
 
@@ -35,10 +42,10 @@ def is_outdated() -> bool:
     """Its container was made of another image than there is now.
 
     A version number does not tell: between two releases all builds have the
-    same.  Raises SidecarUnreachable.
+    same.  Raises PodmanFailed.
     """
-    runs = _podman("container", "inspect", "--format", "{{.Image}}", NAME, check=False).stdout
-    there = _podman("image", "inspect", "--format", "{{.Id}}", IMAGE, check=False).stdout
+    runs = podman("container", "inspect", "--format", "{{.Image}}", NAME, check=False).stdout
+    there = podman("image", "inspect", "--format", "{{.Id}}", IMAGE, check=False).stdout
     return bool(runs and there and runs != there)
 
 
@@ -53,11 +60,11 @@ def _ensure(run_dir: Path, say: Callable[[str], None]) -> None:
         return
     if status:
         say(f"starting the container {NAME} again")
-        _podman("start", NAME)
-    elif _podman("image", "exists", IMAGE, check=False).returncode == 0:
+        podman("start", NAME)
+    elif podman("image", "exists", IMAGE, check=False).returncode == 0:
         say(f"starting the container {NAME}")
         run_dir.mkdir(mode=0o755, parents=True, exist_ok=True)
-        _podman("run", "--detach", "--pull=never", "--name", NAME, *options(run_dir), IMAGE)
+        podman("run", "--detach", "--pull=never", "--name", NAME, *options(run_dir), IMAGE)
     else:
         raise SidecarUnreachable(
             f"no sidecar is running, and there is no image {IMAGE} to start one from: run sudo avckpt install --sidecar"
@@ -86,7 +93,7 @@ def _wait(client: Client, otherwise: str) -> None:
     deadline = time.monotonic() + ANSWERS_WITHIN_S
     while not answers(client):
         if time.monotonic() > deadline or _status() != "running":
-            lines = _podman("logs", "--tail", "1", NAME, check=False)
+            lines = podman("logs", "--tail", "1", NAME, check=False)
             last = (lines.stderr or lines.stdout).strip()
             raise SidecarUnreachable(f"{otherwise}: {last or 'see podman logs ' + NAME}")
         time.sleep(0.2)
@@ -94,19 +101,5 @@ def _wait(client: Client, otherwise: str) -> None:
 
 def _status() -> str:
     """As `podman ps` has it; empty: there is no such container."""
-    done = _podman("inspect", "--type", "container", NAME, check=False)
+    done = podman("inspect", "--type", "container", NAME, check=False)
     return str(json.loads(done.stdout)[0]["State"]["Status"]) if done.returncode == 0 else ""
-
-
-def _podman(*args: str, check: bool = True) -> subprocess.CompletedProcess[str]:
-    try:
-        done = subprocess.run(["podman", *args], capture_output=True, text=True, check=False, timeout=60)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise SidecarUnreachable(f"the sidecar does not answer, and podman {args[0]} failed: {error}") from error
-    if check and done.returncode != 0:
-        lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise SidecarUnreachable(
-            f"the container {NAME} cannot be started: podman {args[0]}: {lines[-1]}; "
-            f"mend that, or remove it (podman rm -f {NAME}) and try again"
-        )
-    return done

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from avckpt import artifacts
 from avckpt.cli import sidecar_container
+from avckpt.cli.podman import podman
 from avckpt.cli.sidecar_container import IMAGE, NAME
 from avckpt.errors import ConfigError
 
@@ -22,10 +23,10 @@ BUILD_S = 1800.0
 
 
 def build(base: str, say: Callable[[str], None]) -> str:
-    """Builds the image, unless there is one of this build; what was done.  Raises ConfigError."""
+    """Builds the image, unless there is one of this build; what was done.  Raises PodmanFailed, ConfigError."""
     wanted = artifacts.build_id()
     label = f'{{{{index .Labels "{BUILD_LABEL}"}}}}'
-    if _podman("image", "inspect", "--format", label, IMAGE, check=False) == wanted:
+    if podman("image", "inspect", "--format", label, IMAGE, check=False).stdout.strip() == wanted:
         return f"{IMAGE}: there already, of build {wanted}"
     say(f"building {IMAGE} (this takes a minute or two)")
     with tempfile.TemporaryDirectory(prefix="avckpt-image-") as name:
@@ -35,25 +36,26 @@ def build(base: str, say: Callable[[str], None]) -> str:
         wheels = folder / "wheels"
         if base and _fetch(base, needs, wheels):
             options += ["--volume", f"{wheels}:/wheels:ro"]
-        _podman("build", "--network=host", "--label", f"{BUILD_LABEL}={wanted}", *options, "-t", IMAGE, str(folder))
+        options += ["--network=host", "--label", f"{BUILD_LABEL}={wanted}", "-t", IMAGE]
+        podman("build", *options, str(folder), timeout_s=BUILD_S)
     return f"{IMAGE}: built, build {wanted}"
 
 
 def load(archive: Path) -> str:
-    """Loads the image from what `podman save` has written; what was done.  Raises ConfigError."""
-    _podman("load", "-i", str(archive))
-    if _podman("image", "exists", IMAGE, check=False) is None:
+    """Loads the image from what `podman save` has written; what was done.  Raises PodmanFailed, ConfigError."""
+    podman("load", "-i", str(archive), timeout_s=BUILD_S)
+    if podman("image", "exists", IMAGE, check=False).returncode != 0:
         raise ConfigError(f"{archive} was loaded, and holds no image {IMAGE}")
     return f"{IMAGE}: loaded from {archive}"
 
 
 def start(run_dir: Path, *, by_quadlet: bool) -> list[str]:
-    """Has the container run from that image; lines of what was done.  Raises SidecarUnreachable."""
+    """Has the container run from that image; lines of what was done.  Raises PodmanFailed, SidecarUnreachable."""
     if by_quadlet:
         return ["start the sidecar with: systemctl daemon-reload && systemctl start avckpt-sidecar.service"]
     lines: list[str] = []
     if sidecar_container.is_outdated():
-        _podman("rm", "--force", NAME)
+        podman("rm", "--force", NAME)
         lines.append(f"removed the container {NAME}: it was of another build")
     sidecar_container.ensure(run_dir, lines.append)
     return [*lines, f"{NAME}: runs"]
@@ -83,10 +85,10 @@ def _fill(folder: Path) -> list[str]:
 def _fetch(base: str, needs: list[str], folder: Path) -> bool:
     """Fetches the Python packages with our own pip, which knows how to reach them; False: the build has to."""
     code = "import platform, sys; print('%d.%d' % sys.version_info[:2], platform.machine())"
-    said = _podman("run", "--rm", "--network=none", base, "python3", "-c", code, check=False)
-    if said is None or len(said.split()) != 2:
+    said = podman("run", "--rm", "--network=none", base, "python3", "-c", code, check=False, timeout_s=BUILD_S)
+    if said.returncode != 0 or len(said.stdout.split()) != 2:
         return False  # its Python comes with the build
-    version, machine = said.split()
+    version, machine = said.stdout.split()
     platforms = (f"manylinux_2_28_{machine}", f"manylinux_2_17_{machine}", f"manylinux2014_{machine}")
     command = [sys.executable, "-m", "pip", "download", "-q", "-d", str(folder), "--only-binary=:all:"]
     command += ["--implementation", "cp", "--python-version", version]
@@ -97,17 +99,3 @@ def _fetch(base: str, needs: list[str], folder: Path) -> bool:
     # By name: pip looks at the markers of its own Python here.
     done = subprocess.run([*command, "typing_extensions", *needs], capture_output=True, check=False)
     return done.returncode == 0
-
-
-def _podman(*args: str, check: bool = True) -> str | None:
-    """Its output; None: it failed, and that may be.  Raises ConfigError."""
-    try:
-        done = subprocess.run(["podman", *args], capture_output=True, text=True, check=False, timeout=BUILD_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise ConfigError(f"podman {args[0]}: {error}") from error
-    if done.returncode == 0:
-        return done.stdout.strip()
-    if check:
-        lines = (done.stderr or done.stdout).strip().splitlines()[-3:] or [f"exit status {done.returncode}"]
-        raise ConfigError(f"podman {args[0]} failed: {' / '.join(lines)}")
-    return None

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Podman's command line."""
+
+from __future__ import annotations
+
+import subprocess
+
+from avckpt.errors import AvckptError
+
+
+class PodmanFailed(AvckptError):
+    """A command of Podman that had to succeed has not, or there is no Podman."""
+
+
+def podman(*args: str, check: bool = True, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """`podman ARGS` to its end.  Raises PodmanFailed; without `check` a status other than 0 is no failure."""
+    try:
+        done = subprocess.run(["podman", *args], capture_output=True, text=True, check=False, timeout=timeout_s)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise PodmanFailed(f"podman {args[0]}: {error}") from error
+    if check and done.returncode != 0:
+        lines = (done.stderr or done.stdout).strip().splitlines()[-3:] or [f"exit status {done.returncode}"]
+        raise PodmanFailed(f"podman {args[0]}: {' / '.join(lines)}")
+    return done
