@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
 from avckpt.events.vocabulary import Kind
 from avckpt.guard import Images
 from avckpt.supervision.pressure import templates_of
@@ -33,10 +34,11 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.cost import Protected, Way, server_pid
+from bench.scale import cpu_s
 from bench.subjects import BenchFailed, build
 from bench.workload import Client, boards_folder, build_workload, read_log
 from testkit.harness import ROOT
-from testkit.procfs import children_of, figures
+from testkit.procfs import figures
 
 RESULTS = ROOT / "bench" / "results" / "dirty_cost.json"
 WAYS = ("none", "copies", "forks")
@@ -48,15 +50,9 @@ AS_FAST_AS_IT_CAN_US = 15
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 132)
 
 
-def cpu_s(pid: int) -> float:
-    """User and system time."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def guards() -> list[int]:
+def guards() -> list[psutil.Process]:
     """Children of ours that are guards."""
-    return [pid for pid in children_of(os.getpid()) if Path(f"/proc/{pid}/comm").read_text().startswith("avckpt-guard")]
+    return [child for child in psutil.Process().children() if child.name().startswith("avckpt-guard")]
 
 
 def held_mb(server: Protected) -> float:
@@ -82,10 +78,10 @@ def measure(how: str, seconds: float, folder: Path) -> dict[str, Any]:
             server.wait(SETTLE_S[how])
             server.events.clear()
             begin, started_ns = server.board.see(), time.monotonic_ns()
-            guard_s = sum(map(cpu_s, guards()))
+            guard_s = cpu_s(guards())
             server.wait(seconds)
             end, ended_ns = server.board.see(), time.monotonic_ns()
-            guard_s = sum(map(cpu_s, guards())) - guard_s
+            guard_s = cpu_s(guards()) - guard_s
             found["held_mb"] = held_mb(server) if kind == "avckpt" else 0.0
             client.wait_end()
         read = read_log(log)
@@ -106,9 +102,10 @@ def measure(how: str, seconds: float, folder: Path) -> dict[str, Any]:
         with Client(folder, server.port, every_us=every, log=log, seconds=1 + seconds / 2) as client:
             client.wait_answers(100, "the client gets answers")
             server.wait(0.5)
-            begin, started_s, used_s = server.board.see(), time.monotonic(), cpu_s(server_pid(server))
+            itself = [psutil.Process(server_pid(server))]
+            begin, started_s, used_s = server.board.see(), time.monotonic(), cpu_s(itself)
             server.wait(seconds / 2)
-            end, took_s, used_s = server.board.see(), time.monotonic() - started_s, cpu_s(server_pid(server)) - used_s
+            end, took_s, used_s = server.board.see(), time.monotonic() - started_s, cpu_s(itself) - used_s
             client.wait_end()
         answers = end.counter[0] - begin.counter[0]
         return found | {"answers_per_s": answers / took_s, "cpu_ms": used_s * 1e6 / max(1, answers)}
