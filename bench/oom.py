@@ -113,7 +113,7 @@ def watch(sidecar: Sidecar, containers: list[Container], rate: int) -> tuple[int
     back: dict[str, int] = {}
     ended: set[str] = set()
     while time.monotonic() < until and len(back.keys() | ended) < len(containers):
-        for row in sidecar.ps("--all"):
+        for row in sidecar.ps(ended=True):
             last[row["id"]] = row
             if row["state"] == "ended":
                 ended.add(row["id"])

@@ -264,7 +264,7 @@ def kill(sidecar: Sidecar, container: Container, client: Client, number: signal.
         # More updates than ever before, so that nobody has to believe in small differences.
         wait_until(lambda: client.further_than(before) or client.broken, 10, "the tracker counts on")
     except TimeoutError as error:
-        ended = next((entry for entry in sidecar.ps("--all") if entry["id"] == container.id), {"reason": str(error)})
+        ended = next((entry for entry in sidecar.ps(ended=True) if entry["id"] == container.id), {"reason": str(error)})
         raise DemoFailed(f"the tracker did not come back: {ended['reason']}") from error
     if client.broken:
         raise DemoFailed(f"the TCP connection broke: {client.broken}")

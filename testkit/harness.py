@@ -20,6 +20,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+from avckpt.cli.client import Client
+from avckpt.cli.sidecar_container import answers
+
+from testkit.procfs import started
+
 ROOT = Path(__file__).resolve().parent.parent
 BASE_IMAGE = "localhost/avckpt-base:latest"
 SIDECAR_IMAGE = "localhost/avckpt-sidecar:latest"
@@ -181,11 +186,16 @@ class Container:
     podman: Podman
     name: str
     id: str
+    _main: tuple[int, int] = field(default=(0, 0), repr=False)
+    """The main process as Podman named it, and when it started."""
 
     @property
     def pid(self) -> int:
         """The main process (avckpt-init, if protected), in the host's PID namespace; 0: does not run."""
-        pid: int = self.inspect()["State"]["Pid"]
+        pid, since = self._main
+        if not since or started(pid) != since:  # it has ended, and there may be another
+            pid = self.inspect()["State"]["Pid"]
+            self._main = (pid, started(pid) if pid else 0)
         return pid
 
     @property
@@ -309,10 +319,14 @@ class Sidecar:
         """`avckpt ARGS` on the host."""
         return run([*avckpt_command(), *args], timeout_s=timeout_s, check=check)
 
-    def ps(self, *options: str) -> list[dict[str, Any]]:
-        """`avckpt ps --json OPTIONS`."""
-        containers: list[dict[str, Any]] = json.loads(self.avckpt("ps", "--json", *options).stdout)
-        return containers
+    @property
+    def client(self) -> Client:
+        """Asks what `avckpt` asks: tests look often, and a process for each look is most of what a look costs."""
+        return Client(RUN_DIR)
+
+    def ps(self, *, ended: bool = False) -> list[dict[str, Any]]:
+        """As `avckpt ps --json` has it."""
+        return self.client.containers(ended=ended)
 
     def find(self, container: Container) -> dict[str, Any] | None:
         """What `avckpt ps` says of one container; None: it does not know it."""
@@ -343,7 +357,7 @@ class Sidecar:
             found = wait_until(look, timeout_s, f"{what} of {container.name}", every_s=0.1)
         except TimeoutError as error:
             # Has it ended?  Then that is what a person wants to read.
-            ended = [entry for entry in self.ps("--all") if entry["id"] == container.id]
+            ended = [entry for entry in self.ps(ended=True) if entry["id"] == container.id]
             raise TimeoutError(f"{error}; avckpt ps says {last or ended or 'nothing of it'}") from None
         assert found is not None
         return found
@@ -380,12 +394,12 @@ class Sidecar:
             *(*config, SIDECAR_IMAGE),
         )
         try:
-            wait_until(self.answers, timeout_s, f"the sidecar answers on {RUN_DIR}/api.sock", every_s=0.1)
+            wait_until(self.answers, timeout_s, f"the sidecar answers on {RUN_DIR}/api.sock", every_s=0.05)
         except TimeoutError as error:
             raise TimeoutError(f"{error}; its log: {self.logs()[-2000:]}") from None
 
     def answers(self) -> bool:
-        return (RUN_DIR / "api.sock").exists() and self.avckpt("ps", "--json", check=False).status == 0
+        return answers(self.client)
 
     def kill(self) -> None:
         """SIGKILL, as a crash would."""

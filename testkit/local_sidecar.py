@@ -111,19 +111,24 @@ class LocalSidecar:
         """Runs the command line against it."""
         return run([*avckpt_command(), *args], env=self.env, check=check, timeout_s=60)
 
-    def ps(self, *options: str) -> list[dict[str, Any]]:
-        """`avckpt ps --json`."""
-        listed: list[dict[str, Any]] = json.loads(self.avckpt("ps", "--json", *options).stdout)
-        return listed
+    @property
+    def client(self) -> Client:
+        """Asks what `avckpt` asks: tests look often, and a process for each look is most of what a look costs."""
+        return Client(self.run_dir)
+
+    def ps(self, *, ended: bool = False) -> list[dict[str, Any]]:
+        """As `avckpt ps --json` has it."""
+        return self.client.containers(ended=ended)
 
     def events(self, name: str, kind: str) -> list[dict[str, Any]]:
         """What `avckpt events` tells of that container, of that kind, oldest first."""
-        return [json.loads(line) for line in self.avckpt("events", name, "-k", kind, "--json").stdout.splitlines()]
+        return [event for event in self.client.history() if event["container"] == name and event["kind"] == kind]
 
-    def row(self, container: Container, *options: str) -> dict[str, Any]:
+    def row(self, container: Container, *, ended: bool = False) -> dict[str, Any]:
         """What `avckpt ps` knows of a container; empty: nothing."""
-        rows = [row for row in self.ps(*options) if row["id"] == container.id and row["init_pid"] == container.init_pid]
-        return rows[0] if rows else {}
+        rows = self.ps(ended=ended)
+        ours = (row for row in rows if row["id"] == container.id and row["init_pid"] == container.init_pid)
+        return next(ours, {})
 
     def wait_for(self, container: Container, timeout_s: float = 10.0, **wanted: Any) -> dict[str, Any]:
         """Waits until `avckpt ps -a` shows these values for the container."""
@@ -131,7 +136,7 @@ class LocalSidecar:
 
         def fits() -> bool:
             nonlocal last
-            last = self.row(container, "-a")
+            last = self.row(container, ended=True)
             return bool(last) and all(last[key] == value for key, value in wanted.items())
 
         try:
@@ -195,7 +200,7 @@ class LocalSidecar:
         if self.process.poll() is not None:
             raise AssertionError(f"the sidecar ended with {self.process.returncode}:\n{self.log}")
         try:
-            pid: int = Client(self.run_dir).info()["pid"]
+            pid: int = self.client.info()["pid"]
             return pid in (self.process.pid, *children_of(self.process.pid))  # it may have a watchdog
         except SidecarUnreachable:
             return False

@@ -45,6 +45,15 @@ def state_of(pid: int) -> str:
         return "X"
 
 
+def started(pid: int) -> int:
+    """When a process started, in ticks since boot; 0 when it has ended, a zombie included."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except GONE:
+        return 0
+    return 0 if fields[0] in "ZX" else int(fields[19])
+
+
 def numbers_of(pid: int) -> list[int]:
     """A task's numbers in its PID namespaces, ours first, its own last.  Raises OSError when it is gone."""
     status = Path(f"/proc/{pid}/status").read_text()

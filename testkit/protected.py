@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import functools
 import os
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -49,8 +49,11 @@ class ProtectedVictim:
 
     def events(self, *kinds: str) -> list[dict[str, Any]]:
         """What `avckpt events` tells of it, of these kinds."""
-        told = map(json.loads, self.sidecar.avckpt("events", "--json").stdout.splitlines())
-        return [event for event in told if event["id"] == self.container.id and event["kind"] in kinds]
+        return [
+            event
+            for event in self.sidecar.client.history()
+            if event["id"] == self.container.id and event["kind"] in kinds
+        ]
 
     def checkpoint(self) -> None:
         """Takes one, and waits for it."""
@@ -66,6 +69,12 @@ class ProtectedVictim:
         return after
 
 
+@functools.cache
+def build_victims() -> None:
+    """tests/victims/build, brought up to date once."""
+    subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
+
+
 def start_victim(
     sidecar: Sidecar,
     factory: ContainerFactory,
@@ -77,7 +86,7 @@ def start_victim(
     generation: int = 2,
 ) -> ProtectedVictim:
     """Starts `command` (a victim and its arguments) and waits for that generation (0: does not wait)."""
-    subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
+    build_victims()
     folder.chmod(0o755)
     board = Board(folder / "board")
     program, *args = command.split()
@@ -132,7 +141,7 @@ def ended(sidecar: Sidecar, container: Container) -> str:
     """Why a container was not restored, as `avckpt ps -a` has it."""
 
     def look() -> str:
-        found = [entry for entry in sidecar.ps("--all") if entry["id"] == container.id and entry["state"] == "ended"]
+        found = [entry for entry in sidecar.ps(ended=True) if entry["id"] == container.id and entry["state"] == "ended"]
         return str(found[-1]["reason"]) if found else ""
 
     return wait_until(look, 10, f"avckpt ps -a tells how {container.name} ended")
@@ -140,5 +149,4 @@ def ended(sidecar: Sidecar, container: Container) -> str:
 
 def told(sidecar: Sidecar, container: Container, kind: str) -> list[dict[str, Any]]:
     """What `avckpt events` tells of a container, of that kind."""
-    events = [json.loads(line) for line in sidecar.avckpt("events", "--json").stdout.splitlines()]
-    return [event for event in events if event["id"] == container.id and event["kind"] == kind]
+    return [event for event in sidecar.client.history() if event["id"] == container.id and event["kind"] == kind]

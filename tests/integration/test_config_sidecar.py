@@ -32,8 +32,7 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
 
 def kinds(sidecar: LocalSidecar, name: str) -> list[str]:
     """The kinds of the container's events so far, from the history."""
-    lines = sidecar.avckpt("events", "--json").stdout.splitlines()
-    return [event["kind"] for event in map(json.loads, lines) if event["container"] == name]
+    return [event["kind"] for event in sidecar.client.history() if event["container"] == name]
 
 
 def kill_and_wait(sidecar: LocalSidecar, container: Container, restores: int) -> dict[str, object]:
@@ -108,7 +107,7 @@ def test_ends_are_judged_by_the_new_one(sidecar: LocalSidecar, tmp_path: Path) -
     assert "exits: restore.on signal,exit -> signal" in sidecar.avckpt("reload").stdout
     end.touch()
     assert made.status(60) == 3
-    assert sidecar.row(made, "-a")["restores"] == 0
+    assert sidecar.row(made, ended=True)["restores"] == 0
 
 
 def test_one_that_its_labels_contradict_is_named_and_goes_on(sidecar: LocalSidecar) -> None:

@@ -51,22 +51,17 @@ def sidecar(tmp_path: Path) -> Iterator[LocalSidecar]:
         yield sidecar
 
 
-def crashes(sidecar: LocalSidecar, name: str) -> list[dict[str, Any]]:
-    """The crash events of a container."""
-    return [json.loads(line) for line in sidecar.avckpt("events", name, "-k", "crash", "--json").stdout.splitlines()]
-
-
 def crash_by(sidecar: LocalSidecar, victim: Container, signum: int) -> dict[str, Any]:
     """Takes a checkpoint, sends a signal, and waits for the crash event.
 
     No other checkpoint comes in between: one between the signal and the death would restore what dies again.
     """
     take_checkpoint(sidecar.avckpt, victim.name)
-    told = len(crashes(sidecar, victim.name))
+    told = len(sidecar.events(victim.name, "crash"))
     os.kill(victim.app_pid, signum)
-    wait_until(lambda: len(crashes(sidecar, victim.name)) > told, 10, "the crash is told of", every_s=0.05)
+    crashes = wait_until(lambda: sidecar.events(victim.name, "crash")[told:], 10, "the crash is told of", every_s=0.05)
     assert sidecar.row(victim), f"it has ended; log:\n{sidecar.log}"
-    return crashes(sidecar, victim.name)[-1]
+    return crashes[-1]
 
 
 def test_what_it_died_of(sidecar: LocalSidecar) -> None:
@@ -157,7 +152,7 @@ def test_others_that_die_in_masses_take_nothing_away(sidecar: LocalSidecar) -> N
     with asleep(sidecar):
         kill_unheard(victim, signal.SIGUSR1)
         subprocess.run([sys.executable, "-c", die % (PROCESSES_MAX + 50)], check=True, timeout=60)
-    event = wait_until(lambda: crashes(sidecar, "victim"), 10, "the crash is told of", every_s=0.05)[0]
+    event = wait_until(lambda: sidecar.events("victim", "crash"), 10, "the crash is told of", every_s=0.05)[0]
     # Its memory is not kept for so long; this is what the kernel told at the death.
     assert (event["crash"]["signal"], event["crash"]["code"]) == ("SIGSEGV", "SEGV_MAPERR")
     assert event["crash"]["tid"] > 0
@@ -183,7 +178,7 @@ def test_a_death_that_was_not_heard_of_has_a_core_all_the_same(sidecar: LocalSid
                 assert process.stdout.readline() == b"\n"
                 process.kill()
         kill_unheard(victim, signal.SIGUSR1)
-    event = wait_until(lambda: crashes(sidecar, "victim"), 10, "the crash is told of", every_s=0.05)[0]
+    event = wait_until(lambda: sidecar.events("victim", "crash"), 10, "the crash is told of", every_s=0.05)[0]
     assert event["outcome"] == "restored"
     assert event["crash"]["signal"] == "SIGSEGV"
     assert event["crash"]["command"].endswith(sys.executable)

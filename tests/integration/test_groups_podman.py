@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
@@ -36,7 +35,7 @@ def test_a_ring_of_containers_goes_back_together(sidecar: Sidecar, container: Co
 
     def lines() -> set[int]:
         ids = {member.id for member in ring}
-        return {row["line"] for row in json.loads(sidecar.avckpt("ps", "--json").stdout) if row["id"] in ids}
+        return {row["line"] for row in sidecar.ps() if row["id"] in ids}
 
     wait_until(lambda: len(lines()) == 1 and min(lines()) > 0, 30, "a line of all")
     for restores in (1, 2):

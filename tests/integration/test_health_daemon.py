@@ -67,8 +67,7 @@ def checked(
 
 def unhealthy(sidecar: LocalSidecar) -> int:
     """How many times a container was rolled back because of its health check."""
-    lines = sidecar.avckpt("events", "--json").stdout.splitlines()
-    return sum(event.get("reason") == "unhealthy" and event["kind"] == "restored" for event in map(json.loads, lines))
+    return sum(e.get("reason") == "unhealthy" and e["kind"] == "restored" for e in sidecar.client.history())
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL])

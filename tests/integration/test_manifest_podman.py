@@ -383,7 +383,7 @@ def test_the_example_of_a_group_agrees_after_crashes(
 
     def rows() -> list[dict[str, Any]]:
         ids = {member.id for member in members}
-        return [row for row in json.loads(sidecar.avckpt("ps", "--json").stdout) if row["id"] in ids]
+        return [row for row in sidecar.ps() if row["id"] in ids]
 
     def line() -> int:
         lines = {row["line"] for row in rows()}

@@ -101,7 +101,7 @@ def test_who_shares_memory_with_others_keeps_its_newest_generation(
             assert web.hook("prestart", {"avckpt.enable": "true", "avckpt.interval": "500ms"}) == ""
             local.wait_for(web, app_pid_inside=2, generations=2)
             os.kill(web.app_pid, signal.SIGUSR1)
-            wait_until(lambda: local.row(web, "-a").get("restores", 0), 30, "it is restored")
+            wait_until(lambda: local.row(web, ended=True).get("restores", 0), 30, "it is restored")
             beats = board.see().beats
             wait_until(lambda: board.see().beats > beats, 10, "it goes on")
             assert neighbour.poll() is None

@@ -74,7 +74,7 @@ def row(local: LocalSidecar, name: str, **wanted: Any) -> Json:
     last: list[Json] = []
 
     def found() -> Json:
-        last[:] = local.ps("-a")
+        last[:] = local.ps(ended=True)
         rows = [each for each in last if each["name"] == name and not each["ended_at"]]
         return next((each for each in rows if all(each[key] == value for key, value in wanted.items())), {})
 

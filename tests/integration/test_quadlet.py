@@ -139,7 +139,7 @@ def crash(service: Service, sidecar: Sidecar, number: int) -> None:
 
 def answer(sidecar: Sidecar, service: Service, deaths: int) -> str:
     """What came of so many deaths: "restored" or "ended"; "" as long as it is not known."""
-    [row] = [row for row in sidecar.ps("--all") if row["id"] == service.id]
+    [row] = [row for row in sidecar.ps(ended=True) if row["id"] == service.id]
     if row["state"] == "ended":
         return "ended"
     return "restored" if row["restores"] >= deaths else ""

@@ -143,7 +143,7 @@ def test_a_restarted_container_is_protected_again(local: LocalSidecar) -> None:
     assert second.hook("prestart", QUICK) == ""
     local.wait_for(second, state="protected")
     assert [row["init_pid"] for row in local.ps()] == [second.init_pid]
-    assert len(local.ps("-a")) == 2
+    assert len(local.ps(ended=True)) == 2
 
 
 def test_registering_twice_is_registering_once(local: LocalSidecar) -> None:

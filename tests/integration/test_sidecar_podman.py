@@ -70,7 +70,7 @@ def test_a_container_lives_through_kill_and_ends_with_stop(container: ContainerF
     done = web.podman.run("stop", "--time", "9", web.name, timeout_s=20)
     assert done.took_s < 5
     assert web.exit_code == 128 + signal.SIGTERM
-    [ended] = [entry for entry in sidecar.ps("-a") if entry["id"] == web.id]
+    [ended] = [entry for entry in sidecar.ps(ended=True) if entry["id"] == web.id]
     assert ended["state"] == "ended"
     assert sidecar.find(web) is None
     log = sidecar.logs()
