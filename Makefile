@@ -95,10 +95,10 @@ test-machine: setup ## demo, hooks, Quadlet, trees, packages on Debian 13 (Podma
 
 # All that tests run and would compile themselves, before several runs of pytest do it at once.
 build-tests: setup-build
-	@$(MAKE) -s -C native
-	@$(MAKE) -s -C native SANITIZE=1
-	@$(MAKE) -s -C native STORES=1
-	@$(MAKE) -s -C tests/victims
+	@$(MAKE) -s -j2 -C native
+	@$(MAKE) -s -j2 -C native SANITIZE=1
+	@$(MAKE) -s -j2 -C native STORES=1
+	@$(MAKE) -s -j2 -C tests/victims
 	@$(MAKE) -s -C tests/victims STATIC=1 build-static/intruder
 	@$(MAKE) -s -C tests/fuzz SEEDS=1
 

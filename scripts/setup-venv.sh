@@ -30,7 +30,7 @@ native_is_new() {
 }
 
 # On its own, before pip does it: a compiler's message is not buried in pip's.
-native_is_new || step native "compiling the engine and avckpt-init" make --no-print-directory -C native
+native_is_new || step native "compiling the engine and avckpt-init" make --no-print-directory -j"$(nproc)" -C native
 
 if [ "$(cat "$STAMPS/venv" 2>/dev/null)" != "$key" ]; then
 	# Built without isolation, so that a change of the C sources needs no network.

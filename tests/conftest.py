@@ -29,6 +29,9 @@ def pytest_configure(config: pytest.Config) -> None:
     so over execve(2): every program under test would inherit it from `make test`.
     A shell ignores SIGINT and SIGQUIT in what it starts with `&`.
     """
+    config.addinivalue_line(
+        "markers", "machine: takes hooks and sidecar of this machine; added to who takes the fixture"
+    )
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if signal.getsignal(signal.SIGQUIT) == signal.SIG_IGN:
@@ -51,14 +54,15 @@ def reset_if_ignored(number: int) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whatever takes the fixture `podman` is marked so; a mark that asks for a favour says why.  Raises UsageError."""
+    """Whatever takes these fixtures is marked so; a mark that asks for a favour says why.  Raises UsageError."""
     for item in items:
         for name in ("shared_machine", "alone"):
             mark = item.get_closest_marker(name)
             if mark is not None and not (len(mark.args) == 1 and str(mark.args[0]).strip()):
                 raise pytest.UsageError(f'{item.nodeid}: write @pytest.mark.{name}("why")')
-        if "podman" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.podman)
+        for name in ("podman", "machine"):
+            if name in getattr(item, "fixturenames", ()):
+                item.add_marker(name)
 
 
 def pytest_report_collectionfinish(items: list[pytest.Item]) -> str:
