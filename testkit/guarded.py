@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import json
 import os
@@ -31,10 +32,13 @@ from testkit.init_peer import Init
 from testkit.procfs import children_of, inside
 
 BUILD = ROOT / "tests/victims/build"
-PATIENCE_S = 15.0 * SLOWNESS
+PATIENCE_S = 60.0 * SLOWNESS
+"""Only a test that fails takes as long: where others take the CPU, to start a guard may take ten seconds."""
 
 IMAGES = Images[os.environ.get("AVCKPT_TEST_IMAGES", "fork").upper()]
 """How checkpoints are made where a test does not care: AVCKPT_TEST_IMAGES=dirty runs them all the other way."""
+
+PR_SET_TIMERSLACK = 29
 
 Json = dict[str, Any]
 
@@ -176,6 +180,14 @@ class GuardProcess:
         ticket = self.say_command(name, cookie)
         return self.wait_for(lambda event: event.get("ticket") == ticket, f"answer to {name}", timeout_s=timeout_s)
 
+    def checkpoint(self, cookie: int = 1) -> Json:
+        """Has one taken, again while it is missed, as where others take the CPU; the last answer."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            answer = self.command("checkpoint", cookie)
+            if answer["kind"] != "missed" or time.monotonic() > deadline:
+                return answer
+
     def say_command(self, name: str, cookie: int = 1, within_s: float = 0.0) -> int:
         """The same without waiting for the answer, which has this ticket; to be begun within that time (0: any)."""
         self.wait("attached", cookie=cookie)
@@ -239,7 +251,8 @@ class Victim(Init):
         super().__init__(
             [BUILD / program, *args],
             pid1=True,
-            options=options,
+            # So that one who gets no CPU for seconds has not died for good.
+            options=("--wait-ms", "60000", *options),
             stdout=self._file.fileno(),
             stderr=subprocess.STDOUT,
             preexec=preexec,
@@ -343,6 +356,12 @@ def kill_at_random(
         victim.wait_beats(3)
         assert inside(victim.app) == pid
         assert victim.see().pid == acting
+
+
+def sleep_exactly(s: float) -> None:
+    """Without the 50 us by which the kernel may be late with other sleeps."""
+    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    time.sleep(s)
 
 
 @contextlib.contextmanager

@@ -36,7 +36,7 @@ REPORT = struct.Struct("=IIiiIIQ")
 VERDICT = struct.Struct("=II")
 ARMED_OFFSET = 32
 
-PATIENCE_S = 10.0 * SLOWNESS
+PATIENCE_S = 30.0 * SLOWNESS
 
 InitT = TypeVar("InitT", bound="Init")
 PageT = TypeVar("PageT", bound="Page")

@@ -8,17 +8,17 @@ import signal
 from collections.abc import Callable
 
 from testkit.board import Seen
-from testkit.guarded import GuardProcess, Json, Victim
-from testkit.harness import SLOWNESS, wait_until
+from testkit.guarded import PATIENCE_S, GuardProcess, Json, Victim
+from testkit.harness import wait_until
 
 KILLS = 6
-PATIENCE_S = 5.0 * SLOWNESS
 
 
 def checkpoint(guard: GuardProcess) -> Json:
     """Takes one, once the guard has found the victim."""
-    guard.wait("attached")
-    return guard.command("checkpoint")
+    taken = guard.checkpoint()
+    assert taken["kind"] == "checkpoint", taken
+    return taken
 
 
 def disturb_app(app: int, see: Callable[[], Seen]) -> None:

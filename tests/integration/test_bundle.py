@@ -15,8 +15,6 @@ import pytest
 from testkit.harness import ContainerFactory, Sidecar, wait_until
 from testkit.protected import told
 
-pytestmark = pytest.mark.shared_machine("the sidecar is given a time to protect")
-
 SECRET = "a-secret-of-the-application"
 
 

@@ -29,12 +29,10 @@ from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, en
 
 SLEEPER = ["sleep", "1000"]
 Stream = Generator[dict[str, Any], None, None]
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
-    pytest.mark.shared_machine(
-        "init waits two seconds for its guard, which may get no CPU for as long; events are given a time to come"
-    ),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+SHARED = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; events are given a time to come"
+)
 
 
 class Connection(http.client.HTTPConnection):
@@ -108,6 +106,7 @@ def test_a_parameter_that_does_nothing_is_refused(target: str, said: str, local:
     assert said in json.loads(body)["error"]["message"]
 
 
+@SHARED
 def test_the_stream_tells_a_crash_as_it_happens_and_ends_with_the_sidecar(local: LocalSidecar) -> None:
     events = stream(local, "?all=1")
     web = local.protected("web", SLEEPER, {**QUICK, "avckpt.group": "chain"})
@@ -133,6 +132,7 @@ def test_the_stream_tells_a_crash_as_it_happens_and_ends_with_the_sidecar(local:
     assert not ended(web)
 
 
+@SHARED
 def test_routine_is_told_only_to_those_who_asked_and_has_no_id(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -150,6 +150,7 @@ def test_routine_is_told_only_to_those_who_asked_and_has_no_id(local: LocalSidec
     assert next(kept)["data"]["kind"] == "died"
 
 
+@SHARED
 def test_who_comes_back_with_the_last_id_misses_nothing_and_hears_nothing_twice(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -171,6 +172,7 @@ def test_who_comes_back_with_the_last_id_misses_nothing_and_hears_nothing_twice(
     assert next(by_query)["id"] == told[4]["id"]
 
 
+@SHARED
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_the_history_outlives_the_sidecar(local: LocalSidecar, how: signal.Signals) -> None:
     web = local.protected("web", SLEEPER)
@@ -187,6 +189,7 @@ def test_the_history_outlives_the_sidecar(local: LocalSidecar, how: signal.Signa
     assert kinds[5:] == ["registered", "checkpoint", "died", "restored", "crash"]
 
 
+@SHARED
 def test_a_follower_that_does_not_read_holds_nobody_up(local: LocalSidecar) -> None:
     local.stop()
     # More than a socket holds: the sidecar is stuck with the first it sends.
@@ -206,6 +209,7 @@ def test_a_follower_that_does_not_read_holds_nobody_up(local: LocalSidecar) -> N
         assert time.monotonic() - started < 8
 
 
+@SHARED
 def test_a_roll_back_is_manual_and_a_refused_command_is_told(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER, ON_COMMAND)
     local.wait_for(web, app_pid_inside=2)
@@ -220,6 +224,7 @@ def test_a_roll_back_is_manual_and_a_refused_command_is_told(local: LocalSidecar
     assert Client(local.run_dir).history()[-1]["reason"] == "signal"
 
 
+@SHARED
 def test_the_end_of_a_container_is_told(local: LocalSidecar) -> None:
     web = local.protected("web", ["sh", "-c", "exec sleep 1000"])
     local.wait_for(web, state="protected")
@@ -235,6 +240,7 @@ def test_the_end_of_a_container_is_told(local: LocalSidecar) -> None:
 # The command line
 
 
+@SHARED
 def test_the_command_events(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -252,6 +258,7 @@ def test_the_command_events(local: LocalSidecar) -> None:
     ]
 
 
+@SHARED
 def test_following_goes_on_over_a_restart_of_the_sidecar(local: LocalSidecar, tmp_path: Path) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -289,6 +296,7 @@ def test_following_goes_on_over_a_restart_of_the_sidecar(local: LocalSidecar, tm
 # The API
 
 
+@SHARED
 def test_what_the_sidecar_answers_is_what_its_description_says(local: LocalSidecar) -> None:
     status, content_type, body = get(local, "/v1/openapi.json")
     assert (status, content_type) == (200, "application/json; charset=utf-8")
@@ -369,6 +377,7 @@ def scrape(local: LocalSidecar) -> dict[str, float]:
     return found
 
 
+@SHARED
 def test_metrics_of_a_crash(local: LocalSidecar) -> None:
     program = "import time\nx = bytearray(20_000_000)\nwhile 1:\n  x[::4096] = bytes(len(x[::4096])); time.sleep(.05)"
     web = local.protected("web", ["python3", "-c", program])
@@ -390,6 +399,7 @@ def test_metrics_of_a_crash(local: LocalSidecar) -> None:
     assert "avckpt_protected['web']" not in scrape(local)
 
 
+@SHARED
 def test_memory_that_several_generations_hold_together_counts_once(local: LocalSidecar, tmp_path: Path) -> None:
     """Pages shared by templates are no process's private memory, and must be counted nevertheless."""
     again = tmp_path / "again"
@@ -409,6 +419,7 @@ def test_memory_that_several_generations_hold_together_counts_once(local: LocalS
     assert 29e6 < local.row(web)["memory_bytes"] < 36e6
 
 
+@SHARED
 def test_an_application_can_not_write_lines_of_its_own(local: LocalSidecar, tmp_path: Path) -> None:
     """File names that the application chooses appear in messages, in the log and on terminals."""
     name = "x\n2026-01-01 ERROR web: all is lost\x1b[2K"

@@ -15,8 +15,6 @@ from avckpt.cli.install import DROP_IN, HOOKS_DIR
 
 from testkit.harness import Podman, avckpt_command, hooks_installed, run, wait_until
 
-pytestmark = pytest.mark.shared_machine("Podman and its service are given a time to start")
-
 INIT = "/run/avckpt-init"
 
 
@@ -50,6 +48,7 @@ def test_the_drop_in_is_in_force(
     assert first_process(podman, name, base_image).startswith(INIT)
 
 
+@pytest.mark.shared_machine("Podman's service is given a time to start")
 def test_a_service_that_runs_already_calls_no_hooks(
     installed: None, podman: Podman, base_image: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,7 @@ from testkit.harness import (
     write_hooks,
 )
 
-pytestmark = pytest.mark.shared_machine("a hook that gets no CPU for ten seconds is late")
+SHARED = pytest.mark.shared_machine("hooks give up after seconds, and come later than that where they get no CPU")
 
 INIT = "/run/avckpt-init --wait-ms 2000 --stop-signal"
 # With the newline that journald waits for.
@@ -398,6 +398,7 @@ def test_without_a_sidecar_a_container_runs_and_the_user_is_told(
     )
 
 
+@SHARED
 def test_a_stuck_sidecar_does_not_keep_a_container_from_running(
     make: ContainerFactory, run_dir: Path, base_image: str
 ) -> None:
@@ -432,6 +433,7 @@ def test_a_broken_hook_does_not_keep_a_container_from_running(
     assert err.startswith("avckpt: a container runs unprotected: ")
 
 
+@SHARED
 @pytest.mark.parametrize(("stage", "seconds"), [("precreate", 11), ("prestart", 6)])
 def test_a_slow_machine_does_not_keep_a_container_from_running(
     *, podman: Podman, hooks_dir: Path, tmp_path: Path, base_image: str, name: str, stage: str, seconds: int

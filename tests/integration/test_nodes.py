@@ -23,12 +23,10 @@ from testkit.harness import avckpt_command, run, wait_until
 from testkit.local_sidecar import LocalSidecar
 from testkit.procfs import children_of, inside
 
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
-    pytest.mark.shared_machine(
-        "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
-    ),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+SHARED = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; the sidecar is given a time to protect"
+)
 
 INIT = str(init_binary())
 COUNTER = """
@@ -88,6 +86,7 @@ def lines(path: Path) -> list[list[str]]:
     return [line.split()[1:] for line in path.read_text().splitlines() if line.startswith("n ")]
 
 
+@SHARED
 def test_a_unit_of_the_host_goes_on_in_place(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     process = start("--name", "counter", *QUICK, "--", *COUNT)
     before = row(local, "host/counter", state="protected")
@@ -109,6 +108,7 @@ def test_a_unit_of_the_host_goes_on_in_place(local: LocalSidecar, start: Any, tm
     assert (tmp_path / "0.err").read_text() == ""
 
 
+@SHARED
 @pytest.mark.parametrize(
     ("script", "status"), [("exit 0", 0), ("exit 7", 7), ("kill -KILL $$", -9), ("kill -SEGV $$", -11)]
 )
@@ -118,6 +118,7 @@ def test_a_unit_that_is_not_restored_ends_as_its_program(start: Any, script: str
     assert process.wait(10) == status
 
 
+@SHARED
 def test_options_and_environment_are_labels(local: LocalSidecar, start: Any) -> None:
     start("--", "sleep", "1000", AVCKPT_INIT=INIT, AVCKPT_LABELS="avckpt.keep=4  avckpt.interval=200ms")
     assert (lambda r: (r["keep"], r["interval_s"]))(row(local, "host/sleep", state="protected")) == (4, 0.2)
@@ -125,6 +126,7 @@ def test_options_and_environment_are_labels(local: LocalSidecar, start: Any) -> 
     assert row(local, "host/sleep-2")["keep"] == 5
 
 
+@SHARED
 def test_what_is_refused_is_said_and_runs(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     process = start("--label", "avckpt.kepe=4", "--", "sh", "-c", "sleep 1; exit 5")
     assert process.wait(10) == 5
@@ -134,6 +136,7 @@ def test_what_is_refused_is_said_and_runs(local: LocalSidecar, start: Any, tmp_p
     assert local.ps() == []
 
 
+@SHARED
 def test_of_the_host_only_root_registers(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     def nobody() -> None:
         os.setsid()
@@ -149,6 +152,7 @@ def test_of_the_host_only_root_registers(local: LocalSidecar, start: Any, tmp_pa
     assert local.ps() == []
 
 
+@SHARED
 def test_a_unit_within_a_unit_is_part_of_it(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     start("--name", "outer", *QUICK, "--", "sh", "-c", f"{INIT} --name inner -- sleep 1000; exit 3")
     row(local, "host/outer", state="protected")
@@ -161,6 +165,7 @@ def test_a_unit_within_a_unit_is_part_of_it(local: LocalSidecar, start: Any, tmp
     assert sorted(each["name"] for each in local.ps()) == ["host/other", "host/outer"]
 
 
+@SHARED
 def test_units_find_the_next_sidecar(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     process = start("--name", "a", *QUICK, "--", *COUNT)
     first = row(local, "host/a", state="protected")
@@ -185,6 +190,7 @@ def test_units_find_the_next_sidecar(local: LocalSidecar, start: Any, tmp_path: 
         row(local, name, state="protected")
 
 
+@SHARED
 def test_whoever_kills_init_means_the_program(local: LocalSidecar, start: Any) -> None:
     process = start("--name", "a", *QUICK, "--", *COUNT)
     app = row(local, "host/a", state="protected")["app_pid"]
@@ -198,6 +204,7 @@ def test_whoever_kills_init_means_the_program(local: LocalSidecar, start: Any) -
     wait_until(lambda: local.ps() == [], 10, "it is gone")
 
 
+@SHARED
 def test_what_a_unit_leaves_behind_stays_and_templates_do_not(local: LocalSidecar, start: Any, tmp_path: Path) -> None:
     script = (
         "import os, time\n"
@@ -245,6 +252,7 @@ wait
 """
 
 
+@SHARED
 def test_a_shell_launcher_without_podman(tmp_path: Path) -> None:
     """`avckpt run`: a node's death is undone without the launcher seeing it, and the launcher can stop its nodes."""
     with (tmp_path / "out").open("wb") as out, (tmp_path / "err").open("wb") as err:
@@ -298,6 +306,7 @@ def test_a_shell_launcher_without_podman(tmp_path: Path) -> None:
     assert (tmp_path / "out").read_text() == f"stopping\na {128 + signal.SIGHUP}\nb {128 + signal.SIGTERM}\n"
 
 
+@SHARED
 def test_a_job_of_a_shell_stops_and_continues(local: LocalSidecar, tmp_path: Path) -> None:
     """A key pressed on the terminal reaches a unit's program exactly once, as without avckpt."""
     (tmp_path / "job.py").write_text(
@@ -364,6 +373,7 @@ def test_a_launcher_without_avckpt_starts_its_nodes_all_the_same(tmp_path: Path)
     assert "there is no avckpt here" in done.stderr
 
 
+@SHARED
 def test_the_row_of_a_unit_is_in_the_api(local: LocalSidecar, start: Any) -> None:
     start("--name", "a", "--", "sleep", "1000")
     assert row(local, "host/a")["node_of"] == "host"

@@ -17,10 +17,8 @@ from avckpt.supervision.inside import OUTPUT_BYTES, Done, _sealed_program, run_i
 
 from testkit.harness import ROOT, Container, ContainerFactory, Podman, wait_until
 
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root"),
-    pytest.mark.shared_machine("commands that are run in containers have time limits"),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="entering a container needs root")
+SHARED = pytest.mark.shared_machine("commands that are run in containers have time limits")
 
 WHO = (
     "id; pwd; hostname; echo $GREETING; ulimit -n; cat /proc/self/cgroup; "
@@ -82,6 +80,7 @@ def test_input_output_and_status(container: ContainerFactory, inside: Callable[[
     assert run("/etc/passwd").status == 126
 
 
+@SHARED
 def test_it_is_killed_when_its_time_is_up(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
     made = container("sleep", "1000")
     before = time.monotonic()
@@ -97,12 +96,14 @@ def test_it_is_killed_when_its_time_is_up(container: ContainerFactory, inside: C
     wait_until(lambda: "sleep 555" not in left() and "sleep 666" not in left(), 5, "nothing of it is left")
 
 
+@SHARED
 def test_an_endless_writer_fills_nothing(container: ContainerFactory, inside: Callable[[Container], Run]) -> None:
     done = inside(container("sleep", "1000"))("yes", timeout_s=0.3)
     assert done.timed_out
     assert len(done.output) <= OUTPUT_BYTES
 
 
+@SHARED
 def test_what_goes_on_in_the_background_is_not_waited_for(
     container: ContainerFactory, inside: Callable[[Container], Run]
 ) -> None:
@@ -138,6 +139,7 @@ def test_nothing_of_ours_can_be_written_to_in_there(container: ContainerFactory)
         os.close(pidfd)
 
 
+@SHARED
 def test_a_container_can_hold_only_what_has_no_privileges(container: ContainerFactory, podman: Podman) -> None:
     """A container's CPU quota and freezer must not stop a process of the host's root in its PID namespace."""
     options = ["--user", "1000:1000", "--cap-drop", "all", "--security-opt", "seccomp=unconfined"]

@@ -23,13 +23,11 @@ from testkit.harness import Completed, avckpt_command, run, wait_until
 from testkit.local_sidecar import app_of
 from testkit.procfs import children_of, comm_of, status_of
 
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root"),
-    pytest.mark.shared_machine(
-        "init waits two seconds for its guard, which may get no CPU for as long; "
-        "a command is given a time to protect its program"
-    ),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="avckpt run needs root")
+SHARED = pytest.mark.shared_machine(
+    "init waits two seconds for its guard, which may get no CPU for as long; "
+    "a command is given a time to protect its program"
+)
 
 COUNTER = """
 import sys, time
@@ -99,6 +97,7 @@ def start(tmp_path: Path) -> Iterator[object]:
         running.process.wait()
 
 
+@SHARED
 @pytest.mark.parametrize(
     ("script", "status"), [("exit 0", 0), ("exit 7", 7), ("kill -KILL $$", 137), ("kill -SEGV $$", 139)]
 )
@@ -219,6 +218,7 @@ def test_a_signal_that_comes_very_early_is_not_lost(start) -> None:  # type: ign
         assert running.process.wait(10) == 128 + signal.SIGTERM
 
 
+@SHARED
 def test_a_killed_program_goes_on_where_it_was(start, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     running = start("-v", "--label", "avckpt.interval=100ms", "--", sys.executable, "-c", COUNTER)
     running.wait_for("protected: first checkpoint")
@@ -240,6 +240,7 @@ def test_a_killed_program_goes_on_where_it_was(start, tmp_path: Path) -> None:  
     assert all(line.startswith("avckpt: ") for line in running.messages.splitlines())
 
 
+@SHARED
 def test_quiet_but_for_deaths_and_restores(start) -> None:  # type: ignore[no-untyped-def]
     running = start("--label", "avckpt.interval=50ms", "--", "sleep", "60")
     app = running.app
@@ -258,6 +259,7 @@ def test_its_guard_has_a_seccomp_filter(start) -> None:  # type: ignore[no-untyp
     assert [status_of(pid)["Seccomp"] for pid in guards] == ["2"]
 
 
+@SHARED
 @pytest.mark.parametrize("restored", [False, True], ids=["as-started", "restored"])
 def test_a_killed_avckpt_ends_the_program(restored: bool, start) -> None:  # type: ignore[no-untyped-def]
     """Otherwise it would run on unnoticed, with neither parent nor job by which to find it."""
@@ -275,6 +277,7 @@ def test_a_killed_avckpt_ends_the_program(restored: bool, start) -> None:  # typ
         os.close(pidfd)
 
 
+@SHARED
 @pytest.mark.parametrize("moment_s", [0.05 * n for n in range(12)])
 def test_killed_at_any_time_it_leaves_nothing(moment_s: float, tmp_path: Path) -> None:
     mark = f"17{os.getpid()}{int(moment_s * 100):03}"
@@ -359,6 +362,7 @@ def test_control_c_is_the_programs(terminal) -> None:  # type: ignore[no-untyped
     assert "SIGINT passed on" not in session.text  # once, from the terminal
 
 
+@SHARED
 def test_control_c_ends_a_plain_program_for_good(terminal) -> None:  # type: ignore[no-untyped-def]
     session = terminal(f"{RUN} --label avckpt.interval=50ms -- sleep 60; echo status=$?")
     session.wait_for("protected: first checkpoint")
@@ -376,6 +380,7 @@ def test_control_z_does_not_lock_the_terminal(terminal) -> None:  # type: ignore
     session.wait_for("status=0")
 
 
+@SHARED
 @pytest.mark.parametrize("how", ["fg", "bg; sleep 0.2; fg"])
 def test_control_z_stops_it_as_a_job(how: str, terminal) -> None:  # type: ignore[no-untyped-def]
     program = "bash -c 'echo ready; while read x; do echo got=$x; done'"
@@ -395,6 +400,7 @@ def test_control_z_stops_it_as_a_job(how: str, terminal) -> None:  # type: ignor
     session.wait_for("status=0")
 
 
+@SHARED
 def test_the_terminal_comes_back_after_a_restore(terminal) -> None:  # type: ignore[no-untyped-def]
     session = terminal(
         f"{RUN} --label avckpt.interval=50ms -- bash -c 'while read -p ? x; do echo got=$x; done'; echo status=$?"
@@ -411,6 +417,7 @@ def test_the_terminal_comes_back_after_a_restore(terminal) -> None:  # type: ign
     session.wait_for("status=0")
 
 
+@SHARED
 def test_in_the_background_it_leaves_the_terminal_alone(terminal, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     # Only builtins while it runs: for a command the shell would take the terminal back.
     session = terminal(

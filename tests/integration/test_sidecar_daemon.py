@@ -30,10 +30,8 @@ from testkit.local_sidecar import ON_COMMAND, QUICK, Container, LocalSidecar, en
 from testkit.procfs import children_of
 
 SLEEPER = ["sleep", "1000"]
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
-    pytest.mark.shared_machine("the daemon's patience with hooks, guards and clients has limits"),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
+SHARED = pytest.mark.shared_machine("the daemon's patience with hooks, guards and clients has limits")
 
 
 @pytest.fixture
@@ -48,6 +46,7 @@ def local(idle_sidecar: LocalSidecar) -> LocalSidecar:
     return idle_sidecar
 
 
+@SHARED
 def test_a_registered_container_is_protected(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     row = local.wait_for(web, state="protected")
@@ -62,6 +61,7 @@ def test_a_registered_container_is_protected(local: LocalSidecar) -> None:
     assert row["reason"] == ""
 
 
+@SHARED
 def test_a_killed_application_comes_back_under_its_pid(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -90,6 +90,7 @@ def checkpoint(local: LocalSidecar, *args: str) -> str:
         assert time.monotonic() < deadline, done
 
 
+@SHARED
 def test_commands_on_a_container(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER, ON_COMMAND)
     local.wait_for(web, app_pid_inside=2)
@@ -107,6 +108,7 @@ def test_commands_on_a_container(local: LocalSidecar) -> None:
     assert not ended(web)
 
 
+@SHARED
 def test_a_container_that_is_stopped_is_forgotten(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -122,6 +124,7 @@ def test_a_container_that_is_stopped_is_forgotten(local: LocalSidecar) -> None:
     assert gone.status == 4
 
 
+@SHARED
 def test_a_container_that_is_killed_whole_is_forgotten(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -134,6 +137,7 @@ def test_a_container_that_is_killed_whole_is_forgotten(local: LocalSidecar) -> N
     assert not [fd for fd in pidfds if "pidfd" in str(fd)]
 
 
+@SHARED
 def test_a_restarted_container_is_protected_again(local: LocalSidecar) -> None:
     first = local.protected("web", SLEEPER)
     local.wait_for(first, state="protected")
@@ -146,6 +150,7 @@ def test_a_restarted_container_is_protected_again(local: LocalSidecar) -> None:
     assert len(local.ps(ended=True)) == 2
 
 
+@SHARED
 def test_registering_twice_is_registering_once(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -162,6 +167,7 @@ def test_labels_that_a_sidecar_can_not_honour_are_refused(local: LocalSidecar) -
     assert local.ps() == []
 
 
+@SHARED
 def test_what_is_no_avckpt_init_is_waited_for_and_left_alone(local: LocalSidecar) -> None:
     """A container that was created but not started looks the same."""
     web = local.container("web", SLEEPER)
@@ -176,6 +182,7 @@ def test_what_is_no_avckpt_init_is_waited_for_and_left_alone(local: LocalSidecar
     assert not ended(web)
 
 
+@SHARED
 def test_what_can_not_be_protected_runs_unprotected_and_says_so(local: LocalSidecar) -> None:
     run(["make", "-s", "-C", str(ROOT / "tests/victims")])
     web = local.protected("web", [str(ROOT / "tests/victims/build/unsupported"), "aio"])
@@ -188,6 +195,7 @@ def test_what_can_not_be_protected_runs_unprotected_and_says_so(local: LocalSide
     assert not ended(web)
 
 
+@SHARED
 def test_a_program_that_executes_another_is_unprotected_until_the_next_checkpoint(
     local: LocalSidecar, tmp_path: Path
 ) -> None:
@@ -223,6 +231,7 @@ open(sys.argv[1], "w").close()
 """Starts more threads than a process of one thread is given room for, when it is told to."""
 
 
+@SHARED
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local: LocalSidecar, tmp_path: Path) -> None:
     """There are more threads than there was room for, and the application cannot be stopped (`podman pause`)."""
@@ -247,6 +256,7 @@ def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local
         local.wait_for(web, state="protected", generations=1)
 
 
+@SHARED
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("command", ["checkpoint", "restore"])
 def test_a_paused_container_says_so_at_once(command: str, version: int, local: LocalSidecar) -> None:
@@ -269,6 +279,7 @@ def test_a_paused_container_says_so_at_once(command: str, version: int, local: L
         assert (row["state"], row["restores"], row["generations"], web.app_pid) == ("protected", 0, 2, app)
 
 
+@SHARED
 def test_a_sidecar_that_starts_later_adopts(idle_sidecar: LocalSidecar) -> None:
     web = idle_sidecar.container("web", SLEEPER)
     said = web.hook("prestart", QUICK)
@@ -296,6 +307,7 @@ def missed(local: LocalSidecar, name: str, labels: dict[str, str]) -> Container:
     return made
 
 
+@SHARED
 def test_a_container_whose_hook_got_no_answer_is_adopted(local: LocalSidecar) -> None:
     web = missed(local, "web", QUICK)
     row = local.wait_for(web, state="protected", timeout_s=15)
@@ -319,6 +331,7 @@ def descriptors_left(local: LocalSidecar, count: int) -> Iterator[None]:
         resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
 
 
+@SHARED
 def test_descriptors_that_run_out_keep_nobody_from_being_adopted_later(local: LocalSidecar) -> None:
     web = missed(local, "web", QUICK)
     with descriptors_left(local, 0):
@@ -327,6 +340,7 @@ def test_descriptors_that_run_out_keep_nobody_from_being_adopted_later(local: Lo
     assert local.wait_for(web, state="protected", timeout_s=15)["adopted"]
 
 
+@SHARED
 def test_a_guard_for_which_there_are_no_descriptors_is_started_later(local: LocalSidecar) -> None:
     web = local.container("web", SLEEPER)
     # The hook's connection, the container's pidfd, and one to look at that.
@@ -340,6 +354,7 @@ def test_a_guard_for_which_there_are_no_descriptors_is_started_later(local: Loca
     assert local.log.count("web: runs unprotected: ") == 1
 
 
+@SHARED
 def test_a_guard_that_could_not_begin_is_started_anew(local: LocalSidecar) -> None:
     """Its timer takes a place in the queue of pending signals, of which none is left."""
     assert local.process is not None
@@ -356,6 +371,7 @@ def test_a_guard_that_could_not_begin_is_started_anew(local: LocalSidecar) -> No
     local.wait_for(web, restores=1, state="protected")
 
 
+@SHARED
 def test_a_reload_adopts_it_at_once(local: LocalSidecar) -> None:
     web = missed(local, "web", QUICK)
     local.avckpt("reload")
@@ -370,6 +386,7 @@ def test_one_that_can_not_be_adopted_is_told_once(local: LocalSidecar) -> None:
     assert local.row(web) == {}
 
 
+@SHARED
 def test_a_sidecar_that_does_not_see_the_hosts_processes_says_so(local: LocalSidecar) -> None:
     """Its container was started without --pid=host."""
     why = "the sidecar does not see the host's processes: start it with --pid=host"
@@ -411,6 +428,7 @@ def test_it_takes_all_the_descriptors_it_may(idle_sidecar: LocalSidecar) -> None
     assert resource.prlimit(idle_sidecar.process.pid, resource.RLIMIT_NOFILE) == (hard, hard)
 
 
+@SHARED
 def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -429,6 +447,7 @@ def test_sigterm_leaves_the_application_running_and_nothing_else(local: LocalSid
     assert web.status() == 128 + signal.SIGKILL
 
 
+@SHARED
 def test_sigkill_leaves_the_application_running_and_the_next_one_takes_over(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -444,6 +463,7 @@ def test_sigkill_leaves_the_application_running_and_the_next_one_takes_over(loca
     local.wait_for(web, restores=1, state="protected")
 
 
+@SHARED
 def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSidecar) -> None:
     web = local.container("web", SLEEPER)
     assert local.process is not None
@@ -462,6 +482,7 @@ def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSi
     local.wait_for(web, restores=1)
 
 
+@SHARED
 def test_crashes_are_restored_while_the_event_loop_hangs(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER)
     local.wait_for(web, state="protected")
@@ -524,6 +545,7 @@ def test_sockets_are_for_root_only(local: LocalSidecar) -> None:
     assert stat.S_IMODE(local.run_dir.stat().st_mode) == 0o755
 
 
+@SHARED
 def test_an_idle_sidecar_sleeps(local: LocalSidecar) -> None:
     """At most a handful of wake-ups: a periodic task would be visible."""
     assert local.process is not None
@@ -546,6 +568,7 @@ def test_info(local: LocalSidecar) -> None:
     assert info["version"] == run([*avckpt_command(), "--version"]).stdout.split()[1]
 
 
+@SHARED
 def test_who_does_not_ask_for_memory_does_not_have_it_looked_at(local: LocalSidecar) -> None:
     local.protected("web", SLEEPER)
     client = Client(local.run_dir)
@@ -561,6 +584,7 @@ def test_who_does_not_ask_for_memory_does_not_have_it_looked_at(local: LocalSide
     assert seen() == row["memory_bytes"]
 
 
+@SHARED
 def test_the_table_on_a_narrow_terminal(local: LocalSidecar) -> None:
     """Nothing is cut off, and states have colours."""
     local.wait_for(local.protected("web", SLEEPER), state="protected", generations=2)

@@ -24,10 +24,7 @@ from testkit.local_sidecar import LocalSidecar
 SLEEPER = ["sleep", "1000"]
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "300ms"}
 PATIENCE_S = 60
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
-    pytest.mark.shared_machine("a screen is given a time to show what it should"),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
 
 
 def cells(app: Top, column: str) -> list[str]:
@@ -99,6 +96,7 @@ def test_a_sidecar_that_goes_and_comes(local: LocalSidecar) -> None:
     driven(local, steps)
 
 
+@pytest.mark.shared_machine("a screen is given a time to show what it should")
 def test_on_a_terminal(local: LocalSidecar) -> None:
     local.protected("lidar", SLEEPER, LABELS)
     leader, terminal = pty.openpty()

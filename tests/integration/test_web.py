@@ -27,10 +27,7 @@ from testkit.local_sidecar import LocalSidecar, local_sidecar
 SLEEPER = ["sleep", "1000"]
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "500ms", "avckpt.group": "drive"}
 PATIENCE_S = 60
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root"),
-    pytest.mark.shared_machine("a browser is given a time to show what it should"),
-]
+pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="the engine needs root")
 
 
 @dataclass

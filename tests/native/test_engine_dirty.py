@@ -16,7 +16,7 @@ import pytest
 from avckpt.guard import Images
 
 from testkit.family import ours
-from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux
+from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux, sleep_exactly
 from testkit.harness import wait_until
 from testkit.procfs import children_of, figures
 
@@ -278,9 +278,7 @@ def test_templates_are_killed_while_one_gives_its_memory_away(tmp_path: Path) ->
             after_s = rng.uniform(0, 0.004)
             victim.kill_app()
             select.select([dead], [], [])
-            until = time.monotonic() + after_s
-            while time.monotonic() < until:
-                pass
+            sleep_exactly(after_s)
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(template, signal.SIGKILL)
             os.close(template)

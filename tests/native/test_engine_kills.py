@@ -13,13 +13,11 @@ from pathlib import Path
 import pytest
 
 from testkit.family import kill_main, look
-from testkit.guarded import GuardProcess, Victim, config, kill_at_random
+from testkit.guarded import GuardProcess, Victim, config, kill_at_random, sleep_exactly
 from testkit.harness import wait_until
 from testkit.procfs import children_of, inside
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
-)
+SHARED = pytest.mark.shared_machine("a kill has to come within the milliseconds of a restore")
 
 KILLS = 12
 
@@ -52,6 +50,7 @@ def test_killed_at_random_moments(command: str, interval_s: float, tmp_path: Pat
         victim.wait_beats(20)
 
 
+@SHARED
 @pytest.mark.parametrize("how", ["segv", "kill"])
 def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
     """Hundreds of times, at any step of the restore; at last it ends, and nothing hangs."""
@@ -69,31 +68,25 @@ def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
         assert sum(event["kind"] == "restored" for event in guard.events if "kind" in event) > 20
 
 
-def spare_of_time(s: float) -> None:
-    """A sleep would be rounded up by a scheduler's tick."""
-    until = time.perf_counter() + s
-    while time.perf_counter() < until:
-        pass
-
-
 def numbered(init: int, number: int, old: int) -> int:
     """The child of init with this number inside that is not `old`, also one that does not run yet; 0: none."""
     return next((m.pid for m in map(look, children_of(init)) if m and m.inside == number and m.pid != old), 0)
 
 
+@SHARED
 @pytest.mark.parametrize("command", ["threads 6 4 --no-churn", "tree 3"])
 def test_is_killed_while_it_is_restored(command: str, tmp_path: Path) -> None:
     """By somebody else, and there is only one generation: that is as good as before."""
     rng, during = random.Random(1), 0
     only_one = config(0, keep=1, restore_window_s=0.000001)
     with Victim(command, tmp_path) as victim, GuardProcess(only_one, [victim.pid]) as guard:
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         number = inside(victim.app)
         for _ in range(40):
             dead, since = victim.app, guard.mark()
             os.kill(dead, signal.SIGKILL)
-            again = wait_until(partial(numbered, victim.pid, number, dead), 5, "it is there again", 0)
-            spare_of_time(rng.uniform(0, 0.0005))
+            again = wait_until(partial(numbered, victim.pid, number, dead), 5, "it is there again", 0.0001)
+            sleep_exactly(rng.uniform(0, 0.0005))
             os.kill(again, signal.SIGKILL)
             guard.wait("restored", since=since)
             victim.wait_beats(3)
@@ -111,7 +104,7 @@ def test_what_is_left_of_old_templates_is_reaped(tmp_path: Path) -> None:
     """The guard does not wait for a template's slow exit, but a zombie would keep the container from ending."""
     with Victim("threads 4 100 --no-churn", tmp_path) as victim, GuardProcess(config(0, keep=1), [victim.pid]) as guard:
         for _ in range(10):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
         # The one that the next checkpoint is copied to stays.
         wait_until(lambda: templates_of(victim) <= 2, 5, "old templates go")
 

@@ -24,7 +24,7 @@ from avckpt.guard import Images
 
 from testkit.cgroups import Cgroup, freezer, throttle
 from testkit.family import ours
-from testkit.guarded import BUILD, GuardProcess, Victim, config, forks_beside
+from testkit.guarded import BUILD, GuardProcess, Victim, config, forks_beside, sleep_exactly
 from testkit.harness import wait_until
 from testkit.procfs import children_of
 
@@ -111,9 +111,7 @@ def test_killed_while_it_is_used(command: str, tmp_path: Path) -> None:
             after_s = rng.uniform(0, 0.002)
             victim.kill_app()
             select.select([dead], [], [])
-            until = time.monotonic() + after_s
-            while time.monotonic() < until:
-                pass
+            sleep_exactly(after_s)
             with contextlib.suppress(ProcessLookupError):  # it was used already
                 signal.pidfd_send_signal(spare, signal.SIGKILL)
             os.close(spare)
@@ -154,17 +152,17 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
 def test_made_while_the_container_ends_it_is_no_news(tmp_path: Path) -> None:
     """Its template was killed with all other processes, but its end is not visible yet."""
     rng = random.Random(4)
-    for n in range(40):
-        (tmp_path / str(n)).mkdir()
-        with (
-            Victim("threads 4 20 --no-churn", tmp_path / str(n)) as victim,
-            GuardProcess(config(), [victim.pid]) as guard,
-        ):
-            guard.command("checkpoint")
-            time.sleep(rng.uniform(0.009, 0.014))
-            os.kill(victim.pid, signal.SIGKILL)
-            guard.wait("ended")
-            assert not [event for event in guard.events if event.get("kind") == "dropped"]
+    with Victim("idle 1 1", tmp_path) as first, GuardProcess(config(), [first.pid]) as guard:
+        for n in range(40):
+            (tmp_path / str(n)).mkdir()
+            with Victim("threads 4 20 --no-churn", tmp_path / str(n)) as victim:
+                guard.start_another(victim.pid)
+                since = guard.mark()
+                guard.command("checkpoint")
+                time.sleep(rng.uniform(0.009, 0.014))
+                os.kill(victim.pid, signal.SIGKILL)
+                guard.wait("ended", since=since)
+        assert not [event for event in guard.events if event.get("kind") == "dropped"]
 
 
 def test_killed_before_there_is_one_while_others_fork(tmp_path: Path) -> None:

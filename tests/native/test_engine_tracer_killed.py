@@ -98,11 +98,11 @@ def test_memory_of_dead_guards_is_given_back(tmp_path: Path) -> None:
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace is what kills the guard; it is not installed")
 def test_handlers_run_on_their_own_stack(tmp_path: Path) -> None:
     """The guard dies before its 1st, 2nd, ... ptrace call: a borrowed thread returns, and handlers find it whole."""
-    with Victim("steady", tmp_path) as victim:
+    with Victim("steady", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:
         for nth in range(1, PTRACE_CALLS + 1):
-            with GuardProcess(config(0.02), [victim.pid]) as guard:
-                guard.wait("checkpoint")
-                kill = f"inject=ptrace:signal=KILL:when={nth}"
-                trace = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=ptrace", "-e", kill]
-                subprocess.run([*trace, "-p", str(guard.guards[0])], timeout=15, check=False, stderr=subprocess.DEVNULL)
-                victim.wait_beats(10)
+            guard.wait("checkpoint", since=guard.mark())
+            kill = f"inject=ptrace:signal=KILL:when={nth}"
+            trace = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", "trace=ptrace", "-e", kill]
+            subprocess.run([*trace, "-p", str(guard.pid)], timeout=15, check=False, stderr=subprocess.DEVNULL)
+            victim.wait_beats(10)
+            guard.start_another(victim.pid)

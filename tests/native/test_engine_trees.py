@@ -24,11 +24,9 @@ from testkit.family import kill_main, look, main_process, members, ours, places,
 from testkit.guarded import GuardProcess, Victim, config, forks_beside, meanwhile, storm
 from testkit.harness import wait_until
 from testkit.procfs import children_of, figures, status_of
+from testkit.scenario import checkpoint
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; "
-    "a tree that does not stop in time is not checkpointed"
-)
+SHARED = pytest.mark.shared_machine("others take the CPU here already, and what is left must suffice")
 
 LONG = os.environ.get("AVCKPT_LONG") == "1"
 KILLS = 100 if LONG else 5
@@ -57,17 +55,6 @@ def built(init_built: None, victims_built: Path) -> None:
 def steady(interval_s: float = 0.0, keep: int = 2) -> GuardConfig:
     """A freeze may take a second here: on a busy machine the default of 50 ms would miss most of them."""
     return config(interval_s, keep=keep, freeze_deadline_s=1.0)
-
-
-def checkpoint(guard: GuardProcess) -> None:
-    """Takes one; tries again when it was missed."""
-    for _ in range(20):
-        event = guard.command("checkpoint")
-        if event["kind"] == "checkpoint":
-            return
-        assert event["kind"] == "missed", event
-        time.sleep(0.02)
-    raise AssertionError(f"twenty missed checkpoints, the last: {event}")
 
 
 def kill_again_and_again(guard: GuardProcess, victim: Victim, kills: int, pause_s: float, orphans: int = 0) -> None:
@@ -141,6 +128,7 @@ def busy_cpus() -> contextlib.AbstractContextManager[None]:
     return meanwhile([sys.executable, "-c", "while True: pass"], len(os.sched_getaffinity(0)) + 1)
 
 
+@SHARED
 @pytest.mark.parametrize("command", ["prefork 6 100", "tree 9 --orphan"])
 def test_numbers_are_taken_by_others(command: str, tmp_path: Path) -> None:
     """By `podman exec`, for example; also PIDs of children that take long to fork, or are init's."""
@@ -163,6 +151,7 @@ def kill_others(victim: Victim, family: set[int], over: threading.Event) -> None
                         os.kill(child, signal.SIGKILL)
 
 
+@SHARED
 def test_copies_are_killed(tmp_path: Path) -> None:
     """Those whose PID another process has taken; by the OOM killer, for example."""
     over = threading.Event()
@@ -188,6 +177,7 @@ def test_copies_are_killed(tmp_path: Path) -> None:
         assert not [event for event in guard.events if event["kind"] == "dropped"]
 
 
+@SHARED
 def test_killed_before_a_checkpoint_is_complete(tmp_path: Path) -> None:
     """A group's leader may have ended when the freeze is over, and is in the checkpoint nevertheless."""
     with (
@@ -221,6 +211,7 @@ def test_dies_again_at_once(command: str, tmp_path: Path) -> None:
             assert places(victim) == before
 
 
+@SHARED
 @pytest.mark.parametrize("command", ["tree 8 --threads 2", "churn 6"])
 def test_killed_while_it_can_not_be_stopped_in_time(command: str, tmp_path: Path) -> None:
     """Freezes and holders keep failing, in every state: no death is final, and checkpoints are taken again."""
@@ -374,6 +365,7 @@ def test_it_ends_as_its_main_process_does(tmp_path: Path) -> None:
         assert victim.see().violations == 0
 
 
+@SHARED
 def test_no_process_notices_that_its_tracer_was_killed(tmp_path: Path) -> None:
     """The guard dies before, during and after checkpoints; no process is left stopped, no template ever runs."""
     with contextlib.ExitStack() as stack:
@@ -414,17 +406,17 @@ def test_the_tracer_is_killed_after_restores(tmp_path: Path) -> None:
             assert places(victim) == before
 
 
+@SHARED
 @pytest.mark.skipif(psutil.virtual_memory().available < 12e9, reason="it takes 6 GB, and twice that to be at ease")
-def test_children_wait_as_long_as_a_big_process_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_children_wait_as_long_as_a_big_process_takes(tmp_path: Path) -> None:
     """They were stopped first, and must not run before the last one was cloned."""
-    monkeypatch.setattr("testkit.guarded.PATIENCE_S", 60.0)  # 6 GB are to be filled
     with Victim("prefork 2 6000", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(4):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             victim.wait_beats(20)
         since = guard.mark()
         kill_main(victim)
-        guard.wait("restored", since=since, timeout_s=60.0)
+        guard.wait("restored", since=since)
         victim.wait_beats(20)
 
 

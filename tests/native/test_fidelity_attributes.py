@@ -12,8 +12,6 @@ import pytest
 from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 from testkit.harness import wait_until
 
-pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
-
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
@@ -61,9 +59,9 @@ def credentials(victim: Victim) -> dict[str, str]:
 def test_a_personality_that_changes(where: str, tmp_path: Path) -> None:
     """Also that of a process whose holder was made before the change."""
     with Victim(f"traits personality {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         wait_until(lambda: victim.see().counter[0] == 1, 5, "it changes")
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         kill(guard, victim)
 
 
@@ -72,10 +70,10 @@ def test_a_thread_that_changes(kind: str, tmp_path: Path) -> None:
     """One that sets itself up when it is first seen; one in a handler, whose alternate stack is hidden then."""
     with Victim(f"traits {kind}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(1 if kind == "setup" else 4):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
         lead(victim, 1)
         victim.wait_beats()
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         kill(guard, victim)
 
 
@@ -85,7 +83,7 @@ def test_a_thread_that_leaves_a_handler(tmp_path: Path) -> None:
         for step in (0, 1, 2):
             lead(victim, step)
             for _ in range(4):
-                assert guard.command("checkpoint")["kind"] == "checkpoint"
+                assert guard.checkpoint()["kind"] == "checkpoint"
         victim.wait_beats()
         kill(guard, victim)
 
@@ -96,9 +94,9 @@ def test_all_threads_change_users(where: str, tmp_path: Path) -> None:
     with Victim(f"traits users {where}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for change in range(1, 13):
             for _ in range(change):
-                assert guard.command("checkpoint")["kind"] == "checkpoint"
+                assert guard.checkpoint()["kind"] == "checkpoint"
             lead(victim, change)
-            answer = guard.command("checkpoint")
+            answer = guard.checkpoint()
             assert answer["kind"] == "checkpoint", answer
             kill(guard, victim)
 
@@ -117,6 +115,7 @@ def kill(guard: GuardProcess, victim: Victim) -> None:
     victim.wait_beats(20)
 
 
+@pytest.mark.shared_machine("how long checkpoints stop the application is looked at")
 def test_one_that_may_not_have_another_process(tmp_path: Path) -> None:
     """At its limit of processes it runs on unharmed, and the reason for the missing checkpoint is reported."""
     with tempfile.TemporaryDirectory() as folder:

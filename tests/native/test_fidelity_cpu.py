@@ -9,8 +9,6 @@ import pytest
 
 from testkit.guarded import BUILD, WHERE, GuardProcess, Victim, config, kill_at_random
 
-pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
-
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

@@ -14,11 +14,6 @@ from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import wait_until
 from testkit.scenario import checkpoint
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; "
-    "what is written between checkpoint and death is the scheduler's choice"
-)
-
 IN_PLACE = "was written in place since the checkpoint"
 DELETED = "was deleted since the checkpoint"
 
@@ -95,7 +90,7 @@ def test_starts_cold_behind_a_database(how: str, why: str, tmp_path: Path) -> No
         gave_up = guard.wait("gave_up", since=since)
         assert "avckpt.files=auto" in str(gave_up["error"])
         assert why in str(gave_up["error"])
-        assert victim.popen.wait(5) == 128 + signal.SIGKILL
+        assert victim.end() == 128 + signal.SIGKILL
 
 
 def test_goes_back_behind_a_database_if_it_is_told_to(tmp_path: Path) -> None:

@@ -10,10 +10,6 @@ import pytest
 from testkit.guarded import WHERE, GuardProcess, Victim, config
 from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; events come at random moments"
-)
-
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

@@ -16,15 +16,20 @@ from pathlib import Path
 import pytest
 from avckpt.guard import Files, Tcp
 
-from testkit.guarded import WHERE, GuardProcess, Victim, config, injected, kill_at_random, since_linux
+from testkit.guarded import (
+    PATIENCE_S,
+    WHERE,
+    GuardProcess,
+    Victim,
+    config,
+    injected,
+    kill_at_random,
+    since_linux,
+)
 from testkit.harness import SLOWNESS, wait_until
 from testkit.meddle import get_fd
 from testkit.procfs import below
 from testkit.scenario import KILLS, checkpoint, disturb, disturb_and_restore, restored, wait_looked
-
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
-)
 
 
 @pytest.fixture(autouse=True)
@@ -47,8 +52,7 @@ def test_as_at_the_checkpoint(scenario: str, where: str, tmp_path: Path) -> None
         GuardProcess(config(), [victim.pid]) as guard,
     ):
         for _ in range(2):
-            taken = checkpoint(guard)
-            assert taken["kind"] == "checkpoint", taken
+            checkpoint(guard)
             for _kill in range(KILLS):
                 disturb(victim)
                 event = restored(victim, guard)
@@ -64,7 +68,7 @@ def test_a_question_that_a_signal_cuts_short_is_asked_again(command: str, tmp_pa
     with Victim(f"{command} {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         guard.wait("attached")
         with injected(guard, "poll,ppoll", "error=EINTR:when=1+2"):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             disturb(victim)
             assert "error" not in restored(victim, guard)
 
@@ -122,6 +126,7 @@ def test_only_what_the_application_may_open_is_opened_again(tmp_path: Path) -> N
             assert "more)" not in error
 
 
+@pytest.mark.shared_machine("how long a restore takes is looked at")
 @pytest.mark.parametrize("where", WHERE)
 def test_thousands_opened_since_are_closed(where: str, tmp_path: Path) -> None:
     """Without looking at each of them, which would take a second."""
@@ -174,7 +179,7 @@ def test_strict_does_not_restore_over_a_written_file(tmp_path: Path, memory: Pat
         gave_up = guard.wait("gave_up")
         assert "avckpt.files=strict" in str(gave_up["error"])
         assert "data was written since the checkpoint" in str(gave_up["error"])
-        assert victim.popen.wait(5) == 128 + signal.SIGKILL
+        assert victim.end() == 128 + signal.SIGKILL
 
 
 def test_strict_restores_when_nothing_was_written(tmp_path: Path, memory: Path) -> None:
@@ -242,9 +247,9 @@ class Client:
         self.stream.flush()
         return self.stream.readline().rstrip("\n")
 
-    def is_reset(self) -> bool:
+    def is_reset(self, patience_s: float = PATIENCE_S) -> bool:
         """True once the other side has reset it; False if nothing of the kind comes."""
-        self.socket.settimeout(0.5)
+        self.socket.settimeout(patience_s)
         try:
             return self.socket.recv(1) == b""
         except ConnectionResetError:
@@ -284,7 +289,7 @@ def test_only_connections_that_moved_are_reset(tmp_path: Path) -> None:
         assert moved.is_reset()
         assert late.is_reset()
         assert still.ask("e") == "2 e"
-        assert not still.is_reset()
+        assert not still.is_reset(0.5)
 
 
 def test_connections_go_on_on_demand(tmp_path: Path) -> None:
@@ -313,13 +318,13 @@ def test_killed_at_random_moments(scenario: str, where: str, tmp_path: Path) -> 
         checkpoint(guard)
         restored(victim, guard, looks=False)
         # All holders are there again, and the second generation.
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         before = guard.fds()
         for n in range(40):
             if n % 10 == 9:
                 disturb(victim)
                 restored(victim, guard)
-                assert guard.command("checkpoint")["kind"] == "checkpoint"
+                assert guard.checkpoint()["kind"] == "checkpoint"
             victim.kill_app(signal.SIGUSR1)
             time.sleep(rng.choice((0.0, rng.uniform(0.0, 0.003))))
             event = restored(victim, guard, looks=False)

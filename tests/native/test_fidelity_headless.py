@@ -13,10 +13,7 @@ import pytest
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random, since_linux
 from testkit.procfs import state_of, threads
 
-pytestmark = [
-    since_linux(6, 9, "pidfds of threads"),
-    pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long"),
-]
+pytestmark = since_linux(6, 9, "pidfds of threads")
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +35,7 @@ def test_the_end_of_the_last_thread(tmp_path: Path) -> None:
     plain = config(restore_on_exit=False)
     with Victim("headless 3", tmp_path) as victim, GuardProcess(plain, [victim.pid]) as guard:
         guard.wait("attached")
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         victim.kill_app()
         guard.wait("restored")
         victim.wait_beats()

@@ -11,8 +11,6 @@ from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import SLOWNESS, wait_until
 from testkit.scenario import disturb, restored
 
-pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
-
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

@@ -17,10 +17,6 @@ import pytest
 from testkit.guarded import WHERE, GuardProcess, Json, Victim, config, kill_at_random
 from testkit.harness import wait_until
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; copies of much memory take long"
-)
-
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
@@ -83,11 +79,6 @@ def uninherited(victim: Victim) -> set[int]:
     return pages(flagged(victim.player, "dc"))
 
 
-def take(guard: GuardProcess) -> None:
-    """Takes a checkpoint; on a busy machine some are missed, and tried again."""
-    wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "a checkpoint is taken", 0.02)
-
-
 @pytest.mark.parametrize("command", ["mappings", "mappings --unbound --in-child"])
 def test_what_no_fork_inherits_is_inherited_by_none_after_a_checkpoint(command: str, tmp_path: Path) -> None:
     """Neither without a death nor after one, although the template has inherited it."""
@@ -95,7 +86,7 @@ def test_what_no_fork_inherits_is_inherited_by_none_after_a_checkpoint(command: 
         before = uninherited(victim)
         assert before
         for _ in range(5):
-            take(guard)
+            assert guard.checkpoint()["kind"] == "checkpoint"
             assert uninherited(victim) == before
         for _ in range(3):
             since = guard.mark()
@@ -103,7 +94,7 @@ def test_what_no_fork_inherits_is_inherited_by_none_after_a_checkpoint(command: 
             guard.wait("restored", since=since)
             victim.wait_beats()
             assert uninherited(victim) == before
-            take(guard)
+            assert guard.checkpoint()["kind"] == "checkpoint"
             assert uninherited(victim) == before
 
 
@@ -113,11 +104,13 @@ def test_it_stays_so_if_the_guard_dies(where: str, tmp_path: Path) -> None:
     rng = random.Random(7)
     with Victim(f"mappings 0 {where}", tmp_path) as victim:
         before = uninherited(victim)
-        for _ in range(25):
-            with GuardProcess(config(0.002), [victim.pid]) as guard:
-                guard.wait("checkpoint", count=2)
+        with GuardProcess(config(0.002), [victim.pid]) as guard:
+            for _ in range(25):
+                guard.wait("checkpoint", since=guard.mark(), count=2)
                 time.sleep(rng.uniform(0.0, 0.01))
-            wait_until(lambda: uninherited(victim) == before, 5, "it is inherited no more")
+                guard.kill_guards()
+                wait_until(lambda: uninherited(victim) == before, 5, "it is inherited no more")
+                guard.start_another(victim.pid)
         victim.wait_beats()
 
 
@@ -136,7 +129,7 @@ def test_more_shared_memory_than_allowed_is_left_alone_and_told(tmp_path: Path) 
 def test_more_shared_memory_than_allowed_of_several_processes(megabytes: int, kind: str, tmp_path: Path) -> None:
     """Refused: a restored process would wait for what the others had stored in it."""
     with Victim(f"crowd common 2 {megabytes}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        answer = guard.command("checkpoint")
+        answer = guard.checkpoint()
         assert answer["kind"] == kind, answer
         if kind == "unprotected":
             assert "8192 kB" in answer["error"]["message"]
@@ -181,7 +174,7 @@ def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
     command = f"regions {scenario} {tmp_path} {where}"
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(2):
-            taken = guard.command("checkpoint")
+            taken = guard.checkpoint()
             assert (taken["kind"], taken.get("error")) == ("checkpoint", None)
             for _kill in range(3):
                 event = restored(victim, guard)
@@ -193,7 +186,7 @@ def test_kinds_that_few_have(scenario: str, where: str, tmp_path: Path) -> None:
 def test_a_divided_segment_is_only_mapped_and_told(tmp_path: Path) -> None:
     command = f"regions divided {tmp_path} --in-child"
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         assert "cannot be detached" in restored(victim, guard)["error"]["message"]
 
 
@@ -201,7 +194,7 @@ def test_a_divided_segment_is_only_mapped_and_told(tmp_path: Path) -> None:
 def test_what_was_sealed_since_can_not_go_back_and_is_told(where: str, tmp_path: Path) -> None:
     command = f"regions changed {tmp_path} {where}"
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         assert "sealed" in restored(victim, guard)["error"]["message"]
 
 
@@ -221,7 +214,7 @@ def test_what_it_can_not_write_is_not_rolled_back(where: str, visible: Path, tmp
         Victim(f"regions viewed {visible} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        assert "error" not in guard.command("checkpoint")
+        assert "error" not in guard.checkpoint()
         (visible / "map").write_bytes(b"now\0")
         assert "error" not in restored(victim, guard)
         assert (visible / "map").read_bytes() == b"now\0"
@@ -234,7 +227,7 @@ def test_what_others_wrote_since_is_not_taken_back(where: str, visible: Path, tm
         Victim(f"regions published {visible} {where}", tmp_path) as victim,
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        assert "error" not in guard.command("checkpoint")
+        assert "error" not in guard.checkpoint()
         with (visible / "map").open("r+b") as file:
             file.write(b"now\0")
         assert "have been written as files since" in restored(victim, guard)["error"]["message"]
@@ -247,7 +240,7 @@ def test_what_others_have_open_for_writing_is_theirs_and_told(visible: Path, tmp
         (visible / "map").open("r+b"),
         GuardProcess(config(), [victim.pid]) as guard,
     ):
-        assert "shared memory are also others'" in guard.command("checkpoint")["error"]["message"]
+        assert "shared memory are also others'" in guard.checkpoint()["error"]["message"]
 
 
 @pytest.fixture

@@ -10,8 +10,6 @@ import pytest
 from testkit.family import kill_main
 from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
 
-pytestmark = pytest.mark.shared_machine("init waits two seconds for its guard, which may get no CPU for as long")
-
 
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:

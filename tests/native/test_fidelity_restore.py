@@ -19,9 +19,7 @@ from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, parasites
 from testkit.harness import wait_until
 from testkit.procfs import children_of, inside, state_of, threads
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; peers have time limits of their own"
-)
+SHARED = pytest.mark.shared_machine("how far the application has come is taken for how long it has run")
 
 
 @pytest.fixture(autouse=True)
@@ -29,10 +27,11 @@ def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
 
 
+@SHARED
 def test_one_generation_restored_many_times(tmp_path: Path) -> None:
     """Each time from the same image: no state leaks from one life into the next."""
     with Victim("threads 8 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        taken = guard.command("checkpoint")
+        taken = guard.checkpoint()
         assert taken["kind"] == "checkpoint", taken
         names = threads(victim.app)
         laps = []
@@ -53,11 +52,12 @@ def test_one_generation_restored_many_times(tmp_path: Path) -> None:
         victim.wait_beats(50)
 
 
+@SHARED
 def test_restore_on_command(tmp_path: Path) -> None:
     """A live application is rolled back, its counters included."""
     with Victim("busy 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         assert guard.command("restore")["kind"] == "refused"
-        guard.command("checkpoint")
+        guard.checkpoint()
         pid = inside(victim.app)
         # So long that the test looks again before it has counted as far once more.
         time.sleep(2)
@@ -76,7 +76,7 @@ def test_names_in_the_process_list(tmp_path: Path) -> None:
         before = threads(victim.app)
         command_line = Path(f"/proc/{victim.app}/cmdline").read_bytes()
         for _ in range(3):
-            guard.command("checkpoint")
+            guard.checkpoint()
 
         def names() -> list[str]:
             # None: an old template, gone by now.
@@ -108,7 +108,7 @@ def test_process_group_and_session_stay(tmp_path: Path) -> None:
             return int(lines["NSpgid"].split()[-1]), int(lines["NSsid"].split()[-1])
 
         before = groups()
-        guard.command("checkpoint")
+        guard.checkpoint()
         for _ in range(2):
             since = guard.mark()
             victim.kill_app()
@@ -120,13 +120,13 @@ def test_process_group_and_session_stay(tmp_path: Path) -> None:
 def test_a_template_that_is_killed_is_a_lost_generation(tmp_path: Path) -> None:
     """From inside the container, for example by a script that kills unknown processes."""
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        first = guard.command("checkpoint")
-        guard.command("checkpoint")
+        first = guard.checkpoint()
+        guard.checkpoint()
         for pid in victim.others():
             os.kill(pid, signal.SIGKILL)
         wait_until(lambda: not victim.others(), 5, "they are gone, and reaped")
         victim.wait_beats(20)
-        third = guard.command("checkpoint")
+        third = guard.checkpoint()
         assert third["generation"] == first["generation"] + 2
         assert third["generations"] == 1
         since = guard.mark()
@@ -183,7 +183,7 @@ def echo(tmp_path: Path) -> Iterator[tuple[Victim, GuardProcess, socket.socket]]
         Victim("tcpecho 0", tmp_path) as victim,
         GuardProcess(config(tcp=Tcp.KEEP), [victim.pid]) as guard,
     ):
-        peer = socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5)
+        peer = socket.create_connection(("127.0.0.1", victim.see().counter[1]), PATIENCE_S)
         with contextlib.closing(peer):
             yield victim, guard, peer
 
@@ -201,7 +201,7 @@ def ask(peer: socket.socket, line: str) -> str:
 def test_a_connection_goes_on(echo: tuple[Victim, GuardProcess, socket.socket]) -> None:
     victim, guard, peer = echo
     assert ask(peer, "one") == "1 one"
-    guard.command("checkpoint")
+    guard.checkpoint()
     assert ask(peer, "two") == "2 two"
     for _ in range(10):
         since = guard.mark()
@@ -217,12 +217,12 @@ def test_what_is_closed_after_a_checkpoint_is_closed(echo: tuple[Victim, GuardPr
     victim, guard, peer = echo
     port = victim.see().counter[1]
     for _ in range(3):
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
     assert ask(peer, "close") == "1 close"
-    peer.settimeout(1)
+    peer.settimeout(PATIENCE_S)
     assert peer.recv(1) == b""
     with socket.create_connection(("127.0.0.1", port), 5) as second:
-        guard.command("checkpoint")
+        guard.checkpoint()
         assert ask(second, "listenclose") == "1 listenclose"
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection(("127.0.0.1", port), 1)
@@ -241,7 +241,7 @@ def test_a_peer_sees_the_end_of_an_app_that_is_not_restored(tmp_path: Path) -> N
         GuardProcess(unsaved, [victim.pid]) as guard,
         socket.create_connection(("127.0.0.1", victim.see().counter[1]), 5) as peer,
     ):
-        guard.command("checkpoint")
+        guard.checkpoint()
         victim.kill_app()
         assert guard.wait("gave_up")["reason"] == "policy"
         with contextlib.suppress(ConnectionResetError):
@@ -252,7 +252,7 @@ def test_a_peer_sees_the_end_of_an_app_that_is_not_restored(tmp_path: Path) -> N
 def test_an_exit_status_that_is_not_restored_is_inits(tmp_path: Path) -> None:
     only_signals = config(restore_on_exit=False)
     with Victim("crash", tmp_path) as victim, GuardProcess(only_signals, [victim.pid]) as guard:
-        guard.command("checkpoint")
+        guard.checkpoint()
         victim.kill_app(signal.SIGUSR2)  # abort()
         assert guard.wait("restored")["wait_status"] & 0x7F == signal.SIGABRT
         victim.wait_beats()
@@ -264,7 +264,7 @@ def test_an_exit_status_that_is_not_restored_is_inits(tmp_path: Path) -> None:
 def test_a_command_that_came_too_late_is_not_carried_out(tmp_path: Path) -> None:
     """Its sender was told that it failed."""
     with Victim("idle 1 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        guard.command("checkpoint")
+        guard.checkpoint()
         app = victim.app
         os.kill(guard.pid, signal.SIGSTOP)
         begun = time.monotonic()
@@ -274,7 +274,7 @@ def test_a_command_that_came_too_late_is_not_carried_out(tmp_path: Path) -> None
         for ticket in tickets:
             answer = guard.wait_for(lambda event, ticket=ticket: event.get("ticket") == ticket, "an answer")  # type: ignore[misc]
             assert (answer["kind"], answer["error"]["kind"]) == ("refused", "deadline")
-        assert guard.command("checkpoint")["generation"] == 2
+        assert guard.checkpoint()["generation"] == 2
         assert victim.app == app
 
 
@@ -282,8 +282,8 @@ def test_restores_are_used_up(tmp_path: Path) -> None:
     """The newest generation keeps crashing, then the one before it; then the application ends with its own status."""
     few = config(restore_max=2, restore_window_s=60.0)
     with Victim("crash", tmp_path) as victim, GuardProcess(few, [victim.pid]) as guard:
-        first = guard.command("checkpoint")["generation"]
-        second = guard.command("checkpoint")["generation"]
+        first = guard.checkpoint()["generation"]
+        second = guard.checkpoint()["generation"]
         used = []
         for _ in range(2):
             since = guard.mark()

@@ -6,17 +6,14 @@ from __future__ import annotations
 import ctypes
 import signal
 import threading
-import time
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random
+from testkit.guarded import WHERE, GuardProcess, Victim, config, kill_at_random, sleep_exactly
 
-pytestmark = pytest.mark.shared_machine(
-    "init waits two seconds for its guard, which may get no CPU for as long; signals come at random moments"
-)
+SHARED = pytest.mark.shared_machine("signals come as fast as a guard is to work")
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +29,7 @@ def test_pending_signals(command: str, where: str, tmp_path: Path) -> None:
         kill_at_random(guard, victim, 60, (0.005, 0.08))
 
 
+@SHARED
 @pytest.mark.parametrize("signum", [signal.SIGABRT, signal.SIGTERM, signal.SIGRTMIN])
 def test_a_deadly_signal_is_in_no_image(signum: int, tmp_path: Path) -> None:
     """Sent during a checkpoint, it stays pending until the application runs: an image with it could not live."""
@@ -70,11 +68,10 @@ class Ticks:
         tgkill = partial(ctypes.CDLL(None).syscall, 234, self._pid, self._tid, self.SIGNAL)
         while not self._over.is_set():
             tgkill()
-            until = time.perf_counter() + 30e-6  # more often, nothing else would get done
-            while time.perf_counter() < until:
-                pass
+            sleep_exactly(30e-6)  # more often, nothing else would get done
 
 
+@SHARED
 def test_signals_of_the_guard_cut_no_queue_short(tmp_path: Path) -> None:
     """PTRACE_PEEKSIGINFO returns fewer signals than there are when its caller is interrupted."""
     with Victim("pending 12", tmp_path) as victim, GuardProcess(config(0.02), [victim.pid]) as guard:

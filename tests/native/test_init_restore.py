@@ -19,12 +19,8 @@ from testkit.harness import wait_until
 from testkit.init_peer import CTL, PATIENCE_S, Guard, Init, Page, Phoenix, Verdict
 from testkit.procfs import children_of, comm_of, state_of
 
-pytestmark = [
-    pytest.mark.usefixtures("init_built", "victims_built"),
-    pytest.mark.shared_machine(
-        "a stand-in for the guard, in Python, must answer within the two seconds that init waits"
-    ),
-]
+pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
+SHARED = pytest.mark.shared_machine("what init waits for, and how long, is compared with the clock")
 
 both = pytest.mark.parametrize("pid1", [False, True], ids=["child", "pid1"])
 STOP_ASKED = 1
@@ -56,7 +52,7 @@ def still_waits(init: Phoenix, for_s: float = 0.3) -> bool:
 @both
 @pytest.mark.parametrize("how", ["die 9", "die 11", "die 6", "exit 3"])
 def test_restored_app_goes_on_under_the_same_init(pid1: bool, how: str) -> None:
-    with Phoenix(pid1=pid1) as init, Guard(init) as guard:
+    with Phoenix(pid1=pid1, options=LONG_WAIT) as init, Guard(init) as guard:
         pid = init.app_pid()
         assert guard.ctl().app_pid == pid
         assert guard.ctl().init_pid == (1 if pid1 else init.pid)
@@ -78,6 +74,7 @@ def test_restored_app_goes_on_under_the_same_init(pid1: bool, how: str) -> None:
         assert init.end() == 0
 
 
+@SHARED
 def test_death_to_report_takes_no_wait(init: Phoenix, guard: Guard) -> None:
     os.kill(init.app_pid(), signal.SIGKILL)
     killed_ns = time.monotonic_ns()
@@ -280,6 +277,7 @@ def test_verdict_of_a_guard_that_died_counts(init: Phoenix, guard: Guard) -> Non
     assert init.end() == 4
 
 
+@SHARED
 def test_silent_guard_is_waited_for_only_so_long() -> None:
     with Phoenix(options=["--wait-ms", "400"]) as init, Guard(init) as guard:
         assert guard.ctl().wait_ms == 400
@@ -290,6 +288,7 @@ def test_silent_guard_is_waited_for_only_so_long() -> None:
         assert "the guard did not answer in time" in init.error_text()
 
 
+@SHARED
 def test_guard_that_says_it_is_at_work_is_waited_for() -> None:
     with Phoenix(options=["--wait-ms", "400"]) as init, Guard(init) as guard:
         pid = init.app_pid()
@@ -371,6 +370,7 @@ def test_only_armed_is_read_from_the_page(init: Phoenix, guard: Guard) -> None:
     assert init.end() == 5
 
 
+@SHARED
 @pytest.mark.skipif(not shutil.which("strace"), reason="strace makes exec slow; it is not installed")
 @pytest.mark.parametrize("program", ["sleep", "no-such-program"])
 def test_guard_does_not_see_the_app_before_its_exec(program: str) -> None:
@@ -488,6 +488,7 @@ def test_who_asks_twice_does_not_wait(init: Phoenix, guard: Guard) -> None:
     assert init.end() == 128 + signal.SIGSEGV
 
 
+@SHARED
 @both
 @pytest.mark.parametrize("moment", ["running", "waiting"])
 def test_stop_never_hangs_on_a_stopped_guard(pid1: bool, moment: str) -> None:

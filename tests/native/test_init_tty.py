@@ -21,10 +21,7 @@ from testkit.harness import wait_until
 from testkit.init_peer import INIT, PATIENCE_S, Guard, Init, Phoenix, Verdict
 from testkit.procfs import children_of, state_of
 
-pytestmark = [
-    pytest.mark.usefixtures("init_built", "victims_built"),
-    pytest.mark.shared_machine("what a terminal shows is given a time"),
-]
+pytestmark = pytest.mark.usefixtures("init_built", "victims_built")
 
 PYTHON = os.path.realpath(sys.executable)
 LONG_WAIT = ("--wait-ms", "60000")
@@ -250,6 +247,7 @@ def test_app_reads_from_the_terminal(terminal: Terminal) -> None:
         assert init.end() == 0
 
 
+@pytest.mark.shared_machine("a shell and what it starts are given a time")
 def test_under_a_shells_job_control(terminal: Terminal) -> None:
     """Under a shell, init leads a foreground job and not the session; at the end the shell gets its terminal back."""
     pid = os.fork()

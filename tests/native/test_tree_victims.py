@@ -22,7 +22,7 @@ from testkit.guarded import Victim
 from testkit.harness import SLOWNESS, wait_until
 from testkit.meddle import get_fd, remote_syscall
 
-pytestmark = pytest.mark.shared_machine("a victim is given a time to find what is wrong")
+SHARED = pytest.mark.shared_machine("a victim is given a time to find what is wrong")
 
 CONTENT = [
     "tree 0",
@@ -61,6 +61,7 @@ def test_content_when_nothing_is_wrong(command: str, tmp_path: Path) -> None:
         assert victim.see().violations == 0
 
 
+@SHARED
 def test_two_hundred_processes_and_a_thousand_threads(tmp_path: Path) -> None:
     with Victim("tree 125 --threads 7 --lap-us 200000", tmp_path) as victim:
         # Some workers have one below them, some have two zombies, and some wait for one.
@@ -260,6 +261,7 @@ DEEDS: dict[str, tuple[str, Callable[[Victim], None], str]] = {
 }
 
 
+@SHARED
 @pytest.mark.parametrize(("command", "deed", "complaint"), DEEDS.values(), ids=DEEDS.keys())
 def test_a_fault_is_noticed(command: str, deed: Callable[[Victim], None], complaint: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim:

@@ -24,7 +24,9 @@ from testkit.harness import SLOWNESS, wait_until
 from testkit.init_peer import PATIENCE_S
 from testkit.meddle import set_fpu_register
 
-pytestmark = pytest.mark.shared_machine("a victim is given a time to find what is wrong, and some look at clocks")
+SHARED = pytest.mark.shared_machine(
+    "a victim that looks at clocks, or runs for a second only, may get no CPU for as long"
+)
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -70,6 +72,7 @@ def start(victims_built: Path, board: Board) -> Iterator[Start]:
         victim.communicate()
 
 
+@SHARED
 @pytest.mark.parametrize(
     "command",
     [
@@ -126,6 +129,7 @@ def test_blocked_and_woken(start: Start, board: Board, kind: str) -> None:
     assert board.see().counter[1] == 0
 
 
+@SHARED
 @pytest.mark.parametrize("kind", TIMED)
 def test_blocked_until_the_timeout(start: Start, board: Board, kind: str) -> None:
     start("eintr", kind, "0.1", "--quiet")
