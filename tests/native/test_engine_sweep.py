@@ -122,8 +122,9 @@ def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[st
 VICTIMS: tuple[str, ...] = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3")
 RESTORED: tuple[str, ...] = ("steady", "steady --in-child")
 if PART == 1:  # seven processes, most of them under filters of their own: too long for a part
-    VICTIMS += ("cells",)
-    RESTORED += ("cells",)
+    # None of these filters kills, and none is in strict mode: docs/limits.md tells what that would mean.
+    VICTIMS += ("under harmless cells",)
+    RESTORED += ("under harmless cells",)
 TREES = ("--in-child", "cells")
 WAYS = {
     "first": (Images.FORK, 0),
