@@ -22,6 +22,8 @@ from typing import Any, TypeVar
 
 from avckpt.cli.client import Client
 from avckpt.cli.sidecar_container import answers
+from avckpt.errors import AvckptError
+from avckpt.guard import Command
 
 from testkit.procfs import started
 
@@ -88,9 +90,16 @@ class Completed:
         return f"`{' '.join(self.args)}` ended with {self.status} after {self.took_s:.2f} s: {said}"
 
 
-def take_checkpoint(avckpt: Callable[..., Completed], name: str, timeout_s: float = 20) -> None:
+def take_checkpoint(client: Client, name: str, timeout_s: float = 20) -> None:
     """As soon as there is something to take one of; a busy machine may be too slow for the freeze deadline."""
-    wait_until(lambda: avckpt("checkpoint", name, check=False).status == 0, timeout_s, "a checkpoint", every_s=0.2)
+
+    def taken() -> bool:
+        with contextlib.suppress(AvckptError):
+            client.command(name, Command.CHECKPOINT)
+            return True
+        return False
+
+    wait_until(taken, timeout_s, f"a checkpoint of {name}", every_s=0.1)
 
 
 class CommandFailed(AssertionError):

@@ -57,7 +57,7 @@ class ProtectedVictim:
 
     def checkpoint(self) -> None:
         """Takes one, and waits for it."""
-        take_checkpoint(self.sidecar.avckpt, self.container.name)
+        take_checkpoint(self.sidecar.client, self.container.name)
 
     def kill(self, signum: int) -> dict[str, Any]:
         """Kills the victim as it is now, and waits for the restore; the entry of `avckpt ps` after it."""

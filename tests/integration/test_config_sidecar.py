@@ -58,7 +58,7 @@ def test_a_new_one_holds_for_running_containers_and_takes_nothing_from_them(side
     plain = sidecar.protected("plain", NAP, ENABLE)
     own = sidecar.protected("own", NAP, {**ENABLE, "avckpt.interval": "30m", "avckpt.keep": "3"})
     for name in ("plain", "own"):
-        take_checkpoint(sidecar.avckpt, name)
+        take_checkpoint(sidecar.client, name)
     assert kill_and_wait(sidecar, plain, 1)["generation"] == 1
 
     sidecar.config.write_text("defaults: {interval: 100ms, keep: 2, restore.on: 'signal,3'}\n")

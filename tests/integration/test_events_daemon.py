@@ -213,7 +213,7 @@ def test_a_follower_that_does_not_read_holds_nobody_up(local: LocalSidecar) -> N
 def test_a_roll_back_is_manual_and_a_refused_command_is_told(local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER, ON_COMMAND)
     local.wait_for(web, app_pid_inside=2)
-    take_checkpoint(local.avckpt, "web")
+    take_checkpoint(local.client, "web")
     answer = json.loads(local.avckpt("restore", "web", "--json").stdout)
     assert answer["event"]["reason"] == "manual"
     died, restored = [e for e in Client(local.run_dir).history() if e["kind"] in ("died", "restored")]
@@ -411,7 +411,7 @@ def test_memory_that_several_generations_hold_together_counts_once(local: LocalS
     web = local.protected("web", ["python3", "-c", program], ON_COMMAND)
     wait_until(lambda: "ready" in web.output.read_text(), 20, "it has its memory")
     for number in (1, 2):
-        take_checkpoint(local.avckpt, "web")
+        take_checkpoint(local.client, "web")
         local.wait_for(web, generations=number)
     again.touch()
     wait_until(lambda: "written" in web.output.read_text(), 20, "it has written to all of it")
@@ -432,7 +432,7 @@ def test_an_application_can_not_write_lines_of_its_own(local: LocalSidecar, tmp_
     )
     web = local.protected("web", [sys.executable, "-c", program], {**ON_COMMAND, "avckpt.files": "rewind"})
     wait_until(path.exists, 5, "the file is open")
-    take_checkpoint(local.avckpt, "web")
+    take_checkpoint(local.client, "web")
     os.kill(web.app_pid, signal.SIGUSR1)
     wait_until(lambda: not path.exists(), 5, "it is closed and gone")
     crash(local, web)

@@ -56,7 +56,7 @@ def crash_by(sidecar: LocalSidecar, victim: Container, signum: int) -> dict[str,
 
     No other checkpoint comes in between: one between the signal and the death would restore what dies again.
     """
-    take_checkpoint(sidecar.avckpt, victim.name)
+    take_checkpoint(sidecar.client, victim.name)
     told = len(sidecar.events(victim.name, "crash"))
     os.kill(victim.app_pid, signum)
     crashes = wait_until(lambda: sidecar.events(victim.name, "crash")[told:], 10, "the crash is told of", every_s=0.05)
@@ -231,7 +231,7 @@ def test_back_to_an_older_generation(sidecar: LocalSidecar) -> None:
     for _ in range(3):
         begun = len(numbers())
         wait_until(lambda: len(numbers()) > begun + 20, 10, "it counts on")  # noqa: B023
-        take_checkpoint(sidecar.avckpt, "counter")
+        take_checkpoint(sidecar.client, "counter")
         at.append(numbers()[-1])
     known = json.loads(sidecar.avckpt("inspect", "counter", "--json").stdout)
     assert [each["generation"] for each in known["generations"]] == [1, 2, 3]

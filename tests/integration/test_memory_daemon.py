@@ -57,7 +57,7 @@ def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_pa
     assert web.hook("prestart", ON_COMMAND) == ""
     local.wait_for(web, app_pid_inside=2)
     for n in (1, 2):
-        take_checkpoint(local.avckpt, "web")
+        take_checkpoint(local.client, "web")
         os.kill(web.app_pid, signal.SIGUSR1)
         wait_until(lambda n=n: board.see().counter[0] >= 40 * n, 20, "it has written all of it again")  # type: ignore[misc]
     assert local.row(web)["generations"] == 2

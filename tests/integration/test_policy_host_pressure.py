@@ -29,11 +29,11 @@ def test_the_one_that_holds_most_gives_its_oldest_up(tmp_path: Path) -> None:
     with local_sidecar(tmp_path) as sidecar:
         sidecar.start()
         little = sidecar.protected("little", [str(VICTIMS / "idle"), "1", "1"], ON_COMMAND)
-        take_checkpoint(sidecar.avckpt, "little")
+        take_checkpoint(sidecar.client, "little")
         board = Board(tmp_path / "board")
         much = sidecar.protected("much", [str(VICTIMS / "hoard"), "40", "--board", str(board.path)], ON_COMMAND)
         wait_until(lambda: board.see().ready, 10, "it is ready")
-        take_checkpoint(sidecar.avckpt, "much")
+        take_checkpoint(sidecar.client, "much")
         app = much.app_pid
         os.kill(app, signal.SIGUSR1)
         with pressure():

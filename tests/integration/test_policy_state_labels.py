@@ -95,7 +95,7 @@ def test_offsets_and_shared_memory(
     with connected(port) as client:
         client.ask("write")
         started = client.ask("count")[2]
-        take_checkpoint(sidecar.avckpt, keeper.name)
+        take_checkpoint(sidecar.client, keeper.name)
         client.ask("write")
         assert client.ask("count") == (20, 2, started)
         os.kill(sidecar.app_pid(keeper), signal.SIGKILL)
@@ -115,7 +115,7 @@ def test_connections(
     keeper = start(container, port, **labels)
     with connected(port) as client:
         started = client.ask("look")[2]
-        take_checkpoint(sidecar.avckpt, keeper.name)
+        take_checkpoint(sidecar.client, keeper.name)
         if moved:
             client.ask("look")
         os.kill(sidecar.app_pid(keeper), signal.SIGKILL)
@@ -138,7 +138,7 @@ def test_strict(sidecar: Sidecar, container: ContainerFactory, written: bool) ->
         started = client.ask("write")[2]
     # What was written right before a checkpoint counts as written since it.
     time.sleep(0.1)
-    take_checkpoint(sidecar.avckpt, keeper.name)
+    take_checkpoint(sidecar.client, keeper.name)
     if written:
         with connected(port) as client:
             client.ask("write")

@@ -35,7 +35,7 @@ def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_
     labels = {**QUICK, "interval": "1h"}
     victim = start_victim(sidecar, container, tmp_path, "crash", labels=labels, options=options, generation=0)
     made = victim.container
-    take_checkpoint(sidecar.avckpt, made.name)
+    take_checkpoint(sidecar.client, made.name)
     before = made.inspect()["State"]
     inside = sidecar.wait_generation(made)["app_pid_inside"]
     deaths = {
@@ -45,7 +45,7 @@ def test_killed_in_every_way(sidecar: Sidecar, container: ContainerFactory, tmp_
         signal.SIGHUP: "exited with status 3",
     }
     for n, (signum, death) in enumerate(deaths.items(), 1):
-        take_checkpoint(sidecar.avckpt, made.name)
+        take_checkpoint(sidecar.client, made.name)
         entry = victim.kill(signum)
         assert (entry["state"], entry["last_death"]) == ("protected", death)
         assert (entry["restores"], entry["app_pid_inside"]) == (n, inside)

@@ -24,7 +24,7 @@ KILLS = 6
 
 def crash_while_in_use(sidecar: Sidecar, victim: ProtectedVictim) -> None:
     """After each restore the program checks its device, and no loss is reported."""
-    take_checkpoint(sidecar.avckpt, victim.container.name)
+    take_checkpoint(sidecar.client, victim.container.name)
     for n in range(1, KILLS + 1):
         disturb_app(victim.app, victim.see)
         entry = victim.kill(signal.SIGKILL)

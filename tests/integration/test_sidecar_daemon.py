@@ -204,12 +204,12 @@ def test_a_program_that_executes_another_is_unprotected_until_the_next_checkpoin
     os.mkfifo(go)
     web = local.protected("web", ["sh", "-c", f"read line < {go}; exec sleep 1000"], ON_COMMAND)
     local.wait_for(web, app_pid_inside=2)
-    take_checkpoint(local.avckpt, "web")
+    take_checkpoint(local.client, "web")
     go.write_text("now\n")
     row = local.wait_for(web, state="unprotected", generations=0)
     assert row["reason"].startswith("generation 1: the application has executed another program")
     assert local.avckpt("restore", "web", check=False).status == 5
-    take_checkpoint(local.avckpt, "web")
+    take_checkpoint(local.client, "web")
     local.wait_for(web, state="protected", generations=1)
     os.kill(web.app_pid, signal.SIGKILL)
     local.wait_for(web, restores=1, state="protected")
@@ -238,7 +238,7 @@ def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local
     there = tmp_path / "there"
     web = local.protected("web", [sys.executable, "-c", MANY, str(there)], ON_COMMAND)
     wait_until(there.exists, 10, "it is ready")
-    take_checkpoint(local.avckpt, "web")
+    take_checkpoint(local.client, "web")
     there.unlink()
     with freezer(version) as pause, contextlib.ExitStack() as undo:
         undo.callback(signal.pidfd_send_signal, web.pidfd, signal.SIGKILL)
@@ -252,7 +252,7 @@ def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local
         assert row["reason"].startswith("checkpoint missed: ")
         assert "nothing is held to go back to" in local.log
         pause.go()
-        take_checkpoint(local.avckpt, "web")
+        take_checkpoint(local.client, "web")
         local.wait_for(web, state="protected", generations=1)
 
 
@@ -261,7 +261,7 @@ def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local
 @pytest.mark.parametrize("command", ["checkpoint", "restore"])
 def test_a_paused_container_says_so_at_once(command: str, version: int, local: LocalSidecar) -> None:
     web = local.protected("web", SLEEPER, ON_COMMAND)
-    take_checkpoint(local.avckpt, "web")
+    take_checkpoint(local.client, "web")
     app = web.app_pid
     with freezer(version) as pause, contextlib.ExitStack() as undo:
         undo.callback(signal.pidfd_send_signal, web.pidfd, signal.SIGKILL)
@@ -274,7 +274,7 @@ def test_a_paused_container_says_so_at_once(command: str, version: int, local: L
         assert "web is paused: `podman unpause web` first" in said.stderr
         assert time.monotonic() - begun < 10
         pause.go()
-        take_checkpoint(local.avckpt, "web")
+        take_checkpoint(local.client, "web")
         row = local.row(web)
         assert (row["state"], row["restores"], row["generations"], web.app_pid) == ("protected", 0, 2, app)
 

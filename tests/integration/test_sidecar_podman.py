@@ -14,7 +14,7 @@ import pytest
 from avckpt.cli import doctor, sidecar_container
 from avckpt.errors import SidecarUnreachable
 
-from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, take_checkpoint, wait_until
+from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, wait_until
 from testkit.protected import told
 
 pytestmark = pytest.mark.shared_machine(
@@ -199,7 +199,7 @@ def test_the_command_line_in_its_container(container: ContainerFactory, sidecar:
         return podman.run("exec", SIDECAR_NAME, "avckpt", *args, check=check)
 
     web = container.protected(*COUNT, labels={"interval": "1h"})
-    take_checkpoint(inside, web.name)
+    wait_until(lambda: inside("checkpoint", web.name, check=False).status == 0, 20, "a checkpoint", every_s=0.2)
     [row] = [entry for entry in json.loads(inside("ps", "--json").stdout) if entry["id"] == web.id]
     here = sidecar.find(web)
     assert here is not None

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.shared_machine(
     "init waits two seconds for its guard, which may get no CPU for as long; kills come at random moments"
 )
 
-KILLS = 8
+KILLS = 4
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def end(bank: Bank) -> None:
 def checkpoint(sidecar: Sidecar, bank: Bank) -> None:
     # What was written right before a checkpoint counts as written since it.
     time.sleep(0.1)
-    take_checkpoint(sidecar.avckpt, bank.container.name, 60)
+    take_checkpoint(sidecar.client, bank.container.name, 60)
 
 
 @pytest.mark.parametrize("journal", ["delete", "wal"])
