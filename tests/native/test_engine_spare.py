@@ -24,7 +24,7 @@ from avckpt.guard import Images
 
 from testkit.cgroups import Cgroup, freezer, throttle
 from testkit.family import ours
-from testkit.guarded import BUILD, GuardProcess, Victim, config, forks_beside, sleep_exactly
+from testkit.guarded import BUILD, PATIENCE_S, GuardProcess, Victim, config, forks_beside, sleep_exactly
 from testkit.harness import wait_until
 from testkit.procfs import children_of
 
@@ -53,7 +53,7 @@ def wait_spare(victim: Victim, other_than: int = 0) -> int:
         found[:] = spares(victim)
         return len(found) == 1 and found != [other_than]
 
-    wait_until(is_made, 5, "a spare is made")
+    wait_until(is_made, PATIENCE_S, "a spare is made")
     return found[0]
 
 
@@ -73,7 +73,7 @@ def die_and_come_back(victim: Victim, guard: GuardProcess) -> None:
 
 def test_it_is_used_up_and_made_again(tmp_path: Path) -> None:
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         spare = wait_spare(victim)
         template = ours(victim, "avckpt-tmpl")
         for _ in range(10):
@@ -81,7 +81,7 @@ def test_it_is_used_up_and_made_again(tmp_path: Path) -> None:
             spare = wait_spare(victim, other_than=spare)
             assert ours(victim, "avckpt-tmpl") == template
         # Only the newest generation has one.
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         wait_until(lambda: ours(victim, "avckpt-tmpl") not in (template, []), 5, "another template")
         wait_spare(victim, other_than=spare)
 
@@ -89,7 +89,7 @@ def test_it_is_used_up_and_made_again(tmp_path: Path) -> None:
 def test_killed_it_is_no_loss(tmp_path: Path) -> None:
     """By the OOM killer, for example: the template is still there."""
     with Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
-        taken = guard.command("checkpoint")
+        taken = guard.checkpoint()
         os.kill(wait_spare(victim), signal.SIGKILL)
         wait_until(lambda: not spares(victim), 5, "it is gone")
         since = guard.mark()
@@ -105,7 +105,7 @@ def test_killed_while_it_is_used(command: str, tmp_path: Path) -> None:
     rng = random.Random(3)
     with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(60):
-            taken = guard.command("checkpoint")
+            taken = guard.checkpoint()
             spare, since = open_spare(victim), guard.mark()
             dead = os.pidfd_open(victim.app)
             after_s = rng.uniform(0, 0.002)
@@ -126,7 +126,7 @@ def test_killed_while_it_is_made(tmp_path: Path) -> None:
     rng = random.Random(1)
     with Victim(f"idle {MEGABYTES} 4", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         for _ in range(30):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             time.sleep(rng.uniform(0, 0.008))
             die_and_come_back(victim, guard)
 
@@ -136,7 +136,7 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
     rng = random.Random(2)
     with Victim(f"idle {MEGABYTES} 4", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
         for _ in range(30):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             since = guard.mark()
             time.sleep(rng.uniform(0, 0.008))
             for pid in ours(victim, rng.choice(["avckpt-tmpl", "avckpt-spare"])):
@@ -145,7 +145,7 @@ def test_template_or_spare_killed_while_it_is_made(tmp_path: Path) -> None:
             victim.wait_beats(3)
         kinds = {event["kind"] for event in guard.events[since:] if "kind" in event}
         assert kinds <= {"checkpoint", "dropped"}, kinds
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         die_and_come_back(victim, guard)
 
 
@@ -158,7 +158,7 @@ def test_made_while_the_container_ends_it_is_no_news(tmp_path: Path) -> None:
             with Victim("threads 4 20 --no-churn", tmp_path / str(n)) as victim:
                 guard.start_another(victim.pid)
                 since = guard.mark()
-                guard.command("checkpoint")
+                guard.checkpoint()
                 time.sleep(rng.uniform(0.009, 0.014))
                 os.kill(victim.pid, signal.SIGKILL)
                 guard.wait("ended", since=since)
@@ -209,7 +209,7 @@ def limited(processes: int, victim: str = "idle 0 4") -> Iterator[tuple[Victim, 
 
 def test_none_when_it_may_not_have_another_process() -> None:
     with limited(6) as (victim, guard):
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         time.sleep(0.1)
         assert not spares(victim)
         for _ in range(5):
@@ -220,10 +220,10 @@ def test_none_when_it_may_not_have_another_process() -> None:
 def test_it_makes_room_for_a_template() -> None:
     """At the limit of tasks the next template is worth more than the last one's spare."""
     with limited(7) as (victim, guard):
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         wait_spare(victim)
         for _ in range(5):
-            answer = guard.command("checkpoint")
+            answer = guard.checkpoint()
             assert answer["kind"] == "checkpoint", str(answer)
             time.sleep(0.1)
             assert not spares(victim)
@@ -233,7 +233,7 @@ def test_it_makes_room_for_a_template() -> None:
 def test_it_is_one_process_too_many() -> None:
     """The limit was lowered since the spare was made: the template alone is as good."""
     with limited(7) as (victim, guard):
-        taken = guard.command("checkpoint")
+        taken = guard.checkpoint()
         wait_spare(victim)
         for pid in ours(victim):
             subprocess.run([*SOMEBODY.split(), "/usr/bin/prlimit", f"--pid={pid}", "--nproc=6:7"], check=True)
@@ -248,7 +248,7 @@ def test_it_is_one_process_too_many() -> None:
 def test_there_is_no_room_for_copies_of_a_big_parent() -> None:
     """Seven processes with their holders and templates, and a program that takes PIDs: no copies are made."""
     with limited(21, "prefork 6 12") as (victim, guard), forks_beside(victim):
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         for _ in range(3):
             die_and_come_back(victim, guard)
         assert not [event for event in guard.events if event.get("kind") == "dropped"]
@@ -264,7 +264,7 @@ def test_priorities_are_kept(tmp_path: Path) -> None:
         os.sched_setscheduler(victim.app, os.SCHED_FIFO, os.sched_param(7))
         os.sched_setaffinity(victim.app, {0})
         for _ in range(3):
-            assert guard.command("checkpoint")["kind"] == "checkpoint"
+            assert guard.checkpoint()["kind"] == "checkpoint"
             wait_spare(victim)
             wait_until(lambda: policies(victim, "avckpt-spare") == {os.SCHED_FIFO}, 5, "the spare has it again")
             assert policies(victim, "avckpt-tmpl") == {os.SCHED_FIFO}
@@ -292,7 +292,7 @@ def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) 
     """A template that failed to make its spare can still be restored from."""
     pause = freezer(version)
     with inside(pause, "threads 4 1", tmp_path) as (victim, guard):
-        taken = guard.command("checkpoint")
+        taken = guard.checkpoint()
         pause.wait()
         time.sleep(pause_s)
         assert not spares(victim), "it was made before the pause"
@@ -313,7 +313,7 @@ def test_made_late_it_is_used(tmp_path: Path) -> None:
     with inside(pause, "threads 4 1", tmp_path) as (victim, guard):
         shared = False
         for _ in range(10):
-            guard.command("checkpoint")
+            guard.checkpoint()
             wait_until(lambda: len(ours(victim)) == 2, 5, "holder and template")
             (template,) = ours(victim, "avckpt-tmpl")
             pause.wait()
@@ -339,12 +339,12 @@ def test_made_late_it_makes_room_for_a_template() -> None:
     with freezer(2) as pause, limited(7) as (victim, guard):
         pause.take(victim.pid)
         pause.take(victim.app)
-        assert guard.command("checkpoint")["kind"] == "checkpoint"
+        assert guard.checkpoint()["kind"] == "checkpoint"
         pause.wait()
         time.sleep(0.8)
         assert not spares(victim), "it was made before the pause"
         pause.go()
-        answer = guard.command("checkpoint")
+        answer = guard.checkpoint()
         assert answer["kind"] == "checkpoint", str(answer)
         time.sleep(0.1)
         assert len(ours(victim)) == 2
@@ -361,7 +361,7 @@ def test_made_slowly(slow: Callable[[], Cgroup], tmp_path: Path) -> None:
     rng, cgroup = random.Random(1), slow()
     with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
         for number in range(10):
-            taken = guard.command("checkpoint")
+            taken = guard.checkpoint()
             time.sleep(rng.uniform(0.015, 0.03))
             cgroup.wait()
             time.sleep(rng.choice([0.02, 0.6, 1.0]))
@@ -378,7 +378,7 @@ def test_its_template_is_killed_in_the_making(slow: Callable[[], Cgroup], tmp_pa
     rng, cgroup = random.Random(2), slow()
     with inside(cgroup, "idle 200 2", tmp_path) as (victim, guard):
         for _ in range(6):
-            guard.command("checkpoint")
+            guard.checkpoint()
             (template,) = ours(victim, "avckpt-tmpl")
             time.sleep(rng.uniform(0.015, 0.03))
             cgroup.wait()
@@ -390,7 +390,7 @@ def test_its_template_is_killed_in_the_making(slow: Callable[[], Cgroup], tmp_pa
             guard.wait("dropped", since=since)
             wait_until(lambda: len(ours(victim)) == 1, 5, "the holder alone")
             victim.wait_beats(5)
-        guard.command("checkpoint")
+        guard.checkpoint()
 
 
 @pytest.mark.parametrize("slow", slow_ones())
@@ -399,7 +399,7 @@ def test_the_guard_stops_in_the_making(slow: Callable[[], Cgroup], tmp_path: Pat
         with GuardProcess(config(keep=1), [victim.pid]) as guard:
             cgroup.take(victim.pid)
             cgroup.take(victim.app)
-            guard.command("checkpoint")
+            guard.checkpoint()
             cgroup.wait()
             time.sleep(0.8)
             # Who is frozen is not ended by SIGKILL before it thaws, with version 1.
