@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from avckpt import cli
+from avckpt.cli.compose import podman_compose
 from avckpt.cli.compose.manifest import Kind, Manifest, Severity, check, files_meant
 from avckpt.errors import ConfigError
 from avckpt_hooks.shared.labels import LABELS
@@ -230,10 +231,25 @@ def test_the_command(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert avckpt("check")[0] == 1
     path.rename(path.with_name("compose.yml"))
     assert avckpt("check")[1].startswith("compose.yml:18: ")
+    assert avckpt("check", "-f", "compose.yml") == avckpt("check", "compose.yml")
     assert avckpt("check", "gone.yaml") == (
         1,
         "gone.yaml:1: No such file or directory\n0 services, to be protected: none; 1 problem\n",
     )
+
+
+def test_down_of_what_is_not_there(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(podman_compose.Compose, "down", lambda *_: pytest.fail("podman-compose was started"))
+    assert avckpt("down", "-f", path) == (1, f"avckpt: {path}:1: No such file or directory\n")
+    path.write_text("services: {a: [}")
+    assert avckpt("down", "-f", path)[1].startswith(f"avckpt: {path}:1: not YAML: ")
+    path.write_text("services: {a: {labels: {avckpt.enable: nonsense}}}")
+    assert avckpt("down", "-f", path, "b") == (1, "avckpt: no such service: b; there are a\n")
+    assert avckpt("down", "-f", path, path)[1].endswith(f"there are a; a file is named with -f {path}\n")
+    done: list[object] = []
+    monkeypatch.setattr(podman_compose.Compose, "down", lambda *_: done.append("down"))
+    assert avckpt("down", "-f", path) == (0, "")
+    assert done == ["down"]
 
 
 def test_what_must_be_process_1_is_worth_a_warning(path: Path) -> None:
@@ -293,6 +309,8 @@ def test_files_that_nobody_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_the_command_for_the_sidecars_own_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AVCKPT_CONFIG", str(path))
+    assert avckpt("check", "--config") == (0, f"no {path}: the built-in defaults hold\n")
+    path.touch()
     assert avckpt("check", "--config") == (0, "no problems\n")
     path.write_text("defaults:\n  keep: 0\n")
     status, output = avckpt("check", "--config")

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from avckpt.cli.compose import podman_compose
 from avckpt.cli.compose.podman_compose import Started
-from avckpt.cli.compose.vehicle import judge
+from avckpt.cli.compose.vehicle import judge, up
 from avckpt.errors import AvckptError
 
 from testkit.harness import wait_until
@@ -95,6 +95,22 @@ def test_a_failure_is_told_by_its_last_words() -> None:
         Fake("echo no such file >&2; exit 4").down([], False, lambda line: None)
     with pytest.raises(AvckptError, match="exit status 4"):
         Fake("exit 4").down([], False, lambda line: None)
+
+
+def test_a_service_without_a_container_is_a_failure_whatever_the_status(tmp_path: Path) -> None:
+    class One(Fake):
+        def containers(self) -> list[Started]:
+            return [container(wanted=False)]
+
+        def services(self) -> list[str]:
+            return ["s", "idle"]
+
+    refused = "Error: creating container storage: the container name c is already in use"
+    with pytest.raises(AvckptError, match="^idle has no container: creating container storage: the container name c"):
+        up(One(f"echo '{refused}'"), [], tmp_path, 0, lambda line: None)
+    # Of no replicas nothing is said.
+    assert [one.state for one in up(One("echo it goes well"), [], tmp_path, 0, lambda line: None)] == ["not asked for"]
+    assert up(One(f"echo '{refused}'"), ["s"], tmp_path, 0, lambda line: None)
 
 
 def test_podman_compose_is_there_as_a_module() -> None:

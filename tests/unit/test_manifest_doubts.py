@@ -59,7 +59,17 @@ def test_who_waits_for_itself_is_told_and_nobody_else(tmp_path: Path) -> None:
     ]
     # Many ways to the same place are no round, and are not walked one by one.
     layers = [f"  s{n}: {{depends_on: [s{n + 2 - n % 2}, s{n + 3 - n % 2}]}}\n" for n in range(200)]
-    assert said(tmp_path, "".join(layers)) == []
+    assert said(tmp_path, "".join([*layers, "  s200: {}\n", "  s201: {}\n"])) == []
+
+
+def test_a_service_that_is_awaited_and_not_there(tmp_path: Path) -> None:
+    text = "  a: {depends_on: [b, c]}\n  b: {depends_on: {d: {required: false}, e: {condition: service_started}}}\n"
+    assert said(tmp_path, text) == [
+        "service a: depends_on c, and there is no such service",
+        "service b: depends_on e, and there is no such service",
+    ]
+    # The file that the environment names may have it.
+    assert said(tmp_path, f"{text}include: ['${{MORE}}']\n") == []
 
 
 def test_pods(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 EPILOG = """
 Exit status: 0 done, 1 failed, 2 wrong usage, 3 the sidecar cannot be reached,
 4 no such container, 5 the container is unprotected or has nothing to restore.
-"avckpt run" ends with its program's status, 128+N if signal N killed it, and
-with 125 if it could not start it.
+"avckpt run" ends with its program's status, 128+N if signal N killed it, 127 if
+there is no such program, 126 if it cannot be executed, 125 if avckpt failed.
 """
 
 
@@ -400,7 +400,7 @@ def _row(c: Json) -> tuple[str, ...]:
         c["state"],
         "-" if c["state"] in ("listening", "nodes") else f"{c['generations']}/{c['keep']}",
         f"{c['memory_bytes'] / 1e6:.1f} MB" if c["generations"] else "-",
-        "-" if c["state"] == "listening" else _interval(c),
+        "-" if c["state"] in ("listening", "nodes") else _interval(c),
         "-" if age_s is None else _ago(age_s),
         f"{_ms(c['last_freeze_s'])} {c['last_images']}".rstrip(),
         str(c["restores"]),

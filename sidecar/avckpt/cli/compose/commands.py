@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from avckpt.errors import ConfigError, ExitCode
+from avckpt.errors import ConfigError, Denied, ExitCode
 
 if TYPE_CHECKING:
     from avckpt.cli.compose.manifest import Manifest
@@ -36,9 +36,10 @@ env_file_option = click.option(
 
 @click.command()
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE...]")
+@click.option("-f", "--file", "more", multiple=True, type=click.Path(path_type=Path), help="As for avckpt up.")
 @click.option("--config", "is_config", is_flag=True, help="The sidecar's; default /etc/avckpt/config.yaml.")
 @click.option("--json", "as_json", is_flag=True, help="A JSON object instead of text.")
-def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
+def check(files: tuple[Path, ...], more: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
     """Check every avckpt.* label and annotation of Compose files, or of Kubernetes' YAML.
 
     Without FILE, those of COMPOSE_FILE, or vehicle.yaml of this folder, or all
@@ -47,6 +48,7 @@ def check(files: tuple[Path, ...], is_config: bool, as_json: bool) -> None:
     what is wrong" and ends with 1 if anything is wrong, with 0 if there are only
     warnings or nothing.
     """
+    files = (*more, *files)
     sys.exit(check_config(files, as_json) if is_config else check_manifest(files, as_json))
 
 
@@ -87,9 +89,7 @@ def up(
     print_problems(found, err=True)
     if found.errors:
         sys.exit(ExitCode.FAILED)
-    unknown = [name for name in services if name not in found.services]
-    if unknown:
-        raise ConfigError(f"no such service: {', '.join(unknown)}; there are {', '.join(sorted(found.services))}")
+    _expect(found, services)
     compose = Compose(paths, project, profiles=profiles, env_file=env_file)
     passed_over = _passed_over(found, services, compose)
     if services and passed_over:
@@ -126,10 +126,21 @@ def down(
     services: tuple[str, ...],
 ) -> None:
     """Stop and remove what "avckpt up" brought up.  Hooks and sidecar stay."""
+    from avckpt import yamlfile
     from avckpt.cli.compose import manifest
     from avckpt.cli.compose.podman_compose import Compose
 
-    compose = Compose(manifest.files_meant(files, os.environ), project, profiles=profiles, env_file=env_file)
+    paths = manifest.files_meant(files, os.environ)
+    for path in paths:
+        try:
+            yamlfile.read(path)
+        except yamlfile.Unreadable as error:
+            raise ConfigError(str(error)) from error
+    found = manifest.check(paths)  # for its services: wrong labels keep nobody from stopping what runs
+    _expect(found, services)
+    if found.wants_protection and os.geteuid() != 0:
+        raise Denied("protected containers are those of root's Podman: use sudo")
+    compose = Compose(paths, project, profiles=profiles, env_file=env_file)
     before = compose.containers() if as_json else []
     compose.down(services, volumes, _say)
     if as_json:
@@ -159,14 +170,16 @@ def check_config(files: Sequence[Path], as_json: bool) -> ExitCode:
     for path in files:
         if not path.exists():
             raise ConfigError(f"{path}: no such file")
-    problems = [problem for path in files or [config.default_path()] for problem in config.examine(path)[1]]
+    paths = files or [config.default_path()]
+    problems = [problem for path in paths for problem in config.examine(path)[1]]
     if as_json:
         listed = [{"file": p.place.file, "line": p.place.line, "message": p.message} for p in problems]
         click.echo(json.dumps({"problems": listed}, indent=2))
     else:
         for problem in problems:
             click.echo(f"{click.style(str(problem.place), fg='red')}: {problem.message}")
-        click.echo(_count(len(problems), "problem") if problems else "no problems")
+        absent = [f"no {path}: the built-in defaults hold" for path in paths if not os.path.exists(path)]
+        click.echo(_count(len(problems), "problem") if problems else "\n".join(absent or ["no problems"]))
     return ExitCode.FAILED if problems else ExitCode.OK
 
 
@@ -192,6 +205,16 @@ def summary(found: Manifest) -> str:
     problems = len(found.problems) - len(found.errors)
     counts = [_count(n, what) for n, what in ((len(found.errors), "problem"), (problems, "warning")) if n]
     return f"{text}; {' and '.join(counts) or 'no problems'}"
+
+
+def _expect(found: Manifest, services: Sequence[str]) -> None:
+    """Raises ConfigError for services that are not in the files."""
+    unknown = [name for name in services if name not in found.services]
+    if unknown:
+        # What other commands take without it.
+        hint = f"; a file is named with -f {unknown[0]}" if os.path.isfile(unknown[0]) else ""
+        there = ", ".join(sorted(found.services))
+        raise ConfigError(f"no such service: {', '.join(unknown)}; there are {there}{hint}")
 
 
 def _passed_over(found: Manifest, named: Sequence[str], compose: Compose) -> list[str]:

@@ -45,8 +45,13 @@ def facts_of(node: yaml.Node) -> Facts:
     disabled = yamlfile.lookup(health, "disable")
     off = isinstance(disabled, yaml.ScalarNode) and disabled.value.lower() in ("true", "yes", "on")
     depends = yamlfile.lookup(node, "depends_on")
-    names = [key.value for key, _ in yamlfile.entries(depends)] or list(_words(depends))
+    names = [key.value for key, how in yamlfile.entries(depends) if not _is_optional(how)] or list(_words(depends))
     return Facts(None if health is None else not off, frozenset(names), _gpu(node))
+
+
+def _is_optional(how: yaml.Node) -> bool:
+    required = yamlfile.lookup(how, "required")
+    return isinstance(required, yaml.ScalarNode) and required.value.lower() in ("false", "no", "off")
 
 
 def facts_of_pod(containers: Iterable[yaml.Node]) -> Facts:
@@ -106,6 +111,14 @@ def of_returns(services: Iterable[Service]) -> Iterator[tuple[Service, str]]:
                 yield service, f"{RECOVERY}=together has no effect: without {ENABLE}=true nothing of it goes back"
             elif recovery in ("", "apart") and service.enabled:
                 yield service, f"it does not go back with the others of group {group}: {RECOVERY}=together is missing"
+
+
+def of_absent(services: Mapping[str, Service]) -> Iterator[tuple[Service, str]]:
+    """Of services that wait for one that is not there, on which podman-compose fails half way."""
+    for service in services.values():
+        for name in sorted(service.facts.depends_on - services.keys()):
+            if "$" not in name:
+                yield service, f"depends_on {name}, and there is no such service"
 
 
 def of_order(services: Mapping[str, Service]) -> Iterator[tuple[Service, str]]:

@@ -153,6 +153,8 @@ class Manifest:
     files: tuple[Path, ...]
     services: dict[str, Service] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
+    is_partial: bool = False
+    """The environment names a file that it includes."""
 
     @property
     def errors(self) -> list[Problem]:
@@ -229,7 +231,8 @@ def judge(manifest: Manifest, nothing: str) -> None:
         manifest.problems.append(Problem(place, service.name, message, Severity.WARNING))
     for service, message in doubts.of_returns(services.values()):
         manifest.problems.append(Problem(service.place, service.name, message, Severity.WARNING))
-    for service, message in doubts.of_order(services):
+    wrong = [*doubts.of_order(services), *(() if manifest.is_partial else doubts.of_absent(services))]
+    for service, message in wrong:
         manifest.problems.append(Problem(service.place, service.name, message))
     if nothing and not services and not manifest.problems:
         manifest.problems.append(Problem(Place(str(manifest.files[0]), 1), "", nothing))
@@ -270,7 +273,11 @@ class _Reader:
         for item in include.value if isinstance(include, yaml.SequenceNode) else []:
             paths = yamlfile.lookup(item, "path") if isinstance(item, yaml.MappingNode) else item
             for one in paths.value if isinstance(paths, yaml.SequenceNode) else [paths]:
-                if isinstance(one, yaml.ScalarNode) and not _is_open(one.value):
+                if not isinstance(one, yaml.ScalarNode):
+                    continue
+                if _is_open(one.value):
+                    self._manifest.is_partial = True
+                else:
                     included = path.parent / one.value
                     self._root(included, yamlfile.place_of(one, path))
                     self.queue.append(included)

@@ -39,7 +39,7 @@ Say = Callable[[str], None]
 _HEALTHY = "--condition=healthy"
 _WAITS = {"--condition=running": "running", _HEALTHY: "healthy"}
 _ONE_WORD = re.compile(r"[\w.-]+")
-_NOT_THERE = "Error: no container with name or ID"
+_NOT_THERE = ("Error: no container with name or ID", "Error: no pod with name or ID")
 _TRACEBACKS = ("Traceback (most recent call last):", "During handling of the above", "The above exception was")
 
 
@@ -77,13 +77,13 @@ class Compose:
         if env_file is not None:
             self._command += ["--env-file", str(env_file)]
 
-    def up(self, services: Sequence[str], say: Say) -> None:
+    def up(self, services: Sequence[str], say: Say) -> str:
         """`up -d`.  What it prints goes to `say`.
 
-        Raises AvckptError when it fails or hangs; containers may have been
-        started all the same.
+        Returns the last error in it: podman-compose 1.6 ends with 0 also where Podman refuses to make a container.
+        Raises AvckptError when it fails or hangs; containers may have been started all the same.
         """
-        self._run(["up", "-d", *services], say)
+        return self._run(["up", "-d", *services], say)
 
     def down(self, services: Sequence[str], volumes: bool, say: Say) -> None:
         """`down`.  Raises AvckptError when it fails."""
@@ -104,7 +104,7 @@ class Compose:
         )
         return [_started(entry) for entry in found]
 
-    def _run(self, args: list[str], say: Say) -> None:
+    def _run(self, args: list[str], say: Say) -> str:
         words = _Words(say)
         # A file, not a pipe: what a container's monitor inherits of a pipe would
         # have to be read until the container ends.
@@ -123,6 +123,7 @@ class Compose:
             raise AvckptError(f"{command} was ended: it waited in vain for {', '.join(stuck)}")
         if process.returncode != 0:
             raise AvckptError(f"{command} failed: {words.last or f'exit status {process.returncode}'}")
+        return words.error
 
     def _ask(self, command: list[str], *, lenient: bool = False) -> str:
         try:
@@ -205,6 +206,8 @@ class _Words:
         self._say = say
         self._in_traceback = False
         self.last = ""
+        self.error = ""
+        """The last line that is an error of Podman's."""
 
     def take(self, output: IO[str]) -> None:
         """Passes on the whole lines that have come."""
@@ -217,6 +220,7 @@ class _Words:
             text = line.rstrip()
             if text and not self._is_noise(text):
                 self.last = text
+                self.error = text if text.startswith("Error: ") else self.error
                 self._say(text)
 
     def _is_noise(self, text: str) -> bool:

@@ -95,26 +95,33 @@ def up(compose: Compose, services: Sequence[str], run_dir: Path, wait_s: float, 
     AvckptError when podman-compose fails; what is up stays up.
     """
     failure: AvckptError | None = None
+    complaint = ""
     try:
-        _up(compose, services, say)
+        complaint = _up(compose, services, say)
     except AvckptError as error:
         failure = error
     started = [one for one in compose.containers() if not services or one.service in services or _runs(one)]
+    if complaint:
+        # Of some errors podman-compose says nothing in its status; without one there may be none on purpose (scale: 0).
+        there = {one.service for one in started}
+        lacking = [name for name in services or compose.services() if name not in there]
+        if lacking:
+            failure = AvckptError(f"{', '.join(lacking)} has no container: {complaint.removeprefix('Error: ')}")
     if failure is not None:
         reasons = [f"{one.name} {_why_not_running(one)}" for one in started if not _runs(one)]
         raise AvckptError("; ".join([str(failure), *reasons]))
     return wait_protected(compose, Client(run_dir), started, wait_s)
 
 
-def _up(compose: Compose, services: Sequence[str], say: Say) -> None:
+def _up(compose: Compose, services: Sequence[str], say: Say) -> str:
     before = {one.name for one in compose.containers()}
     try:
-        compose.up(services, say)
+        return compose.up(services, say)
     except AvckptError:
         # Of what depends on a changed service podman-compose 1.6 removes all, and makes only what was running.
         if before <= {one.name for one in compose.containers()}:
             raise
-        compose.up(services, say)
+        return compose.up(services, say)
 
 
 def wait_protected(compose: Compose, client: Client, started: Sequence[Started], wait_s: float) -> list[Protection]:
