@@ -29,6 +29,7 @@ from avckpt_hooks.shared.protocol import Deregister, Register
 from avckpt import __version__
 from avckpt.api.server import ApiServer
 from avckpt.budget import CpuBudget
+from avckpt.config import PATH as CONFIG_PATH
 from avckpt.config import Configuration
 from avckpt.containers import cgroup, units
 from avckpt.containers.listener import HookListener
@@ -155,6 +156,8 @@ class Daemon:
         except ConfigError as error:
             # A wrong interval is better than no sidecar.
             log.error("the built-in defaults hold: %s", error)
+        if self.configuration.path != CONFIG_PATH and not self.configuration.problem:
+            self._say_what_holds()  # somebody has named that file
         self._cpu.total = self.configuration.defaults.cpu_total
         loop.add_reader(self._engine.event_fd, self._take_events)
         api = ApiServer(self, self.run_dir / "api.sock")
@@ -215,6 +218,9 @@ class Daemon:
         watch = self._watches[self.registry.find(name).cookie]
         container = watch.container
         if watch.guard is None:
+            if container.state is State.NODES:
+                name = container.label
+                raise Unprotected(f"{name} is a launcher: name one of its nodes, as {name}/NODE (avckpt ps lists them)")
             raise Unprotected(f"{container.label} runs unprotected: {container.reason}")
         if command is Command.RESTORE and container.generations == 0:
             raise NothingToRestore(f"{container.label} has nothing to go back to: {container.reason}")
@@ -243,6 +249,13 @@ class Daemon:
             "crashes": [record.to_json() for record in self.inquests.crashes_of(container)],
         }
 
+    def _say_what_holds(self) -> None:
+        path = self.configuration.path
+        if self.configuration.found:
+            log.info("%s was read", path)
+        else:
+            log.warning("no %s: the built-in defaults hold", path)
+
     def reload(self) -> list[Reloaded]:
         """Reloads the configuration file for all containers, including those missed so far.
 
@@ -252,7 +265,7 @@ class Daemon:
         """
         self.configuration.load()
         self._cpu.total = self.configuration.defaults.cpu_total
-        log.info("%s was read", self.configuration.path)
+        self._say_what_holds()
         outcomes = [self._reconfigure(watch) for watch in list(self._watches.values())]
         self._catch_up()
         return [outcome for outcome in outcomes if outcome is not None]

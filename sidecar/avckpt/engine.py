@@ -20,7 +20,7 @@ from typing import Any
 from avckpt_hooks.shared.tell import printable
 
 from avckpt.artifacts import guard_binary
-from avckpt.errors import AvckptError, Code, ConfigError, TargetGone, Unsupported, class_of_code
+from avckpt.errors import AvckptError, Code, ConfigError, Denied, TargetGone, Unsupported, class_of_code
 from avckpt.events.vocabulary import Kind, Reason
 from avckpt.guard import FORK_REASONS, Command, Event, GuardConfig, Images
 
@@ -46,7 +46,10 @@ def probe() -> None:
     """
     err = ffi.new("struct avc_error *")
     if lib.avc_engine_probe(_path(guard_binary()), err) != 0:
-        raise _error(err)
+        problem = _error(err)
+        if isinstance(problem, Denied) and os.geteuid() != 0:
+            raise Denied(f"this needs root: use sudo ({problem})")
+        raise problem
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from avckpt import cli
+from avckpt.cli import client
 from avckpt.cli.client import Client
 from avckpt.errors import NothingToRestore
 from avckpt.guard import Command
@@ -52,6 +53,16 @@ def row(**fields: object) -> dict[str, object]:
         "reason": "",
         **fields,
     }
+
+
+def test_how_to_start_it_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "UNITS", (tmp_path / "units",))
+    assert f" -v {tmp_path}:/run/avckpt " in client.start_it(tmp_path)
+    (tmp_path / "units").mkdir()
+    (tmp_path / "units" / client.SERVICE).touch()
+    monkeypatch.setattr(os.path, "isdir", lambda path: True)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert client.start_it(tmp_path) == "start it with: sudo systemctl start avckpt-sidecar.service"
 
 
 @pytest.mark.parametrize("args", [["ps"], ["ps", "--json"], ["checkpoint", "web"], ["restore", "web"]])
@@ -131,6 +142,16 @@ def test_the_sidecars_errors_decide_the_exit_status(monkeypatch: pytest.MonkeyPa
     result = avckpt("restore", "web")
     assert result.exit_code == 5
     assert result.stderr == "avckpt: web has nothing to go back to\n"
+
+
+def test_a_launcher_has_no_checkpoints_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {"container": row(state="nodes", reason="a launcher"), "settings": {"keep": "2"}, "crashes": []}
+    monkeypatch.setattr(Client, "inspect", lambda self, name: known)
+    assert avckpt("inspect", "web").stdout.splitlines() == [
+        "web (abababababab): nodes: a launcher",
+        "settings: keep=2",
+        "crashes: 0 in the history",
+    ]
 
 
 def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:

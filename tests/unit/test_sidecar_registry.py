@@ -51,6 +51,15 @@ def test_nobody_is_called_so(registry: Registry, called: str) -> None:
         registry.find(called)
 
 
+def test_one_that_has_ended_is_told_of(registry: Registry) -> None:
+    web = registry.find("web")
+    web.reason = "killed by SIGSEGV"
+    registry.remove(web)
+    for called in ("web", "abc"):
+        with pytest.raises(NoSuchContainer, match="^web has ended: killed by SIGSEGV; avckpt events web tells"):
+            registry.find(called)
+
+
 def test_a_restarted_container_is_not_removed_with_its_old_run(registry: Registry) -> None:
     old = registry.find("web")
     new = container("abc1", "web", 10)

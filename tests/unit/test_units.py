@@ -72,7 +72,7 @@ def test_a_nodes_labels_are_over_its_containers() -> None:
     [
         ({"avckpt.scope": "container"}, {}, "avckpt.scope: it is for whoever starts the container"),
         ({"avckpt.group": "other"}, {}, "avckpt.group: it is for whoever starts the container"),
-        ({"avckpt.interval": "20ms"}, {}, "less than 100ms takes a container"),
+        ({"avckpt.interval": "20ms"}, {}, "less than 100ms only if its container's labels do"),
         ({"avckpt.shm": "1GB"}, {}, "avckpt.shm: more than the container was given"),
         ({"avckpt.restore.on": "unhealthy"}, {}, "takes a container's health check"),
         ({"avckpt.enable": "false"}, {}, "avckpt.enable is not true"),

@@ -116,7 +116,8 @@ static void roll_back(struct avc_guard *guard, const struct avc_request *request
 		return;
 	}
 	if (i < 0) {
-		guard_refuse(guard, ticket, AVC_EMPTY, "that generation is not held");
+		guard_refuse(guard, ticket, AVC_EMPTY,
+			     "that generation is not held: avckpt inspect lists those that are");
 		return;
 	}
 	if (init_channel_stop_asked(&guard->channel)) {

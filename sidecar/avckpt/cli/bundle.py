@@ -110,9 +110,10 @@ def contents(
     yield "events.jsonl", lambda: "".join(json.dumps(event) + "\n" for event in events)
     yield "container.json", lambda: _pretty(container)
     inspected: list[Json] = []
+    whose = container.get("node_of") or container["id"]  # a node's container is what Podman knows
 
     def inspect() -> str:
-        inspected.extend(json.loads(_program("podman", "container", "inspect", container["id"])))
+        inspected.extend(json.loads(_program("podman", "container", "inspect", whose)))
         return _pretty({key: inspected[0].get(key) for key in INSPECTED})
 
     def labels() -> str:
@@ -121,17 +122,26 @@ def contents(
         labels = inspected[0]["Config"]["Labels"] or {}
         return _pretty({key: value for key, value in labels.items() if key.startswith("avckpt.")})
 
-    yield "inspect.json", inspect
-    yield "labels.json", labels
-    yield "container.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), container["id"])
+    if whose != "host":
+        yield "inspect.json", inspect
+        yield "labels.json", labels
+        yield "container.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), whose)
     yield "sidecar.json", lambda: _pretty(client.info())
     yield "sidecar.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), sidecar_container.NAME)
     yield "metrics.txt", client.metrics
     yield "doctor.json", lambda: _pretty([asdict(check) for check in doctor.checks()])
-    yield "config.yaml", lambda: _tail(Path(client.info()["config"]["path"]).read_bytes())
+    yield "config.yaml", lambda: _config(client)
     yield "versions.txt", versions
     if core:
         yield "core.zst", lambda: _core(events)
+
+
+def _config(client: Client) -> str:
+    """Raises AvckptError when there is none."""
+    path = Path(client.info()["config"]["path"])
+    if not path.exists():
+        raise AvckptError(f"there is no {path}, the built-in defaults hold")
+    return _tail(path.read_bytes())
 
 
 def _core(events: list[Json]) -> bytes:

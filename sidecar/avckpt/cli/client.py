@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import os
 import socket
 from collections.abc import Iterator
 from http import HTTPStatus
@@ -21,11 +22,28 @@ Json = dict[str, Any]
 TIMEOUT_S = 40.0
 """For a whole request; longer than the sidecar itself waits for the engine."""
 
-# --replace: one of that name that is stopped, or hangs, is no obstacle.
-START_IT = (
-    "start it with: podman run -d --replace --restart=always --name avckpt-sidecar --privileged --pid=host "
-    "--network=none -v /run/avckpt:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
+SERVICE = "avckpt-sidecar.service"
+UNITS = tuple(
+    map(Path, ("/run/systemd/generator", "/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"))
 )
+"""Where systemd has it: of a Quadlet, the administrator's, and the Debian package's."""
+
+
+def start_it(run_dir: Path) -> str:
+    """How to start the sidecar here, as a clause: as a service of systemd where it is one, or else its container."""
+    sudo = "" if os.geteuid() == 0 else "sudo "
+    if any((folder / SERVICE).exists() for folder in UNITS) and os.path.isdir("/run/systemd/system"):
+        return f"start it with: {sudo}systemctl start {SERVICE}"
+    return f"start it with: {sudo}{run_it(run_dir)}"
+
+
+def run_it(run_dir: Path) -> str:
+    """The command that starts its container.  With --replace one of that name that is stopped, or hangs, is no
+    obstacle."""
+    return (
+        "podman run -d --replace --restart=always --name avckpt-sidecar --privileged --pid=host --network=none "
+        f"-v {run_dir}:/run/avckpt -v /etc/avckpt:/etc/avckpt:ro localhost/avckpt-sidecar"
+    )
 
 
 class Client:
@@ -72,7 +90,7 @@ class Client:
 
     def history(self, since: float | None = None) -> list[Json]:
         """The events that are kept, oldest first, with `since` (seconds since 1970) those from then on."""
-        query = "" if since is None else f"?since={since!r}"
+        query = "" if since is None else f"?{urlencode({'since': repr(since)})}"
         return cast("list[Json]", self._request("GET", f"/v1/history{query}")["events"])
 
     def events(self, after: int | None = None, since: float | None = None, *, routine: bool = False) -> Iterator[Json]:
@@ -111,7 +129,7 @@ class Client:
             yield connection
         except (FileNotFoundError, ConnectionRefusedError) as error:
             why = f"no {self._path}" if isinstance(error, FileNotFoundError) else f"nobody listens on {self._path}"
-            raise SidecarUnreachable(f"the sidecar is not running ({why}): {START_IT}") from error
+            raise SidecarUnreachable(f"the sidecar is not running ({why}): {start_it(self._path.parent)}") from error
         except PermissionError as error:
             raise Denied(f"{self._path} is for root only: use sudo") from error
         except TimeoutError as error:

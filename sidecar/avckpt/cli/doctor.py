@@ -22,7 +22,7 @@ from typing import Any
 
 import avckpt
 from avckpt.cli import containers_conf, install, sidecar_container
-from avckpt.cli.client import START_IT
+from avckpt.cli.client import run_it
 from avckpt.cli.install import HOOK_PROGRAM, HOOKS_DIR, INIT_PROGRAM, Manifest
 from avckpt.errors import AvckptError
 
@@ -299,7 +299,7 @@ def _judge_sidecar(facts: Facts) -> Check:
             "build its image again and start it anew",
         )
     if facts.sidecar_outdated:
-        return Check("sidecar", Status.WARN, sidecar_container.OUTDATED, START_IT)
+        return Check("sidecar", Status.WARN, sidecar_container.OUTDATED, f"run: {run_it(_run_dir())}")
     return Check("sidecar", Status.OK, f"answers, version {facts.sidecar_version}")
 
 
@@ -442,12 +442,10 @@ def _facts_of(info: dict[str, Any]) -> PodmanFacts:
 
 def _sidecar() -> tuple[dict[str, Any], str]:
     """What it says of itself, empty when it does not answer, and why not."""
-    from avckpt_hooks.shared import protocol
-
     from avckpt.cli.client import Client
 
     try:
-        info = Client(Path(protocol.run_dir())).info()
+        info = Client(_run_dir()).info()
     except AvckptError as error:
         return {}, str(error)
     except OSError as error:
@@ -455,6 +453,12 @@ def _sidecar() -> tuple[dict[str, Any], str]:
     if "version" not in info:
         return {}, "the sidecar does not say its version: start it again"
     return info, ""
+
+
+def _run_dir() -> Path:
+    from avckpt_hooks.shared import protocol
+
+    return Path(protocol.run_dir())
 
 
 def _sidecar_outdated() -> bool:

@@ -48,7 +48,8 @@ class Instant(click.ParamType):  # type: ignore[type-arg] # generic only in newe
             return value
         if re.fullmatch(r"(\d+(\.\d+)?[smhd])+", value, re.ASCII):
             parts = re.findall(r"([\d.]+)([smhd])", value)
-            return time.time() - sum(float(number) * _UNITS_S[unit] for number, unit in parts)
+            # Longer ago than anything: all there is.
+            return max(time.time() - sum(float(number) * _UNITS_S[unit] for number, unit in parts), 0.0)
         try:
             return datetime.fromisoformat(value).timestamp()
         except (ValueError, OverflowError):

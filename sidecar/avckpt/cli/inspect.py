@@ -35,7 +35,22 @@ def _lines(known: Json) -> list[str]:
     container = known["container"]
     lines = [
         f"{called(container)} ({container['id'][:12]}): {container['state']}"
-        f"{': ' + container['reason'] if container['reason'] else ''}",
+        f"{': ' + container['reason'] if container['reason'] else ''}"
+    ]
+    if container["state"] not in ("nodes", "listening"):
+        lines += _guarded(known)
+    lines.append("settings: " + ", ".join(f"{key}={value}" for key, value in known["settings"].items() if value))
+    crashes = known["crashes"][-CRASHES_SHOWN:]
+    lines.append(f"crashes: {len(known['crashes'])} in the history{', the last:' if crashes else ''}")
+    for event in crashes:
+        lines.append(f"  {datetime.fromtimestamp(event['at']).isoformat(' ', 'milliseconds')}  {event['message']}")
+    return lines
+
+
+def _guarded(known: Json) -> list[str]:
+    """What only those have that are checkpointed themselves."""
+    container = known["container"]
+    lines = [
         f"application {container['app_pid']} (inside {container['app_pid_inside']}), guard {container['guard_pid']}, "
         f"{container['checkpoints']} checkpoint(s), {container['missed']} missed, {container['restores']} restore(s)",
         "generations:" if known["generations"] else "generations: none is held",
@@ -46,9 +61,4 @@ def _lines(known: Json) -> list[str]:
             f"  {each['generation']}: {each['age_s']:.2f} s old, {each['threads']} thread(s), "
             f"frozen {each['freeze_s'] * 1000:.2f} ms{crashes}"
         )
-    lines.append("settings: " + ", ".join(f"{key}={value}" for key, value in known["settings"].items() if value))
-    crashes = known["crashes"][-CRASHES_SHOWN:]
-    lines.append(f"crashes: {len(known['crashes'])} in the history{', the last:' if crashes else ''}")
-    for event in crashes:
-        lines.append(f"  {datetime.fromtimestamp(event['at']).isoformat(' ', 'milliseconds')}  {event['message']}")
     return lines

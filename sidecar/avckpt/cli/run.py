@@ -32,7 +32,7 @@ from avckpt.cli.namespace import spawn_pid1
 from avckpt.containers.cgroup import groups_of
 from avckpt.containers.process import stat_fields
 from avckpt.engine import Engine, probe
-from avckpt.errors import AvckptError, Denied, LabelsWrong
+from avckpt.errors import AvckptError, LabelsWrong
 from avckpt.events.journal import Journal
 from avckpt.events.record import of_guard
 from avckpt.events.vocabulary import Kind, signal_name
@@ -102,12 +102,7 @@ def run(settings: Settings, argv: list[str], *, verbose: bool) -> int:
 
 def _run(argv: list[str], kind: type[S], watch: Callable[[int, S], None], verbose: bool, io_uring: bool) -> int:
     """Raises AvckptError when it cannot be started."""
-    try:
-        probe()
-    except Denied as error:
-        if os.geteuid() == 0:
-            raise
-        raise Denied(f"this needs root: use sudo ({error})") from error
+    probe()
     init = init_binary()
     with _signals() as signals_fd, _terminal() as terminal:
         command = [init.name, "--wait-ms", "2000", "--stop-signal", "15", "--", *argv]

@@ -50,7 +50,14 @@ class Registry:
 
     def find(self, name: str) -> Protected:
         """A live container by name, id or unique id prefix.  Raises NoSuchContainer, Ambiguous."""
-        return find(self._live.values(), name)
+        try:
+            return find(self._live.values(), name)
+        except NoSuchContainer:
+            for gone in reversed(self._ended):
+                if name and (gone.name == name or gone.id.startswith(name)):
+                    how = f"{gone.label} has ended: {gone.reason}; avckpt events {gone.label} tells what happened"
+                    raise NoSuchContainer(how) from None
+            raise
 
 
 def find(containers: Iterable[Protected], name: str) -> Protected:

@@ -116,7 +116,7 @@ def labels_of_node(claimed: Mapping[str, str], container: Mapping[str, str]) -> 
     if policy.restore_on.unhealthy:
         raise LabelsWrong("label avckpt.restore.on: unhealthy takes a container's health check, leave it out")
     if policy.interval_s < min(allowed.interval_s, LEAST_INTERVAL_S):
-        raise LabelsWrong("label avckpt.interval: less than 100ms takes a container that was given it, too")
+        raise LabelsWrong("label avckpt.interval: a node may ask for less than 100ms only if its container's labels do")
     if policy.shm_bytes > max(allowed.shm_bytes, plain.shm_bytes) or policy.shm_bytes > SHM_MAX_BYTES:
         raise LabelsWrong("label avckpt.shm: more than the container was given")
     if not policy.enable:
