@@ -173,6 +173,19 @@ def test_only_the_services_that_are_named(project: Project, sidecar: Sidecar) ->
     assert done.stderr.startswith("avckpt: no such service: by-mop; there are by-annotation, ")
 
 
+def test_a_name_that_another_container_has_is_a_failure(project: Project, podman: Podman) -> None:
+    project.write(SERVICES)
+    name = f"{project.name}_by-map_1"
+    podman.run("create", "--name", name, BASE_IMAGE, "true")
+    try:
+        done = project.avckpt("up", "by-map", check=False)
+    finally:
+        podman.run("rm", "--force", name, shielded=True)
+    assert (done.status, done.stdout) == (1, "")
+    assert "by-map has no container: " in done.stderr.splitlines()[-1]
+    assert "already in use" in done.stderr.splitlines()[-1]
+
+
 def test_files_that_nobody_names_are_those_of_podman_compose(
     project: Project, sidecar: Sidecar, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -184,8 +184,9 @@ def test_one_mistake_behind_an_anchor_is_said_once(path: Path) -> None:
     assert [line[:21] for line in lines(checked(path, text))] == ["v.yaml:1: service a: "]
 
 
-def test_labels_under_deploy_are_not_the_containers(path: Path) -> None:
-    manifest = checked(path, "services:\n  a:\n    deploy:\n      labels:\n        avckpt.enable: true\n")
+@pytest.mark.parametrize("where", ["deploy: {labels: {avckpt.enable: true}}", "label: [avckpt.enable=true]"])
+def test_labels_elsewhere_are_not_the_containers(path: Path, where: str) -> None:
+    manifest = checked(path, f"services:\n  a:\n    {where}\n")
     assert "put it under labels" in lines(manifest)[0]
     assert manifest.services["a"].enabled is False
 
@@ -246,6 +247,10 @@ def test_down_of_what_is_not_there(path: Path, monkeypatch: pytest.MonkeyPatch) 
     path.write_text("services: {a: {labels: {avckpt.enable: nonsense}}}")
     assert avckpt("down", "-f", path, "b") == (1, "avckpt: no such service: b; there are a\n")
     assert avckpt("down", "-f", path, path)[1].endswith(f"there are a; a file is named with -f {path}\n")
+    path.write_text("apiVersion: v1\nkind: Pod\n")
+    for command in ("up", "down"):
+        assert avckpt(command, "-f", path)[1].startswith(f"avckpt: {path} is for Kubernetes: use podman kube play")
+    path.write_text("services: {a: {labels: {avckpt.enable: nonsense}}}")
     done: list[object] = []
     monkeypatch.setattr(podman_compose.Compose, "down", lambda *_: done.append("down"))
     assert avckpt("down", "-f", path) == (0, "")

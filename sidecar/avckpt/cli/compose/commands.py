@@ -84,7 +84,7 @@ def up(
     from avckpt.cli.compose.podman_compose import Compose
 
     run_dir = Path(protocol.run_dir())
-    paths = manifest.files_meant(files, os.environ)
+    paths = _compose_files(files)
     found = manifest.check(paths)
     print_problems(found, err=True)
     if found.errors:
@@ -130,7 +130,7 @@ def down(
     from avckpt.cli.compose import manifest
     from avckpt.cli.compose.podman_compose import Compose
 
-    paths = manifest.files_meant(files, os.environ)
+    paths = _compose_files(files)
     for path in paths:
         try:
             yamlfile.read(path)
@@ -205,6 +205,17 @@ def summary(found: Manifest) -> str:
     problems = len(found.problems) - len(found.errors)
     counts = [_count(n, what) for n, what in ((len(found.errors), "problem"), (problems, "warning")) if n]
     return f"{text}; {' and '.join(counts) or 'no problems'}"
+
+
+def _compose_files(files: Sequence[Path]) -> tuple[Path, ...]:
+    """Those that are meant.  Raises ConfigError when there is none, or one of Kubernetes."""
+    from avckpt.cli.compose import manifest, pods
+
+    paths = manifest.files_meant(files, os.environ)
+    for path in paths:
+        if pods.is_pods(path):
+            raise ConfigError(f"{path} is for Kubernetes: use podman kube play {path} (and podman kube down)")
+    return paths
 
 
 def _expect(found: Manifest, services: Sequence[str]) -> None:

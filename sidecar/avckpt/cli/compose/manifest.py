@@ -338,10 +338,12 @@ class _Reader:
                     )
                 service.settings[kind][setting.key] = setting
         deploy = yamlfile.lookup(yamlfile.lookup(node, "deploy"), "labels")
-        for setting in self._settings(deploy, path, name):
-            self._complain(
-                setting.place, f"{setting.key} under deploy is no label of the container; put it under labels", name
-            )
+        # podman-compose passes over a key that it does not know.
+        misspelt = ((key, yamlfile.lookup(node, key)) for key in ("label", "annotation"))
+        for key, elsewhere in (("deploy", deploy), *misspelt):
+            for setting in self._settings(elsewhere, path, name):
+                why = f"{setting.key} under {key} is no label of the container; put it under labels"
+                self._complain(setting.place, why, name)
         return service
 
     def _settings(self, node: yaml.Node | None, path: Path, name: str) -> Iterator[Setting]:
