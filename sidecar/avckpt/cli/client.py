@@ -22,6 +22,7 @@ Json = dict[str, Any]
 TIMEOUT_S = 40.0
 """For a whole request; longer than the sidecar itself waits for the engine."""
 
+LOG = "its log (podman logs avckpt-sidecar)"
 SERVICE = "avckpt-sidecar.service"
 UNITS = tuple(
     map(Path, ("/run/systemd/generator", "/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"))
@@ -133,9 +134,11 @@ class Client:
         except PermissionError as error:
             raise Denied(f"{self._path} is for root only: use sudo") from error
         except TimeoutError as error:
-            raise SidecarUnreachable(f"the sidecar did not answer within {TIMEOUT_S:g} s: see its log") from error
+            raise SidecarUnreachable(
+                f"the sidecar did not answer within {TIMEOUT_S:g} s: is it paused? see {LOG}"
+            ) from error
         except (OSError, http.client.HTTPException) as error:
-            raise SidecarUnreachable(f"the sidecar went away ({error}): see its log") from error
+            raise SidecarUnreachable(f"the sidecar went away ({error}): see {LOG}") from error
         finally:
             connection.close()
 
