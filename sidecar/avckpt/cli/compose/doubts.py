@@ -116,8 +116,8 @@ def of_returns(services: Iterable[Service]) -> Iterator[tuple[Service, str]]:
 def of_absent(services: Mapping[str, Service]) -> Iterator[tuple[Service, str]]:
     """Of services that wait for one that is not there, on which podman-compose fails half way."""
     for service in services.values():
-        for name in sorted(service.facts.depends_on - services.keys()):
-            if "$" not in name:
+        for name in sorted(service.facts.depends_on):
+            if name not in services and "$" not in name:
                 yield service, f"depends_on {name}, and there is no such service"
 
 
