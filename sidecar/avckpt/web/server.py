@@ -20,6 +20,7 @@ import asyncio
 import hmac
 import ipaddress
 import os
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from importlib.resources import files
@@ -181,7 +182,9 @@ async def start(run_dir: Path, listen: str, port: int, access: Access) -> web.Ap
         await web.TCPSite(runner, listen, port).start()
     except OSError as error:
         await runner.cleanup()
-        raise AvckptError(f"cannot listen on {listen} port {port}", errno=error.errno or 0) from error
+        # A name that is not found has a number of the resolver's, and not of the kernel's.
+        why = error.strerror if isinstance(error, socket.gaierror) else os.strerror(error.errno or 0)
+        raise AvckptError(f"cannot listen on {listen} port {port} ({why})") from error
     return runner
 
 
