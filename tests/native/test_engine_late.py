@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,8 @@ MOST = 30
 ROUNDS = 6
 LATE_MS = 250
 """A thread waits for 100 ms."""
+ARRIVED = {"x86_64": 168, "aarch64": 1152}[os.uname().machine]
+"""HOME_ARRIVED of native/parasite/ARCH/home.h."""
 PARKED_S = 0.05
 """Nobody is in the parasite for so long whose guard runs."""
 
@@ -89,10 +92,22 @@ def test_generations_stay(where: str, tmp_path: Path) -> None:
         is_restored(guard, victim)
 
 
-def test_the_handler_of_a_signal_on_the_way_returns_to_it(tmp_path: Path) -> None:
+def say_home(pid: int) -> None:
+    """What it says one instruction before it is there (`arrived`), where a signal may still come."""
+    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+        if "/memfd:avckpt-parasite" in line and " rw-s " in line:
+            with Path(f"/proc/{pid}/mem").open("r+b", buffering=0) as memory:
+                os.pwrite(memory.fileno(), (1).to_bytes(4, sys.byteorder), int(line.split("-")[0], 16) + ARRIVED)
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_the_handler_of_a_signal_on_the_way_returns_to_it(early: bool, tmp_path: Path) -> None:
     """Until then there is no checkpoint, for a thread that is borrowed meanwhile would not find home."""
+
     with Victim("steady", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         answers = [be_late(guard, victim, lambda: os.kill(victim.app, signal.SIGUSR2))]
+        if early:
+            say_home(victim.app)
         while answers[-1]["kind"] != "checkpoint":
             assert answers[-1]["kind"] == "missed", answers
             assert answers[-1]["generations"] == 1, answers

@@ -134,12 +134,15 @@ static bool has_filters_since(const struct process *process)
  * Then the process gets another parasite. */
 static int await_home(struct process *process, struct avc_error *err)
 {
-	if (!parasite_is_awaited(&process->parasite))
+	const struct parasite *parasite = &process->parasite;
+	const bool says_home = parasite->left_ns && parasite_says_home(parasite);
+
+	if (!parasite->left_ns || (says_home && !parasite->late))
 		return 0;
-	process->infected = now_ns() - process->parasite.left_ns < HOMEWARD_NS;
-	return process->infected ? fail(err, AVC_DEADLINE, 0, process->pid, "stop", "",
-					"a thread is still on its way home")
-				 : 0;
+	process->infected = now_ns() - parasite->left_ns < HOMEWARD_NS;
+	return process->infected && !says_home ? fail(err, AVC_DEADLINE, 0, process->pid, "stop",
+						      "", "a thread is still on its way home")
+					       : 0;
 }
 
 static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *later,

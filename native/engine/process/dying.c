@@ -212,13 +212,35 @@ static int returns_to_old(const struct process *process, const struct thread *t,
 	return parasite_is_old(process, frame->pc);
 }
 
-bool process_needs_old(const struct process *process)
+static int returns_to_parasite(const struct process *process, const struct thread *t,
+			       const struct arch_signal_frame *frame, bool *surely)
+{
+	(void)t;
+	(void)surely;
+	return parasite_contains(&process->parasite, frame->pc);
+}
+
+static bool any_returns(const struct process *process, frame_test *fits)
 {
 	bool ignored;
 
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (process->threads[i].stopped &&
-		    find(process, &process->threads[i], returns_to_old, &ignored))
+		    find(process, &process->threads[i], fits, &ignored))
 			return true;
 	return false;
+}
+
+bool process_needs_old(const struct process *process)
+{
+	return any_returns(process, returns_to_old);
+}
+
+bool process_is_home(const struct process *process)
+{
+	for (uint32_t i = 0; i < process->thread_count; i++)
+		if (process->threads[i].stopped &&
+		    parasite_contains(&process->parasite, arch_pc(&process->threads[i].regs)))
+			return false;
+	return !any_returns(process, returns_to_parasite);
 }

@@ -109,6 +109,8 @@ int dying_check(struct process *process, struct thread *thread, struct avc_error
 /* Whether one of the (stopped) threads is in a handler that returns to what a dead guard has left: a
  * thread that goes home by itself may get a signal on the way. */
 bool process_needs_old(const struct process *process);
+/* Whether no (stopped) thread is in the parasite, nor in a handler that returns there. */
+bool process_is_home(const struct process *process);
 
 /* ---- stop.c --------------------------------------------------------------------- */
 

@@ -103,7 +103,7 @@ void process_stop_begin(struct process *process)
 }
 
 /* Until all are stopped, because threads create threads meanwhile: a walk finds them. */
-int process_stop_all(struct process *process, struct avc_error *err)
+static int stop_rest(struct process *process, struct avc_error *err)
 {
 	for (;;) {
 		struct walk walk = { .process = process, .err = err };
@@ -119,6 +119,28 @@ int process_stop_all(struct process *process, struct avc_error *err)
 		if (!walk.fresh)
 			return 0;
 	}
+}
+
+/* One that goes home by itself says that it is there one instruction before it is, and may get a
+ * signal, or be stopped, at that one, which still needs to know where home is.  That shows only now,
+ * and what it says is only a hint: the app can write it as well. */
+static void await_home(struct process *process)
+{
+	struct parasite *parasite = &process->parasite;
+
+	if (!parasite->left_ns || !parasite_says_home(parasite))
+		return;
+	parasite->late = !process_is_home(process);
+	if (!parasite->late)
+		parasite->left_ns = 0;
+}
+
+int process_stop_all(struct process *process, struct avc_error *err)
+{
+	if (stop_rest(process, err))
+		return -1;
+	await_home(process);
+	return 0;
 }
 
 int process_stop(struct process *process, struct avc_error *err)

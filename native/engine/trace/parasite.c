@@ -500,11 +500,9 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
 	return 0;
 }
 
-bool parasite_is_awaited(struct parasite *parasite)
+bool parasite_says_home(const struct parasite *parasite)
 {
-	if (parasite->left_ns && __atomic_load_n(&parasite->control->arrived, __ATOMIC_ACQUIRE))
-		parasite->left_ns = 0;
-	return parasite->left_ns;
+	return __atomic_load_n(&parasite->control->arrived, __ATOMIC_ACQUIRE);
 }
 
 int thread_borrow(struct process *process, struct thread *thread, struct avc_error *err)
@@ -518,7 +516,7 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	if (arch_is_delicate(thread->tid))
 		return fail(err, AVC_RETRY, 0, thread->tid, "run injected code", "",
 			    "it is in the middle of vector code");
-	if (parasite_is_awaited(&process->parasite))
+	if (process->parasite.left_ns)
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
 			    "a thread is still on its way home");
 	home = thread->regs;

@@ -154,7 +154,11 @@ struct parasite {
 	struct inj_control *control;
 	uint32_t slots, threads_max;
 	size_t slot_bytes, block_bytes;
-	uint64_t left_ns; /* when a thread has left it by itself (parasite_is_awaited()); or 0 */
+	/* When a thread has left it by itself, until a stop of the process has shown that it is home; or
+	 * 0.  It may still be in the handler of a signal that came on the way, and return to it: where
+	 * it goes home to must not be overwritten, and it is in no image. */
+	uint64_t left_ns;
+	bool late; /* the last stop has shown that it was not            */
 	/* Memory of the guard, not of the app: the code, sealed against writing; and the rest,
 	 * which the app can write as well. */
 	int code_fd, data_fd;
@@ -462,9 +466,8 @@ int parasite_run_clone_while(pid_t tid, const struct inj_call *call, void (*mean
  * parasite_clear_undo(). */
 int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6]) warn_unused;
 void parasite_clear_undo(struct process *process);
-/* A thread that has left it by itself may still be in the handler of a signal that came on the way,
- * and return to it: where it goes home to must not be overwritten, and it is in no image. */
-bool parasite_is_awaited(struct parasite *parasite);
+/* Whether the thread that has left it by itself says that it is home. */
+bool parasite_says_home(const struct parasite *parasite);
 /* Whether this is in a parasite left behind by a dead guard, or in a stub that stays. */
 bool parasite_is_old(const struct process *process, avc_remote address);
 /* Options for a stopped task of ours, which has the memory of the parasite's process. */

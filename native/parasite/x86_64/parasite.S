@@ -46,8 +46,8 @@ all_signals:
  * popf.
  *
  * Such a handler returns here, and may take its time: `home` stays as it is until
- * `arrived` is set.  Only a signal between the last two instructions is not covered, whose
- * handler runs for longer than until the next borrower. */
+ * `arrived` is set, and a stop of the whole process has shown that no thread is here any more,
+ * nor in a handler that returns here (process/stop.c): the last instruction still needs it. */
 	.globl	inj_go_home
 	.type	inj_go_home, @function
 inj_go_home:
