@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -44,3 +46,18 @@ def test_shadow_stacks_are_refused(tmp_path: Path) -> None:
         with GuardProcess(config(0.03), [victim.pid]) as guard:
             assert "shadow stacks" in guard.wait("unprotected")["error"]["message"]
             victim.wait_beats(20)
+
+
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="modes of x86-64")
+@pytest.mark.parametrize("kind", ["trap", "narrow"])
+def test_a_mode_in_which_injected_code_would_not_survive(kind: str, tmp_path: Path) -> None:
+    """It is another one while that runs, and then the same; 32-bit code has none injected."""
+    with Victim(f"modes {kind}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        answers = Counter(guard.command("checkpoint")["kind"] for _ in range(60))
+        victim.wait_beats(20)
+        if kind == "narrow":
+            assert answers["unprotected"], answers
+            return
+        assert answers["checkpoint"], answers
+        guard.command("restore")
+        victim.wait_beats(20)

@@ -144,6 +144,25 @@ static int check_shadow_stack(struct process *process, struct avc_error *err)
 	return 0;
 }
 
+/* Before it is stopped for the first time: the kernel numbers its calls in another way, so that an
+ * interrupted one is not repeated for it (trace/rewind.c).  Of 32-bit words the first two of the
+ * auxiliary vector are a type and its value, which is not 0. */
+static int check_word_size(const struct process *process, struct avc_error *err)
+{
+	uint64_t type = 0;
+	int fd;
+
+	if (process->infected)
+		return 0;
+	fd = proc_open(process->pid, "auxv", O_RDONLY);
+	if (fd >= 0 && read(fd, &type, sizeof type) != sizeof type)
+		type = 0; /* it is exiting, and has no memory */
+	close_fd(&fd);
+	return type >> 32 ? fail(err, AVC_UNSUPPORTED, 0, process->pid, "check", "",
+				 "it is a 32-bit program")
+			  : 0;
+}
+
 /* unshare(2) and setns(2): its next child is the first process of another namespace.  A
  * clone of ours would be that, and the namespace would end with it. */
 static int check_namespaces(struct process *process, struct avc_error *err)
@@ -197,8 +216,9 @@ int support_check(struct process *process, struct avc_error *err)
 {
 	struct proc_status status;
 
-	if (check_shadow_stack(process, err) || check_namespaces(process, err) ||
-	    check_descriptors(process, err) || check_mappings(process, err))
+	if (check_word_size(process, err) || check_shadow_stack(process, err) ||
+	    check_namespaces(process, err) || check_descriptors(process, err) ||
+	    check_mappings(process, err))
 		return -1;
 	dying_note_caught(process);
 	if (proc_status(process->pid, &status))

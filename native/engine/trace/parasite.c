@@ -486,6 +486,10 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
 {
 	if (thread_check_dispatch(thread->tid, err))
 		return -1;
+	/* Or in 32-bit code at the moment, as Wine's threads: ours would be taken for that. */
+	if (!arch_is_native(&thread->regs))
+		return fail(err, AVC_UNSUPPORTED, 0, thread->tid, "check", "",
+			    "it is a 32-bit program");
 	if (!has_memory_of_holder(process) && check_there(process, thread->tid, err))
 		return -1;
 	/* A thread must return into the app, never into a parasite that will be unmapped. */

@@ -16,8 +16,12 @@
 #define FLAG_AF 0x010
 #define FLAG_ZF 0x040
 #define FLAG_SF 0x080
+#define FLAG_TF 0x100
 #define FLAG_DF 0x400
 #define FLAG_OF 0x800
+/* Injected code has none of these.  With TF it would trap after each instruction, which ends a thread
+ * that has blocked the signal for that. */
+#define FLAGS_OWN (FLAG_TF | FLAG_DF)
 
 /* The kernel's own codes for "make this call again" (include/linux/errno.h); they never reach user
  * space, but ptrace sees them. */
@@ -130,7 +134,7 @@ void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote 
 	regs->r.rdi = arg;
 	regs->r.rax = 0;
 	regs->r.orig_rax = -1ULL;
-	regs->r.eflags &= ~(unsigned long long)FLAG_DF;
+	regs->r.eflags &= ~(unsigned long long)FLAGS_OWN;
 }
 
 void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, uint64_t a,
@@ -142,7 +146,7 @@ void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote
 	regs->r.rsi = b;
 	regs->r.rax = 0;
 	regs->r.orig_rax = -1ULL;
-	regs->r.eflags &= ~(unsigned long long)FLAG_DF;
+	regs->r.eflags &= ~(unsigned long long)FLAGS_OWN;
 }
 
 /* What `add $1, %al; sahf` needs in %eax to bring the flags back. */
@@ -494,6 +498,7 @@ void arch_stub_call(struct arch_regs *regs, const struct arch_regs *base, avc_re
 {
 	*regs = *base;
 	regs->r.rip = last ? stub + STUB_LAST : stub;
+	regs->r.eflags &= ~(unsigned long long)FLAGS_OWN;
 	regs->r.orig_rax = -1ULL;
 	regs->r.rax = (unsigned long long)nr;
 	for (unsigned int i = 0; i < 6; i++)
