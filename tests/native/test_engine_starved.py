@@ -27,6 +27,8 @@ pytestmark = [
 
 ENOUGH = 6
 """Threads that were sent into the parasite and did not get there in time."""
+SOME = 3
+"""The same where the others of its process run."""
 GUARDS = 60
 """Each is killed while a thread may be on its way home."""
 
@@ -114,6 +116,31 @@ def test_the_next_attempt_comes_at_once(cpus: tuple[int, int], tmp_path: Path) -
         assert sum(map(too_late, guard.events)) >= ENOUGH
         assert not [event for event in guard.events if event.get("kind") == "died"]
         wait_until(lambda: guard.command("checkpoint")["kind"] == "checkpoint", 15, "checkpoints go on")
+        victim.wait_beats(20)
+
+
+def tracer(tid: int) -> int:
+    return int(Path(f"/proc/{tid}/status").read_text().split("TracerPid:")[1].split()[0])
+
+
+def test_nobody_waits_for_a_thread_that_is_late(cpus: tuple[int, int], tmp_path: Path) -> None:
+    """While it is in the parasite, or on its way there, all others of its process run."""
+    with Victim("threads 6 1", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        app = victim.app
+        put_on(cpus[1], app)
+        put_on(cpus[1], guard.pid)
+        os.sched_setaffinity(app, {cpus[0]})
+        late, end = 0, time.monotonic() + 90
+        with hog(cpus[0]):
+            while late < SOME and time.monotonic() < end:
+                if not too_late(guard.command("checkpoint")):
+                    continue
+                others = [int(tid) for tid in os.listdir(f"/proc/{app}/task") if int(tid) != app]
+                traced = [tid for tid in others if Path(f"/proc/{tid}").exists() and tracer(tid)]
+                if tracer(app):
+                    late += 1
+                    assert traced == []
+        assert late >= SOME
         victim.wait_beats(20)
 
 

@@ -228,9 +228,12 @@ int thread_ask(struct process *process, struct thread *thread, struct avc_error 
 
 	call_begin(call, INJ_AFTER_HOME);
 	thread_ask_add(process, is_main, call, &questions);
-	if (read_signal_state(thread, err) || thread_borrow(process, thread, err) ||
-	    parasite_run(thread->tid, call, err))
+	if (read_signal_state(thread, err) || thread_borrow(process, thread, err))
 		return -1;
+	if (parasite_run(thread->tid, call, err)) {
+		thread_runs_on(thread, err); /* not to be given back in the middle of it */
+		return -1;
+	}
 	if (thread_give_back(thread, err) ||
 	    thread_ask_answer(process, thread, call, &questions, err))
 		return -1;
