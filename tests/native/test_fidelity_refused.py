@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -14,12 +15,17 @@ import pytest
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, since_linux
 from testkit.harness import wait_until
+from testkit.init_peer import Init
 from testkit.procfs import children_of, comm_of, state_of
 
 SHARED = pytest.mark.shared_machine("an application that does not stop in time is told another reason")
 
 NETWORKS = since_linux(6, 11, "a namespace of a thread can be asked for")
 DISPATCH = since_linux(6, 4, "what a thread dispatches can be asked for")
+
+
+LONG_S = 8.0
+"""It is tried 6.4 s after the first time, and after as long again."""
 
 
 @pytest.fixture(autouse=True)
@@ -96,6 +102,61 @@ def test_it_may_come_later(kind: str, why: str, tmp_path: Path) -> None:
         assert why in guard.wait("unprotected")["error"]["message"]
         wait_until(lambda: victim.others() == [], 5, "nothing is left in the container", every_s=0.001)
         victim.wait_beats(20)
+
+
+REFUSED = """
+import ctypes, os, sys
+ring = ctypes.CDLL(None).syscall(425, 4, ctypes.create_string_buffer(120))  # io_uring_setup(2); O_CLOEXEC
+assert ring >= 0
+os.read(0, 1)
+os.execv("/bin/sleep", ["sleep", "1000"])
+"""
+
+
+def test_another_program_is_protected_at_once(tmp_path: Path) -> None:
+    """However long the one before it has been refused, which is not tried more than once a minute then."""
+    command = [sys.executable, "-S", "-c", REFUSED]
+    with Init(command, pid1=True, stdin=subprocess.PIPE) as init, GuardProcess(config(0.2), [init.pid]) as guard:
+        guard.wait("unprotected")
+        time.sleep(LONG_S)
+        assert init.popen.stdin is not None
+        init.popen.stdin.write(b"x")
+        init.popen.stdin.flush()
+        guard.wait("checkpoint", timeout_s=LONG_S / 2)
+
+
+# Waits for nothing, without end; for want of a C library its own.
+NARROW = r"""
+static int call(int nr, int a, int b, int c, int d)
+{
+	int r;
+
+	__asm__ volatile("int $0x80" : "=a"(r) : "a"(nr), "b"(a), "c"(b), "d"(c), "S"(d) : "memory");
+	return r;
+}
+
+void _start(void)
+{
+	char event[12];
+	const int epoll_fd = call(329 /* epoll_create1 */, 0, 0, 0, 0);
+
+	call(1 /* exit */, -call(256 /* epoll_wait */, epoll_fd, (int)event, 1, -1), 0, 0, 0);
+}
+"""
+
+
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="32-bit programs of x86-64")
+def test_a_32_bit_program_is_not_even_stopped(tmp_path: Path) -> None:
+    """Its interrupted calls are not repeated for it: it would get EINTR from each attempt."""
+    source, program = tmp_path / "narrow.c", tmp_path / "narrow"
+    source.write_text(NARROW)
+    command = ["cc", "-m32", "-nostdlib", "-static", "-fno-pie", "-no-pie", "-fno-stack-protector", "-o"]
+    if subprocess.run([*command, program, source], capture_output=True).returncode:
+        pytest.skip("the compiler makes no 32-bit programs")
+    with Init([program], pid1=True) as init, GuardProcess(config(0.05), [init.pid]) as guard:
+        assert "32-bit" in guard.wait("unprotected")["error"]["message"]
+        time.sleep(1)
+        assert init.popen.poll() is None
 
 
 def of_victim(victim: Victim, app: int) -> set[int]:

@@ -234,6 +234,27 @@ def test_what_cannot_be_protected_is_tried_less_and_less_often() -> None:
     assert tries(3) == [300, 300, 300]
 
 
+def test_another_program_is_not_refused_yet() -> None:
+    """It is tried as the first one was, and not when the one before it would have been."""
+    guard = Guarded(interval_s=1)
+    c, policy, config = guard.c, guard.policy, guard.config
+    due = guard.now + 5 * SECOND
+    assert c.policy_executed(policy, config, due, guard.now) == due  # it was not refused
+    for _ in range(8):
+        due = c.policy_refused(policy, c.policy_due(config, guard.now), guard.now)
+        guard.now = due
+    due = c.policy_refused(policy, c.policy_due(config, guard.now), guard.now)
+    assert due - guard.now == 60 * SECOND
+    guard.now += SECOND
+    due = c.policy_executed(policy, config, due, guard.now)
+    assert due == c.policy_first_due(config, guard.now) == guard.now + SECOND
+    # One that executes itself again and again is tried no later for that.
+    assert c.policy_executed(policy, config, due, guard.now + SECOND // 2) == due
+    assert c.policy_refused(policy, c.policy_due(config, guard.now), guard.now) == guard.now + SECOND
+    config.interval_ns = 0
+    assert c.policy_executed(policy, config, NEVER, guard.now) == NEVER
+
+
 # --- which deaths are undone ----------------------------------------------------
 
 

@@ -100,6 +100,7 @@ struct avc_guard {
 	uint64_t number; /* of the last generation taken             */
 	uint64_t started_ns, next_ns, stragglers_since_ns, told_stragglers_ns;
 	uint64_t dying_until_ns; /* the app was found dying: guard_reap_unknown() until then */
+	uint64_t tables_ns;      /* when the last look at shared tables was  */
 	bool cramped;            /* there is no room for spares              */
 	uint64_t spare_ns;       /* when the last spare was made             */
 	uint64_t ahead_ns;       /* when to guard_work_ahead(); UINT64_MAX: never  */

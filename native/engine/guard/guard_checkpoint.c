@@ -227,6 +227,8 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 
 	if (guard_find_app(guard, err) || renew_holders(guard, err))
 		return -1;
+	/* Before anything is checked: if it is refused, what it executes from now on is not. */
+	(void)process_listen_for_exec(&guard->main);
 	tree->init = guard->channel.init;
 	tree->slots = guard->config.keep + 1;
 	(void)guard_let_executed_go(guard, true);

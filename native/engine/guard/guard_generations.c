@@ -206,6 +206,7 @@ void guard_release(struct avc_guard *guard, struct process *process)
 
 #define EXEC_CHECK_NS (1 * NS_PER_MS)
 #define EXEC_CHECK_LONG_NS (200 * NS_PER_MS)
+#define TABLES_NS (100 * NS_PER_MS)
 
 static bool found_executed(struct process *process, uint64_t now)
 {
@@ -220,22 +221,42 @@ static bool found_executed(struct process *process, uint64_t now)
 	return process_has_executed(process);
 }
 
-/* Whether it has something of ours that has to go after an exec. */
+/* Whether it has something of ours that has to go after an exec.  One that was refused has no holder
+ * any more, but is infected. */
 static bool has_ours(const struct process *process)
 {
-	return process->descendant ? process->pid && process->infected : process->holder != 0;
+	return process->pid && (process->infected || process->holder);
+}
+
+/* What was saved of the main process, with the descriptors that it has left behind. */
+static void lose_images(struct avc_guard *guard, enum avc_reason reason)
+{
+	while (guard->count)
+		guard_lose_generation(guard, 0, reason, 0);
+	dirty_drop_idle(&guard->dirty);
+	tracee_end_now(); /* they have the descriptors from before */
+	process_unhold(&guard->main);
 }
 
 /* The main process runs another program: everything saved is of the old one. */
 static void lose_program(struct avc_guard *guard)
 {
-	while (guard->count)
-		guard_lose_generation(guard, 0, AVC_REASON_EXECUTED, 0);
-	dirty_drop_idle(&guard->dirty);
 	tracker_end(&guard->main);
-	tracee_end_now(); /* they have the descriptors from before execve(2) */
-	process_unhold(&guard->main);
+	lose_images(guard, AVC_REASON_EXECUTED);
 	guard->main.infected = false; /* the parasite went with its memory */
+}
+
+/* unshare(2) and close_range(2) (CLOSE_RANGE_UNSHARE) leave a table, or a directory, to whoever
+ * shares it, and change nothing where nobody does: what the process closes from then on would stay
+ * open in its holder and templates.  A task that is exiting has neither. */
+static bool has_left_holder(const struct process *process)
+{
+	return process->pid && process->holder &&
+	       (proc_shares(process->pid, process->holder, SHARED_FILES) == 0 ||
+		(process->descendant &&
+		 proc_shares(process->pid, process->holder, SHARED_FOLDERS) == 0)) &&
+	       !proc_is_exiting(process->pid) && !pidfd_ended(process->pidfd) &&
+	       !proc_is_exiting(process->holder);
 }
 
 /* A process that executes another program closes its O_CLOEXEC descriptors, and another process may
@@ -244,19 +265,29 @@ static void lose_program(struct avc_guard *guard)
 bool guard_let_executed_go(struct avc_guard *guard, bool all)
 {
 	const uint64_t now = now_ns();
+	const bool tables = all || now - guard->tables_ns > TABLES_NS;
 	bool any = false;
 
+	if (tables)
+		guard->tables_ns = now;
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		struct process *process = guard->tree.process[i];
+		/* The kernel does not report it. */
+		const bool left = tables && has_left_holder(process);
+		/* Which is a way to leave its table, too. */
+		const bool executed = has_ours(process) &&
+				      (all || left || now >= process->exec_check_ns) &&
+				      found_executed(process, now);
 
-		if (!has_ours(process) || (!all && now < process->exec_check_ns) ||
-		    !found_executed(process, now))
+		if (!left && !executed)
 			continue;
 		any = true;
 		if (process->descendant)
 			guard_release(guard, process);
-		else
+		else if (executed)
 			lose_program(guard);
+		else
+			lose_images(guard, AVC_REASON_UNSHARED);
 	}
 	return any;
 }
@@ -270,6 +301,9 @@ void guard_hear_exec(struct avc_guard *guard, int fd)
 			continue;
 		process_listen_no_more(process); /* it reports only one */
 		process->exec_check_ns = 0;
+		if (!process->descendant)
+			guard->next_ns = policy_executed(&guard->policy, &guard->config,
+							 guard->next_ns, now_ns());
 	}
 }
 

@@ -186,6 +186,17 @@ void policy_retry(struct policy *policy)
 	policy->refused_ns = 0;
 }
 
+/* Never later than planned: a program may execute itself again and again. */
+uint64_t policy_executed(struct policy *policy, const struct avc_config *config, uint64_t due,
+			 uint64_t now)
+{
+	const bool refused = policy->refused_ns;
+	const uint64_t first = policy_first_due(config, now);
+
+	policy_retry(policy);
+	return refused && first < due ? first : due;
+}
+
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
 
 bool policy_is_automatic(const struct avc_config *config)

@@ -94,6 +94,10 @@ bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
 uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now);
 /* On command, or another application: as if it had not been refused yet. */
 void policy_retry(struct policy *policy);
+/* It has executed another program, which may be one that can be protected: if it was refused, when
+ * to try that instead of at `due`. */
+uint64_t policy_executed(struct policy *policy, const struct avc_config *config, uint64_t due,
+			 uint64_t now);
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
 

@@ -126,7 +126,8 @@ enum avc_event_kind {
 	AVC_EVENT_REFUSED = 9,     /* a command could not be carried out          */
 	AVC_EVENT_DROPPED = 10,    /* `generation` was given up before its time;
 	                            * `reason` is why: CRASHED (`attempt` times),
-	                            * UNHEALTHY, MEMORY, KILLED, EXECUTED         */
+	                            * UNHEALTHY, MEMORY, KILLED, EXECUTED,
+	                            * UNSHARED                                    */
 	AVC_EVENT_GUARD_LOST = 11, /* the guard's process has died, or hung and was
 	                            * killed; `error` says how.  The application
 	                            * runs on, unprotected.  The guard's last event,
@@ -162,7 +163,9 @@ enum avc_reason {
 	AVC_REASON_LOOP = 15,      /* gave up: the same death again, at once      */
 	AVC_REASON_LATE = 16,      /* gave up: later than deadline_ns             */
 	AVC_REASON_GROUP = 17,     /* rolled back by avc_guard_recall()           */
-	AVC_REASON_FILTER = 18     /* guard lost: its own seccomp filter does not let it
+	AVC_REASON_UNSHARED = 18,  /* dropped: the app has left its table of descriptors
+	                            * to its templates                            */
+	AVC_REASON_FILTER = 19     /* guard lost: its own seccomp filter does not let it
 	                            * suspend the app's; one without has been started */
 };
 

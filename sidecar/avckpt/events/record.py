@@ -51,8 +51,8 @@ class EventRecord:
     seq: int = said("number in the history, increasing; 0: routine (every checkpoint), reported but not stored", 0)
     reason: Reason | None = said(  # noqa: RUF009
         "why the application died: `signal`, `exit`, `unhealthy`, `manual` or `group` (it went back with others); "
-        "why a generation was dropped: `crashed`, `unhealthy`, `memory`, `killed` (its template) or `executed` "
-        "(another program); why a guard was lost: `filter`, or none",
+        "why a generation was dropped: `crashed`, `unhealthy`, `memory`, `killed` (its template), `executed` "
+        "(another program) or `unshared` (it has a new table of descriptors); why a guard was lost: `filter`, or none",
         values=tuple(dict.fromkeys((*CAUSES, *DROPPED_WORDS, Reason.FILTER))),
     )
     outcome: Reason | None = said(  # noqa: RUF009

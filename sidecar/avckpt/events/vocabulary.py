@@ -85,7 +85,8 @@ class Reason(_Named):
     LOOP = "loop", 15
     LATE = "late", 16
     GROUP = "group", 17
-    FILTER = "filter", 18
+    UNSHARED = "unshared", 18
+    FILTER = "filter", 19
     RESTORED = "restored"
 
 
@@ -110,6 +111,7 @@ DROPPED_WORDS = {
     Reason.MEMORY: "memory is short",
     Reason.KILLED: "its template was killed (by the OOM killer, or from inside)",
     Reason.EXECUTED: "the application has executed another program",
+    Reason.UNSHARED: "the application has a new table of descriptors (unshare, close_range)",
 }
 """Why a generation was dropped early."""
 
