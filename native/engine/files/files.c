@@ -5,6 +5,10 @@
  * A checkpoint reads it twice: before the freeze everything, names included, while the app runs;
  * and during the freeze the state of that instant, while the kernel clones.  A descriptor that has
  * been replaced in between is read in full again.
+ *
+ * While the app runs, it may close what we have a duplicate of, and would find it open still: its
+ * address taken, its lock held, its events in an epoll set.  So the first look has none where the
+ * second, or an earlier one, says as much.
  */
 #include <dirent.h>
 #include <errno.h>
@@ -19,6 +23,7 @@
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/sysmacros.h>
+#include <sys/xattr.h>
 #include <unistd.h>
 
 #include "files.h"
@@ -26,13 +31,17 @@
 #define ROOM_SPARE 64
 #define OURS_MAX 1024 /* duplicates at a time                                          */
 #define READ_TOGETHER 128
+/* So many new sockets of a process are read in the freeze, where each makes it longer by 2 us, or by
+ * some 20 if it could be recreated. */
+#define SOCKETS_LATER 128
 
 struct look {
 	struct files *files, *known;
 	pid_t pid, init;
 	int pidfd, fd_dir;
 	enum files_depth depth;
-	bool trusts; /* heirs are assumed unchanged: files_check_heirs() */
+	bool trusts;    /* heirs are assumed unchanged: files_check_heirs() */
+	uint32_t later; /* how many new sockets may still be left to the freeze */
 	struct stat init_stdio[3];
 	bool init_known[3];
 };
@@ -219,16 +228,11 @@ static struct file *take_known(const struct look *look, struct file *f)
 	f->outside = k->outside;
 	f->id = k->id;
 	f->shared = k->shared;
-	f->owner_type = k->owner_type;
-	f->owner = k->owner;
-	f->owner_inside = k->owner_inside;
-	f->owner_signal = k->owner_signal;
 	f->name = k->name;
-	f->socket = k->socket;
+	f->socket = file_socket_share(k->socket); /* the next first look needs it, too */
 	f->lock = k->lock;
 	f->lock_count = k->lock_count;
 	k->name = NULL;
-	k->socket = NULL;
 	k->lock = NULL;
 	k->lock_count = 0;
 	return k;
@@ -335,7 +339,11 @@ static bool copy_frozen(const struct look *look, const struct file *is, struct f
 	    !((look->trusts && k->heir) || is_parents(look, is)))
 		return false;
 	copy_of(f, is);
-	return take_known(look, f) != NULL;
+	if (!take_known(look, f))
+		return false;
+	if (!f->socket) /* it was left to its parent's look */
+		f->socket = file_socket_share(is->socket);
+	return true;
 }
 
 /* What belongs to the table matters as little as in a freeze; and a table of its own is rebuilt. */
@@ -377,15 +385,120 @@ static bool was_connecting(const struct file_socket *s)
 	       (s->domain == AF_UNIX || s->domain == AF_INET || s->domain == AF_INET6);
 }
 
+/* Only the freezes look at it. */
+static bool is_connection(const struct file_socket *s)
+{
+	return (s->domain == AF_INET || s->domain == AF_INET6) && s->type == SOCK_STREAM &&
+	       s->connected && !s->listening;
+}
+
+static bool has_ended(int fd)
+{
+	struct sockaddr_storage remote;
+	socklen_t bytes = sizeof remote;
+
+	return getpeername(fd, (struct sockaddr *)&remote, &bytes);
+}
+
 /* A change of an idle socket between the two reads must not be missed. */
 static bool is_outdated(int fd, const struct file_socket *s)
 {
 	int listens = 0;
 	socklen_t bytes = sizeof listens;
 
+	if (is_connection(s))
+		return has_ended(fd);
 	return (s->idle || was_connecting(s)) &&
 	       (file_socket_was_used(fd, s) ||
 		(!getsockopt(fd, SOL_SOCKET, SO_ACCEPTCONN, &listens, &bytes) && listens));
+}
+
+static void note_stat(struct file *f, const struct statx *st)
+{
+	f->dev = makedev(st->stx_dev_major, st->stx_dev_minor);
+	f->ino = st->stx_ino;
+	f->rdev = makedev(st->stx_rdev_major, st->stx_rdev_minor);
+	f->mode = st->stx_mode;
+	f->bytes = (int64_t)st->stx_size;
+	f->modified = (struct timespec){ st->stx_mtime.tv_sec, st->stx_mtime.tv_nsec };
+	f->changed = (struct timespec){ st->stx_ctime.tv_sec, st->stx_ctime.tv_nsec };
+}
+
+/* TCP or UDP: reading it takes no look at a file system, for which the app may not be stopped. */
+static bool is_internet(const struct look *look, int number)
+{
+	char path[48], protocol[32] = "";
+
+	snprintf(path, sizeof path, "/proc/%d/fd/%d", look->pid, number);
+	return getxattr(path, "system.sockprotoname", protocol, sizeof protocol - 1) > 0 &&
+	       (!strncmp(protocol, "TCP", 3) || !strncmp(protocol, "UDP", 3));
+}
+
+static bool takes_duplicate(struct look *look, struct file *f)
+{
+	const struct file *was = look->known ? files_find(look->known, f->fd) : NULL;
+	struct file_socket *s = was && was->dev == f->dev && was->ino == f->ino ? was->socket
+										: NULL;
+
+	if (f->kind != FILE_SOCKET)
+		return file_is_video(f);
+	if (!s && look->later && is_internet(look, f->fd)) {
+		look->later--;
+		return false;
+	}
+	if (!s || (s->domain != AF_UNIX && s->domain != AF_INET && s->domain != AF_INET6))
+		return true;
+	if (is_connection(s))
+		f->socket = file_socket_share(s);
+	return file_socket_has_options(s);
+}
+
+static bool is_on_server(const struct look *look, const char *number)
+{
+	int fd = openat(look->fd_dir, number, O_PATH | O_CLOEXEC);
+	const bool is = fd >= 0 && file_is_remote(fd);
+
+	close_fd(&fd);
+	return is;
+}
+
+enum looked { LOOKED, LOOKED_TOO_LITTLE, LOOKED_CLOSED };
+
+/* The first look, without a duplicate. */
+static enum looked look_at_running(struct look *look, int number, struct file *f)
+{
+	enum looked result = LOOKED;
+	char name[16];
+	struct statx st;
+
+	snprintf(name, sizeof name, "%d", number);
+	*f = (struct file){ .fd = number, .shared = number, .offset = -1, .told_flags = -1 };
+	if (statx(look->fd_dir, name, AT_STATX_SYNC_AS_STAT | AT_NO_AUTOMOUNT, STATX_BASIC_STATS,
+		  &st))
+		return LOOKED_CLOSED;
+	note_stat(f, &st);
+	f->name = read_name(look, number);
+	if (!f->name)
+		return LOOKED_CLOSED;
+	f->kind = kind_of(f);
+	file_read_info(look->pid, f);
+	f->flags = f->told_flags & ~O_CLOEXEC;
+	if (f->told_flags < 0)
+		result = LOOKED_CLOSED;
+	else if (takes_duplicate(look, f))
+		result = LOOKED_TOO_LITTLE;
+	if (result != LOOKED) {
+		free(f->name);
+		free(f->lock);
+		free(f->watch);
+		free(f->mark);
+		file_socket_free(f->socket);
+		return result;
+	}
+	f->outside = is_inits(look, f);
+	f->remote = (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
+		    !(f->flags & O_PATH) && is_on_server(look, name);
+	return LOOKED;
 }
 
 static int look_at(struct look *look, int number, struct avc_error *err)
@@ -393,8 +506,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	struct files *files = look->files;
 	const int sync = look->depth == FILES_FROZEN ? AT_STATX_DONT_SYNC : AT_STATX_SYNC_AS_STAT;
 	struct statx st;
-	struct file *f;
-	const struct file *known;
+	struct file *f, *known;
 	const struct file_socket *socket;
 	uint32_t locks;
 	bool silent;
@@ -425,6 +537,13 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		files->count++;
 		return 0;
 	}
+	if (look->depth == FILES_BEFORE) {
+		const enum looked looked = look_at_running(look, number, f);
+
+		files->count += looked == LOOKED;
+		if (looked != LOOKED_TOO_LITTLE)
+			return 0;
+	}
 	fd = proc_borrow_fd(look->pidfd, number);
 	if (fd < 0) {
 		if (errno == EBADF)
@@ -437,13 +556,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		close(fd);
 		return 0;
 	}
-	f->dev = makedev(st.stx_dev_major, st.stx_dev_minor);
-	f->ino = st.stx_ino;
-	f->rdev = makedev(st.stx_rdev_major, st.stx_rdev_minor);
-	f->mode = st.stx_mode;
-	f->bytes = (int64_t)st.stx_size;
-	f->modified = (struct timespec){ st.stx_mtime.tv_sec, st.stx_mtime.tv_nsec };
-	f->changed = (struct timespec){ st.stx_ctime.tv_sec, st.stx_ctime.tv_nsec };
+	note_stat(f, &st);
 	f->flags = fcntl(fd, F_GETFL);
 	known = look->depth == FILES_BEFORE ? NULL : take_known(look, f);
 	if (!known) {
@@ -454,17 +567,22 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		}
 		f->kind = kind_of(f);
 		f->outside = is_inits(look, f);
-		look_at_owner(fd, f);
 		if (f->kind == FILE_SOCKET)
 			file_look_at_socket(fd, f);
 		/* What was opened since is not recreated. */
 		if (f->socket && look->depth != FILES_NOW)
 			file_look_at_options(fd, f->socket, look->init);
 	}
-	if (look->depth == FILES_FROZEN && known && f->socket && is_outdated(fd, f->socket)) {
-		f->known = false; /* for its heirs (look_at_inherited())         */
+	if (!known || look->depth == FILES_FROZEN)
+		look_at_owner(fd, f);
+	if (look->depth == FILES_FROZEN && known && f->kind == FILE_SOCKET &&
+	    (!f->socket || is_outdated(fd, f->socket))) {
+		f->known = !f->socket; /* for its heirs (look_at_inherited())         */
 		file_look_at_socket(fd, f);
-		file_look_at_options(fd, f->socket, look->init);
+		if (f->socket)
+			file_look_at_options(fd, f->socket, look->init);
+		file_socket_free(known->socket);
+		known->socket = file_socket_share(f->socket);
 	}
 	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
 	    !(f->flags & O_PATH))
@@ -936,6 +1054,7 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 			     .pid = pid,
 			     .init = init,
 			     .pidfd = owner->pidfd,
+			     .later = SOCKETS_LATER,
 			     .depth = depth };
 	struct timespec now;
 	int result;
@@ -1016,7 +1135,7 @@ static void find_owners(const struct process *process, struct files *files)
 /* The read before the freeze, while the app may be using its descriptors. */
 struct survey {
 	struct aside aside;
-	struct files *files;
+	struct files *files, *last; /* last: of the last checkpoint, or NULL     */
 	struct files_owner owner;
 	int result;
 	struct avc_error error;
@@ -1028,7 +1147,7 @@ static void survey(struct aside *aside)
 {
 	struct survey *job = (struct survey *)aside;
 
-	job->result = files_look(job->files, &job->owner, FILES_BEFORE, NULL, &job->error);
+	job->result = files_look(job->files, &job->owner, FILES_BEFORE, job->last, &job->error);
 }
 
 /* Only heirs that occur once: one that occurs twice could be moved and moved back unnoticed. */
@@ -1058,6 +1177,7 @@ static void drop_survey(struct aside *aside)
 	if (job->files)
 		forget_parent(job->files);
 	files_free(job->files);
+	files_free(job->last);
 	close_fd(&job->owner.pidfd);
 	free(job);
 }
@@ -1082,6 +1202,8 @@ static struct files *look_before(const struct process *process, const struct pro
 			drop_survey(&job->aside);
 		return NULL;
 	}
+	if (process->files_before)
+		job->last = files_share(process->files_before);
 	if (parent && parent->files_before) {
 		job->files->parent = files_share(parent->files_before);
 		job->files->parent_pid = parent->pid;
@@ -1115,7 +1237,6 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 	files_free(process->files_before);
 	process->files_before = before;
 	process->files_seen = before->count;
-	find_owners(process, before);
 	image = files_new(before->count + before->count / 4 + ROOM_SPARE);
 	if (!image)
 		return fail_errno(err, process->pid, "look at descriptors", "calloc",

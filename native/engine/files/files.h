@@ -23,7 +23,7 @@
  *   files_written.c the same of files that are not open any more
  *
  * Reading uses a duplicate (pidfd_getfd(2)) that lives for microseconds: while it exists, the app's
- * close(2) does not release the file.
+ * close(2) does not release the file.  So there are hardly any while the app runs.
  */
 #ifndef AVCKPT_FILES_H
 #define AVCKPT_FILES_H
@@ -419,6 +419,8 @@ void file_socket_free(struct file_socket *socket);
 bool file_socket_is_alone(const struct file_socket *socket);
 /* What only matters if it has to be recreated: options, user, the file of its name. */
 void file_look_at_options(int fd, struct file_socket *socket, pid_t init);
+/* Whether that reads any. */
+bool file_socket_has_options(const struct file_socket *socket);
 /* Whether one that was idle has got a name or a connection since. */
 bool file_socket_was_used(int fd, const struct file_socket *socket);
 /* Whether getsockname(2) says the same of `fd`. */

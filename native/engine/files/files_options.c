@@ -280,11 +280,16 @@ static bool is_of_pair(const struct file_socket *s)
 	       s->remote_bytes == sizeof(sa_family_t);
 }
 
+bool file_socket_has_options(const struct file_socket *s)
+{
+	return file_socket_is_alone(s) || is_of_pair(s);
+}
+
 void file_look_at_options(int fd, struct file_socket *s, pid_t init)
 {
 	struct stat st;
 
-	if (!(file_socket_is_alone(s) || is_of_pair(s)) || fstat(fd, &st))
+	if (!file_socket_has_options(s) || fstat(fd, &st))
 		return;
 	s->uid = st.st_uid;
 	s->gid = st.st_gid;

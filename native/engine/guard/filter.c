@@ -80,6 +80,7 @@ static const int plain[] = {
 	SYS_newfstatat,
 	SYS_statx,
 	SYS_fstatfs,
+	SYS_getxattr,
 	SYS_getdents64,
 	SYS_getcwd,
 	SYS_fchdir,

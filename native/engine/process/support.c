@@ -242,7 +242,9 @@ static int is_awake(pid_t tid, void *arg)
 	return p && p[1] == ' ' && p[2] == 'R' ? -1 : 0;
 }
 
-static bool unread_bytes(const struct process *process)
+/* Takes duplicates of a running app's sockets, which cost something (files.c): only for a stream of
+ * messages (avckpt.tcp=messages). */
+static bool is_in_message(const struct process *process)
 {
 	for (uint32_t i = 0; i < process->socket_count; i++) {
 		int fd = (int)syscall(SYS_pidfd_getfd, process->pidfd, process->sockets[i], 0),
@@ -252,7 +254,7 @@ static bool unread_bytes(const struct process *process)
 			continue; /* closed since */
 		if (ioctl(fd, FIONREAD, &bytes))
 			bytes = 0; /* not one with bytes to read */
-		if (process->tcp_messages && file_is_coming(fd))
+		if (file_is_coming(fd))
 			bytes = 1;
 		close(fd);
 		if (bytes)
@@ -265,5 +267,6 @@ bool process_is_quiescent(const struct process *process)
 {
 	pid_t pid = process->pid;
 
-	return proc_tasks(process->task_dirfd, is_awake, &pid) == 0 && !unread_bytes(process);
+	return proc_tasks(process->task_dirfd, is_awake, &pid) == 0 &&
+	       !(process->tcp_messages && is_in_message(process));
 }
