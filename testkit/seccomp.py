@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seccomp filters for what a test starts (seccomp(2), x86-64)."""
+"""Seccomp filters for what a test starts (seccomp(2))."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
+import platform
 import struct
 from collections.abc import Callable
 
@@ -12,7 +13,10 @@ PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, SECCOMP_MODE_FILTER = 38, 22, 2
 SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO = 0x7FFF0000, 0x00050000
 LOAD, EQUAL, RETURN = 0x20, 0x15, 0x06  # linux/bpf_common.h
 
-NUMBERS = {"socketpair": 53, "userfaultfd": 323, "close_range": 436}
+NUMBERS = {
+    "x86_64": {"socketpair": 53, "userfaultfd": 323, "close_range": 436},
+    "aarch64": {"socketpair": 199, "userfaultfd": 282, "close_range": 436},
+}[platform.machine()]
 
 _libc = ctypes.CDLL(None, use_errno=True)
 

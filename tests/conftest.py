@@ -11,12 +11,15 @@ import signal
 import subprocess
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from testkit import devices, harness
 from testkit.harness import CommandFailed, ContainerFactory, Podman, Sidecar
-from testkit.local_sidecar import LocalSidecar, local_sidecar
+
+if TYPE_CHECKING:
+    from testkit.local_sidecar import LocalSidecar
 
 CONTAINERS = pytest.StashKey[ContainerFactory]()
 
@@ -106,6 +109,9 @@ def attempt(look: Callable[[], str]) -> str:
 @pytest.fixture
 def local(tmp_path: Path) -> Iterator[LocalSidecar]:
     """A sidecar without Podman, which runs."""
+    # What it imports takes seconds where the native tests run alone, in an emulated machine.
+    from testkit.local_sidecar import local_sidecar
+
     with local_sidecar(tmp_path) as sidecar:
         sidecar.start()
         yield sidecar

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import platform
 import signal
 import subprocess
 import time
@@ -19,7 +20,8 @@ from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import ROOT, wait_until
 from testkit.procfs import status_of
 
-LAYERS = ("base", "base/x86_64", "trace", "state", "files", "process", "checkpoint", "restore", "guard")
+CPU = platform.machine()
+LAYERS = ("base", f"base/{CPU}", "trace", "state", "files", "process", "checkpoint", "restore", "guard")
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,7 @@ def filtered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """tests/native/filtered.c."""
     program = tmp_path_factory.mktemp("filtered") / "filtered"
     native = ROOT / "native"
-    includes = [native / "include", native / "build", native / "parasite", native / "parasite/x86_64"]
+    includes = [native / "include", native / "build", native / "parasite", native / "parasite" / CPU]
     includes += [native / "lastpid", *(native / "engine" / layer for layer in LAYERS)]
     flags = ["-std=gnu11", "-D_GNU_SOURCE", "-pthread", *(f"-I{folder}" for folder in includes)]
     source = Path(__file__).with_name("filtered.c")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import platform
 import random
 import select
 import signal
@@ -303,8 +304,9 @@ def test_paused_before_it_is_made(version: int, pause_s: float, tmp_path: Path) 
 
 
 def shares_memory(a: int, b: int) -> bool:
-    """kcmp(2) with KCMP_VM; the syscall number is x86-64's."""
-    return bool(ctypes.CDLL(None).syscall(312, a, b, 1, 0, 0) == 0)
+    """kcmp(2) with KCMP_VM."""
+    number = {"x86_64": 312, "aarch64": 272}[platform.machine()]
+    return bool(ctypes.CDLL(None).syscall(number, a, b, 1, 0, 0) == 0)
 
 
 def test_made_late_it_is_used(tmp_path: Path) -> None:

@@ -101,6 +101,21 @@ static void set_timeout(int fd, int option)
 	must(!setsockopt(fd, SOL_SOCKET, option, &tv, sizeof(tv)), "a timeout");
 }
 
+/* Newer architectures lack these: what their libc calls instead, and how it says how long. */
+#ifdef SYS_epoll_wait
+#define EPOLL_WAIT(...) CALL4(SYS_epoll_wait, __VA_ARGS__)
+#define POLL(fds, n, ms) CALL3(SYS_poll, fds, n, ms)
+#define SELECT(...) CALL5(SYS_select, __VA_ARGS__)
+#define PAUSE() CALL2(SYS_pause, inlined_next(), inlined_next())
+#define SELECT_UNIT_NS 1000
+#else
+#define EPOLL_WAIT(...) CALL6(SYS_epoll_pwait, __VA_ARGS__, NULL, 8)
+#define POLL(fds, n, ms) CALL5(SYS_ppoll, fds, n, timeout(), NULL, 8)
+#define SELECT(...) CALL6(SYS_pselect6, __VA_ARGS__, NULL)
+#define PAUSE() CALL5(SYS_ppoll, NULL, 0, NULL, NULL, 8)
+#define SELECT_UNIT_NS 1
+#endif
+
 /* In one line, with all registers checked (inlined.h). */
 #define CALL6(nr, a, b, c, d, e, f)                                                         \
 	inlined(here->name, nr, (uint64_t)(a), (uint64_t)(b), (uint64_t)(c), (uint64_t)(d), \
@@ -121,7 +136,7 @@ static int do_epoll_wait(void)
 {
 	struct epoll_event event;
 
-	return drain(CALL4(SYS_epoll_wait, here->epoll_fd, &event, 1, timeout_ms()));
+	return drain(EPOLL_WAIT(here->epoll_fd, &event, 1, timeout_ms()));
 }
 
 static int do_epoll_pwait(void)
@@ -142,7 +157,7 @@ static int do_poll(void)
 {
 	struct pollfd fd = { .fd = here->pipe_fd[0], .events = POLLIN };
 
-	return drain(CALL3(SYS_poll, &fd, 1, timeout_ms()));
+	return drain(POLL(&fd, 1, timeout_ms()));
 }
 
 static int do_ppoll(void)
@@ -166,17 +181,17 @@ static int do_select_with(void *tv)
 
 	FD_ZERO(&set);
 	FD_SET(here->pipe_fd[0], &set);
-	n = CALL5(SYS_select, here->pipe_fd[0] + 1, &set, NULL, NULL, tv);
+	n = SELECT(here->pipe_fd[0] + 1, &set, NULL, NULL, tv);
 	CHECK(n || !FD_ISSET(here->pipe_fd[0], &set), "select: nothing is ready, says its result");
 	return drain(n);
 }
 
 static int do_select(void)
 {
-	struct timeval tv = { (time_t)here->seconds,
-			      (long)((here->seconds - (double)(time_t)here->seconds) * 1e6) };
+	struct timespec ts = after(here->seconds);
 
-	return do_select_with(here->seconds > 0 ? &tv : NULL);
+	ts.tv_nsec /= SELECT_UNIT_NS;
+	return do_select_with(here->seconds > 0 ? &ts : NULL);
 }
 
 static int do_select_const(void)
@@ -485,7 +500,7 @@ static int interrupted(long result)
 static int do_pause(void)
 {
 	here->handled_before = here->handled;
-	return interrupted(CALL2(SYS_pause, inlined_next(), inlined_next()));
+	return interrupted(PAUSE());
 }
 
 static int do_sigsuspend(void)
@@ -497,16 +512,16 @@ static int do_sigsuspend(void)
 static void handle(int signal, siginfo_t *info, void *context)
 {
 	const ucontext_t *was = context;
-	const uintptr_t sp = (uintptr_t)was->uc_mcontext.gregs[REG_RSP], at = (uintptr_t)&was;
+	const uintptr_t sp = INLINED_SP(was), at = (uintptr_t)&was;
 
 	(void)signal;
 	(void)info;
 	CHECK(at < sp && sp - at < 16384, "a handler runs %#lx away from its stack", sp - at);
 	if (!here)
 		return; /* not one of "all" */
-	if (here->call_is_pause && was->uc_mcontext.gregs[REG_RIP] == (long)inlined_after)
-		CHECK(was->uc_mcontext.gregs[REG_RAX] == -EINTR, "%s: a handler sees %#lx in rax",
-		      here->name, (unsigned long)was->uc_mcontext.gregs[REG_RAX]);
+	if (here->call_is_pause && INLINED_PC(was) == (uintptr_t)inlined_after)
+		CHECK(INLINED_RESULT(was) == -EINTR, "%s: a handler sees the result %#lx",
+		      here->name, (unsigned long)INLINED_RESULT(was));
 	here->handled++;
 }
 
@@ -652,15 +667,14 @@ static bool is_aio(const struct kind *kind)
 	return kind->call == do_io_getevents || kind->call == do_io_pgetevents;
 }
 
-static void *constant(bool is_timeval)
+static void *constant(long unit_ns)
 {
 	struct timespec *ts = mmap(NULL, 4096, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS,
 				   -1, 0);
 
 	must(ts != MAP_FAILED, "mmap");
 	*ts = after(here->seconds);
-	if (is_timeval)
-		ts->tv_nsec /= 1000;
+	ts->tv_nsec /= unit_ns;
 	must(!mprotect(ts, 4096, PROT_READ), "mprotect");
 	return ts;
 }
@@ -698,7 +712,9 @@ static void set_up(const struct kind *kind, double seconds)
 	here = &places[kind - kinds];
 	here->name = kind->name;
 	here->seconds = kind->untimed ? 0 : seconds;
-	here->constant = here->seconds > 0 ? constant(kind->call == do_select_const) : NULL;
+	here->constant = here->seconds > 0
+				 ? constant(kind->call == do_select_const ? SELECT_UNIT_NS : 1)
+				 : NULL;
 	here->call_is_pause = kind->call == do_pause || kind->call == do_sigsuspend;
 	must(!pipe(here->pipe_fd), "pipe");
 	must(!socketpair(AF_UNIX, kind->call == do_splice ? SOCK_STREAM : SOCK_DGRAM, 0,

@@ -8,11 +8,31 @@
  */
 #include <ctype.h>
 #include <dirent.h>
+#include <elf.h>
 #include <sys/ptrace.h>
 #include <sys/stat.h>
+#include <sys/uio.h>
 #include <sys/user.h>
 
 #include "victim.h"
+
+#ifdef __x86_64__
+#define SYSCALL "\x0f\x05"
+#define SP rsp
+#define PC rip
+#define NUMBER rax
+#define ARGUMENT_0 rdi
+#define ARGUMENT_1 rsi
+#define ARGUMENT_2 rdx
+#else
+#define SYSCALL "\x01\0\0\xd4"
+#define SP sp
+#define PC pc
+#define NUMBER regs[8]
+#define ARGUMENT_0 regs[0]
+#define ARGUMENT_1 regs[1]
+#define ARGUMENT_2 regs[2]
+#endif
 
 static const char *const spaces[] = { "mnt", "net", "ipc", "uts", "cgroup", "pid" };
 
@@ -169,9 +189,10 @@ static void look_at_memory(int pid)
 static void inject(int pid)
 {
 	struct user_regs_struct regs;
+	const struct iovec iov = { &regs, sizeof regs };
 	unsigned long start, end, at = 0;
 	char path[64], *line;
-	uint8_t code[8192];
+	uint8_t code[8192], *found = NULL;
 	int fd, status;
 
 	snprintf(path, sizeof path, "/proc/%d/mem", pid);
@@ -183,18 +204,25 @@ static void inject(int pid)
 		if (sscanf(line, "%lx-%lx r-xp", &start, &end) != 2 || !strstr(line, "r-xp"))
 			continue;
 		n = pread(fd, code, sizeof code, (off_t)start);
-		for (ssize_t i = 0; i + 1 < n && !at; i++)
-			if (code[i] == 0x0f && code[i + 1] == 0x05)
-				at = start + (unsigned long)i;
+		if (n > 0)
+			found = memmem(code, (size_t)n, SYSCALL, sizeof SYSCALL - 1);
+		if (found)
+			at = start + (unsigned long)(found - code);
 	}
-	must(at && ptrace(PTRACE_GETREGS, pid, NULL, &regs) == 0, "PTRACE_GETREGS");
-	must(pwrite(fd, "/", 2, (off_t)regs.rsp) == 2, "write(mem)");
-	regs.rip = at;
-	regs.orig_rax = -1ULL;
-	regs.rax = SYS_open;
-	regs.rdi = regs.rsp;
-	regs.rsi = O_RDONLY;
-	must(ptrace(PTRACE_SETREGS, pid, NULL, &regs) == 0, "PTRACE_SETREGS");
+	must(at && ptrace(PTRACE_GETREGSET, pid, NT_PRSTATUS, &iov) == 0, "PTRACE_GETREGSET");
+	must(pwrite(fd, "/", 2, (off_t)regs.SP) == 2, "write(mem)");
+	regs.PC = at;
+	regs.NUMBER = SYS_openat;
+	regs.ARGUMENT_0 = (unsigned long long)AT_FDCWD;
+	regs.ARGUMENT_1 = regs.SP;
+	regs.ARGUMENT_2 = O_RDONLY;
+#ifdef __x86_64__
+	regs.orig_rax = -1ULL; /* it is in no call */
+#else
+	ptrace(PTRACE_SETREGSET, pid, NT_ARM_SYSTEM_CALL,
+	       &(struct iovec){ &(int){ -1 }, sizeof(int) });
+#endif
+	must(ptrace(PTRACE_SETREGSET, pid, NT_PRSTATUS, &iov) == 0, "PTRACE_SETREGSET");
 	must(ptrace(PTRACE_SYSCALL, pid, NULL, NULL) == 0, "PTRACE_SYSCALL");
 	/* Its entry, its exit, and what comes of it. */
 	for (int stops = 0; stops < 3; stops++) {

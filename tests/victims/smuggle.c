@@ -39,7 +39,7 @@ static void confine(bool little)
 {
 	struct sock_filter most[] = {
 		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
-		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_mkdir, 0, 1),
+		BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_mkdirat, 0, 1),
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM),
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW),
 	};
@@ -54,6 +54,7 @@ static void confine(bool little)
 		ALLOW(SYS_read),
 		ALLOW(SYS_close),
 		ALLOW(SYS_mmap),
+		ALLOW(SYS_mremap),
 		ALLOW(SYS_munmap),
 		ALLOW(SYS_brk),
 		ALLOW(SYS_exit_group),
@@ -64,7 +65,7 @@ static void confine(bool little)
 		install_filter(few, sizeof(few) / sizeof(*few), SECCOMP_FILTER_FLAG_TSYNC);
 	else
 		install_filter(most, sizeof(most) / sizeof(*most), SECCOMP_FILTER_FLAG_TSYNC);
-	CHECK(mkdir(folder, 0700) < 0 && errno == EPERM, "the filter does not hold");
+	CHECK(mkdirat(AT_FDCWD, folder, 0700) < 0 && errno == EPERM, "the filter does not hold");
 }
 
 static void note(int64_t result)
@@ -81,7 +82,7 @@ static void read_lists(struct inj_call *call)
 	for (unsigned int i = 0; i < LISTED; i++) {
 		struct inj_syscall *s = &call->call[i];
 
-		if (__atomic_load_n(&s->nr, __ATOMIC_RELAXED) == SYS_mkdir &&
+		if (__atomic_load_n(&s->nr, __ATOMIC_RELAXED) == SYS_mkdirat &&
 		    s->result != UNTOUCHED && s->result != -ENOSYS) {
 			note(s->result);
 			s->result = UNTOUCHED;
@@ -95,12 +96,13 @@ static void write_lists(struct inj_call *call, uint64_t name)
 	for (unsigned int i = 0; i < LISTED; i++) {
 		struct inj_syscall *s = &call->call[i];
 
-		if (s->nr == SYS_mkdir)
+		if (s->nr == SYS_mkdirat)
 			continue;
-		s->arg[0] = name;
-		s->arg[1] = 0700;
+		s->arg[0] = (uint64_t)AT_FDCWD;
+		s->arg[1] = name;
+		s->arg[2] = 0700;
 		s->result = UNTOUCHED;
-		__atomic_store_n(&s->nr, SYS_mkdir, __ATOMIC_RELEASE);
+		__atomic_store_n(&s->nr, SYS_mkdirat, __ATOMIC_RELEASE);
 	}
 }
 
@@ -123,32 +125,60 @@ static void outside(const char *pid, uint64_t name)
 		write_lists(&control->runner, name);
 }
 
-/* mkdir(folder, 0700), and what came of it. */
+/* mkdir(folder, 0700), and what came of it; behind a great many nops. */
+struct __attribute__((packed)) smuggled {
+#ifdef __x86_64__
+	uint8_t number[1]; /* mov $SYS_mkdirat, %eax; mov $AT_FDCWD, %edi */
+	uint32_t nr;
+	uint8_t in_folder[1];
+	int32_t cwd;
+	uint8_t named[2]; /* mov $folder, %rsi */
+	uint64_t name;
+	uint8_t rest[9]; /* mov $0700, %edx; syscall; mov $outcome, %rdi */
+	uint64_t to;
+	uint8_t end[5]; /* mov %rax, (%rdi); jmp . */
+#else
+	uint32_t insn[8]; /* mov x8, #SYS_mkdirat; mov x0, #AT_FDCWD; ldr x1, name; mov x2, #0700;
+			   * svc #0; ldr x3, to; str x0, [x3]; b . */
+	uint64_t name, to;
+#endif
+};
+
+#ifdef __x86_64__
+#define NOP "\x90\x90\x90\x90"
+#else
+#define NOP "\x1f\x20\x03\xd5"
+#endif
+
 static void map_code(const struct place *place)
 {
-	uint8_t *code = mmap((void *)place->start, INJ_CODE_BYTES,
-			     PROT_READ | PROT_WRITE | PROT_EXEC,
-			     MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED, -1, 0);
-	const uint64_t to = (uint64_t)&outcome, name = (uint64_t)folder;
-	uint8_t *at = code + INJ_CODE_BYTES - 64;
+	uint8_t *code = mmap(NULL, INJ_CODE_BYTES, PROT_READ | PROT_WRITE | PROT_EXEC,
+			     MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+	const struct smuggled smuggled = {
+#ifdef __x86_64__
+		.number = { 0xb8 },
+		.nr = SYS_mkdirat,
+		.in_folder = { 0xbf },
+		.cwd = AT_FDCWD,
+		.named = { 0x48, 0xbe },
+		.rest = { 0xba, 0xc0, 0x01, 0, 0, 0x0f, 0x05, 0x48, 0xbf },
+		.end = { 0x48, 0x89, 0x07, 0xeb, 0xfe },
+#else
+		.insn = { 0xd2800008 | SYS_mkdirat << 5, 0x92800c60, 0x580000c1, 0xd2803802,
+			  0xd4000001, 0x580000a3, 0xf9000060, 0x14000000 },
+#endif
+		.name = (uint64_t)folder,
+		.to = (uint64_t)&outcome,
+	};
 
 	must(code != MAP_FAILED, "mmap");
-	memset(code, 0x90, INJ_CODE_BYTES); /* nop */
-	*at++ = 0xb8;                       /* mov $SYS_mkdir, %eax */
-	memcpy(at, &(uint32_t){ SYS_mkdir }, 4);
-	at += 4;
-	memcpy(at, (uint8_t[]){ 0x48, 0xbf }, 2); /* mov $folder, %rdi */
-	memcpy(at + 2, &name, 8);
-	at += 10;
-	*at++ = 0xbe; /* mov $0700, %esi */
-	memcpy(at, &(uint32_t){ 0700 }, 4);
-	at += 4;
-	memcpy(at, (uint8_t[]){ 0x0f, 0x05 }, 2); /* syscall */
-	at += 2;
-	memcpy(at, (uint8_t[]){ 0x48, 0xbf }, 2); /* mov $outcome, %rdi */
-	memcpy(at + 2, &to, 8);
-	at += 10;
-	memcpy(at, (uint8_t[]){ 0x48, 0x89, 0x07, 0xeb, 0xfe }, 5); /* mov %rax, (%rdi); jmp . */
+	for (size_t i = 0; i < INJ_CODE_BYTES; i += 4)
+		memcpy(code + i, NOP, 4);
+	memcpy(code + INJ_CODE_BYTES - 64, &smuggled, sizeof smuggled);
+	__builtin___clear_cache((char *)code, (char *)code + INJ_CODE_BYTES);
+	must(mremap(code, INJ_CODE_BYTES, INJ_CODE_BYTES, MREMAP_MAYMOVE | MREMAP_FIXED,
+		    (void *)place->start) != MAP_FAILED,
+	     "mremap");
 }
 
 static void write_setup(const struct place *place)
@@ -177,10 +207,10 @@ static void *attack(void *unused)
 		usleep(1000);
 	place = await_parasite();
 	control = (struct inj_control *)(place.start + INJ_CODE_BYTES);
-	fake = (struct inj_setup){
-		.flags = INJ_MAY_FAIL,
-		.call = { .nr = SYS_mkdir, .arg = { (uint64_t)folder, 0700 }, .result = UNTOUCHED }
-	};
+	fake = (struct inj_setup){ .flags = INJ_MAY_FAIL,
+				   .call = { .nr = SYS_mkdirat,
+					     .arg = { (uint64_t)AT_FDCWD, (uint64_t)folder, 0700 },
+					     .result = UNTOUCHED } };
 	count(3, (uint64_t)folder);
 	count(0, 1);
 	if (!strcmp(where, "code"))

@@ -80,11 +80,11 @@ int main(int argc, char **argv)
 		const long slept = inlined("nanosleep", SYS_nanosleep, (uint64_t)&ts, 0, 3, 4, 5,
 					   6);
 		const int slept_errno = errno;
-		const long waited = inlined("epoll_wait", SYS_epoll_wait, (uint64_t)epoll_fd,
-					    (uint64_t)&event, 1, 3, 5, 6);
+		const long waited = inlined("epoll_pwait", SYS_epoll_pwait, (uint64_t)epoll_fd,
+					    (uint64_t)&event, 1, 3, 0, 8);
 
 		CHECK(slept == 0 || slept_errno == EINTR, "nanosleep: %s", strerror(slept_errno));
-		CHECK(waited == 0 || errno == EINTR, "epoll_wait: %s", strerror(errno));
+		CHECK(waited == 0 || errno == EINTR, "epoll_pwait: %s", strerror(errno));
 		for (volatile int k = 0; k < 100000; k++)
 			;
 		beat();
