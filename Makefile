@@ -23,6 +23,9 @@ KERNEL_TESTS ?= tests/native
 # What `make test-machine` runs on Debian 13.
 MACHINE_TESTS ?= demo $(addprefix tests/integration/test_,hooks_podman.py quadlet.py run.py trees_scripts.py packages.py upgrade.py)
 
+# `make test-aarch64 AARCH64_TESTS=tests/native/test_engine_eintr.py CPU_MODEL=max`
+AARCH64_TESTS ?= tests/native
+
 # `make test-sqlite KILLS=20`, `make soak SECONDS=600`: shorter.
 KILLS   ?= 200
 SECONDS ?= 3600
@@ -92,6 +95,9 @@ test-kernels: ## the engine's tests on other kernels, in emulated machines (KERN
 test-machine: setup ## demo, hooks, Quadlet, trees, packages on Debian 13 (Podman 5.4, systemd, cgroup v2), in an emulated machine
 	@AVCKPT_MACHINE=trixie scripts/setup-machine.sh trixie
 	@AVCKPT_MACHINE=trixie scripts/test-machine.sh trixie $(MACHINE_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)")
+
+test-aarch64: build-aarch64 ## the engine's tests on Debian 12 for aarch64, in an emulated machine (CPU_MODEL=max: with SVE, MTE)
+	@CPU_MODEL=$(CPU_MODEL) scripts/test-aarch64.sh $(AARCH64_TESTS) $(PYTEST_ARGS) $(if $(T),-k "$(T)")
 
 # All that tests run and would compile themselves, before several runs of pytest do it at once.
 build-tests: setup-build
@@ -167,5 +173,5 @@ clean-system: clean ## also remove images, cached base and what setup-podman.sh 
 	scripts/setup-podman.sh --undo
 	scripts/clean-images.sh
 
-.PHONY: help deb deb-image wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels test-machine build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
+.PHONY: help deb deb-image wheel test-packages setup setup-build setup-images setup-tests demo test sweep test-programs test-trees test-kernels test-machine test-aarch64 build-tests test-sqlite soak fuzz lint bench bench-peers bench-cost bench-ros bench-ros-long bench-ros2 bench-cri bench-trees campaign clean clean-system
 .DEFAULT_GOAL := help
