@@ -22,19 +22,23 @@ static struct sockaddr_un name[64];
 static socklen_t name_bytes[64];
 
 /* `path` begins with '@' for an abstract name. */
+/* An abstract name (unix(7)) gets a number of its own: the previous test's victim may still have it. */
 static int bind_unix(int type, const char *path)
 {
 	struct sockaddr_un address = { .sun_family = AF_UNIX };
-	const size_t bytes = strlen(path);
+	const bool abstract = path[0] == '@';
 	const int s = socket(AF_UNIX, type, 0);
+	const int bytes = abstract
+				  ? snprintf(address.sun_path, sizeof address.sun_path, "%s-%llx",
+					     path, (unsigned long long)now_ns())
+				  : snprintf(address.sun_path, sizeof address.sun_path, "%s", path);
 
-	must(s >= 0 && bytes < sizeof address.sun_path, "socket");
-	memcpy(address.sun_path, path, bytes);
-	if (path[0] == '@')
+	must(s >= 0 && bytes < (int)sizeof address.sun_path, "socket");
+	if (abstract)
 		address.sun_path[0] = 0;
 	must(bind(s, (struct sockaddr *)&address,
-		  (socklen_t)(offsetof(struct sockaddr_un, sun_path) + bytes + (path[0] != '@'))) ==
-		     0,
+		  (socklen_t)offsetof(struct sockaddr_un, sun_path) + (socklen_t)bytes +
+			  !abstract) == 0,
 	     path);
 	return s;
 }

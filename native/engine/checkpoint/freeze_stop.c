@@ -52,12 +52,9 @@ int freeze_stop_prepare(struct tree *tree, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < tree->processes; i++)
 		process_stop_begin(tree->process[i]);
-	/* A stop wakes a thread that writes a core into a pipe, and the kernel gives the core up
-	 * (fs/coredump.c, dump_emit()). */
 	for (uint32_t i = 0; i < tree->processes; i++)
-		if (proc_is_dying(tree->process[i]->stat_fd))
-			return fail(err, AVC_GONE, 0, tree->process[i]->pid, "stop", "",
-				    "a signal is killing it");
+		if (process_check_dying(tree->process[i], err))
+			return -1;
 	return 0;
 }
 
@@ -93,7 +90,7 @@ int freeze_stop_others(struct tree *tree, struct avc_error *err)
 			if (!t || t->stage >= FREEZE_STOPPED)
 				continue;
 			all = false;
-			if (!stop_all(t, &failed))
+			if (!process_check_dying(t, &failed) && !stop_all(t, &failed))
 				continue;
 			if (failed.code != AVC_GONE) {
 				*err = failed;

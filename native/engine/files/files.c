@@ -1303,6 +1303,9 @@ void files_settle(struct image *image)
 	files_land();
 	files_find_closed(image->files, image->template);
 	file_rights_read(&image->files->rights, image->process->pid);
+	/* A child can have exited since the freeze. */
+	if (!image->files->rights.known)
+		file_rights_read(&image->files->rights, image->template);
 	for (uint32_t i = 0; i < image->files->count; i++) {
 		struct file *f = &image->files->file[i];
 		struct file now = { .fd = f->fd, .kind = FILE_REGULAR };

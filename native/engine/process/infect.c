@@ -513,7 +513,8 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 	}
 	t->seen = true;
 	rewind_prepare(t);
-	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
+	if (process_check_dying(process, err) || thread_stop(process, t, err) ||
+	    thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;
 	}

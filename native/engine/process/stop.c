@@ -143,9 +143,18 @@ int process_stop_all(struct process *process, struct avc_error *err)
 	return 0;
 }
 
+int process_check_dying(const struct process *process, struct avc_error *err)
+{
+	return proc_is_dying(process->stat_fd)
+		       ? fail(err, AVC_GONE, 0, process->pid, "stop", "", "a signal is killing it")
+		       : 0;
+}
+
 int process_stop(struct process *process, struct avc_error *err)
 {
 	process_stop_begin(process);
+	if (process_check_dying(process, err))
+		return -1;
 	if (process_interrupt(process, false)) {
 		if (process_await(process, err))
 			return -1;
