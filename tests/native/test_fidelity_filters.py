@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config, kill_at_random
+from testkit.guarded import GuardProcess, Victim, config, forks_beside, kill_at_random
 from testkit.harness import wait_until
 from testkit.procfs import children_of, comm_of, inside, status_of
 
@@ -50,6 +50,19 @@ def test_children_and_threads_are_under_their_filters_again(command: str, tmp_pa
             guard.wait("checkpoint", since=guard.mark())
             kill_at_random(guard, victim, 1, (0.0, 0.03))
         wait_until(lambda: confinement(victim) == before, 5, "everybody is under his filters")
+
+
+def test_threads_that_got_a_wrong_number_are_gone(tmp_path: Path) -> None:
+    """Although their filters refuse exit(2): otherwise they would call it for ever, in the way of checkpoints."""
+    with Victim("cells", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+        wait_until(lambda: victim.see().counter[4] >= 6, 10, "all are confined")
+        guard.wait("checkpoint", since=guard.mark(), count=2)
+        before = confinement(victim)
+        with forks_beside(victim):
+            for _ in range(20):
+                guard.wait("checkpoint", since=guard.mark())
+                kill_at_random(guard, victim, 1, (0.0, 0.03))
+        wait_until(lambda: confinement(victim) == before, 5, "nobody else is there")
 
 
 def test_threads_that_shared_their_filters_share_them_again(tmp_path: Path) -> None:

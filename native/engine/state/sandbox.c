@@ -49,12 +49,12 @@ struct sandbox *sandbox_begin(const struct image *image, pid_t child, struct avc
 	return sandbox;
 }
 
-static void at_call(const struct sandbox *sandbox, pid_t tid)
+static void at_call(const struct sandbox *sandbox, pid_t tid, long options)
 {
 	if (sandbox->image->installs)
-		seccomp_at_call_only(tid, sandbox->inside, SANDBOX_OPTIONS);
+		seccomp_at_call_only(tid, sandbox->inside, options);
 	else
-		seccomp_at_call(tid, sandbox->inside, SANDBOX_OPTIONS);
+		seccomp_at_call(tid, sandbox->inside, options);
 }
 
 /* Takes one event of the new process or its threads; false: there is none. */
@@ -75,7 +75,7 @@ static bool pump(struct sandbox *sandbox, bool *ended)
 	    ptrace(PTRACE_GETEVENTMSG, tid, NULL, &born) == 0 && sandbox->count < THREADS_MAX)
 		sandbox->tid[sandbox->count++] = (pid_t)born;
 	if (WSTOPSIG(status) == (SIGTRAP | 0x80))
-		at_call(sandbox, tid);
+		at_call(sandbox, tid, SANDBOX_OPTIONS);
 	ptrace(PTRACE_SYSCALL, tid, NULL, 0L);
 	return true;
 }
@@ -152,14 +152,33 @@ static bool halt(const struct sandbox *sandbox, pid_t tid)
 		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
 			return false;
 		if (stop.kind == STOP_SYSCALL)
-			at_call(sandbox, tid);
+			at_call(sandbox, tid, SANDBOX_OPTIONS);
 		ptrace(PTRACE_SYSCALL, tid, NULL, 0L);
 	}
 }
 
+/* It is about to call exit(2), which its own filters may refuse, for ever, or kill the process for:
+ * supervised until they have no say any more. */
+static void end(const struct sandbox *sandbox, pid_t tid)
+{
+	while (ptrace(PTRACE_SYSCALL, tid, NULL, 0L) == 0) {
+		const struct stop stop = tracee_wait(tid, 0);
+
+		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+			return;
+		if (stop.event == PTRACE_EVENT_EXIT) {
+			ptrace(PTRACE_DETACH, tid, NULL, 0L);
+			return;
+		}
+		if (stop.kind == STOP_SYSCALL)
+			at_call(sandbox, tid, SANDBOX_OPTIONS | PTRACE_O_TRACEEXIT);
+	}
+}
+
 /* Each is stopped where it waits for `go`, and is to return from there.  One that is none of its
- * threads, or of the main thread's number and had ended, ends. */
-static int halt_one(struct sandbox *sandbox, pid_t tid, uint32_t *halted, struct avc_error *err)
+ * threads ends; so does a main thread that had ended, but when all is ready. */
+static int halt_one(const struct sandbox *sandbox, pid_t tid, uint32_t *halted,
+		    struct avc_error *err)
 {
 	const struct image *image = sandbox->image;
 	const struct parasite *parasite = &image->process->parasite;
@@ -182,6 +201,8 @@ static int halt_one(struct sandbox *sandbox, pid_t tid, uint32_t *halted, struct
 		arch_call(&regs, &now, parasite->base + INJ_END_OFFSET, arch_sp(&now), 0);
 	*halted += frame != 0;
 	(void)arch_regs_set(tid, &regs); /* fails if it was killed */
+	if (!frame && tid != sandbox->pid)
+		end(sandbox, tid);
 	return 0;
 }
 
@@ -209,12 +230,12 @@ void sandbox_go(struct sandbox *sandbox)
 	if (image->stop_signal)
 		tracee_signal(sandbox->pid, image->stop_signal);
 	slot->running = slot->threads;
-	for (uint32_t i = 0; i < sandbox->count; i++) {
-		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);
-		/* The others regard it as exited. */
-		if (i == 0 && image->headless)
-			proc_await_end(sandbox->pid);
+	if (image->headless) { /* the others regard it as exited */
+		end(sandbox, sandbox->pid);
+		proc_await_end(sandbox->pid);
 	}
+	for (uint32_t i = 0; i < sandbox->count; i++)
+		ptrace(PTRACE_DETACH, sandbox->tid[i], NULL, 0L);
 	/* Its parent may check at once. */
 	for (uint64_t end = now_ns() + END_NS; image->stop_signal && now_ns() < end;) {
 		struct proc_stat stat;
