@@ -88,9 +88,8 @@ def test_how_and_how_often_both_by_itself(command: str, tmp_path: Path) -> None:
             guard.wait("checkpoint", since=guard.mark())
             kill_at_random(guard, victim, 3, (0.0, 0.5), seed=seed)
         victim.wait_beats(20)
-        # Told once a second: of the last one since.
+        # How often depends on what a checkpoint costs here; that it is told of once a second, see test_pace.py.
         told = [event for event in guard.events if event["kind"] == "checkpoint"]
-        assert sum(event["checkpoints"] for event in told) > len(told)
         assert command == "busy 4" or any(event["images"] == "dirty" for event in told)
 
 

@@ -9,13 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config, forks_beside, kill_at_random
+from testkit.guarded import GuardProcess, Victim, config, forks_beside, injected, kill_at_random
 from testkit.harness import wait_until
 from testkit.procfs import children_of, comm_of, inside, status_of
 
 pytestmark = pytest.mark.shared_machine(
     "supervised processes stop at each call: a checkpoint that comes too late drops the generations"
 )
+
+
+ENDS = ("checkpoint", "missed", "guard_lost")
+"""Of a checkpoint that was asked for."""
 
 
 @pytest.fixture(autouse=True)
@@ -62,6 +66,25 @@ def test_threads_that_got_a_wrong_number_are_gone(tmp_path: Path) -> None:
             for _ in range(20):
                 guard.wait("checkpoint", since=guard.mark())
                 kill_at_random(guard, victim, 1, (0.0, 0.03))
+        wait_until(lambda: confinement(victim) == before, 5, "nobody else is there")
+
+
+def test_what_a_dead_guard_has_left_in_a_child_is_gone(tmp_path: Path) -> None:
+    """Its filter refuses exit(2), so the task that maps what a guard needs outlives that guard."""
+    with Victim("cells", tmp_path) as victim, GuardProcess(config(0), [victim.pid]) as guard:
+        wait_until(lambda: victim.see().counter[4] >= 6, 10, "all are confined")
+        before, left = confinement(victim), 0
+        for nth in range(20, 400, 20):
+            since = guard.mark()
+            with injected(guard, "ptrace", f"signal=KILL:when={nth}"):
+                guard.say_command("checkpoint")
+                guard.wait_for(lambda event: event["kind"] in ENDS, "its end", since=since)
+            left += len(confinement(victim)) > len(before)
+            guard.start_another(victim.pid)
+            if left == 3:
+                break
+        assert left == 3
+        guard.checkpoint()
         wait_until(lambda: confinement(victim) == before, 5, "nobody else is there")
 
 

@@ -292,6 +292,17 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	return 0;
 }
 
+/* Supervised, until its exit, or the deadline. */
+static enum stop_kind see_off(pid_t tid)
+{
+	struct stop stop = { .kind = STOP_NONE };
+
+	while (seccomp_go_on(tid, &stop) == 0 && stop.kind != STOP_EXIT &&
+	       stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
+		stop = tracee_wait(tid, 0);
+	return stop.kind;
+}
+
 /* False: it is still exiting, through the stub. */
 static bool kill_porter(struct process *process, const struct porter *porter)
 {
@@ -305,9 +316,7 @@ static bool kill_porter(struct process *process, const struct porter *porter)
 		tracee_kill(porter->tid);
 	arch_stub_call(&regs, porter->base, porter->cave, true, SYS_exit, arg);
 	if (porter->is_thread && arch_regs_set(porter->tid, &regs) == 0)
-		while (seccomp_go_on(porter->tid, &stop) == 0 && stop.kind != STOP_EXIT &&
-		       stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
-			stop = tracee_wait(porter->tid, 0);
+		stop.kind = see_off(porter->tid);
 	/* It has exited, and can be reaped. */
 	while (stop.kind == STOP_DYING)
 		stop = tracee_wait(porter->tid, 0);
@@ -648,6 +657,43 @@ static int do_stopped(struct process *process, uint32_t slots, timer_t timer, ui
 	return result;
 }
 
+static bool is_in_a_stub(int mem_fd, avc_remote pc)
+{
+	const avc_remote page_end = (pc | (ARCH_PAGE_BYTES - 1)) + 1;
+
+	return has_stub(mem_fd, page_end - (page_end - 1 - pc) / CAVE_BYTES * CAVE_BYTES);
+}
+
+/* A porter whose guard has died ends by itself, unless its process's own filters refuse exit(2): then
+ * it calls that for ever. */
+static void end_left_porters(struct process *process)
+{
+	const int mem_fd = proc_open(process->pid, "mem", O_RDONLY);
+
+	for (uint32_t i = 0; i < process->thread_count && mem_fd >= 0; i++) {
+		struct thread *t = &process->threads[i];
+		struct avc_error ignored = { 0 };
+		struct proc_stat stat;
+
+		if (t->tid == process->pid || t->attached || proc_stat(t->tid, &stat) ||
+		    stat.state != 'R')
+			continue;
+		if (thread_stop(process, t, &ignored) == 0 &&
+		    thread_await(process, t, &ignored) == 0 &&
+		    is_in_a_stub(mem_fd, arch_pc(&t->regs)) &&
+		    seccomp_supervise(t->tid, 0, (long)TRACE_OPTIONS_APP) == 0) {
+			t->stopped = false;
+			t->attached = see_off(t->tid) != STOP_EXIT;
+			t->seen = t->attached;
+			seccomp_end_supervision(t->tid);
+		}
+		thread_release(t);
+	}
+	threads_forget_unseen(process);
+	if (mem_fd >= 0)
+		close(mem_fd);
+}
+
 int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		   struct avc_error *err)
 {
@@ -660,6 +706,8 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 		return do_stopped(process, slots, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
+	if (process_check_dying(process, err) == 0)
+		end_left_porters(process);
 	thread = stop_main(process, err);
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
 	if (thread)
