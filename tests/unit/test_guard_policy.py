@@ -234,6 +234,37 @@ def test_what_cannot_be_protected_is_tried_less_and_less_often() -> None:
     assert tries(3) == [300, 300, 300]
 
 
+def test_one_that_holds_nothing_is_tried_soon() -> None:
+    """The machine stood still for a moment, and the next checkpoint is due in an hour."""
+    guard = Guarded(interval_s=3600)
+    c, policy = guard.c, guard.policy
+
+    def tries(count: int) -> list[float]:
+        """The pauses after so many that were missed, each of which takes no time."""
+        pauses = []
+        for _ in range(count):
+            due = c.policy_without(policy, c.policy_due(guard.config, guard.now), guard.now)
+            pauses.append((due - guard.now) / SECOND)
+            guard.now = due
+        return pauses
+
+    # Longer and longer: there may be a reason that stays.
+    assert tries(13) == [0.1, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 60, 60]
+    guard.config.interval_ns = SECOND
+    assert tries(2) == [1, 1]  # and no later than it is due
+    c.policy_retry(policy)  # on command, or another application
+    assert tries(6) == [0.1, 0.1, 0.2, 0.4, 0.8, 1]
+    guard.take()
+    assert tries(3) == [1, 1, 1]  # there is something to go back to
+    guard.lose_one()
+    assert tries(2) == [0.1, 0.1]
+    guard.wait(1.5)  # missing one may take a while
+    guard.config.interval_ns = 3600 * SECOND
+    assert tries(1) == [1.7]
+    guard.config.interval_ns = 0
+    assert c.policy_without(policy, c.policy_due(guard.config, guard.now), guard.now) == NEVER
+
+
 def test_another_program_is_not_refused_yet() -> None:
     """It is tried as the first one was, and not when the one before it would have been."""
     guard = Guarded(interval_s=1)

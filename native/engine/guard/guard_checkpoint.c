@@ -596,6 +596,13 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
+/* One was missed.  avckpt.interval=auto has pauses of its own (guard_pace_missed()). */
+static void try_soon(struct avc_guard *guard)
+{
+	if (!policy_is_automatic(&guard->config))
+		guard->next_ns = policy_without(&guard->policy, guard->next_ns, now_ns());
+}
+
 void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 {
 	struct avc_event event = guard_event(guard, AVC_EVENT_CHECKPOINT);
@@ -619,6 +626,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		fail(&error, AVC_LIMIT, 0, guard->main.pid, "checkpoint", "",
 		     "it fills the memory of its container: what it had before is kept");
 		guard_emit_error(guard, AVC_EVENT_MISSED, ticket, &error);
+		try_soon(guard);
 		return;
 	}
 	if (ticket)
@@ -656,6 +664,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard_unprotect(guard, ticket, &error);
 		return;
 	}
+	try_soon(guard);
 	event.kind = AVC_EVENT_MISSED;
 	event.generations = guard->count; /* with a new parasite, all may have been dropped */
 	event.ticket = ticket;

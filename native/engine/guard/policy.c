@@ -19,7 +19,8 @@
 #define AGAIN_NS (50 * MS)
 #define AVERAGE_OF 8
 #define LOOK_NS (20 * MS)
-#define REFUSED_LONG_NS UINT64_C(60000000000)
+#define SOON_NS (100 * MS)
+#define LONG_NS UINT64_C(60000000000)
 /* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
 /* After a restore: an app that dies within this time has met the bug in the image. */
@@ -169,21 +170,38 @@ bool policy_missed(struct policy *policy, enum avc_code code, bool of_main)
 	return of_main || !policy->count || ++policy->misses >= MISSES_UNTIL_UNPROTECTED;
 }
 
-uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now)
+static uint64_t as_long_again(uint64_t *since, uint64_t least, uint64_t now)
 {
 	uint64_t pause;
 
-	if (!policy->refused_ns)
-		policy->refused_ns = now;
-	pause = now - policy->refused_ns;
-	if (pause > REFUSED_LONG_NS)
-		pause = REFUSED_LONG_NS;
-	return due > now + pause ? due : now + pause;
+	if (!*since)
+		*since = now;
+	pause = now - *since;
+	if (pause < least)
+		pause = least;
+	return now + (pause < LONG_NS ? pause : LONG_NS);
+}
+
+uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now)
+{
+	const uint64_t again = as_long_again(&policy->refused_ns, 0, now);
+
+	return due > again ? due : again;
+}
+
+uint64_t policy_without(struct policy *policy, uint64_t due, uint64_t now)
+{
+	uint64_t again;
+
+	if (policy->count || due == POLICY_NEVER)
+		return due;
+	again = as_long_again(&policy->without_ns, SOON_NS, now);
+	return due < again ? due : again;
 }
 
 void policy_retry(struct policy *policy)
 {
-	policy->refused_ns = 0;
+	policy->refused_ns = policy->without_ns = 0;
 }
 
 /* Never later than planned: a program may execute itself again and again. */

@@ -50,6 +50,7 @@ struct policy {
 	uint64_t restored_ns;   /* after a crash; 0: not, or long ago         */
 	bool proved;            /* has made progress since it was restored */
 	uint64_t refused_ns;    /* since when it cannot be protected; 0: it can   */
+	uint64_t without_ns;    /* since when one is missed and none is held; 0: no  */
 	/* The last immediate death that was the program's own. */
 	int at_once_status;
 	uint32_t at_once_lineage;
@@ -92,7 +93,11 @@ bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
  * been refused, up to a minute: what lasts for a moment costs little protection, and an app that
  * cannot be protected is hardly ever stopped. */
 uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now);
-/* On command, or another application: as if it had not been refused yet. */
+/* One was missed: when to try again.  At `due`; but if nothing is held to go back to, after as long
+ * again as that has been so, at least 0.1 s, at most a minute: the machine may have stood still for
+ * a moment, and the interval may be an hour.  One that always misses is hardly ever stopped. */
+uint64_t policy_without(struct policy *policy, uint64_t due, uint64_t now);
+/* On command, or another application: as if it had not been refused, and none missed, yet. */
 void policy_retry(struct policy *policy);
 /* It has executed another program, which may be one that can be protected: if it was refused, when
  * to try that instead of at `due`. */

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A checkpoint is missed while there is nothing to go back to: the next is tried soon, however long the interval.
+
+And ever less often, so that one of which none succeeds is hardly ever stopped.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from testkit.cgroups import freezer
+from testkit.guarded import BUILD, PATIENCE_S, GuardProcess, Victim, config
+from testkit.harness import wait_until
+
+pytestmark = pytest.mark.shared_machine("a checkpoint that should succeed is missed where others take the CPU")
+
+HOUR_S = 3600.0
+USER = 54323
+SOMEBODY = f"/usr/bin/setpriv --reuid {USER} --regid {USER} --clear-groups --bounding-set -all --inh-caps -all"
+PAUSE_S = 2.5
+TRIES = 6
+"""In PAUSE_S: at 0, 0.1, 0.2, 0.4, 0.8 and 1.6 s."""
+
+
+@pytest.fixture(autouse=True)
+def built(init_built: None, victims_built: Path) -> None:
+    """avckpt-init and the victims."""
+
+
+def somebody_runs() -> bool:
+    return any(process.info["uids"].real == USER for process in psutil.process_iter(["uids"]) if process.info["uids"])
+
+
+def missed(guard: GuardProcess) -> int:
+    return sum(event.get("kind") == "missed" for event in guard.events)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_paused_before_its_first_one(version: int, tmp_path: Path) -> None:
+    pause = freezer(version)
+    with pause, Victim("threads 4 1", tmp_path) as victim, GuardProcess(config(HOUR_S), [victim.pid]) as guard:
+        guard.wait("attached")
+        pause.take(victim.app)
+        pause.wait()
+        answer = guard.command("checkpoint")
+        assert answer["kind"] == "missed"
+        time.sleep(PAUSE_S)
+        assert missed(guard) <= TRIES
+        pause.go()
+        guard.wait("checkpoint")
+        victim.wait_beats(20)
+
+
+def test_no_room_for_a_template_at_first() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o777)  # the victim is not root
+        command = f"{SOMEBODY} /usr/bin/prlimit --nproc=4:64 {BUILD}/idle 0 4"
+        with Victim(command, Path(folder)) as victim, GuardProcess(config(HOUR_S), [victim.pid]) as guard:
+            guard.wait("attached")
+            assert guard.command("checkpoint")["kind"] == "missed"
+            time.sleep(PAUSE_S)
+            assert 3 <= missed(guard) <= TRIES
+            subprocess.run([*SOMEBODY.split(), "/usr/bin/prlimit", f"--pid={victim.app}", "--nproc=64:64"], check=True)
+            guard.wait("checkpoint", timeout_s=2 * PAUSE_S)
+        wait_until(lambda: not somebody_runs(), PATIENCE_S, "nobody is left who counts with the next ones")
