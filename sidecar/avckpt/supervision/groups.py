@@ -35,6 +35,8 @@ log = logging.getLogger("avckpt")
 
 FIRST_S = 0.3
 """Longest time from a member's start to a line with it: others may be starting, too."""
+SOON_S, LONG_S = 0.1, 60.0
+"""Shortest and longest pause after a line that was missed while none is held."""
 PATIENCE = 2
 """Number of lines in a row that a member that cannot be protected may break, before some are taken without
 it."""
@@ -71,6 +73,8 @@ class Group:
     """By cookie: the newest generation allowed for a dead member that waits for the group."""
     broken: dict[int, int] = field(default_factory=dict)
     """By cookie: lines in a row that this member broke; above PATIENCE: counts those taken without it."""
+    without: float | None = None
+    """Since when lines have been missed while none is held; of the loop's time."""
     coming: asyncio.Event = field(default_factory=asyncio.Event)
     busy: asyncio.Lock = field(default_factory=asyncio.Lock)
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
@@ -79,6 +83,16 @@ class Group:
     def interval_s(self) -> float:
         """The shortest of its members'."""
         return min((each.settings.config.interval_s for each in self.members.values()), default=1.0)
+
+
+def pause_s(interval_s: float, without_s: float | None) -> float:
+    """From one line to the next.  `without_s`: none is held, and they have been missed for so long.
+
+    Then after as long again, as one guard tries (policy_without() in policy.c).
+    """
+    if without_s is None:
+        return interval_s
+    return min(interval_s, max(SOON_S, min(without_s, LONG_S)))
 
 
 def end_haste() -> None:
@@ -188,8 +202,9 @@ class Groups:
 
     async def _take_lines(self, group: Group) -> None:
         while True:
+            due_s = self._pause_s(group)
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(group.coming.wait(), group.interval_s)
+                await asyncio.wait_for(group.coming.wait(), due_s)
                 group.coming.clear()
                 await asyncio.sleep(min(FIRST_S, group.interval_s))
             async with group.busy:
@@ -198,6 +213,10 @@ class Groups:
                         await self._take_line(group)
                 except (AvckptError, OSError) as error:
                     log.error("group %s: a line could not be taken: %s", group.name, error)
+
+    def _pause_s(self, group: Group) -> float:
+        without_s = None if group.without is None else asyncio.get_running_loop().time() - group.without
+        return pause_s(group.interval_s, without_s)
 
     async def _take_line(self, group: Group) -> dict[int, Answer | AvckptError]:
         members = {cookie: guard for cookie, guard in self._able(group).items() if not self._is_skipped(group, cookie)}
@@ -214,14 +233,21 @@ class Groups:
         }
         # If one has it, all have: the others may only have ended since.
         if taken:
+            group.without = None
             group.broken = {cookie: n for cookie, n in group.broken.items() if cookie not in members}
             # A line from before a member started: what it has sent since would have no sender after a
             # rollback.
             older = [line for line in group.lines if taken.keys() <= line.generations.keys()]
             group.lines = [*older[1 - KEEP_MAX :], Line(number, taken)]
             return answers
-        for cookie in self._breakers(answers):
+        breakers = self._breakers(answers)
+        for cookie in breakers:
             group.broken[cookie] = group.broken.get(cookie, 0) + 1
+        # One that cannot be protected may be when the next line is due.
+        if group.lines or breakers:
+            group.without = None
+        elif group.without is None:
+            group.without = asyncio.get_running_loop().time()
         return answers
 
     def _able(self, group: Group) -> dict[int, Guard]:
