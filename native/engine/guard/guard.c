@@ -196,8 +196,7 @@ static void obey(struct avc_guard *guard, const struct avc_request *request)
 		policy_unvouch(&guard->policy);
 		break;
 	case AVC_COMMAND_RELEASE:
-		if (ticket == (uint64_t)guard->remains.pid)
-			guard_release_remains(guard);
+		guard_release_remains(guard, (pid_t)ticket);
 		break;
 	case AVC_COMMAND_SEEN: /* guard_await_seen(); it was restored meanwhile */
 		break;
@@ -409,8 +408,8 @@ static uint64_t work_due(struct avc_guard *guard)
 
 	due = earlier(due, faults_due(&guard->faults, &guard->tree, guard->next_ns));
 	due = earlier(due, guard_tell_due(guard));
-	if (guard->remains.pid)
-		due = earlier(due, guard->remains.until_ns);
+	for (uint32_t i = 0; i < guard->remains_count; i++)
+		due = earlier(due, guard->remains[i].until_ns);
 	if (guard->dead.waits)
 		due = earlier(due, now_ns() + DEAD_LOOK_NS);
 	return earlier(due, tracee_ending_pidfd(0) < 0 ? guard->ahead_ns : tracee_ending_due());
@@ -443,8 +442,8 @@ static void wait_for_news(struct avc_guard *guard, bool straggling)
 	if (guard->foreseen != guard->main.pid)
 		watch(guard, &n, guard->main.pidfd);
 	watch(guard, &n, output_fd(&guard->output));
-	if (guard->remains.pid)
-		watch(guard, &n, guard->remains.pidfd);
+	for (uint32_t i = 0; i < guard->remains_count; i++)
+		watch(guard, &n, guard->remains[i].pidfd);
 	for (uint32_t i = 0; i < guard->tree.processes; i++) {
 		const struct process *process = guard->tree.process[i];
 
@@ -521,7 +520,7 @@ static void let_go(struct avc_guard *guard)
 	output_end(&guard->output);
 	faults_end(&guard->faults);
 	guard_drop_all(guard);
-	guard_release_remains(guard);
+	guard_release_oldest_remains(guard, 0);
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		process_unhold(guard->tree.process[i]);
 	/* When this process exits, the kernel detaches the rest. */

@@ -27,6 +27,8 @@
 
 #define OUTBOX_MAX 64 /* events that the daemon has not taken yet                */
 #define DYING_NS NS_PER_S
+/* A crash is often followed by another one, before the core of the first is written. */
+#define REMAINS_MAX 2
 #define AHEAD_AFTER_NS (20 * NS_PER_MS) /* the app was stopped, and goes first               */
 
 /* A perf event of one thread, inherited by the threads that it creates. */
@@ -127,12 +129,13 @@ struct avc_guard {
 	pid_t daemon;            /* our parent                                      */
 	struct avc_event untold; /* checkpoints not reported yet                    */
 	uint64_t told_ns;        /* when checkpoints were last reported             */
-	/* The holder of a dead app, for tools that read its memory; 0: none */
+	/* The holders of dead apps, for tools that read their memory; oldest first */
 	struct {
 		pid_t pid;
 		int pidfd;
 		uint64_t until_ns;
-	} remains;
+	} remains[REMAINS_MAX];
+	uint32_t remains_count;
 	pid_t unseen; /* the same, as told to the daemon, which has to look yet; 0: need not */
 };
 
@@ -303,8 +306,10 @@ bool guard_filter_hinders(const struct avc_guard *guard);
 /* The main process has ended; init has not reported how yet, so that it may not be restored. */
 void guard_app_dies(struct avc_guard *guard);
 void guard_app_died(struct avc_guard *guard, const struct avc_report *report);
-/* The dead app's memory is not read any more. */
-void guard_release_remains(struct avc_guard *guard);
+/* The memory of a dead app is not read any more. */
+void guard_release_remains(struct avc_guard *guard, pid_t pid);
+/* No more than that many are to be left. */
+void guard_release_oldest_remains(struct avc_guard *guard, uint32_t left);
 /* Releases them when they were killed, or their time is up. */
 void guard_tend_remains(struct avc_guard *guard);
 /* Restores from the newest generation; if that fails, from the one before it; in a group only from

@@ -565,6 +565,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	if (err->code != AVC_LIMIT)
 		return false;
 	dirty_drop_idle(&guard->dirty);
+	guard_release_oldest_remains(guard, 1);
 	guard_await_spares(guard);
 	for (uint32_t i = 0; i < guard->count; i++) {
 		guard->cramped |= guard->generations[i].spare.pid != 0;

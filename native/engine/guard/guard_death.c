@@ -139,31 +139,49 @@ static void say_working(void *channel)
 	init_channel_working(channel);
 }
 
-void guard_release_remains(struct avc_guard *guard)
+static void release(struct avc_guard *guard, uint32_t i)
 {
-	if (guard->remains.pid)
-		tracee_end(guard->remains.pid, guard->remains.pidfd);
-	guard->remains.pid = 0;
+	tracee_end(guard->remains[i].pid, guard->remains[i].pidfd);
+	guard->remains_count--;
+	for (; i < guard->remains_count; i++)
+		guard->remains[i] = guard->remains[i + 1];
+}
+
+void guard_release_remains(struct avc_guard *guard, pid_t pid)
+{
+	for (uint32_t i = guard->remains_count; i-- > 0;)
+		if (guard->remains[i].pid == pid)
+			release(guard, i);
+}
+
+void guard_release_oldest_remains(struct avc_guard *guard, uint32_t left)
+{
+	while (guard->remains_count > left)
+		release(guard, 0);
 }
 
 void guard_tend_remains(struct avc_guard *guard)
 {
-	if (guard->remains.pid &&
-	    (now_ns() >= guard->remains.until_ns || pidfd_ended(guard->remains.pidfd)))
-		guard_release_remains(guard);
+	for (uint32_t i = guard->remains_count; i-- > 0;)
+		if (now_ns() >= guard->remains[i].until_ns || pidfd_ended(guard->remains[i].pidfd))
+			release(guard, i);
 }
 
 /* The holder still has the dead app's memory; its open files belong to the restored one. */
 static void keep_remains(struct avc_guard *guard)
 {
+	uint32_t i;
+
 	if (!guard->config.remains_ns || !guard->main.holder) {
 		process_unhold_soon(&guard->main);
 		return;
 	}
-	guard->remains.pid = process_detach_holder(&guard->main, &guard->remains.pidfd);
-	guard->remains.until_ns = now_ns() + guard->config.remains_ns;
+	guard_release_oldest_remains(guard, REMAINS_MAX - 1);
+	i = guard->remains_count++;
+	guard->remains[i].pid = process_detach_holder(&guard->main, &guard->remains[i].pidfd);
+	guard->remains[i].until_ns = now_ns() + guard->config.remains_ns;
 	/* Memory of a dead process goes before that of any running one. */
-	proc_set_oom_score_adj(guard->remains.pid, "1000");
+	proc_set_oom_score_adj(guard->remains[i].pid, "1000");
 }
 
 static void drop_helper(struct avc_guard *guard)
@@ -267,8 +285,9 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 			guard_kill_lost(guard);
 			break;
 		}
-		/* Perhaps because the new process or the spare was killed, or the spare was one
-		 * process too many.  The template is still good. */
+		/* Perhaps because the new process or the spare was killed, or the spare, or what is
+		 * left of somebody dead, was one process too many.  The template is still good. */
+		guard_release_oldest_remains(guard, 0);
 		if (whole && !again) {
 			generation->spare.unwanted = generation->spare.pid &&
 						     failed.errnum == EAGAIN;
@@ -357,7 +376,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	event.died_ns = report->reaped_ns;
 	if (guard->config.deadline_ns && reason != AVC_REASON_COMMAND)
 		guard->late_ns = report->reaped_ns + guard->config.deadline_ns;
-	guard_release_remains(guard); /* of the death before */
+	guard_release_oldest_remains(guard, REMAINS_MAX - 1);
 	event.remains_pid = guard->config.remains_ns ? guard->main.holder : 0;
 	if (guard->config.remains_ns && guard->count)
 		event.likeness_pid = guard->generations[guard->count - 1].image[0].template;

@@ -93,8 +93,11 @@ bool guard_owns(pid_t pid, const void *arg)
 {
 	const struct avc_guard *guard = arg;
 
-	if (tracee_is_ending(pid) || dirty_owns(&guard->dirty, pid) || guard->remains.pid == pid)
+	if (tracee_is_ending(pid) || dirty_owns(&guard->dirty, pid))
 		return true;
+	for (uint32_t i = 0; i < guard->remains_count; i++)
+		if (guard->remains[i].pid == pid)
+			return true;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (guard->tree.process[i]->holder == pid)
 			return true;
@@ -234,6 +237,7 @@ static void lose_images(struct avc_guard *guard, enum avc_reason reason)
 	while (guard->count)
 		guard_lose_generation(guard, 0, reason, 0);
 	dirty_drop_idle(&guard->dirty);
+	guard_release_oldest_remains(guard, 0);
 	tracee_end_now(); /* they have the descriptors from before */
 	process_unhold(&guard->main);
 }
