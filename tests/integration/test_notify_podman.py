@@ -112,7 +112,9 @@ def test_a_command_is_one_of_the_containers_own(
     # From inside the sidecar's container, too.
     listed = sidecar.podman.run("exec", SIDECAR_NAME, "avckpt", "events", "--json").stdout.splitlines()
     mine = [e for e in map(json.loads, listed) if e["id"] == web.id]
-    assert [e["kind"] for e in mine if e["kind"] != "crash"] == ["registered", "checkpoint", "died", "restored"]
+    # What says more about the death comes when it is found out; where others take the CPU, a checkpoint is missed.
+    kinds = [e["kind"] for e in mine if e["kind"] not in ("crash", "missed")]
+    assert kinds == ["registered", "checkpoint", "died", "restored"]
     assert event in mine
 
 

@@ -212,7 +212,7 @@ def test_the_command_line_in_its_container(container: ContainerFactory, sidecar:
     events = [json.loads(line) for line in inside("events", "--json", "--since", "1h").stdout.splitlines()]
     assert "restored" in {event["kind"] for event in events if event["id"] == web.id}
     assert f"{CONFIG_DIR}/config.yaml" in inside("reload").stdout
-    assert inside("check", "--config").stdout == "no problems\n"
+    assert inside("check", "--config").stdout == f"no {CONFIG_DIR}/config.yaml: the built-in defaults hold\n"
     assert "_AVCKPT_COMPLETE" in inside("completion", "bash").stdout
     doctor = inside("doctor")
     assert "run avckpt doctor on the host too" in doctor.stdout
