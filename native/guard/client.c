@@ -153,7 +153,7 @@ static void guard_succeed(struct avc_guard *guard)
 	fail(&event.error, AVC_GONE, 0, 0, "", "",
 	     "it takes one to suspend the application's own, or to watch its memory");
 	guard_release(guard);
-	guard->config.suspends = 1;
+	guard->config.suspends = guard->config.late = 1;
 	guard->beats = 0;
 	guard->beats_ns = now_ns();
 	if (guard_spawn(guard, &event.error) == 0 &&

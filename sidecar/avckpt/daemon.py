@@ -465,7 +465,9 @@ class Daemon:
         container = watch.container
         try:
             container.config = self._with_share(container, container.config, watch.settings.config)
-            watch.guard = self._engine.start_guard(watch.pidfd, container.config, container.cookie)
+            late = container.adopted or watch.guard_lost_s > -math.inf
+            config = dataclasses.replace(container.config, late=late)
+            watch.guard = self._engine.start_guard(watch.pidfd, config, container.cookie)
         except AvckptError as error:
             container.fail(str(error))
             self.tell(watch, EventRecord(Kind.UNPROTECTED, error=error))

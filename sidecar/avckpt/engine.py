@@ -224,6 +224,7 @@ def _config(init_pidfd: int, config: GuardConfig) -> Any:
     c.keep = config.keep
     c.interval_ns = 0 if config.together else _ns("interval", config.interval_s)
     c.together = config.together
+    c.late = config.late
     c.interval_min_ns = _ns("least interval", config.interval_min_s)
     c.apart_ns = _ns("time between generations", config.apart_s)
     c.budget_freeze_ppm = round(config.budget_freeze * 1e6)

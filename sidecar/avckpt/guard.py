@@ -107,6 +107,8 @@ class GuardConfig:
     images: Images = Images.FORK
     together: bool = False
     """Its checkpoints are those of its group's lines, which the daemon commands at `interval_s`."""
+    late: bool = False
+    """The application has run without this guard: its first checkpoint is due soon, not after `interval_s`."""
     interval_min_s: float = 0.0
     """Not 0: as often as the budgets allow, between this and `interval_s` apart."""
     budget_freeze: float = 0.03

@@ -464,6 +464,20 @@ def test_sigkill_leaves_the_application_running_and_the_next_one_takes_over(loca
 
 
 @SHARED
+def test_the_next_guard_and_the_next_sidecar_do_not_wait_an_interval(local: LocalSidecar) -> None:
+    web = local.protected("web", SLEEPER, ON_COMMAND)
+    local.wait_for(web, app_pid_inside=2)
+    checkpoint(local, "web")
+    first = local.row(web)["guard_pid"]
+    os.kill(first, signal.SIGKILL)
+    wait_until(lambda: local.row(web)["guard_pid"] not in (0, first), 10, "there is another guard")
+    assert local.wait_for(web, state="protected", generations=1)["interval_s"] == 3600
+    local.stop(signal.SIGKILL)
+    local.start()
+    assert local.wait_for(web, state="protected", generations=1)["adopted"]
+
+
+@SHARED
 def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSidecar) -> None:
     web = local.container("web", SLEEPER)
     assert local.process is not None

@@ -103,6 +103,8 @@ struct avc_config {
 	                                 * which would hinder it; set by the engine   */
 	uint8_t together;               /* one of a group: checkpoints are those of its
 	                                 * lines, and it goes back with the others   */
+	uint8_t late;                   /* the app has run without this guard: its first
+	                                 * checkpoint is due soon, not after interval_ns */
 	uint8_t restore_on_status[256]; /* [n] != 0: exit status n is abnormal    */
 };
 
