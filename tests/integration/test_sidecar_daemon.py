@@ -252,8 +252,7 @@ def test_a_missed_checkpoint_that_cost_what_was_held_is_told(version: int, local
         assert row["reason"].startswith("checkpoint missed: ")
         assert "nothing is held to go back to" in local.log
         pause.go()
-        take_checkpoint(local.client, "web")
-        local.wait_for(web, state="protected", generations=1)
+        local.wait_for(web, state="protected")
 
 
 @SHARED

@@ -82,7 +82,9 @@ def test_is_killed_while_it_is_restored(command: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(only_one, [victim.pid]) as guard:
         assert guard.checkpoint()["kind"] == "checkpoint"
         number = inside(victim.app)
-        for _ in range(40):
+        for kills in range(400):  # how many hit it depends on the machine
+            if during > 3 and kills >= 40:
+                break
             dead, since = victim.app, guard.mark()
             os.kill(dead, signal.SIGKILL)
             again = wait_until(partial(numbered, victim.pid, number, dead), 5, "it is there again", 0.0001)
