@@ -342,8 +342,7 @@ static void attach(struct avc_guard *guard)
 		policy_retry(&guard->policy);
 		guard->next_ns = policy_first_due(&guard->config, now_ns());
 		if (guard->config.late)
-			guard->next_ns =
-				policy_without(&guard->policy, guard->next_ns, now_ns());
+			guard->next_ns = policy_without(&guard->policy, guard->next_ns, now_ns());
 		{
 			const struct avc_event event = guard_event(guard, AVC_EVENT_ATTACHED);
 
