@@ -31,13 +31,15 @@ def test_an_application_at_work_is_checkpointed_often_and_told_of_seldom(tmp_pat
     with Victim("busy 4", tmp_path) as victim, GuardProcess(AUTO, [victim.pid]) as guard:
         first = guard.wait("checkpoint")
         assert (first["generation"], first["checkpoints"]) == (1, 1)
-        guard.wait("checkpoint", count=4)
+        # On a slow machine the first ones can be more than a second apart.
+        guard.wait_for(lambda event: event["kind"] == "checkpoint" and event["checkpoints"] > 2, "several in a second")
+        guard.wait("checkpoint", since=guard.mark(), count=3)
         told = [event for event in guard.events if event["kind"] == "checkpoint"]
-        assert sum(event["checkpoints"] for event in told) == told[-1]["generation"] > 6
+        assert sum(event["checkpoints"] for event in told) == told[-1]["generation"]
         assert all(event["freeze_max_s"] >= event["freeze_s"] > 0 for event in told)
         assert all(0.02 <= event["interval_s"] <= 3 for event in told)
-        gaps = [(b["at_ns"] - a["at_ns"]) / 1e9 for a, b in zip(told, told[1:])]
-        assert min(gaps) > 0.8, gaps  # they are a second apart, but not told at once
+        # They are told a second apart: at_ns is that of the checkpoint, up to an interval before.
+        assert (told[-1]["at_ns"] - told[0]["at_ns"]) / 1e9 / (len(told) - 1) > 0.8
         victim.check()
 
 

@@ -668,8 +668,13 @@ static bool is_in_a_stub(int mem_fd, avc_remote pc)
  * it calls that for ever. */
 static void end_left_porters(struct process *process)
 {
-	const int mem_fd = proc_open(process->pid, "mem", O_RDONLY);
+	struct proc_status status;
+	int mem_fd;
 
+	if (proc_status(process->pid, &status) ||
+	    seccomp_is_containers(&status, process->plain_filters))
+		return;
+	mem_fd = proc_open(process->pid, "mem", O_RDONLY);
 	for (uint32_t i = 0; i < process->thread_count && mem_fd >= 0; i++) {
 		struct thread *t = &process->threads[i];
 		struct avc_error ignored = { 0 };
