@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,18 +91,23 @@ def kill_main(victim: Victim, signum: int = signal.SIGKILL) -> None:
     os.kill(main_process(victim), signum)
 
 
-def places(victim: Victim) -> list[tuple[int, int, int, int, str, bool]]:
-    """Who is where; for a tree that does not change, to be compared with another moment's.
+def left_alone(seen: Callable[[], list[Member]], timeout_s: float, whose: str) -> list[Member]:
+    """Those that are seen while no guard traces any of them.
 
-    While a guard traces them it is making templates or holders, which get their names, or are reaped, only some
-    moments later, on a busy machine after seconds: a look at that time is no look.
+    While one does it is making templates or holders, which get their names, or are reaped, only some moments later,
+    on a busy machine after seconds: a look at that time is no look.
     """
 
     def look_again() -> list[Member]:
-        seen = members(victim)
-        return [] if any(member.is_traced for member in seen) else seen
+        now = seen()
+        return [] if any(member.is_traced for member in now) else now
 
-    return sorted(member.place for member in wait_until(look_again, PATIENCE_S, f"{victim.command} is left alone"))
+    return wait_until(look_again, timeout_s, f"{whose} is left alone", every_s=0.005)
+
+
+def places(victim: Victim) -> list[tuple[int, int, int, int, str, bool]]:
+    """Who is where; for a tree that does not change, to be compared with another moment's."""
+    return sorted(member.place for member in left_alone(lambda: members(victim), PATIENCE_S, victim.command))
 
 
 def strangers(victim: Victim, allowed: int = 0) -> list[Member]:

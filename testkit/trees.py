@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from testkit.family import Member, look
+from testkit.family import Member, left_alone, look
 from testkit.harness import SLOWNESS, Container, ContainerFactory, Podman, Sidecar, wait_until
 from testkit.procfs import below
 
@@ -60,16 +60,15 @@ class Tree:
         """The application's processes.
 
         A worker's holder is made by the worker (process_hold_stopped() in infect.c): for a moment it and the task
-        that clones it are below the worker, and traced, as all are in a freeze. A look at that time is no look.
+        that clones it are below the worker.
         """
 
-        def look_again() -> list[Member]:
+        def seen() -> list[Member]:
             main = self.main
             found = [look(pid) for pid in (main, *below(main))]
-            seen = [member for member in found if member is not None and not member.name.startswith("avckpt-")]
-            return [] if any(member.is_traced for member in seen) else seen
+            return [member for member in found if member is not None and not member.name.startswith("avckpt-")]
 
-        return wait_until(look_again, RESTORE_S, f"{self.container.name} is left alone", every_s=0.005)
+        return left_alone(seen, RESTORE_S, self.container.name)
 
     def places(self) -> list[tuple[int, int, int, int, str, bool]]:
         """Who is where: to be the same after a restore if processes neither come nor go."""

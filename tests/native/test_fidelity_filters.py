@@ -41,38 +41,47 @@ def confinement(victim: Victim) -> dict[int, tuple[str, str]]:
     return found
 
 
+def wait_confined(victim: Victim) -> None:
+    """Until all of `cells` have come under their filters."""
+    wait_until(lambda: victim.see().counter[4] >= 6, 10, "all are confined")
+
+
+def kill_each_checkpoint(guard: GuardProcess, victim: Victim, kills: int) -> None:
+    """So many kills, each soon after a checkpoint of its own."""
+    for _ in range(kills):
+        guard.wait("checkpoint", since=guard.mark())
+        kill_at_random(guard, victim, 1, (0.0, 0.03))
+
+
 @pytest.mark.parametrize(
     "command", ["cells", "sandbox --in-child", "sandbox --kill --in-child", "under harmless cells"]
 )
 def test_children_and_threads_are_under_their_filters_again(command: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
-        wait_until(lambda: "cells" not in command or victim.see().counter[4] >= 6, 10, "all are confined")
+        if "cells" in command:
+            wait_confined(victim)
         guard.wait("checkpoint", since=guard.mark(), count=2)
         before = confinement(victim)
         assert len(set(before.values())) > 1
-        for _ in range(10):
-            guard.wait("checkpoint", since=guard.mark())
-            kill_at_random(guard, victim, 1, (0.0, 0.03))
+        kill_each_checkpoint(guard, victim, 10)
         wait_until(lambda: confinement(victim) == before, 5, "everybody is under his filters")
 
 
 def test_threads_that_got_a_wrong_number_are_gone(tmp_path: Path) -> None:
     """Although their filters refuse exit(2): otherwise they would call it for ever, in the way of checkpoints."""
     with Victim("cells", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
-        wait_until(lambda: victim.see().counter[4] >= 6, 10, "all are confined")
+        wait_confined(victim)
         guard.wait("checkpoint", since=guard.mark(), count=2)
         before = confinement(victim)
         with forks_beside(victim):
-            for _ in range(20):
-                guard.wait("checkpoint", since=guard.mark())
-                kill_at_random(guard, victim, 1, (0.0, 0.03))
+            kill_each_checkpoint(guard, victim, 20)
         wait_until(lambda: confinement(victim) == before, 5, "nobody else is there")
 
 
 def test_what_a_dead_guard_has_left_in_a_child_is_gone(tmp_path: Path) -> None:
     """Its filter refuses exit(2), so the task that maps what a guard needs outlives that guard."""
     with Victim("cells", tmp_path) as victim, GuardProcess(config(0), [victim.pid]) as guard:
-        wait_until(lambda: victim.see().counter[4] >= 6, 10, "all are confined")
+        wait_confined(victim)
         before, left = confinement(victim), 0
         for nth in range(20, 400, 20):
             since = guard.mark()

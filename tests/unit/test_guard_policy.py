@@ -6,7 +6,8 @@ from __future__ import annotations
 import random
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 import pytest
@@ -210,18 +211,21 @@ def test_a_failed_checkpoint_leaves_what_is_held_unless_nothing_is_any_good() ->
     assert c.policy_missed(policy, c.AVC_UNSUPPORTED, False)
 
 
+def pauses(guard: Guarded, next_try: Callable[[Any, int, int], int], count: int) -> list[float]:
+    """Before each of so many tries, none of which succeeds, or takes time."""
+    found = []
+    for _ in range(count):
+        due = next_try(guard.policy, guard.c.policy_due(guard.config, guard.now), guard.now)
+        found.append((due - guard.now) / SECOND)
+        guard.now = due
+    return found
+
+
 def test_what_cannot_be_protected_is_tried_less_and_less_often() -> None:
     guard = Guarded(interval_s=1)
     c, policy = guard.c, guard.policy
 
-    def tries(count: int) -> list[float]:
-        """The pauses between so many refusals."""
-        pauses = []
-        for _ in range(count):
-            due = c.policy_refused(policy, c.policy_due(guard.config, guard.now), guard.now)
-            pauses.append((due - guard.now) / SECOND)
-            guard.now = due
-        return pauses
+    tries = partial(pauses, guard, c.policy_refused)
 
     assert tries(10) == [1, 1, 2, 4, 8, 16, 32, 60, 60, 60]
     c.policy_retry(policy)  # on command
@@ -239,14 +243,7 @@ def test_one_that_holds_nothing_is_tried_soon() -> None:
     guard = Guarded(interval_s=3600)
     c, policy = guard.c, guard.policy
 
-    def tries(count: int) -> list[float]:
-        """The pauses after so many that were missed, each of which takes no time."""
-        pauses = []
-        for _ in range(count):
-            due = c.policy_without(policy, c.policy_due(guard.config, guard.now), guard.now)
-            pauses.append((due - guard.now) / SECOND)
-            guard.now = due
-        return pauses
+    tries = partial(pauses, guard, c.policy_without)
 
     # Longer and longer: there may be a reason that stays.
     assert tries(13) == [0.1, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 60, 60]

@@ -21,8 +21,8 @@
 static struct sockaddr_un name[64];
 static socklen_t name_bytes[64];
 
-/* `path` begins with '@' for an abstract name. */
-/* An abstract name (unix(7)) gets a number of its own: the previous test's victim may still have it. */
+/* `path` begins with '@' for an abstract name (unix(7)), which gets a number of its own: the previous
+ * test's victim may still have it. */
 static int bind_unix(int type, const char *path)
 {
 	struct sockaddr_un address = { .sun_family = AF_UNIX };

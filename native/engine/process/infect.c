@@ -522,8 +522,7 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 	}
 	t->seen = true;
 	rewind_prepare(t);
-	if (process_check_dying(process, err) || thread_stop(process, t, err) ||
-	    thread_await(process, t, err) || thread_read(t, err)) {
+	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
 		thread_release(t);
 		return NULL;
 	}
@@ -702,7 +701,7 @@ static void end_left_porters(struct process *process)
 int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		   struct avc_error *err)
 {
-	struct thread *thread;
+	struct thread *thread = NULL;
 	int result;
 
 	/* Another thread may be waiting for children of any kind (__WALL).  Or install a filter for all
@@ -711,9 +710,10 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 		return do_stopped(process, slots, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	if (process_check_dying(process, err) == 0)
+	if (process_check_dying(process, err) == 0) {
 		end_left_porters(process);
-	thread = stop_main(process, err);
+		thread = stop_main(process, err);
+	}
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
 	if (thread)
 		thread_release(thread);

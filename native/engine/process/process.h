@@ -114,13 +114,13 @@ bool process_is_home(const struct process *process);
 
 /* ---- stop.c --------------------------------------------------------------------- */
 
+/* Before any stop: fails with AVC_GONE when a signal is killing it.  A stop would wake the thread that
+ * writes its core into a pipe, and the kernel would give the core up (fs/coredump.c, dump_emit()). */
+int process_check_dying(const struct process *process, struct avc_error *err) warn_unused;
 /* Stops every thread of one process; process_let_go() releases them.  A thread of ordinary priority
  * may have to wait for a CPU before it stops, during which one of real-time priority should not
  * stand still: those are stopped last and released first. */
 int process_stop(struct process *process, struct avc_error *err) warn_unused;
-/* Before any stop: fails with AVC_GONE when a signal is killing it.  A stop would wake the thread that
- * writes its core into a pipe, and the kernel would give the core up (fs/coredump.c, dump_emit()). */
-int process_check_dying(const struct process *process, struct avc_error *err) warn_unused;
 /* The same in parts, for several at a time: forgets the state of the last freeze; interrupts known
  * threads of one kind, and says whether there are any of the other; waits for those; waits for all,
  * and finds the others. */

@@ -122,6 +122,11 @@ static int thread_of(const struct image *image, pid_t tid)
 	return -1;
 }
 
+static bool is_over(const struct stop *stop)
+{
+	return stop->kind == STOP_EXIT || stop->kind == STOP_DYING || stop->kind == STOP_DEADLINE;
+}
+
 /* Lets it make the call that returns it to the app, and not one step more. */
 static void bring_home(pid_t tid)
 {
@@ -131,7 +136,7 @@ static void bring_home(pid_t tid)
 		if (ptrace(PTRACE_SYSCALL, tid, NULL, 0L))
 			return;
 		stop = tracee_wait(tid, 0);
-		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+		if (is_over(&stop))
 			return;
 		stops += stop.kind == STOP_SYSCALL;
 	}
@@ -149,7 +154,7 @@ static bool halt(const struct sandbox *sandbox, pid_t tid)
 		stop = tracee_wait(tid, 0);
 		if (stop.kind == STOP_TRAP || stop.kind == STOP_GROUP)
 			return true;
-		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+		if (is_over(&stop))
 			return false;
 		if (stop.kind == STOP_SYSCALL)
 			at_call(sandbox, tid, SANDBOX_OPTIONS);
@@ -159,12 +164,12 @@ static bool halt(const struct sandbox *sandbox, pid_t tid)
 
 /* It is about to call exit(2), which its own filters may refuse, for ever, or kill the process for:
  * supervised until they have no say any more. */
-static void end(const struct sandbox *sandbox, pid_t tid)
+static void see_off(const struct sandbox *sandbox, pid_t tid)
 {
 	while (ptrace(PTRACE_SYSCALL, tid, NULL, 0L) == 0) {
 		const struct stop stop = tracee_wait(tid, 0);
 
-		if (stop.kind == STOP_EXIT || stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+		if (is_over(&stop))
 			return;
 		if (stop.event == PTRACE_EVENT_EXIT) {
 			ptrace(PTRACE_DETACH, tid, NULL, 0L);
@@ -202,7 +207,7 @@ static int halt_one(const struct sandbox *sandbox, pid_t tid, uint32_t *halted,
 	*halted += frame != 0;
 	(void)arch_regs_set(tid, &regs); /* fails if it was killed */
 	if (!frame && tid != sandbox->pid)
-		end(sandbox, tid);
+		see_off(sandbox, tid);
 	return 0;
 }
 
@@ -231,7 +236,7 @@ void sandbox_go(struct sandbox *sandbox)
 		tracee_signal(sandbox->pid, image->stop_signal);
 	slot->running = slot->threads;
 	if (image->headless) { /* the others regard it as exited */
-		end(sandbox, sandbox->pid);
+		see_off(sandbox, sandbox->pid);
 		proc_await_end(sandbox->pid);
 	}
 	for (uint32_t i = 0; i < sandbox->count; i++)
