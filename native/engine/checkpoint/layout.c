@@ -14,8 +14,9 @@
 #include "checkpoint.h"
 
 #define STEP (64u << 10)
+#define READ_TRIES 16
 
-bool layout_read(pid_t pid, char **text, size_t *bytes)
+static bool read_once(pid_t pid, char **text, size_t *bytes)
 {
 	const int fd = proc_open(pid, "maps", O_RDONLY);
 	size_t used = 0;
@@ -42,6 +43,38 @@ bool layout_read(pid_t pid, char **text, size_t *bytes)
 	if (fd >= 0)
 		close(fd);
 	return n == 0 && used;
+}
+
+/* Since Linux 6.17 (fs/proc/task_mmu.c) a file "maps" is read without the lock of the mappings: one
+ * that a thread merges with the next one meanwhile is there twice, as it was and as it is. */
+static bool is_torn(const char *text)
+{
+	unsigned long last_end = 0;
+
+	for (const char *line = text; *line;) {
+		char *rest;
+		const unsigned long start = strtoul(line, &rest, 16);
+
+		if (start < last_end || *rest != '-')
+			return true;
+		last_end = strtoul(rest + 1, NULL, 16);
+		line = strchr(rest, '\n');
+		if (!line)
+			return true;
+		line++;
+	}
+	return false;
+}
+
+bool layout_read(pid_t pid, char **text, size_t *bytes)
+{
+	for (int i = 0; i < READ_TRIES; i++) {
+		if (!read_once(pid, text, bytes))
+			return false;
+		if (!is_torn(*text))
+			return true;
+	}
+	return false;
 }
 
 static bool continues(const struct mapping *last, const struct mapping *m)
