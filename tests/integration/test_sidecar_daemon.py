@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from avckpt.cli.client import Client
+from avckpt.cli.client import COMMAND_S, Client
 
 from testkit.cgroups import freezer
 from testkit.family import look
@@ -493,6 +493,22 @@ def test_a_stuck_sidecar_delays_a_hook_by_a_second_and_catches_up(local: LocalSi
     local.wait_for(web, state="protected")
     os.kill(web.app_pid, signal.SIGKILL)
     local.wait_for(web, restores=1)
+
+
+@SHARED
+def test_a_stuck_sidecar_keeps_nobody_waiting_for_a_table(local: LocalSidecar) -> None:
+    assert local.process is not None
+    local.process.send_signal(signal.SIGSTOP)
+    try:
+        started = time.monotonic()
+        said = local.avckpt("ps", check=False)
+        took_s = time.monotonic() - started
+    finally:
+        local.process.send_signal(signal.SIGCONT)
+    assert said.status == 3  # no sidecar
+    assert said.stderr.count("\n") == 1
+    assert "the sidecar did not answer within 10 s: is it paused (podman unpause avckpt-sidecar)?" in said.stderr
+    assert took_s < COMMAND_S
 
 
 @SHARED

@@ -19,8 +19,10 @@ from avckpt.guard import Command
 
 Json = dict[str, Any]
 
-TIMEOUT_S = 40.0
-"""For a whole request; longer than the sidecar itself waits for the engine."""
+COMMAND_S = 40.0
+"""How long to wait for what the sidecar has to say of a command; longer than it waits for the engine itself."""
+ANSWER_S = 10.0
+"""The same for what it knows without asking anybody; a busy machine may take some of that."""
 
 LOG = "its log (podman logs avckpt-sidecar)"
 SERVICE = "avckpt-sidecar.service"
@@ -85,7 +87,7 @@ class Client:
 
     def metrics(self) -> str:
         """The metrics, as Prometheus reads them."""
-        with self._connected() as connection:
+        with self._connected(ANSWER_S) as connection:
             connection.request("GET", "/metrics")
             return connection.getresponse().read().decode("utf-8", "replace")
 
@@ -105,7 +107,7 @@ class Client:
             query["after"] = str(after)
         if since is not None:
             query["since"] = repr(since)
-        with self._connected() as connection:
+        with self._connected(COMMAND_S) as connection:
             connection.request("GET", f"/v1/events?{urlencode(query)}")
             response = connection.getresponse()
             if response.status != HTTPStatus.OK:
@@ -117,15 +119,15 @@ class Client:
                     yield _decode(line[len(b"data: ") :])
 
     def _request(self, method: str, target: str) -> Json:
-        with self._connected() as connection:
+        with self._connected(COMMAND_S if method == "POST" else ANSWER_S) as connection:
             connection.request(method, target)
             body = connection.getresponse().read()
         return _decode(body)
 
     @contextlib.contextmanager
-    def _connected(self) -> Iterator[_UnixConnection]:
+    def _connected(self, patience_s: float) -> Iterator[_UnixConnection]:
         """A connection; its errors in the body are converted to ours."""
-        connection = _UnixConnection(self._path)
+        connection = _UnixConnection(self._path, patience_s)
         try:
             yield connection
         except (FileNotFoundError, ConnectionRefusedError) as error:
@@ -135,7 +137,8 @@ class Client:
             raise Denied(f"{self._path} is for root only: use sudo") from error
         except TimeoutError as error:
             raise SidecarUnreachable(
-                f"the sidecar did not answer within {TIMEOUT_S:g} s: is it paused? see {LOG}"
+                f"the sidecar did not answer within {patience_s:g} s: is it paused (podman unpause avckpt-sidecar)? "
+                f"See {LOG}"
             ) from error
         except (OSError, http.client.HTTPException) as error:
             raise SidecarUnreachable(f"the sidecar went away ({error}): see {LOG}") from error
@@ -146,13 +149,13 @@ class Client:
 class _UnixConnection(http.client.HTTPConnection):
     """HTTP over a Unix socket."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__("localhost", timeout=TIMEOUT_S)
-        self._path = path
+    def __init__(self, path: Path, patience_s: float) -> None:
+        super().__init__("localhost", timeout=patience_s)
+        self._path, self._patience_s = path, patience_s
 
     def connect(self) -> None:
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(TIMEOUT_S)
+        self.sock.settimeout(self._patience_s)
         self.sock.connect(str(self._path))
 
 
