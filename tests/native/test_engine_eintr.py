@@ -35,9 +35,10 @@ def test_no_eintr_over_hundreds_of_checkpoints(tmp_path: Path) -> None:
     """One process with a thread blocked in each call; every checkpoint interrupts all of them."""
     # Above clone's way: one generation, so that the cost is the freeze and not the bookkeeping.
     with Victim("eintr all 0", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
-        # A few may miss their deadline on a busy machine.
-        done = guard.burst(CHECKPOINTS + 100, timeout_s=360)
-        assert done["taken"] >= CHECKPOINTS, done
+        taken = 0
+        while taken < CHECKPOINTS:
+            # Some may miss their deadline on a busy machine.
+            taken += guard.burst(CHECKPOINTS - taken, timeout_s=360)["taken"]
         calls = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
         victim.wait_beats(20)
         victim.check()

@@ -192,8 +192,9 @@ uint64_t guard_exec_check_due(const struct avc_guard *guard);
 /* Our tracees that are on no list. */
 void guard_kill_lost(struct avc_guard *guard);
 void guard_await_spares(struct avc_guard *guard);
-/* Waits for those that are just ending, for 50 ms at most. */
-void guard_wait_ended(void);
+/* Waits for those that are just ending, for 50 ms at most, also until init has reaped them: until then
+ * they count where processes are limited. */
+void guard_wait_ended(struct avc_guard *guard);
 void guard_reap_dead(struct avc_guard *guard);
 /* A tracee that is a known thread of the app, or ours (tracee_know()). */
 bool guard_knows_tracee(pid_t tid, const void *guard);

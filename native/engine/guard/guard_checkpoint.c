@@ -11,7 +11,6 @@
 
 #define SPARE_NS (NS_PER_S / 2)
 #define READ_NS (2 * NS_PER_S) /* to read its state while it is stopped                        */
-#define INIT_REAPS_US 3000     /* processes that we have reaped are zombies of init until then   */
 #define QUIESCE_STEP_NS NS_PER_MS
 #define TAKE_TRIES 4
 #define VFORK_NS (2 * NS_PER_S)
@@ -573,8 +572,7 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	}
 	if (tracee_ending_pidfd(0) < 0)
 		return false;
-	guard_wait_ended();
-	usleep(INIT_REAPS_US);
+	guard_wait_ended(guard);
 	return true;
 }
 

@@ -260,7 +260,7 @@ bool guard_bring_back(struct avc_guard *guard, const struct avc_report *report,
 		/* Nor may templates lost by this death keep anything open.  And where processes are
 		 * limited, they count, as spares do. */
 		if (ending)
-			guard_wait_ended();
+			guard_wait_ended(guard);
 		init_channel_working(&guard->channel);
 		(void)last_pid_lock(guard->channel.numbers_fd, true);
 		guard->helper = NULL; /* restore_app() ends it */

@@ -124,13 +124,20 @@ static bool knows_process(pid_t pid, const void *arg)
 	return guard_owns(pid, guard);
 }
 
-void guard_wait_ended(void)
+void guard_wait_ended(struct avc_guard *guard)
 {
 	const uint64_t end = now_ns() + ENDED_NS;
+	bool lent;
 
 	tracee_end_now();
 	while (tracee_reap_ending() && now_ns() < end)
 		usleep(ENDED_STEP_US);
+	/* On a busy machine it would not get to it in time. */
+	lent = rt_priority_lend(guard->channel.init);
+	while (init_channel_has_zombies(&guard->channel) && now_ns() < end)
+		usleep(ENDED_STEP_US);
+	if (lent)
+		rt_priority_reclaim(guard->channel.init);
 }
 
 /* Collects late spares (spare_make) that have been made by now. */

@@ -290,6 +290,20 @@ void init_channel_kill_lost(const struct init_channel *channel,
 	} while (any);
 }
 
+bool init_channel_has_zombies(const struct init_channel *channel)
+{
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(channel->init, children, CHILDREN_MAX);
+	bool any = false;
+
+	for (int i = 0; i < count; i++) {
+		struct proc_stat stat;
+
+		any |= proc_stat(children[i], &stat) == 0 && stat.state == 'Z' && stat.threads == 1;
+	}
+	return any;
+}
+
 /* Can still use what the app shares with others: it, or one of its threads, is not exiting yet. */
 static bool may_run(const struct proc_stat *stat)
 {

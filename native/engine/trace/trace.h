@@ -677,6 +677,8 @@ int init_channel_report(struct init_channel *channel, struct avc_report *report)
 int init_channel_verdict(const struct init_channel *channel, enum avc_verdict_kind kind,
 			 struct avc_error *err);
 void init_channel_working(struct init_channel *channel);
+/* Whether a child of init has ended that init has not reaped yet. */
+bool init_channel_has_zombies(const struct init_channel *channel);
 /* Kills and reaps the children of init that are tracees of ours but not known:
  * clones of which we never heard, because the thread that made them was killed before
  * it could tell.  They would keep the app's number (as a process group's) and, as
