@@ -41,6 +41,10 @@ def local(group: Path, tmp_path: Path) -> Iterator[LocalSidecar]:
         yield sidecar
 
 
+def templates_of(init: int) -> list[int]:
+    return [pid for pid in children_of(init) if comm_of(pid) == "avckpt-tmpl"]
+
+
 def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_path: Path) -> None:
     subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
     first = (group / "memory.limit_in_bytes").exists()
@@ -65,7 +69,8 @@ def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_pa
     wait_until(lambda: local.row(web)["dropped"], 10, "a generation is given up")
     assert local.row(web)["last_dropped"] == "generation 1: memory is short"
     # The other one is left to the kernel, which knows where there is room and where not.
-    (newest,) = (pid for pid in children_of(web.init_pid) if comm_of(pid) == "avckpt-tmpl")
+    wait_until(lambda: len(templates_of(web.init_pid)) == 1, 10, "its template has ended")
+    (newest,) = templates_of(web.init_pid)
     wait_until(lambda: 300 < int(Path(f"/proc/{newest}/oom_score_adj").read_text()) < 1000, 5, "its guard knows of it")
     assert local.row(web)["generations"] == 1
     limit.write_text("-1" if first else "max")
