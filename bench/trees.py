@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-trees`: freeze and restore of process trees beside plain forks of as much memory.
 
-    .venv/bin/python -m bench.trees [--cycles 20] [--only freeze,workers,exec,commands]
+    .venv/bin/python -m bench.trees [--cycles 20] [--only freeze,restore,workers,exec,commands]
 
-Four questions, each with the limit that the project has set itself:
+Five questions, each with the limit that the project has set itself:
 
 - freeze:   a tree, against 1.5 times the sum of the forks of its processes plus 30 us per thread;
+- restore:  a tree, against twice the sum of the forks of its processes plus 0.3 ms for each of them;
 - workers:  restore of a main process with 8 prefork workers that share 200 MB, against 3 times the restore of
             one process of 200 MB; with small pages and with transparent huge pages;
 - exec:     what a child of 100 MB private memory that has executed a program adds to a restore, against the
@@ -47,6 +48,7 @@ AHEAD_S = 0.1
 """From a checkpoint to a kill: what a restore is spared of is done then."""
 COMMANDS = 1000
 TREES = ("tree 8", "tree 24 --threads 4", "prefork 8 200", "prefork 8 200 --thp", "prefork 2 20 --private 100")
+RESTORED = ("tree 8", "tree 24 --threads 4", "prefork 8 20", "prefork 30 5")
 PATIENCE_S = 60.0
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 132)
@@ -158,6 +160,16 @@ def measure_restore(command: str, cycles: int, folder: Path) -> float:
         return cycles_of(subject, cycles, take)
 
 
+def measure_trees(cycles: int, folder: Path) -> list[Figure]:
+    found = []
+    for command in RESTORED:
+        forks, processes = forks_ms(command, folder)
+        took = measure_restore(command, cycles, folder)
+        how = f"2 x {forks:.2f} (plain forks of its {processes} processes) + 0.3 x {processes}"
+        found.append(Figure(f"restore of `{command}`", took, 2 * forks + 0.3 * processes, how))
+    return found
+
+
 def measure_workers(cycles: int, folder: Path) -> list[Figure]:
     found = []
     for pages, option in (("", ""), (" of huge pages", " --thp")):
@@ -217,6 +229,7 @@ def measure_commands(cycles: int, folder: Path) -> list[Figure]:
 
 MEASURES: dict[str, Callable[[int, Path], list[Figure]]] = {
     "freeze": measure_freeze,
+    "restore": measure_trees,
     "workers": measure_workers,
     "exec": measure_exec,
     "commands": measure_commands,

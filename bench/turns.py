@@ -43,7 +43,7 @@ def engine(checkout: Path, output: Path, options: argparse.Namespace) -> Figures
 
 def trees(checkout: Path, output: Path, options: argparse.Namespace) -> Figures:
     """bench.trees: process trees."""
-    _run(checkout, "bench.trees", output, "--only", "freeze,workers", options=options)
+    _run(checkout, "bench.trees", output, "--only", "freeze,restore,workers", options=options)
     return {figure["what"]: figure["measured_ms"] for figure in json.loads(output.read_text())}
 
 

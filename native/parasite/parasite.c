@@ -194,6 +194,13 @@ static void say(struct inj_slot *slot, enum inj_state state)
 	futex_wake(&slot->state);
 }
 
+/* It asks for no more TIDs. */
+static void say_spawned(struct inj_slot *slot)
+{
+	__atomic_store_n(&slot->spawned, 1, __ATOMIC_RELEASE);
+	futex_wake(&slot->spawned);
+}
+
 /* The first failure wins; any thread may have one. */
 static void fail(struct inj_slot *slot, enum inj_step at, int32_t tid, long error)
 {
@@ -205,6 +212,7 @@ static void fail(struct inj_slot *slot, enum inj_step at, int32_t tid, long erro
 		slot->error_tid = tid;
 	}
 	say(slot, INJ_FAILED);
+	say_spawned(slot);
 	leave();
 }
 
@@ -484,6 +492,7 @@ __attribute__((section(".text.entry"))) void inj_restore(struct inj_slot *slot)
 	run_setup(slot, me->tid, slot->setup[INJ_BEFORE]);
 	for (uint32_t i = 1; i < slot->threads; i++)
 		spawn(slot, thread_of(slot, i), &last);
+	say_spawned(slot);
 	set_up(slot, me);
 	if (__atomic_add_fetch(&slot->ready, 1, __ATOMIC_ACQ_REL) != slot->threads) {
 		uint32_t n;

@@ -195,6 +195,7 @@ enum inj_step {
 struct inj_slot {
 	uint32_t state;   /* futex, enum inj_state                          */
 	uint32_t go;      /* futex, enum inj_go, set by the engine          */
+	uint32_t spawned; /* futex: 1 when all threads exist, or it has failed   */
 	uint32_t ready;   /* threads that have set themselves up            */
 	uint32_t running; /* threads about to return to the app */
 	/* ns_last_pid, written by the engine's helper on request               */

@@ -397,8 +397,15 @@ void generation_close_tables(const struct generation *generation)
 		struct process *process = generation->image[i].process;
 		struct avc_error gone = { 0 };
 
+		closing[i] = closing[i] &&
+			     parasite_halt(process->holder, &process->parasite.control->holder,
+					   &gone) == 0;
+	}
+	for (uint32_t i = 1; i < generation->images; i++) {
+		struct avc_error gone = { 0 };
+
 		if (closing[i] &&
-		    parasite_finish(process->holder, &process->parasite.control->holder, &gone))
+		    tracee_await(generation->image[i].process->holder, NULL, &gone) != STOP_TRAP)
 			continue; /* it was killed, and has nothing open any more */
 	}
 }

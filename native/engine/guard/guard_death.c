@@ -3,6 +3,7 @@
  * What follows a death: a restore, or the end of init.
  */
 #include <errno.h>
+#include <poll.h>
 #include <signal.h>
 #include <string.h>
 #include <sys/wait.h>
@@ -12,6 +13,7 @@
 
 #define HOLDER_NS (1 * NS_PER_S) /* busy machines */
 #define HOLDER_STEP_US 200
+#define ENDS_NS (20 * NS_PER_MS)
 
 /* ---- death and restore --------------------------------------------------------- */
 
@@ -351,6 +353,30 @@ static void await_killed_holder(struct avc_guard *guard)
 	}
 }
 
+/* Before their PIDs are free, they have to end, and init to reap them.  While they do, the guard leaves
+ * the CPUs to them. */
+static void kill_descendants(const struct avc_guard *guard)
+{
+	const uint64_t end = now_ns() + ENDS_NS;
+
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		const struct process *process = guard->tree.process[i];
+
+		if (!process->pid)
+			continue;
+		process_kill(process);
+		process_hasten(process);
+		(void)rt_priority_lend(guard->channel.init);
+	}
+	for (uint32_t i = 0; i < guard->tree.processes; i++) {
+		struct pollfd ending = { .fd = guard->tree.process[i]->pidfd, .events = POLLIN };
+		const uint64_t now = now_ns();
+
+		if (guard->tree.process[i]->pid && now < end)
+			(void)poll(&ending, 1, (int)((end - now) / NS_PER_MS));
+	}
+}
+
 void guard_app_dies(struct avc_guard *guard)
 {
 	guard->foreseen = guard->main.pid;
@@ -402,9 +428,7 @@ void guard_app_died(struct avc_guard *guard, const struct avc_report *report)
 	if (reason == AVC_REASON_COMMAND && guard->restore_generation)
 		guard_drop_newer(guard, guard->restore_generation);
 	ready_helper(guard);
-	for (uint32_t i = 0; i < guard->tree.processes; i++)
-		if (guard->tree.process[i]->pid)
-			process_kill(guard->tree.process[i]);
+	kill_descendants(guard);
 	await_killed_holder(guard);
 	if (init_channel_kill_leftovers(&guard->channel, guard_owns, reap_tracees, guard, &error)) {
 		guard_give_up(guard, report, AVC_REASON_FAILED, &error);

@@ -196,11 +196,10 @@ static int protect_piece(struct syscall_batch *batch, const struct piece *piece,
 	return 0;
 }
 
-/* Its mappings have to exist before they are filled; all else can wait for the next calls. */
-static int map_new(const struct remap *r, struct syscall_batch *batch, struct avc_error *err)
+static int map_new(const struct remap *r, struct syscall_batch *batch, bool *changed,
+		   struct avc_error *err)
 {
 	const struct mapping *given = NULL;
-	bool changed = false;
 
 	for (uint32_t i = 0; i < r->pieces; i++) {
 		const struct piece *piece = &r->piece[i];
@@ -208,16 +207,13 @@ static int map_new(const struct remap *r, struct syscall_batch *batch, struct av
 		if (!piece->want ||
 		    (piece->kept && mapping_same_protection(piece->is, piece->want)))
 			continue;
-		changed = true;
+		*changed = true;
 		if (!piece->kept && map_piece(r, batch, piece, &given, err))
 			return -1;
 		if ((piece->kept || mapping_key(piece->want)) && protect_piece(batch, piece, err))
 			return -1;
 	}
-	return give_file(r, batch, NULL, &given, err) ||
-			       (changed && syscall_batch_flush(batch, err))
-		       ? -1
-		       : 0;
+	return give_file(r, batch, NULL, &given, err);
 }
 
 static int advice_of(enum page what)
@@ -235,8 +231,18 @@ static int advice_of(enum page what)
 	}
 }
 
-static int fill(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
-		struct avc_error *err)
+int remap_map(const struct remap *r, struct syscall_batch *batch, bool *changed,
+	      struct avc_error *err)
+{
+	*changed = false;
+	return unmap(r, batch, err) || move_special(r, batch, err) ||
+			       map_new(r, batch, changed, err)
+		       ? -1
+		       : 0;
+}
+
+int remap_fill(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
+	       struct avc_error *err)
 {
 	bool opened = false;
 
@@ -262,13 +268,4 @@ static int fill(const struct remap *r, struct syscall_batch *batch, struct copie
 			return -1;
 	}
 	return 0;
-}
-
-int remap_apply(const struct remap *r, struct syscall_batch *batch, struct copier *copier,
-		struct avc_error *err)
-{
-	return unmap(r, batch, err) || move_special(r, batch, err) || map_new(r, batch, err) ||
-			       fill(r, batch, copier, err)
-		       ? -1
-		       : 0;
 }

@@ -66,6 +66,7 @@ static void reset(const struct parasite *parasite, uint32_t slot_number)
 
 	slot->state = INJ_IDLE;
 	slot->go = INJ_GO_NOT;
+	slot->spawned = 0;
 	slot->ready = 0;
 	slot->running = 0;
 	slot->error = 0;
@@ -189,6 +190,7 @@ static int rebuild(struct restore *restore, struct avc_error *err)
 		restore->fork_ns = now_ns() - start;
 		if (restore->tree && slot->state == INJ_IDLE) {
 			if (restore_tree_make(restore->tree, err) ||
+			    restore_tree_begin(restore->tree, err) ||
 			    send_off(image, restore->pid, &restore->sandbox, err))
 				return -1;
 			restore->fork_ns = now_ns() - start;
@@ -217,8 +219,16 @@ int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
 	const struct parasite *parasite = &image->process->parasite;
 
 	reset(parasite, image->slot);
-	last_pid_serve(helper, parasite_slot(parasite, image->slot));
+	if (helper)
+		last_pid_serve(helper, parasite_slot(parasite, image->slot));
 	return send_off(image, pid, sandbox, err);
+}
+
+void restore_await_spawned(const struct image *image, int pidfd)
+{
+	struct inj_slot *slot = parasite_slot(&image->process->parasite, image->slot);
+
+	(void)wait_word(&slot->spawned, 0, pidfd, now_ns() + READY_NS);
 }
 
 int restore_await(const struct image *image, int pidfd, struct sandbox *sandbox,

@@ -49,10 +49,12 @@ int restore_app(struct restore *restore, struct avc_error *err) warn_unused;
 
 /* ---- restore.c, for one process of several ----------------------------------------- */
 
-/* For a stopped process that equals its template: has it restore itself; waits until it has;
- * reports what failed; releases it. */
+/* For a stopped process that equals its template: has it restore itself, with the help that it needs
+ * for TIDs (NULL: it has one thread); waits until it has; reports what failed; releases it. */
 int restore_start(const struct image *image, struct last_pid *helper, pid_t pid,
 		  struct sandbox **sandbox, struct avc_error *err) warn_unused;
+/* Waits until it needs no more help, at most; not for one in a sandbox. */
+void restore_await_spawned(const struct image *image, int pidfd);
 int restore_await(const struct image *image, int pidfd, struct sandbox *sandbox,
 		  struct avc_error *err) warn_unused;
 void restore_note(const struct image *image, pid_t pid, struct avc_error *notes);
@@ -65,7 +67,9 @@ struct restore_tree;
 struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err);
 /* The main process (a stopped tracee) forks the others. */
 int restore_tree_make(struct restore_tree *tree, struct avc_error *err) warn_unused;
-/* They restore themselves, except the main one. */
+/* They restore themselves, except the main one: at first those that need nothing for it, which is
+ * done while that does; then the others, until all are ready. */
+int restore_tree_begin(struct restore_tree *tree, struct avc_error *err) warn_unused;
 int restore_tree_start(struct restore_tree *tree, struct avc_error *err) warn_unused;
 void restore_tree_go(struct restore_tree *tree);
 void restore_tree_kill(struct restore_tree *tree);
@@ -77,10 +81,13 @@ pid_t restore_tree_pid(const struct restore_tree *tree, uint32_t index);
 
 struct copier;
 
-/* Does it, with a batch that is in the parasite of the plan's process already; but the copier
- * may not have finished. */
-int remap_apply(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
-		struct avc_error *err) warn_unused;
+/* Lists the calls for it, in a batch that is in the parasite of the plan's process already: first
+ * its mappings, which have to exist (if any of them is `changed`) before they are filled; then what
+ * is in them.  The copier may not have finished. */
+int remap_map(const struct remap *plan, struct syscall_batch *batch, bool *changed,
+	      struct avc_error *err) warn_unused;
+int remap_fill(const struct remap *plan, struct syscall_batch *batch, struct copier *copier,
+	       struct avc_error *err) warn_unused;
 
 /* ---- copier.c ----------------------------------------------------------------------- */
 

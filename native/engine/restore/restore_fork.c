@@ -11,8 +11,12 @@
 
 #include "restore_tree.h"
 
-#define TRIES 64
+#define TRY_NS NS_PER_S
 #define TRY_AGAIN_US 200
+/* Calls of a parent for one fork: it closes a socket, receives one, and forks. */
+#define FORK_CALLS 3
+/* Children of one parent that make their own channels. */
+#define FEW 2
 
 /* A process to be forked, and its parents. */
 struct birth {
@@ -22,17 +26,121 @@ struct birth {
 	pid_t number;
 	int exit_signal;
 	bool orphan;
+	/* A child of the host, fresh from fork(2), which gives its memory to this one; 0: none. */
+	pid_t copy;
 	/* What to do meanwhile; NULL: nothing. */
 	void (*meanwhile)(void *arg);
 	void *arg;
 };
 
-void restore_fork_note(struct restore_tree *restored, int exit_signal)
+void restore_fork_note(struct forked *parent, int exit_signal)
 {
 	/* clone(2) takes any number of eight bits for a signal. */
 	if (exit_signal > 0 && exit_signal < NSIG)
-		restored->flush |= UINT64_C(1) << (exit_signal - 1);
+		parent->flush |= UINT64_C(1) << (exit_signal - 1);
 }
+
+int restore_fork_await(struct forked *forked, struct avc_error *err)
+{
+	if (!forked->fresh)
+		return 0;
+	forked->fresh = false;
+	if (tracee_await(forked->pid, NULL, err) != STOP_TRAP)
+		return -1;
+	return parasite_own(forked->batch.parasite, forked->pid)
+		       ? fail_errno(err, forked->pid, "restore", "ptrace(SETOPTIONS)",
+				    "it was killed")
+		       : 0;
+}
+
+int restore_fork_rest(struct forked *forked, struct avc_error *err)
+{
+	const struct syscall_batch *batch = &forked->batch;
+	struct inj_call *runner;
+
+	if (!forked->forking)
+		return 0;
+	forked->forking = false;
+	if (forked->passed < 0)
+		return tracee_settle(batch->pid, err);
+	runner = &batch->parasite->control->runner;
+	call_add(runner, SYS_close, (uint64_t)forked->passed);
+	forked->passed = -1;
+	return parasite_run(batch->pid, runner, err);
+}
+
+/* ---- one fork after the other ----------------------------------------------------------------- */
+
+static uint32_t children_of(const struct restore_tree *restored, const struct forked *host)
+{
+	uint32_t children = 0;
+
+	for (uint32_t i = 1; i < restored->generation->images; i++)
+		children += restored->generation->image[i].process &&
+			    &restored->forked[restore_plan_place(restored->generation, i)->host] ==
+				    host;
+	return children;
+}
+
+/* It begins a list of forks, or goes on with it. */
+static int list_fork(const struct restore_tree *restored, struct forked *host, int exit_signal,
+		     struct fd_channel *passed, struct avc_error *err)
+{
+	struct syscall_batch *by = &host->batch;
+	struct inj_call *runner = &by->parasite->control->runner;
+
+	if (host->forking && host->calls + FORK_CALLS >= INJ_CALLS_MAX &&
+	    restore_fork_rest(host, err))
+		return -1;
+	if (!host->asked) {
+		host->asked = true;
+		/* On a busy machine it would compete with its own children, too. */
+		boost_begin(by->pid);
+		if (children_of(restored, host) > FEW &&
+		    syscall_batch_share_fd_channel(by, &host->channel, err))
+			return -1;
+	}
+	if (!host->forking) {
+		call_begin(runner, INJ_AFTER_PARK);
+		host->calls = 0;
+		if (syscall_batch_send(by, runner, err))
+			return -1;
+	}
+	if (host->passed >= 0)
+		call_add(runner, SYS_close, (uint64_t)host->passed);
+	host->passed = -1;
+	syscall_batch_pass_socket(&host->channel, by->parasite, runner, passed);
+	call_add(runner, SYS_clone, (uint64_t)exit_signal & CSIGNAL);
+	host->calls += FORK_CALLS;
+	return 0;
+}
+
+/* A child of its own, in its session.  Only the event of the fork is awaited: neither does the
+ * parent stop once more before its next fork, nor is the child's stop awaited here. */
+static int fork_next(const struct birth *birth, struct forked *forked, struct avc_error *err)
+{
+	struct restore_tree *restored = birth->restored;
+	struct forked *host = birth->host;
+	const struct inj_call *runner = &host->batch.parasite->control->runner;
+	const bool follows = restored->last_number && restored->last_number + 1 == birth->number;
+
+	if (list_fork(restored, host, birth->exit_signal, &forked->inherited, err) ||
+	    (!follows && last_pid_set(restored->restore->helper, birth->number - 1, err)))
+		return -1;
+	/* Unless another task is cloned meanwhile (restore_fork_keeper()). */
+	restored->last_number = birth->number;
+	/* If that is refused, it rests. */
+	host->forking = false;
+	if (parasite_run_clone_while(host->batch.pid, runner, birth->meanwhile, birth->arg,
+				     &forked->pid, err))
+		return -1;
+	host->forking = forked->fresh = forked->traced = true;
+	syscall_batch_note_passed(runner, &forked->inherited);
+	host->passed = forked->inherited.theirs;
+	return 0;
+}
+
+/* ---- any fork --------------------------------------------------------------------------------- */
 
 /* One clone of a stopped task that rests in the parasite; *child is in its first stop. */
 static int clone_task(struct syscall_batch *batch, struct inj_call *call, uint64_t flags,
@@ -64,9 +172,8 @@ static int take_back(struct syscall_batch *host, pid_t child, struct avc_error *
 	return syscall_batch_flush(host, err);
 }
 
-/* A child, with the wanted PID unless another process has taken it.  `copy`: a child of the host,
- * fresh from fork(2), which gives its memory to this one; 0: none. */
-static int fork_once(const struct birth *birth, pid_t copy, pid_t *child, struct avc_error *err)
+/* A child, with the wanted PID unless another process has taken it. */
+static int fork_once(const struct birth *birth, pid_t *child, struct avc_error *err)
 {
 	struct restore_tree *restored = birth->restored;
 	struct syscall_batch *by = &birth->by->batch;
@@ -74,7 +181,7 @@ static int fork_once(const struct birth *birth, pid_t copy, pid_t *child, struct
 	/* Siblings' PIDs are often consecutive; a request takes two wake-ups. */
 	const bool follows = !birth->orphan && restored->last_number &&
 			     restored->last_number + 1 == birth->number;
-	const bool sibling = copy || (birth->by != birth->host && !birth->orphan);
+	const bool sibling = birth->copy || (birth->by != birth->host && !birth->orphan);
 	struct syscall_batch from = *by;
 	int result;
 
@@ -82,12 +189,12 @@ static int fork_once(const struct birth *birth, pid_t copy, pid_t *child, struct
 	/* An orphan's parent has exited: so does an intermediate one. */
 	if (birth->orphan && clone_task(by, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
 		return -1;
-	if (copy)
-		from.pid = copy;
+	if (birth->copy)
+		from.pid = birth->copy;
 	result = (!follows && last_pid_set(restored->restore->helper, birth->number - 1, err)) ||
 		 clone_task(&from, runner,
-			    ((uint64_t)birth->exit_signal & CSIGNAL) | (copy ? CLONE_VM : 0) |
-				    (sibling ? CLONE_PARENT : 0),
+			    ((uint64_t)birth->exit_signal & CSIGNAL) |
+				    (birth->copy ? CLONE_VM : 0) | (sibling ? CLONE_PARENT : 0),
 			    birth, child, err);
 	if (birth->orphan && take_back(by, from.pid, err))
 		return -1;
@@ -107,35 +214,36 @@ static int take_back_untold(struct syscall_batch *host, pid_t inside, struct avc
 	return 0;
 }
 
-/* Until it has the PID. The kernel assigns it at the end of the fork (kernel/fork.c,
- * copy_process()), when everything is copied: a big process may never get it where others fork all
- * the time.  So the first with another PID is kept as a copy.  Handing over its memory takes no
- * time. */
-static int give_birth(const struct birth *birth, pid_t *child, struct avc_error *err)
+/* Until it has the PID, which a dead process has until init gets a CPU to reap it.  The kernel
+ * assigns it at the end of the fork (kernel/fork.c, copy_process()), when everything is copied: a big
+ * process may never get it where others fork all the time.  So the first with another PID is kept as
+ * a copy.  Handing over its memory takes no time. */
+static int give_birth(struct birth *birth, pid_t *child, struct avc_error *err)
 {
 	struct restore_tree *restored = birth->restored;
 	struct syscall_batch *host = &birth->host->batch;
-	pid_t copy = 0;
+	const uint64_t end = now_ns() + TRY_NS;
 
-	for (int i = 0; i < TRIES; i++) {
+	for (bool again = birth->copy; now_ns() < end; again = true) {
 		struct avc_error failed = { 0 };
 		bool made;
 
-		if (i)
+		if (again) {
+			init_channel_working(restored->restore->channel);
 			usleep(TRY_AGAIN_US);
-		if (i)
-			restore_fork_note(restored, birth->exit_signal);
+			restore_fork_note(birth->host, birth->exit_signal);
+		}
 		*child = 0;
-		made = fork_once(birth, copy, child, &failed) == 0;
+		made = fork_once(birth, child, &failed) == 0;
 		if (made && proc_inside(*child) == birth->number) {
 			restored->last_number = birth->number;
-			return copy ? take_back(host, copy, err) : 0;
+			return birth->copy ? take_back(host, birth->copy, err) : 0;
 		}
-		if (made && !copy && !birth->orphan) {
-			copy = *child;
+		if (made && !birth->copy && !birth->orphan) {
+			birth->copy = *child;
 			continue;
 		}
-		if (!made && !*child && !copy) {
+		if (!made && !*child && !birth->copy) {
 			*err = failed;
 			return -1;
 		}
@@ -146,10 +254,10 @@ static int give_birth(const struct birth *birth, pid_t *child, struct avc_error 
 		if (made)
 			continue;
 		/* One of them was killed, or exceeds a limit on processes. */
-		if ((copy && take_back(host, copy, err)) ||
+		if ((birth->copy && take_back(host, birth->copy, err)) ||
 		    take_back_untold(host, birth->number, err))
 			return -1;
-		copy = 0;
+		birth->copy = 0;
 	}
 	return fail(err, AVC_KERNEL, EEXIST, birth->number, "restore", "clone",
 		    "PID %d is taken by somebody else", birth->number);
@@ -170,6 +278,7 @@ static struct keeper *add_keeper(struct restore_tree *restored, uint32_t host, p
 	}
 	keeper = &restored->keeper[restored->keepers++];
 	*keeper = (struct keeper){ host, session, restored->forked[host] };
+	keeper->task.forking = false;
 	keeper->task.pid = keeper->task.batch.pid = pid;
 	keeper->task.batch.inside = proc_inside(pid);
 	keeper->task.batch.socket = keeper->task.pidfd = -1;
@@ -208,11 +317,11 @@ int restore_fork_keeper(struct restore_tree *restored, uint32_t index, pid_t ses
 static struct keeper *renew(struct restore_tree *restored, uint32_t host, pid_t number, bool group,
 			    struct avc_error *err)
 {
-	const struct birth birth = { .restored = restored,
-				     .host = &restored->forked[host],
-				     .by = &restored->forked[host],
-				     .number = number,
-				     .exit_signal = group ? 0 : SIGCHLD };
+	struct birth birth = { .restored = restored,
+			       .host = &restored->forked[host],
+			       .by = &restored->forked[host],
+			       .number = number,
+			       .exit_signal = group ? 0 : SIGCHLD };
 	struct keeper *keeper;
 	pid_t pid;
 
@@ -248,21 +357,78 @@ static struct forked *maker_of(struct restore_tree *restored, const struct place
 	return keeper ? &keeper->task : NULL;
 }
 
+/* In its host's session, and by that itself; otherwise by a keeper, or by an intermediate task. */
+static bool is_plain(const struct generation *generation, uint32_t index)
+{
+	const struct place *place = restore_plan_place(generation, index);
+
+	return generation->image[index].parent != PARENT_INIT && place->host == place->memory &&
+	       (place->born == PLACE_ANY || place->born == generation->image[place->host].session);
+}
+
+/* Returns whether it has its PID; what it has inherited is noted. */
+static bool has_number(struct forked *forked, pid_t number)
+{
+	struct proc_status status;
+
+	if (proc_status(forked->pid, &status) || status.inside != number)
+		return false;
+	forked->group = status.group;
+	forked->session = status.session;
+	return true;
+}
+
+/* Its PID was taken: it serves as a copy, if nobody has killed it. */
+static pid_t keep_copy(const struct birth *birth, struct forked *forked, struct avc_error *err)
+{
+	struct avc_error gone = { 0 };
+	const pid_t copy = forked->pid;
+
+	forked->traced = false;
+	if (restore_fork_await(forked, &gone) == 0)
+		return copy;
+	restore_fork_note(birth->host, birth->exit_signal);
+	return take_back(&birth->host->batch, copy, err) ? -1 : 0;
+}
+
 int restore_fork(struct restore_tree *restored, uint32_t index, void (*meanwhile)(void *arg),
 		 void *arg, struct avc_error *err)
 {
 	const struct image *image = &restored->generation->image[index];
 	const struct place *place = restore_plan_place(restored->generation, index);
+	struct forked *forked = &restored->forked[index];
 	struct birth birth = { .restored = restored,
 			       .host = &restored->forked[place->host],
-			       .by = maker_of(restored, place, err),
 			       .number = image->inside,
 			       .exit_signal = image->exit_signal,
 			       .orphan = image->parent == PARENT_INIT,
 			       .meanwhile = meanwhile,
 			       .arg = arg };
+	const bool plain = is_plain(restored->generation, index);
+	pid_t copy;
 
-	return birth.by ? give_birth(&birth, &restored->forked[index].pid, err) : -1;
+	forked->batch = birth.host->batch;
+	forked->batch.inside = image->inside;
+	forked->batch.socket = -1;
+	if (plain && fork_next(&birth, forked, err))
+		return -1;
+	if (plain && has_number(forked, birth.number))
+		return 0;
+	restored->last_number = 0;
+	/* The others use what the parasite has for forks. */
+	if (restore_fork_rest(&restored->forked[place->memory], err))
+		return -1;
+	copy = plain ? keep_copy(&birth, forked, err) : 0;
+	birth.copy = copy;
+	birth.by = copy < 0 ? NULL : maker_of(restored, place, err);
+	if (!birth.by || give_birth(&birth, &forked->pid, err))
+		return -1;
+	forked->traced = true;
+	if (birth.copy != copy)
+		close_fd(&forked->inherited.ours); /* by that one only */
+	return has_number(forked, birth.number)
+		       ? 0
+		       : fail_errno(err, forked->pid, "restore", "open(status)", "it was killed");
 }
 
 int restore_fork_end(struct restore_tree *restored, struct avc_error *err)
@@ -271,7 +437,7 @@ int restore_fork_end(struct restore_tree *restored, struct avc_error *err)
 		const struct keeper *keeper = &restored->keeper[--restored->keepers];
 
 		if (keeper->session != PLACE_ANY)
-			restore_fork_note(restored, SIGCHLD);
+			restore_fork_note(&restored->forked[keeper->host], SIGCHLD);
 		if (take_back(&restored->forked[keeper->host].batch, keeper->task.pid, err))
 			return -1;
 	}

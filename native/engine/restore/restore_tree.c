@@ -2,9 +2,12 @@
  *
  * The kernel has no call that gives a process another parent, and a fork of a template is init's
  * child.  So only the main process is forked from its template; the others are forked by their own
- * restored parents, under their own PIDs, and then made into what their templates are (become()):
+ * restored parents, under their own PIDs, and then made into what their templates are (advance()):
  * memory (remap.c), descriptors, signal handlers, credentials.  All of them are tracees that are
  * parked in a parasite until everything is ready.
+ *
+ * Each of these steps takes a wake-up, and on a busy machine a wait for a CPU.  So they are taken by
+ * all children at the same time, while their parent forks the next one.
  */
 #include <errno.h>
 #include <poll.h>
@@ -22,8 +25,6 @@
 #define STEP_NS (5 * NS_PER_S)
 #define GONE_NS NS_PER_S
 #define FILES_SPARE 64
-/* The number of children with their own fd_channel. */
-#define FEW 2
 
 struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error *err)
 {
@@ -37,9 +38,12 @@ struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error 
 	}
 	restored->restore = restore;
 	restored->generation = generation;
-	restored->fd_channel = (struct fd_channel){ -1, -1 };
-	for (uint32_t i = 0; i < generation->images; i++)
-		restored->forked[i].pidfd = restored->forked[i].batch.socket = -1;
+	for (uint32_t i = 0; i < generation->images; i++) {
+		struct forked *forked = &restored->forked[i];
+
+		forked->pidfd = forked->batch.socket = forked->passed = -1;
+		forked->inherited = forked->channel = (struct fd_channel){ -1, -1 };
+	}
 	if (restore_plan_begin(generation, 0, err) == 0)
 		restored->copier = copier_new(err);
 	if (!restored->copier) {
@@ -48,17 +52,6 @@ struct restore_tree *restore_tree_new(struct restore *restore, struct avc_error 
 	}
 	return restored;
 }
-
-/* Done while a process forks, which takes long if it is big: finds out how the child will differ
- * from it, and completes its last child. */
-struct chores {
-	struct restore_tree *restored;
-	uint32_t child; /* 0: one that will be a zombie                          */
-	uint32_t last;  /* 0: none                                             */
-	struct avc_error error;
-	int result;
-	bool done;
-};
 
 /* A zombie: it exits again, and is not waited for. */
 static int make_zombie(struct forked *forked, const struct image *image, struct avc_error *err)
@@ -114,17 +107,16 @@ static int place(struct restore_tree *restored, uint32_t index, struct avc_error
 {
 	const struct image *image = &restored->generation->image[index];
 	const pid_t before = restore_plan_place(restored->generation, index)->before;
-	struct syscall_batch *batch = &restored->forked[index].batch;
-	struct proc_stat stat;
+	struct forked *forked = &restored->forked[index];
+	struct syscall_batch *batch = &forked->batch;
 
-	if (proc_stat(batch->pid, &stat))
-		return fail_errno(err, batch->pid, "restore", "open(stat)", "it was killed");
 	if (image->session == image->inside) {
 		if (before != PLACE_ANY && restore_fork_keeper(restored, index, before, err))
 			return -1;
 		syscall_batch_add(batch, SYS_setsid);
+		forked->group = image->inside;
 	} else {
-		if (image->session > 0 && proc_inside(stat.session) != image->session)
+		if (image->session > 0 && forked->session != image->session)
 			fail(batch->notes, AVC_UNSUPPORTED, 0, image->inside, "restore", "",
 			     "process %d is not in the session it was in, whose leader is gone",
 			     image->inside);
@@ -175,15 +167,11 @@ static int try_group(struct syscall_batch *batch, pid_t group, bool hard, struct
 static int join_group(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
 	const struct image *image = &restored->generation->image[index];
-	struct syscall_batch *batch = &restored->forked[index].batch;
-	struct proc_status status;
+	struct forked *forked = &restored->forked[index];
+	struct syscall_batch *batch = &forked->batch;
 	int result;
 
-	if (image->group <= 0 || image->group == image->inside)
-		return 0;
-	if (proc_status(batch->pid, &status))
-		return fail_errno(err, batch->pid, "restore", "open(status)", "it was killed");
-	if (status.group == image->group)
+	if (image->group <= 0 || image->group == image->inside || forked->group == image->group)
 		return 0;
 	result = try_group(batch, image->group, false, err);
 	if (result <= 0)
@@ -194,29 +182,118 @@ static int join_group(struct restore_tree *restored, uint32_t index, struct avc_
 		       : 0;
 }
 
-static int become(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+/* The total time depends on the size: deadlines are per step. */
+static void go_on(struct restore_tree *restored)
 {
-	struct image *image = &restored->generation->image[index];
+	tracee_deadline_set(restored->restore->timer, STEP_NS);
+	init_channel_working(restored->restore->channel);
+}
+
+/* ---- from a fork to what its template is -------------------------------------------------- */
+
+static int advance(struct restore_tree *restored, uint32_t index, struct avc_error *err);
+
+/* Where no sibling is any more. */
+static int lie_down(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+{
+	const struct place *place = restore_plan_place(restored->generation, index);
+	struct forked *owner = &restored->forked[place->memory];
+	const uint32_t bed = owner->born++ % BATCH_BEDS, before = owner->bed[bed];
+
+	if (before && restored->forked[before].stage == STAGE_MOVES &&
+	    advance(restored, before, err))
+		return -1;
+	owner->bed[bed] = index;
+	syscall_batch_lie_down(&restored->forked[index].batch, bed);
+	return 0;
+}
+
+static int move_in(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+{
+	const struct image *image = &restored->generation->image[index];
 	struct forked *forked = &restored->forked[index];
 	struct syscall_batch *batch = &forked->batch;
-	const struct remap *plan = restore_plan_of(restored->generation, index, err);
-	const bool is_mains = restore_plan_place(restored->generation, index)->memory == 0;
 
-	if (!plan || syscall_batch_open_fd_channel(batch, is_mains ? &restored->fd_channel : NULL,
-						   &image->table, err))
-		return -1;
-	if (syscall_batch_change_parasite(batch, image->process, image->slot, err) ||
-	    process_attrs_take_keys(batch, err) ||
-	    remap_apply(plan, batch, restored->copier, err) ||
+	return restore_fork_await(forked, err) || lie_down(restored, index, err) ||
+			       syscall_batch_open_fd_channel(batch, &forked->inherited,
+							     &image->table, err) ||
+			       syscall_batch_map_parasite(batch, &image->process->parasite, err)
+		       ? -1
+		       : 0;
+}
+
+/* In its own parasite from now on. */
+static int map(struct restore_tree *restored, uint32_t index, bool *changed, struct avc_error *err)
+{
+	const struct image *image = &restored->generation->image[index];
+	struct syscall_batch *batch = &restored->forked[index].batch;
+	const struct remap *plan = restore_plan_of(restored->generation, index, err);
+
+	syscall_batch_enter(batch, &image->process->parasite, image->slot);
+	return !plan || process_attrs_take_keys(batch, err) || remap_map(plan, batch, changed, err)
+		       ? -1
+		       : 0;
+}
+
+static int fill(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+{
+	const struct image *image = &restored->generation->image[index];
+	struct syscall_batch *batch = &restored->forked[index].batch;
+	const struct remap *plan = restore_plan_of(restored->generation, index, err);
+
+	if (!plan || remap_fill(plan, batch, restored->copier, err) ||
 	    process_attrs_put(batch, image, err) || place(restored, index, err) ||
 	    syscall_batch_put_files(batch, &image->table, err))
 		return -1;
 	take_terminal(batch, image);
-	if (syscall_batch_flush(batch, err))
+	return 0;
+}
+
+/* One step, if need be when it has made the calls of the one before.  In the meantime others do
+ * theirs. */
+static int advance(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+{
+	struct forked *forked = &restored->forked[index];
+	struct syscall_batch *batch = &forked->batch;
+	bool changed = false;
+
+	go_on(restored);
+	if (forked->stage == STAGE_FORKED) {
+		forked->stage = STAGE_MOVES;
+		return move_in(restored, index, err) || syscall_batch_start(batch, err) ? -1 : 0;
+	}
+	if (syscall_batch_await(batch, err))
 		return -1;
+	if (forked->stage == STAGE_MOVES) {
+		forked->stage = STAGE_MAPS;
+		if (map(restored, index, &changed, err))
+			return -1;
+		if (changed)
+			return syscall_batch_start(batch, err);
+	}
+	if (forked->stage == STAGE_MAPS) {
+		forked->stage = STAGE_FILLS;
+		return fill(restored, index, err) || syscall_batch_start(batch, err) ? -1 : 0;
+	}
+	forked->stage = STAGE_WHOLE;
 	close_fd(&batch->socket);
 	return 0;
 }
+
+static bool is_on_its_way(const struct forked *forked)
+{
+	return forked->stage > STAGE_NONE && forked->stage < STAGE_WHOLE;
+}
+
+/* Done while a process forks, which takes long if it is big: finds out how the child will differ
+ * from it, and goes on with those before it. */
+struct chores {
+	struct restore_tree *restored;
+	uint32_t child; /* 0: one that will be a zombie                          */
+	struct avc_error error;
+	int result;
+	bool done;
+};
 
 static void do_chores(void *arg)
 {
@@ -228,15 +305,10 @@ static void do_chores(void *arg)
 	chores->done = true;
 	if (chores->child && !restore_plan_of(restored->generation, chores->child, &chores->error))
 		chores->result = -1;
-	else if (chores->last)
-		chores->result = become(restored, chores->last, &chores->error);
-}
-
-/* The total time depends on the size: deadlines are per step. */
-static void go_on(struct restore_tree *restored)
-{
-	tracee_deadline_set(restored->restore->timer, STEP_NS);
-	init_channel_working(restored->restore->channel);
+	for (uint32_t i = 1; !chores->result && i < restored->generation->images; i++)
+		if (is_on_its_way(&restored->forked[i]) &&
+		    tracee_has_stopped(restored->forked[i].pid))
+			chores->result = advance(restored, i, &chores->error);
 }
 
 static int finish_copies(struct restore_tree *restored, struct avc_error *err)
@@ -244,6 +316,24 @@ static int finish_copies(struct restore_tree *restored, struct avc_error *err)
 	while (copier_help(restored->copier))
 		go_on(restored);
 	return copier_finish(restored->copier, err);
+}
+
+/* Only what is whole, and has all its memory, can fork others. */
+static int make_whole(struct restore_tree *restored, struct avc_error *err)
+{
+	bool more = true;
+
+	while (more) {
+		more = false;
+		for (uint32_t i = 1; i < restored->generation->images; i++) {
+			if (!is_on_its_way(&restored->forked[i]))
+				continue;
+			more = true;
+			if (advance(restored, i, err))
+				return -1;
+		}
+	}
+	return finish_copies(restored, err);
 }
 
 /* Its descriptors are below that, with room for temporary ones. */
@@ -254,35 +344,16 @@ static uint32_t files_of(const struct image *image)
 	return (table->count ? (uint32_t)table->entry[table->count - 1].fd : 0) + FILES_SPARE;
 }
 
-/* `last` is the one forked last, which is not complete yet; 0: none. */
-static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *last,
-		    struct avc_error *err)
+static int make_one(struct restore_tree *restored, uint32_t index, struct avc_error *err)
 {
 	const struct image *image = &restored->generation->image[index];
-	const uint32_t host = restore_plan_place(restored->generation, index)->host;
-	struct forked *forked = &restored->forked[index], *by = &restored->forked[host];
-	struct chores chores = { .restored = restored };
+	struct forked *forked = &restored->forked[index];
+	struct chores chores = { .restored = restored, .child = image->process ? index : 0 };
 
 	go_on(restored);
-	/* It has to be complete before it has children. */
-	if (host && host == *last) {
-		if (become(restored, *last, err))
-			return -1;
-		*last = 0;
-	}
-	/* ... and have all its memory. */
-	if (host && finish_copies(restored, err))
-		return -1;
-	chores.child = image->process ? index : 0;
-	chores.last = *last;
-	*last = 0;
 	if (restore_fork(restored, index, do_chores, &chores, err))
 		return -1;
-	forked->traced = true;
-	forked->batch = by->batch;
 	forked->batch.pid = forked->pid;
-	forked->batch.inside = image->inside;
-	forked->batch.socket = -1;
 	forked->pidfd = proc_pidfd_open(forked->pid);
 	if (forked->pidfd < 0)
 		return fail_errno(err, forked->pid, "restore", "pidfd_open", "it was killed");
@@ -292,10 +363,14 @@ static int make_one(struct restore_tree *restored, uint32_t index, uint32_t *las
 	}
 	if (image->process) {
 		process_attrs_lift_limits(forked->pid, image, files_of(image));
-		*last = index;
+		forked->stage = STAGE_FORKED;
 		return 0;
 	}
-	return place(restored, index, err) || syscall_batch_flush(&forked->batch, err) ? -1 : 0;
+	forked->stage = STAGE_WHOLE;
+	return restore_fork_await(forked, err) || place(restored, index, err) ||
+			       syscall_batch_flush(&forked->batch, err)
+		       ? -1
+		       : 0;
 }
 
 /* When no process will join a group that they lead any more. */
@@ -303,11 +378,12 @@ static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 {
 	for (uint32_t i = 0; i < restored->generation->images; i++) {
 		const struct image *image = &restored->generation->image[i];
+		const uint32_t host = restore_plan_place(restored->generation, i)->host;
 		struct forked *forked = &restored->forked[i];
 
 		if (image->process)
 			continue;
-		restore_fork_note(restored, image->exit_signal);
+		restore_fork_note(&restored->forked[host], image->exit_signal);
 		if (make_zombie(forked, image, err))
 			return -1;
 		forked->traced = false;
@@ -315,16 +391,16 @@ static int end_zombies(struct restore_tree *restored, struct avc_error *err)
 	return 0;
 }
 
-/* Discards the signals of zombies that exited again: their parents have had these already. */
-static int flush_signals(struct restore_tree *restored, struct syscall_batch *batch,
-			 struct avc_error *err)
+/* Discards the signals of zombies that exited again: it has had these already. */
+static int flush_signals(struct forked *parent, struct avc_error *err)
 {
+	struct syscall_batch *batch = &parent->batch;
 	avc_remote remote;
 	uint64_t *data;
 
 	do {
 		data = syscall_batch_data(batch, &remote);
-		data[0] = restored->flush;
+		data[0] = parent->flush;
 		data[1] = data[2] = 0;
 		syscall_batch_add(batch, SYS_rt_sigtimedwait, remote, 0, remote + 8, 8);
 		syscall_batch_soften(batch, NULL);
@@ -346,6 +422,7 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 
 	forked->pid = batch->pid = pid;
 	forked->traced = true;
+	forked->stage = STAGE_WHOLE;
 	forked->pidfd = proc_pidfd_open(pid);
 	batch->inside = slot->pid;
 	batch->notes = &restored->restore->notes;
@@ -362,6 +439,13 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 	take_terminal(batch, image);
 	if (syscall_batch_flush(batch, err))
 		return -1;
+	if (image->group > 0 && image->group != image->inside) {
+		struct proc_status status;
+
+		if (proc_status(pid, &status))
+			return fail_errno(err, pid, "restore", "open(status)", "it was killed");
+		forked->group = status.group;
+	}
 	slot->placed = 1;
 	restored->last_number = slot->pid;
 	return 0;
@@ -384,64 +468,65 @@ static int join_up(struct restore_tree *restored, struct avc_error *err)
 		    put_foreground(&restored->forked[i].batch, image, err))
 			return -1;
 	}
-	for (uint32_t i = 0; restored->flush && i < generation->images; i++)
-		if (generation->image[i].process &&
-		    flush_signals(restored, &restored->forked[i].batch, err))
+	for (uint32_t i = 0; i < generation->images; i++)
+		if (restored->forked[i].flush && generation->image[i].process &&
+		    flush_signals(&restored->forked[i], err))
 			return -1;
 	return 0;
 }
 
-/* An orphan may come before the one that forks it, although parents come before their children. */
-static int make_all(struct restore_tree *restored, uint32_t *last, struct avc_error *err)
+/* None of them forks any more. */
+static int end_forks(struct restore_tree *restored, struct avc_error *err)
+{
+	for (uint32_t i = 0; i < restored->generation->images; i++) {
+		struct forked *forked = &restored->forked[i];
+
+		if (restore_fork_rest(forked, err) ||
+		    syscall_batch_unshare_fd_channel(&forked->batch, &forked->channel, err))
+			return -1;
+	}
+	boost_end();
+	return 0;
+}
+
+/* First all children of the main process, then their children: an orphan may come before the one
+ * that forks it. */
+int restore_tree_make(struct restore_tree *restored, struct avc_error *err)
 {
 	const struct generation *generation = restored->generation;
 	uint32_t left = generation->images - 1, before = 0;
 
+	if (begin_main(restored, err))
+		return -1;
 	while (left && left != before) {
 		before = left;
 		for (uint32_t i = 1; i < generation->images; i++) {
 			const uint32_t host = restore_plan_place(generation, i)->host;
 
-			if (restored->forked[i].pid || !restored->forked[host].pid)
+			if (restored->forked[i].pid || restored->forked[host].stage != STAGE_WHOLE)
 				continue;
-			if (make_one(restored, i, last, err))
+			if (make_one(restored, i, err))
 				return -1;
 			left--;
 		}
+		if (make_whole(restored, err))
+			return -1;
 	}
-	return left ? fail(err, AVC_KERNEL, ELOOP, 0, "restore", "",
-			   "%u processes wait for each other to be made", left)
-		    : 0;
-}
-
-int restore_tree_make(struct restore_tree *restored, struct avc_error *err)
-{
-	struct syscall_batch *mains = &restored->forked[0].batch;
-	uint32_t last = 0;
-
-	if (begin_main(restored, err))
-		return -1;
-	if (restored->generation->images > FEW + 1 &&
-	    syscall_batch_share_fd_channel(mains, &restored->fd_channel, err))
-		return -1;
-	if (make_all(restored, &last, err))
-		return -1;
-	if (last && become(restored, last, err))
-		return -1;
-	if (syscall_batch_unshare_fd_channel(mains, &restored->fd_channel, err) ||
-	    finish_copies(restored, err))
-		return -1;
-	return join_up(restored, err);
+	if (left)
+		return fail(err, AVC_KERNEL, ELOOP, 0, "restore", "",
+			    "%u processes wait for each other to be made", left);
+	return end_forks(restored, err) ? -1 : join_up(restored, err);
 }
 
 /* ---- off they go ------------------------------------------------------------------------- */
 
-static int start_one(struct restore_tree *restored, uint32_t index, struct avc_error *err)
+static int start_one(struct restore_tree *restored, uint32_t index, struct last_pid *helper,
+		     struct avc_error *err)
 {
 	struct forked *forked = &restored->forked[index];
 
-	if (restore_start(&restored->generation->image[index], restored->restore->helper,
-			  forked->pid, &forked->sandbox, err))
+	if (restore_start(&restored->generation->image[index], helper, forked->pid,
+			  &forked->sandbox, err))
 		return -1;
 	forked->traced = false;
 	return 0;
@@ -465,18 +550,37 @@ static bool is_on_its_own(const struct image *image)
 	return image->threads == 1 && !image->sandboxed && !image->stop_signal;
 }
 
-int restore_tree_start(struct restore_tree *restored, struct avc_error *err)
+int restore_tree_begin(struct restore_tree *restored, struct avc_error *err)
 {
 	const struct generation *generation = restored->generation;
 
 	for (uint32_t i = 1; i < generation->images; i++)
 		if (generation->image[i].process && is_on_its_own(&generation->image[i]) &&
-		    start_one(restored, i, err))
+		    start_one(restored, i, NULL, err))
 			return -1;
+	return 0;
+}
+
+/* Their TIDs are chosen for one process after the other; everything else they do side by side. */
+int restore_tree_start(struct restore_tree *restored, struct avc_error *err)
+{
+	const struct generation *generation = restored->generation;
+
+	for (uint32_t i = 1; i < generation->images; i++) {
+		struct forked *forked = &restored->forked[i];
+
+		if (!generation->image[i].process || is_on_its_own(&generation->image[i]))
+			continue;
+		if (start_one(restored, i, restored->restore->helper, err))
+			return -1;
+		if (!forked->sandbox)
+			restore_await_spawned(&generation->image[i], forked->pidfd);
+		else if (await_one(restored, i, err))
+			return -1;
+	}
 	for (uint32_t i = 1; i < generation->images; i++)
-		if (generation->image[i].process &&
-		    ((!is_on_its_own(&generation->image[i]) && start_one(restored, i, err)) ||
-		     await_one(restored, i, err)))
+		if (generation->image[i].process && !restored->forked[i].sandbox &&
+		    await_one(restored, i, err))
 			return -1;
 	return 0;
 }
@@ -525,14 +629,16 @@ void restore_tree_kill(struct restore_tree *restored)
 
 void restore_tree_free(struct restore_tree *restored)
 {
+	boost_end();
 	if (!restored)
 		return;
 	for (uint32_t i = 0; i < restored->generation->images; i++) {
 		close_fd(&restored->forked[i].pidfd);
 		close_fd(&restored->forked[i].batch.socket);
+		close_fd(&restored->forked[i].inherited.ours);
+		close_fd(&restored->forked[i].channel.ours);
 	}
 	copier_free(restored->copier);
-	close_fd(&restored->fd_channel.ours);
 	free(restored->keeper);
 	free(restored);
 }

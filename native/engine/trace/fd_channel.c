@@ -38,6 +38,17 @@ void fd_letter_write(struct fd_letter *letter, avc_remote remote)
 	};
 }
 
+int fd_letter_number(const struct fd_letter *letter)
+{
+	const size_t bytes = letter->head.msg_controllen;
+	int fd;
+
+	if (bytes < CMSG_LEN(sizeof fd) || bytes > sizeof letter->control)
+		return -1;
+	memcpy(&fd, letter->control + CMSG_LEN(0), sizeof fd);
+	return fd;
+}
+
 void fd_table_free(struct fd_table *table)
 {
 	for (uint32_t i = 0; i < table->count; i++)

@@ -35,7 +35,25 @@ void syscall_batch_enter(struct syscall_batch *batch, const struct parasite *par
 	batch->list = (struct inj_syscall *)memory;
 	batch->list_max = INJ_FILES_BYTES / 4 / sizeof *batch->list;
 	batch->data = memory + INJ_FILES_BYTES / 4;
-	batch->listed = batch->softs = 0;
+	batch->listed = batch->softs = batch->running = 0;
+}
+
+/* Where several children of one process begin, in its parasite, behind data of its own. */
+struct bed {
+	struct inj_call call;
+	struct inj_syscall list[];
+};
+#define BED_BYTES (16u << 10)
+_Static_assert((BATCH_BEDS + 1) * BED_BYTES <= INJ_FILES_BYTES / 4, "room for all beds");
+
+void syscall_batch_lie_down(struct syscall_batch *batch, uint32_t bed)
+{
+	struct bed *place = (struct bed *)(batch->data + (bed + 1) * BED_BYTES);
+
+	batch->call = &place->call;
+	batch->list = place->list;
+	batch->list_max = (BED_BYTES - sizeof *place) / sizeof *batch->list;
+	batch->listed = batch->softs = batch->running = 0;
 }
 
 void syscall_batch_append(struct syscall_batch *batch, long nr, const uint64_t arg[6])
@@ -112,7 +130,7 @@ int syscall_batch_send(const struct syscall_batch *batch, struct inj_call *call,
 	return 0;
 }
 
-static int run(struct syscall_batch *batch, struct avc_error *err)
+int syscall_batch_start(struct syscall_batch *batch, struct avc_error *err)
 {
 	const uint32_t listed = batch->listed;
 	const uint64_t self = (uint64_t)batch->inside;
@@ -126,10 +144,10 @@ static int run(struct syscall_batch *batch, struct avc_error *err)
 			    "there is no room for so many system calls");
 	call_begin(batch->call, INJ_AFTER_PARK);
 	call_add(batch->call, INJ_LIST, parasite_remote(batch->parasite, batch->list), listed + 1);
-	return syscall_batch_send(batch, batch->call, err) || parasite_start(batch->pid, err) ||
-			       await_end(batch, &batch->list[listed - 1], err)
-		       ? -1
-		       : 0;
+	if (syscall_batch_send(batch, batch->call, err) || parasite_start(batch->pid, err))
+		return -1;
+	batch->running = listed;
+	return 0;
 }
 
 static const char *name_of(long nr)
@@ -173,11 +191,12 @@ static const struct soft *soft_of(const struct syscall_batch *batch, uint32_t in
 	return NULL;
 }
 
-int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err)
+int syscall_batch_await(struct syscall_batch *batch, struct avc_error *err)
 {
-	const uint32_t listed = batch->listed;
-	int result = run(batch, err);
+	const uint32_t listed = batch->running;
+	int result = listed ? await_end(batch, &batch->list[listed - 1], err) : 0;
 
+	batch->running = 0;
 	for (uint32_t i = 0; !result && i < listed; i++) {
 		const struct inj_syscall *s = &batch->list[i];
 		const struct soft *soft;
@@ -195,6 +214,11 @@ int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err)
 	}
 	batch->softs = 0;
 	return result;
+}
+
+int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err)
+{
+	return syscall_batch_start(batch, err) || syscall_batch_await(batch, err) ? -1 : 0;
 }
 
 /* One of any number; earlier ones are flushed when there is no more room. */
@@ -254,21 +278,18 @@ static int close_others(struct syscall_batch *batch, uint64_t first, const struc
 }
 
 /* Descriptor 0 is a socket whose other end is ours. */
-int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
+int syscall_batch_open_fd_channel(struct syscall_batch *batch, struct fd_channel *inherited,
 				  const struct fd_table *table, struct avc_error *err)
 {
 	avc_remote out;
 
-	if (fd_channel && fd_channel->ours >= 0) {
-		if (fd_channel->theirs)
-			syscall_batch_add(batch, SYS_dup3, (uint64_t)fd_channel->theirs, 0,
+	if (inherited->ours >= 0) {
+		batch->socket = inherited->ours;
+		inherited->ours = -1;
+		if (inherited->theirs)
+			syscall_batch_add(batch, SYS_dup3, (uint64_t)inherited->theirs, 0,
 					  O_CLOEXEC);
-		if (close_others(batch, 1, table, err))
-			return -1;
-		batch->socket = fcntl(fd_channel->ours, F_DUPFD_CLOEXEC, 3);
-		return batch->socket < 0 ? fail_errno(err, batch->pid, "restore", "fcntl",
-						      "no descriptor is left for its socket")
-					 : 0;
+		return close_others(batch, 1, table, err);
 	}
 	(void)syscall_batch_data(batch, &out);
 	if (close_others(batch, 0, table, err))
@@ -299,6 +320,37 @@ int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channe
 	return fd_channel->ours < 0 || syscall_batch_flush(batch, err) ? -1 : 0;
 }
 
+void syscall_batch_pass_socket(const struct fd_channel *fd_channel, const struct parasite *parasite,
+			       struct inj_call *call, struct fd_channel *passed)
+{
+	struct fd_letter *letter = (struct fd_letter *)call->out;
+	int ends[2];
+
+	*passed = (struct fd_channel){ -1, -1 };
+	if (fd_channel->ours < 0 || socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, ends))
+		return;
+	if (fd_send(fd_channel->ours, ends[1]) == 0) {
+		const avc_remote remote = parasite_remote(parasite, letter);
+
+		fd_letter_write(letter, remote);
+		call_add(call, SYS_recvmsg, (uint64_t)fd_channel->theirs, remote,
+			 MSG_CMSG_CLOEXEC | MSG_DONTWAIT);
+		passed->ours = ends[0];
+	} else {
+		close(ends[0]);
+	}
+	close(ends[1]);
+}
+
+void syscall_batch_note_passed(const struct inj_call *call, struct fd_channel *passed)
+{
+	if (passed->ours < 0)
+		return;
+	passed->theirs = fd_letter_number((const struct fd_letter *)call->out);
+	if (passed->theirs < 0)
+		close_fd(&passed->ours); /* it has no number left for one more */
+}
+
 int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
 				     struct avc_error *err)
 {
@@ -326,12 +378,9 @@ int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *er
 	return hand_over(batch, 0, fd, err);
 }
 
-/* From its parent's parasite into its own. */
-int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
-				  uint32_t slot, struct avc_error *err)
+int syscall_batch_map_parasite(struct syscall_batch *batch, const struct parasite *parasite,
+			       struct avc_error *err)
 {
-	const struct parasite *parasite = &process->parasite;
-
 	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
@@ -342,9 +391,6 @@ int syscall_batch_change_parasite(struct syscall_batch *batch, const struct proc
 	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
 			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1);
 	syscall_batch_add(batch, SYS_close, 1);
-	if (syscall_batch_flush(batch, err))
-		return -1;
-	syscall_batch_enter(batch, parasite, slot);
 	return 0;
 }
 

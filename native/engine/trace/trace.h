@@ -261,6 +261,8 @@ struct process {
 /* ---- tracee.c ---------------------------------------------------------------- */
 
 /* The one signal the library uses, thread-directed, to end a wait(2) in time. */
+/* Its signal, which interrupts calls and does nothing else. */
+int tracee_timer_signal(void);
 int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
 void tracee_deadline_set(timer_t timer, uint64_t ns);
 void tracee_deadline_clear(timer_t timer);
@@ -339,6 +341,8 @@ int tracee_ending_pidfd(uint32_t i);
 bool tracee_enters_call(pid_t tid);
 /* Whether it is a tracee of this thread. */
 bool tracee_is_ours(pid_t tid);
+/* Whether a tracee has stopped or ended, and tracee_wait() would return at once. */
+bool tracee_has_stopped(pid_t tid);
 /* Holders, and processes that are being created: they must not outlive us. */
 #define TRACE_OPTIONS_OURS (PTRACE_O_EXITKILL | TRACE_OPTIONS_APP)
 #define TRACE_OPTIONS_APP \
@@ -537,6 +541,8 @@ struct fd_letter {
 	uint8_t control[CMSG_SPACE(sizeof(int))] __attribute__((aligned(8)));
 };
 void fd_letter_write(struct fd_letter *letter, avc_remote remote);
+/* The number that the descriptor in it has got; -1: none. */
+int fd_letter_number(const struct fd_letter *letter);
 /* One descriptor over a socket (unix(7), SCM_RIGHTS). */
 int fd_send(int socket, int fd);
 /* The descriptors that a new process is to have. */
@@ -568,7 +574,8 @@ struct syscall_batch {
 		const char *problem;
 	} soft[BATCH_SOFTS]; /* of the calls, those that may fail                  */
 	uint32_t softs;
-	pid_t inside; /* for notes: soft failures                            */
+	uint32_t running; /* calls of the batch that was started                   */
+	pid_t inside;     /* for notes: soft failures                            */
 	struct avc_error *notes;
 	int socket; /* ours, through which it gets descriptors; -1     */
 };
@@ -588,6 +595,13 @@ int syscall_batch_append_any(struct syscall_batch *batch, struct avc_error *err,
 /* The last one may fail: then `problem`, if any, is noted. */
 void syscall_batch_soften(struct syscall_batch *batch, const char *problem);
 int syscall_batch_flush(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+/* The same in parts, for several tasks at a time.  Nothing listed: there is nothing to wait for. */
+int syscall_batch_start(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+int syscall_batch_await(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+/* Fresh from fork(2), in the parasite of its parent, whose batch this is a copy of: from now on it
+ * has a list of its own there, as up to BATCH_BEDS siblings at a time. */
+#define BATCH_BEDS 15
+void syscall_batch_lie_down(struct syscall_batch *batch, uint32_t bed);
 /* parasite_send(): the task makes those calls when it is resumed. */
 int syscall_batch_send(const struct syscall_batch *batch, struct inj_call *call,
 		       struct avc_error *err) warn_unused;
@@ -598,20 +612,26 @@ struct fd_channel {
 };
 
 /* Closes inherited descriptors, except those that it keeps; from then on it can be given
- * descriptors, each as number 1 until it is closed: by an inherited channel, if any, or its own. */
-int syscall_batch_open_fd_channel(struct syscall_batch *batch, const struct fd_channel *fd_channel,
+ * descriptors, each as number 1 until it is closed: by an inherited channel, if any, which it takes,
+ * or its own. */
+int syscall_batch_open_fd_channel(struct syscall_batch *batch, struct fd_channel *inherited,
 				  const struct fd_table *table, struct avc_error *err) warn_unused;
 #define FD_KEPT_MIN 2 /* 0 and 1 are for the channel                               */
-/* Of the main process, inherited by its children: making one takes longer than all transfers
- * through it.  None where there is no descriptor number left for it. */
+/* Of a process that forks several: it passes each of them a channel, which takes less time than
+ * their making their own.  None where there is no descriptor number left for it. */
 int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
 				   struct avc_error *err) warn_unused;
 int syscall_batch_unshare_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
 				     struct avc_error *err) warn_unused;
+/* One of its next calls, before a fork: it receives the other end of a new channel.  When it has:
+ * notes its number.  Both -1: there is none. */
+void syscall_batch_pass_socket(const struct fd_channel *fd_channel, const struct parasite *parasite,
+			       struct inj_call *call, struct fd_channel *passed);
+void syscall_batch_note_passed(const struct inj_call *call, struct fd_channel *passed);
 int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err) warn_unused;
-/* From its parent's parasite into its own. */
-int syscall_batch_change_parasite(struct syscall_batch *batch, const struct process *process,
-				  uint32_t slot, struct avc_error *err) warn_unused;
+/* That of its own, beside its parent's. */
+int syscall_batch_map_parasite(struct syscall_batch *batch, const struct parasite *parasite,
+			       struct avc_error *err) warn_unused;
 /* Its descriptors; it gets no more after that. */
 int syscall_batch_put_files(struct syscall_batch *batch, const struct fd_table *table,
 			    struct avc_error *err) warn_unused;
@@ -647,6 +667,12 @@ void last_pid_serve(struct last_pid *helper, struct inj_slot *slot);
 void last_pid_stop(struct last_pid *helper);
 /* Stops it, and waits until its processes are gone; NULL: nothing to do. */
 void last_pid_end(struct last_pid *helper);
+
+/* ---- boost.c ---------------------------------------------------------------------- */
+
+/* Until boost_end(), or the next one, the task has the guard's priority, if that is real-time. */
+void boost_begin(pid_t tid);
+void boost_end(void);
 
 /* ---- init_channel.c -------------------------------------------------------------- */
 

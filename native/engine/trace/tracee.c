@@ -31,7 +31,7 @@ static void nothing(int signal)
 	(void)signal;
 }
 
-static int timer_signal(void)
+int tracee_timer_signal(void)
 {
 	return SIGRTMAX - 2;
 }
@@ -40,18 +40,19 @@ static void install_handler(void)
 {
 	struct sigaction action = { .sa_handler = nothing }; /* no SA_RESTART: wait(2) ends */
 
-	sigaction(timer_signal(), &action, NULL);
+	sigaction(tracee_timer_signal(), &action, NULL);
 }
 
 int tracee_timer_new(timer_t *timer, struct avc_error *err)
 {
 	static pthread_once_t once = PTHREAD_ONCE_INIT;
-	struct sigevent event = { .sigev_notify = SIGEV_THREAD_ID, .sigev_signo = timer_signal() };
+	struct sigevent event = { .sigev_notify = SIGEV_THREAD_ID,
+				  .sigev_signo = tracee_timer_signal() };
 	sigset_t set;
 
 	pthread_once(&once, install_handler);
 	sigfillset(&set);
-	sigdelset(&set, timer_signal());
+	sigdelset(&set, tracee_timer_signal());
 	pthread_sigmask(SIG_SETMASK, &set, NULL);
 	event.sigev_notify_thread_id = (pid_t)syscall(SYS_gettid);
 	if (timer_create(CLOCK_MONOTONIC, &event, timer))
@@ -258,6 +259,15 @@ bool tracee_is_ours(pid_t tid)
 
 	return waitid(P_PID, (id_t)tid, &nothing_new,
 		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) == 0;
+}
+
+bool tracee_has_stopped(pid_t tid)
+{
+	siginfo_t info = { 0 };
+
+	return waitid(P_PID, (id_t)tid, &info,
+		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) ||
+	       info.si_pid;
 }
 
 #define PC_NS (20 * NS_PER_MS)
