@@ -16,6 +16,7 @@ from testkit.harness import SLOWNESS
 pytestmark = pytest.mark.shared_machine("timeouts of blocked calls are compared with the clock")
 
 CHECKPOINTS = 10_000 if os.environ.get("AVCKPT_LONG") == "1" else 500
+ROUSING = 1_000
 LONGEST, PUNCTUAL = 3, 7
 KINDS_AT = 8
 KINDS, TIMED = 43, 33
@@ -47,6 +48,16 @@ def test_no_eintr_over_hundreds_of_checkpoints(tmp_path: Path) -> None:
         later = victim.see().counter[KINDS_AT : KINDS_AT + KINDS]
         stuck = [n for n in range(KINDS) if n not in UNWOKEN and later[n] == calls[n]]
         assert stuck == [], f"of {victim.command}, as listed in eintr.c: {stuck}"
+
+
+def test_a_signal_ends_a_call_whenever_it_comes(tmp_path: Path) -> None:
+    """Also while the guard holds the thread that it is for, or has sent it back into its call."""
+    with Victim("roused", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
+        assert guard.burst(ROUSING, timeout_s=100 * SLOWNESS)["taken"] >= ROUSING // 2
+        ended = victim.see().counter[:2]
+        victim.wait_beats(20)
+        victim.check()
+        assert min(ended) > ROUSING // 20, ended
 
 
 @pytest.mark.parametrize(("seconds", "interval_s", "late_s"), [(2.0, 0.1, 0.4), (3.0, 0.01, 0.4), (0.3, 0.02, 0.4)])

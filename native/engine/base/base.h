@@ -215,6 +215,7 @@ enum mapping_flag {
 	MAPPING_ONLY_HERE = 4096, /* no other process could map it: memory.c */
 	MAPPING_SPECIAL = 8192,   /* mapping_is_special()                    */
 	MAPPING_FIXED = 16384,    /* de, pf, mm: a driver's, or huge pages   */
+	MAPPING_TAGGED = 32768,   /* mt: aarch64's MTE                       */
 	MAPPING_KEYS = 15 << 16   /* the number of its protection key (pkeys(7)) */
 };
 #define MAPPING_KEY_ONE (1 << 16)

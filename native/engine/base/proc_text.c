@@ -106,6 +106,7 @@ static const struct {
 	{ "hg", MAPPING_HUGE },      { "nh", MAPPING_SMALL },      { "dd", MAPPING_DONTDUMP },
 	{ "mg", MAPPING_MERGEABLE }, { "gd", MAPPING_GROWING },    { "sl", MAPPING_SEALED },
 	{ "de", MAPPING_FIXED },     { "pf", MAPPING_FIXED },      { "mm", MAPPING_FIXED },
+	{ "mt", MAPPING_TAGGED },
 };
 
 /* " rd wr mr mw me ac " */

@@ -257,7 +257,7 @@ bool memory_needs_fork(const struct process *process)
 		if (memory->areas.area[i].wiped)
 			return true;
 	for (uint32_t i = 0; i < memory->kinds.count; i++)
-		if (memory->kinds.area[i].flags & MAPPING_KEYS)
+		if (memory->kinds.area[i].flags & (MAPPING_KEYS | MAPPING_TAGGED))
 			return true;
 	return memory->dontfork;
 }

@@ -157,8 +157,8 @@ static bool is_only_here(pid_t template, const struct mapping *m)
 
 static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
 {
-	const uint32_t kind = m->flags &
-			      (MAPPING_DROPPABLE | MAPPING_GROWING | MAPPING_SEALED | MAPPING_KEYS);
+	const uint32_t kind = m->flags & (MAPPING_DROPPABLE | MAPPING_GROWING | MAPPING_SEALED |
+					  MAPPING_TAGGED | MAPPING_KEYS);
 
 	if (kind && mapping_is_special(m))
 		return kind | MAPPING_SPECIAL;

@@ -578,5 +578,6 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 	/* Strict mode is in force again when it is resumed: nothing happens in between. */
 	seccomp_end_supervision(thread->tid);
 	thread->borrowed = false;
+	thread->sent_back = true;
 	return 0;
 }

@@ -416,11 +416,14 @@ void rewind_call(struct process *process, struct thread *thread)
 		if (!r->mark || arch_result_set(thread->tid, -ERESTARTNOHAND))
 			return; /* another call, or it was killed */
 		arch_result_note(regs, -ERESTARTNOHAND);
+		thread->sent_back = true;
 		if (arch_call_mark_set(thread->tid, regs, r->mark))
 			return;
 	} else if (arch_syscall_result(regs) != -ERESTARTNOHAND || !is_rewound(thread)) {
 		return;
-	} /* else stopped again before it ran: nothing to change */
+	} else { /* stopped again before it ran: nothing to change */
+		thread->sent_back = true;
+	}
 	r->sleeps_known = false;
 	if (now >= r->due_ns)
 		answer_late(thread);

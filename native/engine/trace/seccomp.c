@@ -157,6 +157,7 @@ static const struct kind wanted_to_restore[] = {
 	{ SYS_rt_sigtimedwait, ANY },
 	{ SYS_pkey_free, ANY },
 	{ SYS_pkey_mprotect, ANY },
+	ARCH_ROOM_CALLS
 };
 
 /* Of processes below the main one, which are made as forks of it.  They are not supervised for all

@@ -11,6 +11,9 @@
 
 #include "trace.h"
 
+#define ERESTARTNOHAND 514 /* include/linux/errno.h */
+#define ERESTART_RESTARTBLOCK 516
+
 struct thread *thread_find(struct process *process, pid_t tid)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++)
@@ -147,6 +150,8 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 		return -1;
 	}
 	thread->stopped = true;
+	thread->entering = false;
+	thread->sent_back = false;
 	thread->vetted = false;
 	thread->stop_signal = tracee_group_signal();
 	if (arch_regs_get(thread->tid, &thread->regs)) {
@@ -165,7 +170,60 @@ void thread_runs_on(struct thread *thread, const struct avc_error *err)
 		thread->stopped = false;
 }
 
-void thread_release(struct thread *thread)
+/* A signal that comes before the thread is back in its call should end the call, but where the kernel
+ * does not know any more that there was one, the handler would only delay it.  So the thread is traced
+ * until it has entered the call, and we do what the kernel does elsewhere (see_off()).
+ *
+ * Whether -ERESTARTSYS becomes EINTR depends on sigaction's flags: those calls are restarted. */
+static bool must_enter(const struct thread *thread)
+{
+	const long result = arch_syscall_result(&thread->regs);
+
+	return ARCH_FORGETS_CALLS && thread->sent_back && arch_syscall_nr(&thread->regs) >= 0 &&
+	       (result == -ERESTARTNOHAND || result == -ERESTART_RESTARTBLOCK);
+}
+
+static bool is_caught(pid_t tid, int signal)
+{
+	struct proc_status status;
+
+	return proc_status(tid, &status) == 0 && status.caught >> (signal - 1) & 1;
+}
+
+/* At a stop of a thread that enters its call: releases it, unless it has to be resumed for another
+ * stop. */
+static void see_off(struct thread *thread, const struct stop *stop)
+{
+	const long signal = stop->kind == STOP_SIGNAL ? stop->signal : 0;
+	struct arch_regs regs = thread->regs;
+
+	if (signal && !is_caught(thread->tid, (int)signal)) {
+		ptrace(PTRACE_SYSCALL, thread->tid, NULL, signal);
+		return;
+	}
+	if (signal) {
+		arch_result_note(&regs, -EINTR);
+		(void)arch_regs_set(thread->tid, &regs); /* fails if it was killed */
+	}
+	thread->entering = false;
+	thread->attached = ptrace(PTRACE_DETACH, thread->tid, NULL, signal) != 0;
+}
+
+void thread_see_off(struct thread *thread)
+{
+	while (thread->entering) {
+		const struct stop stop = tracee_wait(thread->tid, 0);
+
+		if (stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
+			return; /* threads_tend_stragglers() does it */
+		if (stop.kind == STOP_EXIT)
+			thread->entering = thread->attached = false;
+		else
+			see_off(thread, &stop);
+	}
+}
+
+static void begin_release(struct thread *thread)
 {
 	struct avc_error ignored = { 0 };
 
@@ -173,6 +231,11 @@ void thread_release(struct thread *thread)
 		return;
 	if (thread->borrowed)
 		thread_give_back(thread, &ignored);
+	if (must_enter(thread) && ptrace(PTRACE_SYSCALL, thread->tid, NULL, 0L) == 0) {
+		thread->entering = true;
+		thread->stopped = false;
+		return;
+	}
 	if (ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) == 0) {
 		thread->attached = false;
 		thread->stopped = false;
@@ -182,11 +245,17 @@ void thread_release(struct thread *thread)
 	thread->stopped = false;
 }
 
+void thread_release(struct thread *thread)
+{
+	begin_release(thread);
+	thread_see_off(thread);
+}
+
 void thread_let_go(const struct process *process, struct thread *thread)
 {
 	if (thread->attached && thread->stopped)
 		rewind_count_stop(process, thread);
-	thread_release(thread);
+	begin_release(thread);
 }
 
 /* Or its parasite has been replaced, and it returns without us. */
@@ -252,6 +321,11 @@ static bool straggle(struct process *process, struct thread *thread)
 			stop.kind = STOP_TRAP;
 	}
 
+	if (thread->entering && stop.kind != STOP_EXIT) {
+		if (stop.kind != STOP_NONE && stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
+			see_off(thread, &stop);
+		return thread->attached;
+	}
 	switch (stop.kind) {
 	case STOP_NONE:
 		/* It may have returned by itself meanwhile, and would never stop again.  Before that
@@ -267,6 +341,7 @@ static bool straggle(struct process *process, struct thread *thread)
 		seccomp_end_supervision(tid);
 		thread->attached = false;
 		thread->borrowed = false;
+		thread->entering = false;
 		return false;
 	case STOP_FORK:
 		take_child(process, thread, stop.message);

@@ -113,6 +113,8 @@ struct thread {
 	uint32_t filter_count;         /* ... when it was queried (state/filters.c)        */
 	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has checked it at this stop                */
+	bool sent_back;        /* into its call, at this stop (ARCH_FORGETS_CALLS)        */
+	bool entering;         /* that, and still traced: thread_let_go()                  */
 	struct arch_regs regs; /* as of the stop, EINTR already replaced        */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
@@ -362,8 +364,10 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 void thread_runs_on(struct thread *thread, const struct avc_error *err);
 /* Releases it without a trace.  A thread that could not be stopped stays attached: a straggler. */
 void thread_release(struct thread *thread);
-/* The same after a freeze: its duration does not count as part of a call's timeout. */
+/* The same after a freeze: its duration does not count as part of a call's timeout.  Some are then
+ * on their way into their call, and waited for by thread_see_off(). */
 void thread_let_go(const struct process *process, struct thread *thread);
+void thread_see_off(struct thread *thread);
 /* Releases stragglers that have stopped; does not wait.  Returns how many are left. */
 uint32_t threads_tend_stragglers(struct process *process);
 /* Moves a thread inside a restartable sequence to its abort handler (rseq(2)). */

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-#include "arch.h"
+#include "base.h"
 
 #include <elf.h>
 #include <errno.h>
@@ -16,6 +16,8 @@
 #define SVC 0xd4000001U /* svc #0 */
 #define PSTATE_MODE 0x1fU
 #define CALLS_MAX 1024
+#define FRAME_BYTES 4688 /* struct rt_sigframe, arch/arm64/kernel/signal.c */
+#define FRAME_RECORD_BYTES 16
 
 /* The kernel's own codes for "make this call again" (include/linux/errno.h). */
 #define ERESTARTSYS 512
@@ -91,6 +93,38 @@ static int first_argument(pid_t tid, int nr, unsigned long long *argument)
 	return 0;
 }
 
+/* A page that the program has never touched is not read: it would be there from then on. */
+static bool is_touched(pid_t tid, avc_remote address)
+{
+	int pagemap = proc_open(tid, "pagemap", O_RDONLY);
+	uint64_t entry = 0;
+
+	if (pagemap < 0 || pread(pagemap, &entry, sizeof entry,
+				 (off_t)(address / ARCH_PAGE_BYTES * sizeof entry)) < 0)
+		entry = 0;
+	close_fd(&pagemap);
+	return entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED);
+}
+
+/* Whether it has just come back from a handler, with the result of a call that the signal has
+ * interrupted: then the frame from which it came is still below its stack, and nothing of it has
+ * changed.  One that an earlier handler has left there may be taken for it, if the program does the
+ * same again with the same registers: it then meets another EINTR, as it did before.  Frames on
+ * alternate stacks are not found. */
+static bool has_been_in_handler(pid_t tid, const struct user_regs_struct *r)
+{
+	const avc_remote record = (r->sp - FRAME_RECORD_BYTES) & ~UINT64_C(15);
+	struct inj_home frame;
+	const struct iovec to = { &frame, offsetof(struct inj_home, padding) },
+			   from = { (void *)(record - FRAME_BYTES), to.iov_len };
+
+	return is_touched(tid, record - FRAME_BYTES) &&
+	       is_touched(tid, record - FRAME_BYTES + to.iov_len) &&
+	       process_vm_readv(tid, &to, 1, &from, 1, 0) == (ssize_t)to.iov_len &&
+	       frame.sp == r->sp && frame.pc == r->pc &&
+	       memcmp(frame.regs, r->regs, sizeof frame.regs) == 0;
+}
+
 static void find_call(pid_t tid, struct arch_regs *regs)
 {
 	const int nr = (int)regs->r.regs[8];
@@ -110,8 +144,9 @@ static void find_call(pid_t tid, struct arch_regs *regs)
 		regs->result = answer_of(regs);
 		regs->r.pc += ARCH_SYSCALL_BYTES;
 	} else if (code[0] == SVC &&
-		   ((long)regs->r.regs[0] == -EINTR || nr == SYS_recvmmsg || nr == SYS_clone ||
-		    nr == SYS_clone3) &&
+		   ((long)regs->r.regs[0] == -EINTR
+			    ? !has_been_in_handler(tid, &regs->r)
+			    : nr == SYS_recvmmsg || nr == SYS_clone || nr == SYS_clone3) &&
 		   first_argument(tid, nr, &argument) == 0) {
 		regs->nr = nr;
 		regs->result = (long)regs->r.regs[0];
@@ -180,6 +215,8 @@ void arch_rewind(struct arch_regs *regs)
 			regs->r.regs[8] = (unsigned long long)regs->nr;
 	} else if (regs->nr >= 0) {
 		regs->r.regs[0] = (unsigned long long)regs->result;
+		if (regs->r.regs[8] >> 32) /* marked: it was rewound, and is over */
+			regs->r.regs[8] = (unsigned long long)regs->nr;
 	}
 	regs->nr = -1;
 }
@@ -252,9 +289,8 @@ void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote 
 #define FPSIMD_MAGIC 0x46508001U
 #define SVE_MAGIC 0x53564501U
 #define FPSIMD_BYTES 528
-#define FRAME_BYTES 4688 /* struct rt_sigframe */
-#define SVE_IS_SVE 1     /* user_sve_header.flags: SVE_PT_REGS_SVE */
-#define SVE_VL_MAX 96    /* what is left of the frame has no room for more */
+#define SVE_IS_SVE 1  /* user_sve_header.flags: SVE_PT_REGS_SVE */
+#define SVE_VL_MAX 96 /* what is left of the frame has no room for more */
 #define SVE_ROOM 16384
 
 struct sve_header {

@@ -16,6 +16,8 @@
 #error "include arch.h"
 #endif
 
+#include <errno.h>
+
 #define ARCH_NAME "aarch64"
 #define ARCH_AUDIT AUDIT_ARCH_AARCH64
 #define ARCH_USER_END (UINT64_C(1) << 48)
@@ -48,6 +50,8 @@ static inline void arch_syscall_nr_set(struct arch_regs *regs, long nr)
 {
 	regs->nr = nr;
 	regs->r.regs[8] = (unsigned long long)nr;
+	if (nr < 0) /* at its entry: it is not made, and its result is this */
+		regs->r.regs[0] = (unsigned long long)-ENOSYS;
 }
 static inline long arch_syscall_result(const struct arch_regs *regs)
 {
@@ -95,6 +99,11 @@ static inline void arch_pc_set(struct arch_regs *regs, avc_remote pc)
  * only for a thread that slept in it. */
 bool arch_may_continue(long nr);
 void arch_note_slept(struct arch_regs *regs);
+
+#define ARCH_ROOM_CALLS { SYS_prctl, 50 /* PR_SVE_SET_VL */ },
+
+/* arch/arm64/kernel/signal.c, do_signal(): it compares the program counter with what it was. */
+#define ARCH_FORGETS_CALLS true
 
 /* Whether the thread has registers that no system call preserves: it must not be borrowed now. */
 bool arch_is_delicate(pid_t tid);

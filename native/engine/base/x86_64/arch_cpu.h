@@ -91,6 +91,13 @@ static inline void arch_note_slept(struct arch_regs *regs)
 	(void)regs;
 }
 
+/* What inj_make_room() calls: {number, first argument}, each with a comma behind it. */
+#define ARCH_ROOM_CALLS
+
+/* Whether the kernel, once a tracer has set the registers of a thread in a call, does not know any more
+ * that there was one (trace/thread.c, must_enter()). */
+#define ARCH_FORGETS_CALLS false
+
 /* Whether the thread has registers that no system call preserves, so that it must not be borrowed
  * now. */
 static inline bool arch_is_delicate(pid_t tid)
