@@ -40,7 +40,7 @@ pack() {
 	mkdir -p "$home/bin" "$stage/usr/bin" "$stage/lib/systemd/system" "$stage/DEBIAN" || return
 	ln -s /usr/bin/python3 "$home/bin/python" || return
 	printf 'home = /usr/bin\ninclude-system-site-packages = false\nversion = %s\n' "$python" >"$home/pyvenv.cfg" || return
-	printf '#!/usr/lib/avckpt/bin/python -I\nfrom avckpt.cli import main\nmain()\n' >"$stage/usr/bin/avckpt" || return
+	printf '#!/usr/lib/avckpt/bin/python -I\nfrom avckpt.cli.commands import main\nmain()\n' >"$stage/usr/bin/avckpt" || return
 	chmod 0755 "$stage/usr/bin/avckpt" || return
 	install -D -m 0644 packaging/avckpt-sidecar.service -t "$stage/lib/systemd/system" || return
 	install -D -m 0644 docs/avckpt.1 -t "$stage/usr/share/man/man1" || return

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 
 import click
-from avckpt.cli import main
+from avckpt.cli.commands import main
 from avckpt.cli.commands import EPILOG
 
 FILES = (

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from avckpt.cli import main
+from avckpt.cli.commands import main
 
 if __name__ == "__main__":
     main(prog_name="avckpt")

@@ -35,7 +35,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def installed(site: Path, *args: str, code: str = "from avckpt.cli import main; main()") -> str:
+def installed(site: Path, *args: str, code: str = "from avckpt.cli.commands import main; main()") -> str:
     """Runs `avckpt ARGS` from the wheel, outside of any checkout."""
     env = {**os.environ, "PYTHONPATH": str(site)}
     done = subprocess.run(

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avckpt import cli
-from avckpt.cli import client
+from avckpt.cli import client, commands
 from avckpt.cli.client import Client
 from avckpt.errors import NothingToRestore
 from avckpt.guard import Command
@@ -31,7 +30,7 @@ def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def avckpt(*args: str) -> Result:
-    return CliRunner().invoke(cli.main, args)
+    return CliRunner().invoke(commands.main, args)
 
 
 def row(**fields: object) -> dict[str, object]:
@@ -217,7 +216,7 @@ def test_who_may_not_ask_is_told(run_dir: Path) -> None:
 
 
 def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
-    program = "import avckpt.cli, avckpt.cli.client, sys; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    program = "import avckpt.cli.commands, avckpt.cli.client, sys; print(sorted({m.split('.')[0] for m in sys.modules}))"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     for heavy in ("rich", "aiohttp", "asyncio", "cffi", "podman", "_cffi_backend"):
         assert f"'{heavy}'" not in loaded

@@ -1,8 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs on the host: the command `avckpt`."""
-
-from __future__ import annotations
-
-from avckpt.cli.commands import main
-
-__all__ = ["main"]
+"""What runs on the host: the command `avckpt` (commands.py).  Imports nothing: others need only a module of it."""
