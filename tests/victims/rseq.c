@@ -12,8 +12,6 @@
 
 #include "victim.h"
 
-#ifdef __x86_64__
-
 enum { CPUS = 1024, ROUND = 20000, SPREAD = 8 /* a cache line per counter */ };
 
 static uint64_t counters[CPUS * SPREAD];
@@ -34,6 +32,7 @@ static bool try_count(struct rseq *rs, uint32_t cpu)
 {
 	uint64_t *counter = &counters[cpu * SPREAD];
 
+#ifdef __x86_64__
 	__asm__ goto(
 		".pushsection __rseq_cs, \"aw\"\n"
 		".balign 32\n"
@@ -61,6 +60,37 @@ static bool try_count(struct rseq *rs, uint32_t cpu)
 		  [cs] "i"(offsetof(struct rseq, rseq_cs)), [id] "i"(offsetof(struct rseq, cpu_id))
 		: "rax", "rcx", "memory", "cc"
 		: aborted);
+#else /* aarch64 */
+	__asm__ goto(
+		".pushsection __rseq_cs, \"aw\"\n"
+		".balign 32\n"
+		"3: .long 0, 0\n"
+		".quad 1f, 2f - 1f, 4f\n"
+		".popsection\n"
+		"adrp x9, 3b\n"
+		"add x9, x9, :lo12:3b\n"
+		"str x9, [%[rs], %[cs]]\n"
+		"1:\n"
+		"ldr w9, [%[rs], %[id]]\n"
+		"cmp w9, %w[cpu]\n"
+		"b.ne 4f\n"
+		"ldr x9, [%[counter]]\n"
+		"mov w10, #60\n"
+		"5: subs w10, w10, #1\n"
+		"b.ne 5b\n"
+		"add x9, x9, #1\n"
+		"str x9, [%[counter]]\n"
+		"2:\n"
+		".pushsection __rseq_abort, \"ax\"\n"
+		".inst 0xd428bc00\n" /* RSEQ_SIG_CODE */
+		"4: b %l[aborted]\n"
+		".popsection\n"
+		:
+		: [rs] "r"(rs), [cpu] "r"(cpu), [counter] "r"(counter),
+		  [cs] "i"(offsetof(struct rseq, rseq_cs)), [id] "i"(offsetof(struct rseq, cpu_id))
+		: "x9", "x10", "memory", "cc"
+		: aborted);
+#endif
 	return true;
 aborted:
 	aborts++;
@@ -153,13 +183,3 @@ int main(int argc, char **argv)
 		nap_us(1000);
 	}
 }
-
-#else
-
-int main(void)
-{
-	errno = ENOSYS;
-	unavailable("rseq has no sequence for this CPU");
-}
-
-#endif
