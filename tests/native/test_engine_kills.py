@@ -14,7 +14,7 @@ import pytest
 
 from testkit.family import kill_main, look
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random, sleep_exactly
-from testkit.harness import wait_until
+from testkit.harness import SLOWNESS, wait_until
 from testkit.procfs import children_of, inside
 
 SHARED = pytest.mark.shared_machine("a kill has to come within the milliseconds of a restore")
@@ -55,9 +55,9 @@ def test_killed_at_random_moments(command: str, interval_s: float, tmp_path: Pat
 def test_dies_as_soon_as_it_is_restored(how: str, tmp_path: Path) -> None:
     """Hundreds of times, at any step of the restore; at last it ends, and nothing hangs."""
     again = config(0.02, restore_window_s=0.000001)
-    with Victim(f"crash {how} 1 --threads 6", tmp_path) as victim, GuardProcess(again, [victim.pid]) as guard:
+    with Victim(f"crash {how} {SLOWNESS} --threads 6", tmp_path) as victim, GuardProcess(again, [victim.pid]) as guard:
         guard.wait("restored")
-        time.sleep(4)
+        time.sleep(4 * SLOWNESS)
         if victim.popen.poll() is None:
             # It would go on for ever: no two deaths are within the window.
             guard.wait("restored", since=guard.mark(), count=3)

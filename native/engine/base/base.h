@@ -264,7 +264,8 @@ struct proc_status {
 	pid_t group, session;
 	pid_t tracer;     /* a thread, in our namespace; 0: none              */
 	uint64_t caught;  /* signals it has handlers for, as in sigset_t      */
-	uint64_t ignored; /* likewise                                         */
+	uint64_t ignored; /* likewise, and so are the following               */
+	uint64_t blocked, pending, shared_pending;
 	uint32_t umask;
 	uint32_t uid[4], gid[4]; /* real, effective, saved, file system         */
 	int group_count;         /* supplementary; further ones are not known */

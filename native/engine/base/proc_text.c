@@ -256,7 +256,13 @@ static uint32_t parse_status_line(const char *line, size_t length, struct proc_s
 			status->caps[i] = strtoull(value, NULL, 16);
 			return (uint32_t)HAS_CAPS << i;
 		}
-	if (!strncmp(line, "VmLck:", 6))
+	if (!strncmp(line, "SigPnd:", 7))
+		status->pending = strtoull(value, NULL, 16);
+	else if (!strncmp(line, "ShdPnd:", 7))
+		status->shared_pending = strtoull(value, NULL, 16);
+	else if (!strncmp(line, "SigBlk:", 7))
+		status->blocked = strtoull(value, NULL, 16);
+	else if (!strncmp(line, "VmLck:", 6))
 		status->locked_kb = strtoll(value, NULL, 10);
 	else if (!strncmp(line, "Groups:", 7) && !status->group_count)
 		parse_groups(value, status);

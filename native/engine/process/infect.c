@@ -523,7 +523,7 @@ static struct thread *stop_main(struct process *process, struct avc_error *err)
 	t->seen = true;
 	rewind_prepare(t);
 	if (thread_stop(process, t, err) || thread_await(process, t, err) || thread_read(t, err)) {
-		thread_release(t);
+		thread_release(process, t);
 		return NULL;
 	}
 	return t;
@@ -691,7 +691,7 @@ static void end_left_porters(struct process *process)
 			t->seen = t->attached;
 			seccomp_end_supervision(t->tid);
 		}
-		thread_release(t);
+		thread_release(process, t);
 	}
 	threads_forget_unseen(process);
 	if (mem_fd >= 0)
@@ -716,7 +716,7 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 	}
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
 	if (thread)
-		thread_release(thread);
+		thread_release(process, thread);
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 	return result;

@@ -170,6 +170,4 @@ void process_let_go(struct process *process)
 			thread_let_go(process, &process->threads[i]);
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		thread_let_go(process, &process->threads[i]);
-	for (uint32_t i = 0; i < process->thread_count; i++)
-		thread_see_off(&process->threads[i]);
 }

@@ -33,7 +33,7 @@ static void end(struct process *process, struct thread *thread, timer_t timer)
 	tracee_deadline_set(timer, END_DEADLINE_NS);
 	if (process_check_dying(process, &gone) == 0 && thread_stop(process, thread, &gone) == 0 &&
 	    thread_await(process, thread, &gone) == 0)
-		thread_release(thread); /* or threads_tend_stragglers() does it, later */
+		thread_release(process, thread); /* or threads_tend_stragglers() does it, later */
 	tracee_deadline_clear(timer);
 	rt_priority_end();
 }

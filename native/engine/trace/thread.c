@@ -74,6 +74,7 @@ int thread_stop(struct process *process, struct thread *thread, struct avc_error
 	int errnum;
 
 	thread->plain = false;
+	process->given = 0;
 	if (ptrace(PTRACE_SEIZE, thread->tid, NULL, (long)TRACE_OPTIONS_APP)) {
 		if (errno == ESRCH)
 			return fail(err, AVC_GONE, ESRCH, thread->tid, "stop", "ptrace(SEIZE)",
@@ -150,7 +151,6 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 		return -1;
 	}
 	thread->stopped = true;
-	thread->entering = false;
 	thread->sent_back = false;
 	thread->vetted = false;
 	thread->stop_signal = tracee_group_signal();
@@ -170,60 +170,41 @@ void thread_runs_on(struct thread *thread, const struct avc_error *err)
 		thread->stopped = false;
 }
 
-/* A signal that comes before the thread is back in its call should end the call, but where the kernel
- * does not know any more that there was one, the handler would only delay it.  So the thread is traced
- * until it has entered the call, and we do what the kernel does elsewhere (see_off()).
+static bool is_waiting(pid_t tid, uint32_t which)
+{
+	const struct __ptrace_peeksiginfo_args first = { .flags = which, .nr = 1 };
+	siginfo_t info;
+
+	return ptrace(PTRACE_PEEKSIGINFO, tid, &first, &info) > 0;
+}
+
+/* A signal with a handler that came while we held the thread ends its call.  Where the kernel does not
+ * know any more that there was a call, it would have the handler run, and the call made again after
+ * it.  (So it does with a signal that comes between this look and the thread's way back.)
  *
  * Whether -ERESTARTSYS becomes EINTR depends on sigaction's flags: those calls are restarted. */
-static bool must_enter(const struct thread *thread)
+static void end_call_by_signal(struct process *process, struct thread *thread)
 {
 	const long result = arch_syscall_result(&thread->regs);
-
-	return ARCH_FORGETS_CALLS && thread->sent_back && arch_syscall_nr(&thread->regs) >= 0 &&
-	       (result == -ERESTARTNOHAND || result == -ERESTART_RESTARTBLOCK);
-}
-
-static bool is_caught(pid_t tid, int signal)
-{
-	struct proc_status status;
-
-	return proc_status(tid, &status) == 0 && status.caught >> (signal - 1) & 1;
-}
-
-/* At a stop of a thread that enters its call: releases it, unless it has to be resumed for another
- * stop. */
-static void see_off(struct thread *thread, const struct stop *stop)
-{
-	const long signal = stop->kind == STOP_SIGNAL ? stop->signal : 0;
 	struct arch_regs regs = thread->regs;
+	struct proc_status status;
+	uint64_t caught;
 
-	if (signal && !is_caught(thread->tid, (int)signal)) {
-		ptrace(PTRACE_SYSCALL, thread->tid, NULL, signal);
+	if (!ARCH_FORGETS_CALLS || !thread->sent_back || arch_syscall_nr(&regs) < 0 ||
+	    (result != -ERESTARTNOHAND && result != -ERESTART_RESTARTBLOCK))
 		return;
-	}
-	if (signal) {
-		arch_result_note(&regs, -EINTR);
-		(void)arch_regs_set(thread->tid, &regs); /* fails if it was killed */
-	}
-	thread->entering = false;
-	thread->attached = ptrace(PTRACE_DETACH, thread->tid, NULL, signal) != 0;
+	if ((!is_waiting(thread->tid, 0) && !is_waiting(thread->tid, PTRACE_PEEKSIGINFO_SHARED)) ||
+	    proc_status(thread->tid, &status))
+		return;
+	caught = status.caught & ~status.blocked;
+	if (!(caught & (status.pending | (status.shared_pending & ~process->given))))
+		return;
+	process->given |= caught & status.shared_pending;
+	arch_result_note(&regs, -EINTR);
+	(void)arch_regs_set(thread->tid, &regs); /* fails if it was killed */
 }
 
-void thread_see_off(struct thread *thread)
-{
-	while (thread->entering) {
-		const struct stop stop = tracee_wait(thread->tid, 0);
-
-		if (stop.kind == STOP_DYING || stop.kind == STOP_DEADLINE)
-			return; /* threads_tend_stragglers() does it */
-		if (stop.kind == STOP_EXIT)
-			thread->entering = thread->attached = false;
-		else
-			see_off(thread, &stop);
-	}
-}
-
-static void begin_release(struct thread *thread)
+void thread_release(struct process *process, struct thread *thread)
 {
 	struct avc_error ignored = { 0 };
 
@@ -231,31 +212,17 @@ static void begin_release(struct thread *thread)
 		return;
 	if (thread->borrowed)
 		thread_give_back(thread, &ignored);
-	if (must_enter(thread) && ptrace(PTRACE_SYSCALL, thread->tid, NULL, 0L) == 0) {
-		thread->entering = true;
-		thread->stopped = false;
-		return;
-	}
-	if (ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) == 0) {
-		thread->attached = false;
-		thread->stopped = false;
-		return;
-	}
-	/* SIGKILL has ended its stop: it has to be reaped. */
+	end_call_by_signal(process, thread);
+	/* If this fails, SIGKILL has ended its stop: it has to be reaped. */
+	thread->attached = ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) != 0;
 	thread->stopped = false;
 }
 
-void thread_release(struct thread *thread)
-{
-	begin_release(thread);
-	thread_see_off(thread);
-}
-
-void thread_let_go(const struct process *process, struct thread *thread)
+void thread_let_go(struct process *process, struct thread *thread)
 {
 	if (thread->attached && thread->stopped)
 		rewind_count_stop(process, thread);
-	begin_release(thread);
+	thread_release(process, thread);
 }
 
 /* Or its parasite has been replaced, and it returns without us. */
@@ -321,11 +288,6 @@ static bool straggle(struct process *process, struct thread *thread)
 			stop.kind = STOP_TRAP;
 	}
 
-	if (thread->entering && stop.kind != STOP_EXIT) {
-		if (stop.kind != STOP_NONE && stop.kind != STOP_DYING && stop.kind != STOP_DEADLINE)
-			see_off(thread, &stop);
-		return thread->attached;
-	}
 	switch (stop.kind) {
 	case STOP_NONE:
 		/* It may have returned by itself meanwhile, and would never stop again.  Before that
@@ -341,7 +303,6 @@ static bool straggle(struct process *process, struct thread *thread)
 		seccomp_end_supervision(tid);
 		thread->attached = false;
 		thread->borrowed = false;
-		thread->entering = false;
 		return false;
 	case STOP_FORK:
 		take_child(process, thread, stop.message);

@@ -114,7 +114,6 @@ struct thread {
 	enum seccomp_way seccomp;
 	bool vetted;           /* thread_vet() has checked it at this stop                */
 	bool sent_back;        /* into its call, at this stop (ARCH_FORGETS_CALLS)        */
-	bool entering;         /* that, and still traced: thread_let_go()                  */
 	struct arch_regs regs; /* as of the stop, EINTR already replaced        */
 	uint64_t sigmask;
 	uint64_t robust_list, robust_bytes;
@@ -203,6 +202,8 @@ struct process {
 		size_t bytes;
 	} old_parasite[OLD_PARASITES_MAX];
 	uint32_t old_parasites, checkpoints;
+	uint64_t
+		given; /* signals for any thread that one has got which was released at this stop */
 	/* Stubs that stay, because a task may still be in them, or return there (infect.c). */
 	avc_remote stubs_start, stubs_end;
 	/* A thread died while it may have been cloning: there may be a tracee that is on no list
@@ -363,11 +364,9 @@ int thread_await(struct process *process, struct thread *thread, struct avc_erro
 /* After injected code in it has failed: notes if it may still be running. */
 void thread_runs_on(struct thread *thread, const struct avc_error *err);
 /* Releases it without a trace.  A thread that could not be stopped stays attached: a straggler. */
-void thread_release(struct thread *thread);
-/* The same after a freeze: its duration does not count as part of a call's timeout.  Some are then
- * on their way into their call, and waited for by thread_see_off(). */
-void thread_let_go(const struct process *process, struct thread *thread);
-void thread_see_off(struct thread *thread);
+void thread_release(struct process *process, struct thread *thread);
+/* The same after a freeze: its duration does not count as part of a call's timeout. */
+void thread_let_go(struct process *process, struct thread *thread);
 /* Releases stragglers that have stopped; does not wait.  Returns how many are left. */
 uint32_t threads_tend_stragglers(struct process *process);
 /* Moves a thread inside a restartable sequence to its abort handler (rseq(2)). */

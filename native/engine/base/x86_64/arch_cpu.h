@@ -95,7 +95,7 @@ static inline void arch_note_slept(struct arch_regs *regs)
 #define ARCH_ROOM_CALLS
 
 /* Whether the kernel, once a tracer has set the registers of a thread in a call, does not know any more
- * that there was one (trace/thread.c, must_enter()). */
+ * that there was one (trace/thread.c, end_call_by_signal()). */
 #define ARCH_FORGETS_CALLS false
 
 /* Whether the thread has registers that no system call preserves, so that it must not be borrowed
