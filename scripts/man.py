@@ -9,8 +9,7 @@ from __future__ import annotations
 import re
 
 import click
-from avckpt.cli.commands import main
-from avckpt.cli.commands import EPILOG
+from avckpt.cli.commands import EPILOG, main
 
 FILES = (
     ("/etc/avckpt/config.yaml", "Defaults for all containers."),

@@ -30,7 +30,8 @@ def folder(tmp_path: Path) -> Path:
     """With `avckpt` in it, to be put into PATH, as this environment has it."""
     program = tmp_path / "bin/avckpt"
     program.parent.mkdir()
-    program.write_text(f"#!{sys.executable}\nimport sys\nfrom avckpt.cli.commands import main\nsys.argv[0] = 'avckpt'\nmain()\n")
+    code = "import sys\nfrom avckpt.cli.commands import main\nsys.argv[0] = 'avckpt'\nmain()\n"
+    program.write_text(f"#!{sys.executable}\n{code}")
     program.chmod(0o755)
     return tmp_path
 

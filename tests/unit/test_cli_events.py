@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from avckpt import cli
+from avckpt.cli import commands
 from avckpt.cli.client import Client
 from click.testing import CliRunner, Result
 
@@ -25,7 +25,7 @@ def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def avckpt(*args: str, **options: Any) -> Result:
-    return CliRunner().invoke(cli.main, args, **options)
+    return CliRunner().invoke(commands.main, args, **options)
 
 
 def event(**fields: object) -> dict[str, object]:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from avckpt import cli
+from avckpt.cli import commands
 from avckpt.cli.compose import podman_compose
 from avckpt.cli.compose.manifest import Kind, Manifest, Severity, check, files_meant
 from avckpt.errors import ConfigError
@@ -209,7 +209,7 @@ def test_files_that_are_something_else(path: Path, text: str, problem: str) -> N
 
 
 def avckpt(*args: object) -> tuple[int, str]:
-    result = CliRunner().invoke(cli.main, [str(arg) for arg in args])
+    result = CliRunner().invoke(commands.main, [str(arg) for arg in args])
     return result.exit_code, result.output
 
 
