@@ -180,7 +180,9 @@ static bool is_waiting(pid_t tid, uint32_t which)
 
 /* A signal with a handler that came while we held the thread ends its call.  Where the kernel does not
  * know any more that there was a call, it would have the handler run, and the call made again after
- * it.  (So it does with a signal that comes between this look and the thread's way back.)
+ * it.  So it does with a signal that comes between this look and the thread's way back.  Tracing the
+ * thread into its call would be no better: a detach at the entry of a call has it return EINTR
+ * (kernel/ptrace.c, __ptrace_unlink(): TIF_SIGPENDING).
  *
  * Whether -ERESTARTSYS becomes EINTR depends on sigaction's flags: those calls are restarted. */
 static void end_call_by_signal(struct process *process, struct thread *thread)
