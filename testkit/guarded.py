@@ -417,7 +417,7 @@ def storm(guard_config: GuardConfig, kills: int, max_ms: float, seed: int, *vict
         ],
         capture_output=True,
         text=True,
-        timeout=110,
+        timeout=110 * SLOWNESS,
         check=False,
         cwd=ROOT,
     )
