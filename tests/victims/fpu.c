@@ -18,6 +18,9 @@ struct registers;
 typedef void hold_fn(const struct registers *in, struct registers *out, long number, long a, long b,
 		     long spin);
 
+#define TO15 "0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15"
+#define TO31 TO15 ",16,17,18,19,20,21,22,23,24,25,26,27,28,29,30,31"
+
 static hold_fn *hold;
 
 #if defined(__x86_64__)

@@ -47,8 +47,6 @@ hold_fn hold_neon, hold_sve;
 		"ldp d10, d11, [sp, #16]\n ldp d8, d9, [sp], #128\n ret\n"                         \
 		".size " #name ", .-" #name "\n.arch armv8-a\n")
 
-#define TO15 "0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15"
-#define TO31 TO15 ",16,17,18,19,20,21,22,23,24,25,26,27,28,29,30,31"
 #define EACH(registers, place, bytes, does) \
 	".irp n," registers "\nmov x10, #" place "+" bytes "*\\n\n" does "\n.endr\n"
 

@@ -47,9 +47,6 @@ hold_fn hold_sse, hold_avx, hold_avx512;
 		"ret\n"                                                            \
 		".size " #name ", .-" #name "\n")
 
-#define TO15 "0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15"
-#define TO31 TO15 ",16,17,18,19,20,21,22,23,24,25,26,27,28,29,30,31"
-
 HOLD(hold_sse, ".irp n," TO15 "\nmovdqu 64*\\n(%r12), %xmm\\n\n.endr\n",
      ".irp n," TO15 "\nmovdqu %xmm\\n, 64*\\n(%r13)\n.endr\n", "");
 HOLD(hold_avx, ".irp n," TO15 "\nvmovdqu 64*\\n(%r12), %ymm\\n\n.endr\n",

@@ -26,71 +26,48 @@ static struct rseq *area(void)
 	return (struct rseq *)((char *)__builtin_thread_pointer() + __rseq_offset);
 }
 
+/* The instructions of try_count(); SIGNATURE is RSEQ_SIG, in front of where it is aborted to. */
+#ifdef __x86_64__
+#define ENTER "leaq 3b(%%rip), %%rax; movq %%rax, %c[cs](%[rs])\n"
+#define COUNT                                      \
+	"cmpl %[cpu], %c[id](%[rs]); jne 4f\n"     \
+	"movq (%[counter]), %%rax\n"               \
+	"movl $60, %%ecx; 5: decl %%ecx; jnz 5b\n" \
+	"incq %%rax; movq %%rax, (%[counter])\n"
+#define SIGNATURE ".byte 0x0f, 0xb9, 0x3d; .long 0x53053053\n"
+#define JUMP "jmp"
+#define CHANGED "rax", "rcx"
+#else /* aarch64 */
+#define ENTER "adrp x9, 3b; add x9, x9, :lo12:3b; str x9, [%[rs], %[cs]]\n"
+#define COUNT                                                \
+	"ldr w9, [%[rs], %[id]]; cmp w9, %w[cpu]; b.ne 4f\n" \
+	"ldr x9, [%[counter]]\n"                             \
+	"mov w10, #60; 5: subs w10, w10, #1; b.ne 5b\n"      \
+	"add x9, x9, #1; str x9, [%[counter]]\n"
+#define SIGNATURE ".inst 0xd428bc00\n"
+#define JUMP "b"
+#define CHANGED "x9", "x10"
+#endif
+
 /* One more for the CPU we are on, if nothing happens to us in the middle.  The
  * pause between reading and writing makes it likely that something does. */
 static bool try_count(struct rseq *rs, uint32_t cpu)
 {
 	uint64_t *counter = &counters[cpu * SPREAD];
 
-#ifdef __x86_64__
 	__asm__ goto(
 		".pushsection __rseq_cs, \"aw\"\n"
 		".balign 32\n"
 		"3: .long 0, 0\n"
 		".quad 1f, 2f - 1f, 4f\n"
-		".popsection\n"
-		"leaq 3b(%%rip), %%rax\n"
-		"movq %%rax, %c[cs](%[rs])\n"
-		"1:\n"
-		"cmpl %[cpu], %c[id](%[rs])\n"
-		"jne 4f\n"
-		"movq (%[counter]), %%rax\n"
-		"movl $60, %%ecx\n"
-		"5: decl %%ecx; jnz 5b\n"
-		"incq %%rax\n"
-		"movq %%rax, (%[counter])\n"
-		"2:\n"
-		".pushsection __rseq_abort, \"ax\"\n"
-		".byte 0x0f, 0xb9, 0x3d\n"
-		".long 0x53053053\n" /* RSEQ_SIG */
-		"4: jmp %l[aborted]\n"
+		".popsection\n" ENTER "1:\n" COUNT "2:\n"
+		".pushsection __rseq_abort, \"ax\"\n" SIGNATURE "4: " JUMP " %l[aborted]\n"
 		".popsection\n"
 		:
 		: [rs] "r"(rs), [cpu] "r"(cpu), [counter] "r"(counter),
 		  [cs] "i"(offsetof(struct rseq, rseq_cs)), [id] "i"(offsetof(struct rseq, cpu_id))
-		: "rax", "rcx", "memory", "cc"
+		: CHANGED, "memory", "cc"
 		: aborted);
-#else /* aarch64 */
-	__asm__ goto(
-		".pushsection __rseq_cs, \"aw\"\n"
-		".balign 32\n"
-		"3: .long 0, 0\n"
-		".quad 1f, 2f - 1f, 4f\n"
-		".popsection\n"
-		"adrp x9, 3b\n"
-		"add x9, x9, :lo12:3b\n"
-		"str x9, [%[rs], %[cs]]\n"
-		"1:\n"
-		"ldr w9, [%[rs], %[id]]\n"
-		"cmp w9, %w[cpu]\n"
-		"b.ne 4f\n"
-		"ldr x9, [%[counter]]\n"
-		"mov w10, #60\n"
-		"5: subs w10, w10, #1\n"
-		"b.ne 5b\n"
-		"add x9, x9, #1\n"
-		"str x9, [%[counter]]\n"
-		"2:\n"
-		".pushsection __rseq_abort, \"ax\"\n"
-		".inst 0xd428bc00\n" /* RSEQ_SIG_CODE */
-		"4: b %l[aborted]\n"
-		".popsection\n"
-		:
-		: [rs] "r"(rs), [cpu] "r"(cpu), [counter] "r"(counter),
-		  [cs] "i"(offsetof(struct rseq, rseq_cs)), [id] "i"(offsetof(struct rseq, cpu_id))
-		: "x9", "x10", "memory", "cc"
-		: aborted);
-#endif
 	return true;
 aborted:
 	aborts++;

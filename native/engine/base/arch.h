@@ -15,6 +15,13 @@
 
 #include "home.h"
 
+/* The kernel's own codes for "make this call again" (include/linux/errno.h); they never reach user
+ * space, but ptrace sees them. */
+#define ERESTARTSYS 512
+#define ERESTARTNOINTR 513
+#define ERESTARTNOHAND 514
+#define ERESTART_RESTARTBLOCK 516
+
 /* An address in a process, never to be dereferenced here. */
 typedef uint64_t avc_remote;
 

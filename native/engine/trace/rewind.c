@@ -38,8 +38,6 @@
 
 #include "trace.h"
 
-#define ERESTARTNOHAND 514 /* include/linux/errno.h */
-#define ERESTART_RESTARTBLOCK 516
 #define DATE_LOOKS 5 /* attempts to read the clock of a busy CPU */
 #define FDS_PER_WORD 64
 #define FD_WORDS_MAX 16384 /* of an fd_set: a million descriptors */

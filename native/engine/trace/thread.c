@@ -11,9 +11,6 @@
 
 #include "trace.h"
 
-#define ERESTARTNOHAND 514 /* include/linux/errno.h */
-#define ERESTART_RESTARTBLOCK 516
-
 struct thread *thread_find(struct process *process, pid_t tid)
 {
 	for (uint32_t i = 0; i < process->thread_count; i++)

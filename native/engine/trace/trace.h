@@ -202,8 +202,7 @@ struct process {
 		size_t bytes;
 	} old_parasite[OLD_PARASITES_MAX];
 	uint32_t old_parasites, checkpoints;
-	uint64_t
-		given; /* signals for any thread that one has got which was released at this stop */
+	uint64_t given; /* signals for any thread: those released at this stop get them */
 	/* Stubs that stay, because a task may still be in them, or return there (infect.c). */
 	avc_remote stubs_start, stubs_end;
 	/* A thread died while it may have been cloning: there may be a tracee that is on no list
@@ -263,8 +262,8 @@ struct process {
 
 /* ---- tracee.c ---------------------------------------------------------------- */
 
-/* The one signal the library uses, thread-directed, to end a wait(2) in time. */
-/* Its signal, which interrupts calls and does nothing else. */
+/* The one signal the library uses, thread-directed, to end a wait(2) in time: it interrupts calls and
+ * does nothing else. */
 int tracee_timer_signal(void);
 int tracee_timer_new(timer_t *timer, struct avc_error *err) warn_unused;
 void tracee_deadline_set(timer_t timer, uint64_t ns);

@@ -253,21 +253,26 @@ bool tracee_enters_call(pid_t tid)
 	       info[0] == SYSCALL_INFO_ENTRY;
 }
 
+/* False: it is no tracee of this thread.  info->si_pid: 0 if there is nothing new. */
+static bool look(pid_t tid, siginfo_t *info)
+{
+	*info = (siginfo_t){ 0 };
+	return waitid(P_PID, (id_t)tid, info,
+		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) == 0;
+}
+
 bool tracee_is_ours(pid_t tid)
 {
-	siginfo_t nothing_new;
+	siginfo_t info;
 
-	return waitid(P_PID, (id_t)tid, &nothing_new,
-		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) == 0;
+	return look(tid, &info);
 }
 
 bool tracee_has_stopped(pid_t tid)
 {
-	siginfo_t info = { 0 };
+	siginfo_t info;
 
-	return waitid(P_PID, (id_t)tid, &info,
-		      WEXITED | WSTOPPED | WNOHANG | WNOWAIT | __WALL | __WNOTHREAD) ||
-	       info.si_pid;
+	return !look(tid, &info) || info.si_pid;
 }
 
 #define PC_NS (20 * NS_PER_MS)

@@ -19,12 +19,6 @@
 #define FRAME_BYTES 4688 /* struct rt_sigframe, arch/arm64/kernel/signal.c */
 #define FRAME_RECORD_BYTES 16
 
-/* The kernel's own codes for "make this call again" (include/linux/errno.h). */
-#define ERESTARTSYS 512
-#define ERESTARTNOINTR 513
-#define ERESTARTNOHAND 514
-#define ERESTART_RESTARTBLOCK 516
-
 #define NT_ARM_SVE_ 0x405
 #define NT_ARM_SSVE_ 0x40b
 #define NT_ARM_ZA_ 0x40c
@@ -93,17 +87,23 @@ static int first_argument(pid_t tid, int nr, unsigned long long *argument)
 	return 0;
 }
 
-/* A page that the program has never touched is not read: it would be there from then on. */
-static bool is_touched(pid_t tid, avc_remote address)
+/* A page that the program has never touched is not read: it would be there from then on.  This is
+ * less than a page long. */
+static bool is_touched(pid_t tid, avc_remote start, avc_remote end)
 {
+	const avc_remote page[2] = { start / ARCH_PAGE_BYTES, end / ARCH_PAGE_BYTES };
 	int pagemap = proc_open(tid, "pagemap", O_RDONLY);
-	uint64_t entry = 0;
+	bool touched = pagemap >= 0;
 
-	if (pagemap < 0 || pread(pagemap, &entry, sizeof entry,
-				 (off_t)(address / ARCH_PAGE_BYTES * sizeof entry)) < 0)
-		entry = 0;
+	for (int i = 0; touched && i < 2; i++) {
+		uint64_t entry = 0;
+
+		touched = pread(pagemap, &entry, sizeof entry, (off_t)(page[i] * sizeof entry)) >=
+				  0 &&
+			  entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED);
+	}
 	close_fd(&pagemap);
-	return entry & (PAGEMAP_PRESENT | PAGEMAP_SWAPPED);
+	return touched;
 }
 
 /* Whether it has just come back from a handler, with the result of a call that the signal has
@@ -118,8 +118,7 @@ static bool has_been_in_handler(pid_t tid, const struct user_regs_struct *r)
 	const struct iovec to = { &frame, offsetof(struct inj_home, padding) },
 			   from = { (void *)(record - FRAME_BYTES), to.iov_len };
 
-	return is_touched(tid, record - FRAME_BYTES) &&
-	       is_touched(tid, record - FRAME_BYTES + to.iov_len) &&
+	return is_touched(tid, record - FRAME_BYTES, record - FRAME_BYTES + to.iov_len) &&
 	       process_vm_readv(tid, &to, 1, &from, 1, 0) == (ssize_t)to.iov_len &&
 	       frame.sp == r->sp && frame.pc == r->pc &&
 	       memcmp(frame.regs, r->regs, sizeof frame.regs) == 0;

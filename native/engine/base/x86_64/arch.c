@@ -23,13 +23,6 @@
  * that has blocked the signal for that. */
 #define FLAGS_OWN (FLAG_TF | FLAG_DF)
 
-/* The kernel's own codes for "make this call again" (include/linux/errno.h); they never reach user
- * space, but ptrace sees them. */
-#define ERESTARTSYS 512
-#define ERESTARTNOINTR 513
-#define ERESTARTNOHAND 514
-#define ERESTART_RESTARTBLOCK 516
-
 int arch_regs_get(pid_t tid, struct arch_regs *regs)
 {
 	return ptrace(PTRACE_GETREGS, tid, NULL, &regs->r) == -1 ? -1 : 0;
