@@ -57,6 +57,9 @@ class Images(enum.IntEnum):
     AUTO = 2
 
 
+SMALL = "it is small"
+"""The reason that is no news: a copy would not be better."""
+
 FORK_REASONS = (
     "",
     "avckpt.images=fork",
@@ -71,7 +74,8 @@ FORK_REASONS = (
     "it writes too much",
     "the older images are a minute old",
     "the older images have too many pages of their own",
-    "it is small",
+    SMALL,
+    "memory for copies is short",
 )
 """`enum avc_fork_reason`: why a checkpoint was taken by a fork."""
 

@@ -311,6 +311,14 @@ def test_says_why_it_forks(command: str, reason: str, tmp_path: Path) -> None:
         guard.wait_for(lambda event: event.get("fork_reason") == reason, reason)
 
 
+@pytest.mark.parametrize(("limit_mb", "how"), [(120, "memory for copies is short"), (300, "dirty"), (0, "dirty")])
+def test_copies_only_where_the_container_has_memory_for_them(limit_mb: int, how: str, tmp_path: Path) -> None:
+    settings = config(images=Images.AUTO, memory_limit_bytes=limit_mb * 1_000_000)
+    with Victim("idle 64 1", tmp_path) as victim, GuardProcess(settings, [victim.pid]) as guard:
+        how_made(guard, 6)
+        assert how_made(guard, 3) == {how}
+
+
 def test_a_copy_needs_no_more_memory_than_was_written(tmp_path: Path) -> None:
     """An idle application: its templates have almost no memory of their own."""
     with Victim("idle 64 2", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:

@@ -83,6 +83,7 @@ struct dirty_tree {
 	struct dirty **of;
 	uint32_t count, room;
 	uint64_t fork_ns; /* duration of the clones of the last checkpoint by forks */
+	bool cramped;     /* by the caller: there is no memory for copies             */
 	/* Of the last one: why a process was forked, if one was; pages copied.     */
 	enum avc_fork_reason reason;
 	uint64_t copied;

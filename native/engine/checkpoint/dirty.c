@@ -157,8 +157,10 @@ static bool is_small(const struct process *process)
 }
 
 /* Why its memory is not even to be watched. */
-static enum avc_fork_reason why_not(const struct process *process, const struct avc_config *config)
+static enum avc_fork_reason why_not(const struct process *process, const struct attempt *attempt)
 {
+	const struct avc_config *config = attempt->config;
+
 	if (config->images == AVC_IMAGES_FORK)
 		return AVC_FORK_CONFIG;
 	if (!process->infected || process->adopts)
@@ -167,6 +169,8 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 		return AVC_FORK_SANDBOX;
 	if (config->images == AVC_IMAGES_AUTO && is_small(process))
 		return AVC_FORK_SMALL;
+	if (config->images == AVC_IMAGES_AUTO && attempt->cramped)
+		return AVC_FORK_ROOM;
 	if (memory_needs_fork(process))
 		return AVC_FORK_MEMORY;
 	if (has_pinned(process->pid) || files_may_pin(process->files_before))
@@ -242,7 +246,7 @@ void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 	process->recycling = false;
 	dirty->idle.catching_up = false;
 	dirty->copied = 0;
-	dirty->reason = why_not(process, config);
+	dirty->reason = why_not(process, attempt);
 	if (dirty->reason) {
 		dirty_drop_idle_one(dirty);
 		tracker_end(process);

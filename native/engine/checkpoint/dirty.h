@@ -23,6 +23,7 @@ struct attempt {
 	struct process *process;
 	uint32_t slot;
 	timer_t timer;
+	bool cramped; /* see struct dirty_tree */
 };
 
 /* Like those in checkpoint.h, for one process. */

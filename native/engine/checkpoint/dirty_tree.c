@@ -97,7 +97,7 @@ void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
 	dirty->copied = 0;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
-		const struct attempt attempt = { config, process, slot, timer };
+		const struct attempt attempt = { config, process, slot, timer, dirty->cramped };
 		struct dirty *one = process ? get(dirty, process) : NULL;
 
 		if (process)

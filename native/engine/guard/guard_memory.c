@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The OOM killer's choice of victim.
+ * What templates may cost in memory, and the OOM killer's choice of victim.
  *
  * It kills the process with the most points: its resident pages, plus its oom_score_adj in
  * thousandths of the limit (mm/oom_kill.c, oom_badness()).
@@ -16,6 +16,9 @@
  */
 #include <fcntl.h>
 #include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
 
 #include "guard.h"
 
@@ -25,6 +28,11 @@
 /* In percent of the limit: above KILLED the app is killed; above FULL no checkpoint is taken. */
 #define KILLED 95
 #define FULL 90
+/* What templates by copies may have of their own, in percent of the app (dirty.c): one copy of all
+ * that it writes, and a part of each template's. */
+#define COPIES 140
+/* In percent of what the host has available, before there are any. */
+#define HOSTS_SHARE 50
 
 static void tell(struct image *image, int value)
 {
@@ -112,4 +120,41 @@ bool guard_app_is_full(const struct avc_guard *guard)
 	pages = fd < 0 ? 0 : proc_vm_pages(fd, &anon);
 	close_fd(&fd);
 	return pages && (uint64_t)anon * ARCH_PAGE_BYTES > limit / 100 * FULL;
+}
+
+/* ---- copies ------------------------------------------------------------------------ */
+
+/* 0: unknown. */
+static uint64_t host_available(void)
+{
+	char buf[512];
+	const char *line;
+	int fd = open("/proc/meminfo", O_RDONLY | O_CLOEXEC);
+	const ssize_t n = fd < 0 ? 0 : read(fd, buf, sizeof buf - 1);
+
+	close_fd(&fd);
+	buf[n > 0 ? n : 0] = 0;
+	line = strstr(buf, "\nMemAvailable:");
+	return line ? strtoull(line + 14, NULL, 10) * 1024 : 0;
+}
+
+bool guard_has_room_for_copies(const struct avc_guard *guard)
+{
+	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
+						       : NULL;
+	const uint64_t limit = guard->config.memory_limit_bytes;
+	uint64_t app = 0;
+
+	if (!newest || guard->config.images != AVC_IMAGES_AUTO)
+		return true;
+	/* Generations were given up because memory is short. */
+	if (guard->policy.room < guard->config.keep)
+		return false;
+	for (uint32_t i = 0; i < newest->images; i++)
+		app += (uint64_t)newest->image[i].anon_pages * ARCH_PAGE_BYTES;
+	if (limit)
+		return app / 100 * (100 + COPIES) <= limit / 100 * FULL;
+	/* Those that exist are no longer available: the sidecar sees when memory becomes short. */
+	return newest->image[0].recycled ||
+	       app / 100 * COPIES <= host_available() / 100 * HOSTS_SHARE;
 }

@@ -44,7 +44,8 @@ enum avc_images {
 	AVC_IMAGES_FORK = 0,  /* by a fork of it                                    */
 	AVC_IMAGES_DIRTY = 1, /* by a copy of what was written since an older one, where
 	                       * that is possible                                   */
-	AVC_IMAGES_AUTO = 2   /* and where it stops the application for less time */
+	AVC_IMAGES_AUTO = 2   /* and where it stops the application for less time, and there
+	                       * is memory for it */
 };
 
 /* Why a process was forked instead of copied. */
@@ -62,7 +63,8 @@ enum avc_fork_reason {
 	AVC_FORK_WRITES = 10,   /* so much was written that a fork takes less      */
 	AVC_FORK_AGE = 11,      /* the older ones were not forked for a minute     */
 	AVC_FORK_COPIES = 12,   /* ... or have too many pages of their own         */
-	AVC_FORK_SMALL = 13     /* it is so small that a fork takes less           */
+	AVC_FORK_SMALL = 13,    /* it is so small that a fork takes less           */
+	AVC_FORK_ROOM = 14      /* the container, or the host, has no memory for copies */
 };
 
 /* The settings of a guard. Durations in nanoseconds. */

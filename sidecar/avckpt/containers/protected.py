@@ -7,7 +7,7 @@ import enum
 from dataclasses import dataclass
 
 from avckpt.events.vocabulary import Kind, describe_wait_status, why_dropped, why_not_restored
-from avckpt.guard import Event, GuardConfig
+from avckpt.guard import SMALL, Event, GuardConfig
 
 
 class State(enum.Enum):
@@ -118,8 +118,8 @@ class Protected:
             self.threads = event.threads
             self.last_checkpoint_at = at
             self.last_freeze_s = event.freeze_s
-            self.last_images = event.images if event.images == "dirty" or event.fork_reason else ""
-            self.last_fork_reason = event.fork_reason
+            self.last_fork_reason = event.fork_reason if event.fork_reason != SMALL else ""
+            self.last_images = event.images if event.images == "dirty" or self.last_fork_reason else ""
             self.last_quiescent = event.quiescent
         elif kind is Kind.MISSED:
             self.missed += 1
