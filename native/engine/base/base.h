@@ -187,6 +187,8 @@ int proc_thread_count(int task_dirfd);
 long proc_vm_pages(int statm_fd, long *anonymous);
 /* How many pages it shares with no other process (slow: reads its page tables), or -1. */
 long proc_private_pages(pid_t pid);
+/* How many pages the host has for programs, without swapping, or -1. */
+long proc_host_available(void);
 /* The PID of a pidfd, in our namespace, or -1. */
 pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);

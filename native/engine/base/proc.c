@@ -345,17 +345,32 @@ long proc_vm_pages(int statm_fd, long *anonymous)
 	return pages;
 }
 
+/* Of a line in kB, "\nNAME:"; -1: there is none. */
+static long pages_of(const char *text, const char *name)
+{
+	const char *line = strstr(text, name);
+
+	return line ? (long)(strtoul(line + strlen(name), NULL, 10) / (ARCH_PAGE_BYTES / 1024))
+		    : -1;
+}
+
 long proc_private_pages(pid_t pid)
 {
 	char buf[2048];
-	const char *line;
-	unsigned long kb;
 
-	if (proc_read(pid, "smaps_rollup", buf, sizeof buf) <= 0)
-		return -1;
-	line = strstr(buf, "\nPrivate_Dirty:");
-	kb = line ? strtoul(line + 15, NULL, 10) : 0;
-	return line ? (long)(kb / (ARCH_PAGE_BYTES / 1024)) : -1;
+	return proc_read(pid, "smaps_rollup", buf, sizeof buf) <= 0
+		       ? -1
+		       : pages_of(buf, "\nPrivate_Dirty:");
+}
+
+long proc_host_available(void)
+{
+	char buf[512];
+	int fd = open("/proc/meminfo", O_RDONLY | O_CLOEXEC);
+	const ssize_t n = fd < 0 ? -1 : read_text(fd, buf, sizeof buf);
+
+	close_fd(&fd);
+	return n <= 0 ? -1 : pages_of(buf, "\nMemAvailable:");
 }
 
 pid_t proc_pidfd_pid(int pidfd)

@@ -83,7 +83,6 @@ struct dirty_tree {
 	struct dirty **of;
 	uint32_t count, room;
 	uint64_t fork_ns; /* duration of the clones of the last checkpoint by forks */
-	bool cramped;     /* by the caller: there is no memory for copies             */
 	/* Of the last one: why a process was forked, if one was; pages copied.     */
 	enum avc_fork_reason reason;
 	uint64_t copied;
@@ -184,9 +183,10 @@ bool layout_steps_find(char *is, char *want, struct layout_steps *steps);
 
 /* ---- dirty_tree.c -------------------------------------------------------------- */
 
-/* Before a freeze: decides about process.recycling, and copies what it can while the app runs. */
+/* Before a freeze: decides about process.recycling, and copies what it can while the app runs.
+ * `room`: there is memory for copies. */
 void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
-		   const struct avc_config *config, uint32_t slot, timer_t timer);
+		   const struct avc_config *config, bool room, uint32_t slot, timer_t timer);
 /* During it, while main threads answer: reads what is left. */
 int dirty_capture(struct dirty_tree *dirty, const struct generation *generation,
 		  struct avc_error *err) warn_unused;

@@ -169,7 +169,7 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 		return AVC_FORK_SANDBOX;
 	if (config->images == AVC_IMAGES_AUTO && is_small(process))
 		return AVC_FORK_SMALL;
-	if (config->images == AVC_IMAGES_AUTO && attempt->cramped)
+	if (!attempt->room)
 		return AVC_FORK_ROOM;
 	if (memory_needs_fork(process))
 		return AVC_FORK_MEMORY;

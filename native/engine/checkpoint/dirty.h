@@ -21,9 +21,9 @@
 struct attempt {
 	const struct avc_config *config;
 	struct process *process;
+	bool room; /* there is memory for copies */
 	uint32_t slot;
 	timer_t timer;
-	bool cramped; /* see struct dirty_tree */
 };
 
 /* Like those in checkpoint.h, for one process. */

@@ -215,7 +215,7 @@ void guard_rank_generations(struct avc_guard *guard);
 /* Whether the app alone fills its container's memory: if restored to this state, it would be
  * killed again at once. */
 bool guard_app_is_full(const struct avc_guard *guard);
-/* Whether avckpt.images=auto may copy: what templates then have of their own must fit into the
+/* Whether checkpoints may be copies.  For avckpt.images=auto, what templates then have of their own must fit into the
  * container's limit, beside the app; without one, into a part of what the host has available. */
 bool guard_has_room_for_copies(const struct avc_guard *guard);
 

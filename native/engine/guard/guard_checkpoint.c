@@ -430,8 +430,8 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	watch_files(guard, freeze->generation);
 	if (guard->count)
 		dirty_take_spare(&guard->dirty, &guard->generations[guard->count - 1]);
-	guard->dirty.cramped = !guard_has_room_for_copies(guard);
-	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, main->slot, guard->timer);
+	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, guard_has_room_for_copies(guard),
+		      main->slot, guard->timer);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;
 

@@ -16,9 +16,6 @@
  */
 #include <fcntl.h>
 #include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <unistd.h>
 
 #include "guard.h"
 
@@ -124,26 +121,12 @@ bool guard_app_is_full(const struct avc_guard *guard)
 
 /* ---- copies ------------------------------------------------------------------------ */
 
-/* 0: unknown. */
-static uint64_t host_available(void)
-{
-	char buf[512];
-	const char *line;
-	int fd = open("/proc/meminfo", O_RDONLY | O_CLOEXEC);
-	const ssize_t n = fd < 0 ? 0 : read(fd, buf, sizeof buf - 1);
-
-	close_fd(&fd);
-	buf[n > 0 ? n : 0] = 0;
-	line = strstr(buf, "\nMemAvailable:");
-	return line ? strtoull(line + 14, NULL, 10) * 1024 : 0;
-}
-
 bool guard_has_room_for_copies(const struct avc_guard *guard)
 {
 	const struct generation *newest = guard->count ? &guard->generations[guard->count - 1]
 						       : NULL;
-	const uint64_t limit = guard->config.memory_limit_bytes;
-	uint64_t app = 0;
+	const long limit = (long)(guard->config.memory_limit_bytes / ARCH_PAGE_BYTES);
+	long app = 0;
 
 	if (!newest || guard->config.images != AVC_IMAGES_AUTO)
 		return true;
@@ -151,10 +134,9 @@ bool guard_has_room_for_copies(const struct avc_guard *guard)
 	if (guard->policy.room < guard->config.keep)
 		return false;
 	for (uint32_t i = 0; i < newest->images; i++)
-		app += (uint64_t)newest->image[i].anon_pages * ARCH_PAGE_BYTES;
+		app += newest->image[i].anon_pages;
 	if (limit)
-		return app / 100 * (100 + COPIES) <= limit / 100 * FULL;
+		return app * (100 + COPIES) <= limit * FULL;
 	/* Those that exist are no longer available: the sidecar sees when memory becomes short. */
-	return newest->image[0].recycled ||
-	       app / 100 * COPIES <= host_available() / 100 * HOSTS_SHARE;
+	return newest->image[0].recycled || app * COPIES <= proc_host_available() * HOSTS_SHARE;
 }
