@@ -76,6 +76,7 @@ FORK_REASONS = (
     "the older images have too many pages of their own",
     SMALL,
     "memory for copies is short",
+    "forks may be more frequent",
 )
 """`enum avc_fork_reason`: why a checkpoint was taken by a fork."""
 

@@ -319,6 +319,25 @@ def test_copies_only_where_the_container_has_memory_for_them(limit_mb: int, how:
         assert how_made(guard, 3) == {how}
 
 
+def test_forks_where_more_of_them_are_affordable(tmp_path: Path) -> None:
+    """It writes 120 MB/s, and has 64 MB: copies would come every 0.7 s."""
+    with Victim("dirt 64 4 --rate 30000", tmp_path) as victim, GuardProcess(ALL_AUTO, [victim.pid]) as guard:
+        guard.wait_for(lambda event: event.get("images") == "dirty", "a copy, to know its cost")
+        guard.wait_for(lambda event: event.get("fork_reason") == "forks may be more frequent", "forks")
+        kill_at_random(guard, victim, 5, (0.1, 0.5))
+
+
+def test_copies_where_a_fork_takes_long(tmp_path: Path) -> None:
+    """However much more CPU time of ours they take: a fork stops it for twenty times as long."""
+    with Victim("dirt 600 2 --rate 500", tmp_path) as victim, GuardProcess(ALL_AUTO, [victim.pid]) as guard:
+        copies = 0
+        while copies < 40:
+            since = guard.mark()
+            taken = guard.wait_for(lambda event: event.get("images") == "dirty", "a copy", since=since)
+            copies += taken["checkpoints"]
+        assert "forks may be more frequent" not in {event.get("fork_reason") for event in guard.events}
+
+
 def test_a_copy_needs_no_more_memory_than_was_written(tmp_path: Path) -> None:
     """An idle application: its templates have almost no memory of their own."""
     with Victim("idle 64 2", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:

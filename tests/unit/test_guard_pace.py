@@ -37,9 +37,9 @@ class Pace:
         self.policy.room = keep
         self.now = START
 
-    def take(self, held_ms: float = 0.3, cpu_ms: float = 1.0) -> None:
+    def take(self, held_ms: float = 0.3, cpu_ms: float = 1.0, method: str = "FORKS") -> None:
         cost = self.ffi.new("struct policy_cost *", {"held_ns": int(held_ms * MS), "cpu_ns": int(cpu_ms * MS)})
-        self.c.policy_pay(self.pace, self.config, cost[0], self.now)
+        self.c.policy_pay(self.pace, self.config, getattr(self.c, f"POLICY_{method}"), cost[0], self.now)
 
     def wants(self, *, used_ms: float = 0, sent: bool = False, sends: bool = False) -> bool:
         activity = self.ffi.new("struct policy_activity *", {"cpu_ns": int(used_ms * MS), "sent": sent, "sends": sends})
@@ -87,7 +87,44 @@ def test_the_first_one_says_little_and_a_single_slow_one_not_much(library: Libra
     pace.take(cpu_ms=5)
     assert pace.interval_ms == 100
     pace.take(cpu_ms=13)
+    assert pace.interval_ms == 100
+    pace.take(cpu_ms=13)
     assert pace.interval_ms == pytest.approx(120, abs=1)
+
+
+def methods(pace: Pace, forks_ms: float, copies_ms: float, count: int) -> str:
+    """The methods of so many, in the order in which they are taken, at this cost."""
+    chosen = ""
+    for _ in range(count):
+        forks = bool(pace.c.policy_prefers_forks(pace.pace, pace.config))
+        chosen += "f" if forks else "c"
+        pace.take(cpu_ms=forks_ms if forks else copies_ms, method="FORKS" if forks else "COPIES")
+    return chosen
+
+
+@pytest.mark.parametrize("copies_ms", [0.1, 5, 6])
+def test_copies_are_made_where_as_many_are_affordable(library: Library, copies_ms: float) -> None:
+    pace = Pace(library)
+    # The first fork says little, and the second may have met a slow moment.
+    assert methods(pace, 5, copies_ms, 50) == "fff" + 47 * "c"
+
+
+def test_forks_are_where_they_may_be_more_frequent(library: Library) -> None:
+    pace = Pace(library)
+    assert methods(pace, 5, 7, 140) == "fffccc" + 64 * "f" + "ccc" + 64 * "f" + "ccc"
+    # Unless both may be as frequent as anything may.
+    pace = Pace(library)
+    assert methods(pace, 0.1, 0.9, 50) == "fff" + 47 * "c"
+
+
+def test_the_method_changes_with_what_both_cost(library: Library) -> None:
+    pace = Pace(library)
+    assert methods(pace, 5, 7, 10) == "fffcccffff"
+    # It has grown: a fork takes longer than what copies took.
+    assert methods(pace, 50, 7, 20) == "f" + 19 * "c"
+    assert pace.interval_ms == pytest.approx(140)
+    # It writes more.
+    assert "cf" in methods(pace, 50, 80, 30)
 
 
 def test_over_time_they_cost_what_the_budget_says(library: Library) -> None:

@@ -234,8 +234,14 @@ def test_what_cannot_be_protected_is_tried_less_and_less_often() -> None:
     assert tries(4) == [1, 1, 2, 4]
     guard.config.interval_ns = 0
     assert c.policy_refused(policy, c.policy_due(guard.config, guard.now), guard.now) == NEVER
-    guard.config.interval_ns = 300 * SECOND
-    assert tries(3) == [300, 300, 300]
+    # However long the interval is.
+    for interval_s in (3, 300, 3600):
+        c.policy_retry(policy)
+        guard.config.interval_ns = interval_s * SECOND
+        assert tries(10) == [1, 1, 2, 4, 8, 16, 32, 60, 60, 60]
+    c.policy_retry(policy)
+    guard.config.interval_ns = SECOND // 20
+    assert tries(6) == [0.05, 0.05, 0.1, 0.2, 0.4, 0.8]
 
 
 def test_one_that_holds_nothing_is_tried_soon() -> None:
@@ -279,6 +285,10 @@ def test_another_program_is_not_refused_yet() -> None:
     # One that executes itself again and again is tried no later for that.
     assert c.policy_executed(policy, config, due, guard.now + SECOND // 2) == due
     assert c.policy_refused(policy, c.policy_due(config, guard.now), guard.now) == guard.now + SECOND
+    # Nor if the interval is an hour.
+    config.interval_ns = 3600 * SECOND
+    assert c.policy_executed(policy, config, c.policy_due(config, guard.now), guard.now) == guard.now + SECOND
+    assert c.policy_executed(policy, config, guard.now + SECOND // 2, guard.now) == guard.now + SECOND // 2
     config.interval_ns = 0
     assert c.policy_executed(policy, config, NEVER, guard.now) == NEVER
 

@@ -184,9 +184,10 @@ bool layout_steps_find(char *is, char *want, struct layout_steps *steps);
 /* ---- dirty_tree.c -------------------------------------------------------------- */
 
 /* Before a freeze: decides about process.recycling, and copies what it can while the app runs.
- * `room`: there is memory for copies. */
+ * `fork`: why not to copy this time, AVC_FORK_NONE: no reason. */
 void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
-		   const struct avc_config *config, bool room, uint32_t slot, timer_t timer);
+		   const struct avc_config *config, enum avc_fork_reason fork, uint32_t slot,
+		   timer_t timer);
 /* During it, while main threads answer: reads what is left. */
 int dirty_capture(struct dirty_tree *dirty, const struct generation *generation,
 		  struct avc_error *err) warn_unused;

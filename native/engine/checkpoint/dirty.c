@@ -169,8 +169,8 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 		return AVC_FORK_SANDBOX;
 	if (config->images == AVC_IMAGES_AUTO && is_small(process))
 		return AVC_FORK_SMALL;
-	if (!attempt->room)
-		return AVC_FORK_ROOM;
+	if (attempt->fork)
+		return attempt->fork;
 	if (memory_needs_fork(process))
 		return AVC_FORK_MEMORY;
 	if (has_pinned(process->pid) || files_may_pin(process->files_before))

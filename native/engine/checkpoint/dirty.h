@@ -21,7 +21,7 @@
 struct attempt {
 	const struct avc_config *config;
 	struct process *process;
-	bool room; /* there is memory for copies */
+	enum avc_fork_reason fork; /* why none is to be copied now, or NONE */
 	uint32_t slot;
 	timer_t timer;
 };

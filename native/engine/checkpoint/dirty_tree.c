@@ -90,14 +90,15 @@ static void sum_up(struct dirty_tree *tree, const struct dirty *dirty)
 }
 
 void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
-		   const struct avc_config *config, bool room, uint32_t slot, timer_t timer)
+		   const struct avc_config *config, enum avc_fork_reason fork, uint32_t slot,
+		   timer_t timer)
 {
 	forget_ended(dirty);
 	dirty->reason = AVC_FORK_NONE;
 	dirty->copied = 0;
 	for (uint32_t i = 0; i < tree->count; i++) {
 		struct process *process = tree->entry[i].process;
-		const struct attempt attempt = { config, process, room, slot, timer };
+		const struct attempt attempt = { config, process, fork, slot, timer };
 		struct dirty *one = process ? get(dirty, process) : NULL;
 
 		if (process)

@@ -117,6 +117,7 @@ struct avc_guard {
 	/* CPU time of the guard: since the last checkpoint, and when the current work began.
 	 * CPU time and faults of the app: as of the last checkpoint. */
 	uint64_t pace_cpu_ns, pace_began_ns, pace_app_cpu_ns, pace_faults;
+	uint64_t pace_held_ns; /* by all attempts at this one */
 	struct output output;
 	struct faults faults;
 	uint64_t sent_ns;              /* when the app was last seen to send; 0: never      */
@@ -215,7 +216,7 @@ void guard_rank_generations(struct avc_guard *guard);
 /* Whether the app alone fills its container's memory: if restored to this state, it would be
  * killed again at once. */
 bool guard_app_is_full(const struct avc_guard *guard);
-/* Whether checkpoints may be copies.  For avckpt.images=auto, what templates then have of their own must fit into the
+/* Whether there is memory for copies: what templates then have of their own must fit into the
  * container's limit, beside the app; without one, into a part of what the host has available. */
 bool guard_has_room_for_copies(const struct avc_guard *guard);
 
@@ -235,9 +236,11 @@ void guard_work_ahead(struct avc_guard *guard);
 /* Around all work for checkpoints: its CPU time is counted. */
 void guard_pace_begin(struct avc_guard *guard);
 void guard_pace_end(struct avc_guard *guard);
+/* Why the next one is not to be a copy, although it may be possible; or NONE. */
+enum avc_fork_reason guard_why_fork(struct avc_guard *guard);
 /* After guard_pace_begin(): a checkpoint was taken, or failed.  Both set when to look again. */
 void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event);
-void guard_pace_missed(struct avc_guard *guard, uint64_t held_ns);
+void guard_pace_missed(struct avc_guard *guard);
 void guard_pace_restored(struct avc_guard *guard);
 /* Checks whether the app has sent. */
 void guard_pace_listen(struct avc_guard *guard);

@@ -430,7 +430,7 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	watch_files(guard, freeze->generation);
 	if (guard->count)
 		dirty_take_spare(&guard->dirty, &guard->generations[guard->count - 1]);
-	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, guard_has_room_for_copies(guard),
+	dirty_prepare(&guard->dirty, &guard->tree, &guard->config, guard_why_fork(guard),
 		      main->slot, guard->timer);
 	for (uint32_t i = 0; i < guard->tree.count; i++) {
 		const struct process *process = guard->tree.entry[i].process;
@@ -504,6 +504,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	budget_deadline(0);
 	if (!result)
 		result = budget_check(guard->main.pid, err);
+	guard->pace_held_ns += freeze->freeze_ns;
 	event->freeze_ns = freeze->freeze_ns;
 	event->stop_ns = freeze->stop_ns;
 	event->clone_ns = freeze->clone_ns;
@@ -596,7 +597,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
-/* One was missed.  avckpt.interval=auto has pauses of its own (guard_pace_missed()). */
+/* One was missed. */
 static void try_soon(struct avc_guard *guard)
 {
 	if (!policy_is_automatic(&guard->config))
@@ -631,6 +632,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	if (ticket)
 		policy_retry(&guard->policy);
+	guard->pace_held_ns = 0;
 	guard_pace_begin(guard);
 	taken = take(guard, &event, &error) == 0;
 	if (taken) {
@@ -643,7 +645,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		guard->unprotected = false;
 		return;
 	}
-	guard_pace_missed(guard, event.freeze_ns);
+	guard_pace_missed(guard);
 	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
 	if (guard_filter_hinders(guard)) {
 		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */

@@ -78,6 +78,18 @@ static uint64_t faults_ns(struct avc_guard *guard, uint64_t freeze_ns)
 	return ns < freeze_ns ? ns : freeze_ns;
 }
 
+enum avc_fork_reason guard_why_fork(struct avc_guard *guard)
+{
+	if (guard->config.images != AVC_IMAGES_AUTO)
+		return AVC_FORK_NONE;
+	if (!guard_has_room_for_copies(guard))
+		return AVC_FORK_ROOM;
+	if (!policy_is_automatic(&guard->config) ||
+	    !policy_prefers_forks(&guard->pace, &guard->config))
+		return AVC_FORK_NONE;
+	return guard->pace.forking ? AVC_FORK_BUDGET : AVC_FORK_FIRST;
+}
+
 void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 {
 	struct policy_cost cost;
@@ -87,30 +99,31 @@ void guard_pace_taken(struct avc_guard *guard, const struct avc_event *event)
 	guard_pace_end(guard);
 	/* Making the template, and freeing it later. */
 	cost.cpu_ns = guard->pace_cpu_ns + 2 * event->clone_ns;
-	cost.held_ns = event->freeze_ns + faults_ns(guard, event->freeze_ns);
+	cost.held_ns = guard->pace_held_ns + faults_ns(guard, event->freeze_ns);
 	guard->pace_cpu_ns = 0;
-	policy_pay(&guard->pace, &guard->config, cost, now_ns());
+	policy_pay(&guard->pace, &guard->config,
+		   event->images == AVC_IMAGES_FORK ? POLICY_FORKS : POLICY_COPIES, cost, now_ns());
 	begin_rest(guard);
 }
 
 /* A failed checkpoint has stopped the app, too: the pause after it keeps to the budget, but is no
  * longer than a fixed interval would be. */
-static uint64_t paid_for(const struct avc_guard *guard, uint64_t held_ns)
+static uint64_t paid_for(const struct avc_guard *guard)
 {
-	const uint64_t pause = held_ns * 1000000 / guard->config.budget_freeze_ppm,
+	const uint64_t pause = guard->pace_held_ns * 1000000 / guard->config.budget_freeze_ppm,
 		       longest = guard->config.interval_ns;
 
 	return now_ns() + (pause < longest ? pause : longest);
 }
 
-void guard_pace_missed(struct avc_guard *guard, uint64_t held_ns)
+void guard_pace_missed(struct avc_guard *guard)
 {
 	if (!policy_is_automatic(&guard->config))
 		return;
 	guard_pace_end(guard);
 	guard->next_ns = policy_try_again(&guard->pace, &guard->config, now_ns());
-	if (guard->next_ns < paid_for(guard, held_ns))
-		guard->next_ns = paid_for(guard, held_ns);
+	if (guard->next_ns < paid_for(guard))
+		guard->next_ns = paid_for(guard);
 }
 
 void guard_pace_restored(struct avc_guard *guard)

@@ -18,8 +18,11 @@
 #define PROOF_NS (1000 * MS) /* an app that lives this long has made progress */
 #define AGAIN_NS (50 * MS)
 #define AVERAGE_OF 8
+#define SAMPLES 3
+#define FORKS 64
 #define LOOK_NS (20 * MS)
 #define SOON_NS (100 * MS)
+#define AGAIN_LEAST_NS (1000 * MS)
 #define LONG_NS UINT64_C(60000000000)
 /* The CPU time that a checkpoint itself makes an idle app use: restarted calls. */
 #define NOISE_NS (MS / 5)
@@ -184,9 +187,12 @@ static uint64_t as_long_again(uint64_t *since, uint64_t least, uint64_t now)
 
 uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now)
 {
-	const uint64_t again = as_long_again(&policy->refused_ns, 0, now);
+	const uint64_t pause = due > now ? due - now : 0;
 
-	return due > again ? due : again;
+	if (due == POLICY_NEVER)
+		return due;
+	return as_long_again(&policy->refused_ns, pause < AGAIN_LEAST_NS ? pause : AGAIN_LEAST_NS,
+			     now);
 }
 
 uint64_t policy_without(struct policy *policy, uint64_t due, uint64_t now)
@@ -209,10 +215,14 @@ uint64_t policy_executed(struct policy *policy, const struct avc_config *config,
 			 uint64_t now)
 {
 	const bool refused = policy->refused_ns;
-	const uint64_t first = policy_first_due(config, now);
+	uint64_t first = policy_first_due(config, now);
 
 	policy_retry(policy);
-	return refused && first < due ? first : due;
+	if (!refused || first == POLICY_NEVER)
+		return due;
+	if (first > now + AGAIN_LEAST_NS)
+		first = now + AGAIN_LEAST_NS;
+	return first < due ? first : due;
 }
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
@@ -224,8 +234,8 @@ bool policy_is_automatic(const struct avc_config *config)
 
 uint64_t policy_interval(const struct policy_pace *pace, const struct avc_config *config)
 {
-	return policy_is_automatic(config) && pace->samples ? pace->interval_ns
-							    : config->interval_ns;
+	return policy_is_automatic(config) && pace->samples[pace->method] ? pace->interval_ns
+									  : config->interval_ns;
 }
 
 static uint64_t average(uint64_t before, uint64_t now)
@@ -233,34 +243,51 @@ static uint64_t average(uint64_t before, uint64_t now)
 	return before - before / AVERAGE_OF + now / AVERAGE_OF;
 }
 
-/* The first one injects the parasite: the second says more. */
-static void learn(struct policy_pace *pace, struct policy_cost cost)
+static uint64_t lesser(uint64_t a, uint64_t b)
 {
-	if (++pace->samples <= 2) {
-		pace->cost = cost;
-		return;
-	}
-	pace->samples = 3;
-	pace->cost.held_ns = average(pace->cost.held_ns, cost.held_ns);
-	pace->cost.cpu_ns = average(pace->cost.cpu_ns, cost.cpu_ns);
+	return a < b ? a : b;
 }
 
-static uint64_t affordable(const struct policy_cost *cost, const struct avc_config *config)
+/* The first one injects the parasite: the second says more; and the third, as the machine may have
+ * stood still for a moment. */
+static void learn(struct policy_cost *known, uint32_t *samples, struct policy_cost cost)
+{
+	if (*samples < SAMPLES) {
+		if (++*samples < SAMPLES) {
+			*known = cost;
+			return;
+		}
+		known->held_ns = lesser(known->held_ns, cost.held_ns);
+		known->cpu_ns = lesser(known->cpu_ns, cost.cpu_ns);
+		return;
+	}
+	known->held_ns = average(known->held_ns, cost.held_ns);
+	known->cpu_ns = average(known->cpu_ns, cost.cpu_ns);
+}
+
+/* As often as the budgets allow, or as avckpt.interval.min does. */
+static uint64_t within_budgets(const struct policy_cost *cost, const struct avc_config *config)
 {
 	const uint64_t held = cost->held_ns * 1000000 / config->budget_freeze_ppm,
 		       cpu = cost->cpu_ns * 1000000 / config->budget_cpu_ppm,
 		       more = held > cpu ? held : cpu;
 
-	if (more < config->interval_min_ns)
-		return config->interval_min_ns;
-	return more < config->interval_ns ? more : config->interval_ns;
+	return more > config->interval_min_ns ? more : config->interval_min_ns;
 }
 
-void policy_pay(struct policy_pace *pace, const struct avc_config *config, struct policy_cost cost,
-		uint64_t now)
+static uint64_t affordable(const struct policy_cost *cost, const struct avc_config *config)
 {
-	learn(pace, cost);
-	pace->interval_ns = affordable(&pace->cost, config);
+	const uint64_t interval = within_budgets(cost, config);
+
+	return interval < config->interval_ns ? interval : config->interval_ns;
+}
+
+void policy_pay(struct policy_pace *pace, const struct avc_config *config,
+		enum policy_method method, struct policy_cost cost, uint64_t now)
+{
+	pace->method = method;
+	learn(&pace->cost[method], &pace->samples[method], cost);
+	pace->interval_ns = affordable(&pace->cost[method], config);
 	pace->failures /= 2;
 	pace->taken_ns = now;
 	if (pace->spent_ns < now)
@@ -271,11 +298,38 @@ void policy_pay(struct policy_pace *pace, const struct avc_config *config, struc
 		pace->spent_ns = now + 2 * pace->interval_ns;
 }
 
+/* By a quarter, so that what is measured does not matter where both cost the same. */
+static bool is_dearer(const struct policy_cost *cost, const struct policy_cost *than,
+		      const struct avc_config *config)
+{
+	return within_budgets(cost, config) / 5 > within_budgets(than, config) / 4;
+}
+
+/* Forks are measured before memory is watched, which is a part of what copies cost. */
+bool policy_prefers_forks(struct policy_pace *pace, const struct avc_config *config)
+{
+	const struct policy_cost *forks = &pace->cost[POLICY_FORKS],
+				 *copies = &pace->cost[POLICY_COPIES];
+
+	if (pace->forking) {
+		pace->forking--;
+		if (is_dearer(forks, copies, config))
+			pace->forking = 0;
+		/* They may cost less now. */
+		if (!pace->forking)
+			pace->samples[POLICY_COPIES] = 0;
+	} else if (pace->samples[POLICY_COPIES] == SAMPLES && is_dearer(copies, forks, config)) {
+		pace->forking = FORKS;
+		pace->samples[POLICY_FORKS] = 1;
+	}
+	return pace->forking || pace->samples[POLICY_FORKS] < SAMPLES;
+}
+
 uint64_t policy_try_again(struct policy_pace *pace, const struct avc_config *config, uint64_t now)
 {
 	uint64_t pause = policy_interval(pace, config);
 
-	if (pace->samples == 0 || pause < AGAIN_NS)
+	if (!pace->samples[pace->method] || pause < AGAIN_NS)
 		pause = AGAIN_NS;
 	for (uint32_t i = 0; i < pace->failures && pause < config->interval_ns; i++)
 		pause *= 2;
@@ -301,7 +355,7 @@ bool policy_wants(const struct policy_pace *pace, const struct avc_config *confi
 	if (now < pace->spent_ns || activity.cpu_ns <= NOISE_NS)
 		return false;
 	/* What is at stake should exceed the cost of saving it. */
-	return activity.sends || activity.cpu_ns >= pace->cost.cpu_ns ||
+	return activity.sends || activity.cpu_ns >= pace->cost[pace->method].cpu_ns ||
 	       now - pace->taken_ns >= config->interval_ns;
 }
 

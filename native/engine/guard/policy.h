@@ -89,9 +89,9 @@ uint32_t policy_line_replaced(const struct policy *policy, const struct policy_l
 /* A checkpoint has failed because of the main process, or of another one.  True: no generation is
  * valid, the app is unprotected.  False: it is retried when it is due. */
 bool policy_missed(struct policy *policy, enum avc_code code, bool of_main);
-/* It is unprotected: when to try again.  At `due` at the earliest, and after as long again as it has
- * been refused, up to a minute: what lasts for a moment costs little protection, and an app that
- * cannot be protected is hardly ever stopped. */
+/* It is unprotected: when to try again.  At `due` or after a second, and then after as long again as
+ * it has been refused, up to a minute: what lasts for a moment costs little protection, even if the
+ * interval is an hour, and an app that cannot be protected is hardly ever stopped. */
 uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now);
 /* One was missed: when to try again.  At `due`; but if nothing is held to go back to, after as long
  * again as that has been so, at least 0.1 s, at most a minute: the machine may have stood still for
@@ -100,7 +100,7 @@ uint64_t policy_without(struct policy *policy, uint64_t due, uint64_t now);
 /* On command, or another application: as if it had not been refused, and none missed, yet. */
 void policy_retry(struct policy *policy);
 /* It has executed another program, which may be one that can be protected: if it was refused, when
- * to try that instead of at `due`. */
+ * to try that instead of at `due`: after a second, at most. */
 uint64_t policy_executed(struct policy *policy, const struct avc_config *config, uint64_t due,
 			 uint64_t now);
 
@@ -112,14 +112,19 @@ struct policy_cost {
 	uint64_t cpu_ns;  /* by us and our templates */
 };
 
+/* How a template is made (dirty.c). */
+enum policy_method { POLICY_FORKS, POLICY_COPIES, POLICY_METHODS };
+
 /* How often there may be a checkpoint.  All zero at the start. */
 struct policy_pace {
-	struct policy_cost cost; /* on average                                      */
-	uint32_t samples;
-	uint32_t failures;    /* in a row                                        */
-	uint64_t interval_ns; /* between two, by the budgets                     */
-	uint64_t taken_ns;    /* when the app resumed after the last one */
-	uint64_t spent_ns;    /* until then the budgets are used up              */
+	struct policy_cost cost[POLICY_METHODS]; /* on average                      */
+	uint32_t samples[POLICY_METHODS];
+	enum policy_method method; /* of the last one                                 */
+	uint32_t forking;          /* so many more, until copies are tried again      */
+	uint32_t failures;         /* in a row                                        */
+	uint64_t interval_ns;      /* between two, by the budgets                     */
+	uint64_t taken_ns;         /* when the app resumed after the last one */
+	uint64_t spent_ns;         /* until then the budgets are used up              */
 };
 
 /* What the app has done since the last one. */
@@ -132,9 +137,12 @@ struct policy_activity {
 bool policy_is_automatic(const struct avc_config *config);
 /* The current interval, automatic or not. */
 uint64_t policy_interval(const struct policy_pace *pace, const struct avc_config *config);
-/* One was taken, at that cost. */
-void policy_pay(struct policy_pace *pace, const struct avc_config *config, struct policy_cost cost,
-		uint64_t now);
+/* One was taken by that method, at that cost. */
+void policy_pay(struct policy_pace *pace, const struct avc_config *config,
+		enum policy_method method, struct policy_cost cost, uint64_t now);
+/* Where copies are possible: whether the next one is to be a fork all the same, because more of
+ * them are affordable, or because it is not known yet what they cost. */
+bool policy_prefers_forks(struct policy_pace *pace, const struct avc_config *config);
 /* Nothing was taken; when to try again. */
 uint64_t policy_try_again(struct policy_pace *pace, const struct avc_config *config, uint64_t now);
 /* One more than the budgets allow on average may come right after output: the earliest time. */

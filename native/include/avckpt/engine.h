@@ -64,7 +64,8 @@ enum avc_fork_reason {
 	AVC_FORK_AGE = 11,      /* the older ones were not forked for a minute     */
 	AVC_FORK_COPIES = 12,   /* ... or have too many pages of their own         */
 	AVC_FORK_SMALL = 13,    /* it is so small that a fork takes less           */
-	AVC_FORK_ROOM = 14      /* the container, or the host, has no memory for copies */
+	AVC_FORK_ROOM = 14,     /* the container, or the host, has no memory for copies */
+	AVC_FORK_BUDGET = 15    /* avckpt.interval=auto, and forks may be more frequent */
 };
 
 /* The settings of a guard. Durations in nanoseconds. */
