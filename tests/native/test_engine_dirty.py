@@ -10,13 +10,14 @@ import re
 import select
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 from avckpt.guard import Images
 
 from testkit.family import ours
-from testkit.guarded import GuardProcess, Json, Victim, config, kill_at_random, since_linux, sleep_exactly
+from testkit.guarded import PATIENCE_S, GuardProcess, Json, Victim, config, kill_at_random, since_linux, sleep_exactly
 from testkit.harness import wait_until
 from testkit.procfs import children_of, figures
 
@@ -80,7 +81,7 @@ def test_killed_at_random_moments(command: str, tmp_path: Path) -> None:
         victim.wait_beats(20)
 
 
-@pytest.mark.parametrize("command", ["dirt 30 4 --rate 20000", "dirt 32 2 --rate 30000 --maps", "busy 4"])
+@pytest.mark.parametrize("command", ["dirt 60 4 --rate 20000", "dirt 64 2 --rate 30000 --maps", "busy 4"])
 def test_how_and_how_often_both_by_itself(command: str, tmp_path: Path) -> None:
     """avckpt.images=auto together with avckpt.interval=auto."""
     with Victim(command, tmp_path) as victim, GuardProcess(ALL_AUTO, [victim.pid]) as guard:
@@ -108,7 +109,7 @@ def how_made(guard: GuardProcess, count: int, victim: Victim | None = None) -> s
 
 def test_changes_over_as_it_writes_more_or_less_and_stays_there(tmp_path: Path) -> None:
     with (
-        Victim("dirt 24 2", tmp_path) as victim,
+        Victim("dirt 48 2", tmp_path) as victim,
         GuardProcess(config(images=Images.AUTO), [victim.pid]) as guard,
     ):
         for _ in range(2):
@@ -218,6 +219,21 @@ def test_the_same_one_is_restored_many_times(tmp_path: Path) -> None:
             victim.wait_beats(5)
         until_copied(guard)
         victim.wait_beats(5)
+
+
+def test_a_template_is_in_the_applications_landlock_domain(tmp_path: Path) -> None:
+    """Which it has entered since the template was forked."""
+    with Victim("fenced 40", tmp_path) as victim, GuardProcess(DIRTY, [victim.pid]) as guard:
+        for domains in range(1, 4):
+            until_copied(guard)
+            os.kill(victim.app, signal.SIGUSR1)
+            wait_until(partial(lambda n: victim.see().counter[0] == n, domains), PATIENCE_S, "it is in that domain")
+            taken = checkpoint(guard)
+            since = guard.mark()
+            victim.kill_app()
+            assert guard.wait("restored", since=since)["generation"] == taken["generation"]
+            victim.wait_beats(5)
+            assert victim.see().counter[0] == domains
 
 
 def until_near(guard: GuardProcess) -> Json:

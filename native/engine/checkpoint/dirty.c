@@ -32,7 +32,7 @@
 #define COPIES_SHARE 2
 #define OWN_SHARE 8 /* more than this part of the process: it is to share more with the others */
 #define OWN_LEAST 1024
-#define SMALL_PAGES 1024
+#define SMALL_PAGES 8192
 #define SLACK_PAGES 64 /* written until the freeze, by one process of many */
 #define FORK_NS 100000 /* without any pages */
 #define FORK_PAGE_NS 90
@@ -147,13 +147,13 @@ static bool has_own_filter(const struct process *process)
 	       !seccomp_is_containers(&status, process->plain_filters);
 }
 
-/* A fork of it takes no longer than the queries that a copy needs. */
+/* A fork of it takes less than a millisecond, hardly more than the queries that a copy needs. */
 static bool is_small(const struct process *process)
 {
-	long pages = 0;
+	long anonymous = 0;
 
-	return proc_vm_pages(process->statm_fd, &pages) >= 0 &&
-	       pages < (process->tracker ? SMALL_PAGES / 2 : SMALL_PAGES);
+	return proc_vm_pages(process->statm_fd, &anonymous) >= 0 &&
+	       anonymous < (process->tracker ? SMALL_PAGES / 2 : SMALL_PAGES);
 }
 
 /* Why its memory is not even to be watched. */
@@ -243,7 +243,7 @@ void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 	const size_t slack = process->descendant ? SLACK_PAGES : COPY_BATCH_PAGES;
 	uint64_t left = 0;
 
-	process->recycling = false;
+	process->recycling = 0;
 	dirty->idle.catching_up = false;
 	dirty->copied = 0;
 	dirty->reason = why_not(process, attempt);
@@ -277,7 +277,7 @@ void dirty_prepare_one(struct dirty *dirty, const struct attempt *attempt)
 	if (config->images == AVC_IMAGES_AUTO && left * READ_PAGE_NS > dirty->fork_ns)
 		give_up(dirty, AVC_FORK_WRITES);
 	else
-		process->recycling = true;
+		process->recycling = proc_inside(dirty->idle.pid);
 	/* With room for what is written until the freeze. */
 	dirty->wanted = (4 * left + slack) * PAGE;
 }

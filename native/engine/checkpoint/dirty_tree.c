@@ -102,7 +102,7 @@ void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
 		struct dirty *one = process ? get(dirty, process) : NULL;
 
 		if (process)
-			process->recycling = false;
+			process->recycling = 0;
 		if (!one) {
 			if (process)
 				dirty->reason = AVC_FORK_FIRST;
@@ -113,7 +113,7 @@ void dirty_prepare(struct dirty_tree *dirty, const struct tree *tree,
 		dirty_prepare_one(one, &attempt);
 		swap_batch(dirty, one);
 		if (process->recycling && !copy_make_room(one, one->wanted)) {
-			process->recycling = false;
+			process->recycling = 0;
 			one->reason = AVC_FORK_FIRST;
 		}
 		sum_up(dirty, one);

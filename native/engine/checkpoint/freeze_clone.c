@@ -285,7 +285,7 @@ static int ask_begin(struct process *process, uint32_t slot, uint64_t takes_ns,
 	process->children = ask_for_children(call);
 	thread_ask_add(process, false, call, &process->questions);
 	if (process->recycling)
-		inherited_ask(&process->parasite, slot, call);
+		inherited_ask(&process->parasite, slot, process->recycling, call);
 	process->asked_ns = now_ns();
 	if (thread_borrow(process, thread, err) || parasite_start(thread->tid, err))
 		return -1;

@@ -123,7 +123,7 @@ static int quieten(struct image *image, struct avc_error *err)
 		rseq = call_add(call, SYS_rseq, cloned->rseq, cloned->rseq_bytes,
 				RSEQ_FLAG_UNREGISTER_, cloned->rseq_signature);
 	if (process->tracker)
-		inherited_ask(&process->parasite, image->slot, call);
+		inherited_ask(&process->parasite, image->slot, 0, call);
 	if (parasite_send(&process->parasite, pid, &image->base, call, err) ||
 	    parasite_run(pid, call, err))
 		return -1;

@@ -27,7 +27,7 @@
 struct list {
 	struct inj_syscall call[INHERITED_SIGNALS + INHERITED_VALUES + 1];
 	uint64_t action[INHERITED_SIGNALS][4];
-	int32_t tsc;
+	uint64_t robust[2]; /* that list of a template's; not used */
 };
 
 static struct list *list_of(const struct parasite *parasite, uint32_t slot)
@@ -36,9 +36,14 @@ static struct list *list_of(const struct parasite *parasite, uint32_t slot)
 	return (struct list *)(parasite_files(parasite, slot) + INJ_FILES_BYTES / 2);
 }
 
-void inherited_ask(const struct parasite *parasite, uint32_t slot, struct inj_call *call)
+/* No call tells the Landlock domain that a task is in.  But it may not look into one outside of it,
+ * nor into its own template if it has entered it since (ptrace(2), PTRACE_MODE_READ). */
+void inherited_ask(const struct parasite *parasite, uint32_t slot, pid_t template,
+		   struct inj_call *call)
 {
-	static const uint64_t asked[INHERITED_VALUES][3] = {
+	struct list *list = list_of(parasite, slot);
+	const uint64_t robust = parasite_remote(parasite, list->robust);
+	const uint64_t asked[INHERITED_VALUES][4] = {
 		[INHERITED_BREAK] = { SYS_brk },
 		{ SYS_prctl, PR_GET_THP_DISABLE },
 		{ SYS_prctl, PR_GET_MEMORY_MERGE_ },
@@ -49,8 +54,8 @@ void inherited_ask(const struct parasite *parasite, uint32_t slot, struct inj_ca
 		{ SYS_prctl, PR_GET_SPECULATION_CTRL, PR_SPEC_STORE_BYPASS },
 		{ SYS_prctl, PR_GET_SPECULATION_CTRL, PR_SPEC_INDIRECT_BRANCH },
 		{ SYS_prctl, PR_GET_KEEPCAPS },
+		{ SYS_get_robust_list, (uint64_t) template, robust, robust + 8 },
 	};
-	struct list *list = list_of(parasite, slot);
 	uint32_t n = 0;
 
 	memset(list, 0, sizeof *list);
@@ -60,8 +65,9 @@ void inherited_ask(const struct parasite *parasite, uint32_t slot, struct inj_ca
 			.arg = { (uint64_t)i + 1, 0, parasite_remote(parasite, list->action[i]), 8 }
 		};
 	for (int i = 0; i < INHERITED_VALUES; i++)
-		list->call[n++] = (struct inj_syscall){ .nr = (int64_t)asked[i][0],
-							.arg = { asked[i][1], asked[i][2] } };
+		list->call[n++] = (struct inj_syscall){
+			.nr = (int64_t)asked[i][0], .arg = { asked[i][1], asked[i][2], asked[i][3] }
+		};
 	list->call[n++] = (struct inj_syscall){ .nr = SYS_prctl, .arg = { PR_GET_DUMPABLE } };
 	call_add(call, INJ_LIST, parasite_remote(parasite, list), n);
 }

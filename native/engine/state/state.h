@@ -147,14 +147,14 @@ void process_attrs_setup_limits(const struct image *image, struct setup *setup);
 /* ---- inherited.c ------------------------------------------------------------------ */
 
 #define INHERITED_SIGNALS 64
-#define INHERITED_VALUES 10
+#define INHERITED_VALUES 11
 #define INHERITED_BREAK 0
 
 /* What a process inherits by fork, besides memory and descriptors: as of the fork, or as its parent
  * has it now.  Compared by memcmp(). */
 struct inherited {
 	uint64_t action[INHERITED_SIGNALS][4]; /* rt_sigaction(2)                    */
-	int64_t value[INHERITED_VALUES];       /* prctl(2), membarrier(2), brk(2)    */
+	int64_t value[INHERITED_VALUES];       /* prctl(2), membarrier(2), brk(2), ... */
 	struct creds creds;
 	uint64_t limit[LIMITS][2];
 	uint64_t stat;   /* a hash of the layout in /proc/PID/stat */
@@ -164,8 +164,10 @@ struct inherited {
 };
 
 /* Adds a call to a list (INJ_LIST), which leaves its answers in that slot; takes these, once made;
- * reads /proc; and takes the thread's own attributes, queried with the rest. */
-void inherited_ask(const struct parasite *parasite, uint32_t slot, struct inj_call *call);
+ * reads /proc; and takes the thread's own attributes, queried with the rest.  `template`: the one to
+ * compare with, as seen by the process; 0: it is the template. */
+void inherited_ask(const struct parasite *parasite, uint32_t slot, pid_t template,
+		   struct inj_call *call);
 void inherited_answer(const struct parasite *parasite, uint32_t slot, struct inherited *inherited,
 		      int64_t *dumpable);
 int inherited_read(struct inherited *inherited, pid_t pid, struct avc_error *err) warn_unused;

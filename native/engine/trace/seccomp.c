@@ -69,6 +69,7 @@ static const struct kind wanted[] = {
 	{ SYS_prctl, PR_GET_THP_DISABLE },
 	{ SYS_prctl, 68 /* PR_GET_MEMORY_MERGE */ },
 	{ SYS_pkey_alloc, ANY },
+	{ SYS_get_robust_list, ANY },
 	/* queries */
 	{ SYS_prctl, PR_GET_TID_ADDRESS },
 	{ SYS_prctl, PR_GET_NAME },

@@ -251,7 +251,7 @@ struct process {
 	bool adopts;                  /* it or an ancestor adopts orphans, or may do so     */
 	bool paused; /* between process_pause_adoption() and process_resume_adoption()         */
 	struct tracker *tracker; /* process/tracker.c; NULL: its memory is not watched         */
-	bool recycling;          /* in this freeze a template is brought up to date          */
+	pid_t recycling; /* in this freeze that template (PID inside) is brought up to date  */
 	/* Readable when it may have executed another program (executed.c); fd -1: not used. */
 	struct exec_sign {
 		int fd;
