@@ -14,6 +14,7 @@
  *   aside.c         calls that may block forever
  *   proc.c          /proc
  *   proc_text.c     parsers of its files
+ *   opens.c         files that a container names, or has
  *   cpu_clock.c     the scheduler's per-CPU clocks
  *   pagemap.c       which pages of a process are present
  *   pageset.c       sets of them
@@ -308,6 +309,7 @@ int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *
 
 /* A line of mountinfo; the strings point into it. */
 struct proc_mount {
+	uint64_t id;
 	uint32_t major, minor;
 	char *point;
 	const char *options, *type;
@@ -318,6 +320,52 @@ struct proc_mount {
 bool proc_parse_mount(char *line, struct proc_mount *mount);
 /* Replaces escapes such as "\\040". */
 void proc_unescape(char *text);
+
+/* ---- opens.c ------------------------------------------------------------------------- */
+
+/* A path as it is resolved below `root`, a descriptor: no link leads out of it, and none of /proc to
+ * what a process has open.  An O_PATH descriptor, or -1 with errno.  `flags` and `resolve` as of
+ * openat2(2), added. */
+int open_below(int root, const char *path, uint64_t flags, uint64_t resolve);
+/* The same below the root of a process: init's is the container's, others may have changed theirs. */
+int open_in_root_of(pid_t pid, const char *path, uint64_t flags);
+/* For calls that take a path: of what a descriptor of ours refers to. */
+struct fd_path {
+	char text[40];
+};
+struct fd_path fd_path(int fd);
+/* Another open file description of that.  With O_NONBLOCK: there may be no process at the other end
+ * of a pipe. */
+int open_again(int fd, int flags);
+/* The id of the mount by which it was opened, as in mountinfo; 0: unknown. */
+uint64_t mount_of(int fd);
+/* Whether a file system of that type asks a server, or a program (FUSE), which may not answer, or be
+ * the application itself. */
+bool mount_is_served(const char *type);
+/* The type of the file system that a descriptor is on, as mounted for that process, without asking
+ * it; "": it is not mounted there. */
+struct mount_type {
+	uint64_t id;
+	char name[32];
+};
+const char *mount_type(pid_t pid, int fd, struct mount_type *last);
+/* Whether what is on that device (struct mapping) is memory by memfd_create(2) or shmget(2), to which
+ * no path leads. */
+bool device_is_memory(uint64_t device);
+/* Opening a file breaks a lease (fcntl(2), F_SETLEASE): whoever has it gets SIGIO, which may end it,
+ * and the opening one waits.  Those of all processes, read when they are first needed; { 0 } at
+ * first. */
+struct leases {
+	bool known;
+	uint32_t count, room;
+	struct leased {
+		uint64_t device, inode;
+	} * file;
+};
+void leases_free(struct leases *leases);
+/* The regular file that is mapped so, from its O_PATH descriptor; no device, which may have an
+ * effect.  -1 with EACCES: it is none; EBUSY: it is leased. */
+int open_to_read(int path_fd, const struct mapping *mapping, struct leases *leases);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */
 
