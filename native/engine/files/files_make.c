@@ -36,8 +36,9 @@ static bool is_the_one(int fd, const struct file *want)
 /* From any descriptor of a file to one with the flags that the app had. */
 static int open_as(int fd, const struct file *want)
 {
+	/* O_TMPFILE is more than one bit, and has O_DIRECTORY. */
 	const int flags = want->flags &
-			  ~(O_CREAT | O_EXCL | O_TRUNC | O_NOFOLLOW | O_DIRECTORY | FASYNC);
+			  ~(O_CREAT | O_EXCL | O_TRUNC | O_NOFOLLOW | O_TMPFILE | FASYNC);
 	int opened, reader;
 
 	if (want->flags & O_PATH)
