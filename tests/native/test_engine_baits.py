@@ -11,7 +11,7 @@ import pytest
 from avckpt.guard import Files
 
 from testkit.guarded import GuardProcess, Victim, config
-from testkit.scenario import checkpoint, restored
+from testkit.scenario import checkpoint, disturb, restored
 
 
 @pytest.fixture(autouse=True)
@@ -38,3 +38,59 @@ def test_a_mount_is_not_sought_outside_of_the_container(tmp_path: Path, memory: 
         (Path(f"/proc/{victim.app}/root{tmp_path}") / "of the container").write_text("written")
         victim.kill_app()
         assert "was written since the checkpoint" in str(guard.wait("gave_up")["error"])
+
+
+def test_a_lease_on_shared_memory_is_not_broken(tmp_path: Path) -> None:
+    """SIGIO would end most programs; so it is not protected, and learns of nothing."""
+    with Victim(f"baits leased-memory {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        for _ in range(3):
+            answer = guard.checkpoint()
+            victim.wait_beats()
+            assert answer["kind"] == "unprotected", answer
+            assert "F_SETLEASE" in str(answer["error"])
+
+
+def test_a_lease_on_a_mapped_file_is_not_broken(tmp_path: Path, memory: Path) -> None:
+    """What such a file holds is not known, and so it counts as written."""
+    with (
+        Victim(f"baits leased-file {tmp_path}", memory) as victim,
+        GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+    ):
+        for _ in range(3):
+            checkpoint(guard)
+            victim.wait_beats()
+        victim.kill_app()
+        assert "is mapped for writing" in str(guard.wait("gave_up")["error"])
+
+
+def test_a_mapped_device_is_not_opened(tmp_path: Path, memory: Path) -> None:
+    """Opening a device may have effects, and while it is open it cannot be given up."""
+    with (
+        Victim(f"baits device {tmp_path}", memory) as victim,
+        GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        assert not [name for name in guard.fds() if "bait" in name]
+        victim.wait_beats()
+
+
+def test_a_file_with_the_name_of_memory_is_a_file(tmp_path: Path) -> None:
+    """Files do not go back, whatever they are called."""
+    with Victim(f"baits named {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        checkpoint(guard)
+        checkpoint(guard)
+        for _ in range(2):
+            disturb(victim)
+            assert "error" not in restored(victim, guard)
+
+
+def test_and_it_can_be_written(tmp_path: Path, memory: Path) -> None:
+    """Which avckpt.files=strict does not overlook."""
+    with (
+        Victim(f"baits named {tmp_path}", memory) as victim,
+        GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+    ):
+        checkpoint(guard)
+        disturb(victim)
+        victim.kill_app()
+        assert "written since the checkpoint" in str(guard.wait("gave_up")["error"])

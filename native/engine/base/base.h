@@ -353,8 +353,7 @@ const char *mount_type(pid_t pid, int fd, struct mount_type *last);
  * no path leads. */
 bool device_is_memory(uint64_t device);
 /* Opening a file breaks a lease (fcntl(2), F_SETLEASE): whoever has it gets SIGIO, which may end it,
- * and the opening one waits.  Those of all processes, read when they are first needed; { 0 } at
- * first. */
+ * and who opens waits for it.  Those of all processes, read when first needed; { 0 } before. */
 struct leases {
 	bool known;
 	uint32_t count, room;
@@ -363,8 +362,9 @@ struct leases {
 	} * file;
 };
 void leases_free(struct leases *leases);
-/* The regular file that is mapped so, from its O_PATH descriptor; no device, which may have an
- * effect.  -1 with EACCES: it is none; EBUSY: it is leased. */
+/* The regular file that is mapped so, from its O_PATH descriptor, without an effect on it.  -1 with
+ * EACCES: it is a device; ENXIO: it can only be mapped; EBUSY: it is leased (`leases` may be NULL:
+ * it cannot be). */
 int open_to_read(int path_fd, const struct mapping *mapping, struct leases *leases);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */

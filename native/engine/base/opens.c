@@ -172,12 +172,16 @@ int open_to_read(int path_fd, const struct mapping *m, struct leases *leases)
 	struct statx st;
 	int fd;
 
-	errno = EACCES;
-	if (!look_at(path_fd, STATX_TYPE, &st) || !S_ISREG(st.stx_mode))
+	if (!look_at(path_fd, STATX_TYPE, &st))
 		return -1;
-	errno = EBUSY;
-	if (is_leased(leases, m->device, m->inode))
+	if (!S_ISREG(st.stx_mode)) {
+		errno = S_ISCHR(st.stx_mode) || S_ISBLK(st.stx_mode) ? EACCES : ENXIO;
 		return -1;
+	}
+	if (leases && is_leased(leases, m->device, m->inode)) {
+		errno = EBUSY;
+		return -1;
+	}
 	fd = open_again(path_fd, O_RDONLY | O_NOATIME);
 	/* Of a user that we do not know. */
 	return fd < 0 && errno == EPERM ? open_again(path_fd, O_RDONLY) : fd;

@@ -404,6 +404,8 @@ void scratch_close(struct scratch *scratch);
 /* Whether it has POSIX or OFD locks; and its file system. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
+/* Whether it is no file but memory (memfd_create(2)); its name does not tell. */
+bool file_is_memory(const struct file *file);
 /* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
  * open file description; `now` is what it is (NULL: fresh). Returns NULL or why not. */
 const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind);

@@ -23,6 +23,7 @@
 #include <sys/signalfd.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/sysmacros.h>
 #include <sys/timerfd.h>
 #include <sys/uio.h>
 #include <sys/un.h>
@@ -592,6 +593,11 @@ bool file_is_remote(int fd)
 		if ((uint32_t)fs.f_type == remote[i])
 			return true;
 	return false;
+}
+
+bool file_is_memory(const struct file *file)
+{
+	return device_is_memory((uint64_t)major(file->dev) << 32 | minor(file->dev));
 }
 
 static const char *put_flocks(int fd, const struct file *want, const struct file *now)
