@@ -94,3 +94,18 @@ def test_and_it_can_be_written(tmp_path: Path, memory: Path) -> None:
         disturb(victim)
         victim.kill_app()
         assert "written since the checkpoint" in str(guard.wait("gave_up")["error"])
+
+
+@pytest.mark.parametrize("what", ["served", "served-map"])
+def test_its_own_file_server_is_not_asked(what: str, tmp_path: Path, memory: Path) -> None:
+    """In a freeze it could not answer, and the freeze would last until its deadline."""
+    with (
+        Victim(f"baits {what} {tmp_path}", memory) as victim,
+        GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
+    ):
+        for _ in range(30):
+            checkpoint(guard)
+            victim.wait_beats(1)
+        late = [event for event in guard.events if "came too late" in str(event.get("error"))]
+        assert not late
+        assert not [event for event in guard.events if event["kind"] == "guard_lost"]

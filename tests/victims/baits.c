@@ -4,11 +4,13 @@
  *
  *   baits WHAT FOLDER     see scenario.h
  */
+#include <pthread.h>
 #include <sys/mount.h>
 #include <sys/stat.h>
 #include <sys/sysmacros.h>
 
 #include "scenario.h"
+#include "server.h"
 
 static volatile uint64_t *shared;
 
@@ -113,11 +115,64 @@ static void named_setup(void)
 	share(open("/memfd:bait", O_RDWR | O_CREAT | O_CLOEXEC, 0600));
 }
 
+/* ---- a file server that is a part of the program ------------------------------------------------ */
+
+/* Another open file all the time: one that was not there when the guard looked before a freeze. */
+static void *open_and_close(void *path)
+{
+	int last = -1;
+
+	for (;;) {
+		const int file = open(path, O_RDWR | O_CLOEXEC);
+
+		CHECK(file >= 0, "%s: %s", (char *)path, strerror(errno));
+		if (last >= 0)
+			close(last);
+		last = file;
+		nap_us(200);
+	}
+	return NULL;
+}
+
+static void served_setup(void)
+{
+	static char path[512];
+	pthread_t thread;
+
+	server_start(path_of("mount"));
+	snprintf(path, sizeof path, "%s/mount/" SERVED_NAME, folder);
+	must(pthread_create(&thread, NULL, open_and_close, path) == 0, "pthread_create");
+}
+
+/* By a child, whose mappings are looked at in the freeze. */
+static void served_map_setup(void)
+{
+	int file;
+	pid_t child;
+
+	server_start(path_of("mount"));
+	file = open(path_of("mount/" SERVED_NAME), O_RDWR | O_CLOEXEC);
+	must(file >= 0, "open");
+	child = fork();
+	must(child >= 0, "fork");
+	if (child == 0) {
+		share(file);
+		count(3, 1);
+		for (;;)
+			pause();
+	}
+	close(file);
+	while (!board->counter[3])
+		nap_us(1000);
+}
+
 static const struct scenario scenarios[] = {
 	{ "covered", covered_setup, nothing, nothing },
 	{ "leased-memory", leased_memory_setup, rewrite, still_leased },
 	{ "leased-file", leased_file_setup, rewrite, still_leased },
 	{ "device", device_setup, nothing, nothing },
+	{ "served", served_setup, nothing, nothing },
+	{ "served-map", served_map_setup, nothing, nothing },
 	{ "named", named_setup, rewrite, is_not_rolled_back },
 };
 

@@ -44,6 +44,7 @@ struct look {
 	uint32_t later; /* how many new sockets may still be left to the freeze */
 	struct stat init_stdio[3];
 	bool init_known[3];
+	struct mount_type mount;
 };
 
 struct files *files_new(uint32_t room)
@@ -462,6 +463,17 @@ static bool is_on_server(const struct look *look, const char *number)
 	return is;
 }
 
+/* Even to ask what file system it is may be a request (FUSE). */
+static bool is_remote(struct look *look, int fd, const struct file *f)
+{
+	const char *type;
+
+	if (look->depth == FILES_BEFORE)
+		return file_is_remote(fd);
+	type = mount_type(look->pid, fd, &look->mount);
+	return *type ? mount_is_served(type) : !file_is_memory(f);
+}
+
 enum looked { LOOKED, LOOKED_TOO_LITTLE, LOOKED_CLOSED };
 
 /* The first look, without a duplicate. */
@@ -586,7 +598,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	}
 	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
 	    !(f->flags & O_PATH))
-		f->remote = file_is_remote(fd);
+		f->remote = is_remote(look, fd, f);
 	locks = known ? known->lock_count + f->lock_count : 0;
 	if (!known || (f->kind == FILE_REGULAR && !(f->flags & O_PATH) &&
 		       (locks || f->remote || file_is_locked(fd))))
@@ -603,6 +615,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	if (look->depth == FILES_FROZEN && is_channel(f) && *files->ours < OURS_MAX) {
 		f->ours = fd; /* until keep_contents() */
 		++*files->ours;
+	} else if (look->depth != FILES_BEFORE && f->remote) {
+		file_close_later(fd);
 	} else {
 		close(fd);
 	}

@@ -375,7 +375,9 @@ uint64_t file_count(int fd);
 void file_keep_messages(struct process *process, int fd, struct file *file, uint32_t bytes);
 /* Whether that is unchanged.  At a restore. */
 bool file_has_messages(int fd, const struct file *want);
-/* Closes descriptors that came with peeked messages: not in a freeze. */
+/* Closing a descriptor may be a request to a file server: files_land() does it. */
+void file_close_later(int fd);
+/* Closes these, and those that came with peeked messages: not in a freeze. */
 void files_land(void);
 /* As shutdown(2) has left it, of one of ours whose process is dead. */
 #define SHUT_IN 1
