@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -96,16 +98,41 @@ def test_and_it_can_be_written(tmp_path: Path, memory: Path) -> None:
         assert "written since the checkpoint" in str(guard.wait("gave_up")["error"])
 
 
+@pytest.mark.parametrize("what", ["server", "other-server"])
+def test_a_file_server_is_not_protected(what: str, tmp_path: Path) -> None:
+    """Whoever has its files open and exits waits for it: templates, and the guard, as long as they have its device."""
+    with Victim(f"baits {what} {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        answer = guard.checkpoint()
+        assert answer["kind"] == "unprotected", answer
+        assert "it serves a file system" in str(answer["error"])
+        victim.wait_beats()
+        victim.kill_app()
+        assert victim.end() == 128 + signal.SIGKILL
+
+
+@pytest.fixture
+def server(tmp_path: Path, victims_built: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A file system at tmp_path/mount; when its server ends, nobody waits for it any more."""
+    with subprocess.Popen([victims_built / "server", tmp_path], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        if process.stdout.readline() != b"ready\n":
+            pytest.skip("/dev/fuse is not available here")
+        yield process
+        process.kill()
+    subprocess.run(["umount", "-l", tmp_path / "mount"], check=True)
+
+
 @pytest.mark.parametrize("what", ["served", "served-map"])
-def test_its_own_file_server_is_not_asked(what: str, tmp_path: Path, memory: Path) -> None:
-    """In a freeze it could not answer, and the freeze would last until its deadline."""
+def test_a_file_server_is_not_asked(what: str, tmp_path: Path, memory: Path, server: subprocess.Popen[bytes]) -> None:
+    """It may not answer, and a freeze would last until its deadline; or be a part of what is stopped."""
     with (
         Victim(f"baits {what} {tmp_path}", memory) as victim,
         GuardProcess(config(files=Files.STRICT), [victim.pid]) as guard,
     ):
-        for _ in range(30):
-            checkpoint(guard)
-            victim.wait_beats(1)
-        late = [event for event in guard.events if "came too late" in str(event.get("error"))]
-        assert not late
-        assert not [event for event in guard.events if event["kind"] == "guard_lost"]
+        try:
+            for _ in range(20):
+                checkpoint(guard)
+                victim.wait_beats(1)
+            assert not [event for event in guard.events if "came too late" in str(event.get("error"))]
+        finally:
+            server.kill()

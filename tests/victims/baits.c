@@ -115,53 +115,73 @@ static void named_setup(void)
 	share(open("/memfd:bait", O_RDWR | O_CREAT | O_CLOEXEC, 0600));
 }
 
-/* ---- a file server that is a part of the program ------------------------------------------------ */
+/* ---- a file server --------------------------------------------------------------------------- */
 
-/* Another open file all the time: one that was not there when the guard looked before a freeze. */
-static void *open_and_close(void *path)
+static int device;
+
+static void *serve(void *arg)
 {
-	int last = -1;
+	for (;;)
+		server_serve(device);
+	return arg;
+}
 
-	for (;;) {
-		const int file = open(path, O_RDWR | O_CLOEXEC);
+static void serve_by(const char *device_path)
+{
+	pthread_t thread;
 
-		CHECK(file >= 0, "%s: %s", (char *)path, strerror(errno));
-		if (last >= 0)
-			close(last);
-		last = file;
-		nap_us(200);
-	}
-	return NULL;
+	device = server_mount(device_path, path_of("mount"));
+	must(pthread_create(&thread, NULL, serve, NULL) == 0, "pthread_create");
+}
+
+static void server_setup(void)
+{
+	serve_by("/dev/fuse");
+}
+
+#define MISC_MAJOR 10
+#define FUSE_MINOR 229
+
+static void other_server_setup(void)
+{
+	must(mknod(path_of("bait"), S_IFCHR | 0600, makedev(MISC_MAJOR, FUSE_MINOR)) == 0, "mknod");
+	serve_by(path_of("bait"));
+}
+
+/* ---- a file on one that does not answer ------------------------------------------------------ */
+
+/* Another descriptor all the time: one that was not there when the guard looked before a freeze. */
+static void *duplicate(void *arg)
+{
+	while (dup(fd[0]) >= 0)
+		nap_us(5000);
+	return arg;
 }
 
 static void served_setup(void)
 {
-	static char path[512];
 	pthread_t thread;
 
-	server_start(path_of("mount"));
-	snprintf(path, sizeof path, "%s/mount/" SERVED_NAME, folder);
-	must(pthread_create(&thread, NULL, open_and_close, path) == 0, "pthread_create");
+	fd[0] = open(path_of("mount/" SERVED_NAME), O_RDWR | O_CLOEXEC);
+	must(fd[0] >= 0, SERVED_NAME);
+	must(pthread_create(&thread, NULL, duplicate, NULL) == 0, "pthread_create");
 }
 
 /* By a child, whose mappings are looked at in the freeze. */
 static void served_map_setup(void)
 {
-	int file;
 	pid_t child;
 
-	server_start(path_of("mount"));
-	file = open(path_of("mount/" SERVED_NAME), O_RDWR | O_CLOEXEC);
-	must(file >= 0, "open");
+	fd[0] = open(path_of("mount/" SERVED_NAME), O_RDWR | O_CLOEXEC);
+	must(fd[0] >= 0, SERVED_NAME);
 	child = fork();
 	must(child >= 0, "fork");
 	if (child == 0) {
-		share(file);
+		share(fd[0]);
 		count(3, 1);
 		for (;;)
 			pause();
 	}
-	close(file);
 	while (!board->counter[3])
 		nap_us(1000);
 }
@@ -171,6 +191,8 @@ static const struct scenario scenarios[] = {
 	{ "leased-memory", leased_memory_setup, rewrite, still_leased },
 	{ "leased-file", leased_file_setup, rewrite, still_leased },
 	{ "device", device_setup, nothing, nothing },
+	{ "server", server_setup, nothing, nothing },
+	{ "other-server", other_server_setup, nothing, nothing },
 	{ "served", served_setup, nothing, nothing },
 	{ "served-map", served_map_setup, nothing, nothing },
 	{ "named", named_setup, rewrite, is_not_rolled_back },

@@ -342,13 +342,20 @@ uint64_t mount_of(int fd);
 /* Whether a file system of that type asks a server, or a program (FUSE), which may not answer, or be
  * the application itself. */
 bool mount_is_served(const char *type);
-/* The type of the file system that a descriptor is on, as mounted for that process, without asking
- * it; "": it is not mounted there. */
-struct mount_type {
-	uint64_t id;
-	char name[32];
+/* The file systems that are mounted for a process, read when first needed; { 0 } before. */
+struct mounts {
+	bool read;
+	uint32_t count, room;
+	struct mounted {
+		uint64_t id;
+		char type[16];
+	} * mount;
 };
-const char *mount_type(pid_t pid, int fd, struct mount_type *last);
+void mounts_free(struct mounts *mounts);
+/* The type of the one that a descriptor is on, without asking it; "": it is none of these. */
+const char *mount_type(struct mounts *mounts, pid_t pid, int fd);
+/* Whether any of these is served, as far as known. */
+bool mounts_may_be_served(const struct mounts *mounts);
 /* Whether what is on that device (struct mapping) is memory by memfd_create(2) or shmget(2), to which
  * no path leads. */
 bool device_is_memory(uint64_t device);

@@ -76,26 +76,52 @@ bool mount_is_served(const char *type)
 	return false;
 }
 
-const char *mount_type(pid_t pid, int fd, struct mount_type *last)
+static void read_mounts(struct mounts *mounts, pid_t pid)
 {
-	const uint64_t id = mount_of(fd);
 	char path[48], *line = NULL;
 	struct proc_mount mount;
 	size_t size = 0;
-	FILE *mounts;
+	FILE *info;
 
-	if (id && id == last->id)
-		return last->name;
-	*last = (struct mount_type){ .id = id };
 	snprintf(path, sizeof path, "/proc/%d/mountinfo", pid);
-	mounts = fopen(path, "re");
-	while (mounts && id && !last->name[0] && getline(&line, &size, mounts) > 0)
-		if (proc_parse_mount(line, &mount) && mount.id == id)
-			snprintf(last->name, sizeof last->name, "%s", mount.type);
+	info = fopen(path, "re");
+	mounts->read = true;
+	while (info && getline(&line, &size, info) > 0 && proc_parse_mount(line, &mount) &&
+	       make_room(&mounts->mount, mounts->count, &mounts->room, sizeof *mounts->mount)) {
+		struct mounted *m = &mounts->mount[mounts->count++];
+
+		m->id = mount.id;
+		snprintf(m->type, sizeof m->type, "%s", mount.type);
+	}
 	free(line);
-	if (mounts)
-		fclose(mounts);
-	return last->name;
+	if (info)
+		fclose(info);
+}
+
+const char *mount_type(struct mounts *mounts, pid_t pid, int fd)
+{
+	const uint64_t id = mount_of(fd);
+
+	if (!mounts->read)
+		read_mounts(mounts, pid);
+	for (uint32_t i = 0; i < mounts->count; i++)
+		if (mounts->mount[i].id == id)
+			return mounts->mount[i].type;
+	return "";
+}
+
+bool mounts_may_be_served(const struct mounts *mounts)
+{
+	for (uint32_t i = 0; i < mounts->count; i++)
+		if (mount_is_served(mounts->mount[i].type))
+			return true;
+	return !mounts->read;
+}
+
+void mounts_free(struct mounts *mounts)
+{
+	free(mounts->mount);
+	*mounts = (struct mounts){ 0 };
 }
 
 #define HUGE_SHIFTS 40 /* of sizes of pages: MFD_HUGE_2MB and others */

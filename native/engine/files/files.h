@@ -59,6 +59,9 @@ void files_settle_family(struct image *image, uint32_t images, struct image *bef
 /* After that: what is open below /proc/PID of the app's own processes. */
 void files_find_own(struct image *image, uint32_t images);
 void files_forget(struct process *process);
+/* Why one that has /dev/fuse open cannot be protected: and whoever exits with a file of its server's
+ * open waits for that. */
+extern const char files_serves[];
 void files_free(struct files *files);
 /* Restores the tables of a dead app: that of the main process, which its templates hold, at once;
  * for the others it fills in image.table.  Lists what the restored processes have to do themselves.
@@ -301,6 +304,7 @@ struct files {
 	const struct file **ends; /* pipes and sockets by inode, built on demand: allocated */
 	uint32_t end_count;
 	bool trusted;           /* its heirs were not read in the freeze */
+	bool served;            /* some file system may be a file server's                 */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */

@@ -32,14 +32,15 @@ static pid_t named_in(const char *name)
 static bool is_in_proc(const struct file *f, pid_t template)
 {
 	int fd = open_in_root_of(template, "/proc", O_NOFOLLOW);
-	struct mount_type mount = { 0 };
+	struct mounts mounts = { 0 };
 	struct statx st;
 	bool is;
 
 	/* Nothing is asked that may not answer, nor mounted (autofs). */
-	is = fd >= 0 && !strcmp(mount_type(template, fd, &mount), "proc") &&
+	is = fd >= 0 && !strcmp(mount_type(&mounts, template, fd), "proc") &&
 	     !statx(fd, "", AT_EMPTY_PATH, STATX_TYPE, &st) &&
 	     makedev(st.stx_dev_major, st.stx_dev_minor) == f->dev;
+	mounts_free(&mounts);
 	close_fd(&fd);
 	return is;
 }

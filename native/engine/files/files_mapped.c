@@ -39,11 +39,11 @@ static bool is_data(const struct mapping *m)
 	       strncmp(m->name, "/run/", 5) && !device_is_memory(m->device);
 }
 
-static int open_data(pid_t pid, const struct mapping *m, struct mount_type *mount,
+static int open_data(pid_t pid, const struct mapping *m, struct mounts *mounts,
 		     struct leases *leases)
 {
 	int path_fd = proc_open_mapped(pid, m->start, m->end, O_PATH), fd = -1;
-	const char *type = path_fd < 0 ? "" : mount_type(pid, path_fd, mount);
+	const char *type = path_fd < 0 ? "" : mount_type(mounts, pid, path_fd);
 
 	if (*type && !mount_is_served(type))
 		fd = open_to_read(path_fd, m, leases);
@@ -53,7 +53,7 @@ static int open_data(pid_t pid, const struct mapping *m, struct mount_type *moun
 
 struct look {
 	pid_t pid;
-	struct mount_type mount;
+	struct mounts mounts;
 	struct leases leases;
 	struct files_mapped *mapped;
 	uint64_t bytes_left;
@@ -74,7 +74,7 @@ static int take_area(const struct mapping *m, void *arg)
 		.offset = m->offset,
 		.inode = m->inode,
 		.device = m->device,
-		.fd = open_data(look->pid, m, &look->mount, &look->leases),
+		.fd = open_data(look->pid, m, &look->mounts, &look->leases),
 	};
 	if (a->fd < 0)
 		return 0;
@@ -102,6 +102,7 @@ struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
 	if (look.mapped)
 		(void)proc_mappings(pid, "maps", take_area, &look);
 	leases_free(&look.leases);
+	mounts_free(&look.mounts);
 	return look.mapped;
 }
 
@@ -130,9 +131,9 @@ static bool is_unchanged(const struct mapped_area *a, pid_t template)
 		.start = a->start, .end = a->end, .device = a->device, .inode = a->inode
 	};
 	const size_t bytes = a->end - a->start;
-	struct mount_type mount = { 0 };
+	struct mounts mounts = { 0 };
 	struct leases leases = { 0 };
-	int fd = open_data(template, &m, &mount, &leases);
+	int fd = open_data(template, &m, &mounts, &leases);
 	uint8_t *now = malloc(bytes);
 	bool same;
 
@@ -141,6 +142,7 @@ static bool is_unchanged(const struct mapped_area *a, pid_t template)
 	       !memcmp(now, a->content, (size_t)a->bytes);
 	free(now);
 	leases_free(&leases);
+	mounts_free(&mounts);
 	close_fd(&fd);
 	return same;
 }

@@ -49,7 +49,7 @@ struct survey {
 	uint64_t left_bytes, others_bytes;
 	bool private_huge, too_many, lost_some, unforked;
 	bool recycled; /* image.recycled                                             */
-	struct mount_type mount;
+	struct mounts mounts;
 	struct leases leases;
 };
 
@@ -99,7 +99,7 @@ static bool is_memory(struct survey *survey, const struct mapping *m)
 		return true;
 	fd = proc_open_mapped(survey->template, m->start, m->end, O_PATH);
 	if (fd >= 0)
-		type = mount_type(survey->template, fd, &survey->mount);
+		type = mount_type(&survey->mounts, survey->template, fd);
 	close_fd(&fd);
 	return !strncmp(m->name, "/dev/", 5) &&
 	       (!strcmp(type, "tmpfs") || !strcmp(type, "hugetlbfs"));
@@ -402,6 +402,7 @@ static int check_layout(const struct image *image, struct avc_error *err)
 	areas_free(&survey.foreign);
 	areas_free(&survey.unkept);
 	leases_free(&survey.leases);
+	mounts_free(&survey.mounts);
 	return result;
 }
 
