@@ -41,7 +41,7 @@ def built(init_built: None, victims_built: Path) -> None:
 @pytest.mark.parametrize(
     "scenario",
     [
-        *("opened", "closed", "replaced", "deleted", "offset", "lost", "full"),
+        *("opened", "closed", "replaced", "deleted", "unnamed", "offset", "lost", "full"),
         *("content", "events", "semaphores", "timer", "epoll", "watched", "flags", "locks"),
     ],
 )

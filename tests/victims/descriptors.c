@@ -171,6 +171,17 @@ static void deleted_verify(void)
 	lseek(fd[0], 0, SEEK_SET);
 }
 
+/* ---- never had a name ------------------------------------------------------------------ */
+
+static void unnamed_setup(void)
+{
+	fd[0] = open(folder, O_TMPFILE | O_RDWR | O_CLOEXEC, 0600);
+	if (fd[0] < 0)
+		unavailable("O_TMPFILE");
+	must(write(fd[0], "still here", 10) == 10 && lseek(fd[0], 0, SEEK_SET) == 0, "write");
+	must(mmap(NULL, 4096, PROT_READ, MAP_SHARED, fd[0], 0) != MAP_FAILED, "mmap");
+}
+
 /* ---- more than can be undone one by one ----------------------------------------------- */
 
 enum { SEMAPHORES = 60, COUNTED = 5 };
@@ -924,6 +935,7 @@ static const struct scenario scenarios[] = {
 	{ "closed", closed_setup, closed_disturb, closed_verify },
 	{ "replaced", replaced_setup, replaced_disturb, replaced_verify },
 	{ "deleted", deleted_setup, deleted_disturb, deleted_verify },
+	{ "unnamed", unnamed_setup, deleted_disturb, deleted_verify },
 	{ "semaphores", semaphores_setup, semaphores_disturb, semaphores_verify },
 	{ "many", nothing, many_disturb, many_verify },
 	{ "revoked", revoked_setup, revoked_disturb, revoked_verify },

@@ -14,6 +14,7 @@
  *   aside.c         calls that may block forever
  *   proc.c          /proc
  *   proc_text.c     parsers of its files
+ *   opens.c         files that a container names, or has
  *   cpu_clock.c     the scheduler's per-CPU clocks
  *   pagemap.c       which pages of a process are present
  *   pageset.c       sets of them
@@ -308,6 +309,7 @@ int proc_parse_mappings(FILE *text, bool smaps, int (*fn)(const struct mapping *
 
 /* A line of mountinfo; the strings point into it. */
 struct proc_mount {
+	uint64_t id;
 	uint32_t major, minor;
 	char *point;
 	const char *options, *type;
@@ -318,6 +320,59 @@ struct proc_mount {
 bool proc_parse_mount(char *line, struct proc_mount *mount);
 /* Replaces escapes such as "\\040". */
 void proc_unescape(char *text);
+
+/* ---- opens.c ------------------------------------------------------------------------- */
+
+/* A path as it is resolved below `root`, a descriptor: no link leads out of it, and none of /proc to
+ * what a process has open.  An O_PATH descriptor, or -1 with errno.  `flags` and `resolve` as of
+ * openat2(2), added. */
+int open_below(int root, const char *path, uint64_t flags, uint64_t resolve);
+/* The same below the root of a process: init's is the container's, others may have changed theirs. */
+int open_in_root_of(pid_t pid, const char *path, uint64_t flags);
+/* For calls that take a path: of what a descriptor of ours refers to. */
+struct fd_path {
+	char text[40];
+};
+struct fd_path fd_path(int fd);
+/* Another open file description of that.  With O_NONBLOCK: there may be no process at the other end
+ * of a pipe. */
+int open_again(int fd, int flags);
+/* The id of the mount by which it was opened, as in mountinfo; 0: unknown. */
+uint64_t mount_of(int fd);
+/* Whether a file system of that type asks a server, or a program (FUSE), which may not answer, or be
+ * the application itself. */
+bool mount_is_served(const char *type);
+/* The file systems that are mounted for a process, read when first needed; { 0 } before. */
+struct mounts {
+	bool read;
+	uint32_t count, room;
+	struct mounted {
+		uint64_t id;
+		char type[16];
+	} * mount;
+};
+void mounts_free(struct mounts *mounts);
+/* The type of the one that a descriptor is on, without asking it; "": it is none of these. */
+const char *mount_type(struct mounts *mounts, pid_t pid, int fd);
+/* Whether any of these is served, as far as known. */
+bool mounts_may_be_served(const struct mounts *mounts);
+/* Whether what is on that device (struct mapping) is memory by memfd_create(2) or shmget(2), to which
+ * no path leads. */
+bool device_is_memory(uint64_t device);
+/* Opening a file breaks a lease (fcntl(2), F_SETLEASE): whoever has it gets SIGIO, which may end it,
+ * and who opens waits for it.  Those of all processes, read when first needed; { 0 } before. */
+struct leases {
+	bool known;
+	uint32_t count, room;
+	struct leased {
+		uint64_t device, inode;
+	} * file;
+};
+void leases_free(struct leases *leases);
+/* The regular file that is mapped so, from its O_PATH descriptor, without an effect on it.  -1 with
+ * EACCES: it is a device; ENXIO: it can only be mapped; EBUSY: it is leased (`leases` may be NULL:
+ * it cannot be). */
+int open_to_read(int path_fd, const struct mapping *mapping, struct leases *leases);
 
 /* ---- pagemap.c ------------------------------------------------------------------------ */
 

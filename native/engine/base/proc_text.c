@@ -342,11 +342,11 @@ void proc_unescape(char *text)
 bool proc_parse_mount(char *line, struct proc_mount *mount)
 {
 	char *const end = line + strcspn(line, "\n");
-	char *rest = line, *device, *word;
+	char *rest = line, *id, *device, *word;
 
 	*end = 0;
-	(void)strsep(&rest, " "); /* its id    */
-	(void)strsep(&rest, " "); /* and its parent's   */
+	id = strsep(&rest, " ");
+	(void)strsep(&rest, " "); /* its parent's */
 	device = strsep(&rest, " ");
 	(void)strsep(&rest, " "); /* which part of the file system it is    */
 	mount->point = strsep(&rest, " ");
@@ -359,6 +359,7 @@ bool proc_parse_mount(char *line, struct proc_mount *mount)
 	mount->details = rest ? rest : end;
 	if (!mount->type || sscanf(device, "%u:%u", &mount->major, &mount->minor) != 2)
 		return false;
+	mount->id = strtoull(id, NULL, 10);
 	proc_unescape(mount->point);
 	return true;
 }

@@ -14,6 +14,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/kcmp.h>
+#include <linux/major.h>
 #include <linux/videodev2.h>
 #include <poll.h>
 #include <stdio.h>
@@ -28,12 +29,16 @@
 
 #include "files.h"
 
+#define FUSE_MINOR 229 /* include/linux/miscdevice.h                                   */
 #define ROOM_SPARE 64
 #define OURS_MAX 1024 /* duplicates at a time                                          */
 #define READ_TOGETHER 128
 /* So many new sockets of a process are read in the freeze, where each makes it longer by 2 us, or by
  * some 20 if it could be recreated. */
 #define SOCKETS_LATER 128
+
+const char files_serves[] = "it serves a file system (FUSE): after a restore, requests that it had "
+			    "read would have no answer";
 
 struct look {
 	struct files *files, *known;
@@ -42,8 +47,10 @@ struct look {
 	enum files_depth depth;
 	bool trusts;    /* heirs are assumed unchanged: files_check_heirs() */
 	uint32_t later; /* how many new sockets may still be left to the freeze */
-	struct stat init_stdio[3];
-	bool init_known[3];
+	struct {
+		uint64_t dev, ino; /* 0: unknown */
+	} init_stdio[3];
+	struct mounts mounts;
 };
 
 struct files *files_new(uint32_t room)
@@ -168,8 +175,8 @@ static char *read_name(const struct look *look, int fd)
 static bool is_inits(const struct look *look, const struct file *f)
 {
 	for (int i = 0; i < 3; i++)
-		if (look->init_known[i] && look->init_stdio[i].st_dev == f->dev &&
-		    look->init_stdio[i].st_ino == f->ino &&
+		if (look->init_stdio[i].ino && look->init_stdio[i].dev == f->dev &&
+		    look->init_stdio[i].ino == f->ino &&
 		    syscall(SYS_kcmp, look->pid, look->init, KCMP_FILE, f->fd, i) == 0)
 			return true;
 	return false;
@@ -453,10 +460,21 @@ static bool takes_duplicate(struct look *look, struct file *f)
 	return file_socket_has_options(s);
 }
 
-static bool is_on_server(const struct look *look, const char *number)
+/* Without asking it, as statfs(2) would.  But one that is mounted elsewhere, from where it was
+ * inherited or received, can be known only so. */
+static bool is_remote(struct look *look, int fd, const struct file *f)
+{
+	const char *type = mount_type(&look->mounts, look->pid, fd);
+
+	if (*type || file_is_memory(f))
+		return mount_is_served(type);
+	return look->depth != FILES_BEFORE || file_is_remote(fd);
+}
+
+static bool is_on_server(struct look *look, const char *number, const struct file *f)
 {
 	int fd = openat(look->fd_dir, number, O_PATH | O_CLOEXEC);
-	const bool is = fd >= 0 && file_is_remote(fd);
+	const bool is = fd >= 0 && is_remote(look, fd, f);
 
 	close_fd(&fd);
 	return is;
@@ -464,17 +482,35 @@ static bool is_on_server(const struct look *look, const char *number)
 
 enum looked { LOOKED, LOOKED_TOO_LITTLE, LOOKED_CLOSED };
 
+/* Opened since it was looked at while the app ran. */
+static bool is_new_on_server(struct look *look, int number)
+{
+	const struct file *k = files_find(look->known, number);
+	struct file f = { 0 };
+	struct statx st;
+	char name[16];
+
+	snprintf(name, sizeof name, "%d", number);
+	if (!look->known->served ||
+	    statx(look->fd_dir, name, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_BASIC_STATS, &st))
+		return false;
+	note_stat(&f, &st);
+	return (S_ISREG(f.mode) || S_ISDIR(f.mode)) &&
+	       !(k && !k->remote && k->dev == f.dev && k->ino == f.ino) &&
+	       is_on_server(look, name, &f);
+}
+
 /* The first look, without a duplicate. */
 static enum looked look_at_running(struct look *look, int number, struct file *f)
 {
+	const int sync = look->depth == FILES_BEFORE ? AT_STATX_SYNC_AS_STAT : AT_STATX_DONT_SYNC;
 	enum looked result = LOOKED;
 	char name[16];
 	struct statx st;
 
 	snprintf(name, sizeof name, "%d", number);
 	*f = (struct file){ .fd = number, .shared = number, .offset = -1, .told_flags = -1 };
-	if (statx(look->fd_dir, name, AT_STATX_SYNC_AS_STAT | AT_NO_AUTOMOUNT, STATX_BASIC_STATS,
-		  &st))
+	if (statx(look->fd_dir, name, sync | AT_NO_AUTOMOUNT, STATX_BASIC_STATS, &st))
 		return LOOKED_CLOSED;
 	note_stat(f, &st);
 	f->name = read_name(look, number);
@@ -483,6 +519,7 @@ static enum looked look_at_running(struct look *look, int number, struct file *f
 	f->kind = kind_of(f);
 	file_read_info(look->pid, f);
 	f->flags = f->told_flags & ~O_CLOEXEC;
+	f->offset = look->depth == FILES_BEFORE ? -1 : f->told_offset;
 	if (f->told_flags < 0)
 		result = LOOKED_CLOSED;
 	else if (takes_duplicate(look, f))
@@ -497,7 +534,7 @@ static enum looked look_at_running(struct look *look, int number, struct file *f
 	}
 	f->outside = is_inits(look, f);
 	f->remote = (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
-		    !(f->flags & O_PATH) && is_on_server(look, name);
+		    !(f->flags & O_PATH) && is_on_server(look, name, f);
 	return LOOKED;
 }
 
@@ -537,7 +574,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 		files->count++;
 		return 0;
 	}
-	if (look->depth == FILES_BEFORE) {
+	if (look->depth == FILES_BEFORE || (look->known && is_new_on_server(look, number))) {
 		const enum looked looked = look_at_running(look, number, f);
 
 		files->count += looked == LOOKED;
@@ -586,7 +623,7 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	}
 	if (!known && (f->kind == FILE_REGULAR || f->kind == FILE_DIRECTORY) &&
 	    !(f->flags & O_PATH))
-		f->remote = file_is_remote(fd);
+		f->remote = is_remote(look, fd, f);
 	locks = known ? known->lock_count + f->lock_count : 0;
 	if (!known || (f->kind == FILE_REGULAR && !(f->flags & O_PATH) &&
 		       (locks || f->remote || file_is_locked(fd))))
@@ -603,6 +640,8 @@ static int look_at(struct look *look, int number, struct avc_error *err)
 	if (look->depth == FILES_FROZEN && is_channel(f) && *files->ours < OURS_MAX) {
 		f->ours = fd; /* until keep_contents() */
 		++*files->ours;
+	} else if (f->remote) {
+		file_close_later(fd);
 	} else {
 		close(fd);
 	}
@@ -1064,9 +1103,13 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 		return fail_errno(err, pid, "look at descriptors", "open(fd)", "it has ended");
 	for (int i = 0; i < 3 && depth != FILES_FROZEN && init; i++) {
 		char path[48];
+		struct statx st;
 
 		snprintf(path, sizeof path, "/proc/%d/fd/%d", init, i);
-		look.init_known[i] = stat(path, &look.init_stdio[i]) == 0;
+		if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st))
+			continue;
+		look.init_stdio[i].dev = makedev(st.stx_dev_major, st.stx_dev_minor);
+		look.init_stdio[i].ino = st.stx_ino;
 	}
 	files->count = 0;
 	clock_gettime(CLOCK_REALTIME, &now);
@@ -1078,6 +1121,13 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	else
 		result = walk(&look, 0, err);
 	close(look.fd_dir);
+	files->served = depth == FILES_BEFORE ? mounts_may_be_served(&look.mounts)
+					      : known && known->served;
+	mounts_free(&look.mounts);
+	if (!result && depth != FILES_NOW &&
+	    files_find_device(files, makedev(MISC_MAJOR, FUSE_MINOR)) >= 0)
+		result = fail(err, AVC_UNSUPPORTED, 0, pid, "look at descriptors", "", "%s",
+			      files_serves);
 	if (result) {
 		for (uint32_t i = 0; i < files->count; i++)
 			drop_ours(&files->file[i]);

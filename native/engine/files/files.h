@@ -59,6 +59,9 @@ void files_settle_family(struct image *image, uint32_t images, struct image *bef
 /* After that: what is open below /proc/PID of the app's own processes. */
 void files_find_own(struct image *image, uint32_t images);
 void files_forget(struct process *process);
+/* Why one that has /dev/fuse open cannot be protected: and whoever exits with a file of its server's
+ * open waits for that. */
+extern const char files_serves[];
 void files_free(struct files *files);
 /* Restores the tables of a dead app: that of the main process, which its templates hold, at once;
  * for the others it fills in image.table.  Lists what the restored processes have to do themselves.
@@ -301,6 +304,7 @@ struct files {
 	const struct file **ends; /* pipes and sockets by inode, built on demand: allocated */
 	uint32_t end_count;
 	bool trusted;           /* its heirs were not read in the freeze */
+	bool served;            /* some file system may be a file server's                 */
 	bool several;           /* other processes may have the other ends of pipes        */
 	bool with_tcp;          /* count the bytes of connections, during a freeze, too      */
 	uint64_t taken_ns;      /* CLOCK_REALTIME                                       */
@@ -375,7 +379,9 @@ uint64_t file_count(int fd);
 void file_keep_messages(struct process *process, int fd, struct file *file, uint32_t bytes);
 /* Whether that is unchanged.  At a restore. */
 bool file_has_messages(int fd, const struct file *want);
-/* Closes descriptors that came with peeked messages: not in a freeze. */
+/* Closing a descriptor may be a request to a file server: files_land() does it. */
+void file_close_later(int fd);
+/* Closes these, and those that came with peeked messages: not in a freeze. */
 void files_land(void);
 /* As shutdown(2) has left it, of one of ours whose process is dead. */
 #define SHUT_IN 1
@@ -404,6 +410,8 @@ void scratch_close(struct scratch *scratch);
 /* Whether it has POSIX or OFD locks; and its file system. */
 bool file_is_locked(int fd);
 bool file_is_remote(int fd);
+/* Whether it is no file but memory (memfd_create(2)); its name does not tell. */
+bool file_is_memory(const struct file *file);
 /* Puts the state of `want` into the descriptor `fd` of ours, which shares the app's
  * open file description; `now` is what it is (NULL: fresh). Returns NULL or why not. */
 const char *file_put_state(int fd, const struct file *want, const struct file *now, bool rewind);

@@ -33,9 +33,10 @@
 /* Not on a disk; shared memory is handled elsewhere. */
 static bool is_data(const struct file *f)
 {
-	static const char *const elsewhere[] = { "/memfd:", "/dev/", "/proc/", "/sys/" };
+	static const char *const elsewhere[] = { "/dev/", "/proc/", "/sys/" };
 
-	if (f->kind != FILE_REGULAR || f->flags & O_PATH || f->outside || f->remote || !f->name)
+	if (f->kind != FILE_REGULAR || f->flags & O_PATH || f->outside || f->remote || !f->name ||
+	    file_is_memory(f))
 		return false;
 	for (size_t i = 0; i < sizeof elsewhere / sizeof *elsewhere; i++)
 		if (!strncmp(f->name, elsewhere[i], strlen(elsewhere[i])))

@@ -31,12 +31,18 @@ static pid_t named_in(const char *name)
 /* The application may have mounted something else there, or see another /proc. */
 static bool is_in_proc(const struct file *f, pid_t template)
 {
-	char path[32];
+	int fd = open_in_root_of(template, "/proc", O_NOFOLLOW);
+	struct mounts mounts = { 0 };
 	struct statx st;
+	bool is;
 
-	snprintf(path, sizeof path, "/proc/%d/root/proc", template);
-	return !statx(AT_FDCWD, path, AT_SYMLINK_NOFOLLOW, STATX_TYPE, &st) &&
-	       makedev(st.stx_dev_major, st.stx_dev_minor) == f->dev;
+	/* Nothing is asked that may not answer, nor mounted (autofs). */
+	is = fd >= 0 && !strcmp(mount_type(&mounts, template, fd), "proc") &&
+	     !statx(fd, "", AT_EMPTY_PATH, STATX_TYPE, &st) &&
+	     makedev(st.stx_dev_major, st.stx_dev_minor) == f->dev;
+	mounts_free(&mounts);
+	close_fd(&fd);
+	return is;
 }
 
 static bool is_there(const struct image *image, uint32_t images, pid_t inside)

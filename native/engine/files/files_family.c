@@ -270,12 +270,8 @@ static bool find_family(const struct tables *tables, const struct file *like, in
 
 static int reopen(int fd, int flags)
 {
-	char path[40];
-	int opened;
+	const int opened = open_again(fd, flags & O_ACCMODE);
 
-	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
-	/* With O_NONBLOCK, or it would wait for a process at the other end. */
-	opened = open(path, (flags & O_ACCMODE) | O_NONBLOCK | O_CLOEXEC);
 	close(fd);
 	return opened;
 }

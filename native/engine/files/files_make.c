@@ -6,7 +6,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/major.h>
-#include <linux/openat2.h>
 #include <netinet/in.h>
 #include <sched.h>
 #include <stdio.h>
@@ -37,40 +36,32 @@ static bool is_the_one(int fd, const struct file *want)
 /* From any descriptor of a file to one with the flags that the app had. */
 static int open_as(int fd, const struct file *want)
 {
-	int flags = want->flags & ~(O_CREAT | O_EXCL | O_TRUNC | O_NOFOLLOW | O_DIRECTORY | FASYNC);
-	char path[40];
-	int opened;
+	/* O_TMPFILE is more than one bit, and has O_DIRECTORY. */
+	const int flags = want->flags &
+			  ~(O_CREAT | O_EXCL | O_TRUNC | O_NOFOLLOW | O_TMPFILE | FASYNC);
+	int opened, reader;
 
 	if (want->flags & O_PATH)
 		return fcntl(fd, F_DUPFD_CLOEXEC, 3);
-	/* There may be no process at the other end of a fifo. */
-	if (want->kind == FILE_FIFO || want->kind == FILE_DEVICE)
-		flags |= O_NONBLOCK;
-	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
-	opened = open(path, flags | O_NOCTTY | O_CLOEXEC);
+	opened = open_again(fd, flags);
 	if (opened < 0 && errno == ENXIO && want->kind == FILE_FIFO) {
 		/* For writing, without a reader: there must be one temporarily. */
-		const int reader = open(path, O_RDONLY | O_NONBLOCK | O_CLOEXEC);
-
-		opened = open(path, flags | O_CLOEXEC);
-		if (reader >= 0)
-			close(reader);
+		reader = open_again(fd, O_RDONLY);
+		opened = open_again(fd, flags);
+		close_fd(&reader);
 	}
 	return opened;
 }
 
-/* init's root is the container's; the app may have changed its own. */
 int file_open_path(const struct file *want, pid_t init, const struct file_rights *rights)
 {
 	struct file_rights_own own;
-	struct open_how how = { .flags = O_PATH | O_CLOEXEC,
-				.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS };
 	int root = proc_open(init, "root", O_PATH | O_DIRECTORY), fd = -1;
 
 	if (root < 0)
 		return -1;
 	if (want->name[0] == '/' && (!rights || !file_rights_take(rights, &own))) {
-		fd = (int)syscall(SYS_openat2, root, want->name, &how, sizeof how);
+		fd = open_below(root, want->name, 0, 0);
 		if (rights)
 			file_rights_give_back(&own);
 	}

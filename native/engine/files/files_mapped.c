@@ -5,7 +5,8 @@
  * A write through a mapping changes the file's time when a page gets dirty, not again
  * before the kernel has written it out, and on a tmpfs never.  So the contents are
  * copied while everything is stopped, and compared at a restore.  What is too much to
- * be copied (avckpt.shm), or was mapped since, counts as written.
+ * be copied (avckpt.shm), or was mapped since, counts as written; and so does what cannot be opened
+ * without an effect, or a request to a file server: it may be the app, which is stopped.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -20,8 +21,8 @@
 
 struct mapped_area {
 	avc_remote start, end;
-	uint64_t offset, inode;
-	int fd;
+	uint64_t offset, inode, device;
+	int fd; /* until it is copied: others may want a lease */
 	uint8_t *content;
 	ssize_t bytes; /* less than the mapping where the file ends earlier; -1: unreadable */
 };
@@ -35,12 +36,25 @@ struct files_mapped {
 static bool is_data(const struct mapping *m)
 {
 	return m->shared && m->mode[1] == 'w' && m->inode && strncmp(m->name, "/dev/", 5) &&
-	       strncmp(m->name, "/memfd:", 7) && strncmp(m->name, "/SYSV", 5) &&
-	       strncmp(m->name, "/run/", 5);
+	       strncmp(m->name, "/run/", 5) && !device_is_memory(m->device);
+}
+
+static int open_data(pid_t pid, const struct mapping *m, struct mounts *mounts,
+		     struct leases *leases)
+{
+	int path_fd = proc_open_mapped(pid, m->start, m->end, O_PATH), fd = -1;
+	const char *type = path_fd < 0 ? "" : mount_type(mounts, pid, path_fd);
+
+	if (*type && !mount_is_served(type))
+		fd = open_to_read(path_fd, m, leases);
+	close_fd(&path_fd);
+	return fd;
 }
 
 struct look {
 	pid_t pid;
+	struct mounts mounts;
+	struct leases leases;
 	struct files_mapped *mapped;
 	uint64_t bytes_left;
 };
@@ -59,12 +73,12 @@ static int take_area(const struct mapping *m, void *arg)
 		.end = m->end,
 		.offset = m->offset,
 		.inode = m->inode,
-		.fd = proc_open_mapped(look->pid, m->start, m->end, O_RDONLY),
+		.device = m->device,
+		.fd = open_data(look->pid, m, &look->mounts, &look->leases),
 	};
 	if (a->fd < 0)
 		return 0;
-	/* No request goes to a file server while the app is stopped: it may be the app. */
-	a->content = file_is_remote(a->fd) ? NULL : malloc(bytes);
+	a->content = malloc(bytes);
 	/* Page faults and disk reads now, not in the freeze. */
 	if (!a->content || read_whole(a->fd, a->content, bytes, (off_t)a->offset) < 0) {
 		free(a->content);
@@ -87,6 +101,8 @@ struct files_mapped *files_mapped_prepare(pid_t pid, uint64_t limit_bytes)
 	/* What cannot be read counts as written at a restore. */
 	if (look.mapped)
 		(void)proc_mappings(pid, "maps", take_area, &look);
+	leases_free(&look.leases);
+	mounts_free(&look.mounts);
 	return look.mapped;
 }
 
@@ -96,6 +112,7 @@ void files_mapped_copy(struct files_mapped *mapped)
 		struct mapped_area *a = &mapped->area[i];
 
 		a->bytes = read_whole(a->fd, a->content, a->end - a->start, (off_t)a->offset);
+		close_fd(&a->fd);
 	}
 }
 
@@ -108,16 +125,25 @@ void files_mapped_free(struct files_mapped *mapped)
 	free(mapped);
 }
 
-static bool is_unchanged(const struct mapped_area *a)
+static bool is_unchanged(const struct mapped_area *a, pid_t template)
 {
+	const struct mapping m = {
+		.start = a->start, .end = a->end, .device = a->device, .inode = a->inode
+	};
 	const size_t bytes = a->end - a->start;
+	struct mounts mounts = { 0 };
+	struct leases leases = { 0 };
+	int fd = open_data(template, &m, &mounts, &leases);
 	uint8_t *now = malloc(bytes);
 	bool same;
 
-	same = now && a->bytes >= 0 &&
-	       read_whole(a->fd, now, bytes, (off_t)a->offset) == a->bytes &&
+	same = fd >= 0 && now && a->bytes >= 0 &&
+	       read_whole(fd, now, bytes, (off_t)a->offset) == a->bytes &&
 	       !memcmp(now, a->content, (size_t)a->bytes);
 	free(now);
+	leases_free(&leases);
+	mounts_free(&mounts);
+	close_fd(&fd);
 	return same;
 }
 
@@ -167,7 +193,7 @@ int files_mapped_check(const struct image *image, pid_t holder, struct avc_error
 	if (check_process(image->template, &check) || check_process(holder, &check))
 		return -1;
 	for (uint32_t i = 0; i < check.mapped->count; i++)
-		if (!is_unchanged(&check.mapped->area[i]))
+		if (!is_unchanged(&check.mapped->area[i], image->template))
 			return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
 				    "avckpt.files=strict: a file that is mapped for writing was "
 				    "written since the checkpoint");

@@ -58,6 +58,14 @@ static bool can_land(void)
 	return landing && landing->count + CONTROL_BYTES / sizeof(int) <= LANDED_MAX;
 }
 
+void file_close_later(int fd)
+{
+	if (can_land())
+		landing->fd[landing->count++] = fd;
+	else
+		close(fd);
+}
+
 void files_land(void)
 {
 	struct landing *job = landing;

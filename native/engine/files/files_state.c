@@ -23,6 +23,7 @@
 #include <sys/signalfd.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
+#include <sys/sysmacros.h>
 #include <sys/timerfd.h>
 #include <sys/uio.h>
 #include <sys/un.h>
@@ -439,15 +440,6 @@ void file_keep_content(struct process *process, int fd, struct file *file, struc
 	keep_pipe(fd, file, (uint32_t)bytes, scratch);
 }
 
-/* Our own open file description of the same pipe, for an O_NONBLOCK of our own. */
-static int reopen(int fd, int flags)
-{
-	char path[32];
-
-	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", fd);
-	return open(path, flags | O_NONBLOCK | O_CLOEXEC);
-}
-
 /* False if it does not become empty: a process outside of the application keeps writing. */
 static bool drain(int fd, const struct file *want)
 {
@@ -466,8 +458,9 @@ const char *file_put_content(int fd, int other_fd, const struct file *want)
 {
 	const bool pipe = want->kind == FILE_PIPE,
 		   messages = !pipe && want->socket->type != SOCK_STREAM;
-	int in = pipe ? reopen(fd, O_RDONLY) : fd,
-	    out = pipe ? reopen(other_fd, O_WRONLY) : other_fd;
+	/* Of a pipe, for an O_NONBLOCK of our own. */
+	int in = pipe ? open_again(fd, O_RDONLY) : fd,
+	    out = pipe ? open_again(other_fd, O_WRONLY) : other_fd;
 	const char *problem = NULL;
 	uint32_t put = 0;
 	bool emptied;
@@ -600,6 +593,11 @@ bool file_is_remote(int fd)
 		if ((uint32_t)fs.f_type == remote[i])
 			return true;
 	return false;
+}
+
+bool file_is_memory(const struct file *file)
+{
+	return device_is_memory((uint64_t)major(file->dev) << 32 | minor(file->dev));
 }
 
 static const char *put_flocks(int fd, const struct file *want, const struct file *now)

@@ -3,7 +3,6 @@
  * avckpt.files=strict: memory does not go back behind files that were written (files.h).
  */
 #include <fcntl.h>
-#include <string.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -12,7 +11,7 @@
 static bool is_data(const struct file *f)
 {
 	return f->kind == FILE_REGULAR && (f->flags & O_ACCMODE) != O_RDONLY &&
-	       !(f->flags & O_PATH) && !f->outside && f->name && strncmp(f->name, "/memfd:", 7);
+	       !(f->flags & O_PATH) && !f->outside && f->name && !file_is_memory(f);
 }
 
 static uint64_t real_ns(const struct timespec *t)

@@ -6,7 +6,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
-#include <linux/openat2.h>
 #include <pthread.h>
 #include <sched.h>
 #include <stdio.h>
@@ -68,21 +67,16 @@ static const char *base_of(const char *path)
 
 static int open_folder(int root, const char *path)
 {
-	struct open_how how = { .flags = O_PATH | O_DIRECTORY | O_CLOEXEC,
-				.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS };
 	char folder[PATH_MAX];
 
 	snprintf(folder, sizeof folder, "%.*s/", (int)(base_of(path) - path), path);
-	return (int)syscall(SYS_openat2, root, folder, &how, sizeof how);
+	return open_below(root, folder, O_DIRECTORY, 0);
 }
 
 static bool path_of(int fd, char path[PATH_MAX])
 {
-	char link[40];
-	ssize_t n;
+	const ssize_t n = readlink(fd_path(fd).text, path, PATH_MAX - 1);
 
-	snprintf(link, sizeof link, "/proc/thread-self/fd/%d", fd);
-	n = readlink(link, path, PATH_MAX - 1);
 	path[n > 0 ? n : 0] = 0;
 	return path[0] == '/';
 }
@@ -252,7 +246,7 @@ static bool is_dead(int file)
 	if (fstat(file, &st) || !S_ISSOCK(st.st_mode))
 		return false;
 	fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
-	snprintf(address.sun_path, sizeof address.sun_path, "/proc/thread-self/fd/%d", file);
+	strcpy(address.sun_path, fd_path(file).text);
 	dead = fd >= 0 && connect(fd, (const struct sockaddr *)&address, sizeof address) &&
 	       errno == ECONNREFUSED;
 	close_fd(&fd);
@@ -299,16 +293,15 @@ static int put_file(int fd, int root, int folder, const struct file_node *node, 
 {
 	const char *name = base_of(node->path);
 	int file = ioctl(fd, UNIX_FILE), result = 0;
-	char link[40];
 
-	snprintf(link, sizeof link, "/proc/thread-self/fd/%d", file);
 	if (file < 0 || (!is_there(folder, name, file) && !move(file, root, folder, name))) {
 		*why = "it was closed since the checkpoint and its file cannot be put back";
 		result = -1;
 	} else if (node->deleted) {
 		unlinkat(folder, name, 0);
 	} else if (fchownat(file, "", node->uid, node->gid, AT_EMPTY_PATH) ||
-		   chmod(link, node->mode)) { /* in this order: chown(2) takes bits away */
+		   chmod(fd_path(file).text,
+			 node->mode)) { /* in this order: chown(2) takes bits away */
 		*why = "its file has not the owner and mode that it had";
 	}
 	close_fd(&file);

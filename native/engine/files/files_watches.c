@@ -8,7 +8,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
-#include <linux/openat2.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,42 +25,14 @@
 
 /* ---- where it is ---------------------------------------------------------------- */
 
-/* No request goes to a server while the app is dead (files.c). */
-static bool is_served(const char *type)
-{
-	static const char *const served[] = { "fuse", "nfs", "cifs", "smb", "9p", "ceph", "afs" };
-
-	for (size_t i = 0; i < sizeof served / sizeof *served; i++)
-		if (!strncmp(type, served[i], strlen(served[i])))
-			return true;
-	return false;
-}
-
 /* Not just O_PATH, for open_by_handle_at(2); but opening a device has side effects. */
 static int open_anchor(int at)
 {
-	char own[40];
 	struct stat st;
 
 	if (fstat(at, &st) || !(S_ISREG(st.st_mode) || S_ISDIR(st.st_mode)))
 		return -1;
-	snprintf(own, sizeof own, "/proc/thread-self/fd/%d", at);
-	return open(own, O_RDONLY | O_CLOEXEC);
-}
-
-/* Below the root of a process: init's is the container's. */
-static int open_below(pid_t pid, const char *path)
-{
-	struct open_how how = { .flags = O_PATH | O_NOFOLLOW | O_CLOEXEC,
-				.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS };
-	const int root = proc_open(pid, "root", O_PATH | O_DIRECTORY);
-	int fd;
-
-	if (root < 0)
-		return -1;
-	fd = (int)syscall(SYS_openat2, root, path, &how, sizeof how);
-	close(root);
-	return fd;
+	return open_again(at, O_RDONLY);
 }
 
 struct file_system {
@@ -81,7 +52,7 @@ static void try_mount(struct file_system *fs, pid_t init, char *line)
 	int at = -1;
 
 	if (!proc_parse_mount(line, &mount) ||
-	    ((uint64_t)mount.major << 20 | mount.minor) != fs->dev || is_served(mount.type) ||
+	    ((uint64_t)mount.major << 20 | mount.minor) != fs->dev || mount_is_served(mount.type) ||
 	    strlen(mount.point) >= sizeof fs->point)
 		return;
 	strcpy(fs->point, mount.point);
@@ -93,9 +64,9 @@ static void try_mount(struct file_system *fs, pid_t init, char *line)
 		proc_unescape(upper);
 		/* A path of the host's; init's parent is the container's monitor there. */
 		if (proc_stat(init, &stat) == 0)
-			at = open_below(stat.parent, upper);
+			at = open_in_root_of(stat.parent, upper, O_NOFOLLOW);
 	} else if (!fs->overlay) {
-		at = open_below(init, mount.point);
+		at = open_in_root_of(init, mount.point, O_NOFOLLOW);
 	}
 	if (at >= 0)
 		fs->anchor = open_anchor(at);
@@ -144,7 +115,7 @@ struct overlay_handle {
 static int open_overlaid(const struct file_system *fs, const struct file_mark *mark, pid_t init)
 {
 	const struct overlay_handle *handle = (const struct overlay_handle *)mark->handle;
-	char own[40], below[2048], path[sizeof below + sizeof fs->point];
+	char below[2048], path[sizeof below + sizeof fs->point];
 	struct stat st;
 	ssize_t n;
 	int real;
@@ -155,15 +126,14 @@ static int open_overlaid(const struct file_system *fs, const struct file_mark *m
 			   mark->handle_bytes - (uint32_t)sizeof *handle);
 	if (real < 0)
 		return -1;
-	snprintf(own, sizeof own, "/proc/thread-self/fd/%d", real);
-	n = readlink(own, below, sizeof below - 1);
+	n = readlink(fd_path(real).text, below, sizeof below - 1);
 	close(real);
 	below[n > 0 ? n : 0] = 0;
 	for (const char *end = below; *end; end += 1 + strcspn(end + 1, "/")) {
 		int fd;
 
 		snprintf(path, sizeof path, "%s%s", fs->point, end);
-		fd = open_below(init, path);
+		fd = open_in_root_of(init, path, O_NOFOLLOW);
 		if (fd >= 0 && fstat(fd, &st) == 0 && st.st_ino == mark->ino)
 			return fd;
 		close_fd(&fd);
@@ -237,7 +207,6 @@ static uint32_t add_missing(int fd, const struct file *want, const struct file *
 
 	for (uint32_t i = 0; i < want->mark_count && budget_step(); i++) {
 		const struct file_mark *mark = &want->mark[i], *is = find_mark(now, mark);
-		char path[40];
 		int at, wd;
 
 		if (is && is->mask == mark->mask)
@@ -250,8 +219,7 @@ static uint32_t add_missing(int fd, const struct file *want, const struct file *
 			failed++;
 			continue;
 		}
-		snprintf(path, sizeof path, "/proc/thread-self/fd/%d", at);
-		wd = inotify_add_watch(fd, path, mark->mask);
+		wd = inotify_add_watch(fd, fd_path(at).text, mark->mask);
 		close(at);
 		if (wd >= 0 && wd != mark->wd)
 			inotify_rm_watch(fd, wd);
@@ -266,9 +234,9 @@ static uint32_t add_missing(int fd, const struct file *want, const struct file *
 
 /* Two equal events in a row would be merged.  The kernel reports no events for files not opened by
  * a name.  Returns the bytes in the queue; true: it is full. */
-static bool fill(int fd, const char *path, int *bytes)
+static bool fill(int fd, int memory, int *bytes)
 {
-	const int file = open(path, O_RDWR | O_CLOEXEC);
+	const int file = open_again(memory, O_RDWR);
 	int before = -1;
 	char byte;
 
@@ -293,11 +261,10 @@ static const char *put_overflow(int fd)
 	const int file = memfd_create("avckpt", MFD_CLOEXEC), event = sizeof(struct inotify_event);
 	int wd, bytes = 0;
 	bool full;
-	char path[40], buf[EVENTS_EACH * sizeof(struct inotify_event)];
+	char buf[EVENTS_EACH * sizeof(struct inotify_event)];
 
-	snprintf(path, sizeof path, "/proc/thread-self/fd/%d", file);
-	wd = file < 0 ? -1 : inotify_add_watch(fd, path, IN_MODIFY | IN_ACCESS);
-	full = wd >= 0 && fill(fd, path, &bytes);
+	wd = file < 0 ? -1 : inotify_add_watch(fd, fd_path(file).text, IN_MODIFY | IN_ACCESS);
+	full = wd >= 0 && fill(fd, file, &bytes);
 	/* There must be no room for the event caused by this. */
 	if (wd >= 0)
 		inotify_rm_watch(fd, wd);

@@ -9,7 +9,7 @@
  */
 #include <errno.h>
 #include <fcntl.h>
-#include <limits.h>
+#include <linux/openat2.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -53,34 +53,62 @@ static bool starts_with_one_of(const char *text, const char *const *words)
 	return false;
 }
 
-/* Without data, or where opening a file has side effects (devices) or may wait for a server (which
- * may be the app itself). */
+/* Without data, or where opening a file has side effects (devices) or may wait for a server. */
 static bool is_worth_it(const char *point, const char *options, const char *type)
 {
 	static const char *const places[] = { "/dev", "/proc", "/sys", NULL };
-	static const char *const types[] = { "proc",   "sysfs", "cgroup", "devpts",  "devtmpfs",
-					     "mqueue", "fuse",  "nfs",    "cifs",    "smb",
-					     "9p",     "ceph",  "afs",    "tracefs", "debugfs",
-					     "bpf",    NULL };
+	static const char *const types[] = { "proc",   "sysfs",   "cgroup",  "devpts", "devtmpfs",
+					     "mqueue", "tracefs", "debugfs", "bpf",    NULL };
 
 	return strncmp(options, "ro", 2) && !starts_with_one_of(point, places) &&
-	       !starts_with_one_of(type, types);
+	       !starts_with_one_of(type, types) && !mount_is_served(type);
 }
 
-static void mark(struct files_written *written, pid_t pid, char *line)
+#define TRIES 3 /* a rename elsewhere may come in between */
+
+/* The way to a mount point is in the kernel's memory: no file server on it is asked. */
+static int open_point(int root, const char *point)
+{
+	int fd = -1;
+
+	for (int i = 0; i < TRIES && fd < 0 && (!i || errno == EAGAIN); i++)
+		fd = open_below(root, point, 0, RESOLVE_CACHED);
+	return fd;
+}
+
+/* By its name the app may have put something else there, or a mount over it: then no path leads to
+ * it. */
+static int mark(struct files_written *written, int root, char *line)
 {
 	struct proc_mount mount;
-	char path[PATH_MAX];
+	int point, result = 0;
 
 	if (!proc_parse_mount(line, &mount) || !is_worth_it(mount.point, mount.options, mount.type))
-		return;
-	if (snprintf(path, sizeof path, "/proc/%d/root%s", pid, mount.point) >= (int)sizeof path) {
-		written->errnum = ENAMETOOLONG;
-		return;
+		return 0;
+	point = open_point(root, mount.point);
+	if (point < 0 || (mount_of(point) == mount.id &&
+			  fanotify_mark(written->fd, FAN_MARK_ADD | FAN_MARK_MOUNT, FAN_MODIFY,
+					AT_FDCWD, fd_path(point).text)))
+		result = errno == ENOENT || errno == EACCES ? 0 : errno;
+	close_fd(&point);
+	return result;
+}
+
+/* 0, or why not all of them. */
+static int mark_all(struct files_written *written, pid_t pid, FILE *info)
+{
+	int root = proc_open(pid, "root", O_PATH | O_DIRECTORY), result = root < 0 ? errno : 0;
+	char *line = NULL;
+	size_t size = 0;
+
+	while (root >= 0 && getline(&line, &size, info) > 0) {
+		const int failed = mark(written, root, line);
+
+		result = result ? result : failed;
 	}
-	if (fanotify_mark(written->fd, FAN_MARK_ADD | FAN_MARK_MOUNT, FAN_MODIFY, AT_FDCWD, path) &&
-	    errno != ENOENT && errno != EACCES)
-		written->errnum = errno;
+	free(line);
+	close_fd(&root);
+	return result;
 }
 
 static bool is_our_mount_namespace(pid_t pid)
@@ -117,11 +145,11 @@ void files_written_watch(struct files_written *written, pid_t pid, struct avc_er
 		mounts = hash_line(mounts, line);
 	/* New mounts are marked before the next checkpoint. */
 	if (mounts != written->mounts) {
-		written->mounts = mounts;
-		written->errnum = is_our_mount_namespace(pid) ? ENOTSUP : 0;
 		rewind(info);
-		while (!written->errnum && getline(&line, &size, info) > 0)
-			mark(written, pid, line);
+		written->errnum = is_our_mount_namespace(pid) ? ENOTSUP
+							      : mark_all(written, pid, info);
+		/* Tried again if it was a matter of time. */
+		written->mounts = written->errnum == EAGAIN ? 0 : mounts;
 	}
 	free(line);
 	fclose(info);

@@ -27,6 +27,7 @@ static const struct {
 	{ "/dev/dri/", "it has a GPU device open" },
 	{ "/dev/kfd", "it has a GPU device open" },
 	{ "/dev/kvm", "it runs virtual machines" },
+	{ "/dev/fuse", files_serves },
 };
 
 static int check_descriptors(struct process *process, struct avc_error *err)

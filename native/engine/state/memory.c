@@ -141,6 +141,7 @@ static bool make_seen_room(struct mem_seen *seen)
 void mem_seen_free(struct mem_seen *seen)
 {
 	free(seen->key);
+	leases_free(&seen->leases);
 	*seen = (struct mem_seen){ 0 };
 }
 
@@ -202,26 +203,31 @@ int memory_prepare(const struct process *process, struct mem_image **image, stru
 	return 0;
 }
 
-/* Reads through the mapped file, which is checked before it is opened: only a regular one is.  No
- * single process may have all of its pages mapped, and reading through /proc/PID/mem would allocate
- * those never written. */
-static bool copy_area(pid_t pid, struct area *a, uint8_t *to)
+static bool is_area(int path_fd, const struct area *a)
 {
-	const int path_fd = proc_open_mapped(pid, a->start, a->end, O_PATH);
-	char path[48];
-	struct stat st;
-	ssize_t n = -1;
-	int fd = -1;
+	struct statx st;
 
-	if (path_fd >= 0 && fstat(path_fd, &st) == 0 && S_ISREG(st.st_mode) &&
-	    st.st_ino == a->inode) {
-		snprintf(path, sizeof path, "/proc/self/fd/%d", path_fd);
-		fd = open(path, O_RDONLY | O_CLOEXEC);
+	return statx(path_fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC, STATX_INO, &st) == 0 &&
+	       st.stx_ino == a->inode &&
+	       ((uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor) == a->device;
+}
+
+/* Reads through the mapped file, if it still is the one that was found to be memory.  No single
+ * process may have all of its pages mapped, and reading through /proc/PID/mem would allocate those
+ * never written. */
+static bool copy_area(pid_t pid, struct area *a, uint8_t *to, struct mem_image *image)
+{
+	const struct mapping m = { .device = a->device, .inode = a->inode };
+	int path_fd = proc_open_mapped(pid, a->start, a->end, O_PATH), fd = -1;
+	ssize_t n = -1;
+
+	if (path_fd >= 0 && is_area(path_fd, a)) {
+		fd = open_to_read(path_fd, &m, a->named ? &image->seen->leases : NULL);
+		image->leased |= fd < 0 && errno == EBUSY;
 	}
 	if (fd >= 0)
 		n = read_whole(fd, to, area_bytes(a), (off_t)a->offset);
-	if (path_fd >= 0)
-		close(path_fd);
+	close_fd(&path_fd);
 	close_fd(&fd);
 	a->kept = n > 0 ? (size_t)n : 0;
 	return n >= 0;
@@ -244,7 +250,7 @@ void memory_copy_shared(const struct process *process, struct mem_image *image)
 		/* Before it is read: what is written meanwhile counts as written since. */
 		if (a->as_file)
 			a->writes = mem_others_writes(process->others, a);
-		image->whole &= budget_step() && copy_area(process->pid, a, to);
+		image->whole &= budget_step() && copy_area(process->pid, a, to, image);
 		to += area_room(a);
 	}
 }

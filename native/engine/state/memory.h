@@ -97,6 +97,7 @@ struct mem_image {
 	struct marks kinds;    /* what a restore has to know about mappings */
 	bool special;          /* it has a vDSO                                   */
 	bool whole;            /* everything could be read                        */
+	bool leased;           /* some could not: a lease would have been broken   */
 	bool too_much;         /* ... of what is wiped, not                       */
 	uint64_t left_bytes;   /* of shared memory, for all processes together     */
 	struct mem_seen *seen; /* during a freeze                                */

@@ -49,6 +49,8 @@ struct survey {
 	uint64_t left_bytes, others_bytes;
 	bool private_huge, too_many, lost_some, unforked;
 	bool recycled; /* image.recycled                                             */
+	struct mounts mounts;
+	struct leases leases;
 };
 
 static uint64_t hash(uint64_t h, uint64_t value)
@@ -70,8 +72,9 @@ static bool is_of_parasite(const struct process *process, avc_remote at)
 /* Only its descendants can share it. */
 static bool is_shared(const struct mapping *m)
 {
-	return m->shared && (!strcmp(m->name, "/dev/zero (deleted)") ||
-			     !strcmp(m->name, "/anon_hugepage (deleted)"));
+	return m->shared && device_is_memory(m->device) &&
+	       (!strcmp(m->name, "/dev/zero (deleted)") ||
+		!strcmp(m->name, "/anon_hugepage (deleted)"));
 }
 
 /* By its name the app can ask to leave it as it is. */
@@ -86,10 +89,20 @@ static bool has_name(const struct mapping *m)
 	return m->shared && m->inode && name && strncmp(name, "avckpt-kept", 11) != 0;
 }
 
-/* Any process that sees the file system can open it. */
-static bool is_as_file(const struct mapping *m)
+/* A file on a disk may have such a name. */
+static bool is_memory(struct survey *survey, const struct mapping *m)
 {
-	return has_name(m) && !strncmp(m->name, "/dev/shm/", 9);
+	const char *type = "";
+	int fd;
+
+	if (device_is_memory(m->device))
+		return true;
+	fd = proc_open_mapped(survey->template, m->start, m->end, O_PATH);
+	if (fd >= 0)
+		type = mount_type(&survey->mounts, survey->template, fd);
+	close_fd(&fd);
+	return !strncmp(m->name, "/dev/", 5) &&
+	       (!strcmp(type, "tmpfs") || !strcmp(type, "hugetlbfs"));
 }
 
 static int hash_mapping(const struct mapping *m, void *arg)
@@ -130,8 +143,10 @@ void marks_add(struct marks *marks, const struct mapping *m, uint32_t flags)
  * block. */
 static bool has_path(const struct mapping *m)
 {
-	static const char *const others[] = { "/memfd:", "/secretmem", "/dmabuf:" };
+	static const char *const others[] = { "/secretmem", "/dmabuf:" };
 
+	if (device_is_memory(m->device) && !strncmp(m->name, "/memfd:", 7))
+		return false;
 	for (size_t i = 0; i < sizeof others / sizeof *others; i++)
 		if (!strncmp(m->name, others[i], strlen(others[i])))
 			return false;
@@ -141,13 +156,17 @@ static bool has_path(const struct mapping *m)
 /* A restored process that does not inherit it would have to map it from the file behind it:
  * impossible for a socket's ring (packet(7)), memfd_secret(2), or a memfd sealed against writable
  * mappings. */
-static bool is_only_here(pid_t template, const struct mapping *m)
+static bool is_only_here(struct survey *survey, const struct mapping *m)
 {
-	int fd, seals;
+	int path_fd, fd, seals;
 
 	if (!m->shared || !m->inode || has_path(m))
 		return false;
-	fd = proc_open_mapped(template, m->start, m->end, O_RDONLY | O_NONBLOCK);
+	path_fd = proc_open_mapped(survey->template, m->start, m->end, O_PATH);
+	if (path_fd < 0)
+		return false;
+	fd = open_to_read(path_fd, m, &survey->leases);
+	close(path_fd);
 	if (fd < 0)
 		return errno == ENXIO;
 	seals = fcntl(fd, F_GET_SEALS); /* -1: no seals */
@@ -155,16 +174,15 @@ static bool is_only_here(pid_t template, const struct mapping *m)
 	return m->mode[1] == 'w' && seals > 0 && seals & (F_SEAL_WRITE | F_SEAL_FUTURE_WRITE);
 }
 
-static uint32_t kind_of(const struct survey *survey, const struct mapping *m)
+static uint32_t kind_of(struct survey *survey, const struct mapping *m)
 {
 	const uint32_t kind = m->flags & (MAPPING_DROPPABLE | MAPPING_GROWING | MAPPING_SEALED |
 					  MAPPING_TAGGED | MAPPING_KEYS);
 
 	if (kind && mapping_is_special(m))
 		return kind | MAPPING_SPECIAL;
-	return survey->process->descendant && is_only_here(survey->template, m)
-		       ? kind | MAPPING_ONLY_HERE
-		       : kind;
+	return survey->process->descendant && is_only_here(survey, m) ? kind | MAPPING_ONLY_HERE
+								      : kind;
 }
 
 static int find_area(const struct mapping *m, void *arg)
@@ -175,6 +193,7 @@ static int find_area(const struct mapping *m, void *arg)
 	 * should be: no random data is repeated. */
 	const bool wiped = (m->flags & (MAPPING_WIPEONFORK | MAPPING_DROPPABLE)) ==
 			   MAPPING_WIPEONFORK;
+	bool named;
 
 	hash_mapping(m, arg);
 	survey->unforked |= survey->recycled && m->flags & MAPPING_DONTFORK &&
@@ -186,7 +205,8 @@ static int find_area(const struct mapping *m, void *arg)
 			marks_add(&survey->memory->advised, m, advice_of(m));
 	}
 	survey->private_huge |= m->flags & MAPPING_HUGETLB && !m->shared;
-	if ((!wiped && !is_shared(m) && !has_name(m)) || is_of_parasite(survey->process, m->start))
+	named = !wiped && has_name(m) && is_memory(survey, m);
+	if ((!wiped && !is_shared(m) && !named) || is_of_parasite(survey->process, m->start))
 		return 0;
 	if (survey->areas.count == AREAS_MAX) {
 		survey->too_many = true;
@@ -199,8 +219,9 @@ static int find_area(const struct mapping *m, void *arg)
 		.inode = m->inode,
 		.device = m->device,
 		.wiped = wiped,
-		.named = !wiped && has_name(m),
-		.as_file = !wiped && is_as_file(m),
+		.named = named,
+		/* Any process that sees the file system can open it. */
+		.as_file = named && !device_is_memory(m->device),
 		.protection = (uint8_t)mapping_protection(m),
 		.way = m->mode[1] == 'w' ? WAY_MAPPING : WAY_NONE,
 	};
@@ -380,6 +401,8 @@ static int check_layout(const struct image *image, struct avc_error *err)
 	areas_free(&survey.areas);
 	areas_free(&survey.foreign);
 	areas_free(&survey.unkept);
+	leases_free(&survey.leases);
+	mounts_free(&survey.mounts);
 	return result;
 }
 
@@ -489,6 +512,10 @@ int areas_check(const struct image *image, struct avc_error *err)
 			    "more than %u MB of its memory are wiped in a clone (MADV_WIPEONFORK), "
 			    "which is too much to copy",
 			    WIPED_MAX >> 20);
+	if (!result && image->memory->leased)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep memory", "",
+			    "it has shared memory with a lease (fcntl(2), F_SETLEASE), which would "
+			    "be broken by reading it");
 	if (!result && !image->memory->whole)
 		return fail(err, AVC_DEADLINE, 0, process->pid, "keep memory", "",
 			    "its shared or MADV_WIPEONFORK memory cannot be read");

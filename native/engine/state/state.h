@@ -225,6 +225,7 @@ struct mem_key {
 struct mem_seen {
 	uint32_t count, room;
 	struct mem_key *key;
+	struct leases leases;
 	uint64_t shared_bytes, wiped_bytes;
 	uint32_t runs;
 };

@@ -66,11 +66,8 @@ static int find_ctl(pid_t init)
  * it is reopened, because O_NONBLOCK and flock(2) belong to the open file description. */
 static int reopen(int *theirs, int flags)
 {
-	char path[32];
-	int fd;
+	const int fd = open_again(*theirs, flags);
 
-	snprintf(path, sizeof path, "/proc/self/fd/%d", *theirs);
-	fd = open(path, flags | O_CLOEXEC | O_NONBLOCK);
 	close_fd(theirs);
 	return fd;
 }

@@ -60,16 +60,6 @@ static int make_memory(size_t bytes)
 	return fd;
 }
 
-/* Read-only: this descriptor cannot be mapped for writing; and kernels before 6.7 refuse shared
- * mappings of a write-sealed memfd by any other descriptor. */
-static int open_read_only(int fd)
-{
-	char path[32];
-
-	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
-	return open(path, O_RDONLY | O_CLOEXEC);
-}
-
 /* The code is the same in every process, and sealed: one memfd for all. */
 static pthread_once_t code_once = PTHREAD_ONCE_INIT;
 static int code_fd = -1;
@@ -81,7 +71,9 @@ static void make_code(void)
 	if (fd >= 0 &&
 	    pwrite(fd, parasite_blob, sizeof parasite_blob, 0) == (ssize_t)sizeof parasite_blob &&
 	    fcntl(fd, F_ADD_SEALS, F_SEAL_WRITE | F_SEAL_SEAL) == 0)
-		code_fd = open_read_only(fd);
+		/* Read-only: this descriptor cannot be mapped for writing; and kernels before 6.7
+		 * refuse shared mappings of a write-sealed memfd by any other descriptor. */
+		code_fd = open_again(fd, O_RDONLY);
 	close_fd(&fd);
 }
 

@@ -1,0 +1,214 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Opening what a container names, or has: neither may lead out of it, wait for it, or have an
+ * effect on it (docs/security.md).
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/openat2.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "base.h"
+
+int open_below(int root, const char *path, uint64_t flags, uint64_t resolve)
+{
+	struct open_how how = {
+		.flags = O_PATH | O_CLOEXEC | flags,
+		.resolve = RESOLVE_IN_ROOT | RESOLVE_NO_MAGICLINKS | resolve,
+	};
+
+	return (int)syscall(SYS_openat2, root, path, &how, sizeof how);
+}
+
+int open_in_root_of(pid_t pid, const char *path, uint64_t flags)
+{
+	int root = proc_open(pid, "root", O_PATH | O_DIRECTORY), fd;
+
+	if (root < 0)
+		return -1;
+	fd = open_below(root, path, flags, 0);
+	close(root);
+	return fd;
+}
+
+struct fd_path fd_path(int fd)
+{
+	struct fd_path path;
+
+	snprintf(path.text, sizeof path.text, "/proc/thread-self/fd/%d", fd);
+	return path;
+}
+
+int open_again(int fd, int flags)
+{
+	return open(fd_path(fd).text, flags | O_NONBLOCK | O_NOCTTY | O_CLOEXEC);
+}
+
+/* ---- file systems ------------------------------------------------------------------------- */
+
+/* Without a request to a file server (AT_STATX_DONT_SYNC). */
+static bool look_at(int fd, unsigned int what, struct statx *st)
+{
+	return !statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, what, st);
+}
+
+uint64_t mount_of(int fd)
+{
+	struct statx st;
+
+	return look_at(fd, STATX_MNT_ID, &st) && st.stx_mask & STATX_MNT_ID ? st.stx_mnt_id : 0;
+}
+
+bool mount_is_served(const char *type)
+{
+	static const char *const served[] = { "fuse", "nfs", "cifs", "smb", "9p", "ceph", "afs" };
+
+	for (size_t i = 0; i < sizeof served / sizeof *served; i++)
+		if (!strncmp(type, served[i], strlen(served[i])))
+			return true;
+	return false;
+}
+
+static void read_mounts(struct mounts *mounts, pid_t pid)
+{
+	char path[48], *line = NULL;
+	struct proc_mount mount;
+	size_t size = 0;
+	FILE *info;
+
+	snprintf(path, sizeof path, "/proc/%d/mountinfo", pid);
+	info = fopen(path, "re");
+	mounts->read = true;
+	while (info && getline(&line, &size, info) > 0 && proc_parse_mount(line, &mount) &&
+	       make_room(&mounts->mount, mounts->count, &mounts->room, sizeof *mounts->mount)) {
+		struct mounted *m = &mounts->mount[mounts->count++];
+
+		m->id = mount.id;
+		snprintf(m->type, sizeof m->type, "%s", mount.type);
+	}
+	free(line);
+	if (info)
+		fclose(info);
+}
+
+const char *mount_type(struct mounts *mounts, pid_t pid, int fd)
+{
+	const uint64_t id = mount_of(fd);
+
+	if (!mounts->read)
+		read_mounts(mounts, pid);
+	for (uint32_t i = 0; i < mounts->count; i++)
+		if (mounts->mount[i].id == id)
+			return mounts->mount[i].type;
+	return "";
+}
+
+bool mounts_may_be_served(const struct mounts *mounts)
+{
+	for (uint32_t i = 0; i < mounts->count; i++)
+		if (mount_is_served(mounts->mount[i].type))
+			return true;
+	return !mounts->read;
+}
+
+void mounts_free(struct mounts *mounts)
+{
+	free(mounts->mount);
+	*mounts = (struct mounts){ 0 };
+}
+
+#define HUGE_SHIFTS 40 /* of sizes of pages: MFD_HUGE_2MB and others */
+#define HUGE_SHIFT_BIT 26
+
+static pthread_once_t memory_once = PTHREAD_ONCE_INIT;
+static uint64_t memory_device[HUGE_SHIFTS + 1];
+
+static void find_memory(void)
+{
+	for (unsigned int shift = 0; shift <= HUGE_SHIFTS; shift++) {
+		const unsigned int huge = shift ? MFD_HUGETLB | shift << HUGE_SHIFT_BIT : 0;
+		int fd = memfd_create("avckpt", MFD_CLOEXEC | huge);
+		struct statx st;
+
+		if (fd >= 0 && look_at(fd, STATX_TYPE, &st))
+			memory_device[shift] = (uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor;
+		close_fd(&fd);
+	}
+}
+
+bool device_is_memory(uint64_t device)
+{
+	pthread_once(&memory_once, find_memory);
+	for (size_t i = 0; device && i < sizeof memory_device / sizeof *memory_device; i++)
+		if (memory_device[i] == device)
+			return true;
+	return false;
+}
+
+/* ---- leases ------------------------------------------------------------------------------- */
+
+static void read_leases(struct leases *leases)
+{
+	unsigned int major, minor;
+	char *line = NULL;
+	size_t size = 0;
+	unsigned long inode;
+	FILE *locks = fopen("/proc/locks", "re");
+
+	leases->known = locks != NULL;
+	while (leases->known && getline(&line, &size, locks) > 0) {
+		if (sscanf(line, "%*d: LEASE %*s %*s %*d %x:%x:%lu", &major, &minor, &inode) != 3)
+			continue;
+		leases->known = make_room(&leases->file, leases->count, &leases->room,
+					  sizeof *leases->file);
+		if (leases->known)
+			leases->file[leases->count++] =
+				(struct leased){ (uint64_t)major << 32 | minor, inode };
+	}
+	free(line);
+	if (locks)
+		fclose(locks);
+}
+
+static bool is_leased(struct leases *leases, uint64_t device, uint64_t inode)
+{
+	if (!leases->known)
+		read_leases(leases);
+	for (uint32_t i = 0; i < leases->count; i++)
+		if (leases->file[i].device == device && leases->file[i].inode == inode)
+			return true;
+	return !leases->known;
+}
+
+void leases_free(struct leases *leases)
+{
+	free(leases->file);
+	*leases = (struct leases){ 0 };
+}
+
+int open_to_read(int path_fd, const struct mapping *m, struct leases *leases)
+{
+	struct statx st;
+	int fd;
+
+	if (!look_at(path_fd, STATX_TYPE, &st))
+		return -1;
+	if (!S_ISREG(st.stx_mode)) {
+		errno = S_ISCHR(st.stx_mode) || S_ISBLK(st.stx_mode) ? EACCES : ENXIO;
+		return -1;
+	}
+	if (leases && is_leased(leases, m->device, m->inode)) {
+		errno = EBUSY;
+		return -1;
+	}
+	fd = open_again(path_fd, O_RDONLY | O_NOATIME);
+	/* Of a user that we do not know. */
+	return fd < 0 && errno == EPERM ? open_again(path_fd, O_RDONLY) : fd;
+}
