@@ -124,9 +124,9 @@ class Collector:
 
     @staticmethod
     def _identified(case: Case, crash: Crash, frames: list[Frame] | None = None) -> Crash:
-        if not crash.command and case.command:
-            why = f"{crash.unknown}; " if crash.unknown else ""
-            crash = replace(crash, command=case.command, unknown=f"{why}the command is that of an earlier look")
+        if crash.unknown != case.crash.unknown and not crash.command and case.command:  # its memory is gone
+            why = f"{crash.unknown}; the command is that of an earlier look"
+            crash = replace(crash, command=case.command, unknown=why)
         return replace(crash, fingerprint=fingerprint(crash, case.wait_status, frames or []))
 
 

@@ -119,7 +119,8 @@ class Inquests(Generic[W]):
             mode = watch.settings.policy.core
             if mode != "off" and followed.outcome is Reason.RESTORED:
                 path, size, what = await self._cores.make(watch.container, case, crash, mode)
-                self._tell(watch, EventRecord(Kind.CORE, core=path or None, core_bytes=size or None, detail=what))
+                core = EventRecord(Kind.CORE, core=path or None, core_bytes=size or None, detail=what)
+                self._tell(watch, replace(core, crash_seq=record.seq))
         finally:
             self._command(watch, Command.RELEASE, case.remains_pid)
 
@@ -150,7 +151,9 @@ class Inquests(Generic[W]):
         deadline_s = watch.settings.policy.deadline_s
         if deadline_s and record.recovered_s is not None and record.recovered_s > deadline_s:
             detail = f"it was back later than avckpt.deadline={deadline_s * 1000:g}ms"
-            self._tell(watch, EventRecord(Kind.LATE, detail=detail, recovered_s=record.recovered_s))
+            self._tell(
+                watch, EventRecord(Kind.LATE, detail=detail, recovered_s=record.recovered_s, crash_seq=record.seq)
+            )
 
     @staticmethod
     def _command(watch: W, command: Command, pid: int) -> None:
