@@ -53,6 +53,7 @@ from avckpt.errors import (
     TargetGone,
     Unprotected,
 )
+from avckpt.events.archive import archive_of
 from avckpt.events.container_log import ContainerLog
 from avckpt.events.feed import Feed
 from avckpt.events.history import History
@@ -125,7 +126,7 @@ class Daemon:
         self.registry = Registry()
         self.records = Records(run_dir / "containers")
         self.feed = Feed()
-        self.history = History(run_dir / "history.jsonl")
+        self.history = History(run_dir / "history.jsonl", archive=archive_of(run_dir))
         self._system_journal = SystemJournal()
         self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
