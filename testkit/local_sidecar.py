@@ -146,7 +146,13 @@ class LocalSidecar:
         return last
 
     def container(
-        self, name: str, argv: Sequence[str], container_id: str | None = None, *, init: bool = True
+        self,
+        name: str,
+        argv: Sequence[str],
+        container_id: str | None = None,
+        *,
+        init: bool = True,
+        stderr: int | None = None,
     ) -> Container:
         """Starts avckpt-init with a program, or the program alone; nobody is told of it yet."""
         output = self.run_dir.parent / f"{name}-{len(self.containers)}.out"
@@ -157,7 +163,7 @@ class LocalSidecar:
                 ["unshare", "--pid", "--fork", "--mount-proc", *command, *argv],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
-                stderr=out,
+                stderr=out if stderr is None else stderr,
                 cwd=ROOT,
             )
         init_pid = wait_until(lambda: next(iter(children_of(process.pid)), 0), 5, "init starts")
@@ -176,9 +182,11 @@ class LocalSidecar:
         self.containers.append(made)
         return made
 
-    def protected(self, name: str, argv: Sequence[str], labels: dict[str, str] = QUICK) -> Container:
+    def protected(
+        self, name: str, argv: Sequence[str], labels: dict[str, str] = QUICK, *, stderr: int | None = None
+    ) -> Container:
         """Starts one and registers it by the prestart hook."""
-        container = self.container(name, argv)
+        container = self.container(name, argv, stderr=stderr)
         said = container.hook("prestart", labels)
         for _ in range(5):
             # A machine that is busy with much else; to register twice is to register once.

@@ -53,6 +53,8 @@ from avckpt.errors import (
     TargetGone,
     Unprotected,
 )
+from avckpt.events.archive import archive_of
+from avckpt.events.container_log import ContainerLog
 from avckpt.events.feed import Feed
 from avckpt.events.history import History
 from avckpt.events.journal import Journal
@@ -101,6 +103,7 @@ class Watch:
     """A unit's connection: when it closes, avckpt-init looks for another sidecar."""
     units: units.Allowance = field(default_factory=units.Allowance)
     """Of a launcher's container."""
+    own_log: ContainerLog = field(default_factory=ContainerLog)
 
     @property
     def notify(self) -> Notify | None:
@@ -123,7 +126,7 @@ class Daemon:
         self.registry = Registry()
         self.records = Records(run_dir / "containers")
         self.feed = Feed()
-        self.history = History(run_dir / "history.jsonl")
+        self.history = History(run_dir / "history.jsonl", archive=archive_of(run_dir))
         self._system_journal = SystemJournal()
         self.metrics = Metrics(__version__, native_version())
         self.notifier = Notifier(self._tell_of_notification)
@@ -501,6 +504,8 @@ class Daemon:
             log.log(line[0], "%s: %s", container.label, line[1])
             if line[0] >= logging.INFO:
                 self._system_journal.tell(container.init_pid, container.label, *line)
+        if record.kind is Kind.RESTORED and watch.settings.policy.mark:
+            watch.own_log.tell(watch.pidfd, record.message)
         self.metrics.take(record)
         self.feed.publish(record)
         return record

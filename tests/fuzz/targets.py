@@ -265,7 +265,7 @@ def guard_event(data: bytes) -> None:
     json.dumps([told.to_json(), container.to_json(), event.to_json()], allow_nan=False).encode()
     metrics = Metrics("1.0", "1.0")
     metrics.take(told)
-    metrics.render([container])
+    metrics.render([container], [container])
 
 
 # ---- API --------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ def read(path: Path) -> dict[str, str]:
         for member in members:
             file = archive.extractfile(member)
             assert file is not None
-            found[member.name.partition("/")[2]] = file.read().decode()
+            found[member.name.partition("/")[2]] = file.read().decode("utf-8", "surrogateescape")
         return found
 
 
@@ -65,13 +65,32 @@ def test_all_that_is_known_of_a_container(sidecar: Sidecar, container: Container
     assert ("config.yaml" in found) != ("config.yaml" in found.get("missing.txt", ""))
     with_core = tmp_path / "core.tar.gz"
     sidecar.avckpt("bundle", crashing.name, "-o", str(with_core), "--core")
-    with tarfile.open(with_core) as archive:
-        (member,) = [each for each in archive.getmembers() if each.name.endswith("/core.zst")]
-        file = archive.extractfile(member)
-        assert file is not None
-        assert file.read(4) == bytes.fromhex("28b52ffd")  # of zstd
+    assert read(with_core)["core.zst"].encode("utf-8", "surrogateescape")[:4] == bytes.fromhex("28b52ffd")  # of zstd
+
+    # Of the first of two crashes.
+    sidecar.wait_generation(crashing)
+    os.kill(sidecar.app_pid(crashing), signal.SIGSEGV)
+    wait_until(lambda: len(told(sidecar, crashing, "core")) == 2, 20, "its second core file is told of")
+    crash, _ = told(sidecar, crashing, "crash")
+    core, other = told(sidecar, crashing, "core")
+    line, _ = sidecar.avckpt("events", crashing.name, "--kind", "crash", "--numbers").stdout.splitlines()
+    assert line.split()[0] == str(crash["seq"]) == str(core["crash_seq"])
+    assert line.endswith(crash["message"])
+    first = tmp_path / "first.tar.gz"
+    sidecar.avckpt("bundle", str(crash["seq"]), "-o", str(first), "--core")
+    found = read(first)
+    assert json.loads(found["event.json"]) == crash
+    assert "it has started" in found["container.log"]
+    assert "restored in" in found["sidecar.log"]
+    kinds = [json.loads(line)["kind"] for line in found["events.jsonl"].splitlines()]
+    assert {"registered", "died", "restored", "crash", "core"} <= set(kinds)
+    kept = found["core.zst"].encode("utf-8", "surrogateescape")
+    assert kept == Path(core["core"]).read_bytes() != Path(other["core"]).read_bytes()
     again = sidecar.avckpt("bundle", crashing.name, "-o", str(path), check=False)
     assert again.status == 1
     assert "cannot be written" in again.stderr
     nobody = sidecar.avckpt("bundle", "no-such-container", check=False)
-    assert (nobody.status, "nothing is known of a container 'no-such-container'" in nobody.stderr) == (4, True)
+    assert (nobody.status, "nothing is known of a container or an event 'no-such-container'" in nobody.stderr) == (
+        4,
+        True,
+    )

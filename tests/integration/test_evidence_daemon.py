@@ -102,6 +102,21 @@ def test_an_exit_has_no_place(sidecar: LocalSidecar) -> None:
     assert event["crash"]["command"] == sys.executable
 
 
+def test_the_command_of_one_that_left_nothing(sidecar: LocalSidecar) -> None:
+    """The sidecar looks when the memory of the dead is not there any more."""
+    program = ["sh", "-c", f"sleep 0.2; exec {sys.executable} -c '{VICTIM}'"]
+    victim = sidecar.protected("victim", program, {**QUICK, "avckpt.keep": "1"})
+    sidecar.wait_for(victim, state="protected", threads=2)
+    with asleep(sidecar):
+        kill_unheard(victim, signal.SIGUSR1)
+        left = set(children_of(victim.init_pid)) - {victim.app_pid}
+        left = {pid for pid in left if comm_of(pid) != "avckpt-hold" or pid == min(_holders(victim))}
+        wait_until(lambda: not left & set(children_of(victim.init_pid)), 20, "its memory is gone", every_s=0.05)
+    event = wait_until(lambda: sidecar.events("victim", "crash"), 10, "the crash is told of", every_s=0.05)[0]
+    assert event["crash"]["command"] == sys.executable
+    assert "the command is that of an earlier look" in event["crash"]["unknown"]
+
+
 def test_a_final_death_waits_for_nobody(sidecar: LocalSidecar) -> None:
     """The container ends as soon as the sidecar has seen where it died, and not after the 0.2 s of a lost sidecar."""
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 from avckpt.cli import doctor, sidecar_container
+from avckpt.cli.client import Client
 from avckpt.errors import SidecarUnreachable
 
-from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_NAME, wait_until
+from testkit.harness import CONFIG_DIR, RUN_DIR, SIDECAR_IMAGE, SIDECAR_NAME, wait_until
 from testkit.protected import told
 
 pytestmark = pytest.mark.shared_machine(
@@ -219,3 +220,26 @@ def test_the_command_line_in_its_container(container: ContainerFactory, sidecar:
     assert "sidecar: answers" in doctor.stdout
     statuses = [inside(*words, check=False).status for words in (("restore", "nobody"), ("restore",), ("ps", "--jsn"))]
     assert statuses == [4, 2, 2]
+
+
+def test_events_outlive_a_reboot_on_a_volume(podman: Podman, sidecar: Sidecar, tmp_path: Path) -> None:
+    """Another sidecar, whose /run/avckpt is empty at each start: only the volume is the same."""
+    name = f"avckpt-archive-{os.getpid()}"
+    events: list[list[dict[str, object]]] = []
+    try:
+        for run_dir in (tmp_path / "first", tmp_path / "second"):
+            run_dir.mkdir()
+            podman.run(
+                *("run", "--detach", "--pull=never", "--name", name, "--privileged", "--pid=host", "--network=none"),
+                *("--volume", f"{run_dir}:/run/avckpt", "--volume", f"{name}:/var/lib/avckpt", SIDECAR_IMAGE),
+            )
+            client = Client(run_dir)
+            wait_until(lambda: sidecar_container.answers(client), 20, "it answers")  # noqa: B023
+            events.append(client.history())
+            podman.run("rm", "--force", "--time", "5", name)
+    finally:
+        podman.run("rm", "--force", "--ignore", name)
+        podman.run("volume", "rm", "--force", name)
+    before, after = events
+    assert before == []
+    assert [event["kind"] for event in after] == ["sidecar_stopped"]

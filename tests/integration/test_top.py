@@ -13,13 +13,14 @@ import time
 from collections.abc import Awaitable, Callable
 
 import pytest
-from avckpt.cli.client import Client
+from avckpt.cli.client import Client, Json
 from avckpt.cli.top import COLUMNS, Top, sparkline
+from rich.text import Text
 from textual.pilot import Pilot
 from textual.widgets import DataTable, RichLog
 
-from testkit.harness import avckpt_command, wait_until
-from testkit.local_sidecar import LocalSidecar
+from testkit.harness import avckpt_command, take_checkpoint, wait_until
+from testkit.local_sidecar import ON_COMMAND, LocalSidecar
 
 SLEEPER = ["sleep", "1000"]
 LABELS = {"avckpt.enable": "true", "avckpt.interval": "300ms"}
@@ -92,6 +93,39 @@ def test_a_sidecar_that_goes_and_comes(local: LocalSidecar) -> None:
         await until(pilot, lambda: "the sidecar is not running" in str(head.render()), "it says so")
         await asyncio.to_thread(local.start)
         await until(pilot, lambda: "not running" not in str(head.render()), "it is back")
+
+    driven(local, steps)
+
+
+@pytest.mark.shared_machine("restores and screens on a busy machine may take longer than the test waits")
+def test_only_what_has_changed_is_painted(local: LocalSidecar, monkeypatch: pytest.MonkeyPatch) -> None:
+    unit = local.protected("lidar", SLEEPER, ON_COMMAND)
+    take_checkpoint(local.client, "lidar")
+    local.wait_for(unit, state="protected", generations=1)
+    looks, painted = 0, []
+    show, update_cell = Top._show, DataTable.update_cell
+
+    def look(app: Top, rows: list[Json], problem: str) -> None:
+        nonlocal looks
+        show(app, rows, problem)
+        looks += 1
+
+    def paint(table: DataTable[Text], row: str, column: str, cell: Text, **options: bool) -> None:
+        update_cell(table, row, column, cell, **options)
+        painted.append(column)
+
+    monkeypatch.setattr(Top, "_show", look)
+    monkeypatch.setattr(DataTable, "update_cell", paint)
+
+    async def steps(app: Top, pilot: Pilot[None]) -> None:
+        await until(pilot, lambda: cells(app, "FREEZES") == ["█"], "the unit, and its events")
+        painted.clear()
+        before = looks
+        await until(pilot, lambda: looks > before + 2, "it has looked again")
+        assert set(painted) == {"CHECKPOINT"}  # its age
+        await asyncio.to_thread(take_checkpoint, local.client, "lidar")
+        await until(pilot, lambda: cells(app, "GENS") == ["2/2"], "the next one")
+        assert "UNIT" not in painted
 
     driven(local, steps)
 

@@ -14,7 +14,7 @@ from avckpt.evidence.collector import Collector
 from avckpt.evidence.crash import Crash, Frame, code_name, crash_of, fingerprint, placed
 from avckpt.evidence.deaths import Death, Delivery, Sent
 from avckpt.evidence.kernel_log import Fault, fault_of
-from avckpt.evidence.remains import Remains, build_id_of, parse_maps
+from avckpt.evidence.remains import Remains, build_id_of, command_of, parse_maps
 from avckpt.guard import Event
 
 
@@ -112,9 +112,14 @@ def test_our_own_memory() -> None:
         assert frame.offset == first.offset + 0x100  # as long as nobody links otherwise
         assert remains.frame(0x10) == Frame(0x10)
         assert [remains.read(0x10, 8), remains.read(1 << 63, 8)] == [b"", b""]
-        assert "python" in remains.command
     finally:
         remains.close()
+
+
+def test_the_command_is_of_a_child() -> None:
+    assert "python" in command_of(os.getpid(), os.getppid())
+    with pytest.raises(ProcessLookupError, match="another one"):
+        command_of(os.getpid(), os.getpid())
 
 
 def test_maps_and_notes_may_be_anything() -> None:

@@ -15,6 +15,8 @@ import time
 from pathlib import Path
 
 import pytest
+from avckpt.events import archive
+from avckpt.events.archive import Archive
 from avckpt.events.history import History
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import Kind
@@ -144,3 +146,56 @@ def test_a_writer_that_is_killed_at_any_instant_leaves_a_history_without_a_gap(p
         newest = numbers[-1]
         history.close()
     assert all(json.loads(line)["kind"] == "died" for line in path.read_text().splitlines())
+
+
+def begun(path: Path, folder: Path, *more: float) -> list[EventRecord]:
+    """What a sidecar knows that finds a history and an archive, and adds to both."""
+    history = History(path, archive=Archive(folder))
+    for at in more:
+        history.add(died(at))
+    history.close()
+    return history.after()
+
+
+def test_an_archive_outlives_the_history(path: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    before = begun(path, folder, 1.0, 2.0)
+    path.unlink()  # a reboot
+    after = begun(path, folder, 3.0)
+    assert after[:2] == before
+    assert [(record.seq - before[0].seq, record.at) for record in after] == [(0, 1.0), (1, 2.0), (2, 3.0)]
+    assert begun(path, folder) == History(path).after() == after
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert stat.S_IMODE((folder / path.name).stat().st_mode) == 0o600
+
+
+def test_each_is_completed_by_the_other(path: Path, tmp_path: Path) -> None:
+    """There was no archive at first, or a sidecar was killed before its disk had all."""
+    folder = tmp_path / "disk"
+    first = begun(path, folder, 1.0)
+    assert not folder.exists()
+    folder.mkdir()
+    assert begun(path, folder) == first
+    both = begun(path, tmp_path / "none", 2.0)
+    assert begun(path, folder, 3.0)[:2] == both
+    path.unlink()
+    assert [record.at for record in begun(path, folder)] == [1.0, 2.0, 3.0]
+
+
+def test_nobody_waits_for_a_disk(
+    path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that does not answer: here a pipe in the place of the file."""
+    for name in ("LOAD_S", "CLOSE_S"):
+        monkeypatch.setattr(archive, name, 0.1)
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    os.mkfifo(folder / path.name)
+    history = History(path, limit=10, archive=Archive(folder, limit=10))
+    records = [history.add(died(float(at))) for at in range(30)]
+    history.close()
+    assert History(path, limit=10).after() == records[20:]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{folder} does not answer: earlier events are not known"
+    ]

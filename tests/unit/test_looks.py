@@ -4,15 +4,23 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
+from avckpt.api.server import ApiServer, Backend
+from avckpt.cli.client import Client
 from avckpt.containers import looks
 from avckpt.containers.looks import in_own_thread, look
 from avckpt.containers.protected import Protected
+from avckpt.containers.registry import Registry
 from avckpt.errors import DeadlineMissed
+from avckpt.events.metrics import Metrics
 from avckpt.policy import settings_of
 from avckpt.supervision import pressure
 from avckpt.supervision.pressure import held_by
@@ -60,6 +68,41 @@ def test_what_is_raised_is_raised_to_who_asked() -> None:
             await look("memory", 1, fail)
         with pytest.raises(FileNotFoundError):
             await in_own_thread(fail)
+
+    asyncio.run(main())
+
+
+def test_a_scrape_waits_once_for_all_that_hang(
+    stuck: threading.Event, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """And has the rest of what it knows of them."""
+
+    def slow(app_pid: int, templates: object) -> int:
+        if app_pid < 10:
+            stuck.wait()
+        return 123
+
+    monkeypatch.setattr(pressure, "held_bytes", slow)
+    registry = Registry()
+    for number in range(1, 13):
+        container = Protected(f"{number:064}", f"web{number}", number, number, settings_of({}).config, 0.0)
+        container.generations, container.app_pid = 2, number
+        registry.add(container)
+    backend = cast("Backend", SimpleNamespace(registry=registry, metrics=Metrics("1.0", "1.0")))
+
+    async def main() -> None:
+        server = ApiServer(backend, tmp_path / "api.sock")
+        await server.start()
+        client = Client(tmp_path)
+        started = time.monotonic()
+        text = await in_own_thread(client.metrics)
+        rows = await in_own_thread(client.containers)
+        took_s = time.monotonic() - started
+        await server.close()
+        measured = re.findall(r'^avckpt_generations_memory_bytes\{container="(\w+)"', text, re.M)
+        assert measured == ["web10", "web11", "web12"]
+        assert text.count("avckpt_generations{") == len(rows) == 12
+        assert took_s < 6 * looks.WAIT_S
 
     asyncio.run(main())
 

@@ -82,7 +82,7 @@ def container(name: str, state: State, generations: int) -> Protected:
 def test_gauges_are_of_live_containers_only() -> None:
     metrics = Metrics("1.0", "1.0")
     web, db = container("web", State.PROTECTED, 2), container("db", State.UNPROTECTED, 0)
-    text = metrics.render([web, db])
+    text = metrics.render([web, db], [web, db])
     assert value(text, "avckpt_generations", container="web") == 2
     assert value(text, "avckpt_protected", container="web") == 1
     assert value(text, "avckpt_generations_memory_bytes", container="web") == 1000

@@ -111,6 +111,8 @@ class Policy:
     """A recovery that takes longer is reported; 0: none is."""
     deadline_late: str = "go-on"
     """What then happens: go-on, or cold (it is abandoned, and the container ends)."""
+    mark: bool = False
+    """Whether a restore adds a line to the container's own log."""
     core: str = "off"
     """A core file for each death that is undone: off, mini (stacks) or on."""
     group: str = ""
@@ -311,10 +313,13 @@ def _parse_enable(text: str) -> dict[str, Any]:
     return {"enable": text.lower() in _TRUE}
 
 
-def _parse_io_uring(text: str) -> dict[str, Any]:
-    if text not in ("on", "off"):
-        raise ValueError("neither on nor off")
-    return {"io_uring": text == "on"}
+def _on_or_off(field_name: str) -> Callable[[str], dict[str, Any]]:
+    def parse(text: str) -> dict[str, Any]:
+        if text not in ("on", "off"):
+            raise ValueError("neither on nor off")
+        return {field_name: text == "on"}
+
+    return parse
 
 
 def _parse_interval(text: str) -> dict[str, Any]:
@@ -473,12 +478,13 @@ LABELS: dict[str, Label] = {
         _one_of("tcp", "reset-moved", "reset", "keep", "messages"),
     ),
     "avckpt.files": Label("auto", "auto, rewind, keep or strict", _one_of("files", "auto", "rewind", "keep", "strict")),
-    "avckpt.io_uring": Label("on", "on or off", _parse_io_uring),
+    "avckpt.io_uring": Label("on", "on or off", _on_or_off("io_uring")),
     "avckpt.images": Label("auto", "fork, dirty or auto", _one_of("images", "fork", "dirty", "auto")),
     "avckpt.shm": Label("4MB", "a size up to 1GB, as 0, 512KB or 4MB", _parse_shm),
     "avckpt.quiesce": Label("20ms", f"0, or {_DURATION}, up to 1s, as 20ms", _parse_quiesce),
     "avckpt.deadline": Label("", f"{_DURATION}, from 1ms to 1h, as 50ms", _parse_deadline),
     "avckpt.deadline.late": Label("go-on", "go-on or cold", _one_of("deadline_late", "go-on", "cold")),
+    "avckpt.mark": Label("off", "on or off", _on_or_off("mark")),
     "avckpt.core": Label("off", "off, mini or on", _one_of("core", "off", "mini", "on")),
     "avckpt.scope": Label("container", "container or nodes", _one_of("scope", "container", "nodes")),
     "avckpt.group": Label("", "a name: letters, digits and -_., at most 63", _parse_group),

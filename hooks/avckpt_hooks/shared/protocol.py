@@ -35,6 +35,9 @@ import socket
 import struct
 import time
 
+RUN_DIR = "/run/avckpt"
+STATE_DIR = "/var/lib/avckpt"
+"""What outlives a reboot, where it exists."""
 VERSION = 1
 MAX_BYTES = 128 * 1024
 """Longest packet; below the default SO_SNDBUF, so that a send never splits."""
@@ -49,7 +52,7 @@ class ProtocolError(ValueError):
 
 def run_dir() -> str:
     """The runtime directory: $AVCKPT_RUN_DIR, or /run/avckpt."""
-    return os.environ.get("AVCKPT_RUN_DIR") or "/run/avckpt"
+    return os.environ.get("AVCKPT_RUN_DIR") or RUN_DIR
 
 
 def hooks_socket() -> str:

@@ -46,7 +46,7 @@ from avckpt.events.metrics import CONTENT_TYPE, Metrics
 from avckpt.events.record import EventRecord
 from avckpt.guard import Command
 from avckpt.policy import Reloaded
-from avckpt.supervision.pressure import held_by
+from avckpt.supervision.pressure import measure
 
 log = logging.getLogger("avckpt")
 
@@ -143,8 +143,7 @@ class ApiServer:
         containers = registry.ended() if _flag(request, "all") else []
         containers += registry.live()
         if _flag(request, "memory", "1"):
-            for container in containers:
-                await held_by(container)
+            await measure(containers)
         rows = [container.to_json() for container in containers]
         return web.json_response({"containers": rows})
 
@@ -203,9 +202,8 @@ class ApiServer:
         return web.json_response(document())
 
     async def _metrics(self, request: web.Request) -> web.Response:
-        for container in self._backend.registry.live():
-            await held_by(container)
-        text = self._backend.metrics.render(self._backend.registry.live())
+        measured = await measure(self._backend.registry.live())
+        text = self._backend.metrics.render(self._backend.registry.live(), measured)
         return web.Response(body=text, headers={"Content-Type": CONTENT_TYPE})
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`avckpt bundle`: one archive with all that is known about a container, to find out why it crashed."""
+"""`avckpt bundle`: one archive with all that is known about a container, or a crash, to find out why."""
 
 from __future__ import annotations
 
@@ -29,20 +29,24 @@ LOG_LINES = 2000
 MOST_BYTES = 8 << 20
 """Of what one program says; the end is what matters."""
 CORE_MOST_BYTES = 256 << 20
+AROUND_S = 600.0
+"""What happened so long before and after an event may have to do with it."""
 README = """What avckpt knows of {name}, {at}.
 
-events.jsonl      what happened to it, one JSON object a line, oldest first
+event.json        the event that was asked for, if one was
+events.jsonl      what happened to it, one JSON object a line, oldest first; with an event, also to its
+                  group, at that time
 container.json    how it is now (avckpt ps --json)
 labels.json       its avckpt.* labels
 inspect.json      image, state, restarts and mounts, as Podman has them; no environment, no command
-container.log     the last {lines} lines that it wrote
+container.log     the last {lines} lines that it wrote (with an event: of that time)
 sidecar.json      the sidecar: version, configuration in force
-sidecar.log       the last {lines} lines of its log
+sidecar.log       the last {lines} lines of its log (with an event: of that time)
 metrics.txt       the sidecar's metrics
 doctor.json       what avckpt doctor says of the machine
 config.yaml       defaults for all containers, where there are any
 versions.txt      kernel, Podman, runtime
-core.zst          with --core: its newest core file (zstd -d, gdb)
+core.zst          with --core: its newest core file, or that of the event (zstd -d, gdb)
 missing.txt       what could not be collected, and why, if anything
 """
 INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCount", "Mounts")
@@ -50,33 +54,43 @@ INSPECTED = ("Id", "Name", "Image", "ImageName", "Created", "State", "RestartCou
 
 
 @click.command()
-@click.argument("name", shell_complete=complete_container)
+@click.argument("name", metavar="NAME|NUMBER", shell_complete=complete_container)
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
     help="Output file; default avckpt-NAME-TIME.tar.gz here.",
 )
-@click.option("--core", is_flag=True, help="With its newest core file (avckpt.core): all its memory, secrets included.")
+@click.option(
+    "--core",
+    is_flag=True,
+    help="With its newest core file (avckpt.core), or that of the event: all its memory, secrets included.",
+)
 def bundle(name: str, output: Path | None, core: bool) -> None:
-    """Collect everything known about container NAME in one archive.
+    """Collect everything known about container NAME, or event NUMBER, in one archive.
 
     Events, state, labels, logs, metrics, versions and what "avckpt doctor" says; no
     environment and no command lines.  Look through it before you pass it on: logs
     contain what the container wrote.
+
+    "avckpt events --numbers" lists the events of the last days.
     """
     from avckpt_hooks.shared import protocol
 
     from avckpt.cli.client import Client
 
     run_dir = Path(protocol.run_dir())
-    container, events = find(Client(run_dir), name)
+    client = Client(run_dir)
+    event = find_event(client, name)
+    container, events = find(client, event["id"] if event else name)
+    if event:
+        events = [each for each in client.history() if _is_around(each, event)]
     stem = f"avckpt-{_plain(container)}-{time.strftime('%Y%m%d-%H%M%S')}"
     path = output or Path(f"{stem}.tar.gz")
     try:
         # Only its owner may read it: a log may say more than others should know.
         with open(path, "xb", opener=_open_private) as file:
-            missing = write(file, stem, list(contents(Client(run_dir), container, events, core=core)))
+            missing = write(file, stem, list(contents(client, container, events, event=event, core=core)))
     except OSError as error:
         raise AvckptError(f"{path} cannot be written", errno=error.errno or 0) from error
     for each in missing:
@@ -93,24 +107,54 @@ def find(client: Client, name: str) -> tuple[Json, list[Json]]:
     names = {row["id"] for row in rows}
     events = [event for event in client.history() if event["id"] in names or name == event["container"]]
     if not rows and not events:
-        raise NoSuchContainer(f"nothing is known of a container {name!r}")
+        raise NoSuchContainer(f"nothing is known of a container or an event {name!r}")
     if rows:
         return max(rows, key=lambda row: row["registered_at"]), events
     return {"name": events[-1]["container"], "id": events[-1]["id"], "state": "ended"}, events
 
 
+def find_event(client: Client, number: str) -> Json:
+    """The event of that number; empty when it is no number, or a container is called so.
+
+    Raises NoSuchContainer when it is not about one.
+    """
+    if not number.isdecimal() or any(number == row["name"] for row in client.containers(ended=True, memory=False)):
+        return {}
+    event: Json = next((each for each in client.history() if each["seq"] == int(number)), {})
+    if event and not event["id"]:
+        raise NoSuchContainer(f"event {number} is not about a container: {event['message']}")
+    return event
+
+
+def _is_around(other: Json, event: Json) -> bool:
+    ours = other["id"] == event["id"] or (event["group"] and other["group"] == event["group"])
+    return bool(ours or not other["id"]) and abs(other["at"] - event["at"]) <= AROUND_S
+
+
 def contents(
-    client: Client, container: Json, events: list[Json], *, core: bool = False
+    client: Client, container: Json, events: list[Json], *, event: Json, core: bool = False
 ) -> Iterator[tuple[str, Callable[[], str | bytes]]]:
     """Names of the files, and how to get what is in them; this may raise AvckptError or OSError."""
     from avckpt.cli import doctor, sidecar_container
 
     at = time.strftime("%Y-%m-%d %H:%M:%S %Z")
     yield "README.txt", lambda: README.format(name=called(container), at=at, lines=LOG_LINES)
+    if event:
+        yield "event.json", lambda: _pretty(event)
     yield "events.jsonl", lambda: "".join(json.dumps(event) + "\n" for event in events)
     yield "container.json", lambda: _pretty(container)
     inspected: list[Json] = []
     whose = container.get("node_of") or container["id"]  # a node's container is what Podman knows
+    logs = ["podman", "logs", "--tail", str(LOG_LINES)]
+    if event:
+        logs = [
+            "podman",
+            "logs",
+            "--since",
+            _rfc3339(event["at"] - AROUND_S),
+            "--until",
+            _rfc3339(event["at"] + AROUND_S),
+        ]
 
     def inspect() -> str:
         inspected.extend(json.loads(_program("podman", "container", "inspect", whose)))
@@ -125,15 +169,15 @@ def contents(
     if whose != "host":
         yield "inspect.json", inspect
         yield "labels.json", labels
-        yield "container.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), whose)
+        yield "container.log", lambda: _program(*logs, whose)
     yield "sidecar.json", lambda: _pretty(client.info())
-    yield "sidecar.log", lambda: _program("podman", "logs", "--tail", str(LOG_LINES), sidecar_container.NAME)
+    yield "sidecar.log", lambda: _program(*logs, sidecar_container.NAME)
     yield "metrics.txt", client.metrics
     yield "doctor.json", lambda: _pretty([asdict(check) for check in doctor.checks()])
     yield "config.yaml", lambda: _config(client)
     yield "versions.txt", versions
     if core:
-        yield "core.zst", lambda: _core(events)
+        yield "core.zst", lambda: _core(events, event)
 
 
 def _config(client: Client) -> str:
@@ -144,15 +188,20 @@ def _config(client: Client) -> str:
     return _tail(path.read_bytes())
 
 
-def _core(events: list[Json]) -> bytes:
-    """The newest that is still there.  Raises AvckptError when there is none, or it is too large to send on."""
-    paths = [Path(event["core"]) for event in events if "core" in event]
+def _core(events: list[Json], event: Json) -> bytes:
+    """That of the event, or the newest that is still there.
+
+    Raises AvckptError when there is none, or it is too large to send on.
+    """
+    numbers = {event.get("seq"), event.get("crash_seq")} - {None}
+    wanted = [each for each in events if not numbers or numbers & {each["seq"], each.get("crash_seq")}]
+    paths = [Path(each["core"]) for each in wanted if "core" in each]
     for path in reversed(paths):
         if path.is_file():
             if path.stat().st_size > CORE_MOST_BYTES:
                 raise AvckptError(f"{path} is too large, send it by itself")
             return path.read_bytes()
-    raise AvckptError("there is none: avckpt.core=mini or on makes one of each death")
+    raise AvckptError("there is none: avckpt.core=mini or on makes one of each crash that is undone")
 
 
 def write(file: io.BufferedIOBase, folder: str, files: list[tuple[str, Callable[[], str | bytes]]]) -> list[str]:
@@ -206,6 +255,10 @@ def _program(*argv: str) -> str:
     if done.returncode != 0:
         raise AvckptError(said.strip().rpartition("\n")[2] or f"{argv[0]} ended with status {done.returncode}")
     return said
+
+
+def _rfc3339(at: float) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(at))
 
 
 def _tail(data: bytes) -> str:

@@ -78,9 +78,10 @@ def complete_container(ctx: click.Context, param: click.Parameter, incomplete: s
 @click.option(
     "-k", "--kind", "kinds", multiple=True, type=click.Choice([kind.value for kind in Kind]), help="Only this kind."
 )
-@click.option("--json", "as_json", is_flag=True, help="JSON lines, one for each event.")
+@click.option("-n", "--numbers", "form", flag_value="numbers", help="With the number of each, for avckpt bundle.")
+@click.option("--json", "form", flag_value="json", help="JSON lines, one for each event.")
 def events(
-    name: str | None, follow: bool, since: float | None, routine: bool, kinds: tuple[str, ...], as_json: bool
+    name: str | None, follow: bool, since: float | None, routine: bool, kinds: tuple[str, ...], form: str | None
 ) -> None:
     """Show what happened: crashes, restores, what is unprotected and why.
 
@@ -93,7 +94,8 @@ def events(
     try:
         for event in _followed(client, since, routine) if follow else _kept(client, name, since):
             if (name is None or _is_of(event, name)) and (not kinds or event["kind"] in kinds):
-                click.echo(json.dumps(event) if as_json else _line(event))
+                number = f"{event['seq'] or '-':<10}  " if form == "numbers" else ""
+                click.echo(json.dumps(event) if form == "json" else number + _line(event))
                 sys.stdout.flush()
     except KeyboardInterrupt:
         return  # the usual way to have enough

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from avckpt_hooks.shared.protocol import STATE_DIR
+
 from avckpt.cli.client import Client
 from avckpt.cli.podman import PodmanFailed, podman
 from avckpt.errors import SidecarUnreachable
@@ -76,7 +78,8 @@ def options(run_dir: Path) -> list[str]:
     """What `podman run` has to be told for a sidecar."""
     config = ["--volume", f"{CONFIG_DIR}:{CONFIG_DIR}:ro"] if CONFIG_DIR.is_dir() else []
     journal = ["--volume", f"{JOURNAL}:{JOURNAL}"] if JOURNAL.is_dir() else []
-    volumes = ["--volume", f"{run_dir}:/run/avckpt", *config, *journal]
+    history = ["--volume", f"{STATE_DIR}:{STATE_DIR}"] if Path(STATE_DIR).is_dir() else []
+    volumes = ["--volume", f"{run_dir}:/run/avckpt", *config, *journal, *history]
     return ["--restart=always", "--privileged", "--pid=host", "--network=none", *volumes]
 
 

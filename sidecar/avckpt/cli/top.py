@@ -201,8 +201,9 @@ class Top(App[None]):
                 table.move_cursor(row=list(wanted).index(chosen))
             return
         for key, cells in wanted.items():
-            for column, cell in zip(COLUMNS, cells):
-                table.update_cell(key, column, cell, update_width=True)
+            for column, before, cell in zip(COLUMNS, table.get_row(key), cells):
+                if cell != before:  # what is the same would be measured and painted again
+                    table.update_cell(key, column, cell, update_width=True)
 
     def _order(self, row: Json) -> tuple[float, str]:
         crash_at = self._seen.get(row["id"], Seen()).crash_at if self._crashed_first else 0.0

@@ -58,6 +58,8 @@ class Protected:
     app_pid_inside: int = 0
     guard_pid: int = 0
     """Of its avckpt-guard; 0: there is none."""
+    command: str = ""
+    """Its program, as it was seen last; empty: it was not."""
     threads: int = 0
     generation: int = 0
     generations: int = 0

@@ -16,8 +16,12 @@ import os
 import time
 from collections import deque
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from avckpt.events.record import EventRecord
+
+if TYPE_CHECKING:
+    from avckpt.events.archive import Archive
 
 log = logging.getLogger("avckpt")
 
@@ -28,14 +32,19 @@ AGAIN_S = 10.0
 
 
 class History:
-    """The events of a machine since it started, at most `limit`.  For one thread.
+    """The last events of a machine: since it started, or with an `archive` from before; at most `limit`.
 
-    What cannot be written is kept in memory until it can, and the log says so once.
+    For one thread.  What cannot be written is kept in memory until it can, and the log says so once.
+    A `durable` one waits for its disk before it replaces the file.
     """
 
-    def __init__(self, path: Path, limit: int = LIMIT) -> None:
+    def __init__(
+        self, path: Path, limit: int = LIMIT, *, archive: Archive | None = None, durable: bool = False
+    ) -> None:
         self._path = path
         self._limit = limit
+        self._archive = archive
+        self._durable = durable
         self._kept: deque[EventRecord] = deque(maxlen=limit)
         self._lines = 0
         self._fd = -1
@@ -43,6 +52,8 @@ class History:
         self._failed_s: float | None = None
         """When a write failed (CLOCK_MONOTONIC); None: none has."""
         whole = self._load()
+        if archive is not None and self._join(archive):
+            whole = False
         # The time of day as the first number: numbers given out before a
         # history was lost are smaller, so that a client that resumes after one
         # of them misses nothing.
@@ -53,13 +64,19 @@ class History:
     def add(self, record: EventRecord) -> EventRecord:
         """Numbers an event and keeps it; returns it with its number."""
         record = dataclasses.replace(record, seq=self._next)
-        self._next += 1
+        self.keep(record)
+        if self._archive is not None:
+            self._archive.add(record)
+        return record
+
+    def keep(self, record: EventRecord) -> None:
+        """Keeps an event that has its number."""
+        self._next = record.seq + 1
         self._kept.append(record)
         if self._failed_s is None and self._lines < 2 * self._limit:
             self._append(record)
         elif self._failed_s is None or time.monotonic() - self._failed_s >= AGAIN_S:
             self._compact()
-        return record
 
     def after(self, seq: int | None = None, since: float | None = None) -> list[EventRecord]:
         """The stored events, oldest first: later than number `seq`, and not before the time of day
@@ -72,12 +89,30 @@ class History:
             if (seq is None or record.seq > seq) and (since is None or record.at >= since)
         ]
 
+    def sync(self) -> None:
+        """Has the disk write what was kept.  Blocks."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):  # the next write says so
+                os.fdatasync(self._fd)
+
     def close(self) -> None:
         """Closes the file; what is added from now on is not written."""
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1
         self._closed = True
+        if self._archive is not None:
+            self._archive.close()
+
+    def _join(self, archive: Archive) -> bool:
+        """Completes each by what only the other has; whether it had something for this one."""
+        here = {record.seq: record for record in self._kept}
+        there = {record.seq: record for record in archive.load()}
+        for seq in sorted(here.keys() - there.keys()):
+            archive.add(here[seq])
+        both = {**there, **here}
+        self._kept = deque((both[seq] for seq in sorted(both)), maxlen=self._limit)
+        return bool(there.keys() - here.keys())
 
     def _load(self) -> bool:
         """Reads the file; False when it must be rewritten before events are appended."""
@@ -130,6 +165,9 @@ class History:
             fd = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             with os.fdopen(fd, "wb") as file:
                 file.writelines(map(_line, self._kept))
+                if self._durable:
+                    file.flush()
+                    os.fdatasync(fd)
             aside.replace(self._path)
         except OSError as error:
             self._complain(error)

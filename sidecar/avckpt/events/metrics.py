@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -136,15 +136,16 @@ class Metrics:
             for histogram in self._longest:
                 self._maxima.pop((histogram, gone), None)
 
-    def render(self, live: Iterable[Protected]) -> bytes:
-        """The text for Prometheus, with the memory of each container's generations as last read."""
+    def render(self, live: Iterable[Protected], measured: Collection[Protected] = ()) -> bytes:
+        """The text for Prometheus; only those that were `measured` have their `memory_bytes` in it."""
         for gauge in (self._generations, self._memory, self._protected, self._checkpoint_at):
             gauge.clear()
         for container in live:
             if container.state is State.LISTENING:
                 continue  # it has asked for no protection
             self._generations.labels(container.label).set(container.generations)
-            self._memory.labels(container.label).set(container.memory_bytes if container.generations else 0)
+            if container in measured:
+                self._memory.labels(container.label).set(container.memory_bytes if container.generations else 0)
             self._protected.labels(container.label).set(container.state is State.PROTECTED)
             if container.last_checkpoint_at is not None:
                 self._checkpoint_at.labels(container.label).set(container.last_checkpoint_at)

@@ -87,6 +87,7 @@ class EventRecord:
     detail: str = said("a clause for users, where the other fields do not say it", "")
     core: str | None = said("path of the core file; missing: none was written, and `detail` says why")
     core_bytes: int | None = said("its size, compressed")
+    crash_seq: int | None = said("of `core` and `late`: number of the event `crash` that they belong to")
     detected_s: float | None = said(
         "from the fatal signal until avckpt-init noticed the death; unknown for exits, and where the kernel's report "
         "was lost (`crash.unknown`)"

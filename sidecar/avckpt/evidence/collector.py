@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avckpt.containers.looks import look
-from avckpt.containers.process import stat_fields
 from avckpt.errors import AvckptError
 from avckpt.events.vocabulary import signal_name
 from avckpt.evidence.crash import Crash, Frame, crash_of, fingerprint, placed
 from avckpt.evidence.deaths import Death, Deaths, Delivery
 from avckpt.evidence.kernel_log import KernelLog
-from avckpt.evidence.remains import Remains
+from avckpt.evidence.remains import Remains, check_parent, command_of
 from avckpt.guard import Event
 
 CALLERS_LEAST = 3
@@ -38,6 +37,8 @@ class Case:
     likeness_pid: int
     """A task with the memory of the last checkpoint; 0: there is none."""
     init_pid: int
+    command: str
+    """As it was seen last, alive or dead; empty: it was not."""
     died_ns: int
     """When avckpt-init knew of it, CLOCK_MONOTONIC."""
 
@@ -81,12 +82,12 @@ class Collector:
             self._log.close()
         self._deaths = self._log = None
 
-    def open_case(self, event: Event, init_pid: int) -> Case:
+    def open_case(self, event: Event, init_pid: int, command: str = "") -> Case:
         """What the kernel told of the end of a process.  At once, and before its number is another one's."""
         pid, wait_status = event.app_pid, event.wait_status
         signum = wait_status & 0x7F
         name = signal_name(signum) if signum else ""
-        kept = (event.remains_pid, event.likeness_pid, init_pid, event.died_ns)
+        kept = (event.remains_pid, event.likeness_pid, init_pid, command, event.died_ns)
         if self._deaths is None:
             crash = Crash(signal=name, unknown=self._problem)
             return Case(pid, wait_status, crash, Death(), None, *kept)
@@ -123,13 +124,15 @@ class Collector:
 
     @staticmethod
     def _identified(case: Case, crash: Crash, frames: list[Frame] | None = None) -> Crash:
+        if crash.unknown != case.crash.unknown and not crash.command and case.command:  # its memory is gone
+            why = f"{crash.unknown}; the command is that of an earlier look"
+            crash = replace(crash, command=case.command, unknown=why)
         return replace(crash, fingerprint=fingerprint(crash, case.wait_status, frames or []))
 
 
 def _remains(pid: int, case: Case) -> Remains:
     """Raises OSError."""
-    if int(stat_fields(pid)[1]) != case.init_pid:
-        raise ProcessLookupError(f"process {pid} is another one")
+    check_parent(pid, case.init_pid)
     remains = Remains(pid)
     if not remains.maps:
         remains.close()
@@ -143,7 +146,7 @@ def _liken(case: Case, crash: Crash) -> tuple[Crash, list[Frame]]:
     try:
         # Only what the kernel told at the death: this stack is another one.
         frames = likeness.frames(case.hit.callers) if case.hit is not None else []
-        return replace(placed(crash, frames), command=likeness.command), frames
+        return replace(placed(crash, frames), command=command_of(likeness.pid, case.init_pid)), frames
     finally:
         likeness.close()
 
@@ -153,7 +156,7 @@ def _examine(case: Case) -> tuple[Crash, list[Frame]]:
     remains = _remains(case.remains_pid, case)
     try:
         frames = _frames(remains, case.hit)
-        return replace(placed(case.crash, frames), command=remains.command), frames
+        return replace(placed(case.crash, frames), command=command_of(remains.pid, case.init_pid)), frames
     finally:
         remains.close()
 

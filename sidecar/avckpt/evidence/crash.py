@@ -65,7 +65,7 @@ class Crash:
     backtrace: str = said(
         "places of its callers, innermost first, joined by blanks: by frame pointers, or as they lie on the stack"
     )
-    command: str = said("program, and of an interpreter its script")
+    command: str = said("program, and of an interpreter its script; as seen at an earlier look where `unknown` says so")
     sender_pid: int = said("process that sent the signal, in the sidecar's PID namespace", 0)
     sender: str = said("name of that process; `kernel`: nobody (the OOM killer, an end of a namespace)")
     fingerprint: str = said("the same for crashes by the same signal at the same place")

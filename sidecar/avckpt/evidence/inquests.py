@@ -7,20 +7,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Coroutine
 from dataclasses import replace
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
+from avckpt.containers.looks import look
 from avckpt.containers.protected import Protected
 from avckpt.engine import Guard
-from avckpt.errors import Busy, TargetGone
+from avckpt.errors import AvckptError, Busy, TargetGone
 from avckpt.events.history import History
 from avckpt.events.record import EventRecord
 from avckpt.events.vocabulary import EXPECTED, Kind, Reason
 from avckpt.evidence.collector import Case, Collector
 from avckpt.evidence.cores import Cores
 from avckpt.evidence.crash import Crash
+from avckpt.evidence.remains import command_of
 from avckpt.guard import Command, Event
 from avckpt.policy import Settings
 
@@ -74,23 +76,37 @@ class Inquests(Generic[W]):
         """Hears what a guard has told: of a death, or what followed."""
         cookie = watch.container.cookie
         if event.kind is Kind.DIED:
-            case = self._collector.open_case(event, watch.container.init_pid)
+            case = self._collector.open_case(event, watch.container.init_pid, watch.container.command)
             outcome = self._open[cookie] = asyncio.get_running_loop().create_future()
-            task = asyncio.get_running_loop().create_task(self._look_into(watch, case, outcome))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._begin(self._look_into(watch, case, outcome))
         elif event.kind in (Kind.RESTORED, Kind.GAVE_UP):
             waiting = self._open.pop(cookie, None)
             if waiting is not None and not waiting.done():
                 waiting.set_result(record)
+        elif event.kind is Kind.ATTACHED or (event.kind is Kind.CHECKPOINT and record.seq):
+            # The first checkpoint: also of what an entry point has executed since.
+            self._begin(self._look_at_command(watch.container))
 
     def crashes_of(self, container: Protected) -> list[EventRecord]:
         """Those in the history, oldest first, also of earlier runs of the same name."""
         return [each for each in self._history.after() if each.kind is Kind.CRASH and _is_of(each, container)]
 
+    def _begin(self, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    @staticmethod
+    async def _look_at_command(container: Protected) -> None:
+        """For a death after which nothing is left to look at."""
+        pid, init_pid = container.app_pid, container.init_pid
+        with contextlib.suppress(AvckptError, OSError):
+            container.command = await look("command", pid, lambda: command_of(pid, init_pid)) or container.command
+
     async def _look_into(self, watch: W, case: Case, outcome: asyncio.Future[EventRecord]) -> None:
         try:
             crash = await self._collector.examine(case)
+            watch.container.command = crash.command
             self._command(watch, Command.SEEN, case.remains_pid or case.likeness_pid)
             try:
                 followed = await asyncio.wait_for(outcome, OUTCOME_S)
@@ -103,7 +119,8 @@ class Inquests(Generic[W]):
             mode = watch.settings.policy.core
             if mode != "off" and followed.outcome is Reason.RESTORED:
                 path, size, what = await self._cores.make(watch.container, case, crash, mode)
-                self._tell(watch, EventRecord(Kind.CORE, core=path or None, core_bytes=size or None, detail=what))
+                core = EventRecord(Kind.CORE, core=path or None, core_bytes=size or None, detail=what)
+                self._tell(watch, replace(core, crash_seq=record.seq))
         finally:
             self._command(watch, Command.RELEASE, case.remains_pid)
 
@@ -134,7 +151,9 @@ class Inquests(Generic[W]):
         deadline_s = watch.settings.policy.deadline_s
         if deadline_s and record.recovered_s is not None and record.recovered_s > deadline_s:
             detail = f"it was back later than avckpt.deadline={deadline_s * 1000:g}ms"
-            self._tell(watch, EventRecord(Kind.LATE, detail=detail, recovered_s=record.recovered_s))
+            self._tell(
+                watch, EventRecord(Kind.LATE, detail=detail, recovered_s=record.recovered_s, crash_seq=record.seq)
+            )
 
     @staticmethod
     def _command(watch: W, command: Command, pid: int) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from avckpt_hooks.shared.tell import printable
 
-from avckpt.containers.process import command_line
+from avckpt.containers.process import command_line, stat_fields
 from avckpt.evidence.crash import FRAMES_MAX, Frame
 
 MAPS_MAX = 32 << 20
@@ -134,14 +134,6 @@ class Remains:
         mapping = self.maps[at] if at >= 0 else None
         return mapping if mapping and address < mapping.end and mapping.inode and "x" in mapping.flags else None
 
-    @property
-    def command(self) -> str:
-        """The program, and of an interpreter its script; other arguments may be secrets."""
-        texts = [printable(word) for word in command_line(self.pid)[:2]]
-        if len(texts) == 2 and _INTERPRETERS.fullmatch(texts[0].rpartition("/")[2]) and not texts[1].startswith("-"):
-            return " ".join(texts)
-        return texts[0]
-
     def _image(self, mapping: Mapping) -> _Image:
         if mapping.file not in self._images:
             self._images[mapping.file] = self._read_image(mapping)
@@ -164,6 +156,24 @@ class Remains:
             elif kind == _PT_NOTE and not build_id and begin < first.end - first.start:
                 build_id = build_id_of(self.read(first.start + begin, min(length, NOTES_MAX)))
         return _Image(tuple(loads), build_id)
+
+
+def command_of(pid: int, init_pid: int) -> str:
+    """The program of a child of `init_pid`, and of an interpreter its script; other arguments may be secrets.
+
+    Raises OSError.
+    """
+    texts = [printable(word) for word in command_line(pid)[:2]]
+    check_parent(pid, init_pid)
+    if len(texts) == 2 and _INTERPRETERS.fullmatch(texts[0].rpartition("/")[2]) and not texts[1].startswith("-"):
+        return " ".join(texts)
+    return texts[0]
+
+
+def check_parent(pid: int, init_pid: int) -> None:
+    """Raises OSError when the number belongs to another process by now."""
+    if int(stat_fields(pid)[1]) != init_pid:
+        raise ProcessLookupError(f"process {pid} is another one")
 
 
 def read_maps(pid: int) -> list[Mapping]:

@@ -40,18 +40,18 @@ export class TimeLine {
     const x = (at) => ((at - from) / spanS) * width;
     this.axis(pen, colour, {from, spanS, width, height, x});
     const rows = new Map(units.map((unit, row) => [unit.label, row + 1]));
-    this.marks = [];
-    for (const kind of DRAWN) {
-      pen.fillStyle = pen.strokeStyle = colour(kind);
-      pen.lineWidth = 1.5;
-      for (const event of events) {
-        const row = rows.get(event.container);
-        if (event.kind !== kind || event.at < from || row === undefined) continue;
-        const mark = {x: x(event.at), y: (row + 0.5) * ROW, event};
-        shape(pen, kind, mark.x, mark.y);
-        this.marks.push(mark);
-      }
+    const marks = new Map(DRAWN.map((kind) => [kind, []]));
+    for (const event of events) {
+      const row = rows.get(event.container);
+      if (event.at < from || row === undefined) continue;
+      marks.get(event.kind)?.push({x: x(event.at), y: (row + 0.5) * ROW, event});
     }
+    pen.lineWidth = 1.5;
+    for (const [kind, those] of marks) {
+      pen.fillStyle = pen.strokeStyle = colour(kind);
+      for (const mark of those) shape(pen, kind, mark.x, mark.y);
+    }
+    this.marks = [...marks.values()].flat();
   }
 
   nameRows(units) {
