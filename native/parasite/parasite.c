@@ -144,8 +144,9 @@ static void make_pause(struct inj_call *call)
 			return;
 }
 
-__attribute__((section(".text.entry"))) void inj_run(struct inj_call *call)
+__attribute__((section(".text.entry"))) void inj_run(uint64_t result, struct inj_call *call)
 {
+	(void)result;
 	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++) {
 		struct inj_syscall *s = &call->call[i];
 

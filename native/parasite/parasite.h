@@ -221,7 +221,9 @@ struct inj_slot {
 };
 
 /* Entry points, at the addresses the linker put them (parasite_blob.h). */
-void inj_run(struct inj_call *call);
+/* A task may be sent there out of a clone(2) that has been reported but has not returned yet; on
+ * aarch64 its result then comes into the register of the first argument. */
+void inj_run(uint64_t result, struct inj_call *call);
 void inj_restore(struct inj_slot *slot);
 void inj_end(void) __attribute__((noreturn));
 

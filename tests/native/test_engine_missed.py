@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from testkit.cgroups import freezer
-from testkit.guarded import BUILD, PATIENCE_S, GuardProcess, Victim, config
+from testkit.guarded import BUILD, PATIENCE_S, GuardProcess, Victim, config, injected
 from testkit.harness import wait_until
 
 pytestmark = pytest.mark.shared_machine("a checkpoint that should succeed is missed where others take the CPU")
@@ -70,3 +70,16 @@ def test_no_room_for_a_template_at_first() -> None:
             subprocess.run([*SOMEBODY.split(), "/usr/bin/prlimit", f"--pid={victim.app}", "--nproc=64:64"], check=True)
             guard.wait("checkpoint", timeout_s=2 * PAUSE_S)
         wait_until(lambda: not somebody_runs(), PATIENCE_S, "nobody is left who counts with the next ones")
+
+
+def test_a_restore_after_one_that_failed_late(tmp_path: Path) -> None:
+    """The other process was cloned by its holder, which is still in clone(2): the main one's template is lost first."""
+    with Victim("busy 4 --in-child", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        assert guard.checkpoint()["kind"] == "checkpoint"
+        with injected(guard, "pidfd_open", "error=ESRCH"):
+            wait_until(lambda: guard.command("checkpoint")["error"]["operation"] == "keep template", PATIENCE_S, "that")
+        victim.kill_app()
+        event = guard.wait_for(lambda event: event.get("kind") in ("restored", "gave_up"), "end of the restore")
+        assert event["kind"] == "restored", event
+        assert "error" not in event
+        victim.wait_beats()

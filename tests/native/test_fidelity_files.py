@@ -67,7 +67,7 @@ def test_a_question_that_a_signal_cuts_short_is_asked_again(command: str, tmp_pa
     """The timer of the guard's deadline ticks: with a signal pending, poll(2) fails even if it is not to wait."""
     with Victim(f"{command} {tmp_path}", tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
         guard.wait("attached")
-        with injected(guard, "poll,ppoll", "error=EINTR:when=1+2"):
+        with injected(guard, "?poll,ppoll", "error=EINTR:when=1+2"):
             assert guard.checkpoint()["kind"] == "checkpoint"
             disturb(victim)
             assert "error" not in restored(victim, guard)

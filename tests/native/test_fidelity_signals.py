@@ -65,7 +65,7 @@ class Ticks:
         self._thread.join()
 
     def _send(self) -> None:
-        tgkill = partial(ctypes.CDLL(None).syscall, 234, self._pid, self._tid, self.SIGNAL)
+        tgkill = partial(ctypes.CDLL(None).tgkill, self._pid, self._tid, self.SIGNAL)
         while not self._over.is_set():
             tgkill()
             sleep_exactly(30e-6)  # more often, nothing else would get done

@@ -36,7 +36,7 @@ struct ends {
 	struct channel get, give; /* the two directions of a socketpair */
 };
 
-static long lap_us = 1000, threads = 1;
+static long lap_us, threads = 1;
 static int workers;
 static bool with_reapers;
 static int all = __WALL;
@@ -514,6 +514,7 @@ int main(int argc, char **argv)
 	const bool orphan = victim_flag(&argc, argv, "--orphan");
 	int i;
 
+	lap_us = 1000 * (long)slowness();
 	with_reapers = victim_flag(&argc, argv, "--reaper");
 	if (victim_flag(&argc, argv, "--usual-waits"))
 		all = 0;

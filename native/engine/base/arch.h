@@ -53,7 +53,8 @@ bool arch_is_syscall(const uint8_t code[ARCH_SYSCALL_BYTES]);
  * is still there and is continued, not restarted. */
 void arch_resume(struct arch_regs *regs);
 
-/* `base` (a live user context of the task) sent to `pc` with one argument. */
+/* `base` (a live user context of the task) sent to `pc` with one argument, as the first and as the
+ * second: a call that it is still in may put its result in the place of the first (inj_run()). */
 void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
 	       uint64_t arg);
 

@@ -14,7 +14,7 @@
 
 	.text
 
-/* inj_enter(call, stack): inj_run(call) on that stack, by a thread of the app's.
+/* inj_enter(call, stack): inj_run(-, call) on that stack, by a thread of the app's.
  *
  * It comes with the app's own stack pointer, and leaves that only when all signals are
  * blocked: the tracer blocks them as well, but may die before it has.  A handler never
@@ -33,7 +33,7 @@ inj_enter:
 	mov	sp, x20
 	mov	x29, #0
 	mov	x30, #0
-	mov	x0, x19
+	mov	x1, x19
 	bl	inj_run
 	brk	#0
 	.balign	8

@@ -12,7 +12,7 @@
 
 	.text
 
-/* inj_enter(call, stack): inj_run(call) on that stack, by a thread of the app's.
+/* inj_enter(call, stack): inj_run(-, call) on that stack, by a thread of the app's.
  *
  * It comes with the app's own stack pointer, and leaves that only when all signals are
  * blocked: the tracer blocks them as well, but may die before it has.  A handler never
@@ -30,7 +30,7 @@ inj_enter:
 	syscall
 	movq	%rbp, %rsp
 	xorl	%ebp, %ebp
-	movq	%rbx, %rdi
+	movq	%rbx, %rsi
 	call	inj_run
 	ud2
 	.balign	8

@@ -277,7 +277,7 @@ void arch_enter(struct arch_regs *regs, const struct arch_regs *base, avc_remote
 void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote pc, avc_remote sp,
 	       uint64_t arg)
 {
-	arch_enter(regs, base, pc, arg, 0);
+	arch_enter(regs, base, pc, arg, arg);
 	regs->r.sp = sp & ~UINT64_C(15);
 	regs->r.regs[29] = 0;
 	regs->r.regs[30] = 0;

@@ -124,7 +124,7 @@ void arch_call(struct arch_regs *regs, const struct arch_regs *base, avc_remote 
 	/* As after a call instruction (System V ABI: 16-byte aligned before it). */
 	regs->r.rsp = (sp & ~UINT64_C(15)) - 8;
 	regs->r.rbp = 0;
-	regs->r.rdi = arg;
+	regs->r.rdi = regs->r.rsi = arg;
 	regs->r.rax = 0;
 	regs->r.orig_rax = -1ULL;
 	regs->r.eflags &= ~(unsigned long long)FLAGS_OWN;
