@@ -20,7 +20,7 @@ static void confine(void)
 		ALLOW(SYS_clock_nanosleep),
 		ALLOW(SYS_restart_syscall),
 		ALLOW(SYS_clock_gettime),
-		ALLOW(SYS_rt_sigreturn),
+		ALLOW_HOMEWARD,
 		ALLOW(SYS_write),
 		ALLOW(SYS_gettid),
 		ALLOW(SYS_getpid),
