@@ -262,7 +262,8 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	thread->stub = porter->cave;
 	thread_head_home(thread, &homeward);
 	arch_stub_call(&regs, &thread->regs, porter->cave, false, SYS_clone, arg);
-	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
+	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP, porter->cave,
+			      ARCH_STUB_BYTES) ||
 	    arch_regs_set(thread->tid, &homeward) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all) ||
 	    arch_regs_set(thread->tid, &regs))
@@ -285,7 +286,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	if (tracee_await(porter->tid, NULL, err) != STOP_TRAP)
 		return -1;
 	if (ptrace(PTRACE_SETOPTIONS, porter->tid, NULL, options) ||
-	    seccomp_supervise(porter->tid, 0, options))
+	    seccomp_supervise(porter->tid, 0, options, porter->cave, ARCH_STUB_BYTES))
 		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
 	/* The main thread waits for it, and each of its calls takes two wake-ups.  Best effort. */
 	(void)sched_setscheduler(porter->tid, SCHED_FIFO, &first);

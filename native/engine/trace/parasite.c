@@ -265,7 +265,8 @@ static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
 
 	if (parasite->seccomp != SECCOMP_SUPERVISED)
 		seccomp_end_supervision(tid);
-	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours)))
+	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours),
+				   parasite->base, INJ_CODE_BYTES))
 		return fail(err, AVC_UNSUPPORTED, 0, tid, "run injected code", "",
 			    "it has too many processes under seccomp filters of its own");
 	if (ours)

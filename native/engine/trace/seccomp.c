@@ -3,8 +3,8 @@
  * Seccomp filters stay in force over injected code. The container's allow what it calls; so do most
  * that applications install. Where they refuse it, injected code is *supervised*: its tracer stops
  * it at the entry to every system call, and suspends the filters (PTRACE_O_SUSPEND_SECCOMP) for that
- * call alone, if it is one that injected code makes. This decision uses nothing that the
- * application can write. At the entry the registers are fixed in the kernel: whatever the
+ * call alone, if it is one that injected code makes, and made by that. This decision uses nothing
+ * that the application can write. At the entry the registers are fixed in the kernel: whatever the
  * application does to the parasite, its stack or its lists, or maps in its place, leads to calls
  * that its own filter checks, or to some of those below.
  *
@@ -569,11 +569,15 @@ int seccomp_read(const struct process *process, struct thread *thread, struct av
 
 /* ---- supervision ---------------------------------------------------------------------------- */
 
+struct task {
+	pid_t tid, inside;
+	long options;
+	avc_remote code; /* injected code, of so many bytes                          */
+	size_t bytes;
+};
+
 static __thread struct {
-	struct {
-		pid_t tid, inside;
-		long options;
-	} task[SUPERVISED_MAX];
+	struct task task[SUPERVISED_MAX];
 	uint32_t count;
 } supervised;
 
@@ -585,7 +589,7 @@ static int find(pid_t tid)
 	return -1;
 }
 
-int seccomp_supervise(pid_t tid, pid_t inside, long options)
+int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code, size_t bytes)
 {
 	int i = find(tid);
 
@@ -599,9 +603,7 @@ int seccomp_supervise(pid_t tid, pid_t inside, long options)
 		return -1;
 	if (i < 0)
 		i = (int)supervised.count++;
-	supervised.task[i].tid = tid;
-	supervised.task[i].inside = inside;
-	supervised.task[i].options = options;
+	supervised.task[i] = (struct task){ tid, inside, options, code, bytes };
 	return 0;
 }
 
@@ -654,13 +656,21 @@ static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 	}
 }
 
-void seccomp_at_call(pid_t tid, pid_t inside, long options)
+/* A thread of the app that has returned by itself makes its own calls, under its own filters. */
+static void at_call(const struct task *task)
 {
 	struct arch_regs regs;
+	long options = task->options;
 
-	if (tracee_enters_call(tid) && arch_regs_get(tid, &regs) == 0 && is_wanted(&regs, inside))
+	if (tracee_enters_call(task->tid) && arch_regs_get(task->tid, &regs) == 0 &&
+	    arch_pc(&regs) - task->code <= task->bytes && is_wanted(&regs, task->inside))
 		options |= suspend_option();
-	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* fails if it was killed */
+	ptrace(PTRACE_SETOPTIONS, task->tid, NULL, options); /* fails if it was killed */
+}
+
+void seccomp_at_call(pid_t tid, pid_t inside, long options)
+{
+	at_call(&(struct task){ tid, inside, options, .bytes = SIZE_MAX });
 }
 
 /* Its threads; a process would not be a tracee of ours.  And filters, which take something away. */
@@ -706,6 +716,6 @@ long seccomp_go_on(pid_t tid, const struct stop *stop)
 	if (i < 0)
 		return ptrace(PTRACE_CONT, tid, NULL, signal);
 	if (stop && stop->kind == STOP_SYSCALL)
-		seccomp_at_call(tid, supervised.task[i].inside, supervised.task[i].options);
+		at_call(&supervised.task[i]);
 	return ptrace(PTRACE_SYSCALL, tid, NULL, signal);
 }

@@ -404,12 +404,14 @@ bool seccomp_must_suspend(void);
 /* Whether a task has no more filters than its container. */
 bool seccomp_is_containers(const struct proc_status *status, uint32_t containers);
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
- * the PID of its process in its own namespace. */
-int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
+ * the PID of its process in its own namespace, `code` and `bytes` are where injected code is. */
+int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code,
+		      size_t bytes) warn_unused;
 #define SECCOMP_WATCHER (-1) /* for `inside`: the one that opens a userfaultfd       */
 void seccomp_end_supervision(pid_t tid);
 bool seccomp_is_supervised(pid_t tid);
-/* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
+/* The same for this stop alone, which is of a system call (STOP_SYSCALL), and wherever its code is:
+ * for one that has none of the app's to run yet. */
 void seccomp_at_call(pid_t tid, pid_t inside, long options);
 /* The same for a task that has yet to get its filters, by calls from memory that the application
  * could change: it makes no other call than those of a restore. */
