@@ -21,6 +21,7 @@
 	raw_syscall(nr, (uint64_t)(a), (uint64_t)(b), (uint64_t)(c), (uint64_t)(d), 0, 0)
 
 #define __WALL_ 0x40000000 /* <linux/wait.h> */
+#define PAUSE_WAITS 1000
 #define SPAWN_TRIES 4000
 #define SPAWN_TRIES_AT_ONCE 8
 #define SPAWN_PAUSE_US 100
@@ -139,8 +140,10 @@ static void make_pause(struct inj_call *call)
 {
 	__atomic_store_n(&call->pause, INJ_PAUSED, __ATOMIC_RELEASE);
 	futex_wake(&call->pause);
-	while (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) == INJ_PAUSED)
-		if (futex_wait(&call->pause, INJ_PAUSED, call->park_ms) == -110 /* ETIMEDOUT */)
+	/* Without a tracer its filters may refuse this call, with any error. */
+	for (int i = 0; i < PAUSE_WAITS; i++)
+		if (__atomic_load_n(&call->pause, __ATOMIC_ACQUIRE) != INJ_PAUSED ||
+		    futex_wait(&call->pause, INJ_PAUSED, call->park_ms) == -110 /* ETIMEDOUT */)
 			return;
 }
 

@@ -24,6 +24,7 @@ from avckpt.guard import Images
 
 from testkit.guarded import PATIENCE_S, GuardProcess, Victim, config, injected
 from testkit.harness import ROOT, wait_until
+from testkit.procfs import status_of
 
 CHANGES = ",".join(
     (
@@ -120,9 +121,11 @@ def answer(guard: GuardProcess, death: Death, nth: int, command: str) -> dict[st
 
 
 VICTIMS: tuple[str, ...] = ("steady", "steady --in-child", "peeker", "peeker --in-child", "signals 3")
+VICTIMS += ("under barren steady",)  # its filter refuses what injected code calls without its guard
 RESTORED: tuple[str, ...] = ("steady", "steady --in-child")
+REFUSED = ("under no-sigprocmask idle 1 1", "sandbox --kill", "unsupported strict")
+"""Under filters by which a dead guard could do harm."""
 if PART == 1:  # seven processes, most of them under filters of their own: too long for a part
-    # None of these filters kills, and none is in strict mode: docs/limits.md tells what that would mean.
     VICTIMS += ("under harmless cells",)
     RESTORED += ("under harmless cells",)
 TREES = ("--in-child", "cells")
@@ -170,6 +173,23 @@ def test_checkpoint(tmp_path: Path, command: str, way: str, death: Death) -> Non
             raise AssertionError("it is not done after so many calls")
         protects(guard)
     print(f"{runs} runs, up to {nth}")
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_refused(tmp_path: Path, command: str, death: Death) -> None:
+    """What cannot be protected has been left as it was."""
+    with Victim(command, tmp_path) as victim, GuardProcess(config(), [victim.pid]) as guard:
+        guard.wait("attached")
+        blocked = status_of(victim.app)["SigBlk"]
+        for nth in numbers():
+            kind = answer(guard, death, nth, "checkpoint")["kind"]
+            victim.wait_beats(3)
+            guard.start_another(victim.pid)
+            assert status_of(victim.app)["SigBlk"] == blocked
+            if kind == "unprotected":
+                return
+            assert kind in ("guard_lost", "missed")
+    raise AssertionError("it is not done after so many calls")
 
 
 def tidy(guard: GuardProcess, victim: Victim) -> None:

@@ -9,17 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from testkit.guarded import GuardProcess, Victim, config, forks_beside, injected, kill_at_random
+from testkit.guarded import GuardProcess, Victim, config, forks_beside, kill_at_random
 from testkit.harness import wait_until
 from testkit.procfs import children_of, comm_of, inside, status_of
 
 pytestmark = pytest.mark.shared_machine(
     "supervised processes stop at each call: a checkpoint that comes too late drops the generations"
 )
-
-
-ENDS = ("checkpoint", "missed", "guard_lost")
-"""Of a checkpoint that was asked for."""
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +39,7 @@ def confinement(victim: Victim) -> dict[int, tuple[str, str]]:
 
 def wait_confined(victim: Victim) -> None:
     """Until all of `cells` have come under their filters."""
-    wait_until(lambda: victim.see().counter[4] >= 6, 10, "all are confined")
+    wait_until(lambda: victim.see().counter[4] >= 5, 10, "all are confined")
 
 
 def kill_each_checkpoint(guard: GuardProcess, victim: Victim, kills: int) -> None:
@@ -53,9 +49,7 @@ def kill_each_checkpoint(guard: GuardProcess, victim: Victim, kills: int) -> Non
         kill_at_random(guard, victim, 1, (0.0, 0.03))
 
 
-@pytest.mark.parametrize(
-    "command", ["cells", "sandbox --in-child", "sandbox --kill --in-child", "under harmless cells"]
-)
+@pytest.mark.parametrize("command", ["cells", "sandbox --in-child", "under harmless cells"])
 def test_children_and_threads_are_under_their_filters_again(command: str, tmp_path: Path) -> None:
     with Victim(command, tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         if "cells" in command:
@@ -68,32 +62,13 @@ def test_children_and_threads_are_under_their_filters_again(command: str, tmp_pa
 
 
 def test_threads_that_got_a_wrong_number_are_gone(tmp_path: Path) -> None:
-    """Although their filters refuse exit(2): otherwise they would call it for ever, in the way of checkpoints."""
+    """Otherwise they would be in the way of checkpoints."""
     with Victim("cells", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
         wait_confined(victim)
         guard.wait("checkpoint", since=guard.mark(), count=2)
         before = confinement(victim)
         with forks_beside(victim):
             kill_each_checkpoint(guard, victim, 20)
-        wait_until(lambda: confinement(victim) == before, 5, "nobody else is there")
-
-
-def test_what_a_dead_guard_has_left_in_a_child_is_gone(tmp_path: Path) -> None:
-    """Its filter refuses exit(2), so the task that maps what a guard needs outlives that guard."""
-    with Victim("cells", tmp_path) as victim, GuardProcess(config(0), [victim.pid]) as guard:
-        wait_confined(victim)
-        before, left = confinement(victim), 0
-        for nth in range(20, 400, 20):
-            since = guard.mark()
-            with injected(guard, "ptrace", f"signal=KILL:when={nth}"):
-                guard.say_command("checkpoint")
-                guard.wait_for(lambda event: event["kind"] in ENDS, "its end", since=since)
-            left += len(confinement(victim)) > len(before)
-            guard.start_another(victim.pid)
-            if left == 3:
-                break
-        assert left == 3
-        guard.checkpoint()
         wait_until(lambda: confinement(victim) == before, 5, "nobody else is there")
 
 
@@ -115,10 +90,12 @@ def filters_of_holders(victim: Victim) -> set[str]:
 
 
 @pytest.mark.parametrize("before", ["", "under harmless "])
-@pytest.mark.parametrize("command", ["sandbox --late --in-child", "sandbox --kill --late --in-child"])
-def test_a_child_that_installs_one_later(command: str, before: str, tmp_path: Path) -> None:
+def test_a_child_that_installs_one_later(before: str, tmp_path: Path) -> None:
     """Its holder, which shares its memory, comes under it, too."""
-    with Victim(before + command, tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:
+    with (
+        Victim(before + "sandbox --late --in-child", tmp_path) as victim,
+        GuardProcess(config(0.03), [victim.pid]) as guard,
+    ):
         guard.wait("checkpoint", count=2)
         (child,) = children_of(victim.app)
         since = guard.mark()

@@ -89,7 +89,6 @@ def start(victims_built: Path, board: Board) -> Iterator[Start]:
         "pending 4",
         "timers",
         "sandbox",
-        "sandbox --kill",
         "attributes",
         "attributes --inherited",
         "alarm 20",

@@ -5,15 +5,15 @@
  *
  *   apart     two threads, with a filter that both have, and another one each, which forbids
  *             seccomp(2)
- *   together  two threads that share theirs; when counter 1 is 1, one installs another for
- *             both (SECCOMP_FILTER_FLAG_TSYNC), and says in counter 2 that it could: 1, or not: 2
+ *   together  two threads that share theirs, with memory that is not for forks; when counter 1
+ *             is 1, one installs another for both (SECCOMP_FILTER_FLAG_TSYNC), and says in counter
+ *             2 that it could: 1, or not: 2
  *   below     one filter, and its own child under two: the first one inherited
- *   strict    in strict mode (SECCOMP_MODE_STRICT), unless under a filter already
  *
  * With --forge there is only one, and when counter 1 is 1 it changes what the parasite keeps of its
  * filter, to be without it after a restore: the program, the call that installs it, or that call
  * into another one, which makes a folder at PATH.  Counter 3: how often it has.  Counter 4: of the
- * six that come under filters, how many have.
+ * five that come under filters, how many have.
  */
 #include <pthread.h>
 
@@ -25,10 +25,8 @@
 
 enum { NONE, PROGRAM, CALL, OTHER };
 static int forges;
-static bool has_strict;
 static const char *path;
 static volatile bool first_is_there, done;
-static int to_strict[2], from_strict[2];
 
 /* Little more than sleeping; `error` for everything else. */
 static void confine(bool more_filters, unsigned int flags)
@@ -39,7 +37,7 @@ static void confine(bool more_filters, unsigned int flags)
 		ALLOW(SYS_clock_nanosleep),
 		ALLOW(SYS_restart_syscall),
 		ALLOW(SYS_clock_gettime),
-		ALLOW(SYS_rt_sigreturn),
+		ALLOW_HOMEWARD,
 		ALLOW(SYS_write),
 		ALLOW(SYS_gettid),
 		ALLOW(SYS_exit_group),
@@ -129,6 +127,10 @@ static void be_together(void)
 	struct sock_filter all[] = { BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW) };
 	struct sock_fprog program = { 1, all };
 
+	/* For a clone the process has to change that, and change it back. */
+	must(!madvise(mmap(NULL, 4096, PROT_READ, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0), 4096,
+		      MADV_DONTFORK),
+	     "MADV_DONTFORK");
 	start(together);
 	confine(true, SECCOMP_FILTER_FLAG_TSYNC);
 	first_is_there = true;
@@ -163,17 +165,6 @@ static void be_below(void)
 		CHECK(getpid() == parent, "another process");
 		nap_us(2000);
 	}
-}
-
-/* Without the clock, which may be the CPU's own. */
-static void be_strict(void)
-{
-	char c;
-
-	must(!prctl(PR_SET_SECCOMP, SECCOMP_MODE_STRICT), "PR_SET_SECCOMP");
-	while (read(to_strict[0], &c, 1) == 1 && write(from_strict[1], &c, 1) == 1)
-		;
-	syscall(SYS_exit, 1);
 }
 
 static void forge_all(void)
@@ -238,7 +229,6 @@ int main(int argc, char **argv)
 {
 	static const char *const what[] = { "", "program", "call", "other" };
 	int status = 0;
-	char c = 0;
 
 	const bool forge = victim_flag(&argc, argv, "--forge");
 
@@ -247,27 +237,17 @@ int main(int argc, char **argv)
 		forges = !strcmp(argv[1], what[k]) ? k : forges;
 	must(!forge || forges, "--forge");
 	path = argv[argc - 1];
-	/* Not under a filter (seccomp(2)). */
-	has_strict = !forges && prctl(PR_GET_SECCOMP) == 0;
-	must(!pipe(to_strict) && !pipe(from_strict), "pipe");
 	if (forges) {
 		begin(be_forger);
 	} else {
 		begin(be_apart);
 		begin(be_together);
 		begin(be_below);
-		if (has_strict)
-			begin(be_strict);
 	}
 	victim_ready();
 	for (;;) {
-		if (has_strict)
-			must(write(to_strict[1], &c, 1) == 1 && read(from_strict[0], &c, 1) == 1,
-			     "strict");
 		CHECK(waitpid(-1, &status, WNOHANG) == 0, "a child has ended (%x)", status);
 		nap_us(1000);
-		if (board->counter[0] == 0)
-			count(4, 1); /* the one in strict mode has answered */
 		count(0, 1);
 		beat();
 	}

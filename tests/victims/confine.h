@@ -17,6 +17,11 @@
 	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
 		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
 
+/* What a filter has to allow for its application to be protected (native/engine/trace/seccomp.c). */
+#define ALLOW_HOMEWARD                                                                             \
+	ALLOW(SYS_rt_sigprocmask), ALLOW(SYS_rt_sigreturn), ALLOW(SYS_munmap), ALLOW(SYS_madvise), \
+		ALLOW(SYS_exit)
+
 static inline void install_filter(struct sock_filter *filter, size_t length, unsigned int flags)
 {
 	struct sock_fprog program = { (unsigned short)length, filter };

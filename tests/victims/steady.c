@@ -65,6 +65,7 @@ int main(int argc, char **argv)
 	struct sigaction slow = { .sa_handler = dwell };
 	const int epoll_fd = epoll_create1(EPOLL_CLOEXEC);
 	struct timespec ts = { 0, 3000000 };
+	sigset_t mask_at_first, mask;
 	struct epoll_event event;
 
 	victim_start(&argc, argv, 0, "");
@@ -75,6 +76,7 @@ int main(int argc, char **argv)
 	must(!sigaction(SIGUSR2, &slow, NULL), "sigaction");
 	set_handler(false);
 	must(!setitimer(ITIMER_REAL, &often, NULL), "setitimer");
+	sigprocmask(SIG_SETMASK, NULL, &mask_at_first);
 	victim_ready();
 	for (unsigned int i = 0;; i++) {
 		const long slept = inlined("nanosleep", SYS_nanosleep, (uint64_t)&ts, 0, 3, 4, 5,
@@ -87,6 +89,8 @@ int main(int argc, char **argv)
 		CHECK(waited == 0 || errno == EINTR, "epoll_pwait: %s", strerror(errno));
 		for (volatile int k = 0; k < 100000; k++)
 			;
+		sigprocmask(SIG_SETMASK, NULL, &mask);
+		CHECK(!memcmp(&mask, &mask_at_first, 8), "it has another signal mask");
 		beat();
 		if (i % 64 == 0)
 			set_handler(i % 128 == 0);

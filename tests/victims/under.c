@@ -3,8 +3,12 @@
  * under FILTER PROGRAM [ARGUMENT...]: executes a program of this folder under a seccomp filter, which
  * its processes inherit.
  *
- *   harmless  refuses acct(2), which nobody calls
- *   hindering refuses, too, calls that only checkpoints and restores make
+ *   harmless       refuses acct(2), which nobody calls
+ *   hindering      refuses, too, calls that only checkpoints and restores make
+ *   barren         refuses all that only checkpoints call and that one can be protected without
+ *   no-sigprocmask refuses rt_sigprocmask(2)
+ *   no-sigreturn   refuses rt_sigreturn(2)
+ *   kill-sigprocmask, kill-sigreturn: kill the process that calls it
  */
 #include <errno.h>
 #include <linux/filter.h>
@@ -17,42 +21,63 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#define REFUSE(nr)                                       \
-	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, (nr), 0, 1), \
-		BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ERRNO | EPERM)
-#define ALLOW BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW)
+#define CALLS_MAX 12
+#define EPERM_IT (SECCOMP_RET_ERRNO | EPERM)
 
-static struct sock_filter harmless[] = {
-	BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
-	REFUSE(SYS_acct),
-	ALLOW,
+static const struct kind {
+	const char *name;
+	unsigned int action;
+	unsigned int call[CALLS_MAX]; /* 0: no more */
+} kinds[] = {
+	{ "harmless", EPERM_IT, { SYS_acct } },
+	{ "hindering",
+	  EPERM_IT,
+	  { SYS_acct, SYS_capget, SYS_capset, SYS_setfsuid, SYS_getresgid, SYS_get_mempolicy,
+	    SYS_personality, SYS_setresuid, SYS_timer_create } },
+	{ "barren",
+	  EPERM_IT,
+	  { SYS_futex, SYS_ppoll, SYS_clone, SYS_wait4, SYS_waitid, SYS_prctl, SYS_mincore,
+	    SYS_socketpair, SYS_recvmsg, SYS_close_range, SYS_capget, SYS_getitimer } },
+	{ "no-sigprocmask", EPERM_IT, { SYS_rt_sigprocmask } },
+	{ "no-sigreturn", EPERM_IT, { SYS_rt_sigreturn } },
+	{ "kill-sigprocmask", SECCOMP_RET_KILL_PROCESS, { SYS_rt_sigprocmask } },
+	{ "kill-sigreturn", SECCOMP_RET_KILL_PROCESS, { SYS_rt_sigreturn } },
 };
-static struct sock_filter hindering[] = {
-	BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
-	REFUSE(SYS_acct),
-	REFUSE(SYS_capget),
-	REFUSE(SYS_capset),
-	REFUSE(SYS_setfsuid),
-	REFUSE(SYS_getresgid),
-	REFUSE(SYS_get_mempolicy),
-	REFUSE(SYS_personality),
-	REFUSE(SYS_setresuid),
-	REFUSE(SYS_timer_create),
-	ALLOW,
-};
+
+static const struct kind *find(const char *name)
+{
+	for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++)
+		if (!strcmp(name, kinds[i].name))
+			return &kinds[i];
+	return NULL;
+}
+
+static int come_under(const struct kind *kind)
+{
+	struct sock_filter filter[2 * CALLS_MAX + 2], *end = filter;
+	struct sock_fprog program = { .filter = filter };
+
+	*end++ = (struct sock_filter)BPF_STMT(BPF_LD | BPF_W | BPF_ABS,
+					      offsetof(struct seccomp_data, nr));
+	for (int i = 0; i < CALLS_MAX && kind->call[i]; i++) {
+		*end++ = (struct sock_filter)BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, kind->call[i], 0,
+						      1);
+		*end++ = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, kind->action);
+	}
+	*end++ = (struct sock_filter)BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_ALLOW);
+	program.len = (unsigned short)(end - filter);
+	return prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) ||
+	       prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program);
+}
 
 int main(int argc, char **argv)
 {
-	const int hinders = argc > 2 && !strcmp(argv[1], "hindering");
-	struct sock_fprog program = {
-		hinders ? sizeof hindering / sizeof *hindering : sizeof harmless / sizeof *harmless,
-		hinders ? hindering : harmless,
-	};
+	const struct kind *kind = argc > 2 ? find(argv[1]) : NULL;
 	char path[4096];
 	ssize_t n;
 
-	if (argc < 3) {
-		fprintf(stderr, "usage: %s harmless|hindering PROGRAM [ARGUMENT...]\n", argv[0]);
+	if (!kind) {
+		fprintf(stderr, "usage: %s FILTER PROGRAM [ARGUMENT...]\n", argv[0]);
 		return 2;
 	}
 	n = readlink("/proc/self/exe", path, sizeof path - strlen(argv[2]) - 1);
@@ -60,8 +85,7 @@ int main(int argc, char **argv)
 		path[n] = 0;
 		strcpy(strrchr(path, '/') + 1, argv[2]);
 	}
-	if (n <= 0 || prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) ||
-	    prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program)) {
+	if (n <= 0 || come_under(kind)) {
 		perror("under");
 		return 1;
 	}

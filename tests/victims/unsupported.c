@@ -14,6 +14,7 @@
  *   userfault has a userfaultfd
  *   huge      private memory of huge pages
  *   nested    children would get a PID namespace of their own
+ *   strict    its main thread is in seccomp's strict mode
  *   filter    one thread under a seccomp filter that asks another process (SECCOMP_RET_USER_NOTIF)
  *   groups    one thread with other groups, which the main thread may not set
  *   hugefile  the same, of a file (a memfd)
@@ -532,6 +533,35 @@ static void be_dispatched(void)
 	selector = 0;
 }
 
+static bool strict;
+static int nudges[2];
+
+static void *nudge(void *arg)
+{
+	while (write(nudges[1], "", 1) == 1)
+		nap_us(1000);
+	return arg;
+}
+
+static bool start_strict(void)
+{
+	pthread_t thread;
+
+	strict = !pipe(nudges) && !pthread_create(&thread, NULL, nudge, NULL);
+	return strict;
+}
+
+/* Without the clock, which may be a system call. */
+static void be_strict(void)
+{
+	char c;
+
+	must(!prctl(PR_SET_SECCOMP, SECCOMP_MODE_STRICT), "PR_SET_SECCOMP");
+	while (read(nudges[0], &c, 1) == 1)
+		__atomic_add_fetch(&board->beats, 1, __ATOMIC_RELEASE);
+	syscall(SYS_exit, 1);
+}
+
 static bool start_limited(void)
 {
 	struct rlimit limit;
@@ -632,6 +662,7 @@ static const struct kind {
 	{ "userfault", start_userfault, stop_fd },
 	{ "huge", start_huge, stop_huge },
 	{ "nested", start_nested, NULL },
+	{ "strict", start_strict, NULL },
 	{ "filter", start_filter, NULL },
 	{ "groups", start_groups, NULL },
 	{ "hugefile", start_hugefile, stop_huge },
@@ -704,6 +735,8 @@ int main(int argc, char **argv)
 		}
 		if (dispatched)
 			be_dispatched();
+		if (strict)
+			be_strict();
 		beat();
 		nap_us(1000);
 	}

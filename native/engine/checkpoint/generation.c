@@ -58,7 +58,6 @@ static int hear_template(struct process *process, struct thread *cloned,
 	cloned->creds.death_signal = was.death_signal;
 	cloned->creds.subreaper = was.subreaper;
 	cloned->creds.slack_ns = was.slack_ns;
-	cloned->creds.seccomp = was.seccomp;
 	cloned->creds.filters = was.filters;
 	cloned->creds.future_lock = was.future_lock;
 	memcpy(cloned->altstack, call->out + TEMPLATE_ALTSTACK, sizeof cloned->altstack);
@@ -235,15 +234,13 @@ static int fill_slot(struct image *image, struct avc_error *err)
 			return -1;
 		}
 		pending_setup_thread(process, &t, &setup);
-		filters_setup_thread(image, main_thread, &process->threads[i], &setup);
+		filters_setup_thread(image, &process->threads[i], &setup);
 	}
 	close(mem_fd);
 	if (image->headless)
 		fill_ended(image);
 	image->sandboxed = image->installs ||
 			   !seccomp_is_containers(&status, process->plain_filters);
-	if (status.seccomp == 1)
-		process->parasite.seccomp = SECCOMP_SUPERVISED;
 	if (memory_finish(image, status.locked_kb, &setup, err))
 		return -1;
 	pending_setup(process, &setup);

@@ -119,14 +119,14 @@ static int hold(struct avc_guard *guard, struct process *process, struct avc_err
 	return result;
 }
 
-/* It has come under seccomp filters, or strict mode, after its holder was made. */
+/* It has come under seccomp filters after its holder was made. */
 static bool has_filters_since(const struct process *process)
 {
 	struct proc_status own, holders;
 
 	return !seccomp_is_confined() && proc_status(process->pid, &own) == 0 &&
 	       proc_status(process->holder, &holders) == 0 &&
-	       (own.seccomp_filters > holders.seccomp_filters || own.seccomp > holders.seccomp);
+	       own.seccomp_filters > holders.seccomp_filters;
 }
 
 /* The handler of a signal that came on a thread's way home ends soon, or never (siglongjmp(3)).

@@ -262,7 +262,8 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	thread->stub = porter->cave;
 	thread_head_home(thread, &homeward);
 	arch_stub_call(&regs, &thread->regs, porter->cave, false, SYS_clone, arg);
-	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP) ||
+	if (seccomp_supervise(thread->tid, process->inside, (long)TRACE_OPTIONS_APP, porter->cave,
+			      ARCH_STUB_BYTES) ||
 	    arch_regs_set(thread->tid, &homeward) ||
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof all, &all) ||
 	    arch_regs_set(thread->tid, &regs))
@@ -285,7 +286,7 @@ static int make_porter(struct process *process, struct thread *thread, struct po
 	if (tracee_await(porter->tid, NULL, err) != STOP_TRAP)
 		return -1;
 	if (ptrace(PTRACE_SETOPTIONS, porter->tid, NULL, options) ||
-	    seccomp_supervise(porter->tid, 0, options))
+	    seccomp_supervise(porter->tid, 0, options, porter->cave, ARCH_STUB_BYTES))
 		return fail_errno(err, porter->tid, "infect", "ptrace(SETOPTIONS)", "it has ended");
 	/* The main thread waits for it, and each of its calls takes two wake-ups.  Best effort. */
 	(void)sched_setscheduler(porter->tid, SCHED_FIFO, &first);
@@ -605,7 +606,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	if (process->mem_fd < 0)
 		return fail_errno(err, process->pid, "infect", "open(mem)", "it has ended");
 	if (thread_check_dispatch(thread->tid, err) || check_task(process, thread, err) ||
-	    thread_check_confined(process, thread, err) ||
+	    seccomp_read(process, thread, err) ||
 	    survey(process, arch_pc(&thread->regs), &cave, err))
 		return -1;
 	thread_fix_rseq(process->mem_fd, thread);
@@ -656,48 +657,6 @@ static int do_stopped(struct process *process, uint32_t slots, timer_t timer, ui
 	return result;
 }
 
-static bool is_in_a_stub(int mem_fd, avc_remote pc)
-{
-	const avc_remote page_end = (pc | (ARCH_PAGE_BYTES - 1)) + 1;
-
-	return has_stub(mem_fd, page_end - (page_end - 1 - pc) / CAVE_BYTES * CAVE_BYTES);
-}
-
-/* A porter whose guard has died ends by itself, unless its process's own filters refuse exit(2): then
- * it calls that for ever. */
-static void end_left_porters(struct process *process)
-{
-	struct proc_status status;
-	int mem_fd;
-
-	if (proc_status(process->pid, &status) ||
-	    seccomp_is_containers(&status, process->plain_filters))
-		return;
-	mem_fd = proc_open(process->pid, "mem", O_RDONLY);
-	for (uint32_t i = 0; i < process->thread_count && mem_fd >= 0; i++) {
-		struct thread *t = &process->threads[i];
-		struct avc_error ignored = { 0 };
-		struct proc_stat stat;
-
-		if (t->tid == process->pid || t->attached || proc_stat(t->tid, &stat) ||
-		    stat.state != 'R')
-			continue;
-		if (thread_stop(process, t, &ignored) == 0 &&
-		    thread_await(process, t, &ignored) == 0 &&
-		    is_in_a_stub(mem_fd, arch_pc(&t->regs)) &&
-		    seccomp_supervise(t->tid, 0, (long)TRACE_OPTIONS_APP) == 0) {
-			t->stopped = false;
-			t->attached = see_off(t->tid) != STOP_EXIT;
-			t->seen = t->attached;
-			seccomp_end_supervision(t->tid);
-		}
-		thread_release(process, t);
-	}
-	threads_forget_unseen(process);
-	if (mem_fd >= 0)
-		close(mem_fd);
-}
-
 int process_infect(struct process *process, uint32_t slots, timer_t timer, uint64_t deadline_ns,
 		   struct avc_error *err)
 {
@@ -710,10 +669,8 @@ int process_infect(struct process *process, uint32_t slots, timer_t timer, uint6
 		return do_stopped(process, slots, timer, deadline_ns, err);
 	rt_priority_begin();
 	tracee_deadline_set(timer, deadline_ns);
-	if (process_check_dying(process, err) == 0) {
-		end_left_porters(process);
+	if (process_check_dying(process, err) == 0)
 		thread = stop_main(process, err);
-	}
 	result = thread ? infect_thread(process, thread, slots, err) : -1;
 	if (thread)
 		thread_release(process, thread);
@@ -756,6 +713,16 @@ static int make_holder(struct process *process, pid_t holder, const struct arch_
 		       : 0;
 }
 
+/* Without a tracer its filters might refuse to set that attribute again. */
+static int check_adoption(const struct process *process, struct avc_error *err)
+{
+	return process->parasite.seccomp == SECCOMP_SUPERVISED
+		       ? fail(err, AVC_UNSUPPORTED, 0, process->pid, "make holder", "",
+			      "it adopts orphans (PR_SET_CHILD_SUBREAPER) under a seccomp filter "
+			      "that forbids what checkpoints call")
+		       : 0;
+}
+
 int process_pause_adoption(struct process *process, struct avc_error *err)
 {
 	struct inj_call *call = &process->parasite.control->runner;
@@ -763,6 +730,8 @@ int process_pause_adoption(struct process *process, struct avc_error *err)
 
 	if (process->paused)
 		return 0;
+	if (check_adoption(process, err))
+		return -1;
 	call_begin(call, INJ_AFTER_HOME);
 	call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER);
 	call_add(call, INJ_PAUSE);
@@ -894,6 +863,8 @@ int process_hold_stopped(struct process *process, pid_t init, struct avc_error *
 	if (!thread || !thread->stopped)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "make holder", "",
 			    "its main thread has ended");
+	if (thread->creds.subreaper && check_adoption(process, err))
+		return -1;
 	call_begin(call, INJ_AFTER_HOME);
 	if (thread->creds.subreaper)
 		call_add(call, SYS_prctl, PR_SET_CHILD_SUBREAPER);

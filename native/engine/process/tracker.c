@@ -89,7 +89,8 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 	if (parasite_send(&process->parasite, child, base, call, err))
 		return -1;
 	/* Containers' filters do not allow this call. */
-	if (seccomp_supervise(child, SECCOMP_WATCHER, (long)TRACE_OPTIONS_OURS))
+	if (seccomp_supervise(child, SECCOMP_WATCHER, (long)TRACE_OPTIONS_OURS,
+			      process->parasite.base, INJ_CODE_BYTES))
 		return fail(err, AVC_DEADLINE, 0, child, "watch memory", "", "too many at once");
 	if (parasite_run(child, call, err))
 		return -1;

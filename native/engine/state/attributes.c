@@ -55,7 +55,6 @@ enum {
 	SECUREBITS,
 	NO_NEW_PRIVS,
 	SLACK,
-	SECCOMP,
 	GROUP_COUNT,
 	POLICY,
 	PERSONALITY,
@@ -86,7 +85,6 @@ const struct inj_syscall *attributes_ask(struct inj_call *call, void *out, avc_r
 	call_add(call, SYS_prctl, PR_GET_SECUREBITS);
 	call_add(call, SYS_prctl, PR_GET_NO_NEW_PRIVS);
 	call_add(call, SYS_prctl, PR_GET_TIMERSLACK);
-	call_add(call, SYS_prctl, PR_GET_SECCOMP);
 	call_add(call, SYS_getgroups);
 	call_add(call, SYS_get_mempolicy, AT(memory_policy), AT(nodes), NODE_BITS);
 	call_add(call, SYS_personality, 0xffffffff);
@@ -120,7 +118,6 @@ void attributes_answer(const struct inj_syscall *first, const void *out, struct 
 	c->fsgid = (uint32_t)first[FSGID].result;
 	c->securebits = (uint32_t)first[SECUREBITS].result;
 	c->no_new_privs = first[NO_NEW_PRIVS].result == 1;
-	c->seccomp = (int32_t)first[SECCOMP].result;
 	c->group_count = (int32_t)first[GROUP_COUNT].result;
 	if (c->group_count > 0 && c->group_count <= GROUPS_KEPT)
 		memcpy(c->group, a->group, (size_t)c->group_count * sizeof *c->group);

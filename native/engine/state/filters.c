@@ -167,16 +167,6 @@ static void drop_unused(struct process *process)
 	}
 }
 
-/* Not as the thread itself has answered, in memory that the application can write. */
-static int32_t mode_of(const struct thread *thread)
-{
-	struct proc_status status;
-
-	if (thread->filter_count)
-		return SECCOMP_MODE_FILTER;
-	return proc_status(thread->tid, &status) ? thread->creds.seccomp : (int32_t)status.seccomp;
-}
-
 void filters_read(struct process *process, struct thread *thread)
 {
 	static uint64_t last;
@@ -187,7 +177,6 @@ void filters_read(struct process *process, struct thread *thread)
 		return;
 	}
 	thread->creds.filters = last = sum_of(thread->tid, &thread->filter_count);
-	thread->creds.seccomp = mode_of(thread);
 	if (thread->filter_count <= process->plain_filters || find(process, last))
 		return;
 	if (!process->chains)
@@ -251,8 +240,7 @@ static int check_thread(const struct process *process, const struct creds *from,
 	bool known;
 	const struct filter *filter = beyond(process, from, &t->creds, &known);
 
-	if (!known ||
-	    (from->seccomp == SECCOMP_MODE_STRICT && t->creds.seccomp != SECCOMP_MODE_STRICT))
+	if (!known)
 		return refuse(process, t, err);
 	for (const struct filter *f = filter; f; f = f->next)
 		if (f->asks)
@@ -335,10 +323,8 @@ int filters_setup(struct image *image, const struct thread *main_thread, struct 
 			continue;
 		if (check_thread(process, from, t, err))
 			return -1;
-		image->installs |= t->creds.filters != from->filters ||
-				   t->creds.seccomp != from->seccomp;
-		image->seal[image->seals++] = (struct seal){ t->inside, t->creds.seccomp,
-							     t->creds.filters };
+		image->installs |= t->creds.filters != from->filters;
+		image->seal[image->seals++] = (struct seal){ t->inside, t->creds.filters };
 	}
 	image->shared_filters = shared_sum(process, from, main_thread);
 	if (image->shared_filters == from->filters)
@@ -351,10 +337,8 @@ int filters_setup(struct image *image, const struct thread *main_thread, struct 
 	return 0;
 }
 
-void filters_setup_thread(const struct image *image, const struct thread *main_thread,
-			  const struct thread *t, struct setup *setup)
+void filters_setup_thread(const struct image *image, const struct thread *t, struct setup *setup)
 {
-	const struct creds *from = inherited_by(image->process, main_thread);
 	const struct creds shared = { .filters = image->shared_filters };
 	bool known;
 
@@ -362,9 +346,6 @@ void filters_setup_thread(const struct image *image, const struct thread *main_t
 	     f = f->next)
 		setup_add_thread(setup, "seccomp", SYS_seccomp, SECCOMP_SET_MODE_FILTER, f->flags,
 				 program_at(setup, f));
-	if (t->creds.seccomp == SECCOMP_MODE_STRICT && from->seccomp != SECCOMP_MODE_STRICT)
-		setup_add_thread(setup, "prctl(SECCOMP)", SYS_prctl, PR_SET_SECCOMP,
-				 SECCOMP_MODE_STRICT);
 }
 
 /* ---- at a restore ------------------------------------------------------------------------ */
@@ -381,11 +362,9 @@ const struct seal *filters_seal_of(const struct image *image, pid_t tid)
 
 int filters_check(const struct seal *seal, pid_t tid, struct avc_error *err)
 {
-	struct proc_status status;
 	uint32_t count;
 
-	if (proc_status(tid, &status) == 0 && (int32_t)status.seccomp == seal->mode &&
-	    sum_of(tid, &count) == seal->filters)
+	if (sum_of(tid, &count) == seal->filters)
 		return 0;
 	return fail(err, AVC_UNSUPPORTED, 0, tid, "restore", "seccomp",
 		    "thread %d would not be under the seccomp filters that it had", seal->inside);

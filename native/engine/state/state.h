@@ -179,7 +179,6 @@ bool inherited_equal(const struct inherited *a, const struct inherited *b);
 /* What a thread must be under before it runs. */
 struct seal {
 	pid_t inside;
-	int32_t mode;     /* prctl(2), PR_GET_SECCOMP                          */
 	uint64_t filters; /* a hash                                            */
 };
 
@@ -192,8 +191,8 @@ void filters_forget(struct process *process);
  * itself, after everything else. */
 int filters_setup(struct image *image, const struct thread *main_thread, struct setup *setup,
 		  struct avc_error *err) warn_unused;
-void filters_setup_thread(const struct image *image, const struct thread *main_thread,
-			  const struct thread *thread, struct setup *setup);
+void filters_setup_thread(const struct image *image, const struct thread *thread,
+			  struct setup *setup);
 /* Of a restored thread that is stopped; NULL: there was none with its number.  Whether it is under
  * what it was under. */
 const struct seal *filters_seal_of(const struct image *image, pid_t tid);

@@ -257,7 +257,8 @@ static int send_in(const struct parasite *parasite, pid_t tid, bool ours,
 
 	if (parasite->seccomp != SECCOMP_SUPERVISED)
 		seccomp_end_supervision(tid);
-	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours)))
+	else if (seccomp_supervise(tid, parasite->inside, options_of(parasite, ours),
+				   parasite->base, INJ_CODE_BYTES))
 		return fail(err, AVC_UNSUPPORTED, 0, tid, "run injected code", "",
 			    "it has too many processes under seccomp filters of its own");
 	if (ours)
@@ -391,6 +392,7 @@ bool parasite_is_old(const struct process *process, avc_remote address)
 	return address >= process->stubs_start && address < process->stubs_end;
 }
 
+/* One without filters may get some from another thread meanwhile (SECCOMP_FILTER_FLAG_TSYNC). */
 static long options_of(const struct parasite *parasite, bool ours)
 {
 	return (long)((ours ? TRACE_OPTIONS_OURS : TRACE_OPTIONS_APP) |
@@ -404,26 +406,6 @@ int parasite_own(const struct parasite *parasite, pid_t tid)
 	return ptrace(PTRACE_SETOPTIONS, tid, NULL, options_of(parasite, true)) ? -1 : 0;
 }
 
-static int read_seccomp(const struct process *process, struct thread *thread, struct avc_error *err)
-{
-	const int status_fd = thread->tid == process->pid ? process->status_fd : -1;
-
-	if (!seccomp_read(thread->tid, status_fd, process->plain_filters, &thread->filters_known,
-			  &thread->seccomp))
-		return 0;
-	if (seccomp_must_suspend())
-		return fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
-			    "it has a seccomp filter of its own now, which takes another guard");
-	return fail_errno(err, thread->tid, "run injected code", "ptrace(SECCOMP_GET_FILTER)",
-			  "its filters cannot be read");
-}
-
-int thread_check_confined(const struct process *process, struct thread *thread,
-			  struct avc_error *err)
-{
-	return seccomp_is_confined() ? read_seccomp(process, thread, err) : 0;
-}
-
 /* Decides how the thread will be resumed: it is borrowed next. */
 static int look_at_seccomp(struct process *process, struct thread *thread, struct avc_error *err)
 {
@@ -431,10 +413,10 @@ static int look_at_seccomp(struct process *process, struct thread *thread, struc
 	long options;
 	bool plain;
 
-	if (parasite->seccomp == SECCOMP_SUPERVISED) /* as found by a checkpoint */
-		thread->seccomp = SECCOMP_SUPERVISED;
-	if (read_seccomp(process, thread, err))
+	if (seccomp_read(process, thread, err))
 		return -1;
+	if (parasite->seccomp == SECCOMP_SUPERVISED) /* for another thread */
+		thread->seccomp = SECCOMP_SUPERVISED;
 	parasite->seccomp = thread->seccomp;
 	options = options_of(parasite, false);
 	plain = options == (long)TRACE_OPTIONS_APP;
@@ -535,7 +517,7 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 
 void thread_head_home(const struct thread *thread, struct arch_regs *regs)
 {
-	const uint64_t nothing[6] = { 0 };
+	const uint64_t nothing[6] = { SIG_SETMASK };
 
 	if (thread->borrowed_for)
 		arch_enter(regs, &thread->regs, thread->borrowed_for->base + INJ_GO_HOME_OFFSET, 0,
@@ -567,7 +549,6 @@ int thread_give_back(struct thread *thread, struct avc_error *err)
 	    ptrace(PTRACE_SETSIGMASK, thread->tid, sizeof thread->sigmask, &thread->sigmask) ||
 	    arch_regs_set(thread->tid, &thread->regs))
 		return fail_errno(err, thread->tid, "give back", "ptrace(SETREGS)", "it has gone");
-	/* Strict mode is in force again when it is resumed: nothing happens in between. */
 	seccomp_end_supervision(thread->tid);
 	thread->borrowed = false;
 	thread->sent_back = true;

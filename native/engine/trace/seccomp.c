@@ -1,15 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * Seccomp filters stay in force over injected code. The container's allow what it calls; so do most
- * that applications install. Where they do not, injected code is *supervised*: its tracer stops it
- * at the entry to every system call, and suspends the filters (PTRACE_O_SUSPEND_SECCOMP) for that
- * call alone, if it is one that injected code makes. This decision uses nothing that the
- * application can write. At the entry the registers are fixed in the kernel: whatever the
+ * that applications install. Where they refuse it, injected code is *supervised*: its tracer stops
+ * it at the entry to every system call, and suspends the filters (PTRACE_O_SUSPEND_SECCOMP) for that
+ * call alone, if it is one that injected code makes, and made by that. This decision uses nothing
+ * that the application can write. At the entry the registers are fixed in the kernel: whatever the
  * application does to the parasite, its stack or its lists, or maps in its place, leads to calls
  * that its own filter checks, or to some of those below.
  *
- * A task without any filter can only be in strict mode.  That is suspended for the first
- * checkpoint, and supervised from then on.
+ * The suspension ends with the tracer.  Injected code then goes on to the end of its list, and home,
+ * under filters that may refuse each of its calls, but must kill for none (also strict mode does),
+ * and must allow those that undo and go home.  Others are not protected.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -31,7 +32,6 @@
 #include "trace.h"
 
 #define ANY (~UINT64_C(0))
-#define FILTERS_MAX 16
 #define SUPERVISED_MAX 512
 /* Threads of a process being restored (parasite.c, spawn()). */
 #define SPAWN_FLAGS                                                                         \
@@ -50,7 +50,7 @@ static const struct kind wanted[] = {
 	{ SYS_futex, ANY },
 	{ SYS_ppoll, ANY },
 	{ SYS_nanosleep, ANY },
-	{ SYS_rt_sigprocmask, ANY },
+	{ SYS_rt_sigprocmask, SIG_SETMASK },
 	{ SYS_exit, ANY },
 	{ SYS_exit_group, ANY },
 	{ SYS_wait4, ANY },
@@ -77,7 +77,6 @@ static const struct kind wanted[] = {
 	{ SYS_prctl, PR_GET_SECUREBITS },
 	{ SYS_prctl, PR_GET_NO_NEW_PRIVS },
 	{ SYS_prctl, PR_GET_TIMERSLACK },
-	{ SYS_prctl, PR_GET_SECCOMP },
 	{ SYS_prctl, PR_GET_PDEATHSIG },
 	{ SYS_prctl, PR_GET_CHILD_SUBREAPER },
 	{ SYS_prctl, PR_CAPBSET_READ },
@@ -183,7 +182,7 @@ static const struct kind wanted_for_trees[] = {
  * make such calls. */
 static const struct kind needed[] = {
 	/* of the porter, and the stub that clones it (infect.c) */
-	{ SYS_rt_sigprocmask, ANY },
+	{ SYS_rt_sigprocmask, SIG_SETMASK },
 	{ SYS_clone, CLONE_VM | CLONE_FILES },
 	{ SYS_clone,
 	  CLONE_VM | CLONE_FILES | CLONE_THREAD | CLONE_SIGHAND | CLONE_FS | CLONE_SYSVSEM },
@@ -200,6 +199,20 @@ static const struct kind needed[] = {
 };
 static const struct kind needed_to_watch = { SYS_userfaultfd, ANY };
 
+/* What must not be refused when the guard has died in the middle: the thread's signals would stay
+ * blocked, its memory would stay as it is for a clone, a porter would call exit(2) for ever.  And
+ * nothing could be restored without rt_sigreturn(2). */
+static const struct homeward {
+	struct kind call;
+	const char *name;
+} homeward[] = {
+	{ { SYS_rt_sigprocmask, SIG_SETMASK }, "rt_sigprocmask" },
+	{ { SYS_rt_sigreturn, ANY }, "rt_sigreturn" },
+	{ { SYS_munmap, ANY }, "munmap" },
+	{ { SYS_madvise, ANY }, "madvise" },
+	{ { SYS_exit, ANY }, "exit" },
+};
+
 #define COUNT(array) (sizeof(array) / sizeof *(array))
 
 /* ---- what a filter says --------------------------------------------------------------------- */
@@ -210,8 +223,8 @@ struct program {
 };
 
 /* The classic BPF of seccomp(2), with only the number, the architecture and, if it is not ANY, the
- * first argument known. A filter that reads anything else may return anything. */
-#define DEPENDS SECCOMP_RET_KILL_PROCESS
+ * first argument known. A filter that reads anything else may return anything that is in it. */
+#define DEPENDS 0xffff0000U /* no action                                            */
 
 static bool load(uint32_t at, long nr, uint64_t arg, uint32_t *value)
 {
@@ -323,31 +336,68 @@ static uint32_t run(const struct program *p, long nr, uint64_t arg)
 }
 
 /* Whether it prevents a call, and how. The most severe of several filters counts. */
-enum verdict { PASSES, REFUSES, BARS };
+enum verdict {
+	PASSES,
+	REFUSES,
+	MAY_REFUSE,
+	ENDS /* the task, or the call is not what it seems: it asks another process, or lies   */
+};
 
-static enum verdict verdict(const struct program *p, long nr, uint64_t arg)
+static enum verdict verdict_of(uint32_t result)
 {
-	switch (run(p, nr, arg) & SECCOMP_RET_ACTION_FULL) {
+	switch (result & SECCOMP_RET_ACTION_FULL) {
 	case SECCOMP_RET_ALLOW:
 	case SECCOMP_RET_LOG:
 		return PASSES;
 	case SECCOMP_RET_ERRNO:
-		return REFUSES;
+		return result & SECCOMP_RET_DATA ? REFUSES : ENDS;
 	default:
-		return BARS;
+		return ENDS;
 	}
 }
 
-/* The app cannot have made a call that the container's own filters refuse, so it is not needed. */
-static bool bars(const struct program *p, bool containers)
+static bool may_end(const struct program *p)
+{
+	for (long i = 0; i < p->count; i++)
+		if (BPF_CLASS(p->insn[i].code) == BPF_RET &&
+		    (BPF_RVAL(p->insn[i].code) == BPF_A || verdict_of(p->insn[i].k) == ENDS))
+			return true;
+	return false;
+}
+
+static enum verdict verdict(const struct program *p, long nr, uint64_t arg)
+{
+	const uint32_t result = run(p, nr, arg);
+
+	if (result == DEPENDS)
+		return may_end(p) ? ENDS : MAY_REFUSE;
+	return verdict_of(result);
+}
+
+/* Whether it prevents a call of injected code.  Fails if such code would do harm under it without a
+ * tracer.  The app cannot have made a call that the container's own filters refuse, so that is not
+ * needed. */
+static int judge(const struct program *p, bool containers, pid_t tid, bool *barred,
+		 struct avc_error *err)
 {
 	for (size_t i = 0; i < COUNT(wanted); i++) {
 		const enum verdict v = verdict(p, wanted[i].nr, wanted[i].arg);
 
-		if (v == BARS || (v == REFUSES && !containers))
-			return true;
+		if (v == ENDS)
+			return fail(
+				err, AVC_UNSUPPORTED, 0, tid, "check", "",
+				"it has a seccomp filter that may kill it, if the guard dies in "
+				"a checkpoint, for what that calls (system call %ld)",
+				wanted[i].nr);
+		*barred |= v == MAY_REFUSE || (v == REFUSES && !containers);
 	}
-	return false;
+	for (size_t i = 0; i < COUNT(homeward); i++)
+		if (verdict(p, homeward[i].call.nr, homeward[i].call.arg) != PASSES)
+			return fail(err, AVC_UNSUPPORTED, 0, tid, "check", "",
+				    "it has a seccomp filter that may refuse %s, without which it "
+				    "would not go on as before if the guard died in a checkpoint",
+				    homeward[i].name);
+	return 0;
 }
 
 static bool refuses_any(const struct program *p, const struct kind *kinds, size_t count)
@@ -369,9 +419,9 @@ static struct {
 	bool known, hinder, hinder_watching;
 } containers_filters;
 
-static void note_containers(const struct program *p)
+static void note_containers(const struct program *p, bool barred)
 {
-	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || bars(p, true);
+	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || barred;
 	containers_filters.hinder_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
 					      PASSES;
 }
@@ -447,15 +497,19 @@ static int read_counts(pid_t tid, int status_fd, struct proc_status *status)
 }
 
 /* It is stopped: nothing but another thread of its process could give it a filter. */
-static int read_confined(pid_t tid, int status_fd, uint32_t containers, enum seccomp_way *way)
+static int read_confined(const struct process *process, struct thread *thread, int status_fd,
+			 struct avc_error *err)
 {
 	struct proc_status status;
 
-	if (read_counts(tid, status_fd, &status))
-		return -1;
-	*way = containers ? SECCOMP_IN_FORCE : SECCOMP_NONE;
-	errno = EACCES;
-	return seccomp_is_containers(&status, containers) ? 0 : -1;
+	if (read_counts(thread->tid, status_fd, &status))
+		return fail_errno(err, thread->tid, "run injected code", "open(status)",
+				  "it has ended");
+	thread->seccomp = process->plain_filters ? SECCOMP_IN_FORCE : SECCOMP_NONE;
+	return seccomp_is_containers(&status, process->plain_filters)
+		       ? 0
+		       : fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
+			      "it has a seccomp filter of its own now, which takes another guard");
 }
 
 static long filter_get(pid_t tid, uint32_t index, void *insn)
@@ -463,46 +517,68 @@ static long filter_get(pid_t tid, uint32_t index, void *insn)
 	return ptrace(PTRACE_SECCOMP_GET_FILTER, tid, (long)index, insn);
 }
 
-int seccomp_read(pid_t tid, int status_fd, uint32_t containers, uint32_t *known,
-		 enum seccomp_way *way)
+/* A task without any filter may be in strict mode. */
+static int read_none(struct thread *thread, int status_fd, struct avc_error *err)
 {
+	struct proc_status status;
+
+	if (read_counts(thread->tid, status_fd, &status))
+		return fail_errno(err, thread->tid, "run injected code", "open(status)",
+				  "it has ended");
+	thread->seccomp = SECCOMP_NONE;
+	return status.seccomp == SECCOMP_MODE_STRICT
+		       ? fail(err, AVC_UNSUPPORTED, 0, thread->tid, "check", "",
+			      "it is in seccomp's strict mode, which would kill it if the guard "
+			      "died in a checkpoint")
+		       : 0;
+}
+
+int seccomp_read(const struct process *process, struct thread *thread, struct avc_error *err)
+{
+	const int status_fd = thread->tid == process->pid ? process->status_fd : -1;
+	const uint32_t containers = process->plain_filters;
+	bool barred = false, less = false;
 	struct program p;
-	bool less = false;
 	uint32_t i;
 
 	if (confined.is)
-		return read_confined(tid, status_fd, containers, way);
+		return read_confined(process, thread, status_fd, err);
 	/* Filters are only ever added. */
-	if (*way == SECCOMP_SUPERVISED ||
-	    (*known && filter_get(tid, *known, NULL) < 0 && errno == ENOENT))
+	if (thread->filters_known && filter_get(thread->tid, thread->filters_known, NULL) < 0 &&
+	    errno == ENOENT)
 		return 0;
-	for (i = 0; (p.count = filter_get(tid, i, p.insn)) > 0; i++) {
+	for (i = 0; (p.count = filter_get(thread->tid, i, p.insn)) > 0; i++) {
+		if (judge(&p, i < containers, thread->tid, &barred, err))
+			return -1;
 		if (i < containers && !containers_filters.known)
-			note_containers(&p);
-		if (i == FILTERS_MAX || bars(&p, i < containers)) {
-			*way = SECCOMP_SUPERVISED;
-			return 0;
-		}
-		less |= i >= containers && hinders_trees(&p);
+			note_containers(&p, barred);
+		less = less || (i >= containers && hinders_trees(&p));
 	}
-	if (errno != ENOENT && errno != EINVAL && errno != EMEDIUMTYPE)
-		return -1;
+	if (errno == EMEDIUMTYPE)
+		return fail(err, AVC_UNSUPPORTED, 0, thread->tid, "check", "",
+			    "it has a seccomp filter that cannot be read");
+	if (errno != ENOENT && errno != EINVAL)
+		return fail_errno(err, thread->tid, "run injected code",
+				  "ptrace(SECCOMP_GET_FILTER)", "its filters cannot be read");
 	containers_filters.known |= i >= containers;
-	*known = i;
-	*way = errno == EMEDIUMTYPE ? SECCOMP_SUPERVISED /* it cannot be read */
-	       : less               ? SECCOMP_LESS
-	       : i                  ? SECCOMP_IN_FORCE
-				    : SECCOMP_NONE;
+	if (!i)
+		return read_none(thread, status_fd, err);
+	thread->filters_known = i;
+	thread->seccomp = barred ? SECCOMP_SUPERVISED : less ? SECCOMP_LESS : SECCOMP_IN_FORCE;
 	return 0;
 }
 
 /* ---- supervision ---------------------------------------------------------------------------- */
 
+struct task {
+	pid_t tid, inside;
+	long options;
+	avc_remote code; /* injected code, of so many bytes                          */
+	size_t bytes;
+};
+
 static __thread struct {
-	struct {
-		pid_t tid, inside;
-		long options;
-	} task[SUPERVISED_MAX];
+	struct task task[SUPERVISED_MAX];
 	uint32_t count;
 } supervised;
 
@@ -514,7 +590,7 @@ static int find(pid_t tid)
 	return -1;
 }
 
-int seccomp_supervise(pid_t tid, pid_t inside, long options)
+int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code, size_t bytes)
 {
 	int i = find(tid);
 
@@ -528,9 +604,7 @@ int seccomp_supervise(pid_t tid, pid_t inside, long options)
 		return -1;
 	if (i < 0)
 		i = (int)supervised.count++;
-	supervised.task[i].tid = tid;
-	supervised.task[i].inside = inside;
-	supervised.task[i].options = options;
+	supervised.task[i] = (struct task){ tid, inside, options, code, bytes };
 	return 0;
 }
 
@@ -583,13 +657,21 @@ static bool is_wanted(const struct arch_regs *regs, pid_t inside)
 	}
 }
 
-void seccomp_at_call(pid_t tid, pid_t inside, long options)
+/* A thread of the app that has returned by itself makes its own calls, under its own filters. */
+static void at_call(const struct task *task)
 {
 	struct arch_regs regs;
+	long options = task->options;
 
-	if (tracee_enters_call(tid) && arch_regs_get(tid, &regs) == 0 && is_wanted(&regs, inside))
+	if (tracee_enters_call(task->tid) && arch_regs_get(task->tid, &regs) == 0 &&
+	    arch_pc(&regs) - task->code <= task->bytes && is_wanted(&regs, task->inside))
 		options |= suspend_option();
-	ptrace(PTRACE_SETOPTIONS, tid, NULL, options); /* fails if it was killed */
+	ptrace(PTRACE_SETOPTIONS, task->tid, NULL, options); /* fails if it was killed */
+}
+
+void seccomp_at_call(pid_t tid, pid_t inside, long options)
+{
+	at_call(&(struct task){ tid, inside, options, .bytes = SIZE_MAX });
 }
 
 /* Its threads; a process would not be a tracee of ours.  And filters, which take something away. */
@@ -604,9 +686,6 @@ static bool is_restoring(const struct arch_regs *regs, pid_t inside)
 		return arg == SECCOMP_SET_MODE_FILTER &&
 		       !(second &
 			 ~(uint64_t)(SECCOMP_FILTER_FLAG_LOG | SECCOMP_FILTER_FLAG_SPEC_ALLOW));
-	case SYS_prctl:
-		return (arg == PR_SET_SECCOMP && second == SECCOMP_MODE_STRICT) ||
-		       is_wanted(regs, inside);
 	default:
 		return is_wanted(regs, inside);
 	}
@@ -638,6 +717,6 @@ long seccomp_go_on(pid_t tid, const struct stop *stop)
 	if (i < 0)
 		return ptrace(PTRACE_CONT, tid, NULL, signal);
 	if (stop && stop->kind == STOP_SYSCALL)
-		seccomp_at_call(tid, supervised.task[i].inside, supervised.task[i].options);
+		at_call(&supervised.task[i]);
 	return ptrace(PTRACE_SYSCALL, tid, NULL, signal);
 }

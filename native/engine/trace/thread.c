@@ -268,7 +268,8 @@ static void take_child(struct process *process, struct thread *thread, pid_t chi
 	/* A porter that is a thread exits by itself, but not under the app's filters. */
 	born->borrowed_for = NULL;
 	born->stub = stub;
-	born->borrowed = seccomp_supervise(child, 0, (long)TRACE_OPTIONS_APP) == 0;
+	born->borrowed = seccomp_supervise(child, 0, (long)TRACE_OPTIONS_APP, stub,
+					   ARCH_STUB_BYTES) == 0;
 }
 
 /* True while it still has to be waited for. */
@@ -307,8 +308,10 @@ static bool straggle(struct process *process, struct thread *thread)
 		take_child(process, thread, stop.message);
 		/* fall through */
 	case STOP_SYSCALL:
-		/* Registers cannot be changed at this stop: let it reach another one. */
-		ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
+		/* Registers cannot be changed at this stop: let it reach another one.  A clone that
+		 * is interrupted where it begins is begun again (ERESTARTNOINTR), and again. */
+		if (!tracee_enters_call(tid))
+			ptrace(PTRACE_INTERRUPT, tid, NULL, NULL);
 		seccomp_go_on(tid, &stop);
 		return true;
 	default:

@@ -76,7 +76,6 @@ struct creds {
 	uint32_t personality;
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
-	int32_t seccomp;  /* mode                                             */
 	uint64_t filters; /* of seccomp: a hash                               */
 	int32_t group_count;
 	uint32_t group[GROUPS_KEPT]; /* supplementary                             */
@@ -96,7 +95,7 @@ enum seccomp_way {
 	SECCOMP_NONE,      /* there are none                                       */
 	SECCOMP_IN_FORCE,  /* they allow its calls                                 */
 	SECCOMP_LESS,      /* ... but not all that restoring several processes takes */
-	SECCOMP_SUPERVISED /* they do not: seccomp_supervise()                     */
+	SECCOMP_SUPERVISED /* they refuse some: seccomp_supervise()                */
 };
 
 struct thread {
@@ -390,11 +389,10 @@ void rewind_date(struct thread *thread);
 
 /* ---- seccomp.c -------------------------------------------------------------------- */
 
-/* Reads a stopped thread's filters, of which the first `containers` are the container's; *known:
- * how many there were the last time.  `status_fd`: its status in /proc, or -1.  A supervised thread
- * stays so.  0, or -1 with errno. */
-int seccomp_read(pid_t tid, int status_fd, uint32_t containers, uint32_t *known,
-		 enum seccomp_way *way) warn_unused;
+/* Reads a stopped thread's filters.  Fails if injected code would do harm under them that loses its
+ * tracer. */
+int seccomp_read(const struct process *process, struct thread *thread,
+		 struct avc_error *err) warn_unused;
 /* Whether the guard may come under a filter of its own, and still protect an application that has
  * none.  `watches`: it is to watch memory. */
 bool seccomp_can_be_confined(bool watches);
@@ -406,12 +404,14 @@ bool seccomp_must_suspend(void);
 /* Whether a task has no more filters than its container. */
 bool seccomp_is_containers(const struct proc_status *status, uint32_t containers);
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
- * the PID of its process in its own namespace. */
-int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
+ * the PID of its process in its own namespace, `code` and `bytes` are where injected code is. */
+int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code,
+		      size_t bytes) warn_unused;
 #define SECCOMP_WATCHER (-1) /* for `inside`: the one that opens a userfaultfd       */
 void seccomp_end_supervision(pid_t tid);
 bool seccomp_is_supervised(pid_t tid);
-/* The same for this stop alone, which is of a system call (STOP_SYSCALL). */
+/* The same for this stop alone, which is of a system call (STOP_SYSCALL), and wherever its code is:
+ * for one that has none of the app's to run yet. */
 void seccomp_at_call(pid_t tid, pid_t inside, long options);
 /* The same for a task that has yet to get its filters, by calls from memory that the application
  * could change: it makes no other call than those of a restore. */
@@ -484,10 +484,6 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
  * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
 int thread_borrow(struct process *process, struct thread *thread,
 		  struct avc_error *err) warn_unused;
-/* Before the first calls of a stopped thread, for which its filters are suspended in any case: whether
- * a guard that cannot do that need not. */
-int thread_check_confined(const struct process *process, struct thread *thread,
-			  struct avc_error *err) warn_unused;
 /* The registers of a borrowed thread that goes home by itself, whatever its signal mask. */
 void thread_head_home(const struct thread *thread, struct arch_regs *regs);
 int thread_give_back(struct thread *thread, struct avc_error *err);
