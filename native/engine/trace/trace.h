@@ -208,6 +208,9 @@ struct process {
 	/* A thread died while it may have been cloning: there may be a tracee that is on no list
 	 * (init_channel_kill_lost). */
 	bool lost;
+	/* CLONE_FILES, CLONE_FS: it has the descriptor table, or the directories, of the process
+	 * that will fork it (tree.c). */
+	uint64_t shared;
 	bool childless;                     /* it had no child process at the last checkpoint   */
 	const struct inj_syscall *children; /* the query whether it has, in a freeze   */
 	struct questions questions;         /* and the other queries                   */
@@ -580,6 +583,8 @@ struct syscall_batch {
 	pid_t inside;     /* for notes: soft failures                            */
 	struct avc_error *notes;
 	int socket; /* ours, through which it gets descriptors; -1     */
+	int theirs; /* its end; and what number it gets each as, until that is closed     */
+	int given;
 };
 
 /* From now on it runs in that parasite. */
@@ -614,11 +619,14 @@ struct fd_channel {
 };
 
 /* Closes inherited descriptors, except those that it keeps; from then on it can be given
- * descriptors, each as number 1 until it is closed: by an inherited channel, if any, which it takes,
- * or its own. */
+ * descriptors: by an inherited channel, if any, which it takes, or its own. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, struct fd_channel *inherited,
 				  const struct fd_table *table, struct avc_error *err) warn_unused;
 #define FD_KEPT_MIN 2 /* 0 and 1 are for the channel                               */
+/* The same in a table that it shares with its parent (CLONE_FILES), and so closes nothing of.
+ * Nobody else may use that until syscall_batch_close_fd_channel(). */
+int syscall_batch_make_fd_channel(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+void syscall_batch_close_fd_channel(struct syscall_batch *batch);
 /* Of a process that forks several: it passes each of them a channel, which takes less time than
  * their making their own.  None where there is no descriptor number left for it. */
 int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
