@@ -5,6 +5,8 @@
  *
  *   harmless  refuses acct(2), which nobody calls
  *   hindering refuses, too, calls that only checkpoints and restores make
+ *   killing   kills a process that makes the call by which the kernel continues a sleep,
+ *             restart_syscall(2), which few programs know of
  */
 #include <errno.h>
 #include <linux/filter.h>
@@ -40,19 +42,38 @@ static struct sock_filter hindering[] = {
 	REFUSE(SYS_timer_create),
 	ALLOW,
 };
+static struct sock_filter killing[] = {
+	BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
+	BPF_JUMP(BPF_JMP | BPF_JEQ | BPF_K, SYS_restart_syscall, 0, 1),
+	BPF_STMT(BPF_RET | BPF_K, SECCOMP_RET_KILL_PROCESS),
+	ALLOW,
+};
+
+#define PROGRAM(filter)                                   \
+	{                                                 \
+		sizeof(filter) / sizeof *(filter), filter \
+	}
+static const struct {
+	const char *name;
+	struct sock_fprog program;
+} filters[] = {
+	{ "harmless", PROGRAM(harmless) },
+	{ "hindering", PROGRAM(hindering) },
+	{ "killing", PROGRAM(killing) },
+};
 
 int main(int argc, char **argv)
 {
-	const int hinders = argc > 2 && !strcmp(argv[1], "hindering");
-	struct sock_fprog program = {
-		hinders ? sizeof hindering / sizeof *hindering : sizeof harmless / sizeof *harmless,
-		hinders ? hindering : harmless,
-	};
+	struct sock_fprog program = { 0 };
 	char path[4096];
 	ssize_t n;
 
-	if (argc < 3) {
-		fprintf(stderr, "usage: %s harmless|hindering PROGRAM [ARGUMENT...]\n", argv[0]);
+	for (size_t i = 0; argc > 2 && i < sizeof filters / sizeof *filters; i++)
+		if (!strcmp(argv[1], filters[i].name))
+			program = filters[i].program;
+	if (!program.len) {
+		fprintf(stderr, "usage: %s harmless|hindering|killing PROGRAM [ARGUMENT...]\n",
+			argv[0]);
 		return 2;
 	}
 	n = readlink("/proc/self/exe", path, sizeof path - strlen(argv[2]) - 1);

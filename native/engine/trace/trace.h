@@ -227,9 +227,11 @@ struct process {
 	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
 	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
 	uint32_t filters;          /* ... its own, at the last check                  */
-	uint32_t main_filters;     /* ... of the main process                         */
-	struct chains *chains;     /* ... of its threads (state/filters.c)            */
-	pid_t init;                /* avckpt-init                                      */
+	/* Whether it has any of its own, and whether that is known since it was stopped. */
+	bool filters_own, filters_seen;
+	uint32_t main_filters; /* ... of the main process                         */
+	struct chains *chains; /* ... of its threads (state/filters.c)            */
+	pid_t init;            /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool heirs_vary;   /* inherited files changed in a freeze                    */
@@ -381,6 +383,9 @@ int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 /* A thread that just stopped: notes which call it is in.  If only we have interrupted that, sets
  * the thread to repeat it, or to return its timeout's result when its time is up. */
 void rewind_call(struct process *process, struct thread *thread);
+/* Before it is released: the same where its filter bars the call by which the kernel would continue
+ * the interrupted one. */
+void rewind_continued(struct process *process, struct thread *thread);
 /* Just before it continues: subtracts the duration of the stop from a remaining timeout. */
 void rewind_count_stop(const struct process *process, const struct thread *thread);
 /* Registers as the app had them, before rewind_call() marked the call or the kernel replaced it by
@@ -408,6 +413,8 @@ bool seccomp_is_confined(void);
 bool seccomp_must_suspend(void);
 /* Whether a task has no more filters than its container. */
 bool seccomp_is_containers(const struct proc_status *status, uint32_t containers);
+/* Whether a filter of this (stopped) thread prevents restart_syscall(2). */
+bool seccomp_bars_restart(struct process *process, pid_t tid);
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
  * the PID of its process in its own namespace. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options) warn_unused;
