@@ -24,6 +24,9 @@ NETWORKS = since_linux(6, 11, "a namespace of a thread can be asked for")
 DISPATCH = since_linux(6, 4, "what a thread dispatches can be asked for")
 
 
+BWRAP = shutil.which("bwrap")
+
+
 LONG_S = 8.0
 """It is tried 6.4 s after the first time, and after as long again."""
 
@@ -223,6 +226,25 @@ def test_a_tracer_of_its_own(tmp_path: Path) -> None:
         os.kill(tracer, signal.SIGKILL)
         guard.wait("checkpoint", since=since)
         victim.wait_beats(20)
+
+
+@pytest.mark.skipif(not BWRAP, reason="no bubblewrap here")
+@pytest.mark.parametrize("options", ["", "--unshare-pid", "--unshare-all"])
+def test_a_sandbox_in_namespaces_of_its_own(options: str) -> None:
+    """bubblewrap: the program in it has a mount namespace, and perhaps others."""
+    command = [str(BWRAP), "--bind", "/", "/", *options.split(), "/bin/cat"]
+    with (
+        Init(command, pid1=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as init,
+        GuardProcess(config(0.02), [init.pid]) as guard,
+    ):
+        assert "has a mnt namespace of its own" in guard.wait("unprotected")["error"]["message"]
+        assert init.popen.stdin is not None
+        assert init.popen.stdout is not None
+        init.popen.stdin.write(b"it runs on\n")
+        init.popen.stdin.flush()
+        assert init.popen.stdout.readline() == b"it runs on\n"
+        init.popen.stdin.close()
+        assert init.popen.wait(PATIENCE_S) == 0
 
 
 class Tracer:
