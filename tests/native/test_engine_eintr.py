@@ -84,10 +84,11 @@ def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, 
         assert seen.counter[1] == 0
 
 
-def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
+@pytest.mark.parametrize("under", UNDER)
+def test_a_timeout_survives_a_restore(under: str, tmp_path: Path) -> None:
     """It starts again with its full length at most: never early, and never without an end."""
     with (
-        Victim("eintr all 0.5 --quiet --late 2", tmp_path) as victim,
+        Victim(f"{under}eintr all 0.5 --quiet --late 2", tmp_path) as victim,
         GuardProcess(config(0.05), [victim.pid]) as guard,
     ):
         guard.wait("checkpoint", count=3)
