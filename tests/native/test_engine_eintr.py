@@ -21,6 +21,8 @@ LONGEST, PUNCTUAL = 3, 7
 KINDS_AT = 8
 KINDS, TIMED = 43, 33
 """Kinds of calls in eintr.c, all registers checked at each; how many of them have a timeout and are part of "all"."""
+UNDER = ("", "under killing ")
+"""Without a filter, and under one that kills whom the kernel lets continue a call as restart_syscall(2)."""
 UNWOKEN = {9, 10, 11, 19, 22, 38}
 """Places on the board of kinds that nothing wakes: the three sleeps; and those that "all" leaves out."""
 
@@ -32,10 +34,11 @@ def built(init_built: None, victims_built: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-def test_no_eintr_over_hundreds_of_checkpoints(tmp_path: Path) -> None:
+@pytest.mark.parametrize("under", UNDER)
+def test_no_eintr_over_hundreds_of_checkpoints(under: str, tmp_path: Path) -> None:
     """One process with a thread blocked in each call; every checkpoint interrupts all of them."""
     # Above clone's way: one generation, so that the cost is the freeze and not the bookkeeping.
-    with Victim("eintr all 0", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
+    with Victim(f"{under}eintr all 0", tmp_path) as victim, GuardProcess(config(keep=1), [victim.pid]) as guard:
         taken = 0
         while taken < CHECKPOINTS:
             # Some may miss their deadline on a busy machine.
@@ -60,13 +63,14 @@ def test_a_signal_ends_a_call_whenever_it_comes(tmp_path: Path) -> None:
         assert min(ended) > ROUSING // 20, ended
 
 
+@pytest.mark.parametrize("under", UNDER)
 @pytest.mark.parametrize(("seconds", "interval_s", "late_s"), [(2.0, 0.1, 0.4), (3.0, 0.01, 0.4), (0.3, 0.02, 0.4)])
-def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, tmp_path: Path) -> None:
+def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, under: str, tmp_path: Path) -> None:
     """A checkpoint does not restart a relative timeout, and none ends early (the victim checks that)."""
     # An interval, where the scheduler has moved a thread to another CPU and nobody knows how long it has been
     # waiting.  The rest is for a busy machine, and less than what a wait that forgets the time it was stopped
     # adds up to in the second case.
-    command = f"eintr all {seconds} --quiet --late {late_s * SLOWNESS}"
+    command = f"{under}eintr all {seconds} --quiet --late {late_s * SLOWNESS}"
     with Victim(command, tmp_path) as victim, GuardProcess(config(interval_s), [victim.pid]) as guard:
         guard.wait("checkpoint")
         victim.board.set_counter(PUNCTUAL, 1)  # what is begun from now on
@@ -80,10 +84,11 @@ def test_timeouts_end_on_time(seconds: float, interval_s: float, late_s: float, 
         assert seen.counter[1] == 0
 
 
-def test_a_timeout_survives_a_restore(tmp_path: Path) -> None:
+@pytest.mark.parametrize("under", UNDER)
+def test_a_timeout_survives_a_restore(under: str, tmp_path: Path) -> None:
     """It starts again with its full length at most: never early, and never without an end."""
     with (
-        Victim("eintr all 0.5 --quiet --late 2", tmp_path) as victim,
+        Victim(f"{under}eintr all 0.5 --quiet --late 2", tmp_path) as victim,
         GuardProcess(config(0.05), [victim.pid]) as guard,
     ):
         guard.wait("checkpoint", count=3)

@@ -1,15 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * sandbox [--kill] [--late]: puts itself under a seccomp filter that allows little more than
- * sleeping and looking at the clock; anything else is EPERM, with --kill the end.  Two
- * threads see that the filter holds.  With --late it does so when it gets SIGUSR1, and counts
- * in counter 1 that it has.
+ * sleeping and looking at the clock; anything else is EPERM, with --kill the end, even the call by
+ * which the kernel continues a sleep, restart_syscall(2).  Two threads see that the filter holds.
+ * With --late it does so when it gets SIGUSR1, counts in counter 1 that it has, and allows that one
+ * call: a thread may be on its way back to its sleep when another one installs the filter for it.
  */
 #include <pthread.h>
 
 #include "confine.h"
 
-static bool kills;
+static bool kills, late;
 static volatile bool started, confined;
 static bool wanted;
 
@@ -18,7 +19,7 @@ static void confine(void)
 	struct sock_filter filter[] = {
 		BPF_STMT(BPF_LD | BPF_W | BPF_ABS, offsetof(struct seccomp_data, nr)),
 		ALLOW(SYS_clock_nanosleep),
-		ALLOW(SYS_restart_syscall),
+		ALLOW(late ? SYS_restart_syscall : SYS_clock_nanosleep),
 		ALLOW(SYS_clock_gettime),
 		ALLOW_HOMEWARD,
 		ALLOW(SYS_write),
@@ -69,7 +70,8 @@ int main(int argc, char **argv)
 	sigset_t asked;
 
 	kills = victim_flag(&argc, argv, "--kill");
-	wanted = !victim_flag(&argc, argv, "--late");
+	late = victim_flag(&argc, argv, "--late");
+	wanted = !late;
 	victim_start(&argc, argv, 0, "[--kill] [--late]");
 	sigemptyset(&asked);
 	sigaddset(&asked, SIGUSR1);

@@ -9,6 +9,8 @@
  *   no-sigprocmask refuses rt_sigprocmask(2)
  *   no-sigreturn   refuses rt_sigreturn(2)
  *   kill-sigprocmask, kill-sigreturn: kill the process that calls it
+ *   killing        kills a process that makes the call by which the kernel continues a sleep,
+ *                  restart_syscall(2), which few programs know of
  */
 #include <errno.h>
 #include <linux/filter.h>
@@ -42,6 +44,7 @@ static const struct kind {
 	{ "no-sigreturn", EPERM_IT, { SYS_rt_sigreturn } },
 	{ "kill-sigprocmask", SECCOMP_RET_KILL_PROCESS, { SYS_rt_sigprocmask } },
 	{ "kill-sigreturn", SECCOMP_RET_KILL_PROCESS, { SYS_rt_sigreturn } },
+	{ "killing", SECCOMP_RET_KILL_PROCESS, { SYS_restart_syscall } },
 };
 
 static const struct kind *find(const char *name)

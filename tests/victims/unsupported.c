@@ -31,9 +31,6 @@
  *   dropped   one thread of another user, and the main thread has become a third one's
  *   vfork     a thread waits for a child that never executes a program (vfork(2))
  *   vdso      a child of a process that has unmapped its vDSO since
- *   shared-files, shared-folder   a child process with the descriptors, or the working
- *             directory, of its parent
- *   orphan-files, orphan-folder   the same of a grandchild whose parent has ended
  *   siblings-files   two child processes with the same descriptors, which are not their parent's
  *   dispatch  its system calls are dispatched by itself, and while it makes none are blocked
  *             (PR_SET_SYSCALL_USER_DISPATCH)
@@ -463,36 +460,6 @@ static bool start_vdso(void)
 		pause();
 }
 
-static bool start_shared_files(void)
-{
-	return start_child(CLONE_FILES);
-}
-
-static bool start_shared_folder(void)
-{
-	return start_child(CLONE_FS);
-}
-
-/* Its own parent has ended. */
-static bool start_grandchild(unsigned long flags)
-{
-	const long child = syscall(SYS_clone, flags | SIGCHLD, 0, 0, 0, 0);
-
-	if (!child)
-		_exit(!start_child(flags));
-	return child > 0 && waitpid((pid_t)child, NULL, 0) == child;
-}
-
-static bool start_orphan_files(void)
-{
-	return start_grandchild(CLONE_FILES);
-}
-
-static bool start_orphan_folder(void)
-{
-	return start_grandchild(CLONE_FS);
-}
-
 /* Two children with the descriptors that were their parent's, which has its own now. */
 static bool start_siblings_files(void)
 {
@@ -677,11 +644,7 @@ static const struct kind {
 	{ "user", start_user, NULL },
 	{ "dropped", start_dropped, NULL },
 	{ "vfork", start_vfork, NULL },
-	{ "shared-files", start_shared_files, NULL },
 	{ "vdso", start_vdso, NULL },
-	{ "shared-folder", start_shared_folder, NULL },
-	{ "orphan-files", start_orphan_files, NULL },
-	{ "orphan-folder", start_orphan_folder, NULL },
 	{ "siblings-files", start_siblings_files, NULL },
 	{ "dispatch", start_dispatch, stop_dispatch },
 	{ "limited", start_limited, stop_limited },

@@ -146,8 +146,9 @@ uint32_t generation_threads(const struct generation *generation);
 /* The first thing that could not be read, or cannot be restored. */
 const struct avc_error *generation_notice(const struct generation *generation);
 int generation_files_error(const struct generation *generation, struct avc_error *err) warn_unused;
-/* Closes what the template of a process that has ended still has open. */
-void generation_close_files(const struct image *image);
+/* Closes what the template of a process that has ended still has open; or leaves it to one that
+ * shares the table, and lives. */
+void generation_close_files(const struct image *image, bool shared);
 /* The same for all processes but the main one, once they are restored and have descriptors of their
  * own: before they continue, because what they close must be closed. */
 void generation_close_tables(const struct generation *generation);

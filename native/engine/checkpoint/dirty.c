@@ -173,7 +173,9 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 		return attempt->fork;
 	if (memory_needs_fork(process))
 		return AVC_FORK_MEMORY;
-	if (has_pinned(process->pid) || files_may_pin(process->files_before))
+	/* Those of a table that it shares are not known here. */
+	if (process->shared & CLONE_FILES || has_pinned(process->pid) ||
+	    files_may_pin(process->files_before))
 		return AVC_FORK_PINNED;
 	return AVC_FORK_NONE;
 }

@@ -116,6 +116,7 @@ static int make_images(const struct tree *tree, struct generation *generation,
 			continue;
 		*image = (struct image){
 			.process = entry->process,
+			.shared = entry->process ? entry->process->shared : 0,
 			.parent = entry->parent == PARENT_INIT ? PARENT_INIT : index[entry->parent],
 			.pidfd = -1,
 			.slot = slot,

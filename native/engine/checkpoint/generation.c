@@ -356,14 +356,14 @@ int generation_finish(struct generation *generation, struct avc_error *err)
 	return 0;
 }
 
-void generation_close_files(const struct image *image)
+void generation_close_files(const struct image *image, bool shared)
 {
 	const struct parasite *parasite = &image->process->parasite;
 	struct inj_call *call = &parasite_slot(parasite, image->slot)->template_call;
 	struct avc_error ignored = { 0 };
 
 	call_begin(call, INJ_AFTER_PARK);
-	call_add(call, SYS_close_range, 0, ~0u);
+	call_add(call, SYS_close_range, 0, ~0u, shared ? CLOSE_RANGE_UNSHARE : 0);
 	if (parasite_send(parasite, image->template, &image->base, call, &ignored) ||
 	    parasite_run(image->template, call, &ignored))
 		return; /* it was killed, and has nothing open any more */
@@ -386,9 +386,14 @@ void generation_close_tables(const struct generation *generation)
 	bool closing[PROCESSES_MAX] = { false };
 
 	for (uint32_t i = 1; i < generation->images; i++) {
-		struct process *process = generation->image[i].process;
+		const struct image *image = &generation->image[i];
+		const uint32_t owner = image_table_owner(generation->image, i);
+		struct process *process = image->process;
 
-		closing[i] = process && process->holder && start_closing(process);
+		/* The main process has its old one again; others have left theirs. */
+		closing[i] = process && process->holder &&
+			     (owner == i || (owner && !generation->image[owner].process->holder)) &&
+			     start_closing(process);
 	}
 	for (uint32_t i = 1; i < generation->images; i++) {
 		struct process *process = generation->image[i].process;

@@ -109,8 +109,19 @@ int restore_plan_check(const struct generation *generation, struct avc_error *er
 	struct place place[PROCESSES_MAX];
 	int result = places_find(generation, place, err);
 
-	for (uint32_t i = 1; !result && i < generation->images; i++)
-		generation->image[i].host = place[i].memory;
+	for (uint32_t i = 1; !result && i < generation->images; i++) {
+		struct image *image = &generation->image[i];
+
+		image->host = place[i].memory;
+		/* Shared with that one, and not with a keeper that begins a session again. */
+		if (image->shared &&
+		    (image->host != (image->parent < 0 ? 0 : (uint32_t)image->parent) ||
+		     place[i].renewed))
+			result = fail(err, AVC_UNSUPPORTED, 0, image->pid, "check", "",
+				      "process %d shares its descriptor table, or directories, "
+				      "with one that could not fork it in its session",
+				      image->inside);
+	}
 	for (uint32_t i = 1; !result && i < generation->images; i++) {
 		const struct image *image = &generation->image[i];
 		const struct image *host = &generation->image[place[i].memory];

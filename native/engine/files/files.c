@@ -17,6 +17,7 @@
 #include <linux/major.h>
 #include <linux/videodev2.h>
 #include <poll.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -1281,6 +1282,14 @@ int files_prepare(struct process *process, const struct process *parent, struct 
 
 	files_free(process->files_image);
 	process->files_image = NULL;
+	if (process->shared & CLONE_FILES) {
+		files_free(process->files_before);
+		process->files_before = NULL;
+		process->files_image = files_new(1); /* they are its parent's */
+		return process->files_image ? 0
+					    : fail_errno(err, process->pid, "look at descriptors",
+							 "calloc", "out of memory");
+	}
 	before = look_before(process, parent, err);
 	if (!before)
 		return -1;
@@ -1314,6 +1323,8 @@ static void look_frozen(struct image *image, const struct image *parent, bool se
 	files->parent_pid = parent ? parent->process->pid : 0;
 	files->ours = ours;
 	files->process = process;
+	if (image->shared & CLONE_FILES)
+		return;
 	if (files_look(files, &owner, FILES_FROZEN, process->files_before, &image->files_error))
 		return;
 	find_owners(process, files);

@@ -5,6 +5,7 @@
  * restored once.
  */
 #include <fcntl.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -550,10 +551,13 @@ int files_restore(struct image *image, uint32_t images, const struct avc_config 
 		/* The table of one that had exited before is gone. */
 		const bool held = process && process->descendant;
 
-		if (!process)
+		if (!process || image[i].shared & CLONE_FILES)
 			continue;
 		tables.work[tables.count++] = (struct files_work){
-			.host = held ? work_of(&tables, image[image[i].host].process) : NULL,
+			.host = held ? work_of(&tables,
+					       image[image_table_owner(image, image[i].host)]
+						       .process)
+				     : NULL,
 			.process = image[i].process,
 			.image = &image[i],
 			.config = config,

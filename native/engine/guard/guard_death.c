@@ -92,6 +92,7 @@ static void adopt_family(struct avc_guard *guard, const struct generation *gener
 				    process_open(process, image->pid, image->inside, &gone) == 0;
 		if (process->infected)
 			process->start = stat.start;
+		process->shared = image->shared;
 	}
 	tree->count = 0;
 	guard->main.childless = generation->images == 1;

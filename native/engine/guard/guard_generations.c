@@ -202,13 +202,30 @@ void guard_kill_lost(struct avc_guard *guard)
 		guard->tree.process[i]->lost = false;
 }
 
+/* Also one that has been made since the last checkpoint, and whose parent has ended. */
+static bool shares_table(const struct avc_guard *guard, pid_t template)
+{
+	pid_t children[CHILDREN_MAX];
+	const int count = proc_children(guard->channel.init, children, CHILDREN_MAX);
+
+	for (uint32_t i = 0; i < guard->tree.processes; i++)
+		if (guard->tree.process[i]->pid &&
+		    proc_shares(template, guard->tree.process[i]->pid, SHARED_FILES) == 1)
+			return true;
+	for (int i = 0; i < count; i++)
+		if (proc_shares(template, children[i], SHARED_FILES) == 1 &&
+		    !guard_owns(children[i], guard))
+			return true;
+	return false;
+}
+
 void guard_release(struct avc_guard *guard, struct process *process)
 {
 	for (uint32_t i = 0; i < guard->count; i++) {
 		const struct image *image = generation_image(&guard->generations[i], process);
 
 		if (image)
-			generation_close_files(image);
+			generation_close_files(image, shares_table(guard, image->template));
 	}
 	dirty_forget(&guard->dirty, process);
 	tree_let_go(process);

@@ -100,6 +100,7 @@ void process_stop_begin(struct process *process)
 		process->threads[i].block = -1;
 	}
 	process->stage = FREEZE_RUNS;
+	process->filters_seen = false;
 }
 
 /* Until all are stopped, because threads create threads meanwhile: a walk finds them. */
@@ -165,6 +166,7 @@ int process_stop(struct process *process, struct avc_error *err)
 
 void process_let_go(struct process *process)
 {
+	process->filters_seen = false; /* they may have got some while they were being stopped */
 	for (uint32_t i = 0; i < process->thread_count; i++)
 		if (is_real_time(&process->threads[i]))
 			thread_let_go(process, &process->threads[i]);

@@ -6,6 +6,7 @@
 #include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -277,24 +278,41 @@ static int look_at(const struct tree *tree, pid_t pid, struct proc_stat *stat)
 	return proc_stat(pid, stat);
 }
 
-/* clone(2): two share what they open, or where they go.  Restored ones would have separate tables
- * and directories, and what the templates of one that has ended close would be closed for the
- * other.  It need not be parent and child: the parent may have ended, or left the table to its
- * children.  Only a clone shares, so a new process is compared with all that are known. */
-static int check_sharing(struct tree *tree, const struct tree_entry *entry, struct avc_error *err)
+/* It shares with another one for so short a time that a guard may have left it behind when it died
+ * just now, as a porter or clone. */
+static bool may_be_left(struct tree *tree, pid_t pid)
 {
-	const struct process *parent = entry->parent >= 0 ? tree->entry[entry->parent].process
-							  : NULL;
+	if (tree->sharer != pid) {
+		tree->sharer = pid;
+		tree->sharer_since_ns = now_ns();
+	}
+	return now_ns() - tree->sharer_since_ns < SHARER_NS;
+}
 
+/* clone(2): two share what they open, or where they go.  A restored one can only share with the
+ * process that forks it: its parent, or for an orphan the main process.  That need not be the other
+ * one: its parent may have ended, or left the table to its children.  Only a clone shares, so a new
+ * process is compared with all that are known. */
+static int check_sharing(struct tree *tree, const struct tree_entry *entry, uint64_t *shared,
+			 struct avc_error *err)
+{
+	const struct process *parent = tree->entry[entry->parent < 0 ? 0 : entry->parent].process;
+	/* With its memory, it may be a porter. */
+	const bool may_share = parent && !proc_same_memory(entry->pid, parent->leader);
+	const bool files = may_share && proc_shares(entry->pid, parent->leader, SHARED_FILES) == 1,
+		   folders = may_share &&
+			     proc_shares(entry->pid, parent->leader, SHARED_FOLDERS) == 1;
+
+	*shared = (files ? CLONE_FILES : 0) | (folders ? CLONE_FS : 0);
 	for (uint32_t i = 0; i < tree->processes; i++) {
 		const pid_t other = tree->process[i]->leader;
 		const char *what = NULL;
 
 		if (other == entry->pid) /* it had that number before */
 			continue;
-		if (proc_shares(entry->pid, other, SHARED_FILES) == 1)
+		if (!files && proc_shares(entry->pid, other, SHARED_FILES) == 1)
 			what = "descriptor table (CLONE_FILES)";
-		else if (proc_shares(entry->pid, other, SHARED_FOLDERS) == 1)
+		else if (!folders && proc_shares(entry->pid, other, SHARED_FOLDERS) == 1)
 			what = "working directory (CLONE_FS)";
 		/* Two that are just ending have none; and holders and templates of a guard that died
 		 * share theirs until the kernel has ended them. */
@@ -305,19 +323,28 @@ static int check_sharing(struct tree *tree, const struct tree_entry *entry, stru
 			return fail(err, AVC_RETRY, 0, entry->pid, "look at processes", "kcmp",
 				    "process %d shares its memory with process %d",
 				    proc_inside(entry->pid), proc_inside(other));
-		/* It may be a porter or clone that a guard has left behind when it died just now. */
-		if (tree->sharer != entry->pid) {
-			tree->sharer = entry->pid;
-			tree->sharer_since_ns = now_ns();
-		}
-		return fail(err,
-			    now_ns() - tree->sharer_since_ns < SHARER_NS ? AVC_RETRY
-									 : AVC_UNSUPPORTED,
-			    0, entry->pid, "look at processes", "",
-			    "process %d shares its %s with process %d", proc_inside(entry->pid),
-			    what, proc_inside(other));
+		return fail(err, may_be_left(tree, entry->pid) ? AVC_RETRY : AVC_UNSUPPORTED, 0,
+			    entry->pid, "look at processes", "",
+			    "process %d shares its %s with process %d, which is not its parent",
+			    proc_inside(entry->pid), what, proc_inside(other));
 	}
 	return 0;
+}
+
+/* One that shared, and may not any more. */
+static int check_shared(struct tree *tree, const struct tree_entry *entry, struct avc_error *err)
+{
+	const uint64_t before = entry->process->shared;
+
+	if (!before)
+		return 0;
+	if (check_sharing(tree, entry, &entry->process->shared, err))
+		return -1;
+	return entry->process->shared == before
+		       ? 0
+		       : fail(err, AVC_RETRY, 0, entry->pid, "look at processes", "kcmp",
+			      "process %d shares no longer with its parent",
+			      proc_inside(entry->pid));
 }
 
 int tree_scan(struct tree *tree, struct avc_error *err)
@@ -345,11 +372,19 @@ int tree_scan(struct tree *tree, struct avc_error *err)
 		}
 		if (i) {
 			entry->process = find_process(tree, entry->pid, stat.start);
+			if (entry->process && check_shared(tree, entry, err))
+				return -1;
 			if (!entry->process) {
 				struct avc_error gone = { 0 };
+				uint64_t shared;
 
-				if (check_sharing(tree, entry, err))
+				if (check_sharing(tree, entry, &shared, err))
 					return -1;
+				if (shared && entry->parent < 0 && may_be_left(tree, entry->pid))
+					return fail(err, AVC_RETRY, 0, entry->pid,
+						    "look at processes", "kcmp",
+						    "process %d may be ending",
+						    proc_inside(entry->pid));
 				entry->process = add_process(tree, entry->pid, stat.start, &gone);
 				if (!entry->process && gone.code != AVC_GONE) {
 					*err = gone;
@@ -359,6 +394,7 @@ int tree_scan(struct tree *tree, struct avc_error *err)
 					entry->ending = true;
 					continue;
 				}
+				entry->process->shared = shared;
 			}
 		}
 		/* Thread by thread only if the last checkpoint did not find that it has no child: a

@@ -87,7 +87,7 @@ static int give_file(const struct remap *r, struct syscall_batch *batch, const s
 	if (m && *given && m->device == (*given)->device && m->inode == (*given)->inode &&
 	    !m->shared && !(*given)->shared)
 		return 0;
-	if (*given && syscall_batch_ask(batch, err, SYS_close, 1))
+	if (*given && syscall_batch_ask(batch, err, SYS_close, (uint64_t)batch->given))
 		return -1;
 	*given = m;
 	if (!m)
@@ -166,7 +166,7 @@ static int map_piece(const struct remap *r, struct syscall_batch *batch, const s
 					 (uint64_t)(flags | MAP_ANONYMOUS | growing), (uint64_t)-1);
 	return give_file(r, batch, m, given, err) ||
 			       syscall_batch_ask(batch, err, SYS_mmap, piece->start, bytes, prot,
-						 (uint64_t)flags, 1,
+						 (uint64_t)flags, (uint64_t)batch->given,
 						 m->offset + (piece->start - m->start)) ||
 			       attach(r, batch, piece, err)
 		       ? -1

@@ -25,6 +25,7 @@ struct birth {
 	struct forked *by;   /* that one, or a keeper of it                          */
 	pid_t number;
 	int exit_signal;
+	uint64_t shared; /* struct image                                      */
 	bool orphan;
 	/* A child of the host, fresh from fork(2), which gives its memory to this one; 0: none. */
 	pid_t copy;
@@ -32,6 +33,11 @@ struct birth {
 	void (*meanwhile)(void *arg);
 	void *arg;
 };
+
+static uint64_t flags_of(const struct birth *birth)
+{
+	return ((uint64_t)birth->exit_signal & CSIGNAL) | birth->shared;
+}
 
 void restore_fork_note(struct forked *parent, int exit_signal)
 {
@@ -83,7 +89,7 @@ static uint32_t children_of(const struct restore_tree *restored, const struct fo
 }
 
 /* It begins a list of forks, or goes on with it. */
-static int list_fork(const struct restore_tree *restored, struct forked *host, int exit_signal,
+static int list_fork(const struct restore_tree *restored, struct forked *host, uint64_t flags,
 		     struct fd_channel *passed, struct avc_error *err)
 {
 	struct syscall_batch *by = &host->batch;
@@ -110,7 +116,7 @@ static int list_fork(const struct restore_tree *restored, struct forked *host, i
 		call_add(runner, SYS_close, (uint64_t)host->passed);
 	host->passed = -1;
 	syscall_batch_pass_socket(&host->channel, by->parasite, runner, passed);
-	call_add(runner, SYS_clone, (uint64_t)exit_signal & CSIGNAL);
+	call_add(runner, SYS_clone, flags);
 	host->calls += FORK_CALLS;
 	return 0;
 }
@@ -124,7 +130,7 @@ static int fork_next(const struct birth *birth, struct forked *forked, struct av
 	const struct inj_call *runner = &host->batch.parasite->control->runner;
 	const bool follows = restored->last_number && restored->last_number + 1 == birth->number;
 
-	if (list_fork(restored, host, birth->exit_signal, &forked->inherited, err) ||
+	if (list_fork(restored, host, flags_of(birth), &forked->inherited, err) ||
 	    (!follows && last_pid_set(restored->restore->helper, birth->number - 1, err)))
 		return -1;
 	/* Unless another task is cloned meanwhile (restore_fork_keeper()). */
@@ -187,14 +193,15 @@ static int fork_once(const struct birth *birth, pid_t *child, struct avc_error *
 
 	restored->last_number = 0;
 	/* An orphan's parent has exited: so does an intermediate one. */
-	if (birth->orphan && clone_task(by, runner, CLONE_VM | CLONE_FILES, NULL, &from.pid, err))
+	if (birth->orphan &&
+	    clone_task(by, runner, CLONE_VM | CLONE_FILES | birth->shared, NULL, &from.pid, err))
 		return -1;
 	if (birth->copy)
 		from.pid = birth->copy;
 	result = (!follows && last_pid_set(restored->restore->helper, birth->number - 1, err)) ||
 		 clone_task(&from, runner,
-			    ((uint64_t)birth->exit_signal & CSIGNAL) |
-				    (birth->copy ? CLONE_VM : 0) | (sibling ? CLONE_PARENT : 0),
+			    flags_of(birth) | (birth->copy ? CLONE_VM : 0) |
+				    (sibling ? CLONE_PARENT : 0),
 			    birth, child, err);
 	if (birth->orphan && take_back(by, from.pid, err))
 		return -1;
@@ -307,8 +314,8 @@ int restore_fork_keeper(struct restore_tree *restored, uint32_t index, pid_t ses
 		return -1;
 
 	if (syscall_batch_flush(batch, err) ||
-	    clone_task(batch, &batch->parasite->control->runner, CLONE_VM | CLONE_FILES | SIGCHLD,
-		       NULL, &pid, err))
+	    clone_task(batch, &batch->parasite->control->runner,
+		       CLONE_VM | CLONE_FILES | CLONE_FS | SIGCHLD, NULL, &pid, err))
 		return -1;
 	return add_keeper(restored, index, session, pid, err) ? 0 : -1;
 }
@@ -401,6 +408,7 @@ int restore_fork(struct restore_tree *restored, uint32_t index, void (*meanwhile
 			       .host = &restored->forked[place->host],
 			       .number = image->inside,
 			       .exit_signal = image->exit_signal,
+			       .shared = image->shared,
 			       .orphan = image->parent == PARENT_INIT,
 			       .meanwhile = meanwhile,
 			       .arg = arg };

@@ -101,6 +101,14 @@ static int make_zombie(struct forked *forked, const struct image *image, struct 
 	}
 }
 
+/* The process whose descriptor table it has. */
+static const struct image *owner_of(const struct restore_tree *restored, uint32_t index)
+{
+	const struct image *image = restored->generation->image;
+
+	return &image[image_table_owner(image, index)];
+}
+
 /* Session and group before it has children of its own.  Those inherited from its parent are usually
  * right. */
 static int place(struct restore_tree *restored, uint32_t index, struct avc_error *err)
@@ -127,9 +135,10 @@ static int place(struct restore_tree *restored, uint32_t index, struct avc_error
 }
 
 /* The leader of a session gets its terminal before it has children, which inherit it. */
-static void take_terminal(struct syscall_batch *batch, const struct image *image)
+static void take_terminal(struct syscall_batch *batch, const struct image *image,
+			  const struct files *files)
 {
-	const int fd = files_find_device(image->files, image->stat.tty);
+	const int fd = files_find_device(files, image->stat.tty);
 
 	if (!image->stat.tty || image->session != image->inside)
 		return;
@@ -139,9 +148,9 @@ static void take_terminal(struct syscall_batch *batch, const struct image *image
 
 /* Restores the foreground group; any process in the session can do it. */
 static int put_foreground(struct syscall_batch *batch, const struct image *image,
-			  struct avc_error *err)
+			  const struct files *files, struct avc_error *err)
 {
-	const int fd = files_find_device(image->files, image->stat.tty);
+	const int fd = files_find_device(files, image->stat.tty);
 	avc_remote remote;
 	pid_t *group = syscall_batch_data(batch, &remote);
 
@@ -214,9 +223,14 @@ static int move_in(struct restore_tree *restored, uint32_t index, struct avc_err
 	struct forked *forked = &restored->forked[index];
 	struct syscall_batch *batch = &forked->batch;
 
-	return restore_fork_await(forked, err) || lie_down(restored, index, err) ||
-			       syscall_batch_open_fd_channel(batch, &forked->inherited,
-							     &image->table, err) ||
+	if (restore_fork_await(forked, err) || lie_down(restored, index, err))
+		return -1;
+	if (image->shared & CLONE_FILES)
+		close_fd(&forked->inherited.ours);
+	return (image->shared & CLONE_FILES
+			? syscall_batch_make_fd_channel(batch, err)
+			: syscall_batch_open_fd_channel(batch, &forked->inherited, &image->table,
+							err)) ||
 			       syscall_batch_map_parasite(batch, &image->process->parasite, err)
 		       ? -1
 		       : 0;
@@ -240,12 +254,15 @@ static int fill(struct restore_tree *restored, uint32_t index, struct avc_error 
 	const struct image *image = &restored->generation->image[index];
 	struct syscall_batch *batch = &restored->forked[index].batch;
 	const struct remap *plan = restore_plan_of(restored->generation, index, err);
+	const bool shared = image->shared & CLONE_FILES;
 
 	if (!plan || remap_fill(plan, batch, restored->copier, err) ||
 	    process_attrs_put(batch, image, err) || place(restored, index, err) ||
-	    syscall_batch_put_files(batch, &image->table, err))
+	    (!shared && syscall_batch_put_files(batch, &image->table, err)))
 		return -1;
-	take_terminal(batch, image);
+	if (shared)
+		syscall_batch_close_fd_channel(batch);
+	take_terminal(batch, image, owner_of(restored, index)->files);
 	return 0;
 }
 
@@ -362,7 +379,7 @@ static int make_one(struct restore_tree *restored, uint32_t index, struct avc_er
 		return -1;
 	}
 	if (image->process) {
-		process_attrs_lift_limits(forked->pid, image, files_of(image));
+		process_attrs_lift_limits(forked->pid, image, files_of(owner_of(restored, index)));
 		forked->stage = STAGE_FORKED;
 		return 0;
 	}
@@ -436,7 +453,7 @@ static int begin_main(struct restore_tree *restored, struct avc_error *err)
 	/* The group may have been led by one of its own processes, or by one that is gone. */
 	if (!slot->session_leader)
 		syscall_batch_soften(batch, NULL);
-	take_terminal(batch, image);
+	take_terminal(batch, image, image->files);
 	if (syscall_batch_flush(batch, err))
 		return -1;
 	if (image->group > 0 && image->group != image->inside) {
@@ -465,7 +482,8 @@ static int join_up(struct restore_tree *restored, struct avc_error *err)
 		const struct image *image = &generation->image[i];
 
 		if (image->process && (i == 0 || image->session == image->inside) &&
-		    put_foreground(&restored->forked[i].batch, image, err))
+		    put_foreground(&restored->forked[i].batch, image, owner_of(restored, i)->files,
+				   err))
 			return -1;
 	}
 	for (uint32_t i = 0; i < generation->images; i++)
@@ -505,7 +523,10 @@ int restore_tree_make(struct restore_tree *restored, struct avc_error *err)
 
 			if (restored->forked[i].pid || restored->forked[host].stage != STAGE_WHOLE)
 				continue;
-			if (make_one(restored, i, err))
+			/* While it uses its parent's table, nobody else does. */
+			if (make_one(restored, i, err) ||
+			    (generation->image[i].shared & CLONE_FILES &&
+			     make_whole(restored, err)))
 				return -1;
 			left--;
 		}

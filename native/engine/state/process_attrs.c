@@ -310,8 +310,8 @@ static int enter(struct syscall_batch *batch, pid_t template, const char *name,
 		return -1;
 	}
 	close(folder);
-	syscall_batch_add(batch, SYS_fchdir, 1);
-	syscall_batch_add(batch, SYS_close, 1);
+	syscall_batch_add(batch, SYS_fchdir, (uint64_t)batch->given);
+	syscall_batch_add(batch, SYS_close, (uint64_t)batch->given);
 	return 0;
 }
 

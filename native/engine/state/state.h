@@ -24,6 +24,7 @@ struct image {
 	struct process *process; /* NULL: it was a zombie */
 	int parent;              /* the place of its parent's image, or ...         */
 	uint32_t host;           /* the same for the one that forks it in a restore */
+	uint64_t shared;         /* struct process; with that one                   */
 	pid_t inside;
 	/* Its session and group, and the foreground group of its terminal; inside, 0: outside of
 	 * the app, or not visible. */
@@ -71,6 +72,8 @@ struct image {
 
 /* ---- image.c ---------------------------------------------------------------------- */
 
+/* The place of the one whose descriptor table this has: its own, unless it shares that. */
+uint32_t image_table_owner(const struct image *image, uint32_t index);
 /* Among all images of a checkpoint; NULL: none. */
 struct image *image_find(struct image *image, uint32_t images, const struct process *process);
 

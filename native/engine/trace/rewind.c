@@ -28,6 +28,7 @@
  * The app's state is unchanged in either case.
  */
 #include <errno.h>
+#include <linux/futex.h>
 #include <string.h>
 #include <sys/ptrace.h>
 #include <sys/socket.h>
@@ -49,7 +50,7 @@
 #define SYS_poll SYS_ppoll
 #endif
 
-enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND };
+enum timeout { NO_TIMEOUT, MILLISECONDS, TIMESPEC, TIMEVAL, RECEIVE, SEND, SLEEP, FUTEX };
 
 /* Calls that return EINTR after a stop, have had no effect when they do, and may be repeated.
  * Never close(2). */
@@ -92,6 +93,15 @@ static const struct rewindable {
 	/* From a socket, or into one. */
 	{ SYS_splice, RECEIVE, 0, -EAGAIN },
 	{ SYS_splice, SEND, 2, -EAGAIN },
+};
+
+/* Calls that the kernel does not repeat but continues, as restart_syscall(2).  That may be the end of
+ * a thread whose filter does not know it (OpenSSH): there they are repeated, too. */
+static const struct rewindable continued[] = {
+	{ SYS_poll, MILLISECONDS, 2, 0 },
+	{ SYS_nanosleep, SLEEP, 0, 0 },
+	{ SYS_clock_nanosleep, SLEEP, 2, 0 },
+	{ SYS_futex, FUTEX, 3, -ETIMEDOUT },
 };
 
 /* ---- how long a call may take --------------------------------------------------------- */
@@ -157,6 +167,14 @@ static uint64_t time_of_call(const struct process *process, const struct arch_re
 	case RECEIVE:
 	case SEND:
 		return time_of_socket(process, (int)argument, call->timeout, answer);
+	case SLEEP: /* where the time left is written to the argument, that is what is repeated */
+		return argument == arch_syscall_arg(regs, call->argument + 1)
+			       ? 0
+			       : time_in_memory(process, argument, 1);
+	case FUTEX: /* others name the time when it is up */
+		return (arch_syscall_arg(regs, 1) & FUTEX_CMD_MASK) == FUTEX_WAIT
+			       ? time_in_memory(process, argument, 1)
+			       : 0;
 	case NO_TIMEOUT:
 		break;
 	}
@@ -175,12 +193,16 @@ static bool has_timeout(long nr)
 static bool look_up(const struct process *process, const struct arch_regs *regs, uint64_t *limit_ns,
 		    int *answer)
 {
+	const bool continues = arch_syscall_result(regs) == -ERESTART_RESTARTBLOCK;
+	const struct rewindable *calls = continues ? continued : rewindable;
+	const size_t count = continues ? sizeof continued / sizeof *continued
+				       : sizeof rewindable / sizeof *rewindable;
 	bool found = false;
 
 	*limit_ns = 0;
-	for (size_t i = 0; !*limit_ns && i < sizeof rewindable / sizeof *rewindable; i++)
-		if (rewindable[i].nr == arch_syscall_nr(regs)) {
-			*limit_ns = time_of_call(process, regs, &rewindable[i], answer);
+	for (size_t i = 0; !*limit_ns && i < count; i++)
+		if (calls[i].nr == arch_syscall_nr(regs)) {
+			*limit_ns = time_of_call(process, regs, &calls[i], answer);
 			found = true;
 		}
 	return found;
@@ -371,6 +393,15 @@ static void forget_error(const struct process *process, const struct arch_regs *
 	close(fd);
 }
 
+/* Whether we have to repeat its call, or nobody does. */
+static bool is_not_restarted(struct process *process, const struct thread *thread)
+{
+	const long result = arch_syscall_result(&thread->regs);
+
+	return result == -EINTR ||
+	       (result == -ERESTART_RESTARTBLOCK && seccomp_bars_restart(process, thread->tid));
+}
+
 /* Marks a call that returned EINTR after a stop, and computes when its time is up. */
 static void begin_watch(const struct process *process, struct thread *thread, uint64_t now)
 {
@@ -391,6 +422,28 @@ static void begin_watch(const struct process *process, struct thread *thread, ui
 	count_sleep(thread);
 }
 
+/* The result first: if the guard dies before the mark is set, the wait is too long, but does not
+ * fail. */
+static bool send_back(struct thread *thread)
+{
+	if (arch_result_set(thread->tid, -ERESTARTNOHAND))
+		return false;
+	arch_result_note(&thread->regs, -ERESTARTNOHAND);
+	thread->sent_back = true;
+	return arch_call_mark_set(thread->tid, &thread->regs, thread->rewound.mark) == 0;
+}
+
+static void end_or_watch(struct process *process, struct thread *thread, uint64_t now)
+{
+	struct rewound *r = &thread->rewound;
+
+	r->sleeps_known = false;
+	if (now >= r->due_ns)
+		answer_late(thread);
+	else if (r->due_ns < process->due_ns)
+		process->due_ns = r->due_ns;
+}
+
 void rewind_call(struct process *process, struct thread *thread)
 {
 	struct arch_regs *regs = &thread->regs;
@@ -406,27 +459,29 @@ void rewind_call(struct process *process, struct thread *thread)
 		return;
 	if (arch_syscall_nr(regs) == SYS_recvmmsg)
 		forget_error(process, regs);
-	if (arch_syscall_result(regs) == -EINTR) {
+	if (is_not_restarted(process, thread)) {
 		if (!is_rewound(thread))
 			begin_watch(process, thread, now);
-		/* The result first: if the guard dies before the mark is set, the wait is too long,
-		 * but does not fail. */
-		if (!r->mark || arch_result_set(thread->tid, -ERESTARTNOHAND))
+		if (!r->mark || !send_back(thread))
 			return; /* another call, or it was killed */
-		arch_result_note(regs, -ERESTARTNOHAND);
-		thread->sent_back = true;
-		if (arch_call_mark_set(thread->tid, regs, r->mark))
-			return;
 	} else if (arch_syscall_result(regs) != -ERESTARTNOHAND || !is_rewound(thread)) {
 		return;
 	} else { /* stopped again before it ran: nothing to change */
 		thread->sent_back = true;
 	}
-	r->sleeps_known = false;
-	if (now >= r->due_ns)
-		answer_late(thread);
-	else if (r->due_ns < process->due_ns)
-		process->due_ns = r->due_ns;
+	end_or_watch(process, thread, now);
+}
+
+/* Also now: another thread may have installed a filter for all while this one was stopped. */
+void rewind_continued(struct process *process, struct thread *thread)
+{
+	if (arch_syscall_nr(&thread->regs) < 0 ||
+	    arch_syscall_result(&thread->regs) != -ERESTART_RESTARTBLOCK ||
+	    !seccomp_bars_restart(process, thread->tid))
+		return;
+	begin_watch(process, thread, thread->stopped_ns);
+	if (thread->rewound.mark && send_back(thread))
+		end_or_watch(process, thread, now_ns());
 }
 
 /* When ppoll, pselect and select are interrupted, they write the remaining timeout to the app's

@@ -414,14 +414,21 @@ static bool hinders_trees(const struct program *p)
 	       refuses_any(p, wanted_for_trees, COUNT(wanted_for_trees));
 }
 
+/* Where the kernel would continue an interrupted call. */
+static bool bars_restart(const struct program *p)
+{
+	return verdict(p, SYS_restart_syscall, ANY) != PASSES;
+}
+
 /* The container's filters, as of the first thread that was looked at. */
 static struct {
-	bool known, hinder, hinder_watching;
+	bool known, hinder, hinder_watching, bar_restart;
 } containers_filters;
 
 static void note_containers(const struct program *p, bool barred)
 {
 	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || barred;
+	containers_filters.bar_restart |= bars_restart(p);
 	containers_filters.hinder_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
 					      PASSES;
 }
@@ -566,6 +573,33 @@ int seccomp_read(const struct process *process, struct thread *thread, struct av
 	thread->filters_known = i;
 	thread->seccomp = barred ? SECCOMP_SUPERVISED : less ? SECCOMP_LESS : SECCOMP_IN_FORCE;
 	return 0;
+}
+
+/* A guard that cannot read them assumes it of all that are not the container's. */
+static bool has_own(struct process *process)
+{
+	struct proc_status status;
+
+	if (!process->filters_seen)
+		process->filters_own = read_counts(process->pid, process->status_fd, &status) ==
+					       0 &&
+				       !seccomp_is_containers(&status, process->plain_filters);
+	process->filters_seen = true;
+	return process->filters_own;
+}
+
+bool seccomp_bars_restart(struct process *process, pid_t tid)
+{
+	struct program p;
+
+	if (containers_filters.bar_restart)
+		return true;
+	if (confined.is)
+		return has_own(process);
+	for (uint32_t i = process->plain_filters; (p.count = filter_get(tid, i, p.insn)) > 0; i++)
+		if (bars_restart(&p))
+			return true;
+	return errno == EMEDIUMTYPE; /* it cannot be read */
 }
 
 /* ---- supervision ---------------------------------------------------------------------------- */

@@ -277,13 +277,34 @@ static int close_others(struct syscall_batch *batch, uint64_t first, const struc
 	return syscall_batch_ask(batch, err, SYS_close_range, first, ~0u);
 }
 
-/* Descriptor 0 is a socket whose other end is ours. */
+/* A socket whose other end is ours; closes that there, too. */
+int syscall_batch_make_fd_channel(struct syscall_batch *batch, struct avc_error *err)
+{
+	avc_remote out;
+	const int *ends = syscall_batch_data(batch, &out);
+
+	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out);
+	if (syscall_batch_flush(batch, err))
+		return -1;
+	/* The lowest free number is that of the other end, then. */
+	batch->theirs = ends[0];
+	batch->given = ends[1];
+	batch->socket = fetch(batch, batch->given, err);
+	syscall_batch_add(batch, SYS_close, (uint64_t)batch->given);
+	return batch->socket < 0 ? -1 : 0;
+}
+
+void syscall_batch_close_fd_channel(struct syscall_batch *batch)
+{
+	syscall_batch_add(batch, SYS_close, (uint64_t)batch->theirs);
+}
+
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, struct fd_channel *inherited,
 				  const struct fd_table *table, struct avc_error *err)
 {
-	avc_remote out;
-
 	if (inherited->ours >= 0) {
+		batch->theirs = 0;
+		batch->given = 1;
 		batch->socket = inherited->ours;
 		inherited->ours = -1;
 		if (inherited->theirs)
@@ -291,15 +312,8 @@ int syscall_batch_open_fd_channel(struct syscall_batch *batch, struct fd_channel
 					  O_CLOEXEC);
 		return close_others(batch, 1, table, err);
 	}
-	(void)syscall_batch_data(batch, &out);
-	if (close_others(batch, 0, table, err))
-		return -1;
-	syscall_batch_add(batch, SYS_socketpair, AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, out);
-	if (syscall_batch_flush(batch, err))
-		return -1;
-	batch->socket = fetch(batch, 1, err);
-	syscall_batch_add(batch, SYS_close, 1);
-	return batch->socket < 0 ? -1 : 0;
+	return close_others(batch, 0, table, err) || syscall_batch_make_fd_channel(batch, err) ? -1
+											       : 0;
 }
 
 int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
@@ -375,7 +389,7 @@ static int hand_over(struct syscall_batch *batch, int socket, int fd, struct avc
 
 int syscall_batch_give(struct syscall_batch *batch, int fd, struct avc_error *err)
 {
-	return hand_over(batch, 0, fd, err);
+	return hand_over(batch, batch->theirs, fd, err);
 }
 
 int syscall_batch_map_parasite(struct syscall_batch *batch, const struct parasite *parasite,
@@ -384,13 +398,14 @@ int syscall_batch_map_parasite(struct syscall_batch *batch, const struct parasit
 	if (syscall_batch_give(batch, parasite->code_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base, INJ_CODE_BYTES, PARASITE_CODE_PROT,
-			  PARASITE_FLAGS, 1);
-	syscall_batch_add(batch, SYS_close, 1);
+			  PARASITE_FLAGS, (uint64_t)batch->given);
+	syscall_batch_add(batch, SYS_close, (uint64_t)batch->given);
 	if (syscall_batch_give(batch, parasite->data_fd, err))
 		return -1;
 	syscall_batch_add(batch, SYS_mmap, parasite->base + INJ_CODE_BYTES,
-			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS, 1);
-	syscall_batch_add(batch, SYS_close, 1);
+			  parasite->bytes - INJ_CODE_BYTES, PARASITE_DATA_PROT, PARASITE_FLAGS,
+			  (uint64_t)batch->given);
+	syscall_batch_add(batch, SYS_close, (uint64_t)batch->given);
 	return 0;
 }
 

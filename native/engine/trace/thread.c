@@ -211,6 +211,7 @@ void thread_release(struct process *process, struct thread *thread)
 		return;
 	if (thread->borrowed)
 		thread_give_back(thread, &ignored);
+	rewind_continued(process, thread);
 	end_call_by_signal(process, thread);
 	/* If this fails, SIGKILL has ended its stop: it has to be reaped. */
 	thread->attached = ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) != 0;
@@ -339,6 +340,7 @@ static bool straggle(struct process *process, struct thread *thread)
 			thread->borrowed = false;
 			thread->regs = now;
 			rewind_call(process, thread);
+			rewind_continued(process, thread);
 		}
 	}
 	if (ptrace(PTRACE_DETACH, tid, NULL, (long)(stop.kind == STOP_SIGNAL ? stop.signal : 0)))

@@ -207,6 +207,9 @@ struct process {
 	/* A thread died while it may have been cloning: there may be a tracee that is on no list
 	 * (init_channel_kill_lost). */
 	bool lost;
+	/* CLONE_FILES, CLONE_FS: it has the descriptor table, or the directories, of the process
+	 * that will fork it (tree.c). */
+	uint64_t shared;
 	bool childless;                     /* it had no child process at the last checkpoint   */
 	const struct inj_syscall *children; /* the query whether it has, in a freeze   */
 	struct questions questions;         /* and the other queries                   */
@@ -223,9 +226,11 @@ struct process {
 	uint64_t shm_bytes;        /* shared memory that is rolled back, at most       */
 	uint32_t plain_filters;    /* seccomp filters of init: the container's        */
 	uint32_t filters;          /* ... its own, at the last check                  */
-	uint32_t main_filters;     /* ... of the main process                         */
-	struct chains *chains;     /* ... of its threads (state/filters.c)            */
-	pid_t init;                /* avckpt-init                                      */
+	/* Whether it has any of its own, and whether that is known since it was stopped. */
+	bool filters_own, filters_seen;
+	uint32_t main_filters; /* ... of the main process                         */
+	struct chains *chains; /* ... of its threads (state/filters.c)            */
+	pid_t init;            /* avckpt-init                                      */
 	struct files *files_before, *files_image; /* files.c                   */
 	uint32_t files_seen;
 	bool heirs_vary;   /* inherited files changed in a freeze                    */
@@ -377,6 +382,9 @@ int thread_check_dispatch(pid_t tid, struct avc_error *err) warn_unused;
 /* A thread that just stopped: notes which call it is in.  If only we have interrupted that, sets
  * the thread to repeat it, or to return its timeout's result when its time is up. */
 void rewind_call(struct process *process, struct thread *thread);
+/* Before it is released: the same where its filter bars the call by which the kernel would continue
+ * the interrupted one. */
+void rewind_continued(struct process *process, struct thread *thread);
 /* Just before it continues: subtracts the duration of the stop from a remaining timeout. */
 void rewind_count_stop(const struct process *process, const struct thread *thread);
 /* Registers as the app had them, before rewind_call() marked the call or the kernel replaced it by
@@ -403,6 +411,8 @@ bool seccomp_is_confined(void);
 bool seccomp_must_suspend(void);
 /* Whether a task has no more filters than its container. */
 bool seccomp_is_containers(const struct proc_status *status, uint32_t containers);
+/* Whether a filter of this (stopped) thread prevents restart_syscall(2). */
+bool seccomp_bars_restart(struct process *process, pid_t tid);
 /* From now on, until seccomp_end_supervision(): `options` are its other ptrace options, `inside` is
  * the PID of its process in its own namespace, `code` and `bytes` are where injected code is. */
 int seccomp_supervise(pid_t tid, pid_t inside, long options, avc_remote code,
@@ -576,6 +586,8 @@ struct syscall_batch {
 	pid_t inside;     /* for notes: soft failures                            */
 	struct avc_error *notes;
 	int socket; /* ours, through which it gets descriptors; -1     */
+	int theirs; /* its end; and what number it gets each as, until that is closed     */
+	int given;
 };
 
 /* From now on it runs in that parasite. */
@@ -610,11 +622,14 @@ struct fd_channel {
 };
 
 /* Closes inherited descriptors, except those that it keeps; from then on it can be given
- * descriptors, each as number 1 until it is closed: by an inherited channel, if any, which it takes,
- * or its own. */
+ * descriptors: by an inherited channel, if any, which it takes, or its own. */
 int syscall_batch_open_fd_channel(struct syscall_batch *batch, struct fd_channel *inherited,
 				  const struct fd_table *table, struct avc_error *err) warn_unused;
 #define FD_KEPT_MIN 2 /* 0 and 1 are for the channel                               */
+/* The same in a table that it shares with its parent (CLONE_FILES), and so closes nothing of.
+ * Nobody else may use that until syscall_batch_close_fd_channel(). */
+int syscall_batch_make_fd_channel(struct syscall_batch *batch, struct avc_error *err) warn_unused;
+void syscall_batch_close_fd_channel(struct syscall_batch *batch);
 /* Of a process that forks several: it passes each of them a channel, which takes less time than
  * their making their own.  None where there is no descriptor number left for it. */
 int syscall_batch_share_fd_channel(struct syscall_batch *batch, struct fd_channel *fd_channel,
