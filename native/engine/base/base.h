@@ -195,6 +195,8 @@ pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
 /* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
 int proc_link(pid_t pid, const char *name, char *buf, size_t size);
+/* Whether that link of both leads to the same file: 1 or 0; -1: unknown.  Asks no file server. */
+int proc_same_file(pid_t a, pid_t b, const char *name);
 /* It is exiting, and may have closed its descriptors already. */
 bool proc_is_exiting(pid_t tid);
 /* Whether it was killed by SIGKILL, even if it has not exited yet. */

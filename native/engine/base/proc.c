@@ -135,6 +135,22 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 	return 0;
 }
 
+int proc_same_file(pid_t a, pid_t b, const char *name)
+{
+	const pid_t pid[] = { a, b };
+	struct statx st[2];
+
+	for (int i = 0; i < 2; i++) {
+		char path[64];
+
+		snprintf(path, sizeof path, "/proc/%d/%s", pid[i], name);
+		if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st[i]))
+			return -1;
+	}
+	return st[0].stx_ino == st[1].stx_ino && st[0].stx_dev_major == st[1].stx_dev_major &&
+	       st[0].stx_dev_minor == st[1].stx_dev_minor;
+}
+
 int proc_stat(pid_t pid, struct proc_stat *stat)
 {
 	char buf[1024];

@@ -285,17 +285,6 @@ void process_attrs_setup_limits(const struct image *image, struct setup *setup)
 			->flags = INJ_MAY_FAIL;
 }
 
-static bool same_root(pid_t a, pid_t b)
-{
-	char path_a[32], path_b[32];
-	struct stat is, other;
-
-	snprintf(path_a, sizeof path_a, "/proc/%d/root", a);
-	snprintf(path_b, sizeof path_b, "/proc/%d/root", b);
-	return stat(path_a, &is) == 0 && stat(path_b, &other) == 0 && is.st_dev == other.st_dev &&
-	       is.st_ino == other.st_ino;
-}
-
 /* Changes to a directory of the template. */
 static int enter(struct syscall_batch *batch, pid_t template, const char *name,
 		 struct avc_error *err)
@@ -320,7 +309,7 @@ static int put_folders(struct syscall_batch *batch, pid_t template, struct avc_e
 {
 	struct arguments *arguments = arguments_of(batch);
 
-	if (!same_root(template, batch->pid)) {
+	if (proc_same_file(template, batch->pid, "root") != 1) {
 		if (enter(batch, template, "root", err))
 			return -1;
 		strcpy(arguments->here, ".");

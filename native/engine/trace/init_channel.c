@@ -33,6 +33,16 @@ void init_channel_init(struct init_channel *channel)
 	};
 }
 
+/* A file may have the name of a memfd; and even a duplicate of it, once closed, is a request to a file
+ * server. */
+static bool is_memory(int fd_dir, const char *number)
+{
+	struct statx st;
+
+	return !statx(fd_dir, number, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st) &&
+	       device_is_memory((uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor);
+}
+
 /* init's descriptor number of the control page, or -1. */
 static int find_ctl(pid_t init)
 {
@@ -51,7 +61,8 @@ static int find_ctl(pid_t init)
 		if (n <= 0)
 			continue;
 		process[n] = 0;
-		if (!strcmp(process, "/memfd:" AVC_CTL_NAME " (deleted)"))
+		if (!strcmp(process, "/memfd:" AVC_CTL_NAME " (deleted)") &&
+		    is_memory(dirfd(dir), entry->d_name))
 			found = atoi(entry->d_name);
 	}
 	closedir(dir);
@@ -207,16 +218,7 @@ pid_t init_channel_app(const struct init_channel *channel)
 
 bool init_channel_app_started(const struct init_channel *channel, pid_t app)
 {
-	char path[64];
-	struct stat own, theirs;
-
-	snprintf(path, sizeof path, "/proc/%d/exe", channel->init);
-	if (stat(path, &own))
-		return false;
-	snprintf(path, sizeof path, "/proc/%d/exe", proc_live_thread(app));
-	if (stat(path, &theirs))
-		return false;
-	return own.st_dev != theirs.st_dev || own.st_ino != theirs.st_ino;
+	return proc_same_file(channel->init, proc_live_thread(app), "exe") == 0;
 }
 
 void init_channel_arm(struct init_channel *channel, bool armed)
