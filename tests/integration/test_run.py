@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import platform
 import pty
 import select
 import signal
@@ -154,7 +155,10 @@ def test_nohup_is_passed_on() -> None:
 ASYNC_IO = "import ctypes; c = ctypes.CDLL(None, use_errno=True); print(c.syscall({}, 0, 0), ctypes.get_errno())"
 
 
-@pytest.mark.parametrize("number", [425, 206], ids=["io_uring_setup", "io_setup"])
+IO_SETUP = {"x86_64": 206, "aarch64": 0}[platform.machine()]
+
+
+@pytest.mark.parametrize("number", [425, IO_SETUP], ids=["io_uring_setup", "io_setup"])
 def test_io_uring_can_be_taken_away(number: int) -> None:
     """And kernel AIO, which programs fall back on."""
     python = ("--", sys.executable, "-c", ASYNC_IO.format(number))
