@@ -18,6 +18,8 @@
 
 #include "trace.h"
 
+static const char not_inits[] = "its control page is not one of avckpt-init's";
+
 #define LEFTOVERS_NS (100 * NS_PER_MS)
 /* On a busy machine a killed process may wait long for a CPU to exit. Until then it can consume
  * what is put back into a pipe: a read(2) that finds data does not check for signals. */
@@ -31,16 +33,6 @@ void init_channel_init(struct init_channel *channel)
 	*channel = (struct init_channel){
 		.init_pidfd = -1, .ctl_fd = -1, .report_fd = -1, .verdict_fd = -1, .numbers_fd = -1
 	};
-}
-
-/* A file may have the name of a memfd; and even a duplicate of it, once closed, is a request to a file
- * server. */
-static bool is_memory(int fd_dir, const char *number)
-{
-	struct statx st;
-
-	return !statx(fd_dir, number, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st) &&
-	       device_is_memory((uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor);
 }
 
 /* init's descriptor number of the control page, or -1. */
@@ -61,8 +53,7 @@ static int find_ctl(pid_t init)
 		if (n <= 0)
 			continue;
 		process[n] = 0;
-		if (!strcmp(process, "/memfd:" AVC_CTL_NAME " (deleted)") &&
-		    is_memory(dirfd(dir), entry->d_name))
+		if (!strcmp(process, "/memfd:" AVC_CTL_NAME " (deleted)"))
 			found = atoi(entry->d_name);
 	}
 	closedir(dir);
@@ -125,14 +116,25 @@ static int open_ctl_of(const struct init_channel *channel, int number)
 	return reopen(&theirs, O_RDWR);
 }
 
+/* A file may have that name; and even a duplicate of it, once closed, is a request to a file
+ * server. */
+static bool is_file(pid_t init, int number)
+{
+	char path[48];
+	struct statx st;
+
+	snprintf(path, sizeof path, "/proc/%d/fd/%d", init, number);
+	return !statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st) &&
+	       !device_is_memory((uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor);
+}
+
 static int connect_all(struct init_channel *channel, int number, struct avc_error *err)
 {
 	const struct avc_ctl *ctl;
 
 	channel->ctl_fd = open_ctl_of(channel, number);
 	if (channel->ctl_fd < 0 && errno == EPROTO)
-		return fail(err, AVC_PROTOCOL, 0, channel->init, "attach", "",
-			    "its control page is not one of avckpt-init's");
+		return fail(err, AVC_PROTOCOL, 0, channel->init, "attach", "", "%s", not_inits);
 	if (channel->ctl_fd < 0)
 		return fail_errno(err, channel->init, "attach", "pidfd_getfd",
 				  "its control page cannot be opened");
@@ -175,6 +177,8 @@ int init_channel_open(struct init_channel *channel, struct avc_error *err)
 	number = find_ctl(channel->init);
 	if (number < 0 || pidfd_ended(pidfd))
 		return 0;
+	if (is_file(channel->init, number))
+		return fail(err, AVC_PROTOCOL, 0, channel->init, "attach", "", "%s", not_inits);
 	/* The magic is written last: before that the page is incomplete. */
 	theirs = proc_borrow_fd(pidfd, number);
 	if (theirs < 0)
