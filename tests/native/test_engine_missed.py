@@ -76,7 +76,7 @@ def fails_late(guard: GuardProcess) -> bool:
     """Misses one because the main process's template is lost, if nothing else asks for a pidfd before that."""
     with injected(guard, "pidfd_open", "error=ESRCH:when=1"):
         answer = guard.command("checkpoint")
-    return answer.get("error", {}).get("operation") == "keep template"
+    return bool(answer.get("error", {}).get("operation") == "keep template")
 
 
 def test_a_restore_after_one_that_failed_late(tmp_path: Path) -> None:
