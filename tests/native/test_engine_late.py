@@ -7,6 +7,7 @@ That costs a checkpoint at most: the generations are as good as before.
 from __future__ import annotations
 
 import os
+import random
 import signal
 import sys
 import time
@@ -26,6 +27,7 @@ MOST = 30
 ROUNDS = 6
 LATE_MS = 250
 """A thread waits for 100 ms."""
+STOPS = 20
 ARRIVED = {"x86_64": 168, "aarch64": 1152}[os.uname().machine]
 """HOME_ARRIVED of native/parasite/ARCH/home.h."""
 PARKED_S = 0.05
@@ -90,6 +92,20 @@ def test_generations_stay(where: str, tmp_path: Path) -> None:
         answer = be_late(guard, victim, lambda: None)
         assert answer["generations"] == (2 if answer["kind"] == "checkpoint" else 1), answer
         is_restored(guard, victim)
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_naps_are_not_cut_short(where: str, tmp_path: Path) -> None:
+    """They are continued or, where the way home makes the kernel forget them (aarch64), begin again."""
+    rng = random.Random(1)
+    with Victim(f"idle 1 2 {where}", tmp_path) as victim, GuardProcess(config(0.001), [victim.pid]) as guard:
+        guard.wait("checkpoint")
+        for _ in range(STOPS):
+            time.sleep(rng.uniform(0.01, 0.05))
+            os.kill(guard.pid, signal.SIGSTOP)
+            time.sleep(LATE_MS / 1000)
+            os.kill(guard.pid, signal.SIGCONT)
+            victim.wait_beats(3)
 
 
 def say_home(pid: int) -> None:

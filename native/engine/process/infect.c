@@ -610,8 +610,7 @@ static int infect_thread(struct process *process, struct thread *thread, uint32_
 	    survey(process, arch_pc(&thread->regs), &cave, err))
 		return -1;
 	thread_fix_rseq(process->mem_fd, thread);
-	home = thread->regs;
-	arch_resume(&home);
+	rewind_home(thread, &home);
 	bytes = arch_stub_build(stub, &home, thread->sigmask);
 	if (arch_stub_read_xstate(thread->tid, stub))
 		return fail_errno(err, thread->tid, "infect", "ptrace(GETREGSET)", "it has ended");

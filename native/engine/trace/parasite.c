@@ -497,8 +497,7 @@ int thread_borrow(struct process *process, struct thread *thread, struct avc_err
 	if (process->parasite.left_ns)
 		return fail(err, AVC_DEADLINE, 0, thread->tid, "run injected code", "",
 			    "a thread is still on its way home");
-	home = thread->regs;
-	arch_resume(&home);
+	rewind_home(thread, &home);
 	arch_home_set(&control->home, &home, thread->sigmask);
 	control->arrived = 0;
 	/* Registers first: if we die between the two, the thread enters the parasite with its own

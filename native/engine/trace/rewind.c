@@ -529,3 +529,15 @@ void rewind_original(const struct thread *thread, struct arch_regs *regs)
 	     arch_syscall_result(regs) == -ERESTART_RESTARTBLOCK))
 		arch_result_note(regs, -EINTR);
 }
+
+void rewind_home(const struct thread *thread, struct arch_regs *home)
+{
+	*home = thread->regs;
+	if (!ARCH_HOME_FORGETS) {
+		arch_resume(home);
+		return;
+	}
+	if (arch_syscall_nr(home) == SYS_restart_syscall && thread->call.nr >= 0)
+		arch_syscall_nr_set(home, thread->call.nr);
+	arch_rewind(home);
+}

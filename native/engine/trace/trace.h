@@ -390,6 +390,9 @@ void rewind_count_stop(const struct process *process, const struct thread *threa
 /* Registers as the app had them, before rewind_call() marked the call or the kernel replaced it by
  * restart_syscall(2). */
 void rewind_original(const struct thread *thread, struct arch_regs *regs);
+/* The registers with which it goes home by itself.  Where it could not continue its call there, but
+ * would get EINTR from restart_syscall(2), the call begins again. */
+void rewind_home(const struct thread *thread, struct arch_regs *home);
 /* Shortly before a thread is stopped: if it may be in such a call, notes since when it sleeps. */
 void rewind_prepare(struct thread *thread);
 /* Once the thread runs again: finds out when its rewound call began, if that is still unknown. */

@@ -22,6 +22,7 @@
 #define ARCH_AUDIT AUDIT_ARCH_AARCH64
 #define ARCH_USER_END (UINT64_C(1) << 48)
 #define ARCH_PAGE_BYTES 4096
+#define ARCH_HOME_FORGETS true /* by rt_sigreturn(2) */
 
 struct arch_regs {
 	struct user_regs_struct r; /* in a call: pc behind it, and its first argument */

@@ -13,6 +13,9 @@
 #define ARCH_AUDIT AUDIT_ARCH_X86_64           /* as seccomp filters know it (linux/audit.h) */
 #define ARCH_USER_END UINT64_C(0x7ffffffff000) /* of user addresses */
 #define ARCH_PAGE_BYTES 4096
+/* Whether going home by itself (inj_go_home()) makes a thread forget what restart_syscall(2) would
+ * continue. */
+#define ARCH_HOME_FORGETS false
 
 struct arch_regs {
 	struct user_regs_struct r;
