@@ -98,7 +98,10 @@ def test_generations_stay(where: str, tmp_path: Path) -> None:
 def test_naps_are_not_cut_short(where: str, tmp_path: Path) -> None:
     """They are continued or, where the way home makes the kernel forget them (aarch64), begin again."""
     rng = random.Random(1)
-    with Victim(f"idle 1 2 {where}", tmp_path) as victim, GuardProcess(config(0.001), [victim.pid]) as guard:
+    with (
+        Victim(f"idle 1 2 --beat-us 20000 {where}", tmp_path) as victim,
+        GuardProcess(config(0.001), [victim.pid]) as guard,
+    ):
         guard.wait("checkpoint")
         for _ in range(STOPS):
             time.sleep(rng.uniform(0.01, 0.05))
