@@ -209,9 +209,9 @@ void thread_release(struct process *process, struct thread *thread)
 
 	if (!thread->attached || !thread->stopped)
 		return;
-	if (thread->borrowed)
-		thread_give_back(thread, &ignored);
-	rewind_continued(process, thread);
+	/* Otherwise it is elsewhere by now. */
+	if (!thread->borrowed || thread_give_back(thread, &ignored) == 0)
+		rewind_continued(process, thread);
 	end_call_by_signal(process, thread);
 	/* If this fails, SIGKILL has ended its stop: it has to be reaped. */
 	thread->attached = ptrace(PTRACE_DETACH, thread->tid, NULL, 0L) != 0;
