@@ -35,8 +35,8 @@ BUILD = ROOT / "tests/victims/build"
 PATIENCE_S = 60.0 * SLOWNESS
 """Only a test that fails takes as long: where others take the CPU, to start a guard may take ten seconds."""
 
-IMAGES = Images[os.environ.get("AVCKPT_TEST_IMAGES", "auto").upper()]
-"""How checkpoints are made where a test does not care: AVCKPT_TEST_IMAGES=dirty copies what is small, too."""
+IMAGES = Images[os.environ.get("AVCKPT_TEST_IMAGES", "fork").upper()]
+"""How checkpoints are made where a test does not care: AVCKPT_TEST_IMAGES=dirty runs them all the other way."""
 
 PR_SET_TIMERSLACK = 29
 

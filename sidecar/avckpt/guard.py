@@ -109,7 +109,7 @@ class GuardConfig:
     """The longest time to wait for the app to stop; 0: the engine's default."""
     files: Files = Files.REWIND
     tcp: Tcp = Tcp.RESET_MOVED
-    images: Images = Images.AUTO
+    images: Images = Images.FORK
     together: bool = False
     """Its checkpoints are those of its group's lines, which the daemon commands at `interval_s`."""
     late: bool = False
