@@ -16,7 +16,7 @@ from types import TracebackType
 from avckpt.artifacts import init_binary
 from avckpt.engine import Engine
 from avckpt.events.vocabulary import Kind
-from avckpt.guard import Command, Event, GuardConfig, Images
+from avckpt.guard import Command, Event, GuardConfig
 
 from testkit.board import Board
 from testkit.harness import ROOT, wait_until
@@ -165,7 +165,6 @@ class Guarded:
                 restore_max=64,
                 restore_window_s=0.05,
                 quiesce_s=0.0,
-                images=Images.FORK,  # copies: bench.dirty
             )
             self._guard = self._engine.start_guard(pidfd, config, cookie=1)
         finally:
