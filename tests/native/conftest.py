@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builds the programs that the native tests run."""
+"""Builds the programs that the native tests run, and what several of them need."""
 
 from __future__ import annotations
 
 import subprocess
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -33,3 +35,10 @@ def victims_built() -> Path:
     """The folder of the built tests/victims."""
     make("tests/victims")
     return ROOT / "tests/victims/build"
+
+
+@pytest.fixture
+def memory() -> Iterator[Path]:
+    """A folder for the board; on a disk its writable mapping would count as data."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        yield Path(path)

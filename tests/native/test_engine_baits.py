@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,13 +18,6 @@ from testkit.scenario import checkpoint, disturb, restored
 @pytest.fixture(autouse=True)
 def built(init_built: None, victims_built: Path) -> None:
     """avckpt-init and the victims."""
-
-
-@pytest.fixture
-def memory() -> Iterator[Path]:
-    """A folder for the board; on a disk its writable mapping would count as data."""
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
-        yield Path(path)
 
 
 def test_a_mount_is_not_sought_outside_of_the_container(tmp_path: Path, memory: Path) -> None:

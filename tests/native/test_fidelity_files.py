@@ -155,13 +155,6 @@ def test_offsets_stay_with_keep(tmp_path: Path) -> None:
             restored(victim, guard)
 
 
-@pytest.fixture
-def memory() -> Iterator[Path]:
-    """A folder for the board; on a disk its writable mapping would count as data."""
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
-        yield Path(path)
-
-
 def test_strict_does_not_restore_over_a_written_file(tmp_path: Path, memory: Path) -> None:
     with (
         Victim(f"descriptors strict {tmp_path}", memory) as victim,
