@@ -30,6 +30,7 @@
 #include <stdint.h>
 #include <stdio.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/types.h>
 #include <time.h>
 
@@ -195,6 +196,18 @@ pid_t proc_pidfd_pid(int pidfd);
 int proc_pidfd_open(pid_t pid);
 /* readlink(2) of "/proc/PID/NAME", as a string.  0 or -1. */
 int proc_link(pid_t pid, const char *name, char *buf, size_t size);
+/* statx(2) of "/proc/PID/NAME", and of a descriptor of ours, without a request to a file server. */
+bool proc_look(pid_t pid, const char *name, unsigned int what, struct statx *st);
+bool fd_look(int fd, unsigned int what, struct statx *st);
+/* A device as in struct mapping. */
+static inline uint64_t device_number(unsigned int major, unsigned int minor)
+{
+	return (uint64_t)major << 32 | minor;
+}
+static inline uint64_t device_of(const struct statx *st)
+{
+	return device_number(st->stx_dev_major, st->stx_dev_minor);
+}
 /* Whether that link of both leads to the same file: 1 or 0; -1: unknown.  Asks no file server. */
 int proc_same_file(pid_t a, pid_t b, const char *name);
 /* It is exiting, and may have closed its descriptors already. */

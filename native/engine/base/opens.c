@@ -53,17 +53,11 @@ int open_again(int fd, int flags)
 
 /* ---- file systems ------------------------------------------------------------------------- */
 
-/* Without a request to a file server (AT_STATX_DONT_SYNC). */
-static bool look_at(int fd, unsigned int what, struct statx *st)
-{
-	return !statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, what, st);
-}
-
 uint64_t mount_of(int fd)
 {
 	struct statx st;
 
-	return look_at(fd, STATX_MNT_ID, &st) && st.stx_mask & STATX_MNT_ID ? st.stx_mnt_id : 0;
+	return fd_look(fd, STATX_MNT_ID, &st) && st.stx_mask & STATX_MNT_ID ? st.stx_mnt_id : 0;
 }
 
 bool mount_is_served(const char *type)
@@ -137,8 +131,8 @@ static void find_memory(void)
 		int fd = memfd_create("avckpt", MFD_CLOEXEC | huge);
 		struct statx st;
 
-		if (fd >= 0 && look_at(fd, STATX_TYPE, &st))
-			memory_device[shift] = (uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor;
+		if (fd >= 0 && fd_look(fd, STATX_TYPE, &st))
+			memory_device[shift] = device_of(&st);
 		close_fd(&fd);
 	}
 }
@@ -170,7 +164,7 @@ static void read_leases(struct leases *leases)
 					  sizeof *leases->file);
 		if (leases->known)
 			leases->file[leases->count++] =
-				(struct leased){ (uint64_t)major << 32 | minor, inode };
+				(struct leased){ device_number(major, minor), inode };
 	}
 	free(line);
 	if (locks)
@@ -198,7 +192,7 @@ int open_to_read(int path_fd, const struct mapping *m, struct leases *leases)
 	struct statx st;
 	int fd;
 
-	if (!look_at(path_fd, STATX_TYPE, &st))
+	if (!fd_look(path_fd, STATX_TYPE, &st))
 		return -1;
 	if (!S_ISREG(st.stx_mode)) {
 		errno = S_ISCHR(st.stx_mode) || S_ISBLK(st.stx_mode) ? EACCES : ENXIO;

@@ -135,20 +135,26 @@ int proc_link(pid_t pid, const char *name, char *buf, size_t size)
 	return 0;
 }
 
+bool proc_look(pid_t pid, const char *name, unsigned int what, struct statx *st)
+{
+	char path[64];
+
+	snprintf(path, sizeof path, "/proc/%d/%s", pid, name);
+	return !statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, what, st);
+}
+
+bool fd_look(int fd, unsigned int what, struct statx *st)
+{
+	return !statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, what, st);
+}
+
 int proc_same_file(pid_t a, pid_t b, const char *name)
 {
-	const pid_t pid[] = { a, b };
-	struct statx st[2];
+	struct statx is, other;
 
-	for (int i = 0; i < 2; i++) {
-		char path[64];
-
-		snprintf(path, sizeof path, "/proc/%d/%s", pid[i], name);
-		if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st[i]))
-			return -1;
-	}
-	return st[0].stx_ino == st[1].stx_ino && st[0].stx_dev_major == st[1].stx_dev_major &&
-	       st[0].stx_dev_minor == st[1].stx_dev_minor;
+	if (!proc_look(a, name, STATX_INO, &is) || !proc_look(b, name, STATX_INO, &other))
+		return -1;
+	return is.stx_ino == other.stx_ino && device_of(&is) == device_of(&other);
 }
 
 int proc_stat(pid_t pid, struct proc_stat *stat)

@@ -132,7 +132,7 @@ static bool parse_mapping(const char *line, struct mapping *m)
 		   &minor, &inode, &name) < 7 ||
 	    strlen(m->mode) != 4)
 		return false;
-	m->device = (uint64_t)major << 32 | minor;
+	m->device = device_number(major, minor);
 	m->start = start;
 	m->end = end;
 	m->offset = offset;

@@ -1103,11 +1103,11 @@ int files_look(struct files *files, const struct files_owner *owner, enum files_
 	if (look.fd_dir < 0)
 		return fail_errno(err, pid, "look at descriptors", "open(fd)", "it has ended");
 	for (int i = 0; i < 3 && depth != FILES_FROZEN && init; i++) {
-		char path[48];
+		char name[8];
 		struct statx st;
 
-		snprintf(path, sizeof path, "/proc/%d/fd/%d", init, i);
-		if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st))
+		snprintf(name, sizeof name, "fd/%d", i);
+		if (!proc_look(init, name, STATX_INO, &st))
 			continue;
 		look.init_stdio[i].dev = makedev(st.stx_dev_major, st.stx_dev_minor);
 		look.init_stdio[i].ino = st.stx_ino;

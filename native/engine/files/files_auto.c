@@ -150,8 +150,7 @@ bool files_is_older(const struct image *image, int fd, const struct stat *st)
 	struct statx born;
 
 	/* One that was created since does not matter. */
-	if (!statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC, STATX_BTIME, &born) &&
-	    born.stx_mask & STATX_BTIME &&
+	if (fd_look(fd, STATX_BTIME, &born) && born.stx_mask & STATX_BTIME &&
 	    (uint64_t)born.stx_btime.tv_sec * NS_PER_S + born.stx_btime.tv_nsec >
 		    image->files->taken_ns)
 		return false;

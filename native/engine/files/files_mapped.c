@@ -125,15 +125,14 @@ void files_mapped_free(struct files_mapped *mapped)
 	free(mapped);
 }
 
-static bool is_unchanged(const struct mapped_area *a, pid_t template)
+static bool is_unchanged(const struct mapped_area *a, pid_t template, struct mounts *mounts,
+			 struct leases *leases)
 {
 	const struct mapping m = {
 		.start = a->start, .end = a->end, .device = a->device, .inode = a->inode
 	};
 	const size_t bytes = a->end - a->start;
-	struct mounts mounts = { 0 };
-	struct leases leases = { 0 };
-	int fd = open_data(template, &m, &mounts, &leases);
+	int fd = open_data(template, &m, mounts, leases);
 	uint8_t *now = malloc(bytes);
 	bool same;
 
@@ -141,8 +140,6 @@ static bool is_unchanged(const struct mapped_area *a, pid_t template)
 	       read_whole(fd, now, bytes, (off_t)a->offset) == a->bytes &&
 	       !memcmp(now, a->content, (size_t)a->bytes);
 	free(now);
-	leases_free(&leases);
-	mounts_free(&mounts);
 	close_fd(&fd);
 	return same;
 }
@@ -185,6 +182,9 @@ static int check_process(pid_t pid, struct check *check)
 int files_mapped_check(const struct image *image, pid_t holder, struct avc_error *err)
 {
 	struct check check = { .mapped = image->mapped, .err = err };
+	struct mounts mounts = { 0 };
+	struct leases leases = { 0 };
+	bool same = true;
 
 	if (!image->mapped)
 		return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
@@ -192,10 +192,12 @@ int files_mapped_check(const struct image *image, pid_t holder, struct avc_error
 	/* The template has what was mapped then, the holder what was mapped last. */
 	if (check_process(image->template, &check) || check_process(holder, &check))
 		return -1;
-	for (uint32_t i = 0; i < check.mapped->count; i++)
-		if (!is_unchanged(&check.mapped->area[i], image->template))
-			return fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
-				    "avckpt.files=strict: a file that is mapped for writing was "
-				    "written since the checkpoint");
-	return 0;
+	for (uint32_t i = 0; same && i < check.mapped->count; i++)
+		same = is_unchanged(&check.mapped->area[i], image->template, &mounts, &leases);
+	leases_free(&leases);
+	mounts_free(&mounts);
+	return same ? 0
+		    : fail(err, AVC_UNSUPPORTED, 0, 0, "restore", "",
+			   "avckpt.files=strict: a file that is mapped for writing was written "
+			   "since the checkpoint");
 }

@@ -83,7 +83,7 @@ static uint64_t mark_of(int fd)
 {
 	struct statx st = { 0 };
 
-	if (statx(fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC, STATX_TYPE | STATX_INO, &st))
+	if (!fd_look(fd, STATX_TYPE | STATX_INO, &st))
 		return RIGHTS_UNKNOWN;
 	return st.stx_ino * 31 + st.stx_dev_minor * 7919 + st.stx_dev_major +
 	       ((uint64_t)st.stx_mode << 48) + ((uint64_t)st.stx_rdev_minor << 32);

@@ -597,7 +597,7 @@ bool file_is_remote(int fd)
 
 bool file_is_memory(const struct file *file)
 {
-	return device_is_memory((uint64_t)major(file->dev) << 32 | minor(file->dev));
+	return device_is_memory(device_number(major(file->dev), minor(file->dev)));
 }
 
 static const char *put_flocks(int fd, const struct file *want, const struct file *now)

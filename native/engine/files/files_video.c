@@ -186,7 +186,7 @@ static int note_area(const struct mapping *m, void *arg)
 		const struct file *f = &files->file[i];
 
 		if (!f->video.count || m->inode != f->ino ||
-		    m->device != ((uint64_t)major(f->dev) << 32 | minor(f->dev)))
+		    m->device != device_number(major(f->dev), minor(f->dev)))
 			continue;
 		more = realloc(files->area, (files->areas + 1) * sizeof *more);
 		if (!more)

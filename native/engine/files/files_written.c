@@ -174,14 +174,12 @@ static bool is_written_data(int fd, const struct files *files, files_counts *cou
 			    const void *arg, char name[FILES_NAME])
 {
 	struct stat st;
-	char path[64];
 	ssize_t n;
 
 	if (fstat(fd, &st) || !S_ISREG(st.st_mode) || is_inherited(files, &st) ||
 	    (counts && !counts(fd, &st, arg)))
 		return false;
-	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
-	n = readlink(path, name, FILES_NAME - 1);
+	n = readlink(fd_path(fd).text, name, FILES_NAME - 1);
 	name[n < 0 ? 0 : n] = 0;
 	return true;
 }

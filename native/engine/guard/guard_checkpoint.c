@@ -597,7 +597,7 @@ static int take(struct avc_guard *guard, struct avc_event *event, struct avc_err
 	}
 }
 
-/* One was missed. */
+/* One was missed.  avckpt.interval=auto has pauses of its own (guard_pace_missed()). */
 static void try_soon(struct avc_guard *guard)
 {
 	if (!policy_is_automatic(&guard->config))

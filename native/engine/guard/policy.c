@@ -29,6 +29,11 @@
 /* After a restore: an app that dies within this time has met the bug in the image. */
 #define AT_ONCE_NS UINT64_C(1000000000)
 
+static uint64_t lesser(uint64_t a, uint64_t b)
+{
+	return a < b ? a : b;
+}
+
 static bool on_probation(const struct policy *policy, const struct avc_config *config, uint64_t now)
 {
 	return policy->restored_ns && now - policy->restored_ns < config->restore_window_ns;
@@ -191,8 +196,7 @@ uint64_t policy_refused(struct policy *policy, uint64_t due, uint64_t now)
 
 	if (due == POLICY_NEVER)
 		return due;
-	return as_long_again(&policy->refused_ns, pause < AGAIN_LEAST_NS ? pause : AGAIN_LEAST_NS,
-			     now);
+	return as_long_again(&policy->refused_ns, lesser(pause, AGAIN_LEAST_NS), now);
 }
 
 uint64_t policy_without(struct policy *policy, uint64_t due, uint64_t now)
@@ -215,14 +219,12 @@ uint64_t policy_executed(struct policy *policy, const struct avc_config *config,
 			 uint64_t now)
 {
 	const bool refused = policy->refused_ns;
-	uint64_t first = policy_first_due(config, now);
+	const uint64_t first = policy_first_due(config, now);
 
 	policy_retry(policy);
 	if (!refused || first == POLICY_NEVER)
 		return due;
-	if (first > now + AGAIN_LEAST_NS)
-		first = now + AGAIN_LEAST_NS;
-	return first < due ? first : due;
+	return lesser(due, lesser(first, now + AGAIN_LEAST_NS));
 }
 
 /* ---- avckpt.interval=auto ------------------------------------------------------ */
@@ -243,26 +245,19 @@ static uint64_t average(uint64_t before, uint64_t now)
 	return before - before / AVERAGE_OF + now / AVERAGE_OF;
 }
 
-static uint64_t lesser(uint64_t a, uint64_t b)
-{
-	return a < b ? a : b;
-}
-
 /* The first one injects the parasite: the second says more; and the third, as the machine may have
  * stood still for a moment. */
 static void learn(struct policy_cost *known, uint32_t *samples, struct policy_cost cost)
 {
-	if (*samples < SAMPLES) {
-		if (++*samples < SAMPLES) {
-			*known = cost;
-			return;
-		}
+	if (*samples == SAMPLES) {
+		known->held_ns = average(known->held_ns, cost.held_ns);
+		known->cpu_ns = average(known->cpu_ns, cost.cpu_ns);
+	} else if (++*samples < SAMPLES) {
+		*known = cost;
+	} else {
 		known->held_ns = lesser(known->held_ns, cost.held_ns);
 		known->cpu_ns = lesser(known->cpu_ns, cost.cpu_ns);
-		return;
 	}
-	known->held_ns = average(known->held_ns, cost.held_ns);
-	known->cpu_ns = average(known->cpu_ns, cost.cpu_ns);
 }
 
 /* As often as the budgets allow, or as avckpt.interval.min does. */
@@ -277,9 +272,7 @@ static uint64_t within_budgets(const struct policy_cost *cost, const struct avc_
 
 static uint64_t affordable(const struct policy_cost *cost, const struct avc_config *config)
 {
-	const uint64_t interval = within_budgets(cost, config);
-
-	return interval < config->interval_ns ? interval : config->interval_ns;
+	return lesser(within_budgets(cost, config), config->interval_ns);
 }
 
 void policy_pay(struct policy_pace *pace, const struct avc_config *config,

@@ -68,10 +68,9 @@ static int make_task(struct process *process, pid_t *child, struct arch_regs *ba
 
 static bool is_userfaultfd(int fd)
 {
-	char path[32], name[32] = "";
+	char name[32] = "";
 
-	snprintf(path, sizeof path, "/proc/self/fd/%d", fd);
-	return readlink(path, name, sizeof name - 1) > 0 &&
+	return readlink(fd_path(fd).text, name, sizeof name - 1) > 0 &&
 	       !strcmp(name, "anon_inode:[userfaultfd]");
 }
 

@@ -122,16 +122,13 @@ static int read_places(struct inherited *inherited, pid_t pid)
 
 	inherited->places = 0;
 	for (size_t i = 0; i < sizeof places / sizeof *places; i++) {
-		char path[48];
 		struct statx st;
 		uint64_t what[3];
 
 		/* Not on a file system that may not answer: FUSE or network. */
-		snprintf(path, sizeof path, "/proc/%d/%s", pid, places[i]);
-		if (statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT,
-			  STATX_INO | STATX_MNT_ID, &st))
+		if (!proc_look(pid, places[i], STATX_INO | STATX_MNT_ID, &st))
 			return -1;
-		what[0] = (uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor;
+		what[0] = device_of(&st);
 		what[1] = st.stx_ino;
 		what[2] = st.stx_mnt_id;
 		inherited->places = hash(inherited->places, what, sizeof what);

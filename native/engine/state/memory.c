@@ -207,9 +207,8 @@ static bool is_area(int path_fd, const struct area *a)
 {
 	struct statx st;
 
-	return statx(path_fd, "", AT_EMPTY_PATH | AT_STATX_DONT_SYNC, STATX_INO, &st) == 0 &&
-	       st.stx_ino == a->inode &&
-	       ((uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor) == a->device;
+	return fd_look(path_fd, STATX_INO, &st) && st.stx_ino == a->inode &&
+	       device_of(&st) == a->device;
 }
 
 /* Reads through the mapped file, if it still is the one that was found to be memory.  No single

@@ -110,11 +110,6 @@ static int add_mapped(const struct mapping *m, void *arg)
 	return 0;
 }
 
-static uint64_t device_of(const struct statx *st)
-{
-	return (uint64_t)st->stx_dev_major << 32 | st->stx_dev_minor;
-}
-
 /* From /proc/PID/fd, without asking a file server. */
 static bool look_at_descriptor(int fd_dir, const char *number, struct statx *st)
 {

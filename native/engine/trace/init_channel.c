@@ -120,12 +120,11 @@ static int open_ctl_of(const struct init_channel *channel, int number)
  * server. */
 static bool is_file(pid_t init, int number)
 {
-	char path[48];
+	char name[24];
 	struct statx st;
 
-	snprintf(path, sizeof path, "/proc/%d/fd/%d", init, number);
-	return !statx(AT_FDCWD, path, AT_STATX_DONT_SYNC | AT_NO_AUTOMOUNT, STATX_INO, &st) &&
-	       !device_is_memory((uint64_t)st.stx_dev_major << 32 | st.stx_dev_minor);
+	snprintf(name, sizeof name, "fd/%d", number);
+	return proc_look(init, name, STATX_INO, &st) && !device_is_memory(device_of(&st));
 }
 
 static int connect_all(struct init_channel *channel, int number, struct avc_error *err)
