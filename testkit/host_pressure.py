@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the kernel say that the host is short of memory, at the cost of nobody else.
+"""Makes the kernel say that tasks wait for memory, at the cost of nobody else.
 
 Writers in a control group of 16 MB dirty pages faster than the disk takes them,
 so that they stand still for memory most of the time: /proc/pressure/memory has
-"some" at about 70 %.  The rest of the machine has all the memory it had.
+"some" at about 70 %.  The rest of the machine has all the memory it had: to the
+sidecar it is short of it only if told so (SHORT).
 """
 
 from __future__ import annotations
@@ -34,6 +35,12 @@ while True:
     at = (at + len(block)) % {SPAN_BYTES}
 """
 
+SHORT = [
+    *(sys.executable, "-c"),
+    "from avckpt.supervision import pressure; pressure.AVAILABLE_STALLED = 1.1; import avckpt.__main__ as a; a.main()",
+]
+"""`avckpt`, for which a host with less than 110 % of its memory available is short of it when tasks wait."""
+
 
 @contextlib.contextmanager
 def pressure() -> Iterator[None]:
@@ -51,6 +58,11 @@ def pressure() -> Iterator[None]:
             writer = subprocess.Popen([sys.executable, "-c", WRITER, str(group / "cgroup.procs"), file.name])
             undo.callback(end, writer)
         yield
+
+
+def stalled_s() -> float:
+    """For how long, since the machine was started, at least one task has waited for memory."""
+    return int(Path("/proc/pressure/memory").read_text().split("total=")[1].split()[0]) / 1e6
 
 
 def make_group() -> Path:

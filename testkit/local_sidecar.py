@@ -75,6 +75,7 @@ class LocalSidecar:
     """A sidecar daemon of this machine's own environment; `start()` it."""
 
     run_dir: Path
+    command: Sequence[str] = field(default_factory=avckpt_command)
     process: subprocess.Popen[bytes] | None = None
     containers: list[Container] = field(default_factory=list)
 
@@ -97,7 +98,7 @@ class LocalSidecar:
         """Starts it and waits until it answers."""
         with self.run_dir.with_suffix(".log").open("ab") as log:
             self.process = subprocess.Popen(
-                [*avckpt_command(), "sidecar"], stderr=log, env={**os.environ, **self.env}, stdin=subprocess.DEVNULL
+                [*self.command, "sidecar"], stderr=log, env={**os.environ, **self.env}, stdin=subprocess.DEVNULL
             )
         wait_until(self._answers, 60, "the sidecar answers")
 

@@ -26,6 +26,9 @@ class Short:
         self.fd, self._end = os.pipe()
         os.write(self._end, b"!")
 
+    def is_high(self) -> bool:
+        return True
+
     def close(self) -> None:
         os.close(self.fd)
         os.close(self._end)

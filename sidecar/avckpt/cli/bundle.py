@@ -40,6 +40,7 @@ container.json    how it is now (avckpt ps --json)
 labels.json       its avckpt.* labels
 inspect.json      image, state, restarts and mounts, as Podman has them; no environment, no command
 container.log     the last {lines} lines that it wrote (with an event: of that time)
+journal.txt       the last {lines} lines of systemd's journal about it (with an event: of that time)
 sidecar.json      the sidecar: version, configuration in force
 sidecar.log       the last {lines} lines of its log (with an event: of that time)
 metrics.txt       the sidecar's metrics
@@ -81,10 +82,11 @@ def bundle(name: str, output: Path | None, core: bool) -> None:
 
     run_dir = Path(protocol.run_dir())
     client = Client(run_dir)
-    event = find_event(client, name)
-    container, events = find(client, event["id"] if event else name)
+    rows, history = client.containers(ended=True), client.history()
+    event = find_event(rows, history, name)
+    container, events = find(rows, history, event["id"] if event else name)
     if event:
-        events = [each for each in client.history() if _is_around(each, event)]
+        events = [each for each in history if _is_around(each, event)]
     stem = f"avckpt-{_plain(container)}-{time.strftime('%Y%m%d-%H%M%S')}"
     path = output or Path(f"{stem}.tar.gz")
     try:
@@ -98,14 +100,14 @@ def bundle(name: str, output: Path | None, core: bool) -> None:
     click.echo(str(path))
 
 
-def find(client: Client, name: str) -> tuple[Json, list[Json]]:
+def find(rows: list[Json], history: list[Json], name: str) -> tuple[Json, list[Json]]:
     """The container of that name, id or beginning of an id, its last run first, and its events.
 
     Raises NoSuchContainer.
     """
-    rows = [row for row in client.containers(ended=True) if name == row["name"] or row["id"].startswith(name)]
+    rows = [row for row in rows if name == row["name"] or row["id"].startswith(name)]
     names = {row["id"] for row in rows}
-    events = [event for event in client.history() if event["id"] in names or name == event["container"]]
+    events = [event for event in history if event["id"] in names or name == event["container"]]
     if not rows and not events:
         raise NoSuchContainer(f"nothing is known of a container or an event {name!r}")
     if rows:
@@ -113,14 +115,14 @@ def find(client: Client, name: str) -> tuple[Json, list[Json]]:
     return {"name": events[-1]["container"], "id": events[-1]["id"], "state": "ended"}, events
 
 
-def find_event(client: Client, number: str) -> Json:
+def find_event(rows: list[Json], history: list[Json], number: str) -> Json:
     """The event of that number; empty when it is no number, or a container is called so.
 
     Raises NoSuchContainer when it is not about one.
     """
-    if not number.isdecimal() or any(number == row["name"] for row in client.containers(ended=True, memory=False)):
+    if not number.isdecimal() or any(number == row["name"] for row in rows):
         return {}
-    event: Json = next((each for each in client.history() if each["seq"] == int(number)), {})
+    event: Json = next((each for each in history if each["seq"] == int(number)), {})
     if event and not event["id"]:
         raise NoSuchContainer(f"event {number} is not about a container: {event['message']}")
     return event
@@ -136,6 +138,7 @@ def contents(
 ) -> Iterator[tuple[str, Callable[[], str | bytes]]]:
     """Names of the files, and how to get what is in them; this may raise AvckptError or OSError."""
     from avckpt.cli import doctor, sidecar_container
+    from avckpt.events import system_journal
 
     at = time.strftime("%Y-%m-%d %H:%M:%S %Z")
     yield "README.txt", lambda: README.format(name=called(container), at=at, lines=LOG_LINES)
@@ -146,15 +149,13 @@ def contents(
     inspected: list[Json] = []
     whose = container.get("node_of") or container["id"]  # a node's container is what Podman knows
     logs = ["podman", "logs", "--tail", str(LOG_LINES)]
+    journal = ["journalctl", "--no-pager", "--quiet", "--output", "short-iso-precise"]
     if event:
-        logs = [
-            "podman",
-            "logs",
-            "--since",
-            _rfc3339(event["at"] - AROUND_S),
-            "--until",
-            _rfc3339(event["at"] + AROUND_S),
-        ]
+        begin, end = event["at"] - AROUND_S, event["at"] + AROUND_S
+        logs = ["podman", "logs", "--since", _rfc3339(begin), "--until", _rfc3339(end)]
+        journal += ["--since", f"@{begin:.0f}", "--until", f"@{end:.0f}"]
+    else:
+        journal += ["--lines", str(LOG_LINES)]
 
     def inspect() -> str:
         inspected.extend(json.loads(_program("podman", "container", "inspect", whose)))
@@ -170,6 +171,8 @@ def contents(
         yield "inspect.json", inspect
         yield "labels.json", labels
         yield "container.log", lambda: _program(*logs, whose)
+    if system_journal.SOCKET.exists():
+        yield "journal.txt", lambda: _program(*journal, f"CONTAINER_NAME={called(container)}")
     yield "sidecar.json", lambda: _pretty(client.info())
     yield "sidecar.log", lambda: _program(*logs, sidecar_container.NAME)
     yield "metrics.txt", client.metrics

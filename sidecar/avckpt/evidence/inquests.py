@@ -106,7 +106,7 @@ class Inquests(Generic[W]):
     async def _look_into(self, watch: W, case: Case, outcome: asyncio.Future[EventRecord]) -> None:
         try:
             crash = await self._collector.examine(case)
-            watch.container.command = crash.command
+            watch.container.command = crash.command or watch.container.command
             self._command(watch, Command.SEEN, case.remains_pid or case.likeness_pid)
             try:
                 followed = await asyncio.wait_for(outcome, OUTCOME_S)

@@ -66,7 +66,7 @@ class Caretaker(Generic[W]):
         """Begins to watch the host's memory."""
         self._host = HostPressure()
         if self._host.fd is not None:
-            asyncio.get_running_loop().add_reader(self._host.fd, self._host_is_short)
+            asyncio.get_running_loop().add_reader(self._host.fd, self._look_at_host)
 
     def begin(self, ward: W, policy: Policy) -> None:
         """A container that is guarded from now on."""
@@ -135,8 +135,8 @@ class Caretaker(Generic[W]):
             if not self._must_look():
                 return
             await asyncio.sleep(LOOK_S)
-            if self._host is not None and self._host.fd is None and self._host.is_high():
-                self._host_is_short()
+            if self._host is not None and self._host.fd is None:
+                self._look_at_host()
             for care in list(self._cares.values()):
                 limited = care.ward.container.config.memory_limit_bytes or care.allowance.short
                 if not limited and number % SELDOM:
@@ -168,7 +168,9 @@ class Caretaker(Generic[W]):
         with contextlib.suppress(TargetGone, Busy):  # it has ended
             guard.configure(container.config)
 
-    def _host_is_short(self) -> None:
+    def _look_at_host(self) -> None:
+        if self._host is None or not self._host.is_high():
+            return
         # Lasting pressure is reported every second; finding who holds most may take longer.
         if self._relieving is None or self._relieving.done():
             self._relieving = asyncio.get_running_loop().create_task(self._relieve())

@@ -40,6 +40,9 @@ TRIGGERS = (b"some 150000 1000000", b"some 300000 2000000")
 """Microseconds stalled of a window; the second needs no privilege (Documentation/accounting/psi.rst)."""
 AVAILABLE = 0.05
 """Fraction of the host's memory, without PSI: less than this available is pressure."""
+AVAILABLE_STALLED = 0.20
+"""The same with PSI. The kernel counts tasks that wait for memory in a control group at its own limit, too:
+any container can have that go on for ever, and what others hold would not help it."""
 
 
 class Advice(enum.Enum):
@@ -96,10 +99,10 @@ class Allowance:
 
 
 class HostPressure:
-    """Detects when the host is short of memory: a PSI trigger, or else MemAvailable.
+    """Detects when the host is short of memory: little is available and, where the kernel has PSI, tasks wait.
 
-    `fd` is readable (poll(2)) once per window with pressure, until it has been
-    polled; None: there is no PSI, poll `is_high()`.
+    `fd` is readable (poll(2)) once per window in which they do, until it has been polled: the moment to ask
+    `is_high()`. None: there is no PSI, ask all the time.
     """
 
     def __init__(self, psi: Path | None = None) -> None:
@@ -126,9 +129,9 @@ class HostPressure:
         return self._epoll.fileno() if self._epoll is not None else None
 
     def is_high(self) -> bool:
-        """Whether the host is short of memory now, as far as can be told without PSI."""
+        """Whether so little memory is available now that the host is short of it."""
         total, available = _host_memory()
-        return available < AVAILABLE * total
+        return available < (AVAILABLE if self.fd is None else AVAILABLE_STALLED) * total
 
     def close(self) -> None:
         """Removes the trigger."""
