@@ -165,7 +165,9 @@ static enum avc_fork_reason why_not(const struct process *process, const struct 
 		return AVC_FORK_CONFIG;
 	if (!process->infected || process->adopts)
 		return AVC_FORK_PROCESSES;
-	if (has_own_filter(process))
+	/* Nothing tells whether one that is not dumpable has entered a Landlock domain
+	 * (inherited.c). */
+	if (has_own_filter(process) || process->undumpable)
 		return AVC_FORK_SANDBOX;
 	if (config->images == AVC_IMAGES_AUTO && is_small(process))
 		return AVC_FORK_SMALL;

@@ -169,11 +169,14 @@ static int prepare_process(struct avc_guard *guard, uint32_t entry, uint32_t *la
 		if (infect(guard, process, err))
 			return -1;
 	}
-	if (process_query_new_threads(process, guard->timer, deadline, later, err))
-		return -1;
 	/* Its holder makes calls from memory that the process can write. */
 	if (process->holder && has_filters_since(process))
 		process_unhold(process);
+	/* That of the main process is what its threads are asked about (fence.c). */
+	if (!process->descendant && !process->holder && hold(guard, process, err))
+		return -1;
+	if (process_query_new_threads(process, guard->timer, deadline, later, err))
+		return -1;
 	process->adopts = process->descendant && tree_has_reaper(&guard->tree, entry);
 	/* Below a process that adopts orphans, only when that one is stopped, too. */
 	if (!process->holder && !process->adopts && hold(guard, process, err))

@@ -763,6 +763,7 @@ int process_resume_adoption(struct process *process, struct avc_error *err)
 static int keep_holder(struct process *process, pid_t holder, int result, struct avc_error *err)
 {
 	process->holder = holder;
+	process->holder_inside = proc_inside(holder);
 	process->held_ns = now_ns();
 	process->exec_check_ns = 0;
 	process->holder_pidfd = proc_pidfd_open(holder);
@@ -907,6 +908,7 @@ static void forget_holder(struct process *process)
 {
 	process->doubtful = false;
 	process->holder = 0;
+	process->holder_inside = 0;
 	process->holder_pidfd = -1;
 }
 

@@ -216,7 +216,10 @@ void thread_ask_add(const struct process *process, bool with_locks, struct inj_c
 	name = call_add(call, SYS_prctl, PR_GET_NAME, out + 32);
 	locks = with_locks ? call_add(call, INJ_FUTURE_LOCK) : NULL;
 	attributes = attributes_ask(call, call->out + 64, out + 64);
-	*questions = (struct questions){ tid_address, altstack, inside, name, locks, attributes };
+	*questions = (struct questions){ tid_address, altstack,   inside, name,
+					 locks,       attributes, NULL,   NULL };
+	_Static_assert(64 + ATTRIBUTES_ASK_BYTES + 16 <= sizeof call->out, "room for the answers");
+	fence_ask(process, call, out + 64 + ATTRIBUTES_ASK_BYTES, questions);
 }
 
 int thread_ask(struct process *process, struct thread *thread, struct avc_error *err)
@@ -231,6 +234,7 @@ int thread_ask(struct process *process, struct thread *thread, struct avc_error 
 	if (read_signal_state(thread, err) || thread_borrow(process, thread, err))
 		return -1;
 	if (parasite_run(thread->tid, call, err)) {
+		parasite_cut_short(call, err);
 		thread_runs_on(thread, err); /* not to be given back in the middle of it */
 		return -1;
 	}
@@ -267,6 +271,8 @@ int thread_ask_answer(struct process *process, struct thread *thread, const stru
 	attributes_answer(questions->attributes, call->out + 64, &thread->creds);
 	if (locks && locks->result > 0)
 		thread->creds.future_lock = (int32_t)locks->result;
+	if (fence_answer(process, thread, questions, err))
+		return -1;
 	filters_read(process, thread);
 	thread->known_tls = arch_tls(&thread->regs);
 	thread->young = !thread->known;

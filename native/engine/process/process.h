@@ -10,6 +10,7 @@
  *   support.c       what cannot be protected; quiescence
  *   waits.c         ends calls whose timeout has expired
  *   dying.c         in its own handler of a fatal signal
+ *   fence.c         ... or in a Landlock domain of its own
  *   tree.c          all of them
  */
 #ifndef AVCKPT_PROCESS_H
@@ -96,6 +97,15 @@ int process_list_threads(struct process *process, struct avc_error *err) warn_un
  * *later of them, which then counts down, are left to the freeze. */
 int process_query_new_threads(struct process *process, timer_t timer, uint64_t deadline_ns,
 			      uint32_t *later, struct avc_error *err) warn_unused;
+
+/* ---- fence.c -------------------------------------------------------------------- */
+
+/* Adds calls to those that a thread makes, with 16 bytes at `out` (its own address). */
+void fence_ask(const struct process *process, struct inj_call *call, avc_remote out,
+	       struct questions *questions);
+/* Sets creds.fenced.  AVC_RETRY: the holder was too old to tell. */
+int fence_answer(struct process *process, struct thread *thread, const struct questions *questions,
+		 struct avc_error *err) warn_unused;
 
 /* ---- dying.c ------------------------------------------------------------------- */
 

@@ -200,6 +200,7 @@ static struct process *process_new(const struct tree *tree)
 		return NULL;
 	process_init(process);
 	process->descendant = true;
+	process->main = main;
 	process->shm_bytes = main->shm_bytes;
 	process->others = main->others;
 	process->tcp_moved = main->tcp_moved;

@@ -312,6 +312,10 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 			    inside);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return refuse(process, inside, "privileges that", " has given up", err);
+	if (to->fenced)
+		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
+			    "%s %d is in a Landlock domain of its own, which cannot be put back",
+			    process->descendant ? "process" : "thread", inside);
 	if (!may_become(from, to))
 		return refuse(process, inside, "another user or group than",
 			      ", which has given up the right to be that", err);

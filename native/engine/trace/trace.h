@@ -77,6 +77,7 @@ struct creds {
 	uint32_t securebits, no_new_privs;
 	uint32_t death_signal, subreaper;
 	uint64_t filters; /* of seccomp: a hash                               */
+	uint32_t fenced;  /* in a Landlock domain that the main process is not in (fence.c) */
 	int32_t group_count;
 	uint32_t group[GROUPS_KEPT]; /* supplementary                             */
 	int32_t memory_policy;       /* set_mempolicy(2), -1: the kernel has none */
@@ -87,7 +88,8 @@ struct creds {
 
 /* Queries to a thread (process.c); NULL: not made. */
 struct questions {
-	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes;
+	const struct inj_syscall *tid_address, *altstack, *inside, *name, *locks, *attributes,
+		*dumpable, *sight;
 };
 
 /* How injected code gets along with the app's seccomp filters (seccomp.c). */
@@ -189,6 +191,7 @@ struct process {
 	struct parasite parasite;
 	bool infected; /* the parasite is known to be in this process           */
 	pid_t holder;  /* 0: none                                          */
+	pid_t holder_inside;
 	int holder_pidfd;
 	struct thread *threads;
 	uint32_t thread_count, thread_room;
@@ -252,6 +255,10 @@ struct process {
 	bool alive;                   /* for too long: it goes on running in the handler   */
 	bool doubtful;                /* it was cloning when a checkpoint failed          */
 	const struct creds *forebear; /* of a process forked from the main one             */
+	const struct process *main;   /* that one; NULL: this is it                        */
+	bool blind;                   /* it may not even look at its holder                 */
+	bool renewed;                 /* its holder was, for the threads' sake (fence.c)    */
+	bool undumpable;              /* prctl(2), PR_GET_DUMPABLE, when it was last asked  */
 	bool adopts;                  /* it or an ancestor adopts orphans, or may do so     */
 	bool paused; /* between process_pause_adoption() and process_resume_adoption()         */
 	struct tracker *tracker; /* process/tracker.c; NULL: its memory is not watched         */
@@ -497,6 +504,10 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
  * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
 int thread_borrow(struct process *process, struct thread *thread,
 		  struct avc_error *err) warn_unused;
+/* For a thread that did not get to run in time, unless its list changes memory: it makes no more
+ * calls, and goes home as soon as it runs.  Others are released before it does, and may put it under
+ * a filter that kills for such calls (SECCOMP_FILTER_FLAG_TSYNC). */
+void parasite_cut_short(struct inj_call *call, const struct avc_error *err);
 /* The registers of a borrowed thread that goes home by itself, whatever its signal mask. */
 void thread_head_home(const struct thread *thread, struct arch_regs *regs);
 int thread_give_back(struct thread *thread, struct avc_error *err);

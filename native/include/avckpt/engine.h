@@ -55,7 +55,7 @@ enum avc_fork_reason {
 	AVC_FORK_FIRST = 2,     /* there is no older one to be used yet */
 	AVC_FORK_PROCESSES = 3, /* a process above it adopts orphans, or it is new */
 	AVC_FORK_KERNEL = 4,    /* the kernel cannot watch memory (before 6.7)     */
-	AVC_FORK_SANDBOX = 5,   /* it has a seccomp filter of its own              */
+	AVC_FORK_SANDBOX = 5,   /* it has a seccomp filter of its own, or is not dumpable */
 	AVC_FORK_MEMORY = 6,    /* of a kind that cannot be watched or copied      */
 	AVC_FORK_PINNED = 7,    /* a device or the kernel may write to it unseen   */
 	AVC_FORK_CHANGED = 8,   /* what a fork inherits has changed                */

@@ -9,6 +9,7 @@ import os
 import platform
 import subprocess
 import tarfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -28,6 +29,7 @@ COMMAND_TIMEOUT_S = 30.0
 LOG_LINES = 2000
 MOST_BYTES = 8 << 20
 """Of what one program says; the end is what matters."""
+CHUNK_BYTES = 1 << 20
 CORE_MOST_BYTES = 256 << 20
 AROUND_S = 600.0
 """What happened so long before and after an event may have to do with it."""
@@ -240,23 +242,36 @@ def versions() -> str:
 
 
 def _program(*argv: str) -> str:
-    """What a program says on both of its outputs.  Raises AvckptError when it fails."""
+    """What a program says on both of its outputs; the end of it, as a container may have written gigabytes.
+
+    Raises AvckptError when it fails.
+    """
     try:
-        done = subprocess.run(
-            argv,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=COMMAND_TIMEOUT_S,
-            check=False,
+        process = subprocess.Popen(
+            argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=0
         )
     except FileNotFoundError:
         raise AvckptError(f"there is no {argv[0]}") from None
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except OSError as error:
         raise AvckptError(f"{argv[0]}: {error}") from error
-    said = _tail(done.stdout)
-    if done.returncode != 0:
-        raise AvckptError(said.strip().rpartition("\n")[2] or f"{argv[0]} ended with status {done.returncode}")
+    end = bytearray()
+    with process:
+        assert process.stdout is not None
+        over = threading.Timer(COMMAND_TIMEOUT_S, process.kill)
+        over.start()
+        try:
+            while chunk := process.stdout.read(CHUNK_BYTES):
+                end += chunk
+                if len(end) > 2 * MOST_BYTES:
+                    del end[:-MOST_BYTES]
+        finally:
+            late = not over.is_alive()
+            over.cancel()
+    said = _tail(end)
+    if late:
+        raise AvckptError(f"{argv[0]} took more than {COMMAND_TIMEOUT_S:.0f} s")
+    if process.returncode != 0:
+        raise AvckptError(said.strip().rpartition("\n")[2] or f"{argv[0]} ended with status {process.returncode}")
     return said
 
 
@@ -264,7 +279,7 @@ def _rfc3339(at: float) -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(at))
 
 
-def _tail(data: bytes) -> str:
+def _tail(data: bytes | bytearray) -> str:
     return data[-MOST_BYTES:].decode("utf-8", "replace")
 
 

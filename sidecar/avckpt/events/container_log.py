@@ -8,6 +8,7 @@ sends its own.  Nothing is written unless that is a pipe to who collects the log
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import select
 import stat
@@ -38,17 +39,16 @@ class ContainerLog:
 
 def _write(process: int, text: str) -> None:
     """Closes `process`, its folder in /proc."""
-    try:
-        if stat.S_ISFIFO(os.stat("fd/2", dir_fd=process).st_mode):
+    with contextlib.ExitStack() as opened:
+        opened.callback(os.close, process)
+        # It is full, nobody reads it, or the container has ended.
+        opened.enter_context(contextlib.suppress(OSError))
+        # Whatever takes its place from here on, only this is opened.
+        log = os.open("fd/2", os.O_PATH | os.O_CLOEXEC, dir_fd=process)
+        opened.callback(os.close, log)
+        if stat.S_ISFIFO(os.fstat(log).st_mode):
             # An open file description of our own: that of the application goes on to block.
-            fd = os.open("fd/2", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC, dir_fd=process)
-            try:
-                if stat.S_ISFIFO(os.fstat(fd).st_mode):
-                    # All of it or nothing, and never inside of a line's write(2).
-                    os.write(fd, f"avckpt: {text}".encode(errors="replace")[: select.PIPE_BUF - 1] + b"\n")
-            finally:
-                os.close(fd)
-    except OSError:
-        pass  # it is full, nobody reads it, or the container has ended
-    finally:
-        os.close(process)
+            fd = os.open(f"/proc/self/fd/{log}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+            opened.callback(os.close, fd)
+            # All of it or nothing, and never inside of a line's write(2).
+            os.write(fd, f"avckpt: {text}".encode(errors="replace")[: select.PIPE_BUF - 1] + b"\n")
