@@ -40,8 +40,9 @@ may take as long as that."""
 
 _MARK = b'"avckpt.'
 """A JSON text without it contains no label or annotation of ours."""
-_LOOKALIKE = b'"avckpt'
-"""A JSON text that, in lower case, lacks it contains none that was meant for us."""
+_LOOKALIKES = [b'"' + name for name in b"avckpt vckpt ackpt avkpt avcpt avckt avckp vackpt acvkpt avkcpt avcpk".split()]
+"""A JSON text that, in lower case, lacks them contains none that was meant for us, but for a letter that was forgotten
+or two that were exchanged."""
 
 
 class Refused(Exception):
@@ -80,7 +81,8 @@ def rewrite(config: bytes, parent: int) -> bytes:
                 f"cannot read a container's labels ({unknown}): if avckpt.enable is one of them, it runs unprotected",
                 parent,
             )
-    if _LOOKALIKE not in spec.lower() and _LOOKALIKE not in config.lower():
+    both = spec.lower() + config.lower()
+    if not any(name in both for name in _LOOKALIKES):
         return config
     return rewrite_labelled(config, container, spec, parent)
 
@@ -105,6 +107,8 @@ def rewrite_labelled(config: bytes, container: str, spec: bytes, parent: int) ->
     for key in sorted({*given, *annotations}):
         if labels.LOOKALIKE.match(key) and not key.startswith(labels.PREFIX):
             meant = labels.meant_by(key)
+            if not meant and not key.lower().startswith("avckpt"):
+                continue
             hint = f"did you mean {meant}?" if meant else f"avckpt's begin with {labels.PREFIX}"
             warn(f"container {name}: the label {key} means nothing; {hint}", parent)
     if not policy.enable and not (policy.listens and _is_ours()):

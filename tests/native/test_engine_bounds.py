@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
 
+from testkit.family import kill_main
 from testkit.guarded import GuardProcess, Victim, config
 from testkit.harness import SLOWNESS
 from testkit.procfs import peak_kb
@@ -74,6 +76,23 @@ def test_memory_that_was_never_touched_costs_nothing(tmp_path: Path) -> None:
             taken = guard.command("checkpoint", timeout_s=PATIENCE_S)
             assert taken["kind"] == "checkpoint", taken
         assert peak_kb(guard_of(guard)) - before < CHILDREN << 10
+
+
+@pytest.mark.timeout(300)
+def test_as_many_processes_as_are_supported(tmp_path: Path) -> None:
+    """They fit into the guard's memory, whose limit also counts what it reserves, and a death is answered in time
+    although a checkpoint of them may take longer than init waits."""
+    with (
+        Victim("crowd shared 500 0", tmp_path) as crowd,
+        GuardProcess(config(0.2, freeze_deadline_s=2.0), [crowd.pid]) as guard,
+    ):
+        for kill in range(3):
+            guard.wait("checkpoint", since=guard.mark(), timeout_s=4 * PATIENCE_S)
+            time.sleep(0.4 * kill)
+            since = guard.mark()
+            kill_main(crowd)
+            assert guard.wait("restored", since=since, timeout_s=PATIENCE_S)["threads"] == 501
+            crowd.wait_beats()
 
 
 def test_what_it_has_open_is_bounded(tmp_path: Path) -> None:

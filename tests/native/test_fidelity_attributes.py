@@ -27,7 +27,9 @@ def test_attributes(command: str, where: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", WHERE)
-@pytest.mark.parametrize("kind", ["exit-signal", "zombie-group", "vdso", "proc", "limits", "hard-limits", "barriers"])
+@pytest.mark.parametrize(
+    "kind", ["exit-signal", "zombie-group", "vdso", "proc", "limits", "hard-limits", "barriers", "retired"]
+)
 def test_traits(kind: str, where: str, tmp_path: Path) -> None:
     """Of children: exit signals, the group of an ended one, limits; membarrier(2)."""
     with Victim(f"traits {kind} {where}", tmp_path) as victim, GuardProcess(config(0.03), [victim.pid]) as guard:

@@ -188,6 +188,8 @@ def test_a_bad_label_fails_and_tells_the_one_who_started_podman(hook: Hook) -> N
         ("AVCKPT.enable", "did you mean avckpt.enable?"),
         ("Avckpt.Restore_On", "did you mean avckpt.restore.on?"),
         ("avckpt_colour", "avckpt's begin with avckpt."),
+        ("avkpt.enable", "did you mean avckpt.enable?"),
+        ("avcpkt.interval", "did you mean avckpt.interval?"),
     ],
 )
 def test_a_label_that_looks_like_one_of_ours_is_said(hook: Hook, key: str, hint: str) -> None:

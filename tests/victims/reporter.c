@@ -12,7 +12,8 @@
  *              the report is made far down that stack (backward-cpp)
  *   python     on an alternate stack, SA_NODEFER, no other blocked, and the first thing that it
  *              does is to put the default back (faulthandler)
- *   sysv       SA_RESETHAND and SA_NODEFER, nothing blocked (signal(2) of System V)
+ *   sysv       SA_RESETHAND and SA_NODEFER, nothing blocked (signal(2) of System V), and a report
+ *              that takes 1 MB of the ordinary stack (Redis)
  *   breakpad   on an alternate stack; a child traces the process and makes the report
  *   exit       as plain; it tears down and ends with status 1
  *   leave      on an alternate stack, which it leaves for good; then it makes its report and ends
@@ -111,7 +112,7 @@ static void on_crash(int signal_number)
 	else if (report_file)
 		report_to_file();
 	else
-		report(is("open") ? 300 : 3);
+		report(is("open") || is("sysv") ? 300 : 3);
 	if (is("exit"))
 		_exit(1);
 	sigaction(signal_number, &plain, NULL);

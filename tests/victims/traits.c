@@ -19,6 +19,8 @@
  *   rearmed       the same, which has left it when counter 1 of the board is 2
  *   users         threads that change their groups and user, all of them (setuid(3)), each time
  *                 counter 1 of the board does; counter 0 follows
+ *   retired       a main process that is another user for the time being (seteuid(2)), with a child
+ *                 of a third user and group
  */
 #include <fcntl.h>
 #include <grp.h>
@@ -39,7 +41,7 @@
 #define USERS 4
 #define NO_SIGNAL 200
 
-static char was[512], is[512], stack[STACK_BYTES];
+static char was[1024], is[1024], stack[STACK_BYTES];
 static pid_t kid, dead, untold;
 static volatile int ready;
 static stack_t thread_stack;
@@ -524,6 +526,45 @@ static void look_at_users(char *to, size_t size)
 	}
 }
 
+static void add_credentials(pid_t pid, char *to, size_t size)
+{
+	char name[32], line[256];
+	FILE *status;
+
+	snprintf(name, sizeof name, "/proc/%d/status", pid);
+	status = fopen(name, "re");
+	must(status != NULL, "fopen");
+	while (fgets(line, sizeof line, status))
+		if (!strncmp(line, "Uid", 3) || !strncmp(line, "Gid", 3) ||
+		    !strncmp(line, "Groups", 6) || !strncmp(line, "Cap", 3))
+			strncat(to, line, size - strlen(to) - 1);
+	fclose(status);
+}
+
+static void setup_retired(void)
+{
+	const gid_t group = 4711;
+
+	kid = fork();
+	must(kid >= 0, "fork");
+	if (!kid) {
+		must(!setgroups(1, &group) && !setresgid(1001, 1001, 1001) &&
+			     !setresuid(1001, 1001, 1001),
+		     "setresuid");
+		kill(getpid(), SIGSTOP);
+		rest();
+	}
+	must(waitpid(kid, NULL, WUNTRACED) == kid && !kill(kid, SIGCONT), "waitpid");
+	must(!seteuid(1000), "seteuid");
+}
+
+static void look_at_retired(char *to, size_t size)
+{
+	*to = 0;
+	add_credentials(getpid(), to, size);
+	add_credentials(kid, to, size);
+}
+
 /* ---- all of them ---------------------------------------------------------------------------- */
 
 static const struct {
@@ -543,6 +584,7 @@ static const struct {
 	{ "disarmed", setup_disarmed, look_at_thread },
 	{ "rearmed", setup_rearmed, look_at_thread },
 	{ "users", setup_users, look_at_users },
+	{ "retired", setup_retired, look_at_retired },
 };
 
 int main(int argc, char **argv)

@@ -237,11 +237,24 @@ static bool start_filter(void)
 	return !pthread_create(&thread, NULL, filtered, NULL);
 }
 
+static bool give_up_groups(void)
+{
+	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
+	struct __user_cap_data_struct data[2] = { { 0 } };
+
+	if (syscall(SYS_capget, &header, data))
+		return false;
+	data[0].effective &= ~(1u << CAP_SETGID);
+	data[0].permitted &= ~(1u << CAP_SETGID);
+	return !syscall(SYS_capset, &header, data);
+}
+
 static void *grouped(void *arg)
 {
 	const gid_t group = 4711;
 
-	if (syscall(SYS_setgroups, 1, &group))
+	/* The main thread has no less than it: that is refused, too. */
+	if (syscall(SYS_setgroups, 1, &group) || !give_up_groups())
 		unavailable("setgroups");
 	*(volatile bool *)arg = true;
 	for (;;)
@@ -252,20 +265,13 @@ static void *grouped(void *arg)
 static bool start_groups(void)
 {
 	static volatile bool done;
-	struct __user_cap_header_struct header = { _LINUX_CAPABILITY_VERSION_3, 0 };
-	struct __user_cap_data_struct data[2] = { { 0 } };
 	pthread_t thread;
 
 	if (pthread_create(&thread, NULL, grouped, (void *)&done))
 		return false;
 	while (!done)
 		nap_us(100);
-	/* Of the main thread, which has no more than the other: but for this one, it would be
-	 * refused for that. */
-	if (syscall(SYS_capget, &header, data))
-		return false;
-	data[0].effective &= ~(1u << CAP_SETGID);
-	return !syscall(SYS_capset, &header, data);
+	return give_up_groups();
 }
 
 static volatile bool together_again;

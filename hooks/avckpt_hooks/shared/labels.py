@@ -495,7 +495,7 @@ LABELS: dict[str, Label] = {
 """Every label a user may set."""
 
 
-LOOKALIKE = re.compile(r"avckpt[._-]", re.IGNORECASE)
+LOOKALIKE = re.compile(r"[avckpt]{5,7}[._-]", re.IGNORECASE)
 """Prefixes of names that were meant for us, right or wrong."""
 
 

@@ -332,6 +332,8 @@ int generation_finish(struct generation *generation, struct avc_error *err)
 
 		if (!image->process)
 			continue;
+		if (!budget_step())
+			return budget_check(main->pid, err);
 		if (i)
 			image->process->forebear = &main_thread->creds;
 		if (begin_template(image, &failed) == 0 && finish(image, &failed) == 0)

@@ -12,6 +12,8 @@
 #define SPARE_NS (NS_PER_S / 2)
 #define READ_NS (2 * NS_PER_S) /* to read its state while it is stopped                        */
 #define QUIESCE_STEP_NS NS_PER_MS
+#define TEMPLATE_NS (20 * NS_PER_MS) /* to make one ready, where there are many         */
+#define LOOK_NS (100 * NS_PER_MS)
 #define TAKE_TRIES 4
 #define VFORK_NS (2 * NS_PER_S)
 #define HOMEWARD_NS (2 * NS_PER_S)
@@ -242,6 +244,8 @@ static int prepare(struct avc_guard *guard, struct avc_error *err)
 
 		if (!process || (!process->infected && tree_shares_memory(tree, i)))
 			continue;
+		if (!budget_step())
+			return budget_check(guard->main.pid, err);
 		process->main_filters = guard->main.filters;
 		process->shm_bytes = guard->main.shm_bytes;
 		process->tcp_moved = guard->main.tcp_moved;
@@ -462,7 +466,7 @@ static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_
 	if (faults_heard(&guard->faults))
 		return fail(err, AVC_DEADLINE, 0, guard->main.pid, "freeze", "",
 			    "it has just handled a fault, and may be dying");
-	tracee_deadline_set(guard->timer, NS_PER_S);
+	tracee_deadline_set(guard->timer, NS_PER_S + fresh->images * TEMPLATE_NS);
 	result = dirty_apply(&guard->dirty, fresh, err);
 	if (!result)
 		result = generation_finish(fresh, err);
@@ -581,11 +585,25 @@ static bool make_way(struct avc_guard *guard, const struct avc_error *err)
 	return true;
 }
 
+/* With hundreds of processes a checkpoint can take longer than init waits for an answer to a death:
+ * then it is given up. */
+static void look_at_main(void *arg)
+{
+	struct avc_guard *guard = arg;
+
+	if (!guard->main.pid || now_ns() - guard->looked_ns < LOOK_NS)
+		return;
+	guard->looked_ns = now_ns();
+	if (proc_is_exiting(guard->main.pid))
+		budget_exceed(AVC_GONE, "it has ended");
+}
+
 static int take(struct avc_guard *guard, struct avc_event *event, struct avc_error *err)
 {
+	guard->looked_ns = now_ns();
 	for (int tries = 1;; tries++) {
 		*err = (struct avc_error){ 0 };
-		budget_begin(NULL, NULL);
+		budget_begin(look_at_main, guard);
 		if (prepare(guard, err) == 0) {
 			guard_filter(guard);
 			if (take_once(guard, event, err) == 0)

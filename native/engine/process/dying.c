@@ -24,6 +24,8 @@
  * alternate one, where the first frame is. */
 #define LOOK_BYTES (256 * 1024)
 #define LOOK_TOP_BYTES (32 * 1024)
+/* Where a signal was caught and is not now.  Redis tests memory by its handler, with 1 MB of stack. */
+#define LOOK_FAR_BYTES (4 * 1024 * 1024)
 #define CHUNK_BYTES (16 * 1024)
 /* Some programs run permanently in their handlers: of calls trapped by a filter (SIGSYS) and of
  * breakpoints, or with the third sign. */
@@ -145,20 +147,21 @@ static int look(const struct process *process, const struct thread *t, frame_tes
 }
 
 /* Thread-local storage is above the stack in a library's allocation; beyond it is other memory. */
-static avc_remote stack_end(const struct thread *t)
+static avc_remote stack_end(const struct process *process, const struct thread *t)
 {
 	const avc_remote sp = arch_sp(&t->regs), tls = arch_tls(&t->regs);
+	const uint64_t bytes = process->uncaught ? LOOK_FAR_BYTES : LOOK_BYTES;
 
-	if (on_altstack(t, sp) && t->altstack[0] + t->altstack[2] - sp < LOOK_BYTES)
+	if (on_altstack(t, sp) && t->altstack[0] + t->altstack[2] - sp < bytes)
 		return t->altstack[0] + t->altstack[2];
-	return tls > sp && tls - sp < LOOK_BYTES ? tls : sp + LOOK_BYTES;
+	return tls > sp && tls - sp < bytes ? tls : sp + bytes;
 }
 
 static int find(const struct process *process, const struct thread *t, frame_test *fits,
 		bool *surely)
 {
 	const avc_remote sp = arch_sp(&t->regs), top = t->altstack[0] + t->altstack[2];
-	const int signal = look(process, t, fits, sp, stack_end(t), surely);
+	const int signal = look(process, t, fits, sp, stack_end(process, t), surely);
 
 	if (!signal && on_altstack(t, sp) && top - sp > LOOK_BYTES)
 		return look(process, t, fits, top - LOOK_TOP_BYTES, top, surely);

@@ -40,22 +40,19 @@ void process_init(struct process *process)
 
 bool process_make_room(struct process *process)
 {
-	process->threads = calloc(THREADS_MAX, sizeof *process->threads);
-	process->thread_room = THREADS_MAX;
 	process->memory = memory_new();
 	process->pending = pending_new();
 	process->timers = timers_new();
-	return process->threads && process->memory && process->pending && process->timers;
+	return threads_reserve(process) && process->memory && process->pending && process->timers;
 }
 
 void process_free_room(struct process *process)
 {
-	free(process->threads);
+	threads_free(process);
 	memory_free(process->memory);
 	filters_forget(process);
 	free(process->pending);
 	free(process->timers);
-	process->threads = NULL;
 	process->memory = NULL;
 	process->pending = NULL;
 	process->timers = NULL;
@@ -308,7 +305,7 @@ static int count_task(pid_t tid, void *arg)
 	struct thread *t;
 
 	walk->count++;
-	if (walk->count > walk->process->thread_room)
+	if (walk->count > THREADS_MAX)
 		return 0;
 	t = thread_find(walk->process, tid);
 	if (!t)
@@ -326,10 +323,9 @@ int process_list_threads(struct process *process, struct avc_error *err)
 		process->threads[i].seen = false;
 	if (proc_tasks(process->task_dirfd, count_task, &walk))
 		return fail_errno(err, process->pid, "walk threads", "getdents64", "it has ended");
-	if (walk.count > process->thread_room)
+	if (walk.count > THREADS_MAX)
 		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "walk threads", "",
-			    "it has %u threads; %u are supported", walk.count,
-			    process->thread_room);
+			    "it has %u threads; %d are supported", walk.count, THREADS_MAX);
 	threads_forget_unseen(process);
 	return err->code ? -1 : 0;
 }

@@ -176,17 +176,24 @@ static bool raises_ambient(const struct creds *from, const struct creds *to)
 static void lower(const struct creds *from, const struct creds *to, struct setup *setup)
 {
 	const bool uids = memcmp(from->uid, to->uid, sizeof to->uid) != 0;
-	const bool caps = uids || memcmp(from->caps, to->caps, sizeof to->caps) ||
+	const bool gids = memcmp(from->gid, to->gid, sizeof to->gid) != 0;
+	/* A daemon that takes its rights back when it needs them. */
+	const bool raised = (uids || gids || differ_in_groups(from, to)) &&
+			    caps_of(from, EFFECTIVE) != caps_of(from, PERMITTED);
+	const bool caps = uids || raised || memcmp(from->caps, to->caps, sizeof to->caps) ||
 			  from->bounding != to->bounding || from->ambient != to->ambient ||
 			  differ_in_securebits(from, to) ||
 			  /* A change of the file-system user changes capabilities, too. */
 			  from->fsuid != to->fsuid;
 	uint32_t bits = from->securebits;
 
+	if (raised)
+		add_capset(setup, caps_of(from, PERMITTED), caps_of(from, PERMITTED),
+			   caps_of(from, INHERITABLE));
 	if (differ_in_groups(from, to))
 		setup_add_thread(setup, "setgroups", SYS_setgroups, (uint64_t)to->group_count,
 				 setup_data(setup, to->group, sizeof to->group));
-	if (memcmp(from->gid, to->gid, sizeof to->gid))
+	if (gids)
 		setup_add_thread(setup, "setresgid", SYS_setresgid, to->gid[0], to->gid[1],
 				 to->gid[2]);
 	/* Otherwise the capabilities would be dropped with the user. */
@@ -273,12 +280,12 @@ static bool may_take_ids(const uint32_t from[3], const uint32_t to[3])
 /* Calls of lower() must not be refused at a restore, when it is too late. */
 static bool may_become(const struct creds *from, const struct creds *to)
 {
-	const uint64_t may = caps_of(from, EFFECTIVE), later = caps_of(from, PERMITTED);
+	const uint64_t may = caps_of(from, PERMITTED);
 
-	return (may >> CAP_SETGID & 1 || may_take_ids(from->gid, to->gid)) &&
-	       (may >> CAP_SETUID & 1 || may_take_ids(from->uid, to->uid)) &&
-	       (later >> CAP_SETGID & 1 || is_among(to->fsgid, to->gid, to->gid[1])) &&
-	       (later >> CAP_SETUID & 1 || is_among(to->fsuid, to->uid, to->uid[1]));
+	return (may >> CAP_SETGID & 1 ||
+		(may_take_ids(from->gid, to->gid) && is_among(to->fsgid, to->gid, to->gid[1]))) &&
+	       (may >> CAP_SETUID & 1 ||
+		(may_take_ids(from->uid, to->uid) && is_among(to->fsuid, to->uid, to->uid[1])));
 }
 
 static int refuse(const struct process *process, pid_t inside, const char *has, const char *main,
@@ -305,11 +312,9 @@ static int set_apart(const struct process *process, pid_t inside, const struct c
 				 setup_data(setup, to->nodes, sizeof to->nodes), NODE_BITS)
 			->flags = INJ_MAY_FAIL;
 	if (differ_in_groups(from, to) &&
-	    (!(from->caps[0] >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
-		return fail(err, AVC_UNSUPPORTED, 0, process->pid, "keep template", "",
-			    "thread %d has other supplementary groups than the main thread, which "
-			    "cannot be put back",
-			    inside);
+	    (!(caps_of(from, PERMITTED) >> CAP_SETGID & 1) || to->group_count > GROUPS_KEPT))
+		return refuse(process, inside, "other supplementary groups than",
+			      ", which cannot be put back", err);
 	if (!has_less(from, to) || (from->no_new_privs && !to->no_new_privs))
 		return refuse(process, inside, "privileges that", " has given up", err);
 	if (to->fenced)

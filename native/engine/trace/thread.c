@@ -4,12 +4,48 @@
  */
 #include <errno.h>
 #include <sched.h>
+#include <sys/mman.h>
 #include <sys/ptrace.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
 #include "trace.h"
+
+#define THREADS_BYTES (THREADS_MAX * sizeof(struct thread))
+#define ROOM_FIRST 16 /* threads; then twice as many, and so on */
+
+/* They stay where they are, so there is address space for all of them.  Of the limit of our memory
+ * (RLIMIT_DATA), which has to do for hundreds of processes, only those take a part that there are:
+ * the kernel counts what may be written. */
+bool threads_reserve(struct process *process)
+{
+	void *room = mmap(NULL, THREADS_BYTES, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+
+	process->threads = room == MAP_FAILED ? NULL : room;
+	return process->threads != NULL;
+}
+
+void threads_free(struct process *process)
+{
+	if (process->threads)
+		munmap(process->threads, THREADS_BYTES);
+	process->threads = NULL;
+	process->thread_room = 0;
+}
+
+static int more_room(struct process *process, pid_t tid, struct avc_error *err)
+{
+	const uint32_t room = process->thread_room ? 2 * process->thread_room : ROOM_FIRST;
+
+	if (process->thread_room == THREADS_MAX)
+		return fail(err, AVC_DEADLINE, 0, tid, "freeze", "",
+			    "threads appear faster than they can be stopped");
+	if (mprotect(process->threads, room * sizeof *process->threads, PROT_READ | PROT_WRITE))
+		return fail_errno(err, tid, "walk threads", "mprotect", "out of memory");
+	process->thread_room = room;
+	return 0;
+}
 
 struct thread *thread_find(struct process *process, pid_t tid)
 {
@@ -23,11 +59,8 @@ struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *
 {
 	struct thread *t;
 
-	if (process->thread_count == process->thread_room) {
-		fail(err, AVC_DEADLINE, 0, tid, "freeze", "",
-		     "threads appear faster than they can be stopped");
+	if (process->thread_count == process->thread_room && more_room(process, tid, err))
 		return NULL;
-	}
 	t = &process->threads[process->thread_count++];
 	*t = (struct thread){ .tid = tid, .call.nr = -1, .block = -1 };
 	return t;

@@ -363,6 +363,9 @@ bool tracee_has_stopped(pid_t tid);
 
 /* ---- thread.c ------------------------------------------------------------------ */
 
+/* Room for THREADS_MAX; false: out of memory. */
+bool threads_reserve(struct process *process);
+void threads_free(struct process *process);
 /* The entry for a tid; NULL when there is no room. */
 struct thread *thread_find(struct process *process, pid_t tid);
 struct thread *thread_add(struct process *process, pid_t tid, struct avc_error *err);

@@ -217,7 +217,8 @@ enum stop_kind tracee_await_while(pid_t tid, void (*tick)(void), pid_t *child,
 			return stop.kind;
 		case STOP_DEADLINE:
 			fail(err, AVC_DEADLINE, 0, tid, "stop", "",
-			     "it did not stop in time: it is paused, or waits in the kernel for a device");
+			     "a thread did not stop in time: it gets no CPU, is paused, or waits in the "
+			     "kernel for a device");
 			return stop.kind;
 		}
 		/* Any stop clears a pending interrupt (kernel/signal.c, ptrace_stop): without a new
