@@ -304,11 +304,11 @@ static void drop_inherited(void)
 		close(null_fd);
 }
 
-/* Watches the keys of the terminal; the guard must know that this task is ours. */
+/* Hears what the app's group is sent; the guard must know that this task is ours. */
 static void listen_to_keys(void)
 {
-	const pid_t pid = self.ctl && !self.is_unit && self.fd[TTY] >= 0 ? keys_listen(self.app_pid)
-									 : 0;
+	const bool listens = self.is_unit ? self.shares_group : self.fd[TTY] >= 0;
+	const pid_t pid = self.ctl && listens ? keys_listen(self.is_unit ? 0 : self.app_pid) : 0;
 
 	if (self.ctl)
 		__atomic_store_n(&self.ctl->keys_pid, pid, __ATOMIC_RELEASE);
@@ -425,6 +425,7 @@ static _Noreturn void finish(int status)
 {
 	if (self.is_unit) {
 		/* Other children are what the program has left behind on purpose. */
+		(void)keys_pressed();
 		unit_end_templates();
 		unit_finish(status);
 	}
@@ -480,7 +481,7 @@ static bool was_wanted(int status, uint64_t at_ns, uint64_t keys_ns)
  * be one. */
 static void app_died(int status, uint64_t at_ns)
 {
-	bool wanted = was_wanted(status, at_ns, keys_pressed());
+	bool wanted = was_wanted(status, at_ns, self.is_unit ? 0 : keys_pressed());
 	struct avc_report report = {
 		.kind = AVC_REPORT_DEATH,
 		.seq = ++self.seq,
@@ -556,7 +557,8 @@ static void app_restored(void)
 	 * not the same group to the kernel. */
 	if (self.fd[TTY] >= 0 && tcgetpgrp(self.fd[TTY]) == self.app_pid)
 		tcsetpgrp(self.fd[TTY], self.app_pid);
-	listen_to_keys();
+	if (!self.is_unit)
+		listen_to_keys(); /* a unit's still does: it is in init's group */
 	for (sig = 1; self.deferred; sig++) {
 		if (!(self.deferred & SIGBIT(sig)))
 			continue;
@@ -657,11 +659,18 @@ static void continue_stopped(void)
 		kill(-self.app_pid, SIGCONT);
 }
 
-/* The terminal signals the whole group, which a unit's program is in, so it has got this one
- * itself. */
+/* A unit's program is in our group, so what was sent to the whole group, by the terminal or a
+ * process, it has got itself. */
 static bool app_has_it(int sig, const struct signalfd_siginfo *info)
 {
-	if (!self.shares_group || info->ssi_code != SI_KERNEL || self.waiting)
+	bool has = self.shares_group && info->ssi_code == SI_KERNEL;
+
+	if (self.shares_group && info->ssi_code == SI_USER) {
+		has = keys_group_got(sig);
+		if (!keys_are_heard())
+			listen_to_keys();
+	}
+	if (!has || self.waiting)
 		return false;
 	if (is_stop(sig))
 		note_stop(now_ns());

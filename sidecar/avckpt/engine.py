@@ -273,6 +273,7 @@ def _event(e: Any) -> Event:
         freeze_s=e.freeze_ns / _NS_PER_S,
         stop_s=e.stop_ns / _NS_PER_S,
         clone_s=e.clone_ns / _NS_PER_S,
+        wait_s=e.wait_ns / _NS_PER_S,
         images=Images(e.images).name.lower() if Kind.of(e.kind) is Kind.CHECKPOINT else "",
         fork_reason=FORK_REASONS[e.fork_reason] if e.fork_reason > 1 else "",
         copied=e.copied,

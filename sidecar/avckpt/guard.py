@@ -154,6 +154,7 @@ class Event:
     freeze_s: float = 0.0
     stop_s: float = 0.0
     clone_s: float = 0.0
+    wait_s: float = 0.0
     images: str = ""
     """Of a checkpoint: "fork" or "dirty"."""
     fork_reason: str = ""

@@ -199,6 +199,25 @@ def test_all_hurry_until_they_are_back_and_no_longer(local: LocalSidecar, ring: 
         )
 
 
+def test_all_hurry_from_the_meeting_before_a_freeze_on(local: LocalSidecar, ring: list[Container]) -> None:
+    """Who has no CPU when the others stop keeps them stopped."""
+    wait_for_line(local, ring)
+    held, waiting = (row(local, member)["guard_pid"] for member in ring[:2])
+    os.kill(held, signal.SIGSTOP)
+    try:
+        # They wait a second for it, with their applications running: longer than any freeze.
+        for _ in range(10):
+            wait_until(lambda: os.sched_getscheduler(waiting) == os.SCHED_FIFO, 5, "a guard waits for another one")
+            time.sleep(0.02)
+            hurries = [os.sched_getscheduler(waiting) for _ in range(10) if not time.sleep(0.02)]
+            if set(hurries) == {os.SCHED_FIFO}:
+                break
+    finally:
+        os.kill(held, signal.SIGCONT)
+    assert set(hurries) == {os.SCHED_FIFO}
+    wait_for_line(local, ring, row(local, ring[1])["line"])
+
+
 def test_a_guard_that_stops_or_dies_leaves_nobody_stopped(local: LocalSidecar, ring: list[Container]) -> None:
     for signum in (signal.SIGSTOP, signal.SIGKILL):
         guard_pid = row(local, ring[1])["guard_pid"]

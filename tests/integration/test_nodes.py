@@ -354,6 +354,55 @@ def test_a_job_of_a_shell_stops_and_continues(local: LocalSidecar, tmp_path: Pat
         os.waitpid(pid, 0)
 
 
+COUNT_SIGNALS = """
+import signal, time
+def heard(signum, frame):
+    with open("heard", "a") as out:
+        print(signal.Signals(signum).name, file=out)
+for signum in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
+    signal.signal(signum, heard)
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+open("heard", "w").close()
+while True:
+    time.sleep(0.05)
+"""
+
+
+@SHARED
+def test_a_signal_for_the_whole_group_comes_once(
+    local: LocalSidecar, start: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """roslaunch signals a node's group: a second SIGINT would interrupt how it ends after the first."""
+    monkeypatch.chdir(tmp_path)
+    # Nothing counts as a stop but the last ones: what follows one is not restored.
+    process = start("--name", "a", *QUICK, "--", sys.executable, "-c", COUNT_SIGNALS)
+    heard: list[str] = []
+
+    def send(whole: bool, *signals: signal.Signals) -> None:
+        for signum in signals:
+            (os.killpg if whole else os.kill)(process.pid, signum)
+            heard.append(signum.name)
+            wait_until(lambda: len((tmp_path / "heard").read_text().split()) >= len(heard), 10, f"{signum} comes")
+            time.sleep(0.15)  # and comes no more
+        assert (tmp_path / "heard").read_text().split() == heard
+
+    app = row(local, "host/a", state="protected", generations=2)["app_pid"]
+    send(True, signal.SIGHUP, signal.SIGUSR1, signal.SIGHUP)
+    send(False, signal.SIGHUP, signal.SIGUSR1)
+    os.kill(app, signal.SIGKILL)
+    row(local, "host/a", restores=1, state="protected")
+    send(True, signal.SIGUSR1)
+    send(False, signal.SIGUSR1)
+    send(True, signal.SIGINT, signal.SIGINT)
+    # It ignores the next step, and the last one is final.
+    os.killpg(process.pid, signal.SIGTERM)
+    time.sleep(0.3)
+    assert process.poll() is None
+    os.killpg(process.pid, signal.SIGKILL)
+    assert process.wait(10) == -signal.SIGKILL
+    wait_until(lambda: local.ps() == [], 10, "it is gone")
+
+
 def test_scope_nodes_takes_no_health_check() -> None:
     done = run(
         [*avckpt_command(), "run", "--label", "avckpt.scope=nodes", "--label", "avckpt.restore.on=unhealthy", "true"],

@@ -50,6 +50,8 @@ def row(**fields: object) -> dict[str, object]:
         "restores": 1,
         "last_restore_s": 0.0063,
         "reason": "",
+        "group": "drive",
+        "line": 0,
         **fields,
     }
 
@@ -158,6 +160,7 @@ def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
         row(),
         row(name="", state="starting", last_freeze_s=None, last_checkpoint_at=None, reason="[red]no[/red] " * 20),
         row(last_images="fork", last_fork_reason="it writes too much"),
+        row(line=12),
     ]
     monkeypatch.setattr(Client, "containers", lambda self, ended: rows)
     lines = avckpt("ps").stdout.splitlines()
@@ -172,7 +175,10 @@ def test_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     # The short id where there is no name; markup is text; one line, however long.
     assert lines[2].split()[:2] == ["abababababab", "starting"]
     assert lines[2].count("[red]no[/red]") == 20
-    assert len(lines) == 4
+    # A group that goes back together has a line.
+    assert lines[4].rstrip().endswith("line 12 of drive")
+    assert "drive" not in lines[1]
+    assert len(lines) == 5
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ struct freeze {
 	int (*meet)(void *arg, struct generation *whole, struct avc_error *err);
 	void *arg;
 	/* Durations. */
-	uint64_t freeze_ns, stop_ns, clone_ns;
+	uint64_t freeze_ns, stop_ns, clone_ns, wait_ns;
 };
 
 /* On return the app runs, whatever happened. */

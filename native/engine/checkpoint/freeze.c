@@ -372,14 +372,18 @@ static int rest_all(struct freeze *freeze, struct avc_error *err)
 static int meet_others(struct freeze *freeze, int result, struct avc_error *err)
 {
 	struct avc_error failed = { 0 };
+	uint64_t start;
 
 	if (!freeze->meet)
 		return result;
 	if (!result)
 		result = rest_all(freeze, err);
-	return freeze->meet(freeze->arg, result ? NULL : freeze->generation, result ? &failed : err)
-		       ? -1
-		       : result;
+	boost_end();
+	start = now_ns();
+	if (freeze->meet(freeze->arg, result ? NULL : freeze->generation, result ? &failed : err))
+		result = -1;
+	freeze->wait_ns = now_ns() - start;
+	return result;
 }
 
 /* The main thread first: otherwise it would have to share the CPUs with all others. */
@@ -409,6 +413,9 @@ int freeze_tree(struct freeze *freeze, struct avc_error *err)
 
 	rt_priority_begin();
 	tracee_deadline_set(freeze->timer, freeze->deadline_ns);
+	/* The others stay stopped until it has got a CPU to stop, to be cloned and to come home. */
+	if (freeze->meet)
+		boost_begin(tree_main(freeze->tree)->pid);
 	result = freeze_stop_prepare(freeze->tree, err);
 	start = generation->taken_ns = now_ns();
 	if (!result)

@@ -446,6 +446,15 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 			touch_slot(&process->parasite, main->slot, process->thread_count);
 	}
 	wait_quiescent(guard, &freeze->generation->quiescent);
+	return 0;
+}
+
+/* From here on with real-time priority: where several are stopped in one instant, whoever gets its
+ * CPU late keeps all others stopped. */
+static int stop_and_freeze(struct avc_guard *guard, struct freeze *freeze, struct avc_error *err)
+{
+	int result;
+
 	if (guard->meeting && guard_meet_ready(guard, err))
 		return -1;
 	for (uint32_t i = 0; i < guard->tree.count; i++)
@@ -454,7 +463,11 @@ static int prepare_freeze(struct avc_guard *guard, struct freeze *freeze, struct
 	budget_deadline(READ_NS);
 	/* Writes between here and the freeze count as later than it. */
 	guard_note_written(guard);
-	return 0;
+	if (lock_numbers(guard, err))
+		return -1;
+	result = freeze_tree(freeze, err);
+	last_pid_unlock(guard->channel.numbers_fd);
+	return result;
 }
 
 static int finish(struct avc_guard *guard, struct generation *fresh, struct avc_error *err)
@@ -502,12 +515,9 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 		generation_drop(fresh);
 		return -1;
 	}
-	if (lock_numbers(guard, err)) {
-		generation_drop(fresh);
-		return -1;
-	}
-	result = freeze_tree(freeze, err);
-	last_pid_unlock(guard->channel.numbers_fd);
+	rt_priority_begin();
+	result = stop_and_freeze(guard, freeze, err);
+	rt_priority_end();
 	budget_deadline(0);
 	if (!result)
 		result = budget_check(guard->main.pid, err);
@@ -515,6 +525,7 @@ static int take_by(struct avc_guard *guard, struct freeze *freeze, struct avc_ev
 	event->freeze_ns = freeze->freeze_ns;
 	event->stop_ns = freeze->stop_ns;
 	event->clone_ns = freeze->clone_ns;
+	event->wait_ns = freeze->wait_ns;
 	event->threads = generation_threads(fresh);
 	if (result || finish(guard, fresh, err) ||
 	    (guard->meeting && guard_meet_taken(guard, err))) {

@@ -205,6 +205,7 @@ struct avc_event {
 	uint64_t freeze_ns;
 	uint64_t stop_ns;  /* of it, until every known thread had stopped   */
 	uint64_t clone_ns; /* of it, until everything was read and cloned   */
+	uint64_t wait_ns;  /* of it, for the rest of its group              */
 	/* CHECKPOINT: how it was made                                            */
 	int32_t images;      /* AVC_IMAGES_FORK or AVC_IMAGES_DIRTY           */
 	int32_t fork_reason; /* enum avc_fork_reason                          */

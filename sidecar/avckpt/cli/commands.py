@@ -405,8 +405,17 @@ def _row(c: Json) -> tuple[str, ...]:
         f"{_ms(c['last_freeze_s'])} {c['last_images']}".rstrip(),
         str(c["restores"]),
         _ms(c["last_restore_s"]),
-        c["reason"] or (f"forked: {c['last_fork_reason']}" if c["last_fork_reason"] else ""),
+        "; ".join(filter(None, (_line(c), c["reason"] or _why_forked(c)))),
     )
+
+
+def _line(c: Json) -> str:
+    """Which one of its group it would go back to."""
+    return f"line {c['line']} of {c['group']}" if c["line"] else ""
+
+
+def _why_forked(c: Json) -> str:
+    return f"forked: {c['last_fork_reason']}" if c["last_fork_reason"] else ""
 
 
 def _interval(c: Json) -> str:

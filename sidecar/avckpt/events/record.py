@@ -193,7 +193,7 @@ def of_guard(
         age_s=event.age_s if restored or kind is Kind.DROPPED else None,
         lost_s=event.age_s + event.restore_s if restored else None,
         freeze_s=event.freeze_s if taken or restored or kind is Kind.MISSED else None,
-        freeze_own_s=event.stop_s + event.clone_s if taken and event.line else None,
+        freeze_own_s=event.freeze_s - event.wait_s if taken and event.line else None,
         checkpoints=event.checkpoints if taken else None,
         freeze_max_s=event.freeze_max_s if taken else None,
         interval_s=event.interval_s if taken else None,
