@@ -578,7 +578,7 @@ static void guard_main(struct avc_guard *guard)
 		carry_out(guard);
 		if (guard->dead.waits)
 			guard_tend_dead(guard);
-		else if (guard_filter_hinders(guard))
+		else if (seccomp_must_suspend())
 			break;
 		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
@@ -690,7 +690,7 @@ int guard_run(int socket)
 		guard_main(guard);
 	}
 	send_last_words(guard);
-	hindered = guard_filter_hinders(guard);
+	hindered = seccomp_must_suspend();
 	guard_free(guard);
 	return hindered ? AVC_GUARD_HINDERED : 0;
 }

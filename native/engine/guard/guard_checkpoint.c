@@ -647,7 +647,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	guard_pace_missed(guard);
 	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
-	if (guard_filter_hinders(guard)) {
+	if (seccomp_must_suspend()) {
 		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */
 		if (!ticket)
 			return;
@@ -661,7 +661,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
-		if (!guard_filter_hinders(guard))
+		if (!seccomp_must_suspend())
 			guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
 		guard_unprotect(guard, ticket, &error);
 		return;
