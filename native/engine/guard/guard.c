@@ -90,6 +90,7 @@ void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, 
 static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
 {
 	policy_shrink(&guard->policy);
+	dirty_drop_idle(&guard->dirty); /* worth less than any generation */
 	if (!guard->count) {
 		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held");
 		return;

@@ -401,9 +401,11 @@ static void work_ahead(struct avc_guard *guard)
 		return;
 	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
-	if (wants_spare(guard, newest))
+	if (wants_spare(guard, newest)) {
 		make_spare(guard, newest);
-	else if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
+		if (guard->count)
+			dirty_drop_stale(&guard->dirty, &guard->generations[guard->count - 1]);
+	} else if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
 		; /* to be continued before anything else */
 	else
 		more = !newest->spare.work &&
