@@ -117,14 +117,16 @@ def ours(container: Container, name: str = "avckpt-") -> list[int]:
     return found
 
 
-def start_hoard(sidecar: Sidecar, factory: ContainerFactory, folder: Path, mb: int, limit_mb: int) -> ProtectedVictim:
+def start_hoard(
+    sidecar: Sidecar, factory: ContainerFactory, folder: Path, mb: int, limit_mb: int, images: str = "fork"
+) -> ProtectedVictim:
     """Starts the victim `hoard` with so much memory, in a container with that limit (0: none)."""
     return start_victim(
         sidecar,
         factory,
         folder,
         f"hoard {mb}",
-        labels={"interval": "1h"},
+        labels={"interval": "1h", "images": images},
         options=["--memory", f"{limit_mb}m", "--memory-swap", f"{limit_mb}m"] if limit_mb else [],
         generation=0,
     )

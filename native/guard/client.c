@@ -150,8 +150,7 @@ static void guard_succeed(struct avc_guard *guard)
 				   .at_ns = now_ns() };
 	struct epoll_event on = { .events = EPOLLIN, .data.ptr = guard };
 
-	fail(&event.error, AVC_GONE, 0, 0, "", "",
-	     "it takes one to suspend the application's own, or to watch its memory");
+	fail(&event.error, AVC_GONE, 0, 0, "", "", "it takes one to suspend the application's own");
 	guard_release(guard);
 	guard->config.suspends = guard->config.late = 1;
 	guard->beats = 0;

@@ -18,6 +18,8 @@ pytestmark = pytest.mark.shared_machine(
 )
 
 MB = 1 << 20
+IMAGES = ["fork", "auto"]
+"""Copies have one template more, and must not cost an application anything either."""
 
 
 def held(sidecar: Sidecar, container: Container) -> dict[str, Any]:
@@ -26,9 +28,12 @@ def held(sidecar: Sidecar, container: Container) -> dict[str, Any]:
     return entry
 
 
+@pytest.mark.parametrize("images", IMAGES)
 @pytest.mark.skipif(SLOWNESS > 1, reason="the sidecar is quicker there than the kernel's OOM killer")
-def test_the_oom_killer_takes_templates_first(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
-    victim = start_hoard(sidecar, container, tmp_path, 60, 160)
+def test_the_oom_killer_takes_templates_first(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, images: str
+) -> None:
+    victim = start_hoard(sidecar, container, tmp_path, 60, 160, images)
     app = victim.app
     for _ in range(2):
         victim.checkpoint()
@@ -46,10 +51,11 @@ def test_the_oom_killer_takes_templates_first(sidecar: Sidecar, container: Conta
     victim.kill(signal.SIGKILL)
 
 
+@pytest.mark.parametrize("images", IMAGES)
 def test_near_its_limit_a_container_gives_the_oldest_generation_up(
-    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, images: str
 ) -> None:
-    victim = start_hoard(sidecar, container, tmp_path, 60, 190)
+    victim = start_hoard(sidecar, container, tmp_path, 60, 190, images)
     victim.checkpoint()
     write_hoard(victim, signal.SIGUSR1, 60)
     victim.checkpoint()
@@ -78,9 +84,12 @@ def templates(container: Container) -> list[int]:
     return ours(container, "avckpt-tmpl")
 
 
+@pytest.mark.parametrize("images", IMAGES)
 @pytest.mark.parametrize("held_mb", [60])
-def test_memory_held_is_shown(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, held_mb: int) -> None:
-    victim = start_hoard(sidecar, container, tmp_path, held_mb, 1000)
+def test_memory_held_is_shown(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path, held_mb: int, images: str
+) -> None:
+    victim = start_hoard(sidecar, container, tmp_path, held_mb, 1000, images)
     victim.checkpoint()
     assert held(sidecar, victim.container)["memory_bytes"] < 5 * MB
     write_hoard(victim, signal.SIGUSR1, held_mb)

@@ -91,6 +91,25 @@ def test_the_seccomp_filter_of_its_guard(
     assert status_of(entry["guard_pid"])["Seccomp"] == mode
 
 
+def test_a_guard_that_watches_memory_has_a_filter_too(
+    sidecar: Sidecar, container: ContainerFactory, tmp_path: Path
+) -> None:
+    """Podman's default profile refuses userfaultfd(2). What is restored is watched again."""
+    labels = {**QUICK, "images": "dirty"}
+    victim = start_victim(sidecar, container, tmp_path, "dirt 40 2 --rate 1000", labels=labels)
+    made = victim.container
+
+    def watched() -> bool:
+        return " uw " in Path(f"/proc/{victim.app}/smaps").read_text()  # VmFlags
+
+    for _ in range(3):
+        wait_until(watched, 20, "its memory is watched", every_s=0.1)
+        entry = sidecar.wait_for(made, lambda e: e["last_images"] == "dirty", "a copy")
+        assert status_of(entry["guard_pid"])["Seccomp"] == "2"
+        victim.kill(signal.SIGKILL)
+    assert victim.see().violations == 0
+
+
 def test_pause_and_unpause(sidecar: Sidecar, container: ContainerFactory, tmp_path: Path) -> None:
     """A paused container is left alone, and protected again when it is unpaused."""
     victim = start_victim(sidecar, container, tmp_path, "threads 4 1")

@@ -335,6 +335,25 @@ def test_copies_only_where_the_container_has_memory_for_them(limit_mb: int, how:
         assert how_made(guard, 3) == {how}
 
 
+def test_where_memory_is_short_only_generations_are_held(tmp_path: Path) -> None:
+    """The template that is kept beside them goes first, and there is no other until memory is there again."""
+    settings = config(images=Images.DIRTY, keep=2)
+    with Victim("dirt 64 2 --rate 1000", tmp_path) as victim, GuardProcess(settings, [victim.pid]) as guard:
+        until_near(guard)
+        wait_until(lambda: len(ours(victim, "avckpt-tmpl")) == 3, 5.0, "two generations' are there, and one more")
+        assert guard.command("drop_oldest")["kind"] == "dropped"
+        wait_until(lambda: len(ours(victim, "avckpt-tmpl")) == 1, 5.0, "only the newest generation's is there")
+        for _ in range(3):
+            assert checkpoint(guard)["fork_reason"] == "memory for copies is short"
+            wait_until(lambda: len(ours(victim, "avckpt-tmpl")) == 1, 5.0, "only the newest generation's is there")
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait("restored", since=since)
+        guard.say_command("refill")
+        until_near(guard)
+        victim.check()
+
+
 def test_forks_where_more_of_them_are_affordable(tmp_path: Path) -> None:
     """It writes 120 MB/s, and has 64 MB: copies would come every 0.7 s."""
     with Victim("dirt 64 4 --rate 30000", tmp_path) as victim, GuardProcess(ALL_AUTO, [victim.pid]) as guard:

@@ -5,7 +5,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import platform
+import random
+import select
 import signal
 import subprocess
 import time
@@ -18,9 +21,10 @@ from avckpt.guard import Images
 from testkit import seccomp
 from testkit.guarded import GuardProcess, Victim, config, kill_at_random
 from testkit.harness import ROOT, wait_until
-from testkit.procfs import status_of
+from testkit.procfs import children_of, comm_of, status_of
 
 CPU = platform.machine()
+CAP_KILL, CAP_SYS_PTRACE, CAP_SYS_ADMIN = 1 << 5, 1 << 19, 1 << 21
 LAYERS = ("base", f"base/{CPU}", "trace", "state", "files", "process", "checkpoint", "restore", "guard")
 
 
@@ -57,6 +61,7 @@ def filters_of(guard: GuardProcess) -> set[tuple[str, str]]:
     return found
 
 
+KERNEL = "the kernel cannot watch its memory"
 FILTERED, PLAIN = {("2", "1")}, {("0", "0")}
 
 
@@ -149,17 +154,82 @@ def test_a_container_whose_filter_refuses_what_is_needed(call: str, tmp_path: Pa
         kill_at_random(guard, victim, 3, (0.02, 0.1))
 
 
+def watchers_of(guard: GuardProcess) -> list[int]:
+    return [pid for pid in children_of(guard.pid) if comm_of(pid) == "avckpt-watch"]
+
+
+def copied_since(guard: GuardProcess, since: int) -> None:
+    guard.wait_for(lambda event: event.get("images") == "dirty", "a copy", since=since)
+
+
 @pytest.mark.parametrize("images", [Images.FORK, Images.DIRTY])
 def test_a_container_that_may_not_have_its_memory_watched(images: Images, tmp_path: Path) -> None:
-    """As in Podman's default profile: userfaultfd(2) is refused. Only where it is to be used does the guard have to
-    suspend the filter."""
+    """As in Podman's default profile: userfaultfd(2) is refused. The guard is confined nevertheless; a process of
+    its own has the filter suspended, for that call alone."""
     install = seccomp.refusing("userfaultfd")
     with (
         Victim("idle 10 4", tmp_path, preexec=install) as victim,
         GuardProcess(config(0.05, images=images), [victim.pid]) as guard,
     ):
         guard.wait("checkpoint", count=2)
-        assert filters_of(guard) == (FILTERED if images is Images.FORK else PLAIN)
-        if images is Images.DIRTY:
-            wait_until(lambda: any(event.get("images") == "dirty" for event in guard.events), 15, "a copy")
+        assert filters_of(guard) == FILTERED
+        if images is Images.FORK:
+            assert watchers_of(guard) == []
+            return
+        copied_since(guard, 0)
+        [watcher] = watchers_of(guard)
+        status = status_of(watcher)
+        assert (status["Seccomp"], int(status["CapEff"], 16)) == ("0", CAP_KILL | CAP_SYS_PTRACE | CAP_SYS_ADMIN)
+        assert [fd.name for fd in Path(f"/proc/{watcher}/fd").iterdir()] == ["0"]
+        for _ in range(3):
+            since = guard.mark()
+            victim.kill_app()
+            guard.wait("restored", since=since)
+            copied_since(guard, since)
         kill_at_random(guard, victim, 3, (0.02, 0.2))
+        assert not refused_by_kernel(guard)
+        os.kill(watcher, signal.SIGKILL)
+        # It goes on with forks when it has to watch another process.
+        since = guard.mark()
+        victim.kill_app()
+        guard.wait_for(lambda event: event.get("fork_reason") == KERNEL, "a fork", since=since)
+        kill_at_random(guard, victim, 3, (0.02, 0.2))
+        assert filters_of(guard) == FILTERED
+        victim.check()
+
+
+def refused_by_kernel(guard: GuardProcess) -> bool:
+    return any(event.get("fork_reason") == KERNEL for event in guard.events)
+
+
+def test_the_watcher_ends_with_its_guard(tmp_path: Path) -> None:
+    with (
+        Victim("idle 10 4", tmp_path, preexec=seccomp.refusing("userfaultfd")) as victim,
+        GuardProcess(config(0.05, images=Images.DIRTY), [victim.pid]) as guard,
+    ):
+        copied_since(guard, 0)
+        [watcher] = [os.pidfd_open(pid) for pid in watchers_of(guard)]
+        guard.kill()
+        assert select.select([watcher], [], [], 5.0)[0] == [watcher]
+        os.close(watcher)
+        victim.wait_beats(5)
+
+
+def test_nothing_is_left_of_guards_that_die_as_they_begin_to_watch(tmp_path: Path) -> None:
+    """For a moment the task that opens the userfaultfd has no tracer."""
+    rng, watchers = random.Random(7), 0
+    with (
+        Victim("busy 3", tmp_path, preexec=seccomp.refusing("userfaultfd")) as victim,
+        GuardProcess(config(0.02, images=Images.DIRTY), [victim.pid]) as guard,
+    ):
+        copied_since(guard, 0)
+        for _ in range(20):
+            guard.start_another(victim.pid)
+            time.sleep(rng.uniform(0.02, 0.25))
+            watchers += len(watchers_of(guard))
+            guard.kill_guards()
+            victim.wait_beats(3)
+        assert watchers
+        wait_until(lambda: not victim.others(), 10, "the tasks that waited for a watcher have ended")
+        assert " uw " not in Path(f"/proc/{victim.app}/smaps").read_text()
+        victim.check()

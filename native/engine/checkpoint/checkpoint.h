@@ -202,6 +202,8 @@ int dirty_check(struct dirty_tree *dirty, const struct generation *generation,
 void dirty_follow(struct dirty_tree *dirty, const struct generation *generation);
 /* Whether a spare of the newest would be a better idle template than the one there is. */
 bool dirty_wants_spare(const struct dirty_tree *dirty, const struct generation *newest);
+/* When that spare has been made: an idle template with many stale pages only takes memory. */
+void dirty_drop_stale(struct dirty_tree *dirty, struct generation *newest);
 /* Before dirty_prepare(): if there is a spare, it becomes the idle template of the main process. */
 void dirty_take_spare(struct dirty_tree *dirty, struct generation *newest);
 /* Its templates are no longer needed: they become idle ones, if they can. */

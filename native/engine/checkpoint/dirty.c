@@ -83,6 +83,12 @@ static bool scan(struct dirty *dirty, const struct attempt *attempt, pid_t templ
 	return false;
 }
 
+bool dirty_is_stale_one(const struct dirty *dirty)
+{
+	return dirty->idle.pid &&
+	       pageset_count(dirty->idle.stale) > (uint64_t)dirty->own_pages / STALE_SHARE;
+}
+
 /* How many pages will have been written since the last scan, at the rate before it. */
 static uint64_t expected(uint64_t written, uint64_t before_ns, uint64_t since_ns)
 {
@@ -103,8 +109,7 @@ static bool copy_rounds(struct dirty *dirty, const struct attempt *attempt, uint
 
 		if (!scan(dirty, attempt, i ? 0 : dirty->idle.pid, left))
 			return false;
-		if (!i &&
-		    pageset_count(dirty->idle.stale) > (uint64_t)dirty->own_pages / STALE_SHARE) {
+		if (!i && dirty_is_stale_one(dirty)) {
 			dirty->reason = AVC_FORK_WRITES;
 			return false;
 		}

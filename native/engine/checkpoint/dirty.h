@@ -37,6 +37,8 @@ void dirty_follow_one(struct dirty *dirty, struct image *image);
 void dirty_recycle_one(struct dirty *dirty, struct image *image);
 void dirty_take_spare_one(struct dirty *dirty, struct generation *generation);
 bool dirty_wants_spare_one(struct dirty *dirty, const struct image *image);
+/* Its idle template is of no use for a copy. */
+bool dirty_is_stale_one(const struct dirty *dirty);
 void dirty_compare_one(struct dirty *dirty, const struct image *image, uint64_t number);
 /* Forgets the idle template, which keeps running. */
 void dirty_leave_idle_one(struct dirty *dirty);

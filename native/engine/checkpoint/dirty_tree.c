@@ -204,6 +204,14 @@ void dirty_take_spare(struct dirty_tree *dirty, struct generation *generation)
 		dirty_take_spare_one(one, generation);
 }
 
+void dirty_drop_stale(struct dirty_tree *dirty, struct generation *generation)
+{
+	struct dirty *one = of_main(dirty, generation);
+
+	if (one && dirty_is_stale_one(one) && !generation->spare.work && spare_is_there(generation))
+		dirty_drop_idle_one(one);
+}
+
 bool dirty_wants_spare(const struct dirty_tree *dirty, const struct generation *generation)
 {
 	struct dirty *one = of_main(dirty, generation);

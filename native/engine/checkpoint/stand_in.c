@@ -14,6 +14,10 @@
 #define PAGE ((avc_remote)ARCH_PAGE_BYTES)
 #define PAGES_MAX 16384
 #define READ_PAGE_NS 700
+#define APPROACH_NS NS_PER_S /* the application is dead: then rather a fork */
+/* It runs again, and a generation is worth waiting for a CPU; the daemon kills a guard that is silent
+ * for longer (avc_guard_check()). */
+#define FINISH_NS (4 * NS_PER_S)
 
 /* It is not worth it if reading the pages that differ takes longer than a fork. */
 static bool is_near(const struct dirty *dirty, const struct generation *generation)
@@ -93,29 +97,50 @@ static void exchange(struct dirty *dirty, struct generation *generation)
 	dirty->standing_in = true;
 }
 
+/* Now the other one belongs to the generation. */
+static void settle(struct dirty *dirty, struct generation *generation)
+{
+	struct image *image = &generation->image[0];
+
+	dirty->standing_in = false;
+	free(image->inherited);
+	image->inherited = dirty->idle.inherited;
+	dirty->idle.inherited = NULL;
+	dirty_leave_idle_one(dirty);
+	/* The plan is for the other template's memory. */
+	restore_plan_free(generation->plan);
+	generation->plan = NULL;
+}
+
 void stand_in_begin(struct dirty_tree *tree, struct generation *generation, timer_t timer)
 {
 	struct image *image = &generation->image[0];
 	struct dirty *dirty = dirty_find(tree, image->process);
+	/* Other processes are forked from it, and compared with it. */
+	const bool at_once = generation->images > 1;
 	struct template_calls calls;
-	bool ready;
+	struct avc_error why = { 0 };
+	bool ready, lent;
 
 	if (!dirty || spare_is_there(generation) || generation->spare.work ||
 	    !is_near(dirty, generation) || pidfd_ended(image->pidfd) ||
 	    pidfd_ended(dirty->idle.pidfd))
 		return;
 	calls = template_calls_begin(&image->process->parasite, &dirty->idle, image->slot);
-	tracee_deadline_set(timer, NS_PER_S);
-	ready = approach(dirty, &calls, image, &dirty->idle.differs);
+	lent = rt_priority_lend(dirty->idle.pid);
+	tracee_deadline_set(timer, APPROACH_NS);
+	ready = approach(dirty, &calls, image, &dirty->idle.differs) &&
+		(!at_once || !copy_write(dirty, &calls, &why));
 	tracee_deadline_clear(timer);
+	if (lent)
+		rt_priority_reclaim(dirty->idle.pid);
 	if (!ready) {
 		dirty_drop_idle_one(dirty);
 		return;
 	}
 	exchange(dirty, generation);
-	/* Other processes are forked from it, and compared with it. */
-	if (generation->images > 1)
-		(void)stand_in_finish(tree, generation, timer);
+	if (at_once)
+		settle(dirty, generation);
 }
 
 bool stand_in_finish(struct dirty_tree *tree, struct generation *generation, timer_t timer)
@@ -124,22 +149,18 @@ bool stand_in_finish(struct dirty_tree *tree, struct generation *generation, tim
 	struct dirty *dirty = dirty_find(tree, image->process);
 	struct template_calls calls;
 	struct avc_error why = { 0 };
-	bool whole;
+	bool whole, lent;
 
 	if (!dirty || !dirty->standing_in)
 		return true;
 	calls = template_calls_begin(&image->process->parasite, &dirty->idle, image->slot);
-	tracee_deadline_set(timer, NS_PER_S);
+	heartbeat();
+	lent = rt_priority_lend(dirty->idle.pid);
+	tracee_deadline_set(timer, FINISH_NS);
 	whole = copy_write(dirty, &calls, &why) == 0;
 	tracee_deadline_clear(timer);
-	dirty->standing_in = false;
-	/* Only now does it belong to the generation. */
-	free(image->inherited);
-	image->inherited = dirty->idle.inherited;
-	dirty->idle.inherited = NULL;
-	dirty_leave_idle_one(dirty);
-	/* The plan is for the other template's memory. */
-	restore_plan_free(generation->plan);
-	generation->plan = NULL;
+	if (lent)
+		rt_priority_reclaim(dirty->idle.pid);
+	settle(dirty, generation);
 	return whole;
 }

@@ -335,11 +335,6 @@ static bool has_own_filters(const struct process *process)
 	return false;
 }
 
-static bool watches(const struct avc_guard *guard)
-{
-	return guard->config.images != AVC_IMAGES_FORK;
-}
-
 void guard_filter(struct avc_guard *guard)
 {
 	if (guard->filter_decided)
@@ -348,19 +343,16 @@ void guard_filter(struct avc_guard *guard)
 #ifdef __SANITIZE_ADDRESS__
 	return; /* its library makes calls of its own */
 #endif
-	if (guard->config.suspends || !seccomp_can_be_confined(watches(guard)))
+	if (guard->config.suspends || !seccomp_can_be_confined())
 		return;
 	for (uint32_t i = 0; i < guard->tree.processes; i++)
 		if (has_own_filters(guard->tree.process[i]))
 			return;
 	output_learn(&guard->output);
 	faults_learn(&guard->faults);
+	/* Without one there are forks only. */
+	if (guard->config.images != AVC_IMAGES_FORK && seccomp_refuses_watching())
+		(void)watcher_start();
 	if (!guard_filter_enter())
 		seccomp_confined();
-}
-
-bool guard_filter_hinders(const struct avc_guard *guard)
-{
-	return seccomp_is_confined() &&
-	       (seccomp_must_suspend() || !seccomp_can_be_confined(watches(guard)));
 }

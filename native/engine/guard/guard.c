@@ -90,6 +90,7 @@ void guard_refuse(struct avc_guard *guard, uint64_t ticket, enum avc_code code, 
 static void drop_oldest(struct avc_guard *guard, uint64_t ticket)
 {
 	policy_shrink(&guard->policy);
+	dirty_drop_idle(&guard->dirty); /* worth less than any generation */
 	if (!guard->count) {
 		guard_refuse(guard, ticket, AVC_EMPTY, "no generation is held");
 		return;
@@ -578,7 +579,7 @@ static void guard_main(struct avc_guard *guard)
 		carry_out(guard);
 		if (guard->dead.waits)
 			guard_tend_dead(guard);
-		else if (guard_filter_hinders(guard))
+		else if (seccomp_must_suspend())
 			break;
 		guard_pace_listen(guard);
 		if (now_ns() >= guard_tell_due(guard))
@@ -690,7 +691,7 @@ int guard_run(int socket)
 		guard_main(guard);
 	}
 	send_last_words(guard);
-	hindered = guard_filter_hinders(guard);
+	hindered = seccomp_must_suspend();
 	guard_free(guard);
 	return hindered ? AVC_GUARD_HINDERED : 0;
 }

@@ -306,8 +306,6 @@ int guard_filter_enter(void) warn_unused;
 /* The same, once all of the app's threads have been looked at, if none has filters that may have to
  * be suspended. */
 void guard_filter(struct avc_guard *guard);
-/* Only a guard without a filter can go on from here. */
-bool guard_filter_hinders(const struct avc_guard *guard);
 
 /* ---- guard_death.c --------------------------------------------------------- */
 

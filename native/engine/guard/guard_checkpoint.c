@@ -408,9 +408,11 @@ static void work_ahead(struct avc_guard *guard)
 		return;
 	last_pid_prepare(guard->channel.init_pidfd);
 	newest = &guard->generations[guard->count - 1];
-	if (wants_spare(guard, newest))
+	if (wants_spare(guard, newest)) {
 		make_spare(guard, newest);
-	else if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
+		if (guard->count)
+			dirty_drop_stale(&guard->dirty, &guard->generations[guard->count - 1]);
+	} else if (stand_in_catch_up(&guard->dirty, newest, guard->timer))
 		; /* to be continued before anything else */
 	else
 		more = !newest->spare.work &&
@@ -679,7 +681,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 	}
 	guard_pace_missed(guard);
 	faults_settle(&guard->faults, &guard->tree, guard->next_ns);
-	if (guard_filter_hinders(guard)) {
+	if (seccomp_must_suspend()) {
 		guard->next_ns = now_ns(); /* guard_main() ends it, which is told */
 		if (!ticket)
 			return;
@@ -693,7 +695,7 @@ void guard_checkpoint(struct avc_guard *guard, uint64_t ticket)
 		return;
 	}
 	if (policy_missed(&guard->policy, error.code, error.pid == guard->main.pid)) {
-		if (!guard_filter_hinders(guard))
+		if (!seccomp_must_suspend())
 			guard->next_ns = policy_refused(&guard->policy, guard->next_ns, now_ns());
 		guard_unprotect(guard, ticket, &error);
 		return;

@@ -453,7 +453,8 @@ uint64_t guard_keep_generation(struct avc_guard *guard, struct generation *fresh
 					   : policy_replaced(&guard->policy, &guard->config, now);
 
 		replaced = guard->generations[i].number;
-		dirty_recycle(&guard->dirty, &guard->generations[i]);
+		if (guard_has_room_for_copies(guard))
+			dirty_recycle(&guard->dirty, &guard->generations[i]);
 		guard_drop_generation(guard, i);
 	}
 	guard->generations[guard->count++] = *fresh;

@@ -128,11 +128,11 @@ bool guard_has_room_for_copies(const struct avc_guard *guard)
 	const long limit = (long)(guard->config.memory_limit_bytes / ARCH_PAGE_BYTES);
 	long app = 0;
 
-	if (!newest)
-		return true;
 	/* Generations were given up because memory is short. */
 	if (guard->policy.room < guard->config.keep)
 		return false;
+	if (!newest || guard->config.images != AVC_IMAGES_AUTO)
+		return true;
 	for (uint32_t i = 0; i < newest->images; i++)
 		app += newest->image[i].anon_pages;
 	if (limit)

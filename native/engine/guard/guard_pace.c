@@ -80,11 +80,9 @@ static uint64_t faults_ns(struct avc_guard *guard, uint64_t freeze_ns)
 
 enum avc_fork_reason guard_why_fork(struct avc_guard *guard)
 {
-	if (guard->config.images != AVC_IMAGES_AUTO)
-		return AVC_FORK_NONE;
 	if (!guard_has_room_for_copies(guard))
 		return AVC_FORK_ROOM;
-	if (!policy_is_automatic(&guard->config) ||
+	if (guard->config.images != AVC_IMAGES_AUTO || !policy_is_automatic(&guard->config) ||
 	    !policy_prefers_forks(&guard->pace, &guard->config))
 		return AVC_FORK_NONE;
 	return guard->pace.forking ? AVC_FORK_BUDGET : AVC_FORK_FIRST;

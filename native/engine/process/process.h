@@ -7,6 +7,7 @@
  *   infect.c        injects parasite and holder
  *   executed.c      ... which are gone when it executes another program
  *   tracker.c       which of its pages are written
+ *   watcher.c       ... where its container may not watch memory
  *   support.c       what cannot be protected; quiescence
  *   waits.c         ends calls whose timeout has expired
  *   dying.c         in its own handler of a fatal signal
@@ -175,6 +176,15 @@ bool process_has_executed(const struct process *process);
 bool process_listen_for_exec(struct process *process);
 void process_listen_no_more(struct process *process);
 
+/* ---- watcher.c -------------------------------------------------------------------- */
+
+/* Before the guard comes under a filter, if it needs one.  False: there is none. */
+bool watcher_start(void);
+bool watcher_is_there(void);
+/* Has a task, which makes that call and has no tracer, make it (TRACKER_UFFD_FLAGS). The task is
+ * killed.  -1: it did not. */
+int watcher_open(pid_t tid, int pidfd) warn_unused;
+
 /* ---- tracker.c -------------------------------------------------------------------- */
 
 /* Sets that scans add to. */
@@ -183,6 +193,11 @@ void process_listen_no_more(struct process *process);
 /* Watches a process's private memory: the kernel records which pages are written, in the process's
  * page table, without a fault that has to be handled.  When our descriptor, the last one, is
  * closed, nothing of it remains in the process. */
+#ifndef UFFD_USER_MODE_ONLY
+#define UFFD_USER_MODE_ONLY 1 /* linux/userfaultfd.h */
+#endif
+#define TRACKER_UFFD_FLAGS (O_CLOEXEC | UFFD_USER_MODE_ONLY)
+
 struct tracker {
 	uint64_t number; /* unique: results of another tracker do not count               */
 	int uffd, pagemap;

@@ -34,10 +34,8 @@
 #ifndef UFFD_FEATURE_WP_ASYNC
 #define UFFD_FEATURE_WP_ASYNC (1 << 15)
 #endif
-#ifndef UFFD_USER_MODE_ONLY
-#define UFFD_USER_MODE_ONLY 1
-#endif
 #define MAKE_NS NS_PER_S
+#define HAND_OVER_S 1 /* for so long a task waits for the watcher                */
 
 /* ---- the descriptor ------------------------------------------------------------------------ */
 
@@ -84,7 +82,7 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 
 	call_begin(call, INJ_AFTER_PARK);
 	call_add(call, SYS_close_range, 0, ~0u, CLOSE_RANGE_UNSHARE);
-	made = call_add(call, SYS_userfaultfd, O_CLOEXEC | UFFD_USER_MODE_ONLY);
+	made = call_add(call, SYS_userfaultfd, TRACKER_UFFD_FLAGS);
 	if (parasite_send(&process->parasite, child, base, call, err))
 		return -1;
 	/* Containers' filters do not allow this call. */
@@ -106,6 +104,40 @@ static int open_in(struct process *process, pid_t child, const struct arch_regs 
 		    "no userfaultfd was made");
 }
 
+/* By the watcher.  Between two tracers, and without one if both die, it waits for a while in a table
+ * of its own and exits.  The watcher turns that exit into the call, which has the same argument: so it
+ * is never made under a filter that may kill for it. */
+static int open_by_watcher(struct process *process, pid_t child, const struct arch_regs *base,
+			   struct avc_error *err)
+{
+	const struct timespec patience = { .tv_sec = HAND_OVER_S };
+	struct inj_call *call = &process->parasite.control->runner;
+	int pidfd, fd = -1;
+
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_close_range, 0, ~0u, CLOSE_RANGE_UNSHARE);
+	if (parasite_send(&process->parasite, child, base, call, err) ||
+	    parasite_run(child, call, err))
+		return -1;
+	memcpy(call->out, &patience, sizeof patience);
+	call_begin(call, INJ_AFTER_PARK);
+	call_add(call, SYS_ppoll, 0, 0, parasite_remote(&process->parasite, call->out));
+	call_add(call, SYS_exit_group, TRACKER_UFFD_FLAGS);
+	if (parasite_send(&process->parasite, child, base, call, err))
+		return -1;
+	pidfd = proc_pidfd_open(child);
+	if (pidfd >= 0 && ptrace(PTRACE_DETACH, child, NULL, NULL) == 0) {
+		fd = watcher_open(child, pidfd);
+		syscall(SYS_pidfd_send_signal, pidfd, SIGKILL, NULL, 0);
+	}
+	close_fd(&pidfd);
+	if (fd >= 0 && is_userfaultfd(fd))
+		return fd;
+	close_fd(&fd);
+	return fail(err, AVC_UNSUPPORTED, 0, child, "watch memory", "userfaultfd",
+		    "it was not made in time, or the kernel does not allow it");
+}
+
 static int open_uffd(struct process *process, struct avc_error *err)
 {
 	struct uffdio_api api = { .api = UFFD_API,
@@ -115,9 +147,11 @@ static int open_uffd(struct process *process, struct avc_error *err)
 	int fd = -1;
 
 	if (make_task(process, &child, &base, err) == 0)
-		fd = open_in(process, child, &base, err);
+		fd = watcher_is_there() ? open_by_watcher(process, child, &base, err)
+					: open_in(process, child, &base, err);
 	if (child) {
-		tracee_kill(child);
+		if (tracee_is_ours(child))
+			tracee_kill(child);
 		seccomp_end_supervision(child);
 	}
 	if (fd >= 0 && ioctl(fd, UFFDIO_API, &api)) {

@@ -2,6 +2,7 @@
  *
  * Descriptors for a process being restored: one at a time, over a socket (unix(7), SCM_RIGHTS).
  */
+#include <errno.h>
 #include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
@@ -47,6 +48,18 @@ int fd_letter_number(const struct fd_letter *letter)
 		return -1;
 	memcpy(&fd, letter->control + CMSG_LEN(0), sizeof fd);
 	return fd;
+}
+
+int fd_receive(int socket)
+{
+	struct fd_letter letter;
+	ssize_t n;
+
+	fd_letter_write(&letter, (avc_remote)&letter);
+	do
+		n = recvmsg(socket, &letter.head, MSG_CMSG_CLOEXEC);
+	while (n < 0 && errno == EINTR);
+	return n > 0 ? fd_letter_number(&letter) : -1;
 }
 
 void fd_table_free(struct fd_table *table)

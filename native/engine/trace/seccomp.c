@@ -422,14 +422,14 @@ static bool bars_restart(const struct program *p)
 
 /* The container's filters, as of the first thread that was looked at. */
 static struct {
-	bool known, hinder, hinder_watching, bar_restart;
+	bool known, hinder, refuse_watching, bar_restart;
 } containers_filters;
 
 static void note_containers(const struct program *p, bool barred)
 {
 	containers_filters.hinder |= refuses_any(p, needed, COUNT(needed)) || barred;
 	containers_filters.bar_restart |= bars_restart(p);
-	containers_filters.hinder_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
+	containers_filters.refuse_watching |= verdict(p, needed_to_watch.nr, needed_to_watch.arg) !=
 					      PASSES;
 }
 
@@ -442,10 +442,14 @@ static struct {
 	bool is, met;
 } confined;
 
-bool seccomp_can_be_confined(bool watches)
+bool seccomp_can_be_confined(void)
 {
-	return containers_filters.known && !containers_filters.hinder &&
-	       !(watches && containers_filters.hinder_watching);
+	return containers_filters.known && !containers_filters.hinder;
+}
+
+bool seccomp_refuses_watching(void)
+{
+	return containers_filters.refuse_watching;
 }
 
 void seccomp_confined(void)

@@ -415,8 +415,10 @@ void rewind_date(struct thread *thread);
 int seccomp_read(const struct process *process, struct thread *thread,
 		 struct avc_error *err) warn_unused;
 /* Whether the guard may come under a filter of its own, and still protect an application that has
- * none.  `watches`: it is to watch memory. */
-bool seccomp_can_be_confined(bool watches);
+ * none. */
+bool seccomp_can_be_confined(void);
+/* Whether the container's filters refuse a userfaultfd. */
+bool seccomp_refuses_watching(void);
 /* It has come under one. */
 void seccomp_confined(void);
 bool seccomp_is_confined(void);
@@ -570,6 +572,8 @@ void fd_letter_write(struct fd_letter *letter, avc_remote remote);
 int fd_letter_number(const struct fd_letter *letter);
 /* One descriptor over a socket (unix(7), SCM_RIGHTS). */
 int fd_send(int socket, int fd);
+/* One that fd_send() has sent; -1: there was none with it, or the other end is closed. */
+int fd_receive(int socket) warn_unused;
 /* The descriptors that a new process is to have. */
 struct fd_table {
 	uint32_t count;
