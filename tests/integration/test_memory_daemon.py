@@ -45,7 +45,8 @@ def templates_of(init: int) -> list[int]:
     return [pid for pid in children_of(init) if comm_of(pid) == "avckpt-tmpl"]
 
 
-def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("images", ["fork", "auto"])
+def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_path: Path, images: str) -> None:
     subprocess.run(["make", "-s", "-C", str(ROOT / "tests/victims")], check=True)
     first = (group / "memory.limit_in_bytes").exists()
     limit, used = [
@@ -58,7 +59,7 @@ def test_a_limit_that_comes_later_holds(local: LocalSidecar, group: Path, tmp_pa
     wait_until(lambda: board.see().ready, 10, "it is ready")
     for pid in (web.init_pid, web.app_pid):
         (group / "cgroup.procs").write_text(str(pid))
-    assert web.hook("prestart", ON_COMMAND) == ""
+    assert web.hook("prestart", {**ON_COMMAND, "avckpt.images": images}) == ""
     local.wait_for(web, app_pid_inside=2)
     for n in (1, 2):
         take_checkpoint(local.client, "web")
