@@ -142,6 +142,7 @@ static int await_own_clone(struct process *process, pid_t *template, struct avc_
 
 	if (parasite_await_clone(thread->tid, call, template, err)) {
 		process->lost |= err->code != AVC_LIMIT;
+		parasite_cut_short(call, err);
 		thread_runs_on(thread, err);
 		return -1;
 	}
@@ -301,6 +302,7 @@ static int ask_halt(struct process *process, struct avc_error *err)
 	if (parasite_halt(thread->tid, &process->parasite.control->runner, err) == 0)
 		return 0;
 	process->asked = false;
+	parasite_cut_short(&process->parasite.control->runner, err);
 	thread_runs_on(thread, err);
 	return -1;
 }

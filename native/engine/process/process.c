@@ -234,6 +234,7 @@ int thread_ask(struct process *process, struct thread *thread, struct avc_error 
 	if (read_signal_state(thread, err) || thread_borrow(process, thread, err))
 		return -1;
 	if (parasite_run(thread->tid, call, err)) {
+		parasite_cut_short(call, err);
 		thread_runs_on(thread, err); /* not to be given back in the middle of it */
 		return -1;
 	}

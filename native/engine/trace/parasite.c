@@ -185,6 +185,17 @@ struct inj_syscall *call_append(struct inj_call *call, long nr, const uint64_t a
 	return s;
 }
 
+void parasite_cut_short(struct inj_call *call, const struct avc_error *err)
+{
+	if (err->code != AVC_DEADLINE)
+		return;
+	for (uint32_t i = 0; i < call->count && i < INJ_CALLS_MAX; i++)
+		if (call->call[i].nr == SYS_madvise || call->call[i].nr == SYS_munmap)
+			return;
+	__atomic_store_n(&call->park_ms, 0, __ATOMIC_RELAXED);
+	__atomic_store_n(&call->count, 0, __ATOMIC_RELEASE);
+}
+
 int parasite_set_undo(struct process *process, long nr, const uint64_t arg[6])
 {
 	struct inj_call *call = &process->parasite.control->runner;

@@ -504,6 +504,10 @@ int thread_vet(struct process *process, struct thread *thread, struct avc_error 
  * thread_borrow, parasite_run*, thread_give_back.  thread_give_back() needs a plain trap stop. */
 int thread_borrow(struct process *process, struct thread *thread,
 		  struct avc_error *err) warn_unused;
+/* For a thread that did not get to run in time, unless its list changes memory: it makes no more
+ * calls, and goes home as soon as it runs.  Others are released before it does, and may put it under
+ * a filter that kills for such calls (SECCOMP_FILTER_FLAG_TSYNC). */
+void parasite_cut_short(struct inj_call *call, const struct avc_error *err);
 /* The registers of a borrowed thread that goes home by itself, whatever its signal mask. */
 void thread_head_home(const struct thread *thread, struct arch_regs *regs);
 int thread_give_back(struct thread *thread, struct avc_error *err);
