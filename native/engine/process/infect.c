@@ -908,6 +908,7 @@ static void forget_holder(struct process *process)
 {
 	process->doubtful = false;
 	process->holder = 0;
+	process->holder_inside = 0;
 	process->holder_pidfd = -1;
 }
 
